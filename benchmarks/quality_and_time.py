@@ -14,7 +14,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 
@@ -111,17 +111,31 @@ def draw(points: list[Point], file: Path) -> None:
     for point in points:
         by_family.setdefault(point.family, []).append(point)
     for axes, name, paper in zip(panels, ("task", "mutual"), PAPER, strict=True):
-        for (family, own), marker, height in zip(by_family.items(), "osD^vPX*<>", (4, -11) * 5, strict=False):
+        for (family, own), marker in zip(by_family.items(), "osD^vPX*<>", strict=False):
             seconds, values = [p.seconds for p in own], [getattr(p, name) for p in own]
-            axes.plot(seconds, values, marker=marker, label=family, markersize=8 if family == PEER else 5)
+            (line,) = axes.plot(seconds, values, marker=marker, label=family, markersize=9)
             for point, value in zip(own, values, strict=True):
                 short = point.label.split(":", 1)[-1].removesuffix(":cyclic")
-                side = (-6, "right") if family == PEER else (4, "left")  # long labels would leave the picture
-                place = {"xytext": (side[0], height), "textcoords": "offset points", "ha": side[1]}
+                if len(short) == 1:  # degrees stand in their markers, where points may be close to each other
+                    place: dict[str, Any] = {
+                        "ha": "center",
+                        "va": "center_baseline",
+                        "color": "white",
+                        "weight": "bold",
+                    }
+                else:
+                    side = {"16x16": (-7, -4, "right"), "32x32": (7, -4, "left")}.get(short, (7, 4, "left"))
+                    place = {
+                        "xytext": side[:2],
+                        "textcoords": "offset points",
+                        "ha": side[2],
+                        "color": line.get_color(),
+                    }
                 axes.annotate(short, (point.seconds, value), **place, fontsize=7)
         axes.axhline(paper, color="0.7", linestyle="--", zorder=0)
         axes.set(xscale="log", xlabel="seconds of one thread", title=f"{name} angle, std [deg]")
         axes.margins(x=0.15)
+        axes.set_xlim(right=150)  # room for labels
         axes.grid(alpha=0.3, which="both")
     figure.legend(
         *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8, frameon=False

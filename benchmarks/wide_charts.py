@@ -28,6 +28,7 @@ ROBOTS: dict[str, tuple[str, str, str, dict[str, float]]] = {  # package, file, 
     "centauro, torso and arm": (DATA, "centauro_description/urdf/centauro.urdf", "arm1_8", {}),
 }
 OTHER_TASKS = {"z1": "position+axis:x"}  # of an arm with six joints and a tool that may turn about its axis
+ACROSS = ("z1", "position+axis:z")  # the axis of the tool lies across that of the last joint
 POSITIONS = ("iiwa", "panda", "xarm7", "baxter, left")
 HEADER = (
     "| arm, task | branch, its share | fit [s CPU] | regular share | leak rms [deg] | conditioning mean, 1 % "
@@ -113,9 +114,8 @@ def loops(name: str, chart: oc.Chart, radius: float, starts: int) -> str:
 
 def main(quick: bool = False) -> list[str]:
     """All rows; `quick` takes one arm, cubic coordinates and few samples."""
-    cases = [(name, OTHER_TASKS.get(name, "pose")) for name in ("iiwa", *ROBOTS)] + [
-        *((name, "position") for name in POSITIONS)
-    ]
+    cases = [(name, OTHER_TASKS.get(name, "pose")) for name in ("iiwa", *ROBOTS)]
+    cases += [ACROSS, *((name, "position") for name in POSITIONS)]
     charts: dict[str, oc.Chart] = {}
     rows = table(HEADER, (row(*case, quick, charts) for case in (cases[:1] if quick else cases)))
     arms = [(name, radius) for name in ("iiwa", "panda") for radius in (0.05, 0.1, 0.2, 0.3)]

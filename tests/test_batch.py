@@ -1,6 +1,8 @@
 """Functions of one sample, called with many: chunks and threads change nothing."""
 
 import os
+import pickle
+from concurrent.futures import ThreadPoolExecutor
 
 import casadi as ca
 import numpy as np
@@ -34,3 +36,16 @@ def test_without_a_wish_every_core_gets_a_thread(monkeypatch: pytest.MonkeyPatch
     for told in ("", "0", "-2", "many"):
         monkeypatch.setenv("OMP_NUM_THREADS", told)
         assert batch._threads() == 3
+
+
+def test_results_of_single_calls_stay_when_the_next_one_comes() -> None:
+    """Memory is kept from call to call, for each thread its own."""
+    x = ca.SX.sym("x", 2)
+    batched = Batched(dense_function("f", [x], [ca.vertcat(x[0] + x[1], x[0] * x[1]), x @ x.T]))
+    again = pickle.loads(pickle.dumps(batched))
+    points = np.random.default_rng(0).normal(size=(200, 1, 2))
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda k: (batched, again)[k % 2](points[k]), range(200)))
+    for point, (both, outer) in zip(points[:, 0], found, strict=True):
+        np.testing.assert_array_equal(both, [[point.sum(), point.prod()]])
+        np.testing.assert_array_equal(outer, [np.outer(point, point)])

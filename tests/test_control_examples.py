@@ -1,12 +1,15 @@
 """Examples and the benchmark of closed loops, in quick mode."""
 
+import struct
 from pathlib import Path
 
 import closed_loop
 import control_tick
 import controllers
 import elbow_follower
+import joystick
 import lengths
+import numpy as np
 import panda_elbow
 import pytest
 from programs import needs_c
@@ -69,3 +72,26 @@ def test_recording_with_other_columns_is_refused(tmp_path: Path) -> None:
     (tmp_path / "points.csv").write_text("1,2,3\n")
     with pytest.raises(SystemExit, match="rows have 3 numbers, expected 18"):
         elbow_follower.read(tmp_path / "points.csv")
+
+
+def test_elbow_of_a_joystick_meets_its_boundary_and_the_hand_stays() -> None:
+    """By MuJoCo; where only the elbow is pushed beyond its boundary, the hand is off by less than 1e-6 m."""
+    found = joystick.main(iter(np.tile(np.eye(7)[6], (700, 1))))
+    assert found["reached"] + found["nearest"] == 1
+    assert found["nearest"] > 0.1
+    assert found["hand_error_m"] < 1e-9
+    assert found["at_boundary_m"] < 1e-6
+    assert found["fastest"] < 1 + 1e-9
+    assert found["room_rad"] > 0
+
+
+def test_events_of_a_joystick_become_sticks(tmp_path: Path) -> None:
+    """Bytes as the kernel writes them: the first state, then axes and a button, in two ticks."""
+    events = [(5000, 0, 0x82, 0), (5000, 16384, 0x82, 6), (5000, 1, 1, 0), (5012, -32767, 2, 0), (5012, 99, 2, 9)]
+    (tmp_path / "events").write_bytes(b"".join(struct.pack("<IhBB", *event) for event in events))
+    sticks = np.array(list(joystick.recorded(tmp_path / "events")))
+    np.testing.assert_allclose(sticks[:, 0], [0.0, 0.0, -1.0])
+    np.testing.assert_allclose(sticks[:, 6], 16384 / 32767)
+    (tmp_path / "events").write_bytes(b"123")
+    with pytest.raises(SystemExit, match="3 bytes, expected events of 8"):
+        next(joystick.recorded(tmp_path / "events"))

@@ -247,7 +247,7 @@ def test_nearly_all_of_a_branch_is_proved_and_holds() -> None:
     robot = oc.problems.get("iiwa").robot
     polynomial = oc.Polynomial(4, ["A1", "A7"])
     chart = oc.fit_wide(robot, oc.Task.pose(robot), "shoulder+ elbow- wrist+", parametrisation=polynomial).chart
-    found = oc.certify(chart, time_limit=12)
+    found = oc.certify(chart, time_limit=6)
     assert found.clear_share > 0.99  # from about 3 s on
     low, high = found.regular.leaves(PROVED)
     rng = np.random.default_rng(9)

@@ -285,6 +285,13 @@ def test_benchmark_of_xi_in_a_quadratic_program_leaves_the_tool_alone() -> None:
     assert found["xi, cost 0.1, drift [rad]"] < 1e-5 < found["none, drift [rad]"]
 
 
+@pytest.mark.slow
+def test_xi_in_an_inverse_dynamics_leaves_the_tool_alone_at_any_weight() -> None:
+    found = xi_in_qp.in_dynamics(quick=True)
+    errors = {kind: [found[f"{kind}, weight {w:g}, error [m]"] for w in xi_in_qp.WEIGHTS] for kind in ("posture", "xi")}
+    assert errors["xi"][2] < 1.01 * errors["xi"][0] < 5e-6 < errors["posture"][1] < errors["posture"][2] / 5
+
+
 def test_gradients_agree_with_pytorch() -> None:
     pytest.importorskip("torch")
     import gradients

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 from public_objects import ring, wide
+from test_docs import blocks
 
 import orthocas as oc
 from orthocas import learn
@@ -57,13 +58,13 @@ def walked(chart: oc.Chart, steps: int, step: float) -> tuple[Array, list[Tracke
 @pytest.mark.parametrize("name", ["planar, wide", "panda-wide"])
 def test_random_walks_break_no_joint_limit(name: str) -> None:
     chart = wide().chart if name == "planar, wide" else oc.charts.load(name)
-    q, statuses = walked(chart, 6000, 0.02)
+    q, statuses = walked(chart, 3000, 0.02)
     robot = chart.problem.robot
     assert ((q >= robot.lower) & (q <= robot.upper)).all()
     assert chart.problem.domain.contains(q).all()
     refused = np.mean([status != TrackerStatus.OK for status in statuses])
     assert 0.001 < refused < 0.9  # the walk did meet boundaries, and went on
-    assert np.ptp(q[-2000:], axis=0).max() > 0.05
+    assert np.ptp(q[-1000:], axis=0).max() > 0.05
 
 
 @pytest.mark.slow
@@ -124,3 +125,27 @@ def test_what_has_no_way_back_is_named() -> None:
         learn.PhiActions(Arm(ring()), chart, 0.1)
     with pytest.raises(InvalidValueError, match="step is"):
         learn.PhiActions(Arm(chart), chart, -1.0)
+
+
+def test_steps_of_the_page_bring_episodes_through_the_pipelines_of_lerobot() -> None:
+    """Batches of a data set to (x, xi), and actions one by one back, with other entries untouched."""
+    pytest.importorskip("lerobot", reason="lerobot is no dependency")
+    import torch  # type: ignore[import-not-found]
+    from lerobot.processor.converters import (  # type: ignore[import-not-found]
+        policy_action_to_transition,
+        transition_to_policy_action,
+    )
+
+    chart = oc.charts.load("panda-position")
+    names = {"chart": chart, "np": np, "coordinates_of": learn.coordinates_of}
+    exec(blocks("python", "how-to/learning.md")[-1], names)
+    t = np.linspace(0, 2, 50)[:, None]
+    episode = torch.as_tensor(chart.problem.domain.centre + 0.2 * np.sin(t + np.arange(7)) * [1, 1, 1, 1, 1, 1, 0])
+    found = names["before"]({"action": episode, "observation.state": episode})
+    np.testing.assert_array_equal(found["observation.state"], episode)
+    np.testing.assert_array_equal(found["action"], chart.phi(np.asarray(episode)))
+    back = names["ToJoints"]()
+    after = names["PolicyProcessorPipeline"]([back], "back", policy_action_to_transition, transition_to_policy_action)
+    back.start(np.asarray(episode[0]))
+    np.testing.assert_allclose([after(row).numpy() for row in found["action"]], episode, rtol=0, atol=1e-9)
+    assert after(found["action"].float()).dtype == torch.float32

@@ -227,6 +227,47 @@ def test_several_coordinates_are_regular_together() -> None:
 
 
 @pytest.mark.slow
+def test_base_and_tool_count_like_other_joints_where_linear_terms_are_poor() -> None:
+    robot = oc.Robot.from_urdf(
+        robot_data("talos_data/robots/talos_reduced.urdf"),
+        "arm_left_7_link",
+        {"torso_1_joint": 0.0, "torso_2_joint": 0.0},
+    )
+    fit = oc.fit_wide(robot, oc.Task.pose(robot), samples=3000)
+    assert fit.chart.coordinates.parametrisation.label == oc.Polynomial(4).label
+    assert fit.regular_share > 0.999
+    q = sample_uniform(fit.chart.problem.domain, 2000, 6)
+    slopes = np.einsum("sn,sn->s", fit.chart.coordinates.jacobian(q)[:, 0], self_motions(robot, q))
+    assert np.sign(slopes).min() == np.sign(slopes).max()
+    turned = q.copy()
+    turned[:, 0] = q[::-1, 0]  # unlike linear terms
+    there, here = (fit.chart.coordinates.jacobian(points)[:, 0, 0] for points in (turned, q))
+    assert np.abs(there - here).max() > 0.01
+
+
+@pytest.mark.slow
+def test_a_tool_that_turns_alone_is_on_one_side_of_singular_positions() -> None:
+    robot = oc.Robot.from_urdf(robot_data("z1_description/urdf/z1.urdf"), "link06")
+    fit = oc.fit_wide(robot, oc.Task.named(robot, "position+axis:x"), parametrisation=oc.Polynomial(3))
+    domain = fit.chart.problem.domain
+    whole = oc.Box(domain.centre, domain.half_width)
+    q = np.vstack([domain.centre, sample_uniform(whole, 4000, 3)])
+    moved = geometric_jacobians(robot, q)
+    axis = robot.tip_rotation(q)[:, :, 0]
+    turned = np.cross(moved[:, 3:].transpose(0, 2, 1), axis[:, None]).transpose(0, 2, 1)  # of the axis, (N, 3, n)
+    assert np.abs(turned[:, :, 5]).max() < 1e-8  # the last joint moves nothing
+    across = robot.tip_rotation(q)[:, :, 1:].transpose(0, 2, 1) @ turned
+    sides = np.linalg.det(np.concatenate([moved[:, :3], across], axis=1)[:, :, :5])
+    sides = np.sign(sides) == np.sign(sides[0])
+    inside = domain.contains(q)
+    assert not inside[~sides].any()
+    clear = domain.singular_values(q) > domain.least_singular_value  # type: ignore[attr-defined]
+    assert clear[~sides].sum() > 500  # which the share does not count
+    np.testing.assert_array_equal(inside[sides], clear[sides])
+    assert fit.regular_share == 1.0
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("like", ["swivel", "A3"])
 def test_coordinates_mean_what_is_asked(like: str) -> None:
     task, polynomial = oc.Task.pose(iiwa()), oc.Polynomial(4, ["A1", "A7"])

@@ -327,7 +327,7 @@ class Coordinates:
         fast = (lambda graph: graph) if self.as_matrices else scalar_code
         return BuiltOnUse(lambda name: BlockedFunction(fast(self.functions[name])))
 
-    @property
+    @cached_property
     def _has_blocks(self) -> bool:
         """Whether products of matrices make the family fast on blocks of joint positions."""
         return self.as_matrices or (len(self.offset) > 0 and isinstance(self.family, SelfDerivativeFamily))

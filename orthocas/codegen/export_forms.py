@@ -49,10 +49,10 @@ _FUNCTIONS = {
 }  # names in NumPy, which PyTorch and JAX share
 
 
-def function_code(name: str, summary: str, function: ca.Function) -> str:
-    """A Python function of columns q (n, N) with the entries of a dense SX function's output, row by row, (k, N)."""
-    q = ca.SX.sym("q", function.size_in(0)[0])
-    rows = ca.vec(ca.densify(function(q)).T)
+def function_code(name: str, summary: str, *functions: ca.Function) -> str:
+    """A Python function of columns q (n, N) with the entries of dense SX functions' outputs, row by row, (k, N)."""
+    q = ca.SX.sym("q", functions[0].size_in(0)[0])
+    rows = ca.vertcat(*(ca.vec(ca.densify(function(q)).T) for function in functions))
     lines = tape_lines(to_tape(ca.Function("rows", [q], [ca.cse(rows)])))
     body = "\n".join(f"    {line}" for line in lines)
     return f'def {name}(q):\n    """{summary}"""\n{body}\n'
@@ -211,7 +211,8 @@ def product_form(coordinates: Coordinates) -> Form | None:
     functions = family.basis(q[coordinates.active])[[rows[term] for term in plan.levels[0]]]
     code = function_code("_one_joint", "Functions of one joint each, (k, N).", dense_function("f", [q], [functions]))
     tables = _coefficients(coordinates, plan, rows) | _slopes(coordinates, slopes, plan, rows)
-    return Form("products", plan.counts, code, tables, plan.indices)
+    lower = [k for k, term in enumerate(plan.terms) if term in plan.lower]
+    return Form("products", plan.counts, code, tables, plan.indices | {"lower": lower})
 
 
 def _coefficients(coordinates: Coordinates, plan: Plan, rows: dict[Term, int]) -> dict[str, Array]:
@@ -269,8 +270,9 @@ def expression_form(chart: Chart) -> Form:
     """xi and its Jacobian, operation by operation."""
     q = ca.SX.sym("q", chart.n)
     slopes = dense_function("J_xi", [q], [chart.function("jacobian")(q)[chart.m :, :]])
+    xi = chart.function("xi")
     code = [
-        function_code("_xi", "Coordinates, (r, N), of columns q (n, N).", chart.function("xi")),
-        function_code("_xi_slopes", "The entries of their Jacobian row by row, (r n, N).", slopes),
+        function_code("_xi", "Coordinates, (r, N), of columns q (n, N).", xi),
+        function_code("_xi_and_slopes", "Coordinates, then their Jacobian row by row, (r + r n, N).", xi, slopes),
     ]
     return Form("expression", {}, "\n\n".join(code), {}, {})

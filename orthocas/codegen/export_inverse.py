@@ -41,11 +41,11 @@ def _newton(chart: Chart) -> Form:
             dense_function("f", [ca.vertcat(target, value)], [difference]),
         )
     ]
-    rates = "_jacobian(q)"
+    rates = "_task_and_slopes"
     if chart.relative.turned:
-        summary = "How fast task values move, with the tip's angular velocity in its axes, row by row, (m n, N)."
-        functions.append(function_code("_task_rates", summary, chart.relative.rates))
-        rates = "np.concatenate([_task_rates(q).reshape(len(UNITS), q.shape[0], q.shape[1]), _xi_jacobian(q)])"
+        summary = "Task values, then how fast they move, angular velocities in the tip's axes, (m + m n, N)."
+        rates = "_task_and_rates"
+        functions.append(function_code(rates, summary, problem.task.function, chart.relative.rates))
     tables = {"centre": domain.centre[:, None], "sizes": chart.phi_sizes[:, None], "bounds": bounds[:, :, None]}
     return Form("inverse", {"rates": rates}, "\n\n".join(functions), tables, {})
 

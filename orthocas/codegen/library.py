@@ -171,8 +171,11 @@ class CompiledLibrary:
 
     def numbers(self, values: ArrayLike) -> Array:
         """Values as a C array of the library's number type."""
+        array = np.asarray(values)
+        if array.dtype == self.precision.scalar:
+            return np.ascontiguousarray(array)
         with np.errstate(over="ignore"):
-            return np.ascontiguousarray(values, dtype=self.precision.scalar)
+            return np.ascontiguousarray(array, dtype=self.precision.scalar)
 
     def _zeros(self, *shape: int) -> Array:
         return np.zeros(shape, dtype=self.precision.scalar)

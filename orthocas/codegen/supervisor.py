@@ -132,8 +132,8 @@ class Supervisor:
         return numbers, _pointer(numbers)
 
     def _begin(self, name: str, q: ArrayLike, command: ArrayLike | None) -> None:
-        given = None if command is None else self._point("command", command)  # lives until C has read it
-        self._functions[name](self._here, _pointer(self._point("q", q)), None if given is None else _pointer(given))
+        point, given = self._point("q", q), None if command is None else self._point("command", command)
+        self._functions[name](self._here, _pointer(point), None if given is None else _pointer(given))
 
     def _numbers(self, name: str, values: ArrayLike, size: int) -> Array:
         """Numbers of the library's type, which may be NaN or infinite."""
@@ -209,4 +209,5 @@ def _kind(value: Any, precision: Precision) -> Any:
 
 
 def _pointer(array: Array) -> Any:
-    return array.ctypes.data_as(_POINTER)
+    """The address of an array, which must live until C has read it. `data_as` would keep it, and takes microseconds."""
+    return _POINTER(array.ctypes.data)

@@ -15,6 +15,7 @@ from orthocas.fitting.terms import Sizes, Weights
 from orthocas.tasks.samples import Draw, Samples, even_parts
 from orthocas.tools.batch import in_threads, in_threads_with, thread_count
 from orthocas.tools.blas_graph import NumpyGraph
+from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import Run, blocked, by_sample, shares
 from orthocas.tools.expressions import replay
@@ -228,9 +229,17 @@ class _LossGraph:
         weighted = [ca.horzcat(*(share * slope for slope in slopes[j::r])) for j in range(r)]
         # chain rule, split at J_xi: the derivatives of the loss are one sample's graph, replayed on columns
         by_theta = ca.jtimes(ca.horzcat(*gradients), theta, ca.horzcat(*(part.T for part in weighted)), True)
-        value, inputs = ca.dot(share, values), [theta, q, data, share]
-        self.value = NumpyGraph("loss", inputs, [value])
-        self.both = NumpyGraph("loss_and_gradient", inputs, [value, ca.densify(by_theta)])
+        self._inputs, self._value, self._slope = [theta, q, data, share], ca.dot(share, values), ca.densify(by_theta)
+
+    @cached_property
+    def value(self) -> NumpyGraph:
+        """The loss alone."""
+        return NumpyGraph("loss", self._inputs, [self._value])
+
+    @cached_property
+    def both(self) -> NumpyGraph:
+        """The loss and its gradient."""
+        return NumpyGraph("loss_and_gradient", self._inputs, [self._value, self._slope])
 
 
 @dataclass(frozen=True, eq=False)

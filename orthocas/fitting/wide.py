@@ -48,6 +48,7 @@ from orthocas.tools.progress import Monitor, Progress, silent
 CLEARANCE = 0.1  #: default least relative singular value
 LEAST_VOLUME = 0.05  #: over r, of the coordinates in domains of wide charts; see `RegularPart`
 DEGREE = 6
+_DEGREE_OF_ALL = 4  # where base and tool joints count like all others
 _PER_TERM, _LEAST_SAMPLES, _MOST_SAMPLES = 30, 5000, 20_000
 _TAG, _JUDGED_TAG, _FIRST_TAG = 3000, 3001, 1000  # seed tags; other samples use other ones
 _FIRST = 200  # samples that scale coordinates
@@ -55,6 +56,7 @@ _JUDGED = 20_000
 _FIRST_STEP = (0.0, 1e-2)  # margin, and weight of the mean squared gradient
 _EASY, _HARDER = ((0.2, 1e-3), (0.2, 1e-4)), ((0.05, 1e-4), (0.05, 1e-5))  # further ones
 _HARD = 0.01  # share of bad positions after the first step with which a large margin asks too much
+_POOR = 5e-3  # share of bad positions with which another family is tried
 _ENOUGH = 5e-4  # share of bad positions, many near limits, that is as good as none
 _WELL = 0.28  # over r, volume of all but 1 % of positions that is enough; a conditioning of 0.2
 _ROUNDS, _FRESH, _WORST, _FRESH_TAG = 2, 50_000, 5000, 3002  # rounds with the worst of fresh samples
@@ -126,6 +128,14 @@ def fit_wide(
     r > 1 the problem is solved for one coordinate after the other, from a fit of degree 3. The domain of the chart is
     the part of the branch where coordinates are regular with a margin, see `RegularPart`.
 
+    Coordinates that are linear in the first and the last joint are best to prove and hold at any turn of them. They ask
+    that self-motions turn base and tool in one sense on the whole branch, as far as the other joints do not outweigh
+    that. Without `parametrisation`, if more than 0.5 % of samples are bad before the worst ones join, polynomials of
+    degree 4 in all joints with limits are tried, too, and the better ones are kept.
+
+    If r joints do not move the task at all, such as the last one under a tool with an axis, singular positions divide
+    the branch once more, by the sign of det of the other joints' columns. Samples and share are of the middle's side.
+
     Wide charts hold on most of what the arm reaches without passing a singular position (`regular_share`), but their
     leaks are large, 20 to 70 degrees on the arms that were measured. They serve inverse kinematics, closed loops,
     trackers and laws with the whole inertia; see `fit` for decoupled control. That det J keeps its sign does not mean
@@ -139,7 +149,8 @@ def fit_wide(
         metric: as in `Problem`.
         clearance: least relative singular value of the task, > 0; see `orthocas.ClearBox`.
         parametrisation: a family that is linear in its parameters. Default: Polynomial(6), with one linear
-            term for each joint on whose position self-motions do not depend, such as the first and the last one.
+            term for each joint on whose position self-motions do not depend, such as the first and the last one; or
+            Polynomial(4), see above.
         home: posture whose branch is meant, (n,) or its name. Default: as for `suggest_domain`.
         like: what coordinates are to mean: a function of an SX column q, the name of a joint, or "swivel", the angle
             of the elbow about the line from shoulder to wrist [rad]. With r = 1, xi then has nearly the values of that
@@ -180,13 +191,9 @@ def fit_wide(
     require_count("seed", seed, least=0)
     chosen = _chosen(robot, task, branch, home)
     problem = _problem(robot, task, metric, chosen, bound)
-    wanted = Polynomial(DEGREE, _free_joints(problem)) if parametrisation is None else parametrisation
-    require_parametrisation(wanted)
-    wanted = wanted.for_problem(problem)
-    if isinstance(wanted, CyclicParametrisation):
-        problem = over_cyclic_joints(problem, tuple(wanted.cyclic))
-    if wanted.closed_form is not None or not isinstance(wanted.family(JointSpace.of(problem), problem.r), LinearFamily):
-        raise InvalidValueError("parametrisation", wanted.label, "a family to fit that is linear in its parameters")
+    wanted = _families(problem) if parametrisation is None else (parametrisation,)
+    cases = [_case(problem, family) for family in wanted]
+    problem, _ = cases[0]
     count = None if samples is None else require_count("samples", samples, least=2)
     posture = chosen.posture if home is None else home_posture(robot, task, home).q
     if problem.r > 1:
@@ -194,19 +201,45 @@ def fit_wide(
     else:
         meaning = Meaning.by_default(problem, posture) if like is None else Meaning.of(problem, like, posture)
         several = None
-    search = _Search(problem, wanted, count, seed, monitor, meaning, several)
+    searches = [_Search(*case, count, seed, monitor, meaning, several) for case in cases]
     with remembered() as pressed:
         stopped = False
         try:
-            search.run()
+            _run(searches)
         except KeyboardInterrupt:
-            if search.best is None:
+            if searches[0].best is None:
                 raise
             stopped = True
-        result = _finished(search, chosen, start, interrupted=stopped or pressed())
+        result = _finished(_better(searches), chosen, start, interrupted=stopped or pressed())
         if result.status is Status.INTERRUPTED or pressed():
             raise Interrupted(result)
     return result
+
+
+def _case(problem: Problem, family: Parametrisation) -> tuple[Problem, Parametrisation]:
+    """A problem and a family that suit each other."""
+    require_parametrisation(family)
+    family = family.for_problem(problem)
+    if isinstance(family, CyclicParametrisation):
+        problem = over_cyclic_joints(problem, tuple(family.cyclic))
+    if family.closed_form is not None or not isinstance(family.family(JointSpace.of(problem), problem.r), LinearFamily):
+        raise InvalidValueError("parametrisation", family.label, "a family to fit that is linear in its parameters")
+    return problem, family
+
+
+def _run(searches: Sequence["_Search"]) -> None:
+    """Search in one family after the other, as long as results are poor, then go on in the best one."""
+    for search in searches:
+        search.begin()
+        if search.rank[0] <= _POOR:
+            break
+    _better(searches).go_on()
+
+
+def _better(searches: Sequence["_Search"]) -> "_Search":
+    """The search with the best coordinates, regular in the middle if there are such."""
+    found = (search for search in searches if search.best is not None)
+    return min(found, key=lambda search: (not search.holds_in_the_middle(), *search.rank))
 
 
 def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: bool) -> WideFit:
@@ -226,7 +259,8 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
     except DomainError as error:
         advice = "give a smaller box as branch, or another branch"
         raise DomainError(f"in the middle of branch '{branch.name}', {error}: {advice}") from None
-    share = float(domain.is_clear(sample_uniform(clear.domain, _JUDGED, (seed, _JUDGED_TAG))).mean())
+    judged = sample_uniform(clear.domain, _JUDGED, (seed, _JUDGED_TAG))
+    share = float(domain.is_clear(judged[_beside_the_middle(clear, judged)]).mean())
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
     worst = worst_points(problem, coordinates, seed, thorough=True)
     notes: dict[str, str | float] = {
@@ -358,9 +392,28 @@ def _chosen(robot: Robot, task: Task, branch: Branch | Box | str | None, home: A
     return found.of(home_posture(robot, task, home).q) or found[0]
 
 
-def _free_joints(problem: Problem) -> tuple[str, ...]:
-    """Names of the joints on whose position the self-motions do not depend, by proof."""
-    return tuple(name for k, name in enumerate(problem.robot.joint_names) if leaves_stay(problem, k))
+def _families(problem: Problem) -> tuple[Polynomial, ...]:
+    """Polynomials that are linear in the joints on whose position the self-motions do not depend, by proof.
+
+    Then those that are so in such joints without limits only, if there are others.
+    """
+    robot = problem.robot
+    free = [k for k in range(robot.n) if leaves_stay(problem, k)]
+    endless = [k for k in free if np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
+    names, fewer = (tuple(robot.joint_names[k] for k in joints) for joints in (free, endless))
+    first = Polynomial(DEGREE, names)
+    return (first,) if names == fewer else (first, Polynomial(_DEGREE_OF_ALL, fewer))
+
+
+def _beside_the_middle(problem: Problem, points: Array) -> NDArray[np.bool_]:
+    """Whether points (N, n) are on the middle's side of singular positions, (N,), if r joints do not move the task."""
+    q, task = np.vstack([problem.domain.centre, points]), problem.task
+    J = task.batched_frame_jacobian(q)[0].reshape(len(q), task.m, problem.n)
+    moving = np.abs(J).max(axis=(0, 1)) > _TINY * np.abs(J).max()
+    if moving.sum() != task.m:
+        return np.ones(len(points), bool)
+    sides = np.linalg.det(J[:, :, moving]) > 0
+    return np.asarray(sides[1:] == sides[0])
 
 
 def _problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Branch, clearance: float) -> Problem:
@@ -459,44 +512,51 @@ class _Search:
         self.best: tuple[float, float, Array] | None = None  #: share of bad positions, -1 % volume, coefficients
         self.stages: list[Stage] = []
 
-    def run(self) -> None:
-        """Solve with a larger margin and less smoothness, and with the worst of fresh samples if that is not enough."""
+    def begin(self) -> None:
+        """Solve with a larger margin and less smoothness."""
         self._judged = self._field(_JUDGED, _JUDGED_TAG)
-        fields, C = [self._field(self.samples, _TAG)], self._first()
-        some = _Field(self.problem, fields[0].points[::_EVERY], self._basis)
-        energy = some.energy()
+        self._fields, self._last = [self._field(self.samples, _TAG)], self._first()
+        some = _Field(self.problem, self._fields[0].points[::_EVERY], self._basis)
+        self._energy = some.energy()
         if self._quantities is not None:
             self.alike = _Alike(Like.of(self.problem.robot, self._quantities), some)
-        C = self._swept(fields, energy, C, _FIRST_STEP)
-        self._keep(C)
-        steps = _EASY if self._bad <= _HARD else _HARDER
-        for step in steps:
-            C = self._swept(fields, energy, C, step)
-            if self._keep(C):
+        self._sweep(_FIRST_STEP)
+        self._steps = _EASY if self.rank[0] <= _HARD else _HARDER
+        for step in self._steps:
+            if self._sweep(step):
                 return
+
+    def go_on(self) -> None:
+        """Solve with the worst of fresh samples, if that was not enough."""
         for turn in range(1, 1 + _ROUNDS):
-            if self._bad <= _ENOUGH:
+            if self.rank[0] <= _ENOUGH:
                 return
             fresh = self._field(_FRESH, _FRESH_TAG + turn)
-            worst = fresh.points[np.argsort(self._volumes(fresh, C))[:_WORST]]
-            fields.append(_Field(self.problem, worst, self._basis))
-            C = self._swept(fields, energy, C, steps[-1], f", worst samples, round {turn}")
-            self._keep(C)
+            worst = fresh.points[np.argsort(self._volumes(fresh, self._last))[:_WORST]]
+            self._fields.append(_Field(self.problem, worst, self._basis))
+            self._sweep(self._steps[-1], f", worst samples, round {turn}")
 
     @property
-    def _bad(self) -> float:
-        """Share of bad positions with the best coefficients so far."""
+    def rank(self) -> tuple[float, float]:
+        """Share of bad positions with the best coefficients so far, if too many, and minus their 1 % volume."""
         assert self.best is not None
-        return self.best[0]
+        return max(self.best[0], _ENOUGH), self.best[1]
+
+    def holds_in_the_middle(self) -> bool:
+        """Whether the best coordinates are regular at the centre of the domain."""
+        assert self.best is not None
+        middle = _Field(self.problem, self.problem.domain.centre[None], self._basis)
+        return abs(float(middle.volumes(middle.jacobian(self.best[2]))[0])) > LEAST_VOLUME / self.problem.r
 
     def coordinates(self, C: Array) -> Coordinates:
         """Coordinates of coefficients (r, K), not normalised."""
         r, space = self.problem.r, JointSpace.of(self.problem)
         return Coordinates(self.parametrisation, space, (), C.ravel(), np.zeros(r), np.ones(r))
 
-    def _swept(self, fields: list[_Field], energy: Array, C: Array, step: tuple[float, float], more: str = "") -> Array:
-        """Coefficients (r, K) after the problem of each coordinate was solved once."""
-        started, C, (margin, smooth) = time.perf_counter(), C.copy(), step
+    def _sweep(self, step: tuple[float, float], more: str = "") -> bool:
+        """Solve the problem of each coordinate once; whether coordinates are regular enough then."""
+        started, C, (margin, smooth) = time.perf_counter(), self._last.copy(), step
+        fields, energy = self._fields, self._energy
         name = f"margin {margin:g}, smoothness {smooth:g}{more}"
         value, E, pull = 0.0, smooth * energy + _RIDGE * np.trace(energy) / len(energy) * np.eye(len(energy)), None
         if self.meaning is not None and self.meaning.wanted:
@@ -509,7 +569,8 @@ class _Search:
         samples = sum(len(field.points) for field in fields)
         result = SolveResult(C.ravel(), value, Status.CONVERGED, len(C), len(C), time.perf_counter() - started)
         self.stages.append(Stage(name, C.size, samples, result))
-        return C
+        self._last = C
+        return self._keep(C)
 
     def _volumes(self, field: _Field, C: Array) -> Array:
         """Volumes of coordinates at samples, (N,), positive at most."""
@@ -521,7 +582,7 @@ class _Search:
         volumes = self._volumes(self._judged, C)
         bad = float(np.mean(volumes <= LEAST_VOLUME / self.problem.r))
         low = float(np.quantile(volumes, 0.01))
-        if self.best is None or (max(bad, _ENOUGH), -low) < (max(self.best[0], _ENOUGH), self.best[1]):
+        if self.best is None or (max(bad, _ENOUGH), -low) < self.rank:
             self.best = bad, -low, C
         return bad <= _ENOUGH and low >= _WELL / self.problem.r
 
@@ -549,7 +610,8 @@ class _Search:
 
     def _field(self, count: int, tag: int) -> _Field:
         """Samples, many of them near the boundary."""
-        return _Field(self.problem, sample_heavily(self.problem.domain, count, (self.seed, tag)), self._basis)
+        points = sample_heavily(self.problem.domain, count, (self.seed, tag))
+        return _Field(self.problem, points[_beside_the_middle(self.problem, points)], self._basis)
 
 
 class _Alike:

@@ -441,7 +441,7 @@ class Robot(Shown):
                 if shape != (self.n, 1):
                     raise ShapeError("a CasADi joint vector", shape, (self.n, 1))
             return function(*arguments)
-        sets = [as_point_set(function.name_in(i), a, self.n) for i, a in enumerate(arguments)]
+        sets = [as_point_set(name, a, self.n) for name, a in zip(function.name_in(), arguments, strict=True)]
         points = [p for p, _ in sets]
         if len({len(p) for p in points}) > 1:
             raise ShapeError("the second state set", points[1].shape, points[0].shape)

@@ -297,12 +297,16 @@ def integrate(
         else compiled.continuous(step, tolerance, outputs=_OUTPUTS)
     )
     state = start
-    for begin, end in _pieces(reference, loop.loads.pushes, step * _OUTPUTS):
-        middle = np.array([(begin + end) / 2])
-        segment, load = int(reference.segment(middle)[0]), loop.loads.at(middle)[0]
-        states = run((begin, end), reference.times[segment], reference.parameters[segment], load, state)
-        state = states[-1]
-        yield Piece(begin + (end - begin) * np.arange(1, _OUTPUTS + 1) / _OUTPUTS, states)
+    try:
+        for begin, end in _pieces(reference, loop.loads.pushes, step * _OUTPUTS):
+            middle = np.array([(begin + end) / 2])
+            segment, load = int(reference.segment(middle)[0]), loop.loads.at(middle)[0]
+            states = run((begin, end), reference.times[segment], reference.parameters[segment], load, state)
+            state = states[-1]
+            yield Piece(begin + (end - begin) * np.arange(1, _OUTPUTS + 1) / _OUTPUTS, states)
+    finally:
+        with building:  # its expressions share nodes with those that other threads build
+            del run
 
 
 def _continuous_by_cvodes(loop: ClosedLoop, reference: Reference, tolerance: float) -> Integrator:
@@ -366,11 +370,15 @@ def run_ticks(
     k, period = len(reference.labels), 1 / rate
     run = _ticks_by_cvodes(loop, period, k, tolerance) if compiled is None else compiled.ticks(period, tolerance)
     state = start
-    for first in range(0, ticks, _TICKS):
-        part = slice(first, min(first + _TICKS, ticks))
-        states, commands, status = run(state, *(column[part] for column in columns))
-        state = states[-1]
-        yield Piece(times[part] + period, states, Held(commands, status[:, 0], 0 * status[:, 0]))
+    try:
+        for first in range(0, ticks, _TICKS):
+            part = slice(first, min(first + _TICKS, ticks))
+            states, commands, status = run(state, *(column[part] for column in columns))
+            state = states[-1]
+            yield Piece(times[part] + period, states, Held(commands, status[:, 0], 0 * status[:, 0]))
+    finally:
+        with building:  # its expressions share nodes with those that other threads build
+            del run
 
 
 def pieces(tick: Callable[[int], Array], times: Array, period: float, size: int) -> Iterator[Piece]:

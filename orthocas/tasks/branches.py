@@ -200,8 +200,8 @@ class _Arm:
         low, high = (self.whole.centre[k] + side * self.whole.half_width[k] for side in (-1, 1))
         values = np.linspace(low, high, _SLICES)
         found: list[tuple[Cut, float]] = []
-        for singular in (True, False):
-            sizes = np.array([self._size(k, v, singular, _ON_SLICE) for v in values])
+        of_slices = np.array([self._sizes(k, v, _ON_SLICE) for v in values])
+        for singular, sizes in zip((True, False), of_slices.T, strict=True):
             if not np.isfinite(sizes).any() or (not singular and np.nanmax(sizes) < _STILL):
                 continue
             for i in _minima(sizes, _LOW * float(np.nanmax(sizes))):
@@ -211,21 +211,20 @@ class _Arm:
         strongest = sorted(found, key=lambda pair: pair[1])[:_MOST_CUTS]
         return sorted((cut for cut, _ in strongest), key=lambda cut: cut.value)
 
-    def _size(self, k: int, value: float, singular: bool, count: int) -> float:
-        """The 90 % quantile, over a slice, of the singular value, or of how far self-motions move the joint."""
+    def _sizes(self, k: int, value: float, count: int) -> tuple[float, float]:
+        """The 90 % quantiles, over a slice, of the singular value, and of how far self-motions move the joint."""
         points = sample_evenly(Box(self.whole.centre, self.whole.half_width), count, (_SEED, k))
         points[:, k] = value
         s, moved = self.judged(points)
         clear = moved[s > _NOT_SINGULAR, k]
-        if singular:
-            return float(np.quantile(s, _QUANTILE))
-        return float(np.quantile(clear, _QUANTILE)) if len(clear) >= _FEW else np.nan
+        still = float(np.quantile(clear, _QUANTILE)) if len(clear) >= _FEW else np.nan
+        return float(np.quantile(s, _QUANTILE)), still
 
     def _refined(self, k: int, values: Array, i: int, singular: bool) -> tuple[Cut, float]:
         """The cut near slice i, and its quantile."""
 
         def size(value: float) -> float:
-            found = self._size(k, value, singular, _FINER)
+            found = self._sizes(k, value, _FINER)[0 if singular else 1]
             return found if np.isfinite(found) else 1.0
 
         found = scipy.optimize.minimize_scalar(

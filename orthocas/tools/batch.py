@@ -57,6 +57,7 @@ class Batched:
 
     function: ca.Function
     _mapped: dict[int, ca.Function] = field(default_factory=dict, repr=False)
+    _mine: Any = field(default_factory=local, repr=False, compare=False)  # memory of each thread for one sample
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate N samples."""
@@ -66,38 +67,61 @@ class Batched:
             how = ("thread", THREADS) if chunk == _LARGE and THREADS > 1 else ()
             with building:
                 self._mapped[chunk] = self.function.map(chunk, *how)
-        return evaluate_columns(self._mapped[chunk], chunk, *arguments)
+        if chunk > 1:
+            return evaluate_columns(self._mapped[chunk], chunk, *arguments)
+        if not hasattr(self._mine, "columns"):
+            self._mine.columns = _Columns(self._mapped[1], 1)
+        results: list[Array] = self._mine.columns(*arguments)
+        return results
+
+    def __reduce__(self) -> tuple[type, tuple[ca.Function]]:
+        return Batched, (self.function,)
 
 
 def evaluate_columns(function: ca.Function, chunk: int, *arguments: Array) -> list[Array]:
     """Like `Batched`, for a function that takes `chunk` samples side by side as columns."""
-    N = len(arguments[0])
-    arguments = tuple(_column_major(a) for a in arguments)
-    buffer: Any
-    buffer, run = function.buffer()  # Any: the stubs of set_arg and set_res ask for a size, the methods take none
-    inputs = [np.empty((chunk, *a.shape[1:])) for a in arguments]
-    shapes = [function.size_out(i) for i in range(function.n_out())]
-    outputs = [np.empty((chunk, columns // chunk, rows)) for rows, columns in shapes]
-    for i, array in enumerate(inputs):
-        buffer.set_arg(i, array.data)
-    for i, array in enumerate(outputs):
-        buffer.set_res(i, array.data)
-    results = [np.empty((N, *out.shape[1:])) for out in outputs]
-    for start in range(0, N, chunk):
-        count = min(chunk, N - start)
-        for array, argument in zip(inputs, arguments, strict=True):
-            array[:count] = argument[start : start + count]
-            array[count:] = argument[start]  # pad the last chunk with a valid sample
-        with deferred():
-            run()
-        for result, out in zip(results, outputs, strict=True):
-            result[start : start + count] = out[:count]
-    return [_row_major(result) for result in results]
+    return _Columns(function, chunk)(*arguments)
+
+
+class _Columns:
+    """A function of `chunk` samples side by side as columns, with the memory of one thread; called like `Batched`."""
+
+    def __init__(self, function: ca.Function, chunk: int) -> None:
+        self._chunk = chunk
+        buffer: Any
+        buffer, self._run = function.buffer()  # Any: the stubs of set_arg and set_res ask for a size, the methods no
+        self._buffer = buffer
+        # CasADi stores matrices column by column
+        shapes = [function.size_in(i) for i in range(function.n_in())]
+        self._inputs = [np.empty((chunk, columns // chunk, rows)) for rows, columns in shapes]
+        shapes = [function.size_out(i) for i in range(function.n_out())]
+        self._outputs = [np.empty((chunk, columns // chunk, rows)) for rows, columns in shapes]
+        for i, array in enumerate(self._inputs):
+            buffer.set_arg(i, array.data)
+        for i, array in enumerate(self._outputs):
+            buffer.set_res(i, array.data)
+
+    def __call__(self, *arguments: Array) -> list[Array]:
+        """Evaluate N samples."""
+        N, chunk = len(arguments[0]), self._chunk
+        columns = [_column_major(a) for a in arguments]
+        results = [np.empty((N, *out.shape[1:])) for out in self._outputs]
+        for start in range(0, N, chunk):
+            count = min(chunk, N - start)
+            for array, argument in zip(self._inputs, columns, strict=True):
+                array[:count] = argument[start : start + count]
+                if count < chunk:
+                    array[count:] = argument[start]  # pad the last chunk with a valid sample
+            with deferred():
+                self._run()
+            for result, out in zip(results, self._outputs, strict=True):
+                result[start : start + count] = out[:count]
+        return [_row_major(result) for result in results]
 
 
 def _column_major(array: Array) -> Array:
-    """Transpose each sample's matrix (rows, columns): CasADi stores matrices column by column."""
-    return array if array.ndim == 2 else array.transpose(0, 2, 1)
+    """Each sample's column (rows,) or matrix (rows, columns) as CasADi stores it, (columns, rows)."""
+    return array[:, None, :] if array.ndim == 2 else array.transpose(0, 2, 1)
 
 
 def _row_major(result: Array) -> Array:

@@ -41,7 +41,8 @@ def deferred() -> Iterator[None]:
         yield
         return
     note = _Note()
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, *_ENDING)}
+    numbers = (signal.SIGINT, *_ENDING) if _ends else (signal.SIGINT,)  # others are not held; asking takes its time
+    handlers = {number: signal.getsignal(number) for number in numbers}
     before = {number: handler for number, handler in handlers.items() if _held(number, handler)}
     for number in before:
         signal.signal(number, note.take)
