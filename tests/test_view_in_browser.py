@@ -117,18 +117,18 @@ def test_a_slider_moves_the_joints_and_the_flange_stays(page: Page, iiwa_fit: Fi
 WIDTHS = (900, 1366, 390)
 
 
-def test_the_arrows_at_the_tool_lie_beside_the_panels(page: Page, iiwa_fit: Fit) -> None:
+@pytest.mark.parametrize("wide", WIDTHS)
+def test_the_arrows_at_the_tool_lie_beside_the_panels(page: Page, iiwa_fit: Fit, wide: int) -> None:
     """At the tool, and a handle's length away in all directions, the topmost element is the picture."""
+    high = 844 if wide < 480 else 700
+    page.call("Emulation.setDeviceMetricsOverride", width=wide, height=high, deviceScaleFactor=1, mobile=wide < 480)
     with oc.view(iiwa_fit.chart, port=0) as view:
-        for wide in WIDTHS:
-            size = {"width": wide, "height": 844 if wide < 480 else 700, "mobile": wide < 480}
-            page.call("Emulation.setDeviceMetricsOverride", deviceScaleFactor=1, **size)
-            opened(page, view.url)
-            page.wait("document.querySelectorAll('canvas').length > 1")
-            place = iiwa_fit.chart.problem.robot.tip_position(iiwa_fit.chart.problem.domain.centre)
-            ends = [place + 0.2 * np.array(way) for way in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))]
-            seen = [f"({SEEN})({point.tolist()})" for point in ends]
-            page.wait(f"[{','.join(seen)}].every(e => e && e.tagName === 'CANVAS')")
+        opened(page, view.url)
+        page.wait("document.querySelectorAll('canvas').length > 1")
+        place = iiwa_fit.chart.problem.robot.tip_position(iiwa_fit.chart.problem.domain.centre)
+        ends = [place + 0.2 * np.array(way) for way in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))]
+        seen = [f"({SEEN})({point.tolist()})" for point in ends]
+        page.wait(f"[{','.join(seen)}].every(e => e && e.tagName === 'CANVAS')")
     page.call("Emulation.clearDeviceMetricsOverride")
 
 
