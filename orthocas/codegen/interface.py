@@ -34,7 +34,8 @@ _OF_TORQUE = {  # code of torque laws for load and velocity observer, by its pla
     "observed": "  double speed[N], M[N * N], bias[N], gravity[N];\n",
     "foresee": "  foresee(state, since);\n",
     "observe": "  memcpy(speed, dq, sizeof speed);\n  observe(state, here, speed, since);\n  dq = speed;\n",
-    "stand_still": "  set_zero(state->expected, N);\n  set_zero(state->unexplained, N);\n  set_zero(state->load, N);\n  state->trusted = 0.0;\n",
+    "stand_still": "  set_zero(state->expected, N);\n  set_zero(state->unexplained, N);\n  set_zero(state->load, N);\n"
+    "  state->trusted = 0.0;\n",
     "moving": ", M, bias, gravity",
     "expect": "  expect(state, $command, fallback, M, bias, gravity);\n",
 }
