@@ -217,8 +217,8 @@ class _Arm:
         points[:, k] = value
         s, moved = self.judged(points)
         clear = moved[s > _NOT_SINGULAR, k]
-        still = float(np.quantile(clear, _QUANTILE)) if len(clear) >= _FEW else np.nan
-        return float(np.quantile(s, _QUANTILE)), still
+        moves = float(np.quantile(clear, _QUANTILE)) if len(clear) >= _FEW else np.nan
+        return float(np.quantile(s, _QUANTILE)), moves
 
     def _refined(self, k: int, values: Array, i: int, singular: bool) -> tuple[Cut, float]:
         """The cut near slice i, and its quantile."""

@@ -89,7 +89,7 @@ class _Columns:
     def __init__(self, function: ca.Function, chunk: int) -> None:
         self._chunk = chunk
         buffer: Any
-        buffer, self._run = function.buffer()  # Any: the stubs of set_arg and set_res ask for a size, the methods no
+        buffer, self._run = function.buffer()  # Any: the stubs ask for sizes that the methods do not take
         self._buffer = buffer
         # CasADi stores matrices column by column
         shapes = [function.size_in(i) for i in range(function.n_in())]
