@@ -507,13 +507,13 @@ class _Search:
         family = parametrisation.family(JointSpace.of(problem), problem.r)
         assert isinstance(family, LinearFamily)
         self._family: LinearFamily = family
-        self._basis: BasisGradients = gradients_of(family, problem.n)
         self.samples = samples or int(np.clip(_PER_TERM * family.width, _LEAST_SAMPLES, _MOST_SAMPLES))
         self.best: tuple[float, float, Array] | None = None  #: share of bad positions, -1 % volume, coefficients
         self.stages: list[Stage] = []
 
     def begin(self) -> None:
         """Solve with a larger margin and less smoothness."""
+        self._basis: BasisGradients = gradients_of(self._family, self.problem.n)  # not before this family is tried
         self._judged = self._field(_JUDGED, _JUDGED_TAG)
         self._fields, self._last = [self._field(self.samples, _TAG)], self._first()
         some = _Field(self.problem, self._fields[0].points[::_EVERY], self._basis)
