@@ -194,7 +194,7 @@ def test_a_stream_of_poses_turns_the_shorter_way(tmp_path: Path) -> None:
     law, task = Projector.on_chart(chart), chart.problem.task  # without a domain
     free = Safety.of(law, reference_speed=np.inf, reference_acceleration=np.inf)
     generated = oc.generate_c(chart, tmp_path, law, "arm", safety=free)
-    supervisor = Supervisor(CompiledLibrary(compile_shared(generated, tmp_path, ("-O1",)), "arm", 7), law, free)
+    supervisor = Supervisor(CompiledLibrary(compile_shared(generated, tmp_path), "arm", 7), law, free)
     q = chart.problem.domain.centre
     value = np.asarray(law.measured(q)).ravel()
     supervisor.start(q)
