@@ -28,13 +28,15 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.cli import simulate
 from orthocas.cli.entry import main
-from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared
+from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared, compiled, compiled_inverse
+from orthocas.codegen.library import STRICT
 from orthocas.control import PDPlus, Reference
 from orthocas.fitting.fit import Fit
 from orthocas.robots import urdf
 from orthocas.tools.checks import Array
 
 compile_shared.__defaults__ = (("-O0",), None)  # users' -O2 takes gcc three times as long, and computes the same
+compiled._FLAGS, compiled_inverse._FLAGS = ("-O1",), (*STRICT, "-O1")  # as their -O2 and -O3; here it runs for longer
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job starts with SIGINT ignored
 
@@ -244,6 +246,12 @@ def run_simulate(run: Run, planar_fit: Fit) -> Run:
         return run("simulate", chart, "--controller", controller, "--steps", steps, "--out", "out", *words)
 
     return call
+
+
+@pytest.fixture
+def unoptimised(monkeypatch: pytest.MonkeyPatch) -> None:
+    """CMake builds in half the time, for tests of what hardly runs."""
+    monkeypatch.setenv("CMAKE_BUILD_TYPE", "Debug")
 
 
 @pytest.fixture
