@@ -8,7 +8,8 @@ Some of CasADi's Python swallows exceptions of all kinds (`except: pass` in `ver
 a fit that remembers signals (`remembered`, `ended_in_order`) ends as interrupted all the same.
 """
 
-import _signal  # what `signal` wraps: its wrappers look for enums, which takes most of the time of `deferred`
+# what `signal` wraps: its wrappers look for enums, which takes most of the time of `deferred`
+import _signal  # type: ignore[import-not-found]
 import signal
 import sys
 import threading
