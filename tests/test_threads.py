@@ -125,7 +125,7 @@ def test_threads_share_the_ranges_of_a_chart() -> None:
     chart = copy.deepcopy(fitted().chart)
     q = points_of(chart)
     expected = [fitted().chart.xi_range(point).high for point in q[:2]]
-    for k, found in enumerate(in_threads(lambda k: chart.xi_range(q[k % 2]).high, 24)):
+    for k, found in enumerate(in_threads(lambda k: chart.xi_range(q[k % 2]).high, 2 * THREADS)):
         np.testing.assert_array_equal(found, expected[k % 2])
 
 
