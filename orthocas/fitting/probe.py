@@ -147,10 +147,10 @@ class Prober:
         return theta
 
     def _loss(self, problem: Problem, family: LinearFamily, samples: Samples, start: Array) -> BasisObjective:
-        """The loss of the fit that confirms the box: with the weights for its metric."""
+        """The loss of the fit that confirms the box: with the default weights."""
         known = self._objective
         if known is None:
-            weights = DEFAULT_WEIGHTS.for_metric(problem.metric)
+            weights = DEFAULT_WEIGHTS.for_problem(problem)
             self._objective = BasisObjective(family, samples, weights, start, lambda count, seed: samples)
         else:
             self._objective = known.moved(gradients_of(family, len(self.active)), samples, start)
