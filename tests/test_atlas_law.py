@@ -53,7 +53,7 @@ def moving(way_atlas: oc.Atlas, tmp_path_factory: pytest.TempPathFactory) -> tup
     """A velocity law."""
     law, folder = Kinematic.on_chart(way_atlas.chart(3), feedback=1.0, limit=2.0), tmp_path_factory.mktemp("moving")
     generated = oc.generate_c(way_atlas, folder, law, "arm")
-    return law, CompiledLibrary(compile_shared(generated, folder, ("-O0",)), "arm", 3, r=2)
+    return law, CompiledLibrary(compile_shared(generated, folder), "arm", 3, r=2)
 
 
 @pytest.mark.slow
