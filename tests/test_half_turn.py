@@ -326,7 +326,7 @@ def test_jumps_of_orientations_do_not_lead_the_law(tmp_path: Path) -> None:
     law = control.PDPlus(known, np.linspace(30.0, 90.0, 7), 0.7, limit=1e4)
     generated = oc.generate_c(known, tmp_path / "c", law, "arm")
     library = CompiledLibrary(compile_shared(generated, tmp_path), "arm", 7)
-    still = control.Safety.of(law, stuck_impulse=np.inf, stale_ticks=1000, offset_rate=1e-9, error_limit=100.0)
+    still = control.Safety.of(law, stuck_speed=np.inf, stale_ticks=1000, offset_rate=1e-9, error_limit=100.0)
     supervisor = Supervisor(library, law, still)
     q = known.problem.domain.centre
     supervisor.start(q)

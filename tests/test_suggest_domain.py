@@ -207,3 +207,14 @@ def test_contradictory_options_are_refused(run: Run, words: tuple[str, ...], com
     code, _, err = run("fit", "planar_3r_xy", *words)
     assert code == 2
     assert complaint in err
+
+
+def test_box_is_searched_with_the_weights_of_the_fit(planar_xy: oc.Problem) -> None:
+    boxes = {}
+    for angles in ("paper", "metric"):
+        found = oc.suggest_domain(
+            planar_xy.robot, planar_xy.task, [0.6, 0.8, 0.8], "inertia", weights=oc.Weights(angles=angles)
+        )
+        assert found.fit.chart.notes["angles"] == angles
+        boxes[angles] = found.domain.half_width[1:].prod()
+    assert boxes["metric"] > 1.1 * boxes["paper"]  # it asks for the leak, which the box is bounded by
