@@ -155,6 +155,7 @@ def test_the_boundary_of_all_charts_has_a_zone_before_it_and_boundaries_between_
         assert before > margin - 1e-9
 
 
+@pytest.mark.slow
 def test_beyond_all_charts_the_arm_is_caught_and_returns_when_asked(
     way_atlas: oc.Atlas, law: Controller, library: CompiledLibrary
 ) -> None:

@@ -209,6 +209,7 @@ def test_command_writes_checks_and_refuses(planar_fit: Fit, run: Run) -> None:
         assert not Path("other").exists()
 
 
+@pytest.mark.slow
 def test_command_chooses_the_model_at_run_time_and_prints_remarks(planar_xy: oc.Problem, run: Run) -> None:
     oc.fit(planar_xy, oc.Linear()).chart.save("arm.orthocas")
     words = ("codegen", "arm.orthocas", "--controller", "impedance", "--out", "c", "--name", "arm")

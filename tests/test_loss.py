@@ -366,6 +366,7 @@ def test_volumes_by_lapack_are_those_of_the_expression(identity: bool) -> None:
     assert hinges[1] == 0 or not identity
 
 
+@pytest.mark.slow
 def test_loss_with_volumes_is_the_loss() -> None:
     """The parts written out and by LAPACK together, with exchanged components, against one expression."""
     sizes, N = Sizes(11, 3, 8, False), 300

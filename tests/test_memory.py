@@ -49,6 +49,7 @@ def held(ticks: Remembering, robot: oc.Robot, q: Array, count: int, push: float 
     return arm.q, ticks.fields["correction"]
 
 
+@pytest.mark.slow
 def test_momentum_and_its_rate_are_pinocchios() -> None:
     """C^T dq = dM/dt dq - C dq; Pinocchio's C has the same skew symmetry."""
     model, rng = arm_model(), np.random.default_rng(1)
@@ -91,6 +92,7 @@ def test_regressor_is_bilinear_in_its_two_velocities() -> None:
     np.testing.assert_allclose(turned(u + v, u + v), turned(u, u) + turned(v, v) + 2 * turned(u, v), atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("remembers", BOTH, ids=lambda kind: kind.name)
 def test_the_sag_of_a_wrong_model_goes(chart: oc.Chart, remembers: Any) -> None:
     q, heavy = chart.problem.domain.centre, chart.problem.robot.with_scaled_masses(1.4)
@@ -103,6 +105,7 @@ def test_the_sag_of_a_wrong_model_goes(chart: oc.Chart, remembers: Any) -> None:
     np.testing.assert_allclose(correction, heavy.gravity(x) - chart.problem.robot.gravity(x), atol=0.5)
 
 
+@pytest.mark.slow
 def test_an_observer_finds_an_unknown_torque_with_its_time_constant(chart: oc.Chart) -> None:
     q, robot = chart.problem.domain.centre, chart.problem.robot
     ticks = Remembering(law_of(chart, MomentumObserver(rate=10.0)))
@@ -112,6 +115,7 @@ def test_an_observer_finds_an_unknown_torque_with_its_time_constant(chart: oc.Ch
     np.testing.assert_allclose(-correction, 5.0, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_torque_that_was_asked_for_is_not_taken_for_a_disturbance(chart: oc.Chart) -> None:
     """Friction compensation of the user's own: the joints feel -3 N m, and the law adds 3."""
     law = law_of(chart, MomentumObserver(), model=RunTimeModel(extra_torque=3.0))
@@ -119,6 +123,7 @@ def test_torque_that_was_asked_for_is_not_taken_for_a_disturbance(chart: oc.Char
     np.testing.assert_allclose(correction, 0.0, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("remembers", BOTH, ids=lambda kind: kind.name)
 def test_a_start_knows_the_torque_that_held_the_arm(chart: oc.Chart, remembers: Any) -> None:
     q, heavy = chart.problem.domain.centre, chart.problem.robot.with_scaled_masses(1.4)
@@ -154,6 +159,7 @@ def test_a_payload_and_torques_of_the_gains_do_not_count_twice_at_a_start(
     np.testing.assert_allclose(supervisor.memory["correction"], unknown, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("remembers", BOTH, ids=lambda kind: kind.name)
 def test_corrections_keep_their_bound_and_forget_nonsense(chart: oc.Chart, remembers: Any) -> None:
     law = law_of(chart, replace(remembers, bound=2.0))

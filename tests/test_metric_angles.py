@@ -112,6 +112,7 @@ def test_default_is_the_metric_for_the_mass_matrix_and_orientations(planar_x: oc
     assert by_default == in_metric != paper
 
 
+@pytest.mark.slow
 def test_bound_on_mutual_angles_is_one_in_the_metric(planar_x: oc.Problem) -> None:
     fit = oc.fit(planar_x, oc.Polynomial(2), samples=400, max_mutual_deg=1.0, weights=Weights(angles="metric"))
     angle = oc.evaluate(fit.chart, 5000).metric_mutual_angle

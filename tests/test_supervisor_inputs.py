@@ -131,6 +131,7 @@ def test_a_measurement_now_and_then_is_enough(supervisor: Supervisor, planar_for
         assert supervisor.step(q, dq, at_rest(chart, q), TICK)[1] is not ControlStatus.BAD_INPUT
 
 
+@pytest.mark.slow
 def test_spoiled_ticks_between_do_not_hide_that_sensors_stand_still(
     supervisor: Supervisor, planar_for_control: oc.Chart
 ) -> None:

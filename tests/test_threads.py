@@ -129,6 +129,7 @@ def test_threads_share_the_ranges_of_a_chart() -> None:
         np.testing.assert_array_equal(found, expected[k % 2])
 
 
+@pytest.mark.slow
 def test_simulations_share_a_law() -> None:
     start = planar().domain.centre
     expected = numbers(simulate(impedance(), steps(), start, step=0.05, control_rate=None))

@@ -460,6 +460,7 @@ def test_decoupled_laws_are_warned_of_the_leak() -> None:
     assert not any("lean into" in remark for remark in coupled.remarks())
 
 
+@pytest.mark.slow
 def test_interrupted_fits_keep_the_best_so_far() -> None:
     known = oc.problems.get("planar_3r_xy")
     reports = []
