@@ -194,7 +194,7 @@ def test_the_nearest_xi_is_the_end_of_its_range() -> None:
     x = chart.phi(there)[:, :6]
     found = chart.nearest_xi(wishes, x)
     wanted, got = chart.xi(wishes)[:, 0], chart.xi(found.q)[:, 0]
-    assert found.found.sum() > 20  # some are possible as they are
+    assert 10 < found.found.sum() < 30  # some are possible as they are, others are not
     np.testing.assert_allclose(got[found.found], wanted[found.found], atol=1e-7)
     compared = 0
     for k, status in enumerate(found.statuses):
