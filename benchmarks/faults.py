@@ -166,7 +166,7 @@ def observed_rows(arms: tuple[str, ...], runs: int) -> Iterator[str]:
         with arm_of(name) as arm:
             for bits, rate in OBSERVED.items():
                 before, after, wrong, pushed = (
-                    [moves(arm.with_encoders(bits, poles), **case) for _ in range(runs)]
+                    motions(arm.with_encoders(bits, poles), runs, **case)
                     for poles, case in (
                         (0.0, {}),
                         (rate, {}),
@@ -190,6 +190,11 @@ def compared(before: list["Motion"], after: list["Motion"]) -> Iterator[tuple[fl
         (lambda case: 1e3 * max(found.away for found in case), ".1f"),
     ):
         yield float(take(before)), float(take(after)), form
+
+
+def motions(arm: Arm, runs: int, **case: Any) -> list["Motion"]:
+    """Runs from one random posture after another."""
+    return [moves(arm, **case) for _ in range(runs)]
 
 
 @dataclass
@@ -216,8 +221,10 @@ def moves(arm: Arm, scale: float = 1.0, delay: int = 0, push: float = 0.0) -> Mo
     asked = motion(chart, wanted, speed, 4 * swing * np.cos(angle) * (angle > 0))
     late, commands, path, caught = deque([arm.robot.gravity(q)] * delay), [], [], False
     for k, reference in enumerate(asked):
-        if push and k - SETTLED in PUSH[1:]:
-            plant.push(push * unit / np.linalg.norm(unit) * (k - SETTLED == PUSH[1]))
+        if push and k - SETTLED == PUSH[1]:
+            plant.push(push * unit / np.linalg.norm(unit))
+        if k - SETTLED == PUSH[2]:
+            plant.release()
         command, status = supervisor.step(*arm.seen(plant), reference, TICK)
         late.append(command)
         plant.step(late.popleft(), TICK)

@@ -131,6 +131,7 @@ def test_a_measurement_now_and_then_is_enough(supervisor: Supervisor, planar_for
         assert supervisor.step(q, dq, at_rest(chart, q), TICK)[1] is not ControlStatus.BAD_INPUT
 
 
+@pytest.mark.slow
 def test_spoiled_ticks_between_do_not_hide_that_sensors_stand_still(
     supervisor: Supervisor, planar_for_control: oc.Chart
 ) -> None:
@@ -180,8 +181,9 @@ def test_sensors_that_stand_still_at_rest_are_found_once_torques_must_have_moved
             np.testing.assert_allclose(supervisor.impulse, impulse, atol=1e-12)
             before = impulse - TICK * (command - held)
     first = statuses.index(ControlStatus.BAD_INPUT)
-    assert (np.abs(before) <= safety.stuck_impulse).all()
-    assert (np.abs(impulse) > safety.stuck_impulse).any()
+    M = chart.problem.robot.mass_matrix(q)
+    assert (np.abs(np.linalg.solve(M, before)) <= safety.stuck_speed).all()
+    assert (np.abs(np.linalg.solve(M, impulse)) > safety.stuck_speed).any()
     assert 5 <= first <= 100
     assert supervisor.mode == 1
     assert statuses[-1] is ControlStatus.BAD_INPUT  # until measurements change
@@ -212,9 +214,7 @@ def test_an_arm_in_mujoco_does_not_run_away_from_sensors_that_stand_still(name: 
     pytest.importorskip("mujoco", minversion="4")
     chart = oc.charts.load(name)
     law, robot, domain = PDPlus.on_chart(chart), chart.problem.robot, chart.problem.domain
-    library = CompiledLibrary(
-        compile_shared(oc.generate_c(chart, tmp_path, law, "arm"), tmp_path, ("-O1",)), "arm", robot.n
-    )
+    library = CompiledLibrary(compile_shared(oc.generate_c(chart, tmp_path, law, "arm"), tmp_path), "arm", robot.n)
     size = 0.3 * np.minimum(domain.half_width, 1.0)
     speeds = {}
     for stale_ticks in (5, 10**6):  # as it is, and without the rule
@@ -293,7 +293,7 @@ def test_a_reference_that_comes_to_rest_is_never_stale(
     supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart
 ) -> None:
     """The stream approaches its target for ever, but its value stops where the last bit stops changing."""
-    stands = Safety.of(supervised_law, stuck_impulse=np.inf)  # the arm of this test, whatever it is asked for
+    stands = Safety.of(supervised_law, stuck_speed=np.inf)  # the arm of this test, whatever it is asked for
     supervisor, q = Supervisor(supervised_library, supervised_law, stands), planar_for_control.problem.domain.centre
     supervisor.start(q)
     reference = at_rest(planar_for_control, q)
@@ -348,7 +348,7 @@ def test_joints_that_turn_without_end_may_report_any_number_of_whole_turns(
     domain, commands = supervised_law.problem.domain, []
     q, wanted = domain.centre + 0.5 * domain.half_width, at_rest(supervised_law.chart, domain.centre)
     for turns in (np.zeros(3), 2 * np.pi * np.array([1.0, -3.0, 2.0])):
-        supervisor = Supervisor(supervised_library, supervised_law, Safety.of(supervised_law, stuck_impulse=np.inf))
+        supervisor = Supervisor(supervised_library, supervised_law, Safety.of(supervised_law, stuck_speed=np.inf))
         supervisor.start(q + turns)
         ticks = [supervisor.step(q + turns, np.zeros(3), wanted, TICK) for _ in range(100)]
         assert {status for _, status in ticks} <= {ControlStatus.OK, ControlStatus.SATURATED}

@@ -7,7 +7,7 @@ from supervised import TICK, at_rest
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, Supervisor
-from orthocas.control import Controller, Safety
+from orthocas.control import Controller, ControlStatus, Safety
 
 pytestmark = needs_c
 
@@ -92,3 +92,21 @@ def test_it_begins_anew_after_starts_brakes_missing_measurements_and_jumps(
         observed.step(wrong, 0 * q, reference, TICK)
         np.testing.assert_allclose(observed.dq - before[1], TICK * observed.expected, rtol=1e-9)
         np.testing.assert_allclose(observed.q - before[0], TICK * (before[1] + observed.dq) / 2, rtol=1e-6)
+
+
+def test_the_catcher_of_a_fast_arm_damps_what_is_observed(observed: Supervisor, planar_for_control: oc.Chart) -> None:
+    """Joints pass 1 rad/s, and counts of 2 mrad claim 0 or 2 rad/s: the estimate is within a quarter of the truth, and
+    the catcher's torque changes by less than its limit of 1 N m a tick."""
+    chart, q = planar_for_control, planar_for_control.problem.domain.centre
+    reference, speed, commands = at_rest(chart, q), np.array([1.0, -1.0, 1.0]), []
+    observed.start(q)
+    seen = q
+    for k in range(600):
+        counted = q + 0.002 * np.round(k * TICK * speed / 0.002)
+        period = 1.0 if k == 0 else TICK
+        command, status = observed.step(counted, (counted - seen) / TICK, reference, period)
+        commands.append(command)
+        seen = counted
+    assert status is ControlStatus.CAUGHT
+    np.testing.assert_allclose(observed.dq, speed, atol=0.25)
+    assert np.abs(np.diff(commands[400:], axis=0)).max() < 1.0

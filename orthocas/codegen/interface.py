@@ -29,14 +29,14 @@ _OF_TORQUE = {  # code of torque laws for load and velocity observer, by its pla
     "  double speed[$n];          /* dq at that command */\n",
     "add_load": "    add_load(state, 1.0, command);\n",
     "state_observer": "  double expected[$n];       /* accelerations that the velocity observer expects */\n"
-    "  double unexplained[$n];    /* accelerations that torques do not explain */\n"
-    "  double trusted;            /* how long the velocity observer has been trusted, at most 1 [s] */\n",
+    "  double unexplained[$n];    /* accelerations that torques do not explain */\n",
     "observed": "  double speed[N], M[N * N], bias[N], gravity[N];\n",
     "foresee": "  foresee(state, since);\n",
     "observe": "  memcpy(speed, dq, sizeof speed);\n  observe(state, here, speed, since);\n  dq = speed;\n",
-    "stand_still": "  set_zero(state->expected, N);\n  set_zero(state->unexplained, N);\n  set_zero(state->load, N);\n"
-    "  state->trusted = 0.0;\n",
+    "stand_still": "  set_zero(state->expected, N);\n  set_zero(state->unexplained, N);\n  set_zero(state->load, N);\n",
     "moving": ", M, bias, gravity",
+    "inertia_now": "  double M[N * N];\n  memcpy(M, state->inertia, sizeof M);\n",
+    "by_inertia": "  if (!solve(M, speed, 1)) set_zero(speed, N);\n",
     "expect": "  expect(state, $command, fallback, M, bias, gravity);\n",
 }
 _OF_MEMORY = {  # code of laws that remember, by its place in the templates of the supervised law

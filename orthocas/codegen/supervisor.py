@@ -172,7 +172,6 @@ def _state_type(
         *((name, joints) for name in ("load", "drive", "speed") if has_spring),
         *(("inertia", precision.c_type * n**2) for _ in range(has_spring)),
         *((name, joints) for name in ("expected", "unexplained") if has_spring),
-        *(("trusted", precision.c_type) for _ in range(has_spring)),
         *((name, joints) for name in ("carry",) if of_atlas),
         *(("memory", _memory_type(remembered, precision)) for _ in range(bool(remembered))),
         *((name, quantities) for name in ("value", "velocity", "acceleration")),

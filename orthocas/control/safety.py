@@ -23,7 +23,7 @@ _TORQUE_ONLY = (  # velocity laws do not use them
     *("observer_rate", "stop_zone", "stop_damping", "brake_stiffness", "brake_yield"),
 )
 UNBOUNDED = (  #: settings that may be infinite
-    *("command_rate", "speed_limit", "stuck_impulse", "lower", "upper", "error_limit"),
+    *("command_rate", "speed_limit", "stuck_speed", "lower", "upper", "error_limit"),
     *("reference_speed", "reference_acceleration"),
 )
 SIGNED = ("lower", "upper")  #: settings that may be negative
@@ -34,7 +34,7 @@ _CATCHER = 12.0  # [1/s] natural frequency and damping rate of the catcher, stab
 _RETURN = 0.3  # [rad/s] or [m/s], on the way back
 _STOPS = 30.0  # [rad/s] natural frequency at the joint limits
 _ZONE = 0.05  # [rad] or [m], at most this share of the range of a joint
-_STUCK = 0.3, 0.03  # [rad/s] that a torque must have given an arm whose sensors stand still; [rad] of velocity laws
+_STUCK = {"torque": 0.15, "velocity": 0.03}  # [rad/s] that commands must have given; [rad] of velocity laws
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -70,7 +70,7 @@ class Safety:
     stale_ticks: Annotated[
         int, "ticks for which a moving arm may measure the same, bit by bit; more are a bad measurement"
     ]
-    stuck_impulse: Annotated[Array, "momentum that an arm which measures the same may get [N m s]; velocity laws: way"]
+    stuck_speed: Annotated[Array, "speed that an arm which measures the same may get [rad/s]; velocity laws: way [rad]"]
     longest_period: Annotated[float, "between two ticks; later ones call the catcher [s]"]
     observer_rate: Annotated[Array, "poles of an observer of velocities, for coarse encoders [1/s]; 0: as measured"]
     lower: Annotated[Array, "joint limits [rad] or [m]"]
@@ -127,7 +127,7 @@ class Safety:
         gravity = np.abs(robot.gravity(points)).max(axis=0)
         measured = Batched(controller.measured)(points)[0]
         span = np.nanmax(measured, axis=0) - np.nanmin(measured, axis=0)
-        torque, free = controller.command == "torque", 1 / np.diag(np.linalg.inv(M))
+        torque = controller.command == "torque"
         speed_limit = np.where(np.isfinite(robot.velocity_limits), robot.velocity_limits, _SPEED)
         slow = np.minimum(_RETURN, speed_limit / 3)
         settings = {
@@ -148,7 +148,7 @@ class Safety:
             "integral_limit": 0.05 * span,
             "hold_ticks": 10,
             "stale_ticks": 5,
-            "stuck_impulse": _STUCK[0] * free if torque else np.full(n, _STUCK[1]),
+            "stuck_speed": np.full(n, _STUCK[controller.command]),
             "longest_period": 0.02,
             "observer_rate": np.zeros(n),
             "lower": robot.lower,
