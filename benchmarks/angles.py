@@ -15,15 +15,28 @@ LOSSES = (
     "| --- | --- | --- | --- | --- | --- |"
 )
 TURN = "| degree | parameters | task std [deg] | mutual std [deg] |\n| --- | --- | --- | --- |"
-CASES = (("planar_3r_xy", 6, "inertia"), ("iiwa", 4, "inertia"), ("iiwa", 4, "euclidean"))
-NAMES = {"planar_3r_xy": "`planar_3r_xy`", "iiwa": "7-DoF arm", "inertia": "A = M", "euclidean": "A = I"}
+CASES = (
+    ("planar_3r_xy", 6, "inertia"),
+    ("iiwa", 4, "inertia"),
+    ("iiwa", 4, "euclidean"),
+    ("iiwa, pose", 4, "euclidean"),
+)
+NAMES = {
+    "planar_3r_xy": "`planar_3r_xy`",
+    "iiwa": "7-DoF arm",
+    "iiwa, pose": "7-DoF arm, pose",
+    "inertia": "A = M",
+    "euclidean": "A = I",
+}
 SMALL = 0.03  # half-width [rad] of the box on which the defect is compared
 
 
 def problem_of(name: str, metric: str) -> oc.Problem:
-    """A named problem with another metric."""
-    known = problems.get(name)
-    return oc.Problem(known.robot, known.task, metric, known.domain, name)
+    """A named problem with another metric; its pose as task, if its name says so."""
+    arm, _, kind = name.partition(", ")
+    known = problems.get(arm)
+    task = oc.Task.named(known.robot, kind, known.domain.centre) if kind else known.task
+    return oc.Problem(known.robot, task, metric, known.domain, name)
 
 
 def losses(samples: int, cases: tuple[tuple[str, int, str], ...]) -> Iterator[str]:

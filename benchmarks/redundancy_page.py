@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from redundancy.protocol import Scenario
 from redundancy.runner import RESULTS, scenarios
-from scipy.stats import binomtest
+from scipy.special import bdtr
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE, RECORD = ROOT / "docs" / "measurements" / "redundancy.md", ROOT / "docs" / "records" / "redundancy.json"
@@ -57,7 +57,7 @@ class Row:
         both = self.cases.keys() & other.cases.keys()
         pairs = [(_felt(self.cases[case], scenario), _felt(other.cases[case], scenario)) for case in both]
         better, worse = sum(a < b for a, b in pairs), sum(a > b for a, b in pairs)
-        return better > worse and binomtest(better, better + worse).pvalue < CHANCE
+        return better > worse and bool(2 * bdtr(worse, better + worse, 0.5) < CHANCE)
 
 
 def _felt(value: float, scenario: Scenario) -> float:

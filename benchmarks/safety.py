@@ -96,7 +96,7 @@ def push(
     plant.reset(q)
     supervisor.start(q)
     reference = np.concatenate([chart.phi(q), np.zeros(2 * chart.n)])
-    speeds, commands, statuses, inside = [], [], [], []
+    path, speeds, commands, statuses = [], [], [], []
     for k in range(round(LONGEST / TICK)):
         if k == on:
             plant.push(share * strongest(plant, PLACES[place], unit) * unit, link=PLACES[place])
@@ -111,10 +111,11 @@ def push(
         speeds.append(np.abs(speed).max())
         commands.append(command)
         statuses.append(status)
-        inside.append(domain.contains(here))
+        path.append(here)
         if k > ask + round(1 / TICK) and supervisor.mode == 0:
             break
-    return judged(np.array(speeds), np.array(commands), statuses, np.array(inside), on + lasts, ask)
+    inside = domain.contains(np.array(path))
+    return judged(np.array(speeds), np.array(commands), statuses, inside, on + lasts, ask)
 
 
 def judged(

@@ -59,7 +59,7 @@ class Integrand:
     @classmethod
     def of(cls, problem: oc.Problem, points: Array, shares: Array, orient: Array) -> "Integrand":
         """The default loss of a problem at points, oriented like the gradients `orient` (N, r, n)."""
-        weights, samples = WEIGHTS.for_metric(problem.metric), samples_at(problem, points)
+        weights, samples = WEIGHTS.for_problem(problem), samples_at(problem, points)
         loss = Loss.of(Sizes(problem.n, problem.m, problem.r, problem.metric.is_identity), weights.by_name)
         described = samples.described(loss.data, samples.orientation(orient))
         flat = [part.reshape(len(points), -1) for part in described]

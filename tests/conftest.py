@@ -6,6 +6,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy: threads of BLAS that spin take other processes' cores
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import gc
 import json
 import signal
 import sys
@@ -28,15 +29,34 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.cli import simulate
 from orthocas.cli.entry import main
-from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared
+from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared, compiled, compiled_inverse
+from orthocas.codegen.library import STRICT
 from orthocas.control import PDPlus, Reference
 from orthocas.fitting.fit import Fit
 from orthocas.robots import urdf
 from orthocas.tools.checks import Array
 
-compile_shared.__defaults__ = (("-O1",), None)  # users' -O2 takes gcc 1.6 times as long, and computes the same
+compile_shared.__defaults__ = (("-O0",), None)  # users' -O2 takes gcc three times as long, and computes the same
+compiled._FLAGS, compiled_inverse._FLAGS = ("-O1",), (*STRICT, "-O1")  # as their -O2 and -O3; here it runs for longer
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job starts with SIGINT ignored
+
+
+def pytest_collection() -> None:
+    """Collect no garbage now: to look through all that tests are made of takes a fifth of the time."""
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage from now on, without what is there."""
+    gc.freeze()
+    gc.enable()
+
+
+def pytest_sessionfinish() -> None:
+    gc.unfreeze()
+    gc.enable()
+
 
 ROBOTS = {
     "panda": ("panda_description/urdf/panda.urdf", "panda_hand"),
@@ -123,7 +143,7 @@ def arm_chart() -> oc.Chart:
     """The 7-DoF arm with A = M, roughly fitted: laws have to be right for any regular chart."""
     problem = oc.problems.get("iiwa")
     inertial = with_metric(problem, "inertia")
-    return oc.fit(inertial, oc.Polynomial(2)).chart
+    return oc.fit(inertial, oc.Polynomial(2), samples=1000).chart
 
 
 @pytest.fixture(scope="session")
@@ -244,6 +264,12 @@ def run_simulate(run: Run, planar_fit: Fit) -> Run:
         return run("simulate", chart, "--controller", controller, "--steps", steps, "--out", "out", *words)
 
     return call
+
+
+@pytest.fixture
+def unoptimised(monkeypatch: pytest.MonkeyPatch) -> None:
+    """CMake builds in half the time, for tests of what hardly runs."""
+    monkeypatch.setenv("CMAKE_BUILD_TYPE", "Debug")
 
 
 @pytest.fixture

@@ -182,6 +182,11 @@ IN_ATLAS = np.array([0.0, 0.9, 0.9])  #: a covered posture
 
 
 @cache
+def branches() -> oc.Branches:
+    return oc.branches(problems.get("iiwa").robot)
+
+
+@cache
 def certificate() -> oc.Certificate:
     return oc.certify(fitted().chart)
 
@@ -260,8 +265,8 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "clear box": lambda: clear().problem.domain,
     "regular part": lambda: wide().chart.problem.domain,
     "wide fit": wide,
-    "branches": lambda: oc.branches(problems.get("iiwa").robot),
-    "branch": lambda: oc.branches(problems.get("iiwa").robot)[0],
+    "branches": branches,
+    "branch": lambda: branches()[0],
     "corridor": lambda: oc.Corridor(oc.Box([0.0, 0.9], 0.8), [[0.0, 0.5], [0.3, 1.2]], [np.inf, 0.2]),
     "clear part of a domain": lambda: ClearPart(0.1, 0.95),
     "torus": lambda: oc.Torus(3),

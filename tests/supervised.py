@@ -1,12 +1,15 @@
 """What tests of supervised laws share: an arm, and runs of it."""
 
 from collections.abc import Callable
+from functools import cache
 
+import casadi as ca
 import numpy as np
 
 import orthocas as oc
 from orthocas.codegen import Supervisor
 from orthocas.control import ControlStatus
+from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
 
 TICK = 1e-3
@@ -22,6 +25,17 @@ def moving(chart: oc.Chart, q: Array, dq: Array) -> Array:
     return np.concatenate([chart.phi(q), chart.jacobian(q) @ dq, curvature])
 
 
+@cache
+def _moved(robot: oc.Robot, steps: int) -> Batched:
+    """q, dq, torque, length of a step -> q, dq after so many steps, in one call."""
+    q, dq, torque, h = (ca.MX.sym(name, size) for name, size in zip("qvuh", (*[robot.n] * 3, 1), strict=True))
+    after, speed = q, dq
+    for _ in range(steps):
+        speed = speed + h * robot.forward_dynamics(after + h / 2 * speed, speed, torque)
+        after = after + h * speed
+    return Batched(ca.Function("moved", [q, dq, torque, h], [after, speed]))
+
+
 class Arm:
     """The rigid body dynamics, integrated in small steps."""
 
@@ -29,12 +43,8 @@ class Arm:
         self.robot, self.q, self.dq = robot, q.copy(), np.zeros(robot.n) if dq is None else dq.copy()
 
     def move(self, torque: Array, seconds: float = TICK, steps: int = 2) -> None:
-        h = seconds / steps
-        for _ in range(steps):
-            middle = self.q + h / 2 * self.dq
-            ddq = self.robot.forward_dynamics(middle, self.dq, torque)
-            self.dq = self.dq + h * ddq
-            self.q = self.q + h * self.dq
+        state = (self.q, self.dq, torque, np.array([seconds / steps]))
+        self.q, self.dq = (part[0] for part in _moved(self.robot, steps)(*(value[None] for value in state)))
 
 
 def run(

@@ -136,12 +136,14 @@ def closure(arrows: set[tuple[str, str]]) -> set[tuple[str, str]]:
     return arrows if longer == arrows else closure(longer)
 
 
+@pytest.mark.slow
 def test_nothing_imports_the_faces() -> None:
     for name, path in MODULES.items():
         if name not in FACES:
             assert not imports_of(path, inside=True, types=True) & set(FACES), name
 
 
+@pytest.mark.slow
 def test_domains_answer_for_themselves() -> None:
     """Few files outside their package know a kind of domain by its name; boxes are the language of all."""
     kinds = {"ClearBox", "Corridor", "Torus"}

@@ -57,6 +57,7 @@ def test_sets_stay_sets() -> None:
         as_point("q", square, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [ca.SX, ca.MX])
 @pytest.mark.parametrize("chart", ["polynomial chart", "network chart"])
 @pytest.mark.parametrize("name", EVALUATIONS)

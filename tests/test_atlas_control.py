@@ -118,6 +118,7 @@ def test_posture_asked_for_and_torque_do_not_jump_at_hand_overs(atlas: oc.Atlas)
     assert not run.fell_back.any()
 
 
+@pytest.mark.slow
 def test_motions_that_repeat_through_charts_are_reported_once(atlas: oc.Atlas) -> None:
     """Around a rectangle; a motion there and back leaves the same behind, and is not the same hand-over."""
     x = x_of(atlas, START)
@@ -148,6 +149,7 @@ def test_torque_fades_from_one_chart_to_the_next_with_a_wrong_model(atlas: oc.At
     assert bends(run).max() < worst / 5
 
 
+@pytest.mark.slow
 def test_posture_asked_for_has_the_velocity_it_claims(atlas: oc.Atlas) -> None:
     motion = there_and_back(atlas, STEP, 4.0)
     asked, h = AskedPosture(atlas), 2e-3

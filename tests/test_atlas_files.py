@@ -46,6 +46,7 @@ def test_file_holds_the_same_atlas(planar_atlas: oc.Atlas, covered: Array) -> No
     assert again.as_dict() == planar_atlas.as_dict()
 
 
+@pytest.mark.slow
 def test_build_in_parts_gives_the_same_cells(planar_atlas: oc.Atlas, tmp_path: Path) -> None:
     path = tmp_path / "arm.orthocas-atlas"
     first = built(path, share=0.3)
@@ -121,6 +122,7 @@ def test_nothing_is_lost_of_a_file_of_version_1_with_a_turned_bit(grown: Stock, 
                 rest.unlink(missing_ok=True)
 
 
+@pytest.mark.slow
 def test_file_of_version_1_goes_on_as_such(planar_atlas: oc.Atlas, grown: Stock, tmp_path: Path) -> None:
     path = tmp_path / "arm.orthocas-atlas"
     path.write_bytes(of_version_1(grown.path.read_bytes(), grown))
@@ -249,6 +251,7 @@ def test_foreign_file_is_not_replaced(tmp_path: Path) -> None:
     assert path.read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_opening_a_large_atlas_reads_no_charts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """20,000 charts of an arm."""
     plan = make_plan(planar(), oc.AtlasSettings(half_width=0.02, symmetric=False), 5.0)

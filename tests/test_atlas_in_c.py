@@ -112,6 +112,7 @@ def test_hostile_numbers_give_statuses_under_sanitizers(whole: GeneratedC, tmp_p
     assert int(output_of(built(whole, "atlas_calls.c", tmp_path, *flags))) > 300
 
 
+@pytest.mark.slow
 def test_fused_products_change_values_by_rounding_only(
     whole: GeneratedC, library: CompiledLibrary, way_atlas: oc.Atlas, positions: Array, tmp_path: Path
 ) -> None:

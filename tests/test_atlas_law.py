@@ -53,7 +53,7 @@ def moving(way_atlas: oc.Atlas, tmp_path_factory: pytest.TempPathFactory) -> tup
     """A velocity law."""
     law, folder = Kinematic.on_chart(way_atlas.chart(3), feedback=1.0, limit=2.0), tmp_path_factory.mktemp("moving")
     generated = oc.generate_c(way_atlas, folder, law, "arm")
-    return law, CompiledLibrary(compile_shared(generated, folder, ("-O0",)), "arm", 3, r=2)
+    return law, CompiledLibrary(compile_shared(generated, folder), "arm", 3, r=2)
 
 
 @pytest.mark.slow
@@ -155,6 +155,7 @@ def test_the_boundary_of_all_charts_has_a_zone_before_it_and_boundaries_between_
         assert before > margin - 1e-9
 
 
+@pytest.mark.slow
 def test_beyond_all_charts_the_arm_is_caught_and_returns_when_asked(
     way_atlas: oc.Atlas, law: Controller, library: CompiledLibrary
 ) -> None:

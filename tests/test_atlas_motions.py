@@ -81,6 +81,7 @@ def test_first_and_last_joint_of_an_orientation_task_are_not_divided(wrist: oc.A
         assert abs(gradient @ still) > np.cos(np.radians(20)) * np.linalg.norm(gradient)
 
 
+@pytest.mark.slow
 def test_charts_of_orientations_hold_for_every_reference(wrist: oc.Atlas) -> None:
     q = np.array([-1.5, 0.4, 3.5, 1.0])
     number = wrist.chart_at(q)

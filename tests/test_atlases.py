@@ -43,6 +43,7 @@ def test_arm_without_symmetries_has_the_identity_only(planar_x: oc.Problem) -> N
     assert (plan.maps.signs.tolist(), plan.maps.shifts.tolist()) == ([[1.0] * 3], [[0.0] * 3])
 
 
+@pytest.mark.slow
 def test_chart_of_a_position_is_one_whose_box_holds_it(planar_atlas: oc.Atlas) -> None:
     """Against a search through all boxes."""
     q = np.random.default_rng(3).uniform(-np.pi, np.pi, (300, 3))

@@ -93,6 +93,7 @@ def test_status_decides_between_infeasible_and_not_found(bounded: BoundedMutual)
         assert "within 2.865 deg" in str(found)
 
 
+@pytest.mark.slow
 def test_degree_that_misses_the_bound_does_not_stop_the_next(planar_x: oc.Problem) -> None:
     """One iteration does not get degree 2 under the bound; degree 3 goes on from there."""
 

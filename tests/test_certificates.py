@@ -178,6 +178,7 @@ class Dying(ThreadPoolExecutor):
         return future
 
 
+@pytest.mark.slow
 def test_boxes_of_processes_that_died_are_judged_again() -> None:
     with Dying(2) as executor:
         shared = oc.certify(chart(), executor=executor)
@@ -188,6 +189,7 @@ def test_boxes_of_processes_that_died_are_judged_again() -> None:
     assert shared.regular.codes.tolist() == certified().regular.codes.tolist()
 
 
+@pytest.mark.slow
 def test_boxes_that_processes_die_over_stay_unproved(caplog: pytest.LogCaptureFixture) -> None:
     with Dying(100) as executor:
         found = oc.certify(chart(), executor=executor)

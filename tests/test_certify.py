@@ -86,6 +86,7 @@ def test_a_dip_that_is_no_fold_is_certified() -> None:
     assert oc.certify(dipped(0.1, 0.1)).proved
 
 
+@pytest.mark.slow
 def test_a_chart_for_all_positions_of_a_cyclic_joint_is_certified() -> None:
     known = problems.get("iiwa")
     problem = oc.Problem(known.robot, known.task, domain=oc.Box(known.domain.centre, 0.15))

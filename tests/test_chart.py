@@ -27,6 +27,7 @@ def test_jacobian_matches_differences_of_phi(planar_x: oc.Problem, parametrisati
     np.testing.assert_allclose(chart.jacobian(q), want, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parametrisation", [oc.Polynomial(3), oc.MLP((5,))], ids=lambda p: p.label)
 def test_casadi_functions_agree_with_batched_numpy(planar_x: oc.Problem, parametrisation: object) -> None:
     chart = oc.fit(planar_x, parametrisation, samples=100).chart

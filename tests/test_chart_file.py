@@ -112,6 +112,7 @@ class Mine:
         return oc.Polynomial(1).family(space, outputs)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_parametrisation_that_could_not_be_read_back_is_not_written(planar_x: oc.Problem, tmp_path: Path) -> None:
     with pytest.warns(NotSavableWarning, match="parametrisation is Mine, expected a registered one"):
         chart = oc.fit(planar_x, Mine(), oc.solvers.LBFGS()).chart
@@ -127,6 +128,7 @@ def test_numpy_numbers_in_settings_do_not_reach_the_file(planar_x: oc.Problem, t
     assert oc.load(tmp_path / "numpy").notes["seed"] == 3
 
 
+@pytest.mark.slow
 def test_custom_operation_that_files_cannot_hold_fails_at_saving_only(tmp_path: Path) -> None:
     robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
     task = oc.Task.custom(robot, "odd", lambda q: ca.erf(q[0]) + ca.hypot(q[0], 3 + q[1]) + ca.log1p(q[0] ** 2))

@@ -141,6 +141,7 @@ def test_reader_from_the_page_gives_phi_of_ready_charts(name: str) -> None:
     require_equal(DATA / f"{name}.orthocas", oc.charts.load(name))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", [oc.Linear(), oc.Fourier(2), oc.MLP((4, 3)), oc.MLP((4,), raw=True)])
 def test_reader_from_the_page_gives_phi_of_all_families(family: Any, planar_xy: oc.Problem, tmp_path: Path) -> None:
     chart = oc.fit(planar_xy, family, samples=100).chart

@@ -76,6 +76,7 @@ def test_killed_fit_ends_as_the_whole_one(
             assert (found.result.value, found.result.status) == (expected.result.value, expected.result.status)
 
 
+@pytest.mark.slow
 def test_finished_fit_is_not_run_again(planar_x: oc.Problem, tmp_path: Path) -> None:
     file = tmp_path / "run.checkpoint"
     first = oc.fit(planar_x, oc.Polynomial(3), checkpoint=file)
@@ -172,6 +173,7 @@ def test_states_that_do_not_fit_are_refused_with_file_and_field(
         oc.fit(planar_x, oc.MLP((2,)), **settings, checkpoint=file)
 
 
+@pytest.mark.slow
 def test_a_finished_stage_that_was_interrupted_is_refused(planar_x: oc.Problem, tmp_path: Path) -> None:
     file = tmp_path / "run"
     oc.fit(planar_x, oc.Polynomial(2), samples=60, checkpoint=file)
@@ -207,7 +209,7 @@ def test_killed_process_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> None
     code = (
         "import orthocas as oc; from orthocas import problems, solvers; from orthocas.fitting import checkpoint; "
         "checkpoint._SECONDS = 0.0; "
-        "fit = oc.fit(problems.get('planar_3r_xy'), oc.MLP((8, 8)), solvers.Adam(epochs=150, steps=20), samples=200, "
+        "fit = oc.fit(problems.get('planar_3r_xy'), oc.MLP((8, 8)), solvers.Adam(epochs=80, steps=20), samples=200, "
         f"checkpoint={str(file)!r}); "
         "print(fit.stages[0].result.iterations, fit.stages[0].result.evaluations)"
     )
@@ -220,8 +222,8 @@ def test_killed_process_leaves_a_checkpoint_that_goes_on(tmp_path: Path) -> None
     process.wait()
     header, arrays = checkpoint.read_archive(file, checkpoint.CHECKPOINT)
     assert header["running"] == "mlp:8x8"
-    assert 0 < arrays["state_iterations"] < 150
-    assert python(code).split() == ["150", str(1 + 150 * 21)]  # one start, 20 steps and one judgement an epoch
+    assert 0 < arrays["state_iterations"] < 80
+    assert python(code).split() == ["80", str(1 + 80 * 21)]  # one start, 20 steps and one judgement an epoch
 
 
 CHILD = """
@@ -265,6 +267,7 @@ def test_process_killed_at_any_time_loses_nothing(planar_x: oc.Problem, tmp_path
     assert [s.result.evaluations for s in resumed.stages] == [s.result.evaluations for s in whole.stages]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [solvers.GaussNewton(20), solvers.QuasiNewton(20)], ids=lambda solver: solver.name)
 def test_parameters_that_lead_to_infinite_matrices_are_errors_of_ours(
     planar_x: oc.Problem, tmp_path: Path, solver: solvers.Solver
@@ -282,6 +285,7 @@ def test_parameters_that_lead_to_infinite_matrices_are_errors_of_ours(
                 ).all()
 
 
+@pytest.mark.slow
 def test_a_state_without_a_gradient_gets_a_new_one(planar_x: oc.Problem, tmp_path: Path) -> None:
     file, settings = tmp_path / "run", {"solver": solvers.QuasiNewton(20), "samples": 60}
     with pytest.raises(Killed):

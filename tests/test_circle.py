@@ -174,6 +174,7 @@ def test_certificate_of_a_ring_ends_one_to_one_before_a_whole_turn(around: oc.Ch
     assert oc.check_certificate(whole, certificate)
 
 
+@pytest.mark.slow
 def test_path_goes_round_by_the_shorter_ways_of_its_schedule(around: oc.Chart) -> None:
     """Angles from -pi to pi at the waypoints mean the same as angles that count on."""
     bend = 0.05 * np.sin(np.linspace(0, np.pi, 9))

@@ -54,6 +54,7 @@ def test_higher_degrees_start_where_lower_ones_end(
     assert finer.chart(finer.embedded(theta, pairs)).xi(POINTS) == pytest.approx(chart.xi(POINTS))
 
 
+@pytest.mark.slow
 def test_grown_start_winds_twice_around_the_maximum(pairs: circle_coordinates.SymmetricPairs) -> None:
     """The angle turns by 4 pi on a circle around the maximum, where the pair has a double zero."""
     problem = planar_problem("euclidean")

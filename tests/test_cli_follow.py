@@ -33,6 +33,7 @@ def chart(run: Run) -> oc.Chart:
     return clear()
 
 
+@pytest.mark.slow
 def test_motion_is_that_of_python(run: Run, chart: oc.Chart) -> None:
     code, out, err = run("follow", "a.orthocas", "p.csv", *LIMITS, "--out", "q.csv", "--json")
     assert (code, err) == (0, "")
@@ -51,6 +52,7 @@ def test_motion_is_that_of_python(run: Run, chart: oc.Chart) -> None:
     assert run("follow", "a.orthocas", "p.csv", *LIMITS, "--out", "q.csv")[1].splitlines()[-1].startswith("file ")
 
 
+@pytest.mark.slow
 def test_schedules_objectives_and_obstacles(run: Run, chart: oc.Chart) -> None:
     xi = float(chart.xi(chart.problem.domain.centre)[0])
     rows = [f"{xi + 0.02 * np.sin(k)},{y!r},{x!r}" for k, (x, y) in enumerate(waypoints(chart).tolist())]

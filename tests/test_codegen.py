@@ -167,7 +167,7 @@ def test_compiled_kinematics_and_dynamics_match_pinocchio(name: str, tmp_path: P
     task = oc.Task.position(robot, "zy" if n > 2 else "z")
     chart = oc.fit(oc.Problem(robot, task, "euclidean", box), oc.Linear(base=tuple(base))).chart
     generated = oc.generate_c(chart, tmp_path, None, "arm")
-    library = CompiledLibrary(compile_shared(generated, tmp_path, ("-O1",)), "arm", n)
+    library = CompiledLibrary(compile_shared(generated, tmp_path), "arm", n)
     data, frame, rows = model.createData(), model.getFrameId(tip), [2, 1][: task.m]
     for q, dq in rng.uniform(-2, 2, (100, 2, n)):
         p = pinocchio_position(model, q)
@@ -252,7 +252,7 @@ def test_c_of_robots_with_many_joints_is_short_and_right(tmp_path: Path) -> None
     assert lengths[1] < 3.5 * lengths[0]
     small = law_of_chain(12)
     generated = oc.generate_c(small.chart, tmp_path / "small", small, "arm")
-    library = CompiledLibrary(compile_shared(generated, tmp_path, ("-O1",)), "arm", 12)
+    library = CompiledLibrary(compile_shared(generated, tmp_path), "arm", 12)
     assert library.check() < 1e-12
     q = sample_uniform(small.problem.domain, 5, 3)
     for k, (point, dq) in enumerate(zip(q, np.random.default_rng(1).normal(size=q.shape), strict=True)):

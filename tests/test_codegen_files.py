@@ -44,6 +44,7 @@ int main(void) {
 
 @pytest.mark.slow
 @needs_cmake
+@pytest.mark.usefixtures("unoptimised")
 def test_installed_libraries_are_found_and_linked(pd_plus: tuple[GeneratedC, PDPlus], tmp_path: Path) -> None:
     """By CMake and pkg-config, from a folder with a space, after it has been moved."""
     first, place, project = tmp_path / "first place", tmp_path / "second place", tmp_path / "consumer"
@@ -70,6 +71,7 @@ def test_installed_libraries_are_found_and_linked(pd_plus: tuple[GeneratedC, PDP
 
 @pytest.mark.slow
 @needs_cmake
+@pytest.mark.usefixtures("unoptimised")
 def test_as_a_part_of_another_project_nothing_is_installed(pd_plus: tuple[GeneratedC, PDPlus], tmp_path: Path) -> None:
     (tmp_path / "main.c").write_text(_MAIN)
     text = _CONSUMER.replace(_FOUND, f'add_subdirectory("{pd_plus[0].folder}" arm)')
@@ -207,6 +209,7 @@ def test_command_writes_checks_and_refuses(planar_fit: Fit, run: Run) -> None:
         assert not Path("other").exists()
 
 
+@pytest.mark.slow
 def test_command_chooses_the_model_at_run_time_and_prints_remarks(planar_xy: oc.Problem, run: Run) -> None:
     oc.fit(planar_xy, oc.Linear()).chart.save("arm.orthocas")
     words = ("codegen", "arm.orthocas", "--controller", "impedance", "--out", "c", "--name", "arm")

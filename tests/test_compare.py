@@ -172,6 +172,7 @@ def test_control_ticks_are_measured_once_a_parametrisation(planar_x: oc.Problem,
     assert [row[-1].endswith(" us") for row in table[1:]] == [True, True, False]
 
 
+@pytest.mark.slow
 def test_ticks_are_left_out_without_a_compiler(
     planar_x: oc.Problem, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

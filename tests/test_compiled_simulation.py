@@ -83,6 +83,7 @@ def test_coulomb_friction_and_stops_are_those_of_cvodes(law: PDPlus, reference: 
     require_same(runs, 1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [200.0, 1000.0])
 def test_sampled_runs_are_those_of_cvodes(law: PDPlus, reference: Reference, rate: float) -> None:
     """With noise, a push within a tick, and a start beyond the domain, where the fallback holds the arm."""

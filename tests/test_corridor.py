@@ -93,6 +93,7 @@ def test_samples_are_uniform() -> None:
     assert domain.contains(sample_heavily(domain, 300, 2)).all()
 
 
+@pytest.mark.slow
 def test_loop_closes_where_the_pseudo_inverse_drifts(loop: tuple[oc.Problem, Array, Array], chart: oc.Chart) -> None:
     _, x, postures = loop
     drift = np.abs(postures[-1] - postures[0]).max()

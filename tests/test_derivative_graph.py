@@ -29,6 +29,7 @@ def chart_of(task: object, xi: object) -> oc.Chart:
     return oc.fit(problem, oc.Given.from_function("xi", 2, xi)).chart
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [True, False], ids=["task", "coordinates"])
 def test_a_derivative_that_casadi_rounds_to_one_without_a_zero_is_not_certified(first: bool) -> None:
     """The exact determinant is +-3 q1, which vanishes at q1 = 0, inside the domain."""

@@ -240,23 +240,3 @@ def test_parts_are_found_in_order() -> None:
         assert [(code, a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True)] == [
             part for part in parts if part[0] == code
         ]
-
-
-@pytest.mark.slow
-def test_nearly_all_of_a_branch_is_proved_and_holds() -> None:
-    robot = oc.problems.get("iiwa").robot
-    polynomial = oc.Polynomial(4, ["A1", "A7"])
-    chart = oc.fit_wide(robot, oc.Task.pose(robot), "shoulder+ elbow- wrist+", parametrisation=polynomial).chart
-    found = oc.certify(chart, time_limit=6)
-    assert found.clear_share > 0.99  # from about 3 s on
-    low, high = found.regular.leaves(PROVED)
-    rng = np.random.default_rng(9)
-    chosen = rng.choice(len(low), 100_000)
-    points = rng.uniform(low[chosen], high[chosen])
-    domain = chart.problem.domain
-    assert isinstance(domain, oc.RegularPart)
-    clear = domain.singular_values(points) > domain.least_singular_value
-    assert clear.sum() > 5000  # enough to look at; how many depends on how far the proof got
-    assert (domain.volumes(points[clear]) > 0).all()
-    far = robot.tip_rotation(points) @ robot.tip_rotation(domain.centre).T
-    assert (np.trace(far, axis1=1, axis2=2) < 2 * np.cos(3.1) + 1).any()  # half a turn is no boundary of the proof

@@ -28,6 +28,7 @@ def test_polynomials_keep_nearly_everything() -> None:
     assert lost[6].grown.task_angle.std < 1e-9
 
 
+@pytest.mark.slow
 def test_the_result_is_an_expression() -> None:
     chart = oc.distil(grown(), oc.Polynomial(3)).chart
     q = BOX.centre

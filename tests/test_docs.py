@@ -125,7 +125,7 @@ def test_python_blocks_of_the_page_on_paths_run(tmp_path: Path) -> None:
 @pytest.mark.slow
 @needs_c
 @needs_cmake
-@pytest.mark.usefixtures("checkout")
+@pytest.mark.usefixtures("checkout", "unoptimised", "blank_pictures")
 def test_ten_minutes_to_a_controller_in_c_run(run: Run) -> None:
     """Every command of docs/how-to/c_code.md, in order."""
     lines = [line for block in blocks("sh", "how-to/c_code.md") for line in block.splitlines()]

@@ -55,6 +55,7 @@ def test_coordinates_are_shifted_and_scaled(iiwa_fit: Fit) -> None:
     np.testing.assert_allclose(lengths, 1.0, atol=0.05)  # scaled on other samples
 
 
+@pytest.mark.slow
 def test_same_seed_same_result_and_another_seed_another(planar_x: oc.Problem) -> None:
     first, second, other = (oc.fit(planar_x, oc.Polynomial(3), seed=s).chart.coordinates.theta for s in (4, 4, 5))
     np.testing.assert_array_equal(first, second)
@@ -140,6 +141,7 @@ def test_panda_and_ur10_fit_without_tuning_straight_from_their_urdfs() -> None:
         assert report.task_angle.std < 5
 
 
+@pytest.mark.slow
 def test_all_coordinates_may_be_idle() -> None:
     robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
     task = oc.Task.custom(robot, "first joint", lambda q: q[0])
@@ -149,6 +151,7 @@ def test_all_coordinates_may_be_idle() -> None:
     assert oc.evaluate(fit.chart, 100).task_angle.std == 0
 
 
+@pytest.mark.slow
 def test_joint_that_the_metric_depends_on_is_not_split_off() -> None:
     """A decouples q3 but depends on it: exact coordinates exist (m = 1), and they are functions of q3 too."""
     robot = oc.Robot.planar([1.0] * 3, [1.0] * 3)
@@ -187,6 +190,7 @@ class StopsAfterFirstStage:
         return SolveResult(result.theta, result.value, status, 1, 1, 0.0)
 
 
+@pytest.mark.slow
 def test_interrupted_fit_raises_with_the_best_chart_so_far(planar_x: oc.Problem) -> None:
     with pytest.raises(Interrupted, match="the Fit found so far") as stop:
         oc.fit(planar_x, oc.Polynomial(5), StopsAfterFirstStage())

@@ -105,12 +105,14 @@ def test_exact_coordinates_are_straight() -> None:
     assert fit.worst.least > 0.999
 
 
+@pytest.mark.slow
 def test_without_the_fold_term_the_same_fit_folds(iiwa: oc.Problem) -> None:
     fit = oc.fit(iiwa, oc.Polynomial(3), weights=Weights(folds=0))
     assert fit.worst is None
     assert worst_points(iiwa, fit.chart.coordinates).least < 0
 
 
+@pytest.mark.slow
 def test_fold_term_acts_at_collected_points_with_its_exact_gradient(iiwa: oc.Problem) -> None:
     """Against central differences; and the value is weight / 2 mean(max(0.32 - det D, 0)^2) more."""
     unsafe = oc.fit(iiwa, oc.Polynomial(2), weights=Weights(folds=0))

@@ -53,6 +53,7 @@ def motion() -> JointMotion:
     return oc.follow(planar(), loop(planar(), 0.15), velocity_limits=[1.0, 1.5, 2.0], acceleration_limits=4.0)
 
 
+@pytest.mark.slow
 def test_tool_and_coordinates_are_where_they_should_be() -> None:
     found, chart = motion(), planar()
     np.testing.assert_allclose(chart.task(found.q), found.x, atol=1e-9)
@@ -82,6 +83,7 @@ def test_rates_are_finite_differences_of_positions() -> None:
     np.testing.assert_allclose(found.q[0] + trapezoid(found.dq, dx=h, axis=0), found.q[-1], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_limits_are_kept_in_corners() -> None:
     """A zigzag of straight lines, at periods that miss the corners and at one that sees them."""
     chart = planar()
@@ -107,6 +109,7 @@ def test_limits_are_kept_and_used() -> None:
     assert kept.boundary == pytest.approx(1 - (np.abs(found.q - START) / 0.7).max())
 
 
+@pytest.mark.slow
 def test_motion_is_nearly_as_fast_as_possible() -> None:
     """One joint moves by a distance d at most with speed v and acceleration a: no motion takes less than d/v + v/a."""
     robot = oc.Robot.planar([1.0, 1.0], [3.0, 3.0])
@@ -120,6 +123,7 @@ def test_motion_is_nearly_as_fast_as_possible() -> None:
         assert least * (1 - 1e-9) <= found.duration < 1.06 * least
 
 
+@pytest.mark.slow
 def test_schedules_go_through_their_values() -> None:
     chart = planar()
     path = loop(chart, 0.1, 12)
@@ -158,6 +162,7 @@ def test_start_settles_the_coordinates() -> None:
     np.testing.assert_allclose(found.xi[0], chart.xi(other), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_objective_keeps_away_from_boundaries() -> None:
     chart, q = planar(), START + np.array([0.4, -0.5, 0.4])
     path = chart.task(q) + loop(chart, 0.1) - loop(chart, 0.1)[0]

@@ -51,6 +51,7 @@ def test_every_command_is_stopped_by_signals() -> None:
     assert {name for name in wanted if name not in stopped} == set()
 
 
+@pytest.mark.slow
 def test_every_reader_belongs_to_a_campaign() -> None:
     root, found = Path(inspect.getfile(oc)).parent, set()
     for file in sorted(root.rglob("*.py")):

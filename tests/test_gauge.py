@@ -71,6 +71,7 @@ def test_refit_is_aligned_to_a_chart(planar_x: oc.Problem) -> None:
     assert (np.diag(cosines) > 0).all()
 
 
+@pytest.mark.slow
 def test_chart_of_another_size_is_refused(planar_x: oc.Problem, planar_xy: oc.Problem) -> None:
     other = oc.fit(planar_xy, oc.Polynomial(1)).chart
     with pytest.raises(InvalidValueError, match="align_to is a chart with n = 3, r = 1"):

@@ -79,6 +79,7 @@ def test_coordinates_do_not_change_along_flow_lines(chart: oc.Chart) -> None:
         assert (change.max(axis=1) / size).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_gradients_are_orthogonal_to_the_task(chart: oc.Chart) -> None:
     """True by construction; that the gradients are those of xi is what the test after this one shows."""
     points = known_points(chart)
@@ -88,6 +89,7 @@ def test_gradients_are_orthogonal_to_the_task(chart: oc.Chart) -> None:
     assert oc.evaluate(chart, 300).task_angle.max < 1e-4
 
 
+@pytest.mark.slow
 def test_jacobian_agrees_with_differences_of_values(chart: oc.Chart) -> None:
     """An independent look at orthogonality too: differences know nothing of sensitivities."""
     points, step = known_points(chart, 40), 1e-6
@@ -101,6 +103,7 @@ def test_jacobian_agrees_with_differences_of_values(chart: oc.Chart) -> None:
     assert np.median(error) < 1e-5
 
 
+@pytest.mark.slow
 def test_inverse_leads_back(chart: oc.Chart) -> None:
     points = known_points(chart, 20)
     wanted = chart.phi(points)
@@ -114,6 +117,7 @@ def test_inverse_leads_back(chart: oc.Chart) -> None:
     np.testing.assert_allclose(solved, points[good], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_files_hold_everything(chart: oc.Chart, tmp_path: Path) -> None:
     chart.save(tmp_path / "grown.orthocas")
     again = oc.load(tmp_path / "grown.orthocas")
@@ -134,6 +138,7 @@ def test_faces_are_integers_in_memory_and_in_files(tmp_path: Path) -> None:
         chart.coordinates.leaf.faces[0, 0] = 1
 
 
+@pytest.mark.slow
 def test_faces_kept_as_floats_by_early_versions_still_load(tmp_path: Path) -> None:
     chart = oc.grow(planar_3r("euclidean"), 0.0, cells=20)
     chart.save(tmp_path / "new.orthocas")
@@ -181,6 +186,7 @@ def test_both_metrics_agree_on_the_base_leaf() -> None:
     np.testing.assert_allclose(charts[0].xi(on_leaf), charts[1].xi(on_leaf), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_points_that_leave_the_chart_get_a_status() -> None:
     chart = oc.grow(planar_3r("euclidean"), 0.0, cells=20)
     points = CELL.centre + CELL.half_width * np.random.default_rng(0).uniform(-1, 1, (500, 3))

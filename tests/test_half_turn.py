@@ -151,6 +151,7 @@ def test_derivatives_of_errors_are_finite_differences(kind: str) -> None:
     np.testing.assert_allclose(slope(3), along(0, 4), atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("kind", ["pose", "pose:z"])
 def test_trackers_follow_four_turns_about_each_axis(kind: str, axis: str) -> None:
@@ -162,6 +163,7 @@ def test_trackers_follow_four_turns_about_each_axis(kind: str, axis: str) -> Non
         np.testing.assert_allclose(q, wanted, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pose", "pose:z"])
 def test_solvers_find_poses_half_a_turn_away(kind: str) -> None:
     known, q = chart(kind), turning(2.0, 801)
@@ -178,6 +180,7 @@ def test_solvers_find_poses_half_a_turn_away(kind: str) -> None:
     np.testing.assert_allclose(arm().tip_rotation(free.q), arm().tip_rotation(q[half]), atol=1e-7)
 
 
+@pytest.mark.slow
 def test_self_motions_do_not_depend_on_the_reference() -> None:
     q = oc.problems.get("iiwa").domain.centre + np.pi * np.eye(7)[6]
     assert np.linalg.norm(chart().task(q)[3:]) == pytest.approx(2, abs=1e-6)
@@ -195,6 +198,7 @@ def test_wishes_are_met_half_a_turn_away() -> None:
     np.testing.assert_allclose(R[1], R[0], atol=1e-7)
 
 
+@pytest.mark.slow
 def test_paths_of_two_full_turns_are_followed() -> None:
     q = turning(1.0, 41)
     motions = [
@@ -239,6 +243,7 @@ def laws(kind: str, turned_deg: float) -> list[control.Controller]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pose", "pose:z"])
 @pytest.mark.parametrize("number", range(5))
 def test_laws_do_not_depend_on_the_reference(kind: str, number: int) -> None:

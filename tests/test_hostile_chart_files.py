@@ -199,6 +199,7 @@ def test_a_huge_degree_is_compared_with_the_parameters_before_a_basis_is_built(s
         oc.load(resealed(saved, header))
 
 
+@pytest.mark.slow
 def test_entries_that_the_header_does_not_list_are_left_alone(saved: Path, planar_fit: Fit) -> None:
     with zipfile.ZipFile(saved, "a", zipfile.ZIP_DEFLATED) as file:
         file.writestr("unlisted.npy", bytes(2**26))
@@ -210,6 +211,7 @@ def test_entries_that_the_header_does_not_list_are_left_alone(saved: Path, plana
     np.testing.assert_array_equal(chart.phi([0.6, 0.8, 0.8]), planar_fit.chart.phi([0.6, 0.8, 0.8]))
 
 
+@pytest.mark.slow
 def test_a_listed_entry_that_unpacks_to_far_more_than_the_file_is_refused(saved: Path) -> None:
     resealed(saved, theta=np.zeros(2**22))
     with zipfile.ZipFile(saved) as source:

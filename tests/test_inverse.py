@@ -120,6 +120,7 @@ def test_require_names_the_rows(planar_arm: oc.Chart) -> None:
     assert planar_arm.solve(phi[:1]).require().found.all()
 
 
+@pytest.mark.slow
 def test_all_solutions_of_a_folded_chart_are_found() -> None:
     """x = cos q1 + cos(q1 + q2) and xi linear: the solutions of one equation in one unknown, counted on a net."""
     robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[1.0, 1.0])
@@ -172,6 +173,7 @@ def test_a_certified_chart_has_all_the_solutions_that_newton_finds() -> None:
     assert several >= 2
 
 
+@pytest.mark.slow
 def test_out_of_reach_is_said_only_where_the_arm_is_too_short(planar_arm: oc.Chart) -> None:
     """The three links of 1 m reach 3 m; a task of the user's own has no such bound."""
     phi = planar_arm.phi(planar_arm.problem.domain.centre)
@@ -197,6 +199,7 @@ def test_no_tip_is_farther_away_than_beyond_reach_says() -> None:
         assert beyond_reach(chart.problem.task, x + np.eye(chart.m)[0] * 9.0).all()
 
 
+@pytest.mark.slow
 def test_inverse_refuses_what_lies_outside_and_has_the_nearest_inside() -> None:
     """The ready chart of the Panda: with xi1 moved by 9, q1 and q6 end beyond their limits."""
     chart = oc.charts.load("panda-position")

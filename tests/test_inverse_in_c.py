@@ -53,6 +53,7 @@ def test_a_library_is_compiled_once(planar_arm: oc.Chart, tmp_path: Path, monkey
     np.testing.assert_array_equal(copy.solve(phi).q, first.solve(phi).q)
 
 
+@pytest.mark.slow
 @needs_c
 def test_singular_solutions_of_compiled_c_are_named(tmp_path: Path) -> None:
     robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])

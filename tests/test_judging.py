@@ -76,6 +76,7 @@ def test_leak_does_not_depend_on_task_coordinates_but_the_papers_angle_does(plan
         assert abs(report.task_angle.std - first.task_angle.std) > 0.1
 
 
+@pytest.mark.slow
 def test_for_one_task_component_and_identity_metric_the_leak_is_the_papers_angle(planar_x: oc.Problem) -> None:
     chart = oc.fit(with_metric(planar_x, "euclidean"), oc.Linear()).chart
     report = oc.evaluate(chart, 500)
@@ -92,6 +93,7 @@ def test_the_papers_angle_hides_the_leak_for_the_inertia_metric(charts: dict[str
     assert shown.leak.rms < 3 * shown.task_angle.std  # m = 1
 
 
+@pytest.mark.slow
 def test_idle_joints_are_left_out_of_the_second_set_of_figures(iiwa_fit: Fit, planar_fit: Fit) -> None:
     report = oc.evaluate(iiwa_fit.chart, 2000)
     others = report.without_idle

@@ -21,6 +21,7 @@ def test_lbfgs_refuses_pairs_of_another_objective(pair: np.ndarray) -> None:
         solvers.LBFGS().minimise(Valley(), START, Watch(keeper=LastState({**keeper.state, "pair_1": pair})))
 
 
+@pytest.mark.slow
 def test_lbfgs_needs_no_more_evaluations_than_scipy() -> None:
     """Rosenbrock's function of 20 variables from ten starts: the same minimum for at most a tenth more work."""
 

@@ -81,6 +81,7 @@ def _tip(*q: float) -> np.ndarray:
     return np.asarray(ARM.tip_position(np.array(q)))[:2]
 
 
+@pytest.mark.slow
 def test_disk_values_and_points_are_inverse() -> None:
     cell = oc.Box([np.pi / 2, 0, 0], [np.pi / 2, np.pi, np.pi])
     problem = oc.Problem(ARM, oc.Task.position(ARM, "x"), "euclidean", cell)
@@ -108,6 +109,7 @@ def test_disk_gradients_agree_with_differences_within_a_triangle() -> None:
         np.testing.assert_allclose(values.xi + change, images[:, k], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_linear_leaf_points_solve_both_conditions() -> None:
     arm = problems.get("iiwa")
     problem = oc.Problem(arm.robot, oc.Task.position(arm.robot, "z"), "inertia", oc.Box(arm.domain.centre, 0.3))
@@ -130,6 +132,7 @@ def test_where_a_linear_leaf_has_no_point_there_is_nan() -> None:
     assert np.isnan(leaf.points(xi)).all(axis=1).tolist() == [True, False, True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cells", [20, 60])
 def test_disk_topology_is_that_of_a_disk(cells: int) -> None:
     cell = oc.Box([np.pi / 2, 0, 0], [np.pi / 2, np.pi, np.pi])

@@ -2,6 +2,7 @@
 
 import leak_bound
 import numpy as np
+import pytest
 
 
 def test_the_mean_of_a_gradient_along_a_rotation_vanishes_on_a_ball() -> None:
@@ -22,6 +23,7 @@ def test_the_mean_of_a_gradient_along_a_rotation_vanishes_on_a_ball() -> None:
     assert abs((gradient * (x @ np.abs(W).T)).sum(axis=1).mean()) > 0.1  # not for fields that are no rotations
 
 
+@pytest.mark.slow
 def test_a_fit_leaks_at_least_as_much_as_the_bound_and_hardly_more_on_a_small_ball() -> None:
     (ratio,) = [value for key, value in leak_bound.main(quick=True).items() if "position" in key]
     assert 1.0 <= ratio < 1.3

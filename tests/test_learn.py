@@ -83,6 +83,7 @@ def test_an_action_moves_one_coordinate_with_the_tool_at_rest() -> None:
     np.testing.assert_allclose(moved[:3] - again[:3], [0.01, 0, 0], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_an_action_turns_a_pose_about_the_tips_axes() -> None:
     chart = oc.charts.load("panda-wide")
     env = learn.PhiActions(Arm(chart), chart, 0.01)
@@ -95,6 +96,7 @@ def test_an_action_turns_a_pose_about_the_tips_axes() -> None:
     np.testing.assert_allclose(turn[:, 2], [0, 0, 1], atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["planar, wide", "circle", "pose"])
 def test_episodes_come_back_as_they_were(name: str) -> None:
     chart = {"planar, wide": wide().chart, "circle": ring(), "pose": oc.charts.load("panda-wide")}[name]

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from programs import Run, needs_c
+from supervised import TICK, Arm
 from test_payload import arm_model
 
 import orthocas as oc
@@ -19,7 +20,6 @@ from orthocas.control.memory import _momentum, _regressor
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.tools.checks import Array
 
-TICK = 1e-3
 BOTH = [MomentumObserver(), Adaptation()]
 
 
@@ -41,15 +41,15 @@ def at_rest(chart: oc.Chart, q: Array) -> Array:
 def held(ticks: Remembering, robot: oc.Robot, q: Array, count: int, push: float = 0.0) -> tuple[Array, Array]:
     """Joint positions after ticks at rest, and what the memory corrects."""
     chart: Any = ticks._controller.chart
-    wanted, x, dq = at_rest(chart, q), q.copy(), np.zeros(3)
+    wanted, arm = at_rest(chart, q), Arm(robot, q)
     for _ in range(count):
-        command, status = ticks.tick(x, dq, wanted, TICK)
+        command, status = ticks.tick(arm.q, arm.dq, wanted, TICK)
         assert status == ControlStatus.OK
-        dq = dq + TICK * np.linalg.solve(robot.mass_matrix(x), command + push - robot.bias(x, dq))
-        x = x + TICK * dq
-    return x, ticks.fields["correction"]
+        arm.move(command + push, steps=1)
+    return arm.q, ticks.fields["correction"]
 
 
+@pytest.mark.slow
 def test_momentum_and_its_rate_are_pinocchios() -> None:
     """C^T dq = dM/dt dq - C dq; Pinocchio's C has the same skew symmetry."""
     model, rng = arm_model(), np.random.default_rng(1)
@@ -92,6 +92,7 @@ def test_regressor_is_bilinear_in_its_two_velocities() -> None:
     np.testing.assert_allclose(turned(u + v, u + v), turned(u, u) + turned(v, v) + 2 * turned(u, v), atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("remembers", BOTH, ids=lambda kind: kind.name)
 def test_the_sag_of_a_wrong_model_goes(chart: oc.Chart, remembers: Any) -> None:
     q, heavy = chart.problem.domain.centre, chart.problem.robot.with_scaled_masses(1.4)
@@ -104,6 +105,7 @@ def test_the_sag_of_a_wrong_model_goes(chart: oc.Chart, remembers: Any) -> None:
     np.testing.assert_allclose(correction, heavy.gravity(x) - chart.problem.robot.gravity(x), atol=0.5)
 
 
+@pytest.mark.slow
 def test_an_observer_finds_an_unknown_torque_with_its_time_constant(chart: oc.Chart) -> None:
     q, robot = chart.problem.domain.centre, chart.problem.robot
     ticks = Remembering(law_of(chart, MomentumObserver(rate=10.0)))
@@ -113,6 +115,7 @@ def test_an_observer_finds_an_unknown_torque_with_its_time_constant(chart: oc.Ch
     np.testing.assert_allclose(-correction, 5.0, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_torque_that_was_asked_for_is_not_taken_for_a_disturbance(chart: oc.Chart) -> None:
     """Friction compensation of the user's own: the joints feel -3 N m, and the law adds 3."""
     law = law_of(chart, MomentumObserver(), model=RunTimeModel(extra_torque=3.0))
@@ -120,6 +123,7 @@ def test_torque_that_was_asked_for_is_not_taken_for_a_disturbance(chart: oc.Char
     np.testing.assert_allclose(correction, 0.0, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("remembers", BOTH, ids=lambda kind: kind.name)
 def test_a_start_knows_the_torque_that_held_the_arm(chart: oc.Chart, remembers: Any) -> None:
     q, heavy = chart.problem.domain.centre, chart.problem.robot.with_scaled_masses(1.4)
@@ -155,16 +159,16 @@ def test_a_payload_and_torques_of_the_gains_do_not_count_twice_at_a_start(
     np.testing.assert_allclose(supervisor.memory["correction"], unknown, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("remembers", BOTH, ids=lambda kind: kind.name)
 def test_corrections_keep_their_bound_and_forget_nonsense(chart: oc.Chart, remembers: Any) -> None:
     law = law_of(chart, replace(remembers, bound=2.0))
     ticks, q = Remembering(law), chart.problem.domain.centre
-    x, dq, wanted = q.copy(), np.zeros(3), at_rest(chart, q)
-    robot = chart.problem.robot.with_scaled_masses(1.4)
+    arm, wanted = Arm(chart.problem.robot.with_scaled_masses(1.4), q), at_rest(chart, q)
     for _ in range(1500):
-        command, _ = ticks.tick(x, dq, wanted, TICK)
-        dq = dq + TICK * np.linalg.solve(robot.mass_matrix(x), command - robot.bias(x, dq))
-        x = x + TICK * dq
+        command, _ = ticks.tick(arm.q, arm.dq, wanted, TICK)
+        arm.move(command, steps=1)
+    x = arm.q
     assert np.abs(ticks.fields["correction"]).max() == 2.0
     ticks.tick(x, np.full(3, 1e200), wanted, TICK)
     ticks.tick(x, np.zeros(3), 1e200 * wanted, TICK)
@@ -182,26 +186,26 @@ def test_c_remembers_what_python_remembers(chart: oc.Chart, tmp_path: Path, reme
     generated = oc.generate_c(chart, tmp_path, law, "arm", single_precision=single)
     supervisor = Supervisor(CompiledLibrary(compile_shared(generated, tmp_path), "arm", 3, single), law)
     q, robot = chart.problem.domain.centre, chart.problem.robot.with_scaled_masses(1.4)
-    ticks, wanted, x, dq = Remembering(law), at_rest(chart, q), q.copy(), np.zeros(3)
-    supervisor.take_over(x, chart.problem.robot.gravity(x))
+    ticks, wanted, arm = Remembering(law), at_rest(chart, q), Arm(robot, q)
+    supervisor.take_over(q, chart.problem.robot.gravity(q))
     for k in range(1000):
         if k == 500:  # a measurement is missing: the arm is held, and Python's observer begins again where it was
-            supervisor.step(np.full(3, np.nan), dq, wanted.ravel(), TICK)
+            supervisor.step(np.full(3, np.nan), arm.dq, wanted.ravel(), TICK)
             ticks._fresh = True
-        command, status = supervisor.step(x, dq, wanted.ravel(), TICK)
-        there, _ = ticks.tick(x, dq, wanted, TICK)
+        command, status = supervisor.step(arm.q, arm.dq, wanted.ravel(), TICK)
+        there, _ = ticks.tick(arm.q, arm.dq, wanted, TICK)
         assert status in (ControlStatus.OK, ControlStatus.SATURATED)
         np.testing.assert_allclose(command, there, atol=2e-2 if single else 1e-9)
         np.testing.assert_allclose(
             supervisor.memory["correction"], ticks.fields["correction"], atol=2e-2 if single else 1e-9
         )
-        dq = dq + TICK * np.linalg.solve(robot.mass_matrix(x), command - robot.bias(x, dq))
-        x = x + TICK * dq
+        arm.move(command, steps=1)
+    x = arm.q
     assert np.abs(supervisor.memory["correction"]).max() > 1.0
     supervisor.hold(x)
     assert not supervisor.memory["correction"].any()  # a load may have gone when brakes open again
     supervisor.start(x, robot.gravity(x))
-    supervisor.step(x, 0 * dq, at_rest(chart, x).ravel(), TICK)
+    supervisor.step(x, 0 * x, at_rest(chart, x).ravel(), TICK)
     lacks = robot.gravity(x) - chart.problem.robot.gravity(x)
     np.testing.assert_allclose(supervisor.memory["correction"], lacks, atol=1e-4)
 
@@ -216,17 +220,16 @@ def test_the_catcher_holds_a_heavier_arm_with_what_is_known_of_it(chart: oc.Char
         law = law_of(chart, remembers)
         library = compile_shared(oc.generate_c(chart, tmp_path / name, law, "arm"), tmp_path / name)
         supervisor = Supervisor(CompiledLibrary(library, "arm", 3), law)
-        x, dq, wanted = q.copy(), np.zeros(3), at_rest(chart, q).ravel()
+        arm, wanted = Arm(heavy, q), at_rest(chart, q).ravel()
         supervisor.start(q, heavy.gravity(q))
-        supervisor.step(q, dq, wanted, TICK)
-        supervisor.step(q, dq, wanted, 1.0)  # late: caught
+        supervisor.step(q, 0 * q, wanted, TICK)
+        supervisor.step(q, 0 * q, wanted, 1.0)  # late: caught
         places = []
         for _ in range(3000):
-            command, status = supervisor.step(x, dq, wanted, TICK)
+            command, status = supervisor.step(arm.q, arm.dq, wanted, TICK)
             assert status == ControlStatus.CAUGHT
-            dq = dq + TICK * np.linalg.solve(heavy.mass_matrix(x), command - heavy.bias(x, dq))
-            x = x + TICK * dq
-            places.append(np.abs(x - q).max())
+            arm.move(command, steps=1)
+            places.append(np.abs(arm.q - q).max())
         np.testing.assert_allclose(supervisor.load, lacks, rtol=0.02)
         assert places[-1] < 1e-3
         away[name] = max(places)
@@ -285,14 +288,13 @@ def test_a_memory_of_a_users_own_runs_in_python_and_c(chart: oc.Chart, tmp_path:
 def test_adaptation_does_not_make_soft_laws_swing(chart: oc.Chart, stiffness: float, ratio: float) -> None:
     """With an exact model; a weight of the error of 5 1/s did, for such springs."""
     law = PDPlus(chart, stiffness, ratio, limit=400.0, remembers=Adaptation())
-    ticks, robot, q = Remembering(law), chart.problem.robot, chart.problem.domain.centre
-    wanted, x, dq, period = at_rest(chart, q), q + 0.05, np.zeros(3), 2e-3
+    ticks, q, period = Remembering(law), chart.problem.domain.centre, 2e-3
+    wanted, arm = at_rest(chart, q), Arm(chart.problem.robot, q + 0.05)
     away = []
     for _ in range(5000):
-        command, _ = ticks.tick(x, dq, wanted, period)
-        dq = dq + period * np.linalg.solve(robot.mass_matrix(x), command - robot.bias(x, dq))
-        x = x + period * dq
-        away.append(np.abs(x - q).max())
+        command, _ = ticks.tick(arm.q, arm.dq, wanted, period)
+        arm.move(command, period, steps=1)
+        away.append(np.abs(arm.q - q).max())
     assert max(away[4000:]) < 0.5 * max(away[:1000])
 
 

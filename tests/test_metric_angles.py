@@ -10,7 +10,7 @@ from charts import with_metric
 from programs import Run
 
 import orthocas as oc
-from orthocas import solvers
+from orthocas import problems, solvers
 from orthocas.bases import JointSpace, Parametrisation
 from orthocas.errors import CheckpointError, UnknownNameError
 from orthocas.fitting.basis_objective import BasisObjective
@@ -88,7 +88,7 @@ def test_it_lowers_the_leak_and_the_paper_s_loss_the_paper_s_angle(planar_xy: oc
 
 
 @pytest.mark.slow
-def test_default_is_the_metric_for_the_mass_matrix_only(planar_x: oc.Problem) -> None:
+def test_default_is_the_metric_for_the_mass_matrix_and_orientations(planar_x: oc.Problem) -> None:
     custom = lambda q: ca.diag(2 + ca.cos(q))  # noqa: E731
     for metric, angles in (
         ("inertia", "metric"),
@@ -98,8 +98,12 @@ def test_default_is_the_metric_for_the_mass_matrix_only(planar_x: oc.Problem) ->
     ):
         problem = with_metric(planar_x, metric)
         assert oc.fit(problem, oc.Polynomial(1), samples=50).chart.notes["angles"] == angles
-        assert Weights().for_metric(problem.metric).angles == angles
-        assert Weights(angles="paper").for_metric(problem.metric).angles == "paper"
+        assert Weights().for_problem(problem).angles == angles
+        assert Weights(angles="paper").for_problem(problem).angles == "paper"
+    arm = problems.get("iiwa").robot
+    for kind, angles in (("position", "paper"), ("pose", "metric"), ("axis:x", "metric")):
+        problem = oc.Problem(arm, oc.Task.named(arm, kind, np.full(7, 0.4)), domain=oc.Box(np.full(7, 0.4), 0.1))
+        assert Weights().for_problem(problem).angles == angles
     theta = np.random.default_rng(0).normal(size=18)
     by_default, in_metric, paper = (
         float(oc.loss(planar_x, oc.Polynomial(2), samples=30, weights=weights, start=theta)(theta))
@@ -108,6 +112,7 @@ def test_default_is_the_metric_for_the_mass_matrix_only(planar_x: oc.Problem) ->
     assert by_default == in_metric != paper
 
 
+@pytest.mark.slow
 def test_bound_on_mutual_angles_is_one_in_the_metric(planar_x: oc.Problem) -> None:
     fit = oc.fit(planar_x, oc.Polynomial(2), samples=400, max_mutual_deg=1.0, weights=Weights(angles="metric"))
     angle = oc.evaluate(fit.chart, 5000).metric_mutual_angle

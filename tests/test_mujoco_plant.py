@@ -314,6 +314,7 @@ def test_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch
         MuJoCoPlant(plant.robot)
 
 
+@pytest.mark.slow
 def test_branches_keep_the_order_of_the_tree() -> None:
     """Bodies in an order that is not depth-first: MuJoCo orders them otherwise."""
     model, tip = arm("talos, both arms and the torso")

@@ -141,6 +141,7 @@ def test_box_of_an_arm_with_two_solutions_is_refused() -> None:
     assert not proved(known, half, 2000)
 
 
+@pytest.mark.slow
 def test_wide_range_of_a_turning_base_is_kept_where_the_coordinates_bound_it() -> None:
     known = oc.charts.load("panda-position")
     half = known.problem.domain.half_width * np.array([1, 0.3, 0.3, 0.3, 0.3, 0.3, 1])

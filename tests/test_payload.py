@@ -35,6 +35,7 @@ def arm_model() -> pin.Model:
         return pin.buildModelFromUrdf(str(path))
 
 
+@pytest.mark.slow
 def test_dynamics_with_a_payload_equal_those_of_pinocchio() -> None:
     """As a further argument, and built into the robot; the tool turns and moves the tip frame."""
     rng = np.random.default_rng(3)

@@ -11,6 +11,7 @@ from orthocas.fitting.fit import Fit
 from orthocas.plotting import quality_figure, self_motion_figure
 
 
+@pytest.mark.slow
 def test_quality_figure_shows_both_deviations_and_the_leak(planar_fit: Fit) -> None:
     report = oc.evaluate(planar_fit.chart, 1000)
     left, middle, right = quality_figure(report).axes

@@ -42,6 +42,7 @@ def test_known_angles_are_reported() -> None:
     assert report.task_angle.histogram.sum() == 200
 
 
+@pytest.mark.slow
 def test_parallel_coordinates_are_reported_as_degenerate() -> None:
     report = oc.evaluate(chart_with_normals([[0, 1, 0], [0, 1, 0.01]]), 100)
     assert report.conditioning.mean < 0.01
@@ -49,6 +50,7 @@ def test_parallel_coordinates_are_reported_as_degenerate() -> None:
     assert report.as_dict()["degenerate"] is True
 
 
+@pytest.mark.slow
 def test_conditioning_ignores_how_the_task_is_scaled_but_not_the_metric() -> None:
     normals = [[0, 1, 0], [0.2, 0.3, 1]]
     plain = oc.evaluate(chart_with_normals(normals), 100)
@@ -61,6 +63,7 @@ def test_conditioning_ignores_how_the_task_is_scaled_but_not_the_metric() -> Non
     assert abs(other.conditioning.mean - plain.conditioning.mean) > 0.01
 
 
+@pytest.mark.slow
 def test_conditioning_matches_a_direct_computation_in_whitened_coordinates(planar_fit: Fit) -> None:
     chart = planar_fit.chart
     report = oc.evaluate(chart, samples=200, seed=5)

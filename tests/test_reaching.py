@@ -205,6 +205,7 @@ def test_sets_keep_the_task_and_fill_the_domain(build: Callable[[], oc.Chart]) -
     assert checked > 20
 
 
+@pytest.mark.slow
 def test_extent_of_a_set_is_at_least_that_of_single_coordinates() -> None:
     chart = fitted().chart
     q = chart.problem.domain.centre
@@ -214,6 +215,7 @@ def test_extent_of_a_set_is_at_least_that_of_single_coordinates() -> None:
     assert (motion.extent.high - motion.extent.low > 1.01 * (alone.high - alone.low)).any()
 
 
+@pytest.mark.slow
 def test_self_motion_of_grown_coordinates() -> None:
     motion = circle().self_motion([1.0, 0.2])
     assert isinstance(motion, SelfMotionCurve)

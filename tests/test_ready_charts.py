@@ -40,6 +40,7 @@ def test_chart_has_a_proof_and_is_the_one_on_its_card(name: str) -> None:
     assert card.model.robot.split()[0] in repr(card)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WIDE)
 def test_wide_chart_holds_on_its_branch(name: str) -> None:
     """Volumes have one sign at all positions of the domain, from finite differences of poses and coordinates."""

@@ -42,6 +42,7 @@ def test_postures_of_the_self_motion_have_the_elbow_that_was_asked_for() -> None
     assert np.abs(arm.error(q, arm.placement(arm.home))).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_all_scenarios_have_a_thread_and_streams_that_begin_at_home() -> None:
     known = runner.scenarios()
     assert len(known) == 10

@@ -46,6 +46,7 @@ def test_ends_are_those_of_a_process_that_remembers_nothing(law: PDPlus) -> None
     assert len(np.unique(np.round(ends, 9), axis=0)) == len(ends)
 
 
+@pytest.mark.slow
 def test_a_second_run_builds_nothing(law: PDPlus) -> None:
     run(law)
     before = loops._rate.cache_info()

@@ -67,6 +67,7 @@ def test_rows_without_numbers_or_far_away_are_treated_as_single_ones(tmp_path: P
     np.testing.assert_allclose(found[good], chart.phi(q[good]), rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_rows_in_single_precision(tmp_path: Path) -> None:
     chart = fitted().chart
     q = sample_uniform(chart.problem.domain, 50, 4)

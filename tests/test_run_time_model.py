@@ -76,6 +76,7 @@ def test_given_model_replaces_the_own_one(arm_chart: oc.Chart) -> None:
         np.testing.assert_allclose(found, want, rtol=2e-7, atol=1e-6 * np.abs(want).max())
 
 
+@pytest.mark.slow
 def test_given_model_makes_the_loop_of_pd_plus_linear(arm_chart: oc.Chart) -> None:
     """M_phi dde + D de + K e = 0 on Pinocchio's dynamics; on the reference, the command is that of the own model."""
     controller = PDPlus(arm_chart, K, Z, limit=np.inf, model=RunTimeModel("given"))
@@ -96,6 +97,7 @@ def test_given_model_makes_the_loop_of_pd_plus_linear(arm_chart: oc.Chart) -> No
         np.testing.assert_allclose(tau, called(own, s), atol=1e-9 * np.abs(tau).max())
 
 
+@pytest.mark.slow
 def test_robot_that_compensates_gravity_gets_none(arm_chart: oc.Chart) -> None:
     own = PDPlus(arm_chart, K, limit=np.inf)
     law = PDPlus(arm_chart, K, limit=np.inf, model=RunTimeModel(gravity="robot"))

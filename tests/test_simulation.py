@@ -107,6 +107,7 @@ def test_coupling_index_reads_the_worst_excursion(planar_chart: oc.Chart, planar
     assert np.isnan(coupling.index[:, [0, 2]]).all()  # two targets at once are left out
 
 
+@pytest.mark.slow
 def test_breakdown_adds_up_to_the_task_acceleration(
     planar_chart: oc.Chart, planar_steps: Reference, planar_q0: Array
 ) -> None:

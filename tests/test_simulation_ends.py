@@ -20,6 +20,7 @@ from orthocas.tools.checks import Array
 from orthocas.tools.progress import Progress
 
 
+@pytest.mark.slow
 def test_unreachable_reference_is_reported_before_the_run(planar_chart: oc.Chart, planar_q0: Array) -> None:
     away = Reference.steps(planar_chart.labels, planar_chart.phi(planar_q0), [(1.0, {"xi1": -2.0})], 3.0)
     seen: list[Progress] = []

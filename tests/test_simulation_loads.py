@@ -15,6 +15,7 @@ from orthocas.simulation import (
 from orthocas.tools.checks import Array
 
 
+@pytest.mark.slow
 def test_push_displaces_as_far_as_the_stiffness_lets_it(planar_chart: oc.Chart, planar_q0: Array) -> None:
     """At rest under a constant force F at the tip: J^T K (phi - phi_d) = J_tip^T F."""
     robot = planar_chart.problem.robot
@@ -49,6 +50,7 @@ def test_events_that_differ_by_rounding_are_one(planar_chart: oc.Chart, planar_q
     assert np.isfinite(run.energy_balance).all()
 
 
+@pytest.mark.slow
 def test_friction_takes_its_energy(planar_chart: oc.Chart, planar_q0: Array) -> None:
     """V falls by what damping and friction take, the integral of dq . tau_f."""
     friction = Friction(viscous=0.3, coulomb=[0.2, 0.1, 0.0])
@@ -66,6 +68,7 @@ def test_friction_takes_its_energy(planar_chart: oc.Chart, planar_q0: Array) -> 
     assert taken > 0.01
 
 
+@pytest.mark.slow
 def test_wrong_masses_are_felt(planar_chart: oc.Chart, planar_steps: Reference, planar_q0: Array) -> None:
     heavy = planar_chart.problem.robot.with_scaled_masses([1.1, 1.2, 1.3])
     np.testing.assert_allclose(heavy.tree.masses, 3 * np.array([1.1, 1.2, 1.3]))

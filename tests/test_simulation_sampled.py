@@ -18,6 +18,7 @@ from orthocas.simulation import (
 from orthocas.tools.checks import Array
 
 
+@pytest.mark.slow
 def test_sampled_control_approaches_continuous_control(
     planar_chart: oc.Chart, planar_steps: Reference, planar_q0: Array
 ) -> None:

@@ -36,6 +36,7 @@ def test_none_in_a_regular_box() -> None:
     assert singular_points(problems.get("planar_3r_x")) == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metric", ["euclidean", "inertia"])
 def test_coordinates_jump_by_half_a_turn_at_the_saddles(metric: str) -> None:
     """By symmetry about the origin, the two sides of a saddle reach opposite points of the circle x = 1."""

@@ -131,6 +131,7 @@ def test_solvers_with_a_matrix_refuse_objectives_without_one(planar_xy: oc.Probl
         oc.fit(planar_xy, oc.MLP((4,)), solver, samples=50)
 
 
+@pytest.mark.slow
 def test_quasi_newton_meets_gauss_newton_with_few_matrices() -> None:
     """The same minimum of a real fit, from one matrix for many steps."""
     problem, counts = problems.get("iiwa"), []

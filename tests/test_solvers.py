@@ -109,6 +109,7 @@ KILLED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("solver", "objective"),
     [(solver, Valley()) for solver in KILLED] + [(solver, Plain(Valley())) for solver in KILLED[3:]],

@@ -55,6 +55,7 @@ def test_former_names_of_packages_lead_to_the_new_ones() -> None:
     assert (oc.parametrisations, oc.following) == (oc.bases, oc.paths)
 
 
+@pytest.mark.slow
 def test_functions_stay_functions_beside_modules_of_their_names() -> None:
     code = (
         "import orthocas.charts.grow, orthocas.exact.involutivity\nimport orthocas as oc\nfrom orthocas import distil\n"

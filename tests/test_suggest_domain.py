@@ -61,6 +61,7 @@ def test_two_thirds_of_heavy_samples_lie_near_faces_and_corners() -> None:
     np.testing.assert_allclose(means, [1 / 2, 2 / 3, 4 / 5], atol=0.01)  # of |u|^p: 1 / (1 + p)
 
 
+@pytest.mark.slow
 def test_a_chart_on_the_suggested_domain_has_the_quality_that_was_asked() -> None:
     """Measured again with other samples, by other code."""
     found = suggestion()
@@ -140,6 +141,7 @@ def test_trial_charts_are_as_good_as_fits_of_their_degree(metric: str) -> None:
     assert trial.conditioning > 0.5 * fitted.conditioning
 
 
+@pytest.mark.slow
 def test_bad_arguments_are_refused() -> None:
     robot, task = planar()
     panda = arm("panda")
@@ -207,3 +209,14 @@ def test_contradictory_options_are_refused(run: Run, words: tuple[str, ...], com
     code, _, err = run("fit", "planar_3r_xy", *words)
     assert code == 2
     assert complaint in err
+
+
+def test_box_is_searched_with_the_weights_of_the_fit(planar_xy: oc.Problem) -> None:
+    boxes = {}
+    for angles in ("paper", "metric"):
+        found = oc.suggest_domain(
+            planar_xy.robot, planar_xy.task, [0.6, 0.8, 0.8], "inertia", weights=oc.Weights(angles=angles)
+        )
+        assert found.fit.chart.notes["angles"] == angles
+        boxes[angles] = found.domain.half_width[1:].prod()
+    assert boxes["metric"] > 1.1 * boxes["paper"]  # it asks for the leak, which the box is bounded by

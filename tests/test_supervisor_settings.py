@@ -110,6 +110,7 @@ def test_integral_action_removes_sag_and_does_not_wind_up(
     assert sag[0.0] > 1e-3
 
 
+@pytest.mark.slow
 def test_springs_and_dampers_keep_away_from_joint_limits(
     supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart
 ) -> None:

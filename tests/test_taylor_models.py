@@ -49,6 +49,7 @@ def values_at(model: TaylorModel, t: Array) -> Array:
     return np.asarray((model.coefficients * powers.reshape(len(powers), *[1] * (model.remainder.ndim - 1), -1)).sum(0))
 
 
+@pytest.mark.slow
 def test_sine_cosine_and_exponential_contain_the_exact_values() -> None:
     points = np.random.default_rng(5).uniform(-9, 9, 60)
     (s, s_error), (c, c_error) = sine_and_cosine(points)

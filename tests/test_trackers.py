@@ -109,6 +109,7 @@ def cost(chart: oc.Chart, phi: np.ndarray, q: np.ndarray) -> float:
     return float((e[: chart.m] ** 2).sum() + 1e-6 * (e[chart.m :] ** 2).sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [clear, lambda: oc.fit(oc.problems.get("planar_3r_xy"), oc.Polynomial(2)).chart])
 def test_trackers_go_to_the_nearest_x_and_come_back(make: Callable[[], oc.Chart]) -> None:
     """Far out of reach, the end is as near as what another method finds, inside; on the way nothing jumps."""

@@ -167,6 +167,7 @@ def test_a_camera_that_looks_at_its_target_has_no_error() -> None:
     np.testing.assert_allclose(turned, [2 * np.sin(angle / 2), 0], atol=1e-14)
 
 
+@pytest.mark.slow
 def test_files_keep_frames_and_tasks(baxter: oc.Robot, tmp_path: Path) -> None:
     centre = 0.5 * postures(baxter, 1)[0]
     for task in (

@@ -54,14 +54,14 @@ def checked(vertices: Array, faces: Array, points: Array, flatness: float = 1.0)
 
 def over_all(vertices: Array, faces: Array, points: Array) -> Array:
     """Distances with the corners, edges and planes of every triangle tried, by least squares."""
-    best = np.full(len(points), np.inf)
-    for corners in vertices[faces]:
-        for part in ([0], [1], [2], [0, 1], [1, 2], [2, 0], [0, 1, 2]):
-            edges = corners[part[1:]] - corners[part[0]]
-            along = (points - corners[part[0]]) @ np.linalg.pinv(edges) if len(edges) else np.zeros((len(points), 0))
-            on_it = (along.min(axis=1, initial=0.0) >= 0) & (along.sum(axis=1) <= 1)
-            distance = np.linalg.norm(corners[part[0]] + along @ edges - points, axis=1)
-            best = np.where(on_it, np.minimum(best, distance), best)
+    best, corners = np.full(len(points), np.inf), vertices[faces]
+    for part in ([0], [1], [2], [0, 1], [1, 2], [2, 0], [0, 1, 2]):
+        first = corners[:, part[:1]]
+        edges = corners[:, part[1:]] - first
+        along = (points - first) @ np.linalg.pinv(edges)
+        on_it = (along.min(axis=2, initial=0.0) >= 0) & (along.sum(axis=2) <= 1)
+        distance = np.linalg.norm(first + along @ edges - points, axis=2)
+        best = np.minimum(best, np.where(on_it, distance, np.inf).min(axis=0))
     return best
 
 

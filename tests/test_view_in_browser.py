@@ -45,6 +45,13 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
         yield tab
 
 
+@pytest.fixture(scope="module")
+def still_arm(iiwa_fit: Fit) -> Iterator[str]:
+    """The address of a view of the 7-DoF arm that nobody moves."""
+    with oc.view(iiwa_fit.chart, port=0) as view:
+        yield view.url
+
+
 def opened(page: Page, url: str) -> None:
     """Open the page of a server."""
     page.open(f"{url}{COARSE}")
@@ -118,17 +125,16 @@ WIDTHS = (900, 1366, 390)
 
 
 @pytest.mark.parametrize("wide", WIDTHS)
-def test_the_arrows_at_the_tool_lie_beside_the_panels(page: Page, iiwa_fit: Fit, wide: int) -> None:
+def test_the_arrows_at_the_tool_lie_beside_the_panels(page: Page, iiwa_fit: Fit, still_arm: str, wide: int) -> None:
     """At the tool, and a handle's length away in all directions, the topmost element is the picture."""
     high = 844 if wide < 480 else 700
     page.call("Emulation.setDeviceMetricsOverride", width=wide, height=high, deviceScaleFactor=1, mobile=wide < 480)
-    with oc.view(iiwa_fit.chart, port=0) as view:
-        opened(page, view.url)
-        page.wait("document.querySelectorAll('canvas').length > 1")
-        place = iiwa_fit.chart.problem.robot.tip_position(iiwa_fit.chart.problem.domain.centre)
-        ends = [place + 0.2 * np.array(way) for way in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))]
-        seen = [f"({SEEN})({point.tolist()})" for point in ends]
-        page.wait(f"[{','.join(seen)}].every(e => e && e.tagName === 'CANVAS')")
+    opened(page, still_arm)
+    page.wait("document.querySelectorAll('canvas').length > 1")
+    place = iiwa_fit.chart.problem.robot.tip_position(iiwa_fit.chart.problem.domain.centre)
+    ends = [place + 0.2 * np.array(way) for way in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))]
+    seen = [f"({SEEN})({point.tolist()})" for point in ends]
+    page.wait(f"[{','.join(seen)}].every(e => e && e.tagName === 'CANVAS')")
     page.call("Emulation.clearDeviceMetricsOverride")
 
 

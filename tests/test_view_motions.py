@@ -54,6 +54,7 @@ def test_broken_motion_files_are_named(text: str, tmp_path: Path) -> None:
         read_joint_motion(path, fitted().chart.problem.robot)
 
 
+@pytest.mark.slow
 def test_constant_coordinates_return_and_the_pseudo_inverse_drifts(iiwa_fit: Fit) -> None:
     chart = iiwa_fit.chart
     ours, theirs = cyclic_motions(chart, cycles=2)

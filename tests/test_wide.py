@@ -19,6 +19,7 @@ import orthocas as oc
 from orthocas import control
 from orthocas.bases.family import JointSpace
 from orthocas.bases.given import sew_angle
+from orthocas.charts.certificate import PROVED
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.self_motion import StopKind
 from orthocas.codegen import check_c
@@ -44,10 +45,17 @@ def panda() -> oc.Robot:
 
 
 @cache
+def branches() -> oc.Branches:
+    return oc.branches(iiwa())
+
+
+def home_branch() -> oc.Branch:
+    return branches()["shoulder+ elbow- wrist+"]
+
+
+@cache
 def wide_pose() -> oc.WideFit:
-    return oc.fit_wide(
-        iiwa(), oc.Task.pose(iiwa()), "shoulder+ elbow- wrist+", parametrisation=oc.Polynomial(4, ["A1", "A7"])
-    )
+    return oc.fit_wide(iiwa(), oc.Task.pose(iiwa()), home_branch(), parametrisation=oc.Polynomial(4, ["A1", "A7"]))
 
 
 @cache
@@ -85,7 +93,7 @@ def self_motions(robot: oc.Robot, q: Numbers) -> Numbers:
 
 @pytest.mark.slow
 def test_branches_of_arms_are_cut_where_geometry_says() -> None:
-    found = oc.branches(iiwa())
+    found = branches()
     assert [(cut.joint_name, cut.value, cut.singular, cut.exact) for cut in found.cuts] == [
         ("A2", 0.0, False, True),
         ("A4", 0.0, True, True),
@@ -102,7 +110,7 @@ def test_branches_of_arms_are_cut_where_geometry_says() -> None:
 @pytest.mark.slow
 def test_self_motions_do_not_cross_cuts() -> None:
     q = sample_uniform(oc.Box(np.zeros(7), 2.0), 200, 3)
-    for cut in oc.branches(iiwa()).cuts:
+    for cut in branches().cuts:
         on = q.copy()
         on[:, cut.joint] = cut.value
         z = self_motions(iiwa(), on)
@@ -113,7 +121,7 @@ def test_self_motions_do_not_cross_cuts() -> None:
 
 @pytest.mark.slow
 def test_mirrored_positions_have_the_same_pose() -> None:
-    found = oc.branches(iiwa())
+    found = branches()
     assert found.mirrors == (0, 1, 2)
     q = found["shoulder+ elbow- wrist+"].posture
     for k, word in enumerate(("shoulder-", "elbow+", "wrist-")):
@@ -127,7 +135,7 @@ def test_mirrored_positions_have_the_same_pose() -> None:
 
 @pytest.mark.slow
 def test_branches_are_found_by_name_and_position() -> None:
-    found = oc.branches(iiwa())
+    found = branches()
     assert found.of(found[3].posture) is found[3]
     assert found.of(np.full(7, 3.0)) is None
     with pytest.raises(UnknownNameError, match="unknown branch 'up'"):
@@ -186,7 +194,7 @@ def test_the_nearest_xi_is_the_end_of_its_range() -> None:
     x = chart.phi(there)[:, :6]
     found = chart.nearest_xi(wishes, x)
     wanted, got = chart.xi(wishes)[:, 0], chart.xi(found.q)[:, 0]
-    assert found.found.sum() > 20  # some are possible as they are
+    assert 10 < found.found.sum() < 30  # some are possible as they are, others are not
     np.testing.assert_allclose(got[found.found], wanted[found.found], atol=1e-7)
     compared = 0
     for k, status in enumerate(found.statuses):
@@ -217,7 +225,8 @@ def test_self_motions_end_where_coordinates_do() -> None:
 
 @pytest.mark.slow
 def test_several_coordinates_are_regular_together() -> None:
-    fit = oc.fit_wide(iiwa(), oc.Task.position(iiwa()), parametrisation=oc.Polynomial(3, ["A1", "A7"]), samples=5000)
+    cubic = oc.Polynomial(3, ["A1", "A7"])
+    fit = oc.fit_wide(iiwa(), oc.Task.position(iiwa()), home_branch(), parametrisation=cubic, samples=5000)
     assert fit.chart.r == 4
     assert fit.regular_share > 0.97
     q = sample_uniform(fit.chart.problem.domain, 2000, 6)
@@ -271,7 +280,7 @@ def test_a_tool_that_turns_alone_is_on_one_side_of_singular_positions() -> None:
 @pytest.mark.parametrize("like", ["swivel", "A3"])
 def test_coordinates_mean_what_is_asked(like: str) -> None:
     task, polynomial = oc.Task.pose(iiwa()), oc.Polynomial(4, ["A1", "A7"])
-    fit = oc.fit_wide(iiwa(), task, "shoulder+ elbow- wrist+", like=like, parametrisation=polynomial)
+    fit = oc.fit_wide(iiwa(), task, home_branch(), like=like, parametrisation=polynomial)
     assert fit.regular_share > 0.995
     assert fit.branch is not None
     q, chart = fit.branch.posture, fit.chart
@@ -289,11 +298,11 @@ def test_coordinates_mean_what_is_asked(like: str) -> None:
 def test_meanings_that_cannot_be_are_refused() -> None:
     task = oc.Task.pose(iiwa())
     with pytest.raises(InvalidValueError, match="like is a quantity that stands still at the home"):
-        oc.fit_wide(iiwa(), task, "shoulder+ elbow- wrist+", like="A4")  # the elbow bends as the hand is far
+        oc.fit_wide(iiwa(), task, home_branch(), like="A4")  # the elbow bends as the hand is far
     with pytest.raises(UnknownNameError, match="unknown like 'elbow'"):
-        oc.fit_wide(iiwa(), task, "shoulder+ elbow- wrist+", like="elbow")
+        oc.fit_wide(iiwa(), task, home_branch(), like="elbow")
     with pytest.raises(InvalidValueError, match="2 quantities, expected one"):
-        oc.fit_wide(iiwa(), task, "shoulder+ elbow- wrist+", like=["A3", "A1"])
+        oc.fit_wide(iiwa(), task, home_branch(), like=["A3", "A1"])
 
 
 @pytest.mark.slow
@@ -392,6 +401,7 @@ def test_laws_stop_where_coordinates_end() -> None:
 
 @needs_c
 @pytest.mark.slow
+@pytest.mark.usefixtures("blank_pictures")
 def test_the_whole_inertia_follows_in_mujoco(run: Run, tmp_path: Path) -> None:
     wide_pose().chart.save(tmp_path / "wide.orthocas")
     branch = wide_pose().branch
@@ -450,6 +460,7 @@ def test_decoupled_laws_are_warned_of_the_leak() -> None:
     assert not any("lean into" in remark for remark in coupled.remarks())
 
 
+@pytest.mark.slow
 def test_interrupted_fits_keep_the_best_so_far() -> None:
     known = oc.problems.get("planar_3r_xy")
     reports = []
@@ -493,3 +504,21 @@ def test_regular_part_refuses_coordinates_that_fold_at_its_centre() -> None:
     assert isinstance(domain, oc.RegularPart)
     with pytest.raises(DomainError, match="coordinates have the volume .* at the centre"):
         oc.RegularPart(domain, domain.coordinates, 0.999999)
+
+
+@pytest.mark.slow
+def test_nearly_all_of_a_branch_is_proved_and_holds() -> None:
+    robot, chart = iiwa(), wide_pose().chart
+    found = oc.certify(chart, time_limit=6)
+    assert found.clear_share > 0.99  # from about 3 s on
+    low, high = found.regular.leaves(PROVED)
+    rng = np.random.default_rng(9)
+    chosen = rng.choice(len(low), 100_000)
+    points = rng.uniform(low[chosen], high[chosen])
+    domain = chart.problem.domain
+    assert isinstance(domain, oc.RegularPart)
+    clear = domain.singular_values(points) > domain.least_singular_value
+    assert clear.sum() > 5000  # enough to look at; how many depends on how far the proof got
+    assert (domain.volumes(points[clear]) > 0).all()
+    far = robot.tip_rotation(points) @ robot.tip_rotation(domain.centre).T
+    assert (np.trace(far, axis1=1, axis2=2) < 2 * np.cos(3.1) + 1).any()  # half a turn is no boundary of the proof

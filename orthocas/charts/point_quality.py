@@ -48,8 +48,10 @@ class Judged:
         """Judge coordinates at joint positions (N, n)."""
         starts = range(0, max(len(points), 1), _CHUNK)
         parts = [_judged(problem, coordinates, points[start : start + _CHUNK]) for start in starts]
-        together = in_threads(lambda name: np.concatenate([part[name] for part in parts]), list(parts[0]))
-        found = dict(zip(parts[0], together, strict=True))
+        found: dict[str, Any] = parts[0]
+        if len(parts) > 1:
+            together = in_threads(lambda name: np.concatenate([part[name] for part in parts]), list(found))
+            found = dict(zip(found, together, strict=True))
         return cls(**{"metric_mutual_cosines": found["mutual_cosines"], **found})
 
 

@@ -50,7 +50,6 @@ from orthocas.fitting.fit import fit as fit_chart
 from orthocas.fitting.probe import Bounds
 from orthocas.fitting.settings import PRECISIONS, Precision, default_parametrisation
 from orthocas.fitting.suggest_domain import CONDITIONING, LEAK_DEG, DomainSuggestion
-from orthocas.fitting.terms import Weights
 from orthocas.fitting.wide import WideFit
 from orthocas.solvers import get as get_solver
 from orthocas.solvers.protocol import Status
@@ -142,12 +141,12 @@ def fit(
     try:
         with terminal_monitor() as monitor:
             if bounds is not None:
-                built, suggestion = suggested(problem, words, parametrisation, bounds, seed, monitor)
+                built, suggestion = suggested(problem, words, parametrisation, bounds, loss, seed, monitor)
             if built is None:
                 result: Fit = wide_fit(problem, words, branch, like, parametrisation, samples, seed, monitor)
             else:
                 others = (minimiser, samples, max_mutual_deg, checkpoint, like)
-                usual = others == (None,) * 5 and loss == Weights() and precision == PRECISIONS[0]
+                usual = others == (None,) * 5 and precision == PRECISIONS[0]
                 result = (_confirming(suggestion, built, parametrisation) if usual else None) or fit_chart(
                     built,
                     parametrisation,

@@ -257,6 +257,7 @@ def suggested(
     options: ProblemOptions,
     parametrisation: Parametrisation | None,
     bounds: Bounds,
+    weights: Weights,
     seed: int,
     monitor: Monitor,
 ) -> tuple[Problem, DomainSuggestion]:
@@ -285,6 +286,7 @@ def suggested(
         leak_deg=bounds.leak_deg,
         conditioning=bounds.conditioning,
         parametrisation=parametrisation,
+        weights=weights,
         seed=seed,
         monitor=monitor,
     )

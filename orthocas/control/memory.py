@@ -15,6 +15,7 @@ from orthocas.control.linear_algebra import block_inertia
 from orthocas.errors import InvalidValueError
 from orthocas.robots import dynamics
 from orthocas.robots.tree import KinematicTree
+from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import (
     Array,
     as_float_array,
@@ -136,6 +137,7 @@ class Remembering(Shown):
         if memory is None:
             raise InvalidValueError("controller", controller.name, "a law with a memory")
         self._controller, self._memory = controller, memory
+        self._law, self._step = _on_arrays(controller.function), _on_arrays(memory.step)
         self.fields: dict[str, Array] = {}  #: what it remembers
         self.start()
 
@@ -167,12 +169,23 @@ class Remembering(Shown):
         state = as_point("q", q, n), as_point("dq", dq, n), *wanted
         gains = law.gains
         used = gains | {gain: gains[gain] + self.fields[name] for gain, name in memory.adds.items()}
-        command, status = law.function(*state, *used.values())
+        command, (number,) = _values(self._law, *state, *used.values())
+        status = ControlStatus(int(number))
         active, since = float(status == ControlStatus.OK), 0.0 if self._fresh else as_number("period", period)
-        found = memory.step.call([*state, *gains.values(), command, active, since, *self.fields.values()])
-        self.fields = {name: value.full().ravel() for name, value in zip(self.fields, found, strict=True)}
+        found = _values(self._step, *state, *gains.values(), command, active, since, *self.fields.values())
+        self.fields = dict(zip(self.fields, found, strict=True))
         self._fresh = False
-        return command.full().ravel(), ControlStatus(int(status))
+        return command, status
+
+
+def _on_arrays(function: ca.Function) -> Batched:
+    """A function of columns, to be called with arrays: CasADi's own conversions take most of the time of a tick."""
+    inputs = [ca.MX.sym(name, *function.size_in(i)) for i, name in enumerate(function.name_in())]
+    return Batched(dense_function(function.name(), inputs, function.call(inputs), function.name_in()))
+
+
+def _values(function: Batched, *columns: ArrayLike) -> list[Array]:
+    return [out[0] for out in function(*(np.reshape(column, (1, -1)) for column in columns))]
 
 
 @dataclass(frozen=True)

@@ -340,13 +340,13 @@ def fit(
 ) -> Fit:
     """Find coordinates xi(q) of a family that are nearly orthogonal to the task.
 
-    The fit minimises the mean of [AS2023] eq. (24) over uniform samples of the domain, for A = M with angles in the
-    metric. Joints that do not affect the task become coordinates themselves. With `Polynomial(degree, cyclic="auto")`,
-    the domain of the chart covers all positions of the cyclic joints; see `orthocas.cyclic_joints`. Families linear in
-    their parameters start from a spectral solution of low degree, and the degree rises step by step. Between the
-    degrees, a search for the worst points of the domain keeps the chart from folding. Ctrl-C raises `Interrupted`: its
-    `result` is the fit with the best coordinates so far and status INTERRUPTED. So callers that need a finished fit,
-    and loops around them, end as well.
+    The fit minimises the mean of [AS2023] eq. (24) over uniform samples of the domain, with angles in the metric for A
+    = M and for tasks that turn the tool. Joints that do not affect the task become coordinates themselves. With
+    `Polynomial(degree, cyclic="auto")`, the domain of the chart covers all positions of the cyclic joints; see
+    `orthocas.cyclic_joints`. Families linear in their parameters start from a spectral solution of low degree, and the
+    degree rises step by step. Between the degrees, a search for the worst points of the domain keeps the chart from
+    folding. Ctrl-C raises `Interrupted`: its `result` is the fit with the best coordinates so far and status
+    INTERRUPTED. So callers that need a finished fit, and loops around them, end as well.
 
     Args:
         problem: robot, task, metric and domain.

@@ -14,7 +14,7 @@ from orthocas.charts.point_quality import in_the_metric
 from orthocas.fitting.basis_gradients import gradients_of
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.starts import spectral_start
-from orthocas.fitting.terms import DEFAULT_WEIGHTS
+from orthocas.fitting.terms import DEFAULT_WEIGHTS, Weights
 from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.domains import Box, sample_evenly, sample_heavily
@@ -94,6 +94,7 @@ class Prober:
     problem: Problem  #: robot, task and metric; trial boxes replace its domain
     active: list[int]  #: joints that are not coordinates themselves
     cyclic: tuple[str, ...] = ()  #: joints that enter linearly
+    weights: Weights = DEFAULT_WEIGHTS  #: of the fit that confirms the box; lengths and terms of others do not count
     _objective: BasisObjective | None = None  #: of the last box; others only move it
     _start: Array | None = None  #: parameters of the last box without folds, on its cube; None: a spectral start
 
@@ -147,10 +148,10 @@ class Prober:
         return theta
 
     def _loss(self, problem: Problem, family: LinearFamily, samples: Samples, start: Array) -> BasisObjective:
-        """The loss of the fit that confirms the box: with the weights for its metric."""
+        """The loss of the fit that confirms the box."""
         known = self._objective
         if known is None:
-            weights = DEFAULT_WEIGHTS.for_metric(problem.metric)
+            weights = replace(self.weights.for_problem(problem), length=0.0, extra={})
             self._objective = BasisObjective(family, samples, weights, start, lambda count, seed: samples)
         else:
             self._objective = known.moved(gradients_of(family, len(self.active)), samples, start)

@@ -72,7 +72,7 @@ class FitSettings:
         if max_mutual_deg is not None and not isinstance(solver, Ipopt):
             raise InvalidValueError("solver", solver.name, "ipopt, the only solver that supports max_mutual_deg")
         count = None if samples is None else require_count("samples", samples, least=2)
-        loss = Weights.of(weights).for_metric(problem.metric)
+        loss = Weights.of(weights).for_problem(problem)
         require_kind("split_idle", split_idle, bool)
         require_known("precision", precision, PRECISIONS)
         if precision == "single" and max_mutual_deg is not None:

@@ -14,6 +14,7 @@ from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.fit import Fit, fit
 from orthocas.fitting.probe import Bounds, Miss, Prober, Verdict, judged_chart
 from orthocas.fitting.settings import default_parametrisation, require_parametrisation
+from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM, require_driven
 from orthocas.tasks.domains import Box, Domain
@@ -250,6 +251,7 @@ def suggest_domain(
     leak_deg: float = LEAK_DEG,
     conditioning: float = CONDITIONING,
     parametrisation: Parametrisation | None = None,
+    weights: Weights | WeightNumbers = DEFAULT_WEIGHTS,
     seed: int = 0,
     monitor: Monitor = silent,
 ) -> DomainSuggestion:
@@ -270,6 +272,7 @@ def suggest_domain(
         conditioning: smallest conditioning, at samples of which two thirds lie near faces and corners; 0 to 1.
         parametrisation: the family of the fit. Default: Polynomial(degree=4); of degree 3 for more
             than 8 joints, and of degree 2 from 12.
+        weights: weights of the fits, as in `fit`.
         seed: seed of the fit.
         monitor: called with progress.
 
@@ -294,7 +297,7 @@ def suggest_domain(
         (True, True)
     """
     start = time.perf_counter()
-    bounds = _checked(robot, task, leak_deg, conditioning, seed)
+    bounds, loss = _checked(robot, task, leak_deg, conditioning, seed), Weights.of(weights)
     if parametrisation is not None:
         require_parametrisation(parametrisation)
     posture = home_posture(robot, task, home)
@@ -302,11 +305,11 @@ def suggest_domain(
     problem = Problem(robot, task, metric, Box(posture.q, np.minimum(_unit(robot), room)))
     check(problem, _CHECKED)
     joints = _Joints.of(problem)
-    prober = Prober(problem, joints.active, joints.cyclic)
+    prober = Prober(problem, joints.active, joints.cyclic, loss)
     stricter = replace(bounds, conditioning=min(1.0, _MARGIN * bounds.conditioning))
     widths, broken = WidestBox(prober, posture.q, room, joints.free, stricter, monitor).found(_unit(robot))
     wanted = default_parametrisation(problem, bounded=True) if parametrisation is None else parametrisation
-    found, verdict = _confirmed(problem, wanted, joints, widths, bounds, seed, monitor)
+    found, verdict = _confirmed(problem, wanted, joints, widths, bounds, loss, seed, monitor)
     return DomainSuggestion(
         fit=found,
         home=posture.q,
@@ -398,6 +401,7 @@ def _confirmed(
     joints: _Joints,
     widths: Array,
     bounds: Bounds,
+    weights: Weights,
     seed: int,
     monitor: Monitor,
 ) -> tuple[Fit, Verdict]:
@@ -408,7 +412,7 @@ def _confirmed(
     for shrinkings in range(_TRIES):
         box = Box(problem.domain.centre, widths * factors**shrinkings, unbounded)
         trial = Problem(robot, problem.task, problem.metric, box, problem.name)
-        found = fit(trial, parametrisation, seed=seed, monitor=monitor)
+        found = fit(trial, parametrisation, weights=weights, seed=seed, monitor=monitor)
         verdict = judged_chart(found.chart, JUDGES, seed + 1)
         if max(verdict.excess(bounds).values()) <= 1:
             return found, verdict

@@ -64,7 +64,7 @@ def loss(
     theta = ca.MX.sym("theta", family.size)
     J = _jacobians(family, drawn.points, theta)  # (r n, N), each J_xi column by column
     identity = drawn.metric_inverse is None
-    known = Weights.of(weights).for_metric(problem.metric)
+    known = Weights.of(weights).for_problem(problem)
     of_sample = Loss.of(Sizes(problem.n, problem.m, problem.r, identity), known.by_name)
     orientation = _orientation(drawn, ca.Function("J", [theta], [J])(theta0).full(), problem.r)
     data = [_columns(part) for part in drawn.described(of_sample.data, orientation)]

@@ -9,7 +9,7 @@ import numpy as np
 
 from orthocas.charts.angles import pairs
 from orthocas.errors import InvalidValueError, ShapeError
-from orthocas.tasks.metric import Metric
+from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, as_float_array, as_number, require_kind, require_known, require_shape
 from orthocas.tools.expressions import MOST_ROWS, determinant
 
@@ -399,8 +399,9 @@ class Weights:
         extra: weights >= 0 of registered terms, by name; see `orthocas.register_loss_term`.
         angles: what the task and mutual terms measure: 'paper', the cosines of [AS2023] eq. (24) with Euclidean norms;
             'metric', cosines in the metric with an orthonormal basis of the task gradients, which do not depend on the
-            choice of task coordinates. Default: 'metric' for A = M, where closed loops are better with it, and 'paper'
-            otherwise; see docs/explanation/angles.md.
+            choice of task coordinates. Default: 'metric' for A = M, where closed loops are better with it, and for
+            tasks with components in rad, where cosines depend on the axes of the orientation; 'paper' otherwise. See
+            docs/explanation/angles.md.
 
     Raises:
         InvalidValueError: if a weight is negative or not finite, or all weights are zero.
@@ -449,9 +450,12 @@ class Weights:
             raise InvalidValueError("lambda1", weights.task, "a positive number")
         return weights
 
-    def for_metric(self, metric: Metric) -> "Weights":
-        """The same weights with the default angles of a metric, unless angles are given."""
-        return replace(self, angles="metric" if metric.is_inertia else "paper") if self.angles is None else self
+    def for_problem(self, problem: Problem) -> "Weights":
+        """The same weights with the default angles of a problem, unless angles are given."""
+        if self.angles is not None:
+            return self
+        turns = "rad" in problem.task.units
+        return replace(self, angles="metric" if turns or problem.metric.is_inertia else "paper")
 
     @property
     def by_name(self) -> dict[str, float]:

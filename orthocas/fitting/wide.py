@@ -49,6 +49,7 @@ CLEARANCE = 0.1  #: default least relative singular value
 LEAST_VOLUME = 0.05  #: over r, of the coordinates in domains of wide charts; see `RegularPart`
 DEGREE = 6
 _DEGREE_OF_ALL = 4  # where base and tool joints count like all others
+_EVEN = 0.5  # share of samples that are uniform; the others are heavy near limits
 _PER_TERM, _LEAST_SAMPLES, _MOST_SAMPLES = 30, 5000, 20_000
 _TAG, _JUDGED_TAG, _FIRST_TAG = 3000, 3001, 1000  # seed tags; other samples use other ones
 _FIRST = 200  # samples that scale coordinates
@@ -56,10 +57,11 @@ _JUDGED = 20_000
 _FIRST_STEP = (0.0, 1e-2)  # margin, and weight of the mean squared gradient
 _EASY, _HARDER = ((0.2, 1e-3), (0.2, 1e-4)), ((0.05, 1e-4), (0.05, 1e-5))  # further ones
 _HARD = 0.01  # share of bad positions after the first step with which a large margin asks too much
-_POOR = 5e-3  # share of bad positions with which another family is tried
+_POOR = 1e-3  # share of bad positions with which another family is tried
 _ENOUGH = 5e-4  # share of bad positions, many near limits, that is as good as none
 _WELL = 0.28  # over r, volume of all but 1 % of positions that is enough; a conditioning of 0.2
 _ROUNDS, _FRESH, _WORST, _FRESH_TAG = 2, 50_000, 5000, 3002  # rounds with the worst of fresh samples
+_UNIFORM_TAG = 1  # within the other tags
 _EVERY = 4  # samples whose gradients count as long
 _TINY = 1e-12  # length of a row
 _NEWTON_STEPS, _GAIN, _RIDGE = 30, 5e-3, 1e-10
@@ -118,20 +120,21 @@ def fit_wide(
 
         mean max(0, 1 + c |dxi/dq|_A^-1 - dxi/dq . z)^2 + s mean |dxi/dq|^2_A^-1
 
-    over boundary-heavy samples of the branch that are clear of singular positions, by Newton's method. A coordinate
-    loses nothing where the cosine between its gradient and the self-motion is above the margin c, as far as its
-    gradient is long enough. The second mean is least where gradients point along z, that is where coordinates are
-    orthogonal to the task and to each other. First c = 0, then c = 0.2, or c = 0.05 if more than 1 % of other samples
-    are not regular yet, each with two weights s. As long as more than 0.05 % are not regular after that, the worst of
-    50,000 fresh samples join, twice at most. The best of these results is kept: fewest bad positions, as far as these
-    are more than 0.05 %, then the largest 1 % quantile of the volume of `RegularPart`. With
+    over samples of the branch that are clear of singular positions, half of them uniform and half boundary-heavy, by
+    Newton's method. A coordinate loses nothing where the cosine between its gradient and the self-motion is above the
+    margin c, as far as its gradient is long enough. The second mean is least where gradients point along z, that is
+    where coordinates are orthogonal to the task and to each other. First c = 0, then c = 0.2, or c = 0.05 if more than
+    1 % of other samples are not regular yet, each with two weights s. As long as more than 0.05 % are not regular after
+    that, the worst of 50,000 fresh samples join, twice at most. The best of these results is kept: fewest bad
+    positions, as far as these are more than 0.05 %, then the largest 1 % quantile of the volume of `RegularPart`. With
     r > 1 the problem is solved for one coordinate after the other, from a fit of degree 3. The domain of the chart is
     the part of the branch where coordinates are regular with a margin, see `RegularPart`.
 
     Coordinates that are linear in the first and the last joint are best to prove and hold at any turn of them. They ask
     that self-motions turn base and tool in one sense on the whole branch, as far as the other joints do not outweigh
-    that. Without `parametrisation`, if more than 0.5 % of samples are bad before the worst ones join, polynomials of
-    degree 4 in all joints with limits are tried, too, and the better ones are kept.
+    that. Without `parametrisation`, if more than 0.1 % of samples are bad before the worst ones join, polynomials of
+    degree 4 in all joints are tried, too, and the better ones are kept. Where these are, a joint without limits has one
+    turn in which samples lie; beyond it, positions belong to the domain as far as coordinates are regular there.
 
     If r joints do not move the task at all, such as the last one under a tool with an axis, singular positions divide
     the branch once more, by the sign of det of the other joints' columns. Samples and share are of the middle's side.
@@ -395,11 +398,12 @@ def _chosen(robot: Robot, task: Task, branch: Branch | Box | str | None, home: A
 def _families(problem: Problem) -> tuple[Polynomial, ...]:
     """Polynomials that are linear in the joints on whose position the self-motions do not depend, by proof.
 
-    Then those that are so in such joints without limits only, if there are others.
+    Then those that are so in such slides without limits only, if there are others: a joint that turns has one turn.
     """
     robot = problem.robot
     free = [k for k in range(robot.n) if leaves_stay(problem, k)]
-    endless = [k for k in free if np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
+    slides = robot.tree.prismatic
+    endless = [k for k in free if slides[k] and np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
     names, fewer = (tuple(robot.joint_names[k] for k in joints) for joints in (free, endless))
     first = Polynomial(DEGREE, names)
     return (first,) if names == fewer else (first, Polynomial(_DEGREE_OF_ALL, fewer))
@@ -609,8 +613,10 @@ class _Search:
         return np.asarray(theta.reshape(r, -1) * coarse.scale[:, None])
 
     def _field(self, count: int, tag: int) -> _Field:
-        """Samples, many of them near the boundary."""
-        points = sample_heavily(self.problem.domain, count, (self.seed, tag))
+        """Samples, half of them uniform like positions that count for the share, the others heavy near limits."""
+        domain, even = self.problem.domain, int(_EVEN * count)
+        uniform = sample_uniform(domain, even, (self.seed, tag, _UNIFORM_TAG))
+        points = np.vstack([uniform, sample_heavily(domain, count - even, (self.seed, tag))])
         return _Field(self.problem, points[_beside_the_middle(self.problem, points)], self._basis)
 
 

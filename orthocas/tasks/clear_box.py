@@ -18,9 +18,10 @@ from orthocas.tasks.domains import (
     sample_uniform,
 )
 from orthocas.tasks.task import Task
-from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_number, as_point_set, frozen_array, require_kind, require_known
+from orthocas.tools.columns import BlockedFunction
 from orthocas.tools.json import part
 
 CLEAR_BOX = "clear box"  #: name of the kind
@@ -233,8 +234,8 @@ class ClearBox(Box):
         return dense_function("pivots", [q], [ca.vertcat(*found)])
 
     @cached_property
-    def _batched_pivots(self) -> Batched:
-        return Batched(self.pivots)
+    def _batched_pivots(self) -> BlockedFunction:
+        return BlockedFunction(self.pivots)
 
     def _jacobians(self, points: Array) -> Array:
         """J at points (N, n), (N, m, n)."""

@@ -57,7 +57,7 @@ class Batched:
 
     function: ca.Function
     _mapped: dict[int, ca.Function] = field(default_factory=dict, repr=False)
-    _mine: Any = field(default_factory=local, repr=False, compare=False)  # memory of each thread for one sample
+    _mine: Any = field(default_factory=local, repr=False, compare=False)  # memory of each thread for few samples
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate N samples."""
@@ -67,12 +67,14 @@ class Batched:
             how = ("thread", THREADS) if chunk == _LARGE and THREADS > 1 else ()
             with building:
                 self._mapped[chunk] = self.function.map(chunk, *how)
-        if chunk > 1:
+        if chunk == _LARGE:
             return evaluate_columns(self._mapped[chunk], chunk, *arguments)
         if not hasattr(self._mine, "columns"):
-            self._mine.columns = _Columns(self._mapped[1], 1)
-        results: list[Array] = self._mine.columns(*arguments)
-        return results
+            self._mine.columns = {}
+        mine: dict[int, _Columns] = self._mine.columns
+        if chunk not in mine:
+            mine[chunk] = _Columns(self._mapped[chunk], chunk)
+        return mine[chunk](*arguments)
 
     def __reduce__(self) -> tuple[type, tuple[ca.Function]]:
         return Batched, (self.function,)

@@ -8,6 +8,8 @@ Some of CasADi's Python swallows exceptions of all kinds (`except: pass` in `ver
 a fit that remembers signals (`remembered`, `ended_in_order`) ends as interrupted all the same.
 """
 
+# what `signal` wraps: its wrappers look for enums, which takes most of the time of `deferred`
+import _signal  # type: ignore[import-not-found]
 import signal
 import sys
 import threading
@@ -42,17 +44,17 @@ def deferred() -> Iterator[None]:
         return
     note = _Note()
     numbers = (signal.SIGINT, *_ENDING) if _ends else (signal.SIGINT,)  # others are not held; asking takes its time
-    handlers = {number: signal.getsignal(number) for number in numbers}
+    handlers = {number: _signal.getsignal(number) for number in numbers}
     before = {number: handler for number, handler in handlers.items() if _held(number, handler)}
     for number in before:
-        signal.signal(number, note.take)
+        _signal.signal(number, note.take)
     _notes.append(note)
     try:
         yield
     finally:
         _notes.remove(note)
         for number, handler in before.items():
-            signal.signal(number, handler)
+            _signal.signal(number, handler)
         if note.number is not None:
             for outer in _notes:  # compiled code around this one may not pass the exception on
                 outer.number = outer.number or note.number

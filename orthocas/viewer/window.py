@@ -56,6 +56,7 @@ _log = logging.getLogger(__name__)
 connections = logging.getLogger(f"{__name__}.connections")
 _FRAME = 1 / 30  # [s] between ticks; browsers without a graphics card fall behind more
 _QUIET = 0.25  # [s] without jobs, after which the page settles
+_SILENT = 1.0  # [s] that a connection may say nothing
 _LARGEST = 2**20  # bytes of a message from a browser; sliders and cameras need hundreds
 _HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[0-9a-z._-]+)(?::\d{1,5})?")
 LOCAL = "127.0.0.1"
@@ -363,6 +364,15 @@ def _with_guard(serve: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
     answer_of = import_module("websockets.http11").Response
     headers_of = import_module("websockets.datastructures").Headers
 
+    class Attentive(_serving().ServerConnection):  # type: ignore[misc]
+        """A connection that is dropped if it asks for nothing: browsers keep some, and closing waited 6 s for them."""
+
+        async def handshake(self, *arguments: Any, **options: Any) -> None:
+            told = [self.request_rcvd, self.connection_lost_waiter]
+            await asyncio.wait(told, timeout=_SILENT, return_when=asyncio.FIRST_COMPLETED)
+            if any(future.done() for future in told):
+                await super().handshake(*arguments, **options)
+
     def serve_guarded(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
         if getattr(handler, "__module__", None) != _VISER:
             return serve(handler, *arguments, process_request=process_request, **options)
@@ -377,7 +387,7 @@ def _with_guard(serve: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
                 return answer_of(HTTPStatus.FORBIDDEN, "Forbidden", told, text)
             return titled(process_request(connection, replace(request, path=path)))
 
-        limits = {"max_size": _LARGEST, "logger": connections}
+        limits = {"max_size": _LARGEST, "logger": connections, "create_connection": Attentive}
         return serve(guard.inbox.guarded(handler), *arguments, process_request=judge, **{**options, **limits})
 
     return serve_guarded

@@ -66,6 +66,20 @@ def _chain(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
+class _Child:
+    """A process that judges one job after the other: to start it takes seconds, for all that judges import."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, there = context.Pipe()
+        self.process = context.Process(target=_work, args=(there,), daemon=True)
+        self.process.start()
+        there.close()
+
+
+_idle: list[_Child] = []  # children that wait for the next campaign
+
+
 def run(campaign: str, judge: Judge, seeds: Iterable[int], seconds: float = SECONDS) -> list[Finding]:
     """Judge the mutants of all seeds in a child; a child that dies or hangs is replaced by a new one."""
     findings, left = [], list(seeds)
@@ -78,35 +92,43 @@ def run(campaign: str, judge: Judge, seeds: Iterable[int], seconds: float = SECO
 
 def _in_one_child(campaign: str, judge: Judge, seeds: list[int], seconds: float) -> tuple[int, list[Finding]]:
     """How many seeds one child got through, the one that ended it included, and its findings."""
-    context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe()
-    child = context.Process(target=_work, args=(judge, seeds, seconds, there), daemon=True)
-    child.start()
-    there.close()
-    findings = []
+    try:
+        child = _idle.pop()
+    except IndexError:
+        child = _Child()
+    here, process, findings = child.pipe, child.process, []
+    here.send((judge, seeds, seconds))
     for done, seed in enumerate(seeds, start=1):
         try:
             waited = here.poll(20 * seconds + (60 if done == 1 else 0))  # on a busy machine; the first imports too
             what = here.recv() if waited else "hangs where Python cannot interrupt it"
         except EOFError:
-            child.join()
-            what = f"its process died with exit code {child.exitcode}"
+            process.join()
+            what = f"its process died with exit code {process.exitcode}"
             waited = False
         if what is not None:
             findings.append(Finding(campaign, seed, what))
         if not waited:
-            child.kill()
-            child.join()
+            process.kill()
+            process.join()
             return done, findings
-    child.join()
+    _idle.append(child)
     return len(seeds), findings
 
 
-def _work(judge: Judge, seeds: list[int], seconds: float, answers: Connection) -> None:
-    """In the child: one answer for every seed."""
+def _work(jobs: Connection) -> None:
+    """In the child: one answer for every seed of a job."""
     signal.signal(signal.SIGPROF, _time_is_up)
-    for seed in seeds:
-        answers.send(_measured(judge, seed, seconds))
+    while True:
+        try:
+            judge, seeds, seconds = jobs.recv()
+        except EOFError:  # the parent has ended
+            return
+        for seed in seeds:
+            jobs.send(_measured(judge, seed, seconds))
+        for kind in (resource.RLIMIT_CPU, resource.RLIMIT_DATA):  # what the next job imports does not count
+            hard = resource.getrlimit(kind)[1]
+            resource.setrlimit(kind, (hard, hard))
 
 
 def _measured(judge: Judge, seed: int, seconds: float) -> str | None:
