@@ -57,7 +57,10 @@ _JUDGED = 20_000
 _FIRST_STEP = (0.0, 1e-2)  # margin, and weight of the mean squared gradient
 _EASY, _HARDER = ((0.2, 1e-3), (0.2, 1e-4)), ((0.05, 1e-4), (0.05, 1e-5))  # further ones
 _HARD = 0.01  # share of bad positions after the first step with which a large margin asks too much
-_POOR = 1e-3  # share of bad positions with which another family is tried
+_POOR, _POOR_SEVERAL = (
+    1e-3,
+    5e-3,
+)  # share of bad positions with which another family is tried; that of r > 1 takes longer
 _ENOUGH = 5e-4  # share of bad positions, many near limits, that is as good as none
 _WELL = 0.28  # over r, volume of all but 1 % of positions that is enough; a conditioning of 0.2
 _ROUNDS, _FRESH, _WORST, _FRESH_TAG = 2, 50_000, 5000, 3002  # rounds with the worst of fresh samples
@@ -132,9 +135,10 @@ def fit_wide(
 
     Coordinates that are linear in the first and the last joint are best to prove and hold at any turn of them. They ask
     that self-motions turn base and tool in one sense on the whole branch, as far as the other joints do not outweigh
-    that. Without `parametrisation`, if more than 0.1 % of samples are bad before the worst ones join, polynomials of
-    degree 4 in all joints are tried, too, and the better ones are kept. Where these are, a joint without limits has one
-    turn in which samples lie; beyond it, positions belong to the domain as far as coordinates are regular there.
+    that. Without `parametrisation`, if more than 0.1 % of samples (0.5 % with r > 1) are bad before the worst ones
+    join, polynomials of degree 4 in all joints are tried, too, and the better ones are kept. Where these are, a joint
+    without limits has one turn in which samples lie; beyond it, positions belong to the domain as far as coordinates
+    are regular there.
 
     If r joints do not move the task at all, such as the last one under a tool with an axis, singular positions divide
     the branch once more, by the sign of det of the other joints' columns. Samples and share are of the middle's side.
@@ -234,7 +238,7 @@ def _run(searches: Sequence["_Search"]) -> None:
     """Search in one family after the other, as long as results are poor, then go on in the best one."""
     for search in searches:
         search.begin()
-        if search.rank[0] <= _POOR:
+        if search.rank[0] <= (_POOR if search.problem.r == 1 else _POOR_SEVERAL):
             break
     _better(searches).go_on()
 
