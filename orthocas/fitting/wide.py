@@ -57,10 +57,7 @@ _JUDGED = 20_000
 _FIRST_STEP = (0.0, 1e-2)  # margin, and weight of the mean squared gradient
 _EASY, _HARDER = ((0.2, 1e-3), (0.2, 1e-4)), ((0.05, 1e-4), (0.05, 1e-5))  # further ones
 _HARD = 0.01  # share of bad positions after the first step with which a large margin asks too much
-_POOR, _POOR_SEVERAL = (
-    1e-3,
-    5e-3,
-)  # share of bad positions with which another family is tried; that of r > 1 takes longer
+_POOR, _POOR_SEVERAL = 1e-3, 5e-3  # share of bad positions with which another family is tried; if r > 1
 _ENOUGH = 5e-4  # share of bad positions, many near limits, that is as good as none
 _WELL = 0.28  # over r, volume of all but 1 % of positions that is enough; a conditioning of 0.2
 _ROUNDS, _FRESH, _WORST, _FRESH_TAG = 2, 50_000, 5000, 3002  # rounds with the worst of fresh samples
