@@ -215,9 +215,10 @@ def test_pages_of_others_in_a_real_browser_get_no_websocket(view: oc.viewer.View
         "VERSION", import_module("viser").__version__
     )
     (tmp_path / "evil.html").write_text("<html><body>evil</body></html>")
+    serve = http.server.ThreadingHTTPServer  # browsers keep spare connections, for which others would wait
     handler = type("Quiet", (http.server.SimpleHTTPRequestHandler,), {"log_message": lambda *words: None})
     with (
-        http.server.HTTPServer(("127.0.0.1", 0), lambda *words: handler(*words, directory=str(tmp_path))) as evil,
+        serve(("127.0.0.1", 0), lambda *words: handler(*words, directory=str(tmp_path))) as evil,
         browser(tmp_path / "profile", (400, 300), smooth=False) as page,
     ):
         threading.Thread(target=evil.serve_forever, daemon=True).start()
