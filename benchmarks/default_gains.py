@@ -163,7 +163,7 @@ def compiled(law: PDPlus) -> Iterator[CompiledLibrary]:
     """The law in C."""
     with TemporaryDirectory() as folder:
         generated = oc.generate_c(law.chart, folder, law, "law")
-        yield CompiledLibrary(compile_shared(generated, Path(folder)), "law", law.problem.n)
+        yield CompiledLibrary(compile_shared(generated, Path(folder), ("-O1",)), "law", law.problem.n)
 
 
 def starts_of(problem: oc.Problem, count: int) -> np.ndarray:

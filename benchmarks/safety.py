@@ -76,7 +76,7 @@ def pushes(chart: oc.Chart, runs: int, seed: int = 0) -> list[Push]:
     cases = [(place, direction) for direction in DIRECTIONS for place in PLACES]
     with TemporaryDirectory() as folder:
         generated = oc.generate_c(chart, folder, law, "arm")
-        library = CompiledLibrary(compile_shared(generated, Path(folder)), "arm", chart.n)
+        library = CompiledLibrary(compile_shared(generated, Path(folder), ("-O1",)), "arm", chart.n)
         return [push(chart, Supervisor(library, law), plant, *cases[k % len(cases)], rng) for k in range(runs)]
 
 
