@@ -228,7 +228,7 @@ AnglesName = Annotated[
     str | None,
     typer.Option(
         "--angles",
-        help="Angles in the loss: paper (Euclidean norms) or metric; default: metric with --metric inertia.",
+        help="Angles in the loss: paper (Euclidean norms) or metric; default: metric with --metric inertia and for tasks that turn the tool.",
     ),
 ]
 PrecisionName = Annotated[
