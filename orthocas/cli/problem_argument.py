@@ -228,7 +228,8 @@ AnglesName = Annotated[
     str | None,
     typer.Option(
         "--angles",
-        help="Angles in the loss: paper (Euclidean norms) or metric; default: metric with --metric inertia and for tasks that turn the tool.",
+        help="Angles in the loss: paper (Euclidean norms) or metric; default: metric with --metric inertia and for "
+        "tasks that turn the tool.",
     ),
 ]
 PrecisionName = Annotated[
