@@ -30,6 +30,7 @@ from orthocas.fitting.checkpoint import Stage
 from orthocas.fitting.fit import Fit, fit, in_gauge, normalised
 from orthocas.fitting.like import SWIVEL, Like, Likeness, quantity_of
 from orthocas.fitting.settings import require_parametrisation
+from orthocas.fitting.terms import Weights
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import require_driven
 from orthocas.solvers.protocol import SolveResult, Status
@@ -70,7 +71,7 @@ _STEP, _MOST_STEPS, _FEWEST = 0.02, 400, 5  # of unit self-motions, along which 
 _ALIKE = 0.01  # weight of the mean squared distance to gradients of quantities, with r > 1
 _STILL = 1e-3  # change of a quantity for a unit self-motion
 _START = 3  # degree of the start, if there are several coordinates
-_START_WEIGHTS = (100.0, 3.0, 1000.0, 0.0, 10_000.0)
+_START_WEIGHTS = Weights(100.0, 3.0, 1000.0, 0.0, 10_000.0, angles="paper")  # better than in the metric on TIAGo Pro
 _MIDDLES, _CLEARER = 20_000, 1.5  # positions that may be the middle of a domain, and their clearance over the bound
 
 
