@@ -134,7 +134,7 @@ ARMS = {
 }
 WIDEST = "--domain auto --param polynomial:4:cyclic"  #: a leak of at most 8 deg, a conditioning of at least 0.2
 TIGHT = f"{WIDEST} --leak-deg 5 --conditioning 0.4"
-#: the paper's angles: one-to-one boxes are 1.3 to 3 times as wide as with angles in the metric
+#: the paper's angles: with angles in the metric, domains are larger and one-to-one boxes narrower
 POSE = "--task pose --domain auto --leak-deg 5 --param polynomial:4:cyclic --angles paper"
 BRANCH = "--task pose --domain branch"
 RECIPES = {  #: arm and options of `orthocas fit`
