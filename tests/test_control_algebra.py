@@ -1,16 +1,21 @@
 """Smooth matrix functions of control laws, and damping designs, against NumPy, SciPy and closed forms."""
 
+import ctypes
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
 from scipy.linalg import eigh, sqrtm
 
-from orthocas.control.linear_algebra import DAMPING_DESIGNS, damping_matrix, spd_inverse, square_root
+from orthocas.codegen.kernels import generate_kernels
+from orthocas.codegen.library import compilers
+from orthocas.control.linear_algebra import DAMPING_DESIGNS, DampingDesign, damped, root_times, spd_inverse
 from orthocas.tools.checks import Array
+from orthocas.tools.processes import run_program
 
 RNG = np.random.default_rng(11)
 
@@ -20,6 +25,14 @@ def spd(size: int, condition: float) -> Array:
     Q = np.linalg.qr(RNG.normal(size=(size, size)))[0]
     values = np.exp(np.linspace(0, np.log(condition), size))
     return np.asarray(Q @ np.diag(values) @ Q.T)
+
+
+def square_root(A: Any) -> Any:
+    return root_times(A, type(A).eye(A.shape[0]))
+
+
+def damping_matrix(design: DampingDesign, M: Any, K: Any, Z: Any) -> Any:
+    return damped(design, M, K, Z, type(M).eye(M.shape[0]))
 
 
 def function_of(expression: object, symbol: ca.SX) -> ca.Function:
@@ -128,3 +141,27 @@ def test_damping_generates_to_c_that_agrees(tmp_path: Path) -> None:
         given = (spd(4, 10.0 ** RNG.uniform(0, 5)), RNG.uniform(1, 1000, 4), RNG.uniform(0, 1, 4))
         for want, found in zip(function(*given), compiled(*given), strict=True):
             np.testing.assert_allclose(found.full(), want.full(), rtol=1e-12, atol=1e-10)
+
+
+@pytest.mark.parametrize("size", [2, 3, 7, 12])
+def test_roots_in_generated_c_stop_when_they_are_exact(tmp_path: Path, size: int) -> None:
+    """On eigenvalues up to 1e6 apart, in any units, and no further in the work array than it is long."""
+    A, V = ca.MX.sym("A", size, size), ca.MX.sym("V", size, 2)
+    kernels = generate_kernels([ca.Function("root", [A, V], [root_times(A, V)])], "own")
+    source, library = tmp_path / "root.c", tmp_path / "root.so"
+    source.write_text(f"#include <math.h>\n{kernels.code.replace('static int own_root', 'int own_root')}\n")
+    run_program([compilers()[0], "-std=c99", "-O1", "-fPIC", "-shared", "-o", str(library), str(source), "-lm"])
+    _, _, _, length = kernels.work["root"]
+    run = ctypes.CDLL(str(library)).own_root
+    for condition in (1.0, 1e2, 1e4, 1e6):
+        for scale in (1e-9, 1.0, 1e9):
+            given, columns, found = scale * spd(size, condition), RNG.normal(size=(2, size)), np.zeros((2, size))
+            places = [array.ctypes.data for array in (given, columns, found)]
+            arg, res = (ctypes.c_void_p * 8)(*places[:2]), (ctypes.c_void_p * 8)(places[2])
+            work = np.full(length + 64, 7.0)
+            assert run(arg, res, (ctypes.c_int * 8)(), ctypes.c_void_p(work.ctypes.data), 0) == 0
+            want = sqrtm(given).real @ columns.T
+            np.testing.assert_allclose(
+                found.T, want, atol=1e-14 * np.sqrt(condition) * np.sqrt(scale * condition) * size
+            )
+            assert (work[length:] == 7.0).all()

@@ -9,7 +9,7 @@ from typing import Any
 
 import casadi as ca
 
-from orthocas.control.linear_algebra import LARGE_INVERSE
+from orthocas.control.linear_algebra import LARGE_INVERSE, ROOT_TIMES, ROUNDS
 from orthocas.errors import CompileError
 
 _VERSION = f"by CasADi {ca.CasadiMeta.version()}"
@@ -39,6 +39,42 @@ _INVERSE = """{
     for (i = 0; i < SIZE; ++i)
       for (j = 0; j <= i; ++j) res[0][i * SIZE + j] = res[0][j * SIZE + i] = -a[i * SIZE + j];
   if (res[1] != 0) res[1][0] = volume;
+  return 0;
+}"""
+# The rounds of `orthocas.control.linear_algebra.root_times`, until what they leave of X = I + E, in the series
+# X^-1/2 = I - E/2 + 3/8 E^2 - ..., is below rounding after its second term. Its arrays are beyond those of the rounds.
+_ROOT_TIMES = """{
+  casadi_real *X = w + BELOW, *found = X + SIZE * SIZE, *other = found + SIZE * COUNT, rest = 1.0;
+  casadi_int i, j, round;
+  for (i = 0; i < SIZE * SIZE; ++i) X[i] = arg[0][i];
+  for (i = 0; i < SIZE * COUNT; ++i) found[i] = 0.0;
+  casadi_product_SIZE_SIZE_COUNT(X, arg[1], found);
+  for (round = 0; round < ROUNDS; ++round) {
+    const casadi_real* from[2];
+    casadi_real* to[2];
+    for (rest = 0.0, i = 0; i < SIZE; ++i)
+      for (j = 0; j <= i; ++j) {
+        const casadi_real size = fabs(i == j ? X[i * SIZE + j] - 1.0 : X[i * SIZE + j]);
+        if (size > rest) rest = size;
+      }
+    if (!(1.0 + rest * rest * rest > 1.0)) break;
+    from[0] = X;
+    from[1] = found;
+    to[0] = other;
+    to[1] = other + SIZE * SIZE;
+    if (ROUND(from, to, iw, w, mem)) return 1;
+    other = X;
+    X = to[0];
+    found = to[1];
+  }
+  for (i = 0; i < SIZE * SIZE; ++i) X[i] *= -0.5;
+  for (i = 0; i < SIZE; ++i) X[i * SIZE + i] += 0.5;
+  for (i = 0; i < SIZE * COUNT; ++i) other[i] = 0.0;
+  casadi_product_SIZE_SIZE_COUNT(X, found, other);
+  for (i = 0; i < SIZE * COUNT; ++i) other[i] = found[i] + 1.5 * other[i];
+  casadi_product_SIZE_SIZE_COUNT(X, other, found);
+  if (res[0] != 0)
+    for (i = 0; i < SIZE * COUNT; ++i) res[0][i] = found[i];
   return 0;
 }"""
 #: what stands for `pow`, which is slow on small processors: products for whole exponents
@@ -147,12 +183,24 @@ def with_own_code(blocks: dict[str, str], functions: list[ca.Function], bodies: 
     """
     changed = {name: _HAND_ON.sub(", mem)", block) for name, block in blocks.items()} if bodies else dict(blocks)
     for number, function in enumerate(in_order_of_generation(functions)):
-        own = _INVERSE.replace("SIZE", str(function.size1_in(0))) if function.name() == LARGE_INVERSE else None
-        body = bodies.get(function.name(), own)
+        name = f"casadi_f{number}"
+        body = bodies.get(function.name(), _body(function, blocks[name]))
         if body is not None:
-            name = f"casadi_f{number}"
             changed[name] = blocks[name].split("{", 1)[0] + body
     return changed
+
+
+def _body(function: ca.Function, block: str) -> str | None:
+    """The body in C of a function of `orthocas.control.linear_algebra` that is faster than what CasADi writes."""
+    size = str(function.size1_in(0)) if function.n_in() else ""
+    if function.name() == LARGE_INVERSE:
+        return _INVERSE.replace("SIZE", size)
+    if function.name() != ROOT_TIMES:
+        return None
+    below = min(int(offset) for _, offset in _PLACE.findall(block))
+    known = {"SIZE": size, "COUNT": str(function.size2_in(1)), "BELOW": str(below), "ROUNDS": str(ROUNDS)}
+    known["ROUND"] = _CALL.findall(block)[0]
+    return re.sub("|".join(sorted(known, key=len, reverse=True)), lambda found: known[found[0]], _ROOT_TIMES)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.expressions import WRITTEN_OUT
 
 LARGE_INVERSE = "large_inverse"  #: name of the functions for which generated C has code of its own
+ROOT_TIMES = "root_times"  #: likewise
 ROUNDS = 8  #: accurate to rounding up to a condition number of 1e6 (tests/test_control_algebra.py)
 _SAMPLES, _SEED = 256, 0
 SOFTEST = 1e-6  #: smallest squared frequency in double_diagonal, relative to the largest: K_i = 0 divides by zero
@@ -55,35 +56,40 @@ def _swept(k: int) -> ca.Function:
     return ca.Function(LARGE_INVERSE, [matrix], [-ca.reshape(end[:-1], k, k), end[-1]])
 
 
-def square_root(matrix: Expression) -> Expression:
-    """The symmetric positive definite S with S S = A, (k, k).
+def root_times(matrix: Expression, vectors: Expression) -> Expression:
+    """S V with the symmetric positive definite S, S S = A, for A (k, k) and V (k, c).
 
-    Newton's iteration in the product form of Denman and Beavers, scaled by determinants, with a fixed number of rounds.
-    The result is a rational function of the entries and of roots of determinants. In graphs (MX), all rounds call one
-    function.
+    Newton's iteration in the product form of Denman and Beavers, scaled by determinants, with a fixed number of rounds;
+    generated C stops as soon as the rest is below rounding. All matrices of the rounds commute, so that V takes the
+    place of S. The result is a rational function of the entries and of roots of determinants.
 
     Source:
         [H2008] Sec. 6.3, product form of the Denman-Beavers iteration with determinantal scaling.
     """
-    k = matrix.shape[0]
-    if k == 1:
-        return ca.sqrt(matrix)
-    root, product = matrix, matrix
-    for _ in range(ROUNDS):
-        root, product = _newton_round(k)(root, product)
-    return root
+    if matrix.shape[0] == 1:
+        return ca.sqrt(matrix) * vectors
+    return _rounds(*vectors.shape)(matrix, vectors)
 
 
 @cache
-def _newton_round(k: int) -> ca.Function:
-    """One round on S and the product X, both (k, k); all are rational functions of A and therefore symmetric."""
+def _rounds(k: int, c: int) -> ca.Function:
+    A, V = ca.MX.sym("A", k, k), ca.MX.sym("V", k, c)
+    product, found = A, A @ V
+    for _ in range(ROUNDS):
+        product, found = _newton_round(k, c)(product, found)
+    return ca.Function(ROOT_TIMES, [A, V], [found])
+
+
+@cache
+def _newton_round(k: int, c: int) -> ca.Function:
+    """One round on the product X (k, k), a rational function of A and therefore symmetric, and on S V (k, c)."""
     kind = kind_of(k)
-    root, product, identity = kind.sym("S", k, k), kind.sym("X", k, k), ca.DM.eye(k)
+    product, found, identity = kind.sym("X", k, k), kind.sym("SV", k, c), ca.DM.eye(k)
     inverse, determinant = spd_inverse(product)
     mu_squared = determinant ** (-1 / k)
-    next_root = ca.sqrt(mu_squared) * (root + root @ inverse / mu_squared) / 2
+    next_found = ca.sqrt(mu_squared) * (found + inverse @ found / mu_squared) / 2
     next_product = (identity + (mu_squared * product + inverse / mu_squared) / 2) / 2
-    return ca.Function("newton_round", [root, product], [_symmetric(next_root), _symmetric(next_product)])
+    return ca.Function("newton_round", [product, found], [_symmetric(next_product), ca.densify(next_found)])
 
 
 def _symmetric(matrix: Any) -> Any:
@@ -130,10 +136,14 @@ DampingDesign = Literal["square_root", "double_diagonal"]
 DAMPING_DESIGNS: tuple[DampingDesign, ...] = ("square_root", "double_diagonal")
 
 
-def damping_matrix(
-    design: DampingDesign, inertia: Expression, stiffness: Expression, damping_ratio: Expression
+def damped(
+    design: DampingDesign,
+    inertia: Expression,
+    stiffness: Expression,
+    damping_ratio: Expression,
+    velocities: Expression,
 ) -> Expression:
-    """Damping matrix D(q), (k, k), for an inertia (k, k) and the diagonals of K and Z, (k, 1).
+    """D V with the damping matrix D(q), (k, k), for an inertia (k, k), the diagonals of K and Z, (k, 1), and V (k, c).
 
     - square_root: D = M^1/2 Z K^1/2 + K^1/2 Z M^1/2. Symmetric, but not always positive semi-definite.
     - double_diagonal: D = 2 Z^1/2 (M # K) Z^1/2, always positive semi-definite, with the geometric mean
@@ -145,13 +155,14 @@ def damping_matrix(
         square_root: [AS2023] eq. (29); double diagonalisation: [AOFH2003]; its form without eigenvectors and for
         several ratios is ours, docs/explanation/derivations_control.md#damping.
     """
+    c = velocities.shape[1]
     if design == "square_root":
-        half = square_root(inertia) * _row(damping_ratio * ca.sqrt(stiffness))
-        return half + half.T
+        share = ca.repmat(damping_ratio * ca.sqrt(stiffness), 1, c)
+        both = root_times(inertia, ca.horzcat(share * velocities, velocities))
+        return both[:, :c] + share * both[:, c:]
     root_K = ca.sqrt(_not_too_soft(stiffness, inertia))
-    mean = square_root(inertia / (root_K @ root_K.T))
-    scale = root_K * ca.sqrt(damping_ratio)
-    return 2 * (scale @ scale.T) * mean
+    scale = ca.repmat(root_K * ca.sqrt(damping_ratio), 1, c)
+    return 2 * scale * root_times(inertia / (root_K @ root_K.T), scale * velocities)
 
 
 def _not_too_soft(stiffness: Expression, inertia: Expression) -> Expression:
@@ -162,8 +173,3 @@ def _not_too_soft(stiffness: Expression, inertia: Expression) -> Expression:
     mass = ca.diag(inertia)
     floor = mass * ca.fmax(SOFTEST * ca.mmax(stiffness / mass), SOFTEST**2)
     return ca.if_else(stiffness < 0, stiffness, ca.if_else(stiffness < floor, floor, stiffness))
-
-
-def _row(diagonal: Expression) -> Expression:
-    """The vector (k, 1) repeated in every row of (k, k); an entrywise product with it scales columns."""
-    return ca.repmat(diagonal.T, diagonal.shape[0], 1)

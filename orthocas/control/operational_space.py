@@ -35,7 +35,7 @@ from orthocas.control.gains import (
     non_negative_gains,
     positive_gains,
 )
-from orthocas.control.linear_algebra import DAMPING_DESIGNS, DampingDesign, block_inertia, damping_matrix, median_volume
+from orthocas.control.linear_algebra import DAMPING_DESIGNS, DampingDesign, block_inertia, damped, median_volume
 from orthocas.control.memory import MEMORIES, Memory, Remembers
 from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
@@ -401,11 +401,11 @@ class _OperationalSpace(Shown):
         K = ca.diag(inputs["stiffness"])
         M = self.model.own_mass_matrix(self.problem.robot, inputs)
         e, de, J = self._errors(inputs)
-        D = self._inertia(J, M, inputs)[-1]
+        damping_force = self._damped(self._inertia(J, M)[1], inputs, de)
         M_phi = block_inertia(self.chart.n, (self.chart.n,))(J, M)[1]
         kinetic = ca.bilin(M_phi, de, de) if self.feed_forward else ca.bilin(M, inputs["dq"], inputs["dq"])
         storage = (kinetic + ca.bilin(K, e, e)) / 2
-        outputs = {"storage": storage, "dissipated_power": ca.bilin(D, de, de)}
+        outputs = {"storage": storage, "dissipated_power": ca.dot(de, damping_force)}
         return named_function("energy", inputs, outputs)
 
     @cached_property
@@ -414,7 +414,7 @@ class _OperationalSpace(Shown):
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
         chosen = {name: inputs[name] for name in ("q", *self._of_the_damping)}
         J, M = self.chart.rates(inputs["q"]), self.model.own_mass_matrix(self.problem.robot, inputs)
-        D = self._inertia(J, M, inputs)[-1]
+        D = self._damped(self._inertia(J, M)[1], inputs, ca.MX.eye(self.chart.n))
         return self.chart.runnable(named_function("damping_matrix", chosen, {"D": D}))
 
     def check_damping(self, samples: int = 1000, seed: int = 0) -> DampingCheck:
@@ -463,12 +463,16 @@ class _OperationalSpace(Shown):
     def _blocks(self) -> tuple[int, ...]:
         return (self.chart.n,) if self.coupling == "coupled" else (self.chart.m, self.chart.r)
 
-    def _inertia(self, J: ca.MX, M: ca.MX, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ...]:
-        """B = M^-1 J^T, the inertia Lambda in blocks, its volume, and D with the same blocks."""
+    def _inertia(self, J: ca.MX, M: ca.MX) -> tuple[ca.MX, ca.MX, ca.MX]:
+        """B = M^-1 J^T, the inertia Lambda in blocks, and its volume."""
         B, Lambda, volume = block_inertia(self.chart.n, self._blocks)(J, M)
+        return B, Lambda, volume
+
+    def _damped(self, Lambda: ca.MX, inputs: dict[str, ca.MX], velocities: ca.MX) -> ca.MX:
+        """D V, with the same blocks, for V (n, c)."""
         designed_for = inputs.get("damping_stiffness", inputs["stiffness"])
-        D = _block_damping(self.damping, self._blocks)(Lambda, designed_for, inputs["damping_ratio"])
-        return B, Lambda, volume, D
+        function = _block_damping(self.damping, self._blocks, velocities.shape[1])
+        return function(Lambda, designed_for, inputs["damping_ratio"], velocities)
 
     def _errors(self, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
         """The error e, how fast it changes, and J = de/dq."""
@@ -483,8 +487,8 @@ class _OperationalSpace(Shown):
         """Force in the coordinates, (n, 1), the volume of the gradients, and J."""
         q, dq, robot, model = inputs["q"], inputs["dq"], self.problem.robot, self.model
         e, de, J = self._errors(inputs)
-        B, Lambda, volume, D = self._inertia(J, model.mass_matrix(robot, inputs), inputs)
-        force = -inputs["stiffness"] * e - D @ de
+        B, Lambda, volume = self._inertia(J, model.mass_matrix(robot, inputs))
+        force = -inputs["stiffness"] * e - self._damped(Lambda, inputs, de)
         if self.feed_forward:
             w = B @ (Lambda @ self._drift(inputs))  # J^-1 d_phi_d; if (5) holds, by (8) also when decoupled
             wanted = inputs["reference"], inputs["reference_velocity"], inputs["reference_acceleration"]
@@ -549,10 +553,10 @@ def _positive_or_none(name: str, value: ArrayLike | None, length: int) -> Array 
     return None if value is None else positive_gains(name, value, length)
 
 
-def _block_damping(design: DampingDesign, blocks: tuple[int, ...]) -> ca.Function:
-    """Lambda (block diagonal), stiffness, damping_ratio -> D with the same blocks."""
+def _block_damping(design: DampingDesign, blocks: tuple[int, ...], columns: int) -> ca.Function:
+    """Lambda (block diagonal), stiffness, damping_ratio, V (n, columns) -> D V; D has the same blocks."""
     n = sum(blocks)
-    Lambda, K, Z = ca.MX.sym("Lambda", n, n), ca.MX.sym("K", n), ca.MX.sym("Z", n)
-    places = np.split(np.arange(n), np.cumsum(blocks)[:-1])
-    parts = [damping_matrix(design, Lambda[p.tolist(), p.tolist()], K[p.tolist()], Z[p.tolist()]) for p in places]
-    return ca.Function("damping", [Lambda, K, Z], [ca.densify(ca.diagcat(*parts))])
+    Lambda, K, Z, V = (ca.MX.sym(*of) for of in (("Lambda", n, n), ("K", n), ("Z", n), ("V", n, columns)))
+    places = [place.tolist() for place in np.split(np.arange(n), np.cumsum(blocks)[:-1])]
+    parts = [damped(design, Lambda[p, p], K[p], Z[p], V[p, :]) for p in places]
+    return ca.Function("damping", [Lambda, K, Z, V], [ca.densify(ca.vertcat(*parts))])

@@ -351,12 +351,12 @@ class Projector(TwoTaskLaw):
         problem, m = self.problem, self.problem.m
         inputs = self._inputs()
         q, dq = inputs["q"], inputs["dq"]
-        e, J, D_x, D_2 = errors_and_damping(problem, self._second, inputs)
+        e, J, damped_x, damped_2 = errors_and_damping(problem, self._second, inputs)
         J_2 = self._second.jacobian(q)
         B, Lambda, _ = block_inertia(problem.n, (m,))(J, problem.metric.function(q))
         through = dq - B @ (Lambda @ (J @ dq))  # P dq
         storage = (ca.bilin(problem.robot.mass_matrix(q), dq, dq) + ca.dot(e, inputs["stiffness"] * e)) / 2
-        power = ca.bilin(D_x, J @ dq, J @ dq) + ca.bilin(D_2, J_2 @ through, J_2 @ dq)
+        power = ca.dot(J @ dq, damped_x(J @ dq)) + ca.dot(J_2 @ through, damped_2(J_2 @ dq))
         outputs = {"storage": storage, "dissipated_power": power}
         return named_function("energy", inputs, outputs)
 

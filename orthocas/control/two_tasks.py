@@ -1,6 +1,7 @@
 """Two tasks, of which the first has priority: second tasks, their forces, and what both laws share."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Protocol, get_args
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from orthocas.charts.chart import Chart
 from orthocas.control.errors import without_turns
-from orthocas.control.linear_algebra import block_inertia, damping_matrix, median_volume
+from orthocas.control.linear_algebra import block_inertia, damped, median_volume
 from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError, SingularTaskError, UnreachableReferenceError
@@ -270,37 +271,44 @@ def two_task_forces(problem: Problem, second: SecondTask, inputs: Inputs, feed_f
     m, K = problem.m, inputs["stiffness"]
     q, dq = inputs["q"], inputs["dq"]
     J_2 = second.jacobian(q)
-    e, J, D_x, D_2 = errors_and_damping(problem, second, inputs)
-    f_x = -K[:m] * e[:m] - D_x @ (J @ dq)
-    f_2 = -K[m:] * e[m:] - D_2 @ (J_2 @ dq) + inputs.get("second_force", 0)
+    e, J, damped_x, damped_2 = errors_and_damping(problem, second, inputs)
+    f_x, f_2 = -K[:m] * e[:m], -K[m:] * e[m:] + inputs.get("second_force", 0)
     if not feed_forward:
-        return f_x, f_2
+        return f_x - damped_x(J @ dq), f_2 - damped_2(J_2 @ dq)
     M, C_dq = problem.robot.mass_matrix(q), problem.robot.coriolis_product(q, dq, dq)
     B, M_x, _ = block_inertia(problem.n, (m,))(J, M)
     sharp, M_2, _ = second.weighted(q, M)
     x_d, rate, acceleration = (inputs[name] for name in ("reference", "reference_velocity", "reference_acceleration"))
     relative = Relative(problem.task)
     bend = relative.bend(q, dq, dq, (x_d[:m], rate[:m], acceleration[:m]))
-    f_x += M_x @ (B.T @ C_dq - bend) + D_x @ relative.drift(q, x_d[:m], rate[:m])
-    f_2 += M_2 @ (acceleration[m:] - second.curvature(q, dq)) + sharp.T @ C_dq + D_2 @ rate[m:]
+    f_x += M_x @ (B.T @ C_dq - bend) - damped_x(J @ dq - relative.drift(q, x_d[:m], rate[:m]))
+    f_2 += M_2 @ (acceleration[m:] - second.curvature(q, dq)) + sharp.T @ C_dq - damped_2(J_2 @ dq - rate[m:])
     return f_x, f_2
 
 
-def errors_and_damping(problem: Problem, second: SecondTask, inputs: Inputs) -> tuple[ca.MX, ca.MX, ca.MX, ca.MX]:
-    """e = [x - x_d; x_2 - x_2d], de_x/dq, D_x with the inertia M_x, and D_2 with M_2 by [AS2023] eq. (29)."""
+Damped = Callable[[ca.MX], ca.MX]  #: v -> D v
+
+
+def errors_and_damping(problem: Problem, second: SecondTask, inputs: Inputs) -> tuple[ca.MX, ca.MX, Damped, Damped]:
+    """e = [x - x_d; x_2 - x_2d], de_x/dq, and the functions v -> D_x v, with the inertia M_x, and v -> D_2 v, with M_2.
+
+    Source:
+        [AS2023] eq. (29).
+    """
     q, K, Z, m = inputs["q"], inputs["stiffness"], inputs["damping_ratio"], problem.m
     M = problem.robot.mass_matrix(q)
     e_x, J = Relative(problem.task).error(q, inputs["reference"][:m])
     M_x = block_inertia(problem.n, (m,))(J, M)[1]
     M_2 = second.weighted(q, M)[1]
-    D_x, D_2 = _damping(m)(M_x, K[:m], Z[:m]), _damping(M_2.shape[0])(M_2, K[m:], Z[m:])
     rest = second.shortest(second.measured(q) - inputs["reference"])[m:]
-    return ca.vertcat(e_x, rest), J, D_x, D_2
+    return ca.vertcat(e_x, rest), J, _damping(M_x, K[:m], Z[:m]), _damping(M_2, K[m:], Z[m:])
 
 
-def _damping(size: int) -> ca.Function:
-    inertia, K, Z = ca.MX.sym("M", size, size), ca.MX.sym("K", size), ca.MX.sym("Z", size)
-    return ca.Function("damping", [inertia, K, Z], [ca.densify(damping_matrix("square_root", inertia, K, Z))])
+def _damping(inertia: ca.MX, stiffness: ca.MX, damping_ratio: ca.MX) -> Damped:
+    size = inertia.shape[0]
+    M, K, Z, v = ca.MX.sym("M", size, size), *(ca.MX.sym(name, size) for name in ("K", "Z", "v"))
+    D_v = ca.Function("damping", [M, K, Z, v], [ca.densify(damped("square_root", M, K, Z, v))])
+    return lambda velocity: D_v(inertia, stiffness, damping_ratio, velocity)
 
 
 class TwoTaskLaw(Shown, ABC):
