@@ -159,6 +159,7 @@ def control_values(controller: Controller) -> dict[str, str]:
         "gain_values": ",\n".join(f"  {{{numbers(value)}}}" for value in gains.values()),
         "gain_table": "\n".join(f"| `{gain}` | {numbers(value)} |" for gain, value in gains.items()),
         "gain_arguments": "\n".join(f"  arg[{5 + i}] = gains->{gain};" for i, gain in enumerate(gains)),
+        "after_gains": str(5 + len(gains)),
         "commands_torque": str(int(torque)),
         "law": controller.formula,
         "fallback": _fallback(controller),

@@ -188,7 +188,6 @@ def _memory_values(controller: Controller, known: Mapping[str, str]) -> dict[str
         **control_values(controller),
         "fields": "\n".join(f"  double {field}[{len(value)}];" for field, value in memory.start.items()),
         "start": ",\n".join(f"  {{{numbers(value)}}}" for value in memory.start.values()),
-        "after_gains": str(first),
         "pointers": "\n".join(pointers),
         "kept": "\n".join(kept),
         "corrections": "",

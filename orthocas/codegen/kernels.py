@@ -1,6 +1,7 @@
 """CasADi functions as C kernels, with work arrays on the stack."""
 
 import re
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -8,6 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from orthocas.control.linear_algebra import LARGE_INVERSE, ROOT_TIMES, ROUNDS
 from orthocas.errors import CompileError
@@ -209,13 +211,14 @@ class Kernels:
 
     code: str
     work: dict[str, tuple[int, int, int, int]]  #: lengths of arg, res, iw and w that a call needs, by function name
+    numbers: dict[str, int]  #: length of the first output, by function name
 
     def sizes(self) -> dict[str, str]:
-        """Values of the placeholders for these lengths: NAME_arg, NAME_res, NAME_iw and NAME_w."""
+        """Values of the placeholders for these lengths: NAME_arg, NAME_res, NAME_iw, NAME_w and NAME_numbers."""
         return {
             f"{kernel}_{word}": str(max(1, size))
             for kernel, sizes in self.work.items()
-            for word, size in zip(("arg", "res", "iw", "w"), sizes, strict=True)
+            for word, size in zip(("arg", "res", "iw", "w", "numbers"), (*sizes, self.numbers[kernel]), strict=True)
         }
 
     def array_bytes(self, name: str, number_size: int) -> int:
@@ -248,7 +251,7 @@ def generate_kernels(
     code = re.sub(rf"\b(?:casadi_(?=\w)|(?={'|'.join(names)})(?=\w+\(const double\*\* arg))", f"{prefix}_", code)
     code = _without_pow(code, f"{prefix}_power")
     work = {f.name(): (f.sz_arg(), f.sz_res(), f.sz_iw(), doubles[f.name()]) for f in functions}
-    return Kernels(code, work)
+    return Kernels(code, work, {f.name(): f.numel_out(0) for f in functions})
 
 
 def _without_pow(code: str, name: str) -> str:
@@ -335,6 +338,52 @@ def _without_warnings(block: str) -> str:
     return f"{static}{{{silenced}{body}"
 
 
+def with_shared_calls(
+    functions: list[ca.Function], names: Collection[str], kept: Collection[str] = ()
+) -> list[ca.Function]:
+    """The same graphs, and a graph `shared` of what some of them call at their first input, q, more than once in all.
+
+    Args:
+        functions: graphs whose first inputs are joint positions (n, 1).
+        names: of those that share; they take what `shared` computes as an additional last input.
+        kept: names of called functions that stay as they are.
+    """
+    sharing = {function.name(): function for function in functions if function.name() in names}
+    while True:
+        counted = Counter[int]()
+        called_at_q: dict[int, ca.Function] = {}
+
+        def count(called: ca.Function, arguments: list[ca.MX]) -> None:
+            if len(arguments) == 1:
+                counted[hash(called)] += 1
+                if called_at_q.setdefault(hash(called), called) and counted[hash(called)] == 1:
+                    _replaced(called, count)
+
+        def opened(called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
+            return _content(called, arguments, kept) if counted[hash(called)] == 1 else None
+
+        for function in sharing.values():
+            _replaced(function, count)
+        changed = {name: found for name, function in sharing.items() if (found := _replaced(function, opened))}
+        if not changed:
+            break
+        sharing |= changed
+    common = [called_at_q[key] for key, calls in counted.items() if calls > 1]
+    ends = np.cumsum([0, *(called.numel_out(0) for called in common)])
+    places = {hash(called): slice(*of) for called, of in zip(common, pairwise(ends.tolist()), strict=True)}
+    shared, q = ca.MX.sym("shared", int(ends[-1])), ca.MX.sym("q", functions[0].size1_in(0))
+
+    def taken(called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
+        place = places.get(hash(called)) if len(arguments) == 1 else None
+        return None if place is None else ca.reshape(shared[place], *called.size_out(0))
+
+    for name, function in sharing.items():
+        sharing[name] = _replaced(function, taken, [shared]) or function
+    values = [ca.vec(ca.densify(called(q))) for called in common]
+    whole = [sharing.get(function.name(), function) for function in functions]
+    return [ca.Function("shared", [q], [ca.vertcat(*values)]), *whole]
+
+
 def with_turns_once(functions: list[ca.Function], kept: Collection[str] = ()) -> list[ca.Function]:
     """The same graphs, in which sines and cosines of joint positions are computed once for all that is called.
 
@@ -354,19 +403,31 @@ def with_turns_once(functions: list[ca.Function], kept: Collection[str] = ()) ->
         form = made[hash(called)]
         return None if form is None else form(*turns(arguments[0]), *arguments)
 
-    def opened(called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
-        whole = called.name() in kept or not called.is_a("MXFunction")
-        return None if whole else called.call(arguments, True, False)[0]
-
     def rewritten(function: ca.Function) -> ca.Function:
-        within = _replaced(function, opened)  # graphs in graphs
+        within = _replaced(function, lambda called, arguments: _content(called, arguments, kept))
         return (_replaced(function, given_turns) or function) if within is None else rewritten(within)
 
     return [rewritten(function) for function in functions]
 
 
-def _replaced(function: ca.Function, form: Callable[[ca.Function, list[ca.MX]], ca.MX | None]) -> ca.Function | None:
-    """A graph with other expressions for what it calls at its first input; None if there are none."""
+def _content(called: ca.Function, arguments: list[ca.MX], kept: Collection[str]) -> ca.MX | None:
+    """What a called graph consists of; None for other functions."""
+    whole = called.name() in kept or not called.is_a("MXFunction")
+    return None if whole else called.call(arguments, True, False)[0]
+
+
+def _replaced(
+    function: ca.Function,
+    form: Callable[[ca.Function, list[ca.MX]], ca.MX | None],
+    more: list[ca.MX] | None = None,
+) -> ca.Function | None:
+    """A graph with other expressions for what it calls at its first input; None if there are none.
+
+    Args:
+        function: the graph.
+        form: the expression for a called function and its arguments; None: it stays.
+        more: symbols that these expressions have, as additional inputs.
+    """
     if not function.is_a("MXFunction"):
         return None
     inputs = function.mx_in()
@@ -385,7 +446,8 @@ def _replaced(function: ca.Function, form: Callable[[ca.Function, list[ca.MX]], 
     if not old:
         return None
     outputs = ca.cse(ca.graph_substitute(outputs, old, new))  # substitution copies what is between
-    return ca.Function(function.name(), inputs, outputs, function.name_in(), function.name_out())
+    inputs, names = inputs + (more or []), function.name_in() + [symbol.name() for symbol in more or []]
+    return ca.Function(function.name(), inputs, outputs, names, function.name_out())
 
 
 def _given_turns(function: ca.Function) -> ca.Function | None:

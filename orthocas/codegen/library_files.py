@@ -12,7 +12,7 @@ from orthocas.charts.chart import Chart
 from orthocas.codegen.boundary import Source, boundary_condition
 from orthocas.codegen.description import filled
 from orthocas.codegen.interface import supervision_kernels, template_values
-from orthocas.codegen.kernels import Kernels, generate_kernels, with_turns_once
+from orthocas.codegen.kernels import Kernels, generate_kernels, with_shared_calls, with_turns_once
 from orthocas.codegen.library import GeneratedC
 from orthocas.codegen.precision import DOUBLE, SINGLE, Precision
 from orthocas.codegen.rows import names_of_files, rows_files
@@ -96,7 +96,8 @@ def _functions(source: Source, controller: Controller | None, precision: Precisi
         graph = source.graph(precision.graph(controller))
         inputs = graph.mx_in()
         boundary = boundary_condition(source, controller)
-        found += [ca.Function("control", inputs, graph.call(inputs)), *supervision_kernels(controller, boundary)]
+        law = [ca.Function("control", inputs, graph.call(inputs)), *supervision_kernels(controller, boundary)]
+        found += with_shared_calls(law, ("control", "deviation", "implied"), source.own_code)
     return with_turns_once(found, source.own_code)
 
 
@@ -116,7 +117,7 @@ def _stack_bytes(kernels: Kernels, source: Source, k: int, size: int) -> int:
     n = source.chart.n
     inverse = kernels.array_bytes("chart", size) + size * n * (n + 6)
     compose = kernels.array_bytes("dynamics", size) + size * n * (n + 5)
-    supervised = size * (9 * n + 8 * k) if k else 0
+    supervised = size * (9 * n + 8 * k + kernels.numbers["shared"]) if k else 0
     locals_ = round(_LOCALS * max(1.0, n / 7) ** 2)  # compilers keep matrices in local variables
     inner = [name for name in ("pivots", "gram", "room") if name in kernels.work]  # inside others
     clear = sum(kernels.array_bytes(name, size) for name in inner)
