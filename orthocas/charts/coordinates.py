@@ -128,9 +128,9 @@ def _from_tables(family: SelfDerivativeFamily, theta: Array, n: int) -> dict[str
     values = ca.MX(ca.DM(theta.reshape(r, family.width)))
     slopes = ca.MX(ca.DM(tables[:, :, places].reshape(n * r, len(places))))
     q, v, w = (ca.MX.sym(name, n) for name in ("q", "v", "w"))
-    jacobian = ca.reshape(slopes @ smaller_basis(q), r, n)
-    second = ca.reshape(slopes @ change(q, v), r, n) @ w
-    return _functions(values @ basis(q), jacobian, second, q, v, w)
+    jacobian, rate = (ca.reshape(slopes @ of, r, n) for of in (smaller_basis(q), change(q, v)))
+    found = _functions(values @ basis(q), jacobian, rate @ w, q, v, w)
+    return {**found, "jacobian_rate": ca.Function("dJ_xi", [q, v], [rate])}
 
 
 def _functions(xi: Any, jacobian: Any, second: Any, q: Any, v: Any, w: Any) -> dict[str, ca.Function]:
@@ -311,7 +311,12 @@ class Coordinates:
             xi.append((parts["xi"](q[active]) - ca.DM(self.offset)) * scale)
             J_active = parts["jacobian"](q[active]) * ca.repmat(scale, 1, len(active))
             J.append(J_active @ ca.DM(unit[active]) if idle else J_active)
-            second.append(parts["second_derivative"](q[active], v[active], w[active]) * scale)
+            if "jacobian_rate" in parts:
+                at, along = (ca.MX.sym(name, n) for name in ("q", "v"))  # a call with its own symbols would be opened
+                rate = parts["jacobian_rate"](at[active], along[active])
+                second.append((ca.Function("dJ_xi", [at, along], [rate])(q, v) @ w[active]) * scale)
+            else:
+                second.append(parts["second_derivative"](q[active], v[active], w[active]) * scale)
         if idle:
             xi.append(q[idle] - ca.DM(self.space.centre[idle]))
             J.append(ca.MX(ca.DM(unit[idle])))

@@ -339,49 +339,61 @@ def _without_warnings(block: str) -> str:
 
 
 def with_shared_calls(
-    functions: list[ca.Function], names: Collection[str], kept: Collection[str] = ()
+    functions: list[ca.Function], states: Mapping[str, int], kept: Collection[str] = ()
 ) -> list[ca.Function]:
-    """The same graphs, and a graph `shared` of what some of them call at their first input, q, more than once in all.
+    """The same graphs, and a graph `shared` of q and dq: what some of them call more than once in all for these alone.
 
     Args:
         functions: graphs whose first inputs are joint positions (n, 1).
-        names: of those that share; they take what `shared` computes as an additional last input.
+        states: by name, of those that share: 1 if only that input is of the state (q, dq), 2 if the second one is, too.
+            They take what `shared` computes as an additional last input.
         kept: names of called functions that stay as they are.
     """
-    sharing = {function.name(): function for function in functions if function.name() in names}
+    sharing = {function.name(): function for function in functions if function.name() in states}
     while True:
-        counted = Counter[int]()
-        called_at_q: dict[int, ca.Function] = {}
-
-        def count(called: ca.Function, arguments: list[ca.MX]) -> None:
-            if len(arguments) == 1:
+        counted, at_state = Counter[int](), dict[int, tuple[ca.Function, int]]()
+        for name, function in sharing.items():
+            for called, inputs in _called_for(function, states[name]):
                 counted[hash(called)] += 1
-                if called_at_q.setdefault(hash(called), called) and counted[hash(called)] == 1:
-                    _replaced(called, count)
+                at_state[hash(called)] = called, inputs
 
         def opened(called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
-            return _content(called, arguments, kept) if counted[hash(called)] == 1 else None
+            return None if counted[hash(called)] > 1 else _content(called, arguments, kept)
 
-        for function in sharing.values():
-            _replaced(function, count)
         changed = {name: found for name, function in sharing.items() if (found := _replaced(function, opened))}
         if not changed:
             break
         sharing |= changed
-    common = [called_at_q[key] for key, calls in counted.items() if calls > 1]
-    ends = np.cumsum([0, *(called.numel_out(0) for called in common)])
-    places = {hash(called): slice(*of) for called, of in zip(common, pairwise(ends.tolist()), strict=True)}
-    shared, q = ca.MX.sym("shared", int(ends[-1])), ca.MX.sym("q", functions[0].size1_in(0))
-
-    def taken(called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
-        place = places.get(hash(called)) if len(arguments) == 1 else None
-        return None if place is None else ca.reshape(shared[place], *called.size_out(0))
-
+    common = [found for key, found in at_state.items() if counted[key] > 1]
+    n = functions[0].size1_in(0)
+    ends = np.cumsum([0, *(called.numel_out(0) for called, _ in common)]).tolist()
+    places = {hash(called): slice(*of) for (called, _), of in zip(common, pairwise(ends), strict=True)}
+    shared, state = ca.MX.sym("shared", ends[-1]), [ca.MX.sym(name, n) for name in ("q", "dq")]
     for name, function in sharing.items():
+        given = {hash(symbol) for symbol in function.mx_in()[: states[name]]}
+
+        def taken(called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
+            place = places.get(hash(called)) if given.issuperset(map(hash, arguments)) else None
+            return None if place is None else ca.reshape(shared[place], *called.size_out(0))
+
         sharing[name] = _replaced(function, taken, [shared]) or function
-    values = [ca.vec(ca.densify(called(q))) for called in common]
+    values = [ca.vec(ca.densify(called(*state[:inputs]))) for called, inputs in common]
     whole = [sharing.get(function.name(), function) for function in functions]
-    return [ca.Function("shared", [q], [ca.vertcat(*values)]), *whole]
+    return [ca.Function("shared", state, [ca.vertcat(*values)]), *whole]
+
+
+def _called_for(function: ca.Function, states: int) -> list[tuple[ca.Function, int]]:
+    """What a graph calls for its first inputs alone, in this order, and for how many; and what that calls for q."""
+    found: list[tuple[ca.Function, int]] = []
+    given = [hash(symbol) for symbol in function.mx_in()[:states]] if function.is_a("MXFunction") else []
+
+    def seen(called: ca.Function, arguments: list[ca.MX]) -> None:
+        if list(map(hash, arguments)) == given[: len(arguments)]:
+            found.append((called, len(arguments)))
+            found.extend(_called_for(called, 1))
+
+    _replaced(function, seen)
+    return found
 
 
 def with_turns_once(functions: list[ca.Function], kept: Collection[str] = ()) -> list[ca.Function]:

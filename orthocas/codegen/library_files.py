@@ -97,7 +97,7 @@ def _functions(source: Source, controller: Controller | None, precision: Precisi
         inputs = graph.mx_in()
         boundary = boundary_condition(source, controller)
         law = [ca.Function("control", inputs, graph.call(inputs)), *supervision_kernels(controller, boundary)]
-        found += with_shared_calls(law, ("control", "deviation", "implied"), source.own_code)
+        found += with_shared_calls(law, {"control": 2, "deviation": 1, "implied": 2}, source.own_code)
     return with_turns_once(found, source.own_code)
 
 
