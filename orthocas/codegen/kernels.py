@@ -4,6 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from types import MappingProxyType
 from typing import Any
@@ -351,33 +352,28 @@ def with_shared_calls(
     """
     sharing = {function.name(): function for function in functions if function.name() in states}
     while True:
-        counted, at_state = Counter[int](), dict[int, tuple[ca.Function, int]]()
-        for name, function in sharing.items():
-            for called, inputs in _called_for(function, states[name]):
-                counted[hash(called)] += 1
-                at_state[hash(called)] = called, inputs
-
-        def opened(called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
-            return None if counted[hash(called)] > 1 else _content(called, arguments, kept)
-
+        called = [found for name, function in sharing.items() for found in _called_for(function, states[name])]
+        times = Counter(hash(function) for function, _ in called)
+        several = {key for key, count in times.items() if count > 1}
+        opened = partial(_content, kept=kept, but=several)
         changed = {name: found for name, function in sharing.items() if (found := _replaced(function, opened))}
         if not changed:
             break
         sharing |= changed
-    common = [found for key, found in at_state.items() if counted[key] > 1]
+    common = {hash(function): (function, inputs) for function, inputs in called if hash(function) in several}
     n = functions[0].size1_in(0)
-    ends = np.cumsum([0, *(called.numel_out(0) for called, _ in common)]).tolist()
-    places = {hash(called): slice(*of) for (called, _), of in zip(common, pairwise(ends), strict=True)}
+    ends = np.cumsum([0, *(function.numel_out(0) for function, _ in common.values())]).tolist()
+    places = {key: slice(*of) for key, of in zip(common, pairwise(ends), strict=True)}
     shared, state = ca.MX.sym("shared", ends[-1]), [ca.MX.sym(name, n) for name in ("q", "dq")]
+
+    def taken(given: set[int], called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
+        place = places.get(hash(called)) if given.issuperset(map(hash, arguments)) else None
+        return None if place is None else ca.reshape(shared[place], *called.size_out(0))
+
     for name, function in sharing.items():
         given = {hash(symbol) for symbol in function.mx_in()[: states[name]]}
-
-        def taken(called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
-            place = places.get(hash(called)) if given.issuperset(map(hash, arguments)) else None
-            return None if place is None else ca.reshape(shared[place], *called.size_out(0))
-
-        sharing[name] = _replaced(function, taken, [shared]) or function
-    values = [ca.vec(ca.densify(called(*state[:inputs]))) for called, inputs in common]
+        sharing[name] = _replaced(function, partial(taken, given), [shared]) or function
+    values = [ca.vec(ca.densify(function(*state[:inputs]))) for function, inputs in common.values()]
     whole = [sharing.get(function.name(), function) for function in functions]
     return [ca.Function("shared", state, [ca.vertcat(*values)]), *whole]
 
@@ -416,15 +412,17 @@ def with_turns_once(functions: list[ca.Function], kept: Collection[str] = ()) ->
         return None if form is None else form(*turns(arguments[0]), *arguments)
 
     def rewritten(function: ca.Function) -> ca.Function:
-        within = _replaced(function, lambda called, arguments: _content(called, arguments, kept))
+        within = _replaced(function, partial(_content, kept=kept))
         return (_replaced(function, given_turns) or function) if within is None else rewritten(within)
 
     return [rewritten(function) for function in functions]
 
 
-def _content(called: ca.Function, arguments: list[ca.MX], kept: Collection[str]) -> ca.MX | None:
-    """What a called graph consists of; None for other functions."""
-    whole = called.name() in kept or not called.is_a("MXFunction")
+def _content(
+    called: ca.Function, arguments: list[ca.MX], kept: Collection[str], but: Collection[int] = ()
+) -> ca.MX | None:
+    """What a called graph consists of; None for other functions, and for those with the given names and hashes."""
+    whole = called.name() in kept or hash(called) in but or not called.is_a("MXFunction")
     return None if whole else called.call(arguments, True, False)[0]
 
 
