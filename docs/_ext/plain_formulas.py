@@ -11,8 +11,8 @@ from docutils import nodes
 from numpy.typing import ArrayLike
 from sphinx import addnodes
 from sphinx.application import Sphinx
-from sphinx.transforms import SphinxTransform
 from sphinx.ext.napoleon import Config, GoogleDocstring
+from sphinx.transforms import SphinxTransform
 from sphinx.util.typing import stringify_annotation
 
 import orthocas
@@ -29,7 +29,7 @@ INDEX = re.compile(rf"(?<!\w)(d?(?:[A-Za-z]|{LETTER})|grad)_({LETTER}|[A-Za-z0-9
 WORD = re.compile(rf"(?<![\w`])(d?)({LETTER})(\d?)(?!\w|=|\.\w)")
 RAISED = re.compile(  # on pages: xi_j, |v|_A, M_φ^-1
     rf"(?P<base>(?<![A-Za-z0-9_])[dD]?(?:[^\W\d_][\u0300-\u036f]?|∇|∂|{LETTER}|leak)|[|)²])"
-    rf"_(?P<low>\{{[^}}\s]+\}}|(?<=[|²]_)[AM]⁻¹|(?:{LETTER}|[A-Za-z0-9Α-ω]{{1,3}})(?:,[A-Za-z0-9])?)(?![A-Za-z0-9_])"
+    rf"_(?P<low>\{{[^}}\s]+\}}|(?<=[|²]_)[AM]⁻¹|(?:{LETTER}|[A-Za-z0-9ξφω]{{1,3}})(?:,[A-Za-z0-9])?)(?![A-Za-z0-9_])"
     r"|\^(?P<high>-?[\d.]*\d|-?½|-?[A-Za-z]|#A?|\([^()\s]*\)|\{[^}\s]+\})(?:(?<=½)|(?![A-Za-z0-9]))"
 )
 CODES = (
@@ -127,7 +127,7 @@ def raised(text: str) -> Iterator[nodes.Node]:
     for found in RAISED.finditer(text):
         yield nodes.Text(text[end : found.start()] + _plain(found["base"] or ""))
         part, kind = (found["low"], nodes.subscript) if found["low"] else (found["high"], nodes.superscript)
-        yield kind("", _plain(part).replace("-", "−"))
+        yield kind("", _plain(part))
         end = found.end()
     yield nodes.Text(text[end:])
 
