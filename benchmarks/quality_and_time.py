@@ -124,7 +124,11 @@ def draw(points: list[Point], file: Path) -> None:
                         "weight": "bold",
                     }
                 else:
-                    side = {"16x16": (-7, -4, "right"), "32x32": (7, -4, "left")}.get(short, (7, 4, "left"))
+                    side = {
+                        "16x16": (0, -12, "center"),
+                        "32x32": (7, -4, "left"),
+                        "1000 steps of 100": (0, 9, "center"),
+                    }.get(short, (7, 4, "left"))
                     place = {
                         "xytext": side[:2],
                         "textcoords": "offset points",

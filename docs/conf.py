@@ -19,7 +19,7 @@ extensions = [
     "native_math",
     "sphinx_copybutton",
     "command_line",
-    "table_index",
+    "tables",
 ]
 exclude_patterns = ["_ext", "joss"]  # the paper is no page
 myst_enable_extensions = ["dollarmath"]

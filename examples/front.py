@@ -66,7 +66,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
 
 
 def _draw_fronts(figure: Figure, axes: Axes, lambda2: tuple[float, ...], fronts: dict[int, list[Report]]) -> None:
-    for (degree, reports), marker in zip(fronts.items(), "os", strict=False):
+    for (degree, reports), marker, side in zip(fronts.items(), "os", (1, -1), strict=False):
         task = [report.task_angle.std for report in reports]
         mutual = [report.mutual_angle.std for report in reports]
         quality = [report.conditioning.p01 for report in reports]
@@ -75,7 +75,15 @@ def _draw_fronts(figure: Figure, axes: Axes, lambda2: tuple[float, ...], fronts:
             task, mutual, c=quality, cmap="viridis", vmin=0, vmax=0.7, marker=marker, s=45, label=f"degree {degree}"
         )
         for x, y, value in zip(task, mutual, lambda2, strict=True):
-            axes.annotate(f"{value:g}", (x, y), xytext=(6, -2), textcoords="offset points", fontsize=7)
+            axes.annotate(
+                f"{value:g}",
+                (x, y),
+                xytext=(5 * side, 3 * side - 1),
+                textcoords="offset points",
+                fontsize=7,
+                horizontalalignment="left" if side > 0 else "right",
+            )
+    axes.margins(x=0.08)
     figure.colorbar(points, ax=axes, label="conditioning, 1 % quantile")
     axes.scatter(*PAPER, color="#d95f02", marker="*", s=120, label="paper's network (its own samples)")
     axes.set_yscale("log")

@@ -10,13 +10,15 @@ from orthocas.cli.demo import made
 
 
 def main(out: Path, quick: bool = False) -> dict[str, float]:
-    """Fit, evaluate and save; standard deviations [deg], conditioning and seconds.
+    """Fit, evaluate and save; standard deviations [deg], conditioning, seconds, and how far the coordinates reach.
 
     Args:
         out: folder for chart and pictures.
         quick: degree 3 and few samples.
     """
-    return made(out, quick)[1]
+    fit, found = made(out, quick)
+    reach = fit.chart.xi_range(fit.chart.problem.domain.centre)
+    return found | {f"{one.label} {end}": getattr(one, end) for one in reach for end in ("low", "high")}
 
 
 if __name__ == "__main__":

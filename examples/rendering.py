@@ -29,7 +29,7 @@ _STAY = 2e-3  # [m] and twice the sine of half an angle: what moves less is draw
 _OPACITY, _DIM = 0.42, 0.5
 _TRACE = 0.006  # radius of the path of the elbow, as a share of the arm's length
 
-Picture = NDArray[np.uint8]  #: (height, width, 3)
+Picture = NDArray[np.uint8]  #: red, green, blue and opacity, (height, width, 4)
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Layer:
 
 
 def render(layers: Sequence[Layer], camera: Camera, width: int, height: int, floor: float | None = 0.0) -> Picture:
-    """Draw layers on a white ground, with a soft shadow on the floor.
+    """Draw layers on nothing, with a soft shadow on the floor, for pages of any colour.
 
     Args:
         layers: solids in the world.
@@ -75,10 +75,10 @@ def render(layers: Sequence[Layer], camera: Camera, width: int, height: int, flo
         floor: height of the floor [m]; None for none.
     """
     size = (_SAMPLES * width, _SAMPLES * height)
-    ground = np.ones((size[1] * size[0], 3))
+    seen = np.zeros((size[1] * size[0], 4))  # colours times opacity, and opacity
     if floor is not None:
         for layer in layers:
-            ground *= 1 - layer.opacity * _shadow(layer.solids, camera, size, floor)[:, None]
+            seen[:, 3] += layer.opacity * _shadow(layer.solids, camera, size, floor) * (1 - seen[:, 3])
     drawn = [(layer.opacity, *_drawn(layer.solids, camera, size)) for layer in layers]
     near = np.stack(
         [depth + (depth > 0) * _FRONT * layer.above for layer, (_, depth, _) in zip(layers, drawn, strict=True)]
@@ -87,9 +87,16 @@ def render(layers: Sequence[Layer], camera: Camera, width: int, height: int, flo
     for place in order:
         for k, (opacity, depth, colours) in enumerate(drawn):
             here = np.flatnonzero((place == k) & (depth > 0))
-            ground[here] += opacity * (colours[here] - ground[here])
-    smooth = ground.reshape(height, _SAMPLES, width, _SAMPLES, 3).mean(axis=(1, 3))
+            seen[here] += opacity * (np.column_stack([colours[here], np.ones(len(here))]) - seen[here])
+    smooth = seen.reshape(height, _SAMPLES, width, _SAMPLES, 4).mean(axis=(1, 3))
+    smooth[..., :3] /= np.maximum(smooth[..., 3:], 1e-12)
     return np.asarray(np.round(255 * np.clip(smooth, 0, 1)), dtype=np.uint8)
+
+
+def on_white(picture: Picture) -> NDArray[np.uint8]:
+    """A picture on white, (height, width, 3)."""
+    opacity = picture[..., 3:] / 255
+    return np.asarray(np.round(picture[..., :3] * opacity + 255 * (1 - opacity)), dtype=np.uint8)
 
 
 def _drawn(solids: Sequence[Solid], camera: Camera, size: tuple[int, int]) -> tuple[Array, Array]:

@@ -5,7 +5,7 @@ from importlib.metadata import files
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageChops
+from PIL import Image
 from rendering import Picture, fan_picture
 
 import orthocas as oc
@@ -55,13 +55,10 @@ def robot_file(path: str) -> Path:
 
 
 def save_trimmed(picture: Picture, path: Path) -> None:
-    """Save a picture without its white boundaries, except for a margin."""
+    """Save a picture without its empty boundaries, except for a margin."""
     whole = Image.fromarray(picture)
-    left, upper, right, lower = ImageChops.invert(whole).getbbox() or (0, 0, *whole.size)
-    part = whole.crop((left - MARGIN, upper - MARGIN, right + MARGIN, lower + MARGIN))
-    outside = Image.new("RGB", part.size, "white")
-    outside.paste(whole, (MARGIN - left, MARGIN - upper))
-    outside.save(path, optimize=True)
+    left, upper, right, lower = whole.getchannel("A").getbbox() or (0, 0, *whole.size)
+    whole.crop((left - MARGIN, upper - MARGIN, right + MARGIN, lower + MARGIN)).save(path, optimize=True)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
-from rendering import Camera, Layer, render
+from rendering import Camera, Layer, on_white, render
 from scipy.spatial.transform import Rotation
 from self_motion_picture import POSTURE, robot_file
 
@@ -132,7 +132,7 @@ def panel(
     """The arm at q, a ghost of it at the start, and the circle of the hand."""
     ring = [capsule(a, b, (0.004, 0.004), TRACE, 6) for a, b in zip(hand[:-10:10], hand[10::10], strict=True)]
     layers = [Layer([*placed(robot, look, q), *ring]), Layer(placed(robot, look, start), 0.25)]
-    return render(layers, CAMERA, *size)
+    return on_white(render(layers, CAMERA, *size))
 
 
 def placed(robot: oc.Robot, look: Look, q: np.ndarray) -> list[Solid]:

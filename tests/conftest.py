@@ -1,6 +1,5 @@
 """Shared problems, charts and real robot descriptions; one thread for linear algebra."""
 
-import math
 import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy: threads of BLAS that spin take other processes' cores
@@ -10,6 +9,7 @@ import gc
 import json
 import signal
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
 from pathlib import Path
@@ -225,7 +225,7 @@ def drawings(request: pytest.FixtureRequest) -> dict[str, Drawing]:
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
     """Run a command of orthocas in an empty folder, in this process, without lines of progress on a busy machine."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("orthocas.cli.output.PAUSE", math.inf)
+    monkeypatch.setattr("orthocas.cli.output.PAUSE", threading.TIMEOUT_MAX)
 
     def call(*words: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["orthocas", *words])

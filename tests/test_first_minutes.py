@@ -7,7 +7,7 @@ from programs import Run
 import orthocas as oc
 from orthocas.cli import demo
 from orthocas.cli.output import lines_of_progress
-from orthocas.errors import DomainError, LawWarning, NotRedundantError
+from orthocas.errors import DomainError, InvalidValueError, LawWarning, NotRedundantError
 from orthocas.tools.progress import Progress
 
 HOME_DEG = [0.0, 30.0, 0.0, -60.0, 0.0, 45.0, 0.0]
@@ -19,6 +19,10 @@ def test_joint_positions_in_degrees_get_a_hint(iiwa: oc.Problem) -> None:
             oc.Problem(iiwa.robot, iiwa.task, domain=box)
     with pytest.raises(DomainError, match="are these degrees"):
         oc.suggest_domain(iiwa.robot, iiwa.task, home=HOME_DEG)
+    chart = oc.charts.load("panda-position")
+    for call in (chart.xi_range, chart.self_motion, chart.tracker):
+        with pytest.raises(InvalidValueError, match="are these degrees"):
+            call(HOME_DEG)
     with pytest.raises(DomainError) as far:
         oc.Problem(iiwa.robot, iiwa.task, domain=oc.Box(np.radians(HOME_DEG), 3.0))
     assert "degrees" not in str(far.value)
@@ -42,12 +46,16 @@ def test_laws_that_are_hardly_meant_warn() -> None:
     assert any("damping_ratio = 70" in remark for remark in law.remarks())
 
 
-def test_long_computations_print_a_line_now_and_then(capsys: pytest.CaptureFixture[str]) -> None:
-    show, often = lines_of_progress(10.0), lines_of_progress(0.0)
-    show(Progress("degree 4", 0.5, "loss 1"))
+def test_long_computations_print_a_line_now_and_then_also_within_a_step(capsys: pytest.CaptureFixture[str]) -> None:
+    with lines_of_progress(10.0) as show:
+        show(Progress("degree 4", 0.5, "loss 1"))
     assert capsys.readouterr() == ("", "")
-    often(Progress("degree 4", 0.5, "loss 1"))
-    assert capsys.readouterr() == ("", "note: degree 4, 50%: loss 1\n")
+    printed = ""
+    with lines_of_progress(0.01) as show:
+        show(Progress("degree 4", 0.5, "loss 1"))
+        while printed.count("degree 4") < 3:  # one report, several lines
+            printed += capsys.readouterr().err
+    assert "note: 0 s, degree 4, 50%: loss 1\n" in printed
 
 
 @pytest.mark.slow

@@ -33,7 +33,22 @@ ANSWERS = {
     ),
     "Does one (x, ξ) mean one posture?": ("how-to/inverse", "**No fold is not one solution.**"),
 }
-SEARCHED = {"joint limits": "how-to/limits", "ROS": "how-to/robots", "velocity limit": "how-to/limits"}
+SEARCHED = {
+    "joint limits": "how-to/limits",
+    "ROS": "how-to/robots",
+    "ROS 2": "how-to/robots",
+    "velocity limit": "how-to/limits",
+    "elbow": "how-to/elbow",
+    "null space": "how-to/coming_from",
+    "dual arm": "how-to/two_arms",
+    "IK": "how-to/inverse",
+    "singularity": "how-to/domains",
+    "gravity compensation": "how-to/robots",
+    "torque": "explanation/control",
+    "gripper": "tutorials/own_arm",
+    "collision avoidance": "how-to/paths",
+    "install": "index",
+}
 
 
 @pytest.mark.parametrize("question", ANSWERS)

@@ -73,6 +73,20 @@ def test_formulas_of_docstrings_become_markup() -> None:
     )
 
 
+def test_formulas_in_the_text_of_pages_get_indices_and_powers_and_names_do_not() -> None:
+    pytest.importorskip("sphinx")
+    raised = import_module("plain_formulas").raised
+
+    def shown(text: str) -> str:
+        signs = {"subscript": "<{}>", "superscript": "^<{}>"}
+        return "".join(signs.get(type(node).__name__, "{}").format(node.astext()) for node in raised(text))
+
+    assert shown("M_φ⁻¹, dξ_j(q), v_x,iᵀ and |e|²_A⁻¹") == "M<φ>⁻¹, dξ<j>(q), v<x,i>ᵀ and |e|²<A⁻¹>"
+    assert shown("K^½ZM^½ and J_x^#") == "K^<½>ZM^<½> and J<x>^<#>"
+    for name in ("planar_3r_xy", "OUTSIDE_DOMAIN", "task_std_deg", "ros2_control"):
+        assert shown(name) == name
+
+
 HOW_TO = [name for name in PAGES if name.startswith("how-to/")]
 
 

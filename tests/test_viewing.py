@@ -183,11 +183,11 @@ def test_command_line_refusals(run: Run, words: list[str], message: str) -> None
 
 
 def test_cameras_see_the_arm_in_pictures_of_every_shape() -> None:
-    """The ball around the arm, projected by hand, is within the part of the picture that no panel covers."""
+    """The ball around the arm, projected by hand, is within the picture."""
     middle, radius = np.array([0.2, -0.1, 0.5]), 0.7
     direction, up = np.array([2.0, -2.0, 1.0]) / 3, np.array([0.0, 0.0, 1.0])
-    frame = window.Framing(middle, direction, up, window._ROOM * radius / np.sin(window._VIEW_ANGLE / 2))
-    for width, height in ((1180, 900), (736, 768), (556, 700), (390, 844)):
+    frame = window.Framing(middle, direction, window._ROOM * radius / np.sin(window._VIEW_ANGLE / 2))
+    for width, height in ((1180, 900), (736, 768), (472, 800), (390, 422)):
         position, look_at = frame.seen_from(width, height)
         ahead = (look_at - position) / np.linalg.norm(look_at - position)
         right = np.cross(ahead, up) / np.linalg.norm(np.cross(ahead, up))
@@ -195,6 +195,4 @@ def test_cameras_see_the_arm_in_pictures_of_every_shape() -> None:
         points = np.random.default_rng(7).normal(size=(500, 3))
         seen = (middle + radius * points / np.linalg.norm(points, axis=1)[:, None] - position) @ axes.T
         pixels = height / 2 / np.tan(window._VIEW_ANGLE / 2) * seen[:, :2] / seen[:, 2:]
-        assert (np.abs(pixels[:, 0]) < width / 2).all()
-        assert (pixels[:, 1] < height / 2).all()
-        assert (pixels[:, 1] > (0 if width < 480 else -height / 2)).all()
+        assert (np.abs(pixels) < np.array([width, height]) / 2).all()

@@ -1,16 +1,18 @@
-"""Docstrings as pages show them: formulas with Greek letters, indices and powers, and links to pages and names.
+"""Formulas that are written as plain text, J_x A^-1 J_xi^T = 0, get indices and powers on the pages.
 
-The docstrings themselves are plain text, for `help` and editors: J_x A^-1 J_xi^T = 0, docs/explanation/angles.md,
-[AS2023].
+Docstrings are plain text for `help` and editors; on pages they also get Greek letters, and links to pages and names.
 """
 
 import re
 from collections.abc import Iterator
 from typing import Any
 
+from docutils import nodes
 from numpy.typing import ArrayLike
+from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.ext.napoleon import Config, GoogleDocstring
+from sphinx.transforms import SphinxTransform
 from sphinx.util.typing import stringify_annotation
 
 import orthocas
@@ -25,6 +27,20 @@ LINKED = re.compile(rf"`(?:orthocas\.|oc\.)?((?:{'|'.join(orthocas.__all__)})(?:
 POWER = re.compile(r"\^(-?\d+|-?T|#A?|\*|\{[^}\s]+\})")
 INDEX = re.compile(rf"(?<!\w)(d?(?:[A-Za-z]|{LETTER})|grad)_({LETTER}|[A-Za-z0-9]{{1,3}}|\{{[^}}\s]+\}})(?!\w)")
 WORD = re.compile(rf"(?<![\w`])(d?)({LETTER})(\d?)(?!\w|=|\.\w)")
+RAISED = re.compile(  # on pages: xi_j, |v|_A, M_φ^-1
+    rf"(?P<base>(?<![A-Za-z0-9_])[dD]?(?:[^\W\d_][\u0300-\u036f]?|∇|∂|{LETTER}|leak)|[|)²])"
+    rf"_(?P<low>\{{[^}}\s]+\}}|(?<=[|²]_)[AM]⁻¹|(?:{LETTER}|[A-Za-z0-9ξφω]{{1,3}})(?:,[A-Za-z0-9])?)(?![A-Za-z0-9_])"
+    r"|\^(?P<high>-?[\d.]*\d|-?½|-?[A-Za-z]|#A?|\([^()\s]*\)|\{[^}\s]+\})(?:(?<=½)|(?![A-Za-z0-9]))"
+)
+CODES = (
+    nodes.literal,
+    nodes.FixedTextElement,
+    nodes.math,
+    nodes.raw,
+    addnodes.desc_signature,
+    addnodes.literal_strong,
+    addnodes.literal_emphasis,
+)
 PAGE = re.compile(r"docs/([\w/-]+)\.md(?:#[\w-]+)?")
 CITED = re.compile(r"\[([A-Z]{1,5}\d{4})\]")
 TYPES = {stringify_annotation(kind, "smart"): name for kind, name in ((ArrayLike, "ArrayLike"), (Array, "Array"))}
@@ -86,8 +102,39 @@ def shortened(app: Sphinx, what: str, name: str, thing: Any, options: Any, words
     return words, result
 
 
+class Raised(SphinxTransform):
+    """Sets the indices and powers in the text of a page."""
+
+    default_priority = 500
+
+    def apply(self) -> None:
+        """Called by Sphinx for each page."""
+        for text in list(self.document.findall(nodes.Text)):
+            if RAISED.search(text) and not any(isinstance(node, CODES) for node in ancestors(text)):
+                text.parent.replace(text, list(raised(text)))
+
+
+def ancestors(node: nodes.Node) -> Iterator[nodes.Node]:
+    """What a node lies in."""
+    while node.parent is not None:
+        node = node.parent
+        yield node
+
+
+def raised(text: str) -> Iterator[nodes.Node]:
+    """A text in pieces: "dξ_j" is "dξ" and an index."""
+    end = 0
+    for found in RAISED.finditer(text):
+        yield nodes.Text(text[end : found.start()] + _plain(found["base"] or ""))
+        part, kind = (found["low"], nodes.subscript) if found["low"] else (found["high"], nodes.superscript)
+        yield kind("", _plain(part))
+        end = found.end()
+    yield nodes.Text(text[end:])
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Register with autodoc."""
+    """Register with autodoc and Sphinx."""
+    app.add_transform(Raised)
     app.connect("autodoc-process-docstring", rewrite)
     app.connect("autodoc-process-signature", shortened)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from orthocas.charts.quality import Report
 
 _MOST_POSTURES = 1000
+_PANELS = 2  #: side by side
 _TASK, _EXTRA, _LEAK = "#1f5fa8", "#d95f02", "#5a9e6f"
 
 
@@ -50,17 +51,20 @@ def self_motion_figure(chart: "Chart", postures: int = 9, reach: float | None = 
     require_count("postures", postures, most=_MOST_POSTURES)
     if reach is not None:
         require_at_least("reach", reach, 0)
-    figure = Picture(figsize=(3.0 * chart.r, 3.5), layout=ConstrainedLayoutEngine(h_pad=0.15, w_pad=0.1))
+    columns = min(chart.r, _PANELS)
+    rows = -(-chart.r // columns)
+    figure = Picture(figsize=(4.5 * columns, 3.9 * rows), layout=ConstrainedLayoutEngine(h_pad=0.15, w_pad=0.1))
     sweeps = [_sweep(chart, j, postures, reach) for j in range(chart.r)]
     everything = chart.problem.robot.joint_points(np.concatenate(sweeps)).reshape(-1, 3)
     colours = mpl.colormaps["viridis"](np.linspace(0.1, 0.9, postures))
     for j, sweep in enumerate(sweeps):
-        panel = figure.add_subplot(1, chart.r, j + 1, projection="3d")
+        panel = figure.add_subplot(rows, columns, j + 1, projection="3d")
         for points, colour in zip(chart.problem.robot.joint_points(sweep), colours, strict=True):
-            panel.plot(*points.T, "-o", color=colour, markersize=2.5, linewidth=1.5)
+            panel.plot(*points.T, "-o", color=colour, markersize=3, linewidth=1.8)
         moved = np.abs(chart.task(sweep) - chart.task(chart.problem.domain.centre)).max()
         low, high = chart.xi(sweep[[0, -1]])[:, j]
-        panel.set_title(rf"$\xi_{j + 1}$ from {low:.3g} to {high:.3g}" + f"\ntask moves {_bound(moved)}", fontsize=10)
+        title = rf"$\xi_{{{j + 1}}}$ from {low:.3g} to {high:.3g}, dark to light"
+        panel.set_title(f"{title}\ntask moves {_bound(moved)}", fontsize=10)
         _equal_axes(panel, everything)
     return figure
 
@@ -117,9 +121,11 @@ def _equal_axes(axes: Any, points: Array) -> None:
         getattr(axes, f"{name}axis").labelpad = -3
     axes.tick_params(labelsize=7, pad=0)
     axes.locator_params(nbins=4)
-    axes.set_box_aspect((1, 1, 1), zoom=0.85)
+    axes.set_box_aspect((1, 1, 1), zoom=1.05)
     flat = (high - low)[2] < 1e-9
     axes.view_init(elev=90 if flat else 22, azim=-90 if flat else -60)
+    if flat:
+        axes.set(zticks=[], zlabel="")
 
 
 def _bound(length: float) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.charts.newton import Newton
 from orthocas.charts.phi import counted_on, largest, require_no_turns
-from orthocas.errors import InvalidValueError
+from orthocas.errors import InvalidValueError, degrees_hint
 from orthocas.tasks.domains import bounds_of, contains
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, Indices, as_number, as_point, frozen_array, require_count
@@ -371,7 +371,8 @@ def start_inside(chart: "Chart", q: ArrayLike) -> Array:
     given = point.round(4).tolist()
     if not contains(chart.problem.domain, point):
         stop = Walls(chart.problem).worst(point)
-        raise InvalidValueError("q", given, f"a point of the domain, which ends at {stop}")
+        hint = degrees_hint(*point[~np.array(chart.problem.robot.tree.prismatic)])
+        raise InvalidValueError("q", given, f"a point of the domain, which ends at {stop}{hint}")
     if not (np.isfinite(chart.phi(point)).all() and np.isfinite(chart.batched_rates(point[None])).all()):
         raise InvalidValueError("q", given, "a point at which the chart is finite")
     return point

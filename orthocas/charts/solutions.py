@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocas.charts.newton import GOAL, REFRESHES, Bound, PointFunctions, PointSolver
 from orthocas.charts.phi import PhiMap
-from orthocas.errors import DomainError, InvalidValueError, InverseError
-from orthocas.tasks.domains import Domain, contains, reach
+from orthocas.errors import DomainError, InvalidValueError, InverseError, degrees_hint
+from orthocas.tasks.domains import Domain, bounds_of, contains, reach
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, Indices, as_float_array, as_point, require_shape
@@ -211,7 +211,8 @@ class Tracker(Shown):
         """
         point = as_point("q", q, len(self._limit))
         if not contains(self._domain, point):
-            raise InvalidValueError("q", point.tolist(), "a point of the domain")
+            hint = degrees_hint(*point[np.isfinite(bounds_of(self._domain)[0])])
+            raise InvalidValueError("q", point.tolist(), f"a point of the domain{hint}")
         self._solver.q[:] = point
         if not self._solver.refresh():
             raise InvalidValueError("q", point.tolist(), "a point where J is regular")

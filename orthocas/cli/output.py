@@ -2,6 +2,7 @@
 
 import inspect
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -119,24 +120,29 @@ def report_rows(report: "Report") -> dict[str, str]:
 @contextmanager
 def terminal_monitor() -> Iterator[Monitor]:
     """A monitor that draws one bar per stage; a line every ten seconds when standard error is not a terminal."""
-    if not sys.stderr.isatty():
-        yield lines_of_progress(PAUSE)
-        return
-    with _stage_bars() as show:
+    with _stage_bars() if sys.stderr.isatty() else lines_of_progress(PAUSE) as show:
         yield show
 
 
-def lines_of_progress(pause: float) -> Monitor:
-    """A monitor that prints where a long computation is, at most once every `pause` seconds."""
-    last = time.monotonic()
+@contextmanager
+def lines_of_progress(pause: float) -> Iterator[Monitor]:
+    """A monitor whose last report is printed every `pause` seconds, also while one step takes longer than that."""
+    begin, reports, ended = time.monotonic(), [""], threading.Event()
 
     def show(progress: Progress) -> None:
-        nonlocal last
-        if (now := time.monotonic()) - last >= pause:
-            last = now
-            note(f"{progress.stage}, {progress.fraction:.0%}: {progress.detail}")
+        reports[0] = f", {progress.stage}, {progress.fraction:.0%}: {progress.detail}"
 
-    return show
+    def speak() -> None:
+        while not ended.wait(pause):
+            note(f"{time.monotonic() - begin:.0f} s{reports[0]}")
+
+    speaker = threading.Thread(target=speak, daemon=True)
+    speaker.start()
+    try:
+        yield show
+    finally:
+        ended.set()
+        speaker.join()
 
 
 @contextmanager

@@ -35,12 +35,13 @@
     };
   }
 
-  // On phones the panel is as wide as the screen and leaves half of it to the arm.
+  // On phones the panel is as wide as the screen, and the scene has the upper half.
   function styled() {
     const style = document.createElement("style");
     style.textContent = `@media (max-width: 576px) {
       div[style*="max-height: 60%"] { width: 100% !important; max-height: 50% !important }
       div[style*="max-height: 60%"] div[style*="width: 20em"] { width: 100% !important }
+      div:has(> div > canvas[style*="pointer-events: none"]) { height: 50% !important }
     }`;
     document.head.append(style);
   }

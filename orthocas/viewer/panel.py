@@ -19,7 +19,7 @@ STYLE = """<style>
 .oc h4{font-size:11px;letter-spacing:.06em;text-transform:uppercase;color:#7a828c;margin:14px 0 5px;font-weight:600}
 .oc .name{font-size:16px;font-weight:650}.oc .about{color:#6a727c;font-size:12px}
 .oc .row{display:grid;grid-template-columns:8em 1fr 4.6em;gap:8px;align-items:center;margin:3px 0}
-.oc .row>span:first-child{overflow:hidden;text-overflow:ellipsis;white-space:nowrap}
+.oc .row>span:first-child{overflow-wrap:anywhere}
 .oc .row>b{font-weight:500;text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap}
 .oc .bar{position:relative;height:8px;border-radius:4px;background:#e9ecef}
 .oc .bar i{position:absolute;top:0;bottom:0;border-radius:4px}

@@ -66,7 +66,6 @@ _SCRIPT = Path(__file__).with_name("page.js")
 _PANELS = 320, 300  # [px] widths of readings and sliders
 _VIEW_ANGLE = 0.7  # [rad] of the camera
 _ROOM = 1.15  # around the arms in the picture
-_PHONE, _COVERED = 480, 0.5  # [px] width of a screen up to which the panel lies on the scene, and the share it covers
 _NEAR = 1e-3  # share of the distance of a camera within which it stands where it was placed
 _FLAT = 1e-9
 _FLOOR, _FADE, _LINE = (
@@ -504,7 +503,7 @@ def place_camera(server: Any, robot: Robot, q: Array, shift: Array | None = None
     middle, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 0.4 * chain_length(robot.tree))
     up = up_of(robot)
     server.scene.set_up_direction(tuple(up))
-    frame = Framing(middle, direction_of_camera(robot), up, _ROOM * radius / np.sin(_VIEW_ANGLE / 2))
+    frame = Framing(middle, direction_of_camera(robot), _ROOM * radius / np.sin(_VIEW_ANGLE / 2))
     camera = server.initial_camera
     camera.fov = _VIEW_ANGLE
     position, look_at = frame.seen_from(1, 1)
@@ -518,20 +517,11 @@ class Framing:
 
     middle: Array  #: of the arms (3,) [m]
     direction: Array  #: unit vector to the camera (3,)
-    up: Array  #: (3,)
     distance: float  #: of the camera for a picture that is as wide as high, or wider [m]
 
     def seen_from(self, width: float, height: float) -> tuple[Array, Array]:
-        """Position of the camera and the point that it looks at (3,) [m], for a picture of a size in pixels.
-
-        On phones, the panel covers the lower half.
-        """
-        free = height * (1 - _COVERED if 1 < width <= _PHONE else 1.0)
-        distance = self.distance * height / min(width, free)
-        across = self.up - (self.up @ self.direction) * self.direction
-        across = across if np.linalg.norm(across) > _FLAT else np.array([0.0, 1.0, 0.0])  # looking down
-        below = (height - free) / height * distance * np.tan(_VIEW_ANGLE / 2) * across / np.linalg.norm(across)
-        return self.middle + distance * self.direction - below, self.middle - below
+        """Position of the camera and the point that it looks at (3,) [m], for a picture of a size in pixels."""
+        return self.middle + self.distance * height / min(width, height) * self.direction, self.middle
 
     def keep(self, client: Any) -> None:
         """Place the camera of a browser anew when its picture changes its shape."""
