@@ -56,7 +56,7 @@ def law_form(law: Impedance | PDPlus) -> Form:
         "limit": law.limit,
     }
     tables = {name: value[:, None] for name, value in columns.items()}
-    tables |= {"identity": np.eye(n), "reach": np.array([domain.centre - bound, domain.centre + bound])[:, :, None]}
+    tables["reach"] = np.array([domain.centre - bound, domain.centre + bound])[:, :, None]
     damping = _DAMPING[law.damping].replace("@softest@", repr(SOFTEST)).replace("@least@", repr(SOFTEST))
     values = {
         "formula": law.formula,
