@@ -10,7 +10,14 @@ from orthocas.tasks.domains import Domain, FoldBound, PathBound, SingularBound, 
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
 
-STATUSES = ("FOUND", "NEAREST", "OUTSIDE_DOMAIN", "LIMIT", "NOT_FOUND", "BAD_INPUT")  #: those of `InverseStatus` in modules
+STATUSES = (
+    "FOUND",
+    "NEAREST",
+    "OUTSIDE_DOMAIN",
+    "LIMIT",
+    "NOT_FOUND",
+    "BAD_INPUT",
+)  #: those of `InverseStatus` in modules
 _SLACK = 1e-9  # of the half-widths: rounding at boundaries and joint limits
 _PARALLEL, _POINTS = 1e-12, 8  # gradients that differ by less count as the same; where they are compared
 
