@@ -1,4 +1,4 @@
-"""The nearest xi of exported modules: feasible, no worse than what others find, with derivatives, in three libraries."""
+"""The nearest xi of exported modules: feasible, no worse than what others find, with derivatives."""
 
 import sys
 from collections.abc import Callable

@@ -93,8 +93,8 @@ def export(chart: Chart | Impedance | PDPlus, to: str, path: str | Path, force: 
     """Write a chart as a Python module that needs one library only: "numpy", "torch" or "jax".
 
     The module has the functions `task`, `xi`, `phi` and `jacobian` of joint positions (n,) or (N, n), as a chart does,
-    and `inverse` of phi from given starts. Numbers are those of the chart to rounding. With PyTorch and JAX they are
-    differentiable, run on GPUs, and keep the precision of q; see docs/how-to/export.md.
+    `inverse` of phi from given starts, and `nearest_xi`. Numbers are those of the chart to rounding. With PyTorch and
+    JAX they are differentiable, run on GPUs, and keep the precision of q; see docs/how-to/export.md.
 
     For `control.PDPlus` and `control.Impedance`, and PyTorch or JAX, the module of the law's chart also has `command`,
     the torques of the law with their status.
