@@ -35,6 +35,7 @@ import suggested_domains
 import supervised_tick
 import wide_charts
 import xi_in_qp
+import xi_in_solvers
 from paper.registry import FIGURES
 from PIL import Image
 from programs import needs_c
@@ -290,6 +291,20 @@ def test_xi_in_an_inverse_dynamics_leaves_the_tool_alone_at_any_weight() -> None
     found = xi_in_qp.in_dynamics(quick=True)
     errors = {kind: [found[f"{kind}, weight {w:g}, error [m]"] for w in xi_in_qp.WEIGHTS] for kind in ("posture", "xi")}
     assert errors["xi"][2] < 1.01 * errors["xi"][0] < 5e-6 < errors["posture"][1] < errors["posture"][2] / 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("title", xi_in_solvers.WEIGHTS)
+def test_xi_in_other_solvers_leaves_the_tool_alone_at_any_weight(title: str) -> None:
+    """The recipes of docs/how-to/qp.md, which need environments of their own."""
+    pytest.importorskip(title.lower(), reason="needs an older Pinocchio, see docs/how-to/qp.md")
+    measured, code = xi_in_solvers.MEASURED[title], xi_in_solvers.part(title)
+    errors = {
+        kind: [measured(code, kind, weight, False)[0] for weight in xi_in_solvers.WEIGHTS[title]]
+        for kind in ("posture", "xi")
+    }
+    assert max(errors["xi"]) < 5e-6
+    assert errors["posture"][2] > 20 * errors["xi"][2]
 
 
 def test_gradients_agree_with_pytorch() -> None:
