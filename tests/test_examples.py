@@ -13,6 +13,7 @@ import distillation
 import domain_size
 import elbow_angle
 import exported_inverse
+import exported_nearest
 import fits
 import folds
 import follow_path
@@ -29,6 +30,7 @@ import numpy as np
 import paper_network
 import pytest
 import quality_and_time
+import random_walk
 import scaling
 import starts
 import suggested_domains
@@ -276,6 +278,19 @@ def test_benchmark_of_exported_inverses_finds_the_answers_of_the_chart() -> None
     found = exported_inverse.main(quick=True)
     assert found["panda, pose, wide, numpy, difference [rad]"] < 1e-9
     assert found["iiwa, position, degree 4, numpy, other status"] == 0
+
+
+@pytest.mark.slow
+def test_benchmark_of_the_nearest_xi_finds_the_answers_of_the_chart() -> None:
+    found = exported_nearest.main(quick=True)
+    assert found["iiwa7-pose, numpy, as the chart [%]"] == 100.0
+
+
+@pytest.mark.slow
+def test_benchmark_of_random_walks_breaks_no_limit() -> None:
+    found = random_walk.main(quick=True)
+    assert found["one arm, beyond joint limits"] == 0
+    assert found.get("many arms, JAX, beyond joint limits", 0) == 0
 
 
 @pytest.mark.slow
