@@ -88,7 +88,7 @@ def test_python_blocks_of_the_page_on_atlases_run(tmp_path: Path) -> None:
 def test_python_blocks_of_the_page_on_batches_run(run: Run, tmp_path: Path) -> None:
     code = "\n".join(blocks("python", "how-to/export.md"))
     printed = python(f"{code}\nchart.save('arm.orthocas')", tmp_path).splitlines()
-    assert printed == ["(100000, 3) (100000, 3, 3)", "True ('x', 'y', 'xi1')", "True", "True True"]
+    assert printed == ["(100000, 3) (100000, 3, 3)", "True ('x', 'y', 'xi1')", "True", "True True", "True True"]
     (line,) = blocks("sh", "how-to/export.md")
     assert run(*shlex.split(line)[1:])[0] == 0
     assert "import torch" in (tmp_path / "arm.py").read_text()

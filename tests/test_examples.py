@@ -13,6 +13,7 @@ import distillation
 import domain_size
 import elbow_angle
 import exported_inverse
+import exported_nearest
 import fits
 import folds
 import follow_path
@@ -29,12 +30,14 @@ import numpy as np
 import paper_network
 import pytest
 import quality_and_time
+import random_walk
 import scaling
 import starts
 import suggested_domains
 import supervised_tick
 import wide_charts
 import xi_in_qp
+import xi_in_solvers
 from paper.registry import FIGURES
 from PIL import Image
 from programs import needs_c
@@ -278,6 +281,19 @@ def test_benchmark_of_exported_inverses_finds_the_answers_of_the_chart() -> None
 
 
 @pytest.mark.slow
+def test_benchmark_of_the_nearest_xi_finds_the_answers_of_the_chart() -> None:
+    found = exported_nearest.main(quick=True)
+    assert found["iiwa7-pose, numpy, as the chart [%]"] == 100.0
+
+
+@pytest.mark.slow
+def test_benchmark_of_random_walks_breaks_no_limit() -> None:
+    found = random_walk.main(quick=True)
+    assert found["one arm, beyond joint limits"] == 0
+    assert found.get("many arms, JAX, beyond joint limits", 0) == 0
+
+
+@pytest.mark.slow
 def test_benchmark_of_xi_in_a_quadratic_program_leaves_the_tool_alone() -> None:
     pytest.importorskip("pink", reason="pink is in the extra `peers`")
     found = xi_in_qp.main(quick=True)
@@ -290,6 +306,20 @@ def test_xi_in_an_inverse_dynamics_leaves_the_tool_alone_at_any_weight() -> None
     found = xi_in_qp.in_dynamics(quick=True)
     errors = {kind: [found[f"{kind}, weight {w:g}, error [m]"] for w in xi_in_qp.WEIGHTS] for kind in ("posture", "xi")}
     assert errors["xi"][2] < 1.01 * errors["xi"][0] < 5e-6 < errors["posture"][1] < errors["posture"][2] / 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("title", xi_in_solvers.WEIGHTS)
+def test_xi_in_other_solvers_leaves_the_tool_alone_at_any_weight(title: str) -> None:
+    """The recipes of docs/how-to/qp.md, which need environments of their own."""
+    pytest.importorskip(title.lower(), reason="needs an older Pinocchio, see docs/how-to/qp.md")
+    measured, code = xi_in_solvers.MEASURED[title], xi_in_solvers.part(title)
+    errors = {
+        kind: [measured(code, kind, weight, False)[0] for weight in xi_in_solvers.WEIGHTS[title]]
+        for kind in ("posture", "xi")
+    }
+    assert max(errors["xi"]) < 5e-6
+    assert errors["posture"][2] > 20 * errors["xi"][2]
 
 
 def test_gradients_agree_with_pytorch() -> None:

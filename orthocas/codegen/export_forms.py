@@ -63,7 +63,7 @@ def tape_lines(tape: Tape) -> list[str]:
     lines: list[str] = []
     known: dict[int, str] = {}  # words for the constants in work slots
     results: dict[int, str] = {}
-    for name, into, *of in tape["steps"]:
+    for (name, into, *of), uses in zip(tape["steps"], _uses(tape["steps"]), strict=True):
         if name == "const":
             known[into] = _literal(float(of[0]))
         elif name == "output":
@@ -72,8 +72,19 @@ def tape_lines(tape: Tape) -> list[str]:
         else:
             text = f"q[{of[0]}]" if name == "input" else _operation(name, of, known)
             known.pop(into, None)
-            lines.append(f"w{into} = {text}")
+            lines.append(f"w{into} = _shared({text}, q)" if uses > 1 and name != "input" else f"w{into} = {text}")
     return [*lines, f"return np.stack([{', '.join(results[k] for k in range(len(results)))}])"]
+
+
+def _uses(steps: Sequence[Sequence[Any]]) -> list[int]:
+    """How many operands of later steps each step's result is."""
+    found, writer = [0] * len(steps), dict[int, int]()
+    for k, (name, into, *of) in enumerate(steps):
+        for slot in () if name in ("const", "input") else of:
+            found[writer[slot]] += 1
+        if name != "output":
+            writer[into] = k
+    return found
 
 
 def _operation(name: str, of: list[Any], known: dict[int, str]) -> str:
@@ -211,8 +222,7 @@ def product_form(coordinates: Coordinates) -> Form | None:
     functions = family.basis(q[coordinates.active])[[rows[term] for term in plan.levels[0]]]
     code = function_code("_one_joint", "Functions of one joint each, (k, N).", dense_function("f", [q], [functions]))
     tables = _coefficients(coordinates, plan, rows) | _slopes(coordinates, slopes, plan, rows)
-    lower = [k for k, term in enumerate(plan.terms) if term in plan.lower]
-    return Form("products", plan.counts, code, tables, plan.indices | {"lower": lower})
+    return Form("products", plan.counts, code, tables, plan.indices)
 
 
 def _coefficients(coordinates: Coordinates, plan: Plan, rows: dict[Term, int]) -> dict[str, Array]:

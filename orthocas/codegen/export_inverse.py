@@ -6,11 +6,18 @@ import numpy as np
 from orthocas.charts.chart import Chart
 from orthocas.charts.solutions import InverseStatus
 from orthocas.codegen.export_forms import Form, function_code
-from orthocas.tasks.domains import FoldBound, PathBound, SingularBound, bounds_of, sample_uniform
+from orthocas.tasks.domains import Domain, FoldBound, PathBound, SingularBound, bounds_of, sample_uniform
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
 
-STATUSES = ("FOUND", "OUTSIDE_DOMAIN", "LIMIT", "NOT_FOUND", "BAD_INPUT")  #: those of `InverseStatus` in modules
+STATUSES = (
+    "FOUND",
+    "NEAREST",
+    "OUTSIDE_DOMAIN",
+    "LIMIT",
+    "NOT_FOUND",
+    "BAD_INPUT",
+)  #: those of `InverseStatus` in modules
 _SLACK = 1e-9  # of the half-widths: rounding at boundaries and joint limits
 _PARALLEL, _POINTS = 1e-12, 8  # gradients that differ by less count as the same; where they are compared
 
@@ -21,8 +28,11 @@ def statuses() -> str:
 
 
 def inverse_forms(chart: Chart) -> list[Form]:
-    """The function `_inverse` of columns phi and q_start (2 n, N), and what it calls beside the functions of phi."""
-    return [_newton(chart), *_condition(chart)]
+    """The functions `_inverse` of columns phi and q_start (2 n, N), and `_nearest` of columns q_wish and x (n + m, N).
+
+    And what they call beside the functions of phi.
+    """
+    return [_newton(chart), *_condition(chart), _nearest(chart)]
 
 
 def _newton(chart: Chart) -> Form:
@@ -50,8 +60,28 @@ def _newton(chart: Chart) -> Form:
     return Form("inverse", {"rates": rates}, "\n\n".join(functions), tables, {})
 
 
+def _nearest(chart: Chart) -> Form:
+    """Steps to the nearest xi, with the box of the domain."""
+    domain = chart.problem.domain
+    tables = {
+        "range": np.array(bounds_of(domain))[:, :, None],
+        "half_width": domain.half_width[:, None],
+        "identity": np.eye(chart.n + _rooms(domain)),
+    }
+    return Form("nearest", {"rooms": str(_rooms(domain))}, "", tables, {})
+
+
+def _rooms(domain: Domain) -> int:
+    """How many numbers are positive inside a domain, beside the bounds of joints."""
+    if domain.singular_bound is not None:
+        return 1 if domain.fold_bound is None else 2
+    if domain.path_bound is not None:
+        return 1
+    return 0 if domain.condition is None else int(domain.condition.pivots.size1_out(0))
+
+
 def _condition(chart: Chart) -> list[Form]:
-    """The function `_meets_condition` of columns q (n, N) -> (N,), for what a domain asks beside its box."""
+    """The function `_room` of columns q (n, N) -> (rooms, N), for what a domain asks beside its box."""
     domain = chart.problem.domain
     if domain.singular_bound is not None:
         fold = domain.fold_bound
@@ -70,7 +100,7 @@ def _clear(chart: Chart, clear: SingularBound, fold: FoldBound | None) -> Form:
     values = {
         "squared_bound": repr(clear.least_singular_value**2),
         "and_regular": "" if fold is None else ", and the coordinates do not fold",
-        "fold": "" if fold is None else " & _is_regular(q, rows)",
+        "fold": "" if fold is None else ", _room_to_fold(q, rows)",
     }
     tables = {"row_scale": clear.scale[:, None], "unit": np.eye(chart.m)}
     return Form("clear", values, code, tables, {})

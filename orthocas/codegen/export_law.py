@@ -44,7 +44,7 @@ def law_form(law: Impedance | PDPlus) -> Form:
     Raises:
         InvalidValueError: if the law takes inputs at run time, such as a payload or a given mass matrix.
     """
-    model, n = law.model, law.chart.n
+    model = law.model
     if model.gains(law.problem, law.feed_forward):
         raise InvalidValueError("model of the law", ", ".join(model.gains(law.problem, law.feed_forward)), "its own")
     bound, domain = reach(law.problem.domain), law.problem.domain
@@ -56,7 +56,7 @@ def law_form(law: Impedance | PDPlus) -> Form:
         "limit": law.limit,
     }
     tables = {name: value[:, None] for name, value in columns.items()}
-    tables |= {"identity": np.eye(n), "reach": np.array([domain.centre - bound, domain.centre + bound])[:, :, None]}
+    tables["reach"] = np.array([domain.centre - bound, domain.centre + bound])[:, :, None]
     damping = _DAMPING[law.damping].replace("@softest@", repr(SOFTEST)).replace("@least@", repr(SOFTEST))
     values = {
         "formula": law.formula,
