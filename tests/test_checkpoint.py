@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from programs import python
+from programs import nightly, python
 
 import orthocas as oc
 from orthocas import solvers
@@ -248,7 +248,7 @@ LONG = [
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fit", LONG, ids=["gauss_newton", "gradient_flow"])
+@pytest.mark.parametrize("fit", [LONG[0], *nightly(LONG[1])], ids=["gauss_newton", "gradient_flow"])
 def test_process_killed_at_any_time_loses_nothing(planar_x: oc.Problem, tmp_path: Path, fit: str) -> None:
     """SIGKILL a random time after the first iteration, twice, in the middle of an iteration or of a write."""
     parametrisation, solver = eval(fit, {"oc": oc, "solvers": solvers})

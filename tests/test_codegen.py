@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 from charts import linear_on_the_torus
 from conftest import ROBOTS, arm, pinocchio_position
-from programs import needs_c
+from programs import needs_c, nightly
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared, gain_numbers
@@ -31,6 +31,8 @@ pytestmark = needs_c
 
 
 Generated = tuple[GeneratedC, Controller]
+#: with joints that turn, slide, turn without end, and a tree of them
+KINDS = ("panda", "tiago with its prismatic torso", "double pendulum, continuous", "talos, both arms and the torso")
 
 
 def laws(chart: oc.Chart) -> list[Controller]:
@@ -156,7 +158,7 @@ def test_check_is_fair_near_singularities(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", [*KINDS, *nightly(*sorted(ROBOTS.keys() - KINDS))])
 def test_compiled_kinematics_and_dynamics_match_pinocchio(name: str, tmp_path: Path) -> None:
     """Nothing of ours between the compiled library and Pinocchio's numbers."""
     model, tip = arm(name)

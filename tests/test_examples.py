@@ -53,6 +53,7 @@ def test_demo_saves_chart_and_pictures(tmp_path: Path) -> None:
         assert (tmp_path / name).stat().st_size > 10_000
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_fit_benchmark_prints_rows() -> None:
     rows = fits.main(quick=True)
@@ -60,6 +61,7 @@ def test_fit_benchmark_prints_rows() -> None:
     assert rows[0].startswith("| iiwa | polynomial:2 |")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_fold_benchmark_finds_none() -> None:
     (line,) = folds.main(quick=True)
@@ -68,6 +70,7 @@ def test_fold_benchmark_finds_none() -> None:
     assert searched <= min(uniform, heavy)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_benchmark_of_paths_keeps_limits_and_closes() -> None:
     rows = following.main(quick=True)
@@ -88,6 +91,7 @@ def test_path_past_a_post(tmp_path: Path) -> None:
         assert picture.size[0] > 1000
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_quality_and_time_are_drawn_for_two_degrees(tmp_path: Path) -> None:
     low, high = quality_and_time.main(tmp_path, quick=True)
@@ -95,12 +99,14 @@ def test_quality_and_time_are_drawn_for_two_degrees(tmp_path: Path) -> None:
     assert (tmp_path / "front_seconds.png").stat().st_size > 10_000
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_certificate_benchmark_proves_its_box() -> None:
     (line,) = certificates.main(quick=True)
     assert "| 100% |" in line
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_scaling_benchmark_prints_rows() -> None:
     assert len(scaling.main(quick=True)) == 2
@@ -163,6 +169,7 @@ def test_a_clear_box_takes_for_clear_what_pinocchio_does() -> None:
     assert frame.endswith("| 0.0 % | 0.0 % |")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_suggested_domain_of_an_arm_from_its_urdf_has_no_folds() -> None:
     (line,) = suggested_domains.main(quick=True)
@@ -220,6 +227,7 @@ def test_gallery_page_shows_every_figure() -> None:
     assert page.count("- Agrees: ") == page.count("- Differs: ") == len(shown)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_growing_benchmark_compares_equal_results(capsys: pytest.CaptureFixture[str]) -> None:
     found = growing_queries.main(quick=True)
@@ -230,6 +238,7 @@ def test_growing_benchmark_compares_equal_results(capsys: pytest.CaptureFixture[
     assert "| ours |" in capsys.readouterr().out
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_fronts_of_ipopt_and_gauss_newton_agree(capsys: pytest.CaptureFixture[str]) -> None:
     found = ipopt_front.main(quick=True)
@@ -238,6 +247,7 @@ def test_fronts_of_ipopt_and_gauss_newton_agree(capsys: pytest.CaptureFixture[st
     assert capsys.readouterr().out.count("\n") == 4
 
 
+@pytest.mark.nightly
 @needs_c
 @pytest.mark.slow
 def test_the_flange_moves_alike_in_single_precision(capsys: pytest.CaptureFixture[str]) -> None:
@@ -247,6 +257,7 @@ def test_the_flange_moves_alike_in_single_precision(capsys: pytest.CaptureFixtur
     assert len(re.findall(r"\| (?:double|float) \|", capsys.readouterr().out)) == 2
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @needs_c
 def test_benchmark_of_the_inverse_finds_every_row(capsys: pytest.CaptureFixture[str]) -> None:
@@ -256,6 +267,7 @@ def test_benchmark_of_the_inverse_finds_every_row(capsys: pytest.CaptureFixture[
     assert len(re.findall(r"\| (?:NumPy|compiled C) \|", capsys.readouterr().out)) == 8
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_benchmarks_of_networks_and_starts_print_rows(capsys: pytest.CaptureFixture[str]) -> None:
     assert "| q | 300 | 1000, 30 |" in paper_network.row((1000.0, 30.0), raw=True, quick=True)
@@ -263,6 +275,7 @@ def test_benchmarks_of_networks_and_starts_print_rows(capsys: pytest.CaptureFixt
     assert "| polynomial:2 | gauss_newton |" in capsys.readouterr().out
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @needs_c
 def test_benchmark_of_batches_prints_rows() -> None:
@@ -270,6 +283,7 @@ def test_benchmark_of_batches_prints_rows() -> None:
     assert [row.split("|")[1].strip() for row in rows[:3]] == ["orthocas", "NumPy, float64", "NumPy, float32"]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_benchmark_of_exported_inverses_finds_the_answers_of_the_chart() -> None:
     found = exported_inverse.main(quick=True)
@@ -313,6 +327,7 @@ def test_the_elbow_angle_leans_farther_into_the_task_than_fitted_coordinates() -
     )
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_benchmark_of_wide_charts_closes_loops() -> None:
     row, loops = wide_charts.main(quick=True)
