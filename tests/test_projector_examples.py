@@ -64,6 +64,7 @@ def test_hidden_spring_stays_loaded_and_discharges(tmp_path: Path) -> None:
     assert n["impedance_energy_before_tip_moves_J"] < 1e-3 < n["impedance_energy_on_the_way_J"]
 
 
+@pytest.mark.nightly
 def test_projected_coordinates_keep_what_joint_springs_lose(tmp_path: Path) -> None:
     n = projected_coordinates.main(tmp_path, quick=True)
     assert (tmp_path / "projected_coordinates.png").stat().st_size > 10_000
