@@ -131,6 +131,7 @@ def test_compiled_timing_harness_times_calls() -> None:
     assert times["f"] > 1
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_front_shows_the_trade_and_the_trap(tmp_path: Path) -> None:
     found = front.main(tmp_path, quick=True)
@@ -141,6 +142,7 @@ def test_front_shows_the_trade_and_the_trap(tmp_path: Path) -> None:
     assert (tmp_path / "front.png").stat().st_size > 10_000
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_involutivity_defect_tells_the_angles_of_fits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = involutivity.main(tmp_path, quick=True)
@@ -153,6 +155,7 @@ def test_involutivity_defect_tells_the_angles_of_fits(tmp_path: Path, capsys: py
     assert (tmp_path / "involutivity.png").stat().st_size > 10_000
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_angles_grow_with_the_box_as_the_defect_expects_at_any_degree(tmp_path: Path) -> None:
     found = domain_size.main(tmp_path, quick=True)
@@ -179,6 +182,7 @@ def test_suggested_domain_of_an_arm_from_its_urdf_has_no_folds() -> None:
     assert float(least) >= 0.2
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_comparison_example_draws_and_returns_the_best(tmp_path: Path) -> None:
     best = compare_parametrisations.main(tmp_path, quick=True)
