@@ -3,10 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
-export PYTHONDONTWRITEBYTECODE = # or every test that starts Python compiles orthocas again
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 
-.PHONY: demo paper test check docs joss fuzz lint types wheel-check bench redundancy figures charts clean
+.PHONY: demo paper test test-all check docs joss fuzz lint types wheel-check bench redundancy figures charts clean
 
 demo: $(INSTALLED)  ## fit the 7-DoF arm, print its quality, save chart and picture in out/
 	$(BIN)/orthocas demo --out out
@@ -14,11 +13,14 @@ demo: $(INSTALLED)  ## fit the 7-DoF arm, print its quality, save chart and pict
 paper: $(INSTALLED)  ## the 30 figures of the paper in out/paper/; FIGURE=fig06 draws one
 	$(BIN)/python -m examples.paper $(or $(FIGURE),all) --out out/paper
 
-test: $(INSTALLED)  ## the whole test suite
+test: $(INSTALLED)  ## the test suite
 	$(PYTEST)
 
+test-all: $(INSTALLED)  ## also the tests marked `nightly`
+	$(PYTEST) -m ""
+
 check: lint  ## while working: lint and the fast tests, with the slowest of them named
-	$(PYTEST) -m "not slow" --durations 5
+	$(PYTEST) -m "not slow and not nightly" --durations 5
 
 docs: $(INSTALLED)  ## the documentation site in build/docs, its pages run; a warning is an error
 	$(BIN)/python -m pip install --quiet -e '.[docs]'

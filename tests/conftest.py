@@ -5,6 +5,8 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy: threads of BLAS that spin take other processes' cores
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # or every Python that tests start compiles orthocas again
+
 import gc
 import json
 import signal
@@ -27,6 +29,7 @@ from simulate_command import SHORT
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.charts import quality
 from orthocas.cli import simulate
 from orthocas.cli.entry import main
 from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared, compiled, compiled_inverse
@@ -38,6 +41,8 @@ from orthocas.tools.checks import Array
 
 compile_shared.__defaults__ = (("-O0",), None)  # users' -O2 takes gcc three times as long, and computes the same
 compiled._FLAGS, compiled_inverse._FLAGS = ("-O1",), (*STRICT, "-O1")  # as their -O2 and -O3; here it runs for longer
+sys.dont_write_bytecode = False  # for the test files, which come after this one
+quality.SAMPLES = 20_000  # users' 100,000 take five times as long, and angles differ by some thousandths
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job starts with SIGINT ignored
 

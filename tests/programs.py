@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from contextlib import chdir, redirect_stdout
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,13 @@ Run = Callable[..., tuple[int, str, str]]  #: words of a command line to exit co
 
 needs_c = pytest.mark.skipif(shutil.which("cc") is None and shutil.which("gcc") is None, reason="no C compiler")
 needs_cmake = pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake")
+
+
+def nightly(*values: Any) -> list[Any]:
+    """Values of a parametrised test that only `make test-all` takes: other numbers on the same path."""
+    return [
+        pytest.param(*(value if isinstance(value, tuple) else (value,)), marks=pytest.mark.nightly) for value in values
+    ]
 
 
 def output_of(*words: str | Path, folder: Path | None = None) -> str:

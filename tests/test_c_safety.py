@@ -78,7 +78,7 @@ def random_ticks(case: Generated, ticks: int, out: Path, *flags: str) -> Path:
     return built(generated, "random_ticks.c", out, f"-DTICKS={ticks}L", f"-DLIMIT={limit}", "-DSINGULAR=0,0,0", *flags)
 
 
-@pytest.mark.parametrize(("case", "ticks"), [("pd_plus", 250_000), ("on_the_torus", 100_000), ("corridor", 100_000)])
+@pytest.mark.parametrize(("case", "ticks"), [("pd_plus", 100_000), ("on_the_torus", 50_000), ("corridor", 50_000)])
 def test_random_ticks_under_sanitizers_never_trap(
     case: str, ticks: int, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
@@ -141,8 +141,8 @@ def test_valgrind_finds_nothing(pd_plus: Generated, tmp_path: Path) -> None:
 
 def test_calls_take_no_more_stack_than_the_header_says(arm_chart: oc.Chart, clang: str, tmp_path: Path) -> None:
     """Measured on a painted stack, for what needs most, by gcc without optimisation and clang with it."""
-    solver = oc.solvers.LBFGS(max_iterations=3)
-    network = oc.fit(arm_chart.problem, oc.MLP((16, 12)), samples=300, solver=solver).chart
+    solver = oc.solvers.LBFGS(max_iterations=1)
+    network = oc.fit(arm_chart.problem, oc.MLP((16, 12)), samples=50, solver=solver).chart
     gcc, clang_2 = (compilers()[0], "-O0"), (clang, "-O2")
     for law, ways in ((PDPlus(arm_chart, 50.0), (gcc, clang_2)), (PDPlus(network, 50.0), (gcc,))):
         generated = oc.generate_c(law.chart, tmp_path, law, "arm")
@@ -217,8 +217,9 @@ def test_every_dialect_accepts_it(pd_plus: Generated, tmp_path: Path) -> None:
     generated, _ = pd_plus
     source, compiler = generated.folder / "arm.c", compilers()[0]
     more = ["-Wshadow", "-Wconversion", "-Wcast-qual", "-Wstrict-prototypes"]
-    target = ["-O2", "-c", "-o", str(tmp_path / "arm.o")]
+    whole = ["-O2", "-c", "-o", str(tmp_path / "arm.o")]
     for dialect in ("c99", "gnu99", "c11", "gnu17"):
+        target = whole if dialect == "c99" else ["-fsyntax-only"]  # a dialect matters to the parser only
         command = [compiler, *STRICT, f"-std={dialect}", *more, *target, str(source)]
         assert subprocess.run(command, capture_output=True, text=True, check=False).stderr == "", dialect
     if shutil.which("c++") is None:

@@ -134,7 +134,7 @@ def test_parts_cover_the_box_exactly() -> None:
 
 @pytest.mark.slow
 def test_an_unfinished_proof_is_resumed() -> None:
-    wide = chart(0.3)
+    wide = chart()
     begun = oc.certify(wide, time_limit=0)
     assert not begun.proved
     assert begun.regular.open_count > 0
@@ -149,10 +149,10 @@ def test_ctrl_c_returns_what_is_proved_so_far() -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(Interrupted) as stopped:
-        oc.certify(chart(0.3), monitor=stop)
+        oc.certify(chart(), monitor=stop)
     result = stopped.value.result
     assert isinstance(result, oc.Certificate)
-    assert oc.certify(chart(0.3), resume=result).proved
+    assert oc.certify(chart(), resume=result).proved
 
 
 def test_an_executor_finds_the_same_parts() -> None:

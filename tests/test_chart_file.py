@@ -35,8 +35,7 @@ KINDS = {
 @pytest.mark.parametrize("kind", ["orientation", "pose:z", "axis:x", "position+axis:z"])
 def test_tasks_with_a_reference_come_back_with_it(kind: str, iiwa: oc.Problem, tmp_path: Path) -> None:
     problem = oc.Problem(iiwa.robot, oc.Task.named(iiwa.robot, kind), domain=iiwa.domain)
-    chart = oc.fit(problem, oc.Polynomial(1), samples=100).chart
-    chart.save(tmp_path / "turned")
+    oc.fit(problem, oc.Linear()).chart.save(tmp_path / "turned")
     again = oc.load(tmp_path / "turned").problem.task
     q = iiwa.domain.centre + 0.1
     np.testing.assert_array_equal(np.array(again.function(q)), np.array(problem.task.function(q)))

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import robot_data
-from programs import Run, output_of
+from programs import Run, nightly, output_of
 
 import orthocas as oc
 from orthocas import problems
@@ -390,7 +390,7 @@ def test_bad_grids_are_refused_before_any_work(run: Run, tmp_path: Path, words: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("words", "code"), [("info planar_2r", 0), ("--version", 0), ("info nothing", 2)])
+@pytest.mark.parametrize(("words", "code"), [("--version", 0), ("info nothing", 2), *nightly(("info planar_2r", 0))])
 def test_closed_standard_streams_lead_nowhere(words: str, code: int, tmp_path: Path) -> None:
     """Also all of them: a file that is opened next must not become standard output."""
     for streams in (">&-", "<&- >&-", "<&- >&- 2>&-"):

@@ -17,6 +17,7 @@ from programs import needs_c
 pytestmark = pytest.mark.slow
 
 
+@pytest.mark.nightly
 def test_panda_moves_its_elbow_and_not_its_hand(tmp_path: Path) -> None:
     found = panda_elbow.main(tmp_path, quick=True)
     assert found["coupled_elbow_m"] > 0.04
@@ -28,6 +29,7 @@ def test_panda_moves_its_elbow_and_not_its_hand(tmp_path: Path) -> None:
     assert (tmp_path / "panda_elbow.png").stat().st_size > 20_000
 
 
+@pytest.mark.nightly
 def test_table_of_controllers_shows_what_fitted_coordinates_are_good_for() -> None:
     found = controllers.main(quick=True)
     fitted = found["planar_3r_x PD+ decoupled, fitted"]
@@ -46,6 +48,7 @@ def test_closed_loop_benchmark_agrees_with_its_peer(tmp_path: Path, monkeypatch:
     assert 1e-6 < found["planar_3r_x sampled at 1 kHz error"] < 1e-3  # half a tick late
 
 
+@pytest.mark.nightly
 @needs_c
 def test_ticks_of_generated_c_are_measured() -> None:
     found = control_tick.main(quick=True)
@@ -54,11 +57,13 @@ def test_ticks_of_generated_c_are_measured() -> None:
         assert 0 < row["median"] <= row["p99"] <= row["worst"]
 
 
+@pytest.mark.nightly
 def test_length_term_evens_gradients() -> None:
     found = lengths.main(quick=True)
     assert found["planar_3r_x 4 1"].length_ratio < 0.3 * found["planar_3r_x 4 0"].length_ratio
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_elbow_follows_as_near_as_the_self_motion_allows(tmp_path: Path) -> None:
     found = elbow_follower.main(tmp_path, quick=True)["left"]

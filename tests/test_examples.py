@@ -56,6 +56,7 @@ def test_demo_saves_chart_and_pictures(tmp_path: Path) -> None:
         assert (tmp_path / name).stat().st_size > 10_000
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_fit_benchmark_prints_rows() -> None:
     rows = fits.main(quick=True)
@@ -63,6 +64,7 @@ def test_fit_benchmark_prints_rows() -> None:
     assert rows[0].startswith("| iiwa | polynomial:2 |")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_fold_benchmark_finds_none() -> None:
     (line,) = folds.main(quick=True)
@@ -71,6 +73,7 @@ def test_fold_benchmark_finds_none() -> None:
     assert searched <= min(uniform, heavy)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_benchmark_of_paths_keeps_limits_and_closes() -> None:
     rows = following.main(quick=True)
@@ -91,6 +94,7 @@ def test_path_past_a_post(tmp_path: Path) -> None:
         assert picture.size[0] > 1000
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_quality_and_time_are_drawn_for_two_degrees(tmp_path: Path) -> None:
     low, high = quality_and_time.main(tmp_path, quick=True)
@@ -98,12 +102,14 @@ def test_quality_and_time_are_drawn_for_two_degrees(tmp_path: Path) -> None:
     assert (tmp_path / "front_seconds.png").stat().st_size > 10_000
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_certificate_benchmark_proves_its_box() -> None:
     (line,) = certificates.main(quick=True)
     assert "| 100% |" in line
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_scaling_benchmark_prints_rows() -> None:
     assert len(scaling.main(quick=True)) == 2
@@ -128,6 +134,7 @@ def test_compiled_timing_harness_times_calls() -> None:
     assert times["f"] > 1
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_front_shows_the_trade_and_the_trap(tmp_path: Path) -> None:
     found = front.main(tmp_path, quick=True)
@@ -138,6 +145,7 @@ def test_front_shows_the_trade_and_the_trap(tmp_path: Path) -> None:
     assert (tmp_path / "front.png").stat().st_size > 10_000
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_involutivity_defect_tells_the_angles_of_fits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = involutivity.main(tmp_path, quick=True)
@@ -150,6 +158,7 @@ def test_involutivity_defect_tells_the_angles_of_fits(tmp_path: Path, capsys: py
     assert (tmp_path / "involutivity.png").stat().st_size > 10_000
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_angles_grow_with_the_box_as_the_defect_expects_at_any_degree(tmp_path: Path) -> None:
     found = domain_size.main(tmp_path, quick=True)
@@ -166,6 +175,7 @@ def test_a_clear_box_takes_for_clear_what_pinocchio_does() -> None:
     assert frame.endswith("| 0.0 % | 0.0 % |")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_suggested_domain_of_an_arm_from_its_urdf_has_no_folds() -> None:
     (line,) = suggested_domains.main(quick=True)
@@ -175,6 +185,7 @@ def test_suggested_domain_of_an_arm_from_its_urdf_has_no_folds() -> None:
     assert float(least) >= 0.2
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_comparison_example_draws_and_returns_the_best(tmp_path: Path) -> None:
     best = compare_parametrisations.main(tmp_path, quick=True)
@@ -223,6 +234,7 @@ def test_gallery_page_shows_every_figure() -> None:
     assert page.count("- Agrees: ") == page.count("- Differs: ") == len(shown)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_growing_benchmark_compares_equal_results(capsys: pytest.CaptureFixture[str]) -> None:
     found = growing_queries.main(quick=True)
@@ -233,6 +245,7 @@ def test_growing_benchmark_compares_equal_results(capsys: pytest.CaptureFixture[
     assert "| ours |" in capsys.readouterr().out
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_fronts_of_ipopt_and_gauss_newton_agree(capsys: pytest.CaptureFixture[str]) -> None:
     found = ipopt_front.main(quick=True)
@@ -241,6 +254,7 @@ def test_fronts_of_ipopt_and_gauss_newton_agree(capsys: pytest.CaptureFixture[st
     assert capsys.readouterr().out.count("\n") == 4
 
 
+@pytest.mark.nightly
 @needs_c
 @pytest.mark.slow
 def test_the_flange_moves_alike_in_single_precision(capsys: pytest.CaptureFixture[str]) -> None:
@@ -250,6 +264,7 @@ def test_the_flange_moves_alike_in_single_precision(capsys: pytest.CaptureFixtur
     assert len(re.findall(r"\| (?:double|float) \|", capsys.readouterr().out)) == 2
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @needs_c
 def test_benchmark_of_the_inverse_finds_every_row(capsys: pytest.CaptureFixture[str]) -> None:
@@ -259,6 +274,7 @@ def test_benchmark_of_the_inverse_finds_every_row(capsys: pytest.CaptureFixture[
     assert len(re.findall(r"\| (?:NumPy|compiled C) \|", capsys.readouterr().out)) == 8
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_benchmarks_of_networks_and_starts_print_rows(capsys: pytest.CaptureFixture[str]) -> None:
     assert "| q | 300 | 1000, 30 |" in paper_network.row((1000.0, 30.0), raw=True, quick=True)
@@ -266,6 +282,7 @@ def test_benchmarks_of_networks_and_starts_print_rows(capsys: pytest.CaptureFixt
     assert "| polynomial:2 | gauss_newton |" in capsys.readouterr().out
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @needs_c
 def test_benchmark_of_batches_prints_rows() -> None:
@@ -273,6 +290,7 @@ def test_benchmark_of_batches_prints_rows() -> None:
     assert [row.split("|")[1].strip() for row in rows[:3]] == ["orthocas", "NumPy, float64", "NumPy, float32"]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_benchmark_of_exported_inverses_finds_the_answers_of_the_chart() -> None:
     found = exported_inverse.main(quick=True)
@@ -343,6 +361,7 @@ def test_the_elbow_angle_leans_farther_into_the_task_than_fitted_coordinates() -
     )
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_benchmark_of_wide_charts_closes_loops() -> None:
     row, loops = wide_charts.main(quick=True)

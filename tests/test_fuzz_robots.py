@@ -6,4 +6,4 @@ from fuzz.robots import robots
 
 @pytest.mark.slow
 def test_robot_files_give_robots_or_one_error() -> None:
-    assert robots(120) == []
+    assert robots(60) == []

@@ -3,6 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
+from programs import nightly
 from scipy.integrate import solve_ivp
 from sundials_flow import SundialsFlow
 
@@ -44,7 +45,7 @@ def test_batched_flow_stops_where_the_solution_ends() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("metric", ["euclidean", "inertia", STIFFNESS], ids=["I", "M", "custom"])
+@pytest.mark.parametrize("metric", [*nightly("euclidean"), "inertia", STIFFNESS], ids=["I", "M", "custom"])
 def test_pull_ends_where_the_paper_s_gradient_flow_ends(metric: object) -> None:
     """Equation (23) by SciPy, run until h has converged to 1e-9, against the task-parametrised flow."""
     problem = planar(metric)

@@ -8,6 +8,7 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
+from programs import nightly
 
 import orthocas as oc
 from orthocas import solvers
@@ -33,7 +34,7 @@ def press_after(seconds: float) -> threading.Timer:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seconds", [0.15, 0.31, 0.57])
+@pytest.mark.parametrize("seconds", [0.15, *nightly(0.31, 0.57)])
 @pytest.mark.parametrize("name", FITS)
 def test_ctrl_c_at_any_moment(planar_x: oc.Problem, name: str, seconds: float) -> None:
     parametrisation, solver, settings = FITS[name]

@@ -171,6 +171,14 @@ def test_quality_is_nan_where_the_task_is_flat_and_a_torus_has_no_boundary() -> 
     assert everywhere.quality([0.3, 9.0]).boundary_distance == np.inf
 
 
+def test_the_search_leaves_out_faces_where_the_task_has_no_finite_gradient() -> None:
+    """h = q1 + sqrt(q2), on a box that begins at q2 = 0."""
+    robot = oc.Robot.planar([1.0, 1.0, 1.0], [1.0, 1.0, 1.0])
+    task = oc.Task.custom(robot, "root", lambda q: q[0] + ca.sqrt(q[1]))
+    chart = oc.fit(oc.Problem(robot, task, domain=oc.Box([0.0, 0.5, 0.0], 0.5)), oc.Linear()).chart
+    assert 0 < oc.evaluate(chart, 500).conditioning.min < 1
+
+
 def test_quality_is_nan_where_gradients_overflow(planar_fit: Fit) -> None:
     for far in (1e120, 1e300):
         quality = planar_fit.chart.quality([0.3, far, 0.5])

@@ -1,12 +1,9 @@
 """Coordinates that are like given quantities, against projected gradients and closed forms."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import casadi as ca
 import numpy as np
 import pytest
+from programs import Run
 
 import orthocas as oc
 from orthocas import problems
@@ -140,9 +137,9 @@ def test_what_excludes_a_meaning(parametrisation: oc.Polynomial, settings: dict[
 
 
 @pytest.mark.slow
-def test_the_command_takes_meanings(tmp_path: Path) -> None:
-    out = tmp_path / "a.orthocas"
-    words = ["fit", "iiwa", "--param", "polynomial:2", "--like", "A3,A1", "--samples", "600", "--out", str(out)]
-    done = subprocess.run([sys.executable, "-m", "orthocas", *words], capture_output=True, text=True, check=True)
-    assert "A3 [rad]" in done.stdout
-    assert oc.Chart.load(out).named_coordinates[:2] == ("xi1: A3 [rad]", "xi2: A1 [rad]")
+def test_the_command_takes_meanings(run: Run) -> None:
+    words = ("--param", "polynomial:2", "--like", "A3,A1", "--samples", "600", "--out", "a.orthocas")
+    code, out, _ = run("fit", "iiwa", *words)
+    assert code == 0
+    assert "A3 [rad]" in out
+    assert oc.Chart.load("a.orthocas").named_coordinates[:2] == ("xi1: A3 [rad]", "xi2: A1 [rad]")

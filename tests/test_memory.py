@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
-from programs import Run, needs_c
+from programs import Run, needs_c, nightly
 from supervised import TICK, Arm
 from test_payload import arm_model
 
@@ -284,7 +284,7 @@ def test_a_memory_of_a_users_own_runs_in_python_and_c(chart: oc.Chart, tmp_path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("stiffness", "ratio"), [(20.0, 0.7), (8.0, 0.7), (50.0, 0.3)])
+@pytest.mark.parametrize(("stiffness", "ratio"), [(8.0, 0.7), *nightly((20.0, 0.7), (50.0, 0.3))])
 def test_adaptation_does_not_make_soft_laws_swing(chart: oc.Chart, stiffness: float, ratio: float) -> None:
     """With an exact model; a weight of the error of 5 1/s did, for such springs."""
     law = PDPlus(chart, stiffness, ratio, limit=400.0, remembers=Adaptation())

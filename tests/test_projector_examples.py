@@ -64,6 +64,7 @@ def test_hidden_spring_stays_loaded_and_discharges(tmp_path: Path) -> None:
     assert n["impedance_energy_before_tip_moves_J"] < 1e-3 < n["impedance_energy_on_the_way_J"]
 
 
+@pytest.mark.nightly
 def test_projected_coordinates_keep_what_joint_springs_lose(tmp_path: Path) -> None:
     n = projected_coordinates.main(tmp_path, quick=True)
     assert (tmp_path / "projected_coordinates.png").stat().st_size > 10_000
@@ -103,6 +104,7 @@ def test_joints_drift_with_the_pseudo_inverse_only(tmp_path: Path) -> None:
     assert all(value < 1e-5 for key, value in n.items() if "tool error" in key)
 
 
+@pytest.mark.nightly
 def test_tool_holds_still_while_the_arm_moves(tmp_path: Path) -> None:
     n = self_motion_on_command.main(tmp_path, quick=True)
     assert (tmp_path / "self_motion_on_command.png").stat().st_size > 10_000

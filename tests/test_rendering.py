@@ -67,6 +67,7 @@ def test_the_hand_of_the_readme_stays_while_the_elbow_moves(tmp_path: Path) -> N
         assert opacity.max() == 255
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_film_of_the_readme_shows_a_hand_that_stays_and_joints_that_come_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -234,6 +234,7 @@ def test_stiffness_reaches_the_controller() -> None:
     assert stiff < 0.7 * soft
 
 
+@pytest.mark.nightly
 def test_conclusions_hold_for_other_choices(capsys: pytest.CaptureFixture[str]) -> None:
     found = closed_loop_choices.main(quick=True)
     assert found["choices"] == 3

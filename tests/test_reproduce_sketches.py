@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 from paper import FIGURES, ChosenFit, Drawing
 from paper.fig29 import unfolded
 from paper.pose_map import joints, pose, pose_jacobian
+from programs import nightly
 
 import orthocas as oc
 from orthocas.bases import JointSpace
@@ -91,7 +92,7 @@ def test_arm_has_the_angles_of_the_paper(drawings: dict[str, Drawing]) -> None:
     assert abs(n["mutual_mean_deg"] - 90) < 1  # 90.40 in the paper
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, *nightly(1)])
 def test_networks_draw_the_figures_of_fits_with_the_same_facts(seed: int) -> None:
     """What is asserted of polynomials in Figs. 20 and 23, with small networks from two starts."""
     chosen = ChosenFit(oc.MLP((16, 16)), seed)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from programs import needs_c
+from programs import needs_c, nightly
 from test_controllers import State, by_hand, called, torque
 from test_payload import arm_model, loaded, random_payload
 
@@ -201,12 +201,20 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 @pytest.mark.slow
 @needs_c
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_generated_c_equals_python_for_every_variant(planar_chart: oc.Chart, tmp_path: Path, variant: str) -> None:
-    for law in (Impedance, PDPlus):
-        controller = law(planar_chart, **{"stiffness": 50.0, **VARIANTS[variant]})
-        generated = oc.generate_c(planar_chart, tmp_path, controller, "arm")
-        assert check_c(generated, planar_chart, controller, states=200).differences["control"] < 1e-10
-        header = (tmp_path / "arm.h").read_text()
-        for name in controller.gains:
-            assert f"  double {name}[{len(controller.gains[name])}]; /* " in header
+@pytest.mark.parametrize(
+    ("variant", "law"),
+    [
+        *((variant, PDPlus) for variant in VARIANTS),
+        ("all inputs", Impedance),
+        *nightly(*((variant, Impedance) for variant in VARIANTS if variant != "all inputs")),
+    ],
+)
+def test_generated_c_equals_python_for_every_variant(
+    planar_chart: oc.Chart, tmp_path: Path, variant: str, law: Any
+) -> None:
+    controller = law(planar_chart, **{"stiffness": 50.0, **VARIANTS[variant]})
+    generated = oc.generate_c(planar_chart, tmp_path, controller, "arm")
+    assert check_c(generated, planar_chart, controller, states=200).differences["control"] < 1e-10
+    header = (tmp_path / "arm.h").read_text()
+    for name in controller.gains:
+        assert f"  double {name}[{len(controller.gains[name])}]; /* " in header

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from charts import with_metric
-from programs import needs_c
+from programs import needs_c, nightly
 
 import orthocas as oc
 from orthocas.codegen import Supervisor
@@ -51,7 +51,7 @@ def tiago() -> Iterator[faults.Arm]:
         yield arm
 
 
-@pytest.mark.parametrize("bits", [0, 13])
+@pytest.mark.parametrize("bits", [0, *nightly(13)])
 def test_faults_do_not_make_an_arm_run_away(tiago: faults.Arm, bits: int) -> None:
     """Late torques, dead sensors, wild references and brakes; also with coarse encoders and the observer."""
     arm = tiago.with_encoders(bits, faults.OBSERVED.get(bits, 0.0))

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from paper import Drawing, Recipe, registry
-from programs import Run, python
+from programs import Run, nightly, python
 
 import orthocas as oc
 from orthocas.certificates.judges import Verdicts
@@ -313,7 +313,7 @@ def test_ctrl_c_before_our_handlers_is_one_line(module: str, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
+@pytest.mark.parametrize("share", [0.5, *nightly(0.2, 0.8)])
 def test_ctrl_c_during_imports_is_one_line(share: float) -> None:
     command = [sys.executable, "-m", "orthocas", "info", "planar_3r_x"]
     start = time.monotonic()

@@ -209,9 +209,9 @@ def test_hostile_ticks_stay_bounded_with_the_right_status(
     gentle = oc.generate_c(pd_plus[1].chart, tmp_path, pd_plus[1], "arm", single_precision=True)
     stateless, supervised = (
         [int(word) for word in output_of(built(case, program, tmp_path, f"-DTICKS={ticks}L", *options, *flags)).split()]
-        for case, program, ticks in ((gentle, "random_ticks.c", 100_000), (generated, "supervised_ticks.c", 300_000))
+        for case, program, ticks in ((gentle, "random_ticks.c", 50_000), (generated, "supervised_ticks.c", 300_000))
     )
-    assert (sum(stateless), sum(supervised)) == (100_000, 300_000)
+    assert (sum(stateless), sum(supervised)) == (50_000, 300_000)
     for status in ("OK", "OUTSIDE_DOMAIN", "NOT_FINITE", "SATURATED"):
         assert stateless[ControlStatus[status]] > 500, (status, stateless)
     for status in ("OK", "SATURATED", "NEAR_BOUNDARY", "CAUGHT", "RETURNING", "BAD_INPUT"):

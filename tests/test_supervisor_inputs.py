@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from programs import built, needs_c
+from programs import built, needs_c, nightly
 from supervised import TICK, Arm, at_rest, moving, run
 
 import orthocas as oc
@@ -208,7 +208,7 @@ def test_sensors_that_stand_still_on_the_way_back_are_found(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["iiwa7-position", "panda-position"])
+@pytest.mark.parametrize("name", ["panda-position", *nightly("iiwa7-position")])
 def test_an_arm_in_mujoco_does_not_run_away_from_sensors_that_stand_still(name: str, tmp_path: Path) -> None:
     """It moves at 0.5 rad/s when its measurements freeze; 200 ms later it must not be faster than 3 rad/s."""
     pytest.importorskip("mujoco", minversion="4")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from programs import needs_c
+from programs import needs_c, nightly
 from supervised import TICK, Arm, at_rest, run
 
 import orthocas as oc
@@ -63,7 +63,7 @@ def moved(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["iiwa7-position", "panda-position"])
+@pytest.mark.parametrize("name", ["panda-position", *nightly("iiwa7-position")])
 def test_the_catcher_holds_three_unknown_kilograms(name: str, tmp_path: Path) -> None:
     """In MuJoCo, without rotors: taken 1 s before the catch, and in its tick. The arm rests, holds the true weight, and
     goes back when asked."""

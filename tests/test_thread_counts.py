@@ -159,11 +159,11 @@ assert THREADS == int(sys.argv[1])
 assert {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"} == {THREADS}
 iiwa, planar = problems.get("iiwa"), problems.get("planar_3r_x")
 fits = [
-    oc.fit(iiwa, oc.Polynomial(4), solvers.GaussNewton(max_iterations=2), samples=2000),
-    oc.fit(iiwa, oc.Polynomial(3), solvers.GaussNewton(max_iterations=2), weights=(1000, 30, 150, 0.1)),
-    oc.fit(iiwa, oc.Polynomial(3), solvers.LBFGS(max_iterations=5), samples=2000),
-    oc.fit(planar, oc.Polynomial(6), solvers.GradientFlow(max_iterations=3), samples=3000),
-    oc.fit(planar, oc.Polynomial(6), solvers.Adam(epochs=1), samples=3000),
+    oc.fit(iiwa, oc.Polynomial(3), solvers.GaussNewton(max_iterations=2), samples=2000),
+    oc.fit(iiwa, oc.Polynomial(2), solvers.GaussNewton(max_iterations=2), weights=(1000, 30, 150, 0.1)),
+    oc.fit(iiwa, oc.Polynomial(2), solvers.LBFGS(max_iterations=5), samples=2000),
+    oc.fit(planar, oc.Polynomial(5), solvers.GradientFlow(max_iterations=3), samples=3000),
+    oc.fit(planar, oc.Polynomial(5), solvers.Adam(epochs=1), samples=3000),
 ]
 np.savez(sys.argv[2], *(fit.chart.coordinates.theta for fit in fits))
 """

@@ -98,13 +98,13 @@ def calls_of_atlas(atlas: oc.Atlas) -> list[Call]:
     ]
 
 
-SERIES: dict[str, tuple[Callable[[], list[Call]], int]] = {  #: of 10,000 calls
-    "polynomial": (lambda: calls_of_chart(copy.deepcopy(fitted().chart)), 4800),
-    "network": (lambda: calls_of_chart(copy.deepcopy(network())), 2400),
-    "circle": (lambda: calls_of_chart(copy.deepcopy(circle())), 120),
-    "disk": (lambda: calls_of_chart(copy.deepcopy(disk())), 80),
-    "atlas": (lambda: calls_of_atlas(copy.deepcopy(atlas())), 800),
-    "law": (lambda: calls_of_law(copy.deepcopy(impedance())), 2600),
+SERIES: dict[str, tuple[Callable[[], list[Call]], int]] = {  #: of 5,000 calls
+    "polynomial": (lambda: calls_of_chart(copy.deepcopy(fitted().chart)), 2400),
+    "network": (lambda: calls_of_chart(copy.deepcopy(network())), 1200),
+    "circle": (lambda: calls_of_chart(copy.deepcopy(circle())), 60),
+    "disk": (lambda: calls_of_chart(copy.deepcopy(disk())), 40),
+    "atlas": (lambda: calls_of_atlas(copy.deepcopy(atlas())), 400),
+    "law": (lambda: calls_of_law(copy.deepcopy(impedance())), 1300),
 }
 
 

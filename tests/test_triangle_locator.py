@@ -67,15 +67,15 @@ def over_all(vertices: Array, faces: Array, points: Array) -> Array:
 
 def queries(mesh: TriangleMesh) -> dict[str, Array]:
     rng = np.random.default_rng(8)
-    base = on_mesh(mesh, 400)
-    a, b = mesh.vertices[mesh.edges[:200]].transpose(1, 0, 2)
+    base = on_mesh(mesh, 150)
+    a, b = mesh.vertices[mesh.edges[:80]].transpose(1, 0, 2)
     return {
         "on": base,
         "near": base + rng.normal(size=base.shape) * 0.02,
         "off": base + rng.normal(size=base.shape) * 0.5,
         "far": rng.normal(size=(60, 3)) * 100,
-        "vertex": mesh.vertices[:200],
-        "edge": a + rng.uniform(size=(200, 1)) * (b - a),
+        "vertex": mesh.vertices[:80],
+        "edge": a + rng.uniform(size=(80, 1)) * (b - a),
     }
 
 

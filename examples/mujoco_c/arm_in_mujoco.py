@@ -32,7 +32,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
 
     Args:
         out: folder for everything that is made.
-        quick: no film.
+        quick: few samples, and no film.
 
     Returns:
         See `findings`.
@@ -40,7 +40,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     out.mkdir(parents=True, exist_ok=True)
     problem = problems.get("iiwa")
     problem = oc.Problem(problem.robot, problem.task, "inertia", problem.domain, "iiwa")
-    chart = oc.fit(problem, oc.Polynomial(3), weights=WEIGHTS).chart
+    chart = oc.fit(problem, oc.Polynomial(3), weights=WEIGHTS, samples=1500 if quick else None).chart
     oc.generate_c(chart, out / "generated", PDPlus.on_chart(chart), name="arm")
     x, _, z = chart.phi(problem.domain.centre)[: chart.m]
     write_scene(problem.robot.tree, out / "scene.xml", x + HAND_RADIUS + GAP, z)

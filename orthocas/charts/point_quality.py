@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from orthocas.charts.angles import MOST_JOINTS, judge_by_columns, judge_by_lapack
 from orthocas.charts.coordinates import CoordinateMap
+from orthocas.errors import SingularTaskError
 from orthocas.tasks.domains import Domain, bounds_of, contains, sample_heavily
 from orthocas.tasks.problem import Problem, distance_from_half_a_turn, task_jacobians
 from orthocas.tasks.samples import Samples, samples_at
@@ -252,11 +253,12 @@ def _signed_conditioning(problem: Problem, coordinates: CoordinateMap, u: Array)
     """Conditioning times the sign of det J at points of the cube, (N,); NaN outside the domain."""
     points, values = _joint_positions(problem, u), np.full(len(u), np.nan)
     inside = np.flatnonzero(contains(problem.domain, points))
-    J = problem.task.batched_jacobian(points[inside])[0]
-    inside = inside[
-        np.isfinite(J.reshape(len(inside), problem.m * problem.n)).all(axis=1)
-    ]  # not half a turn from the reference
-    judged = Judged.at(problem, coordinates, points[inside])
+    try:
+        judged = Judged.at(problem, coordinates, points[inside])
+    except SingularTaskError:  # for example at half a turn
+        J = problem.task.batched_jacobian(points[inside])[0]
+        inside = inside[np.isfinite(J.reshape(len(inside), problem.m * problem.n)).all(axis=1)]
+        judged = Judged.at(problem, coordinates, points[inside])
     values[inside[judged.kept]] = judged.signs * judged.conditioning
     return values
 

@@ -1,6 +1,7 @@
 """Metrics A(q) on joint space. They define what "orthogonal" means."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Self
 
@@ -161,6 +162,9 @@ def require_spd(matrices: Array, points: Array) -> None:
             f"metric is not symmetric at q = {np.round(points[worst], 4).tolist()} "
             f"(difference {asymmetry[worst]:.3g}), expected symmetric positive definite"
         )
+    with suppress(np.linalg.LinAlgError):  # faster than eigenvalues
+        np.linalg.cholesky(matrices - _SINGULAR * size[:, None, None] * np.eye(matrices.shape[1]))
+        return
     smallest = np.linalg.eigvalsh(matrices)[:, 0]
     worst = int(np.argmin(smallest - _SINGULAR * size))
     if smallest[worst] <= _SINGULAR * size[worst]:
