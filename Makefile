@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 
-.PHONY: demo paper test test-all check docs joss fuzz lint types wheel-check bench redundancy figures charts clean
+.PHONY: demo paper test nightly check docs joss fuzz lint types wheel-check bench redundancy figures charts clean
 
 demo: $(INSTALLED)  ## fit the 7-DoF arm, print its quality, save chart and picture in out/
 	$(BIN)/orthocas demo --out out
@@ -16,8 +16,8 @@ paper: $(INSTALLED)  ## the 30 figures of the paper in out/paper/; FIGURE=fig06 
 test: $(INSTALLED)  ## the test suite
 	$(PYTEST)
 
-test-all: $(INSTALLED)  ## also the tests marked `nightly`
-	$(PYTEST) -m ""
+nightly: $(INSTALLED)  ## the tests that `make test` leaves out
+	$(PYTEST) -m nightly
 
 check: lint  ## while working: lint and the fast tests, with the slowest of them named
 	$(PYTEST) -m "not slow and not nightly" --durations 5

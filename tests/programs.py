@@ -25,7 +25,7 @@ needs_cmake = pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake
 
 
 def nightly(*values: Any) -> list[Any]:
-    """Values of a parametrised test that only `make test-all` takes: other numbers on the same path."""
+    """Values of a parametrised test that only `make nightly` takes: other numbers on the same path."""
     return [
         pytest.param(*(value if isinstance(value, tuple) else (value,)), marks=pytest.mark.nightly) for value in values
     ]
