@@ -16,7 +16,7 @@ from programs import needs_c, nightly
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared, gain_numbers
-from orthocas.codegen.kernels import with_turns_once
+from orthocas.codegen.kernels import with_shared_calls, with_turns_once
 from orthocas.control import (
     Controller,
     ControlStatus,
@@ -193,6 +193,33 @@ def test_compiled_kinematics_and_dynamics_match_pinocchio(name: str, tmp_path: P
         np.testing.assert_allclose(phi[: task.m], data.oMf[frame].translation[rows], atol=1e-10)
         jacobian = pin.computeFrameJacobian(model, data, p, frame, pin.LOCAL_WORLD_ALIGNED)
         np.testing.assert_allclose(J[: task.m], jacobian[rows], atol=1e-10)
+
+
+def test_what_several_graphs_call_for_the_state_alone_is_computed_once() -> None:
+    """Also inside others; but not for another order of the state, and nothing if there is nothing in common."""
+    q, dq, x, a, b = (ca.MX.sym(name, 2) for name in ("q", "dq", "x", "a", "b"))
+    place = ca.Function("place", [a], [ca.sin(a) * a[1]])
+    rate = ca.Function("rate", [a, b], [ca.cos(a) * b[0]])
+    outer = ca.Function("outer", [x], [2 * place(x)])
+    graphs = [
+        ca.Function("first", [q, dq, x], [place(q) + rate(q, dq) * x]),
+        ca.Function("second", [q, x], [outer(q) - x]),
+        ca.Function("third", [q, dq], [rate(q, dq) + rate(dq, q)]),
+        ca.Function("alone", [q], [place(q)]),
+    ]
+    shared, *given = with_shared_calls(graphs, {"first": 2, "second": 1, "third": 2})
+    at, speed, other = np.array([0.3, -0.7]), np.array([0.2, 1.1]), np.array([5.0, 6.0])
+    values = shared(at, speed)
+    assert values.shape == (4, 1)  # place and rate
+    for graph, changed, inputs in zip(
+        graphs[:3], given[:3], [(at, speed, other), (at, other), (at, speed)], strict=True
+    ):
+        np.testing.assert_allclose(changed(*inputs, values).full(), graph(*inputs).full(), rtol=1e-15)
+        assert abs(changed(*inputs, values + 1).full() - graph(*inputs).full()).min() > 0.1  # it uses them
+    assert given[3].n_in() == 1
+    nothing, only = with_shared_calls(graphs[3:], {"alone": 1})
+    assert nothing(at, speed).shape == (1, 1)
+    np.testing.assert_array_equal(only(at, 0.0).full(), graphs[3](at).full())
 
 
 def test_kernels_compute_sines_of_joints_once(planar_chart: oc.Chart, tmp_path: Path) -> None:

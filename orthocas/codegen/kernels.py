@@ -364,16 +364,17 @@ def with_shared_calls(
     n = functions[0].size1_in(0)
     ends = np.cumsum([0, *(function.numel_out(0) for function, _ in common.values())]).tolist()
     places = {key: slice(*of) for key, of in zip(common, pairwise(ends), strict=True)}
-    shared, state = ca.MX.sym("shared", ends[-1]), [ca.MX.sym(name, n) for name in ("q", "dq")]
+    shared, state = ca.MX.sym("shared", max(1, ends[-1])), [ca.MX.sym(name, n) for name in ("q", "dq")]
 
-    def taken(given: set[int], called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
-        place = places.get(hash(called)) if given.issuperset(map(hash, arguments)) else None
+    def taken(given: list[ca.MX], called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
+        place = places.get(hash(called)) if _are_first(arguments, given) else None
         return None if place is None else ca.reshape(shared[place], *called.size_out(0))
 
     for name, function in sharing.items():
-        given = {hash(symbol) for symbol in function.mx_in()[: states[name]]}
-        sharing[name] = _replaced(function, partial(taken, given), [shared]) or function
-    values = [ca.vec(ca.densify(function(*state[:inputs]))) for function, inputs in common.values()]
+        symbols = function.mx_in()
+        with_shared = _replaced(function, partial(taken, symbols[: states[name]]), [shared])
+        sharing[name] = with_shared or ca.Function(name, [*symbols, shared], function.call(symbols))
+    values = [ca.vec(ca.densify(function(*state[:inputs]))) for function, inputs in common.values()] or [ca.MX(0)]
     whole = [sharing.get(function.name(), function) for function in functions]
     return [ca.Function("shared", state, [ca.vertcat(*values)]), *whole]
 
@@ -381,15 +382,20 @@ def with_shared_calls(
 def _called_for(function: ca.Function, states: int) -> list[tuple[ca.Function, int]]:
     """What a graph calls for its first inputs alone, in this order, and for how many; and what that calls for q."""
     found: list[tuple[ca.Function, int]] = []
-    given = [hash(symbol) for symbol in function.mx_in()[:states]] if function.is_a("MXFunction") else []
+    given = function.mx_in()[:states]
 
     def seen(called: ca.Function, arguments: list[ca.MX]) -> None:
-        if list(map(hash, arguments)) == given[: len(arguments)]:
+        if _are_first(arguments, given):
             found.append((called, len(arguments)))
             found.extend(_called_for(called, 1))
 
     _replaced(function, seen)
     return found
+
+
+def _are_first(arguments: list[ca.MX], given: list[ca.MX]) -> bool:
+    """Whether arguments are the first ones of the given symbols, in this order."""
+    return len(arguments) <= len(given) and all(hash(a) == hash(b) for a, b in zip(arguments, given, strict=False))
 
 
 def with_turns_once(functions: list[ca.Function], kept: Collection[str] = ()) -> list[ca.Function]:
