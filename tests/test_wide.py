@@ -91,6 +91,15 @@ def self_motions(robot: oc.Robot, q: Numbers) -> Numbers:
     return np.stack([signs[k] * np.linalg.det(np.delete(J, k, axis=2)) for k in range(robot.n)], axis=1)
 
 
+def test_branches_are_drawn_each_in_its_posture() -> None:
+    found = branches()
+    figure = found.plot()
+    assert [panel.get_title().split("\n")[0] for panel in figure.axes] == [item.name for item in found]
+    for panel, item in zip(figure.axes, found, strict=True):
+        drawn = np.column_stack(panel.lines[0].get_data_3d())  # type: ignore[attr-defined]
+        np.testing.assert_allclose(drawn[-1], found.robot.tip_position(item.posture), atol=1e-12)
+
+
 @pytest.mark.slow
 def test_branches_of_arms_are_cut_where_geometry_says() -> None:
     found = branches()

@@ -1,6 +1,6 @@
 """Figures of charts: histograms of their quality, and the arm along each coordinate."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import matplotlib as mpl
 import numpy as np
@@ -12,7 +12,7 @@ from orthocas.charts.quality import AngleStatistics, LeakStatistics
 from orthocas.charts.self_motion import fan_along
 from orthocas.errors import InvalidValueError
 from orthocas.tools.checks import Array, require_at_least, require_count
-from orthocas.tools.picture import Picture
+from orthocas.tools.picture import Picture, equal_axes
 
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
@@ -65,7 +65,7 @@ def self_motion_figure(chart: "Chart", postures: int = 9, reach: float | None = 
         low, high = chart.xi(sweep[[0, -1]])[:, j]
         title = rf"$\xi_{{{j + 1}}}$ from {low:.3g} to {high:.3g}, dark to light"
         panel.set_title(f"{title}\ntask moves {_bound(moved)}", fontsize=10)
-        _equal_axes(panel, everything)
+        equal_axes(panel, everything)
     return figure
 
 
@@ -109,23 +109,6 @@ def _sweep(chart: "Chart", j: int, postures: int, reach: float | None) -> Array:
             q = chart.inverse(target, q, outside=True)  # as far as was asked
             found[k] = q
     return found
-
-
-def _equal_axes(axes: Any, points: Array) -> None:
-    """Use the same scale on all three axes, around the points. A planar arm is drawn from above."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    half = (high - low).max() / 2 * 1.05
-    for name, middle in zip("xyz", (low + high) / 2, strict=True):
-        getattr(axes, f"set_{name}lim")(middle - half, middle + half)
-        getattr(axes, f"set_{name}label")(f"{name} [m]", fontsize=8)
-        getattr(axes, f"{name}axis").labelpad = -3
-    axes.tick_params(labelsize=7, pad=0)
-    axes.locator_params(nbins=4)
-    axes.set_box_aspect((1, 1, 1), zoom=1.05)
-    flat = (high - low)[2] < 1e-9
-    axes.view_init(elev=90 if flat else 22, azim=-90 if flat else -60)
-    if flat:
-        axes.set(zticks=[], zlabel="")
 
 
 def _bound(length: float) -> str:

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -17,6 +18,9 @@ from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, as_point, require_kind
 from orthocas.tools.display import Shown, listed
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 CLEAR = 0.1  #: relative singular value above which a position counts as clear where shares are counted
 _SLICES, _ON_SLICE, _FINER, _SEED = 61, 200, 400, 0  # slices q_k = v, and positions on each
 _NOT_SINGULAR = 0.02  # relative singular value of the positions that count for crossing
@@ -29,6 +33,7 @@ _APART = 0.45  # [rad or m] cuts of one joint that are nearer are one
 _MOST_CUTS = 2  # of a joint
 _NEIGHBOURS, _SAME = 5, 1e-8  # of a minimum; difference of poses that are equal [m and rad]
 _SAMPLES = 20_000
+_PANELS, _COLOUR = 4, "#1f5fa8"  # of pictures: side by side, of the arm
 _ARM = 7  #: joints of an arm, counted from its tip, whose self-motions are looked at
 _PARTS = {6: {1: "shoulder", 2: "elbow", 4: "wrist"}, 7: {1: "shoulder", 3: "elbow", 5: "wrist"}}
 
@@ -101,6 +106,24 @@ class Branches(Shown, Sequence[Branch]):
         q = as_point("q", q, self.robot.n)
         found: Array = _reflected(self.robot, self.cuts[cut], q[None])[0]
         return found
+
+    def plot(self) -> "Figure":
+        """The posture of each branch, in a panel with its name and its share of the clear positions."""
+        from matplotlib.layout_engine import ConstrainedLayoutEngine  # takes long, and searches need no pictures
+
+        from orthocas.tools.picture import Picture, equal_axes
+
+        columns = min(len(self), _PANELS)
+        rows = -(-len(self) // columns)
+        layout = ConstrainedLayoutEngine(h_pad=0.15, w_pad=0.1)
+        figure = Picture(figsize=(3.4 * columns, 3.4 * rows), layout=layout)
+        postures = self.robot.joint_points(np.array([item.posture for item in self]))
+        for k, (item, points) in enumerate(zip(self, postures, strict=True)):
+            panel = figure.add_subplot(rows, columns, k + 1, projection="3d")
+            panel.plot(*points.T, "-o", color=_COLOUR, markersize=4, linewidth=2.2)
+            panel.set_title(f"{item.name}\n{item.share:.1%} of the clear positions", fontsize=9)
+            equal_axes(panel, postures.reshape(-1, 3))
+        return figure
 
     def facts(self) -> dict[str, str]:
         """Cuts and branches."""
