@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from orthocas.bases.cyclic import cyclic_joints
 from orthocas.bases.family import Parametrisation
 from orthocas.errors import DomainError, InvalidValueError
-from orthocas.fitting.fit import Fit, fit
+from orthocas.fitting.fit import Fit, fit_from
 from orthocas.fitting.probe import Bounds, Miss, Prober, Verdict, judged_chart
 from orthocas.fitting.settings import default_parametrisation, require_parametrisation
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
@@ -32,7 +32,7 @@ JUDGES = 30_000  #: samples that judge the fit
 _START, _STEP = 0.5, 1.6  # first scale of the box, and factor to the next while the boundary is unknown
 _CLOSE = 1.06  # the boundary is found within this factor
 _SMALLEST = 1e-3  # scale of a box that is too small to be of use
-_ROUNDS, _FEW_JOINTS = 2, 12  # exchanges of width between joints; one for so many joints, whose trials take a second
+_ROUNDS, _MANY_JOINTS = 2, 12  # exchanges of width between joints; none for so many joints, whose trials take a second
 _WIDER = 1.2  # factor by which one joint alone is widened
 _LARGEST_EXCHANGE = np.log(1.5)
 _STAGE = "suggest a domain"
@@ -163,20 +163,20 @@ class WidestBox:
         if not self.free:
             return self.room.copy(), {}
         widths = self._to_boundary(unit, _START)
-        for _ in range(_ROUNDS if len(self.free) < _FEW_JOINTS else 1):
+        for _ in range(_ROUNDS if len(self.free) < _MANY_JOINTS else 0):
             trial = self._to_boundary(widths * np.exp(-self._exchange(widths)), 1.0)
             if np.log(trial[self.free]).sum() <= np.log(widths[self.free]).sum():
                 break
             widths = trial
         return self._grown(widths)
 
-    def verdict(self, widths: Array) -> Verdict:
-        """Fit and judge the box of the given half-widths."""
+    def verdict(self, widths: Array, enough: Bounds | None = None, leap: bool = False) -> Verdict:
+        """Fit and judge the box of the given half-widths, see `Prober.verdict`."""
         self.probes += 1
         detail = f"trial {self.probes}: mean half-width {widths[self.free].mean():.3g}"
         expected = _PROBES + _PROBES_OF_A_JOINT * len(self.free)
         self.monitor(Progress(_STAGE, min(0.99, self.probes / expected), detail))
-        return self.prober.verdict(Box(self.home, widths))
+        return self.prober.verdict(Box(self.home, widths), enough, leap)
 
     def _clipped(self, widths: Array) -> Array:
         clipped = self.room.copy()
@@ -228,7 +228,8 @@ class WidestBox:
             factor = _WIDER
             while widths[k] < self.room[k]:
                 wider = self._widened(widths, k, factor)
-                misses = [name for name, ratio in self.verdict(wider).excess(self.bounds).items() if ratio > 1]
+                found = self.verdict(wider, self.bounds, leap=factor > _WIDER).excess(self.bounds)
+                misses = [name for name, ratio in found.items() if ratio > 1]
                 if misses and factor == _WIDER:
                     broken[k] = misses
                     break
@@ -309,7 +310,7 @@ def suggest_domain(
     stricter = replace(bounds, conditioning=min(1.0, _MARGIN * bounds.conditioning))
     widths, broken = WidestBox(prober, posture.q, room, joints.free, stricter, monitor).found(_unit(robot))
     wanted = default_parametrisation(problem, bounded=True) if parametrisation is None else parametrisation
-    found, verdict = _confirmed(problem, wanted, joints, widths, bounds, loss, seed, monitor)
+    found, verdict = _confirmed(prober, wanted, joints, widths, bounds, seed, monitor)
     return DomainSuggestion(
         fit=found,
         home=posture.q,
@@ -396,23 +397,22 @@ def _farthest(robot: Robot) -> Array:
 
 
 def _confirmed(
-    problem: Problem,
+    prober: Prober,
     parametrisation: Parametrisation,
     joints: _Joints,
     widths: Array,
     bounds: Bounds,
-    weights: Weights,
     seed: int,
     monitor: Monitor,
 ) -> tuple[Fit, Verdict]:
     """A fit that keeps the bounds, and its quality. The box shrinks until there is one."""
-    robot = problem.robot
+    problem, robot = prober.problem, prober.problem.robot
     unbounded = [k for k in joints.idle if np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
     factors = np.where(np.isin(np.arange(robot.n), joints.free), _SHRINK, 1.0)
     for shrinkings in range(_TRIES):
         box = Box(problem.domain.centre, widths * factors**shrinkings, unbounded)
         trial = Problem(robot, problem.task, problem.metric, box, problem.name)
-        found = fit(trial, parametrisation, weights=weights, seed=seed, monitor=monitor)
+        found = fit_from(prober.start_on, trial, parametrisation, prober.weights, seed, monitor)
         verdict = judged_chart(found.chart, JUDGES, seed + 1)
         if max(verdict.excess(bounds).values()) <= 1:
             return found, verdict
