@@ -32,7 +32,7 @@ JUDGES = 30_000  #: samples that judge the fit
 _START, _STEP = 0.5, 1.6  # first scale of the box, and factor to the next while the boundary is unknown
 _CLOSE = 1.06  # the boundary is found within this factor
 _SMALLEST = 1e-3  # scale of a box that is too small to be of use
-_ROUNDS, _MANY_JOINTS = 2, 12  # exchanges of width between joints; none for so many joints, whose trials take a second
+_ROUNDS, _FEW_JOINTS = 2, 12  # exchanges of width between joints; one for so many joints, whose trials take a second
 _WIDER = 1.2  # factor by which one joint alone is widened
 _LARGEST_EXCHANGE = np.log(1.5)
 _STAGE = "suggest a domain"
@@ -163,7 +163,7 @@ class WidestBox:
         if not self.free:
             return self.room.copy(), {}
         widths = self._to_boundary(unit, _START)
-        for _ in range(_ROUNDS if len(self.free) < _MANY_JOINTS else 0):
+        for _ in range(_ROUNDS if len(self.free) < _FEW_JOINTS else 1):
             trial = self._to_boundary(widths * np.exp(-self._exchange(widths)), 1.0)
             if np.log(trial[self.free]).sum() <= np.log(widths[self.free]).sum():
                 break
@@ -184,7 +184,7 @@ class WidestBox:
         return clipped
 
     def _excess(self, widths: Array) -> float:
-        return max(self.verdict(widths).excess(self.bounds).values())
+        return max(self.verdict(widths, leap=True).excess(self.bounds).values())
 
     def _refusal(self, widths: Array) -> DomainError:
         """Which bound breaks even on a box of these half-widths (n,), and what may help."""
@@ -200,7 +200,7 @@ class WidestBox:
         low, high = 0.0, np.inf
         while high > _CLOSE * low:
             widths = self._clipped(scale * unit)
-            if self._excess(widths) <= 1:
+            if max(self.verdict(widths, self.bounds).excess(self.bounds).values()) <= 1:
                 low = scale
                 if np.array_equal(widths, self.room):
                     break
@@ -225,10 +225,10 @@ class WidestBox:
         """Widen each joint alone while the bounds are kept, and say what breaks then."""
         broken: dict[int, list[Miss]] = {k: [] for k in self.free}
         for k in self.free:
-            factor = _WIDER
+            before, factor = widths[k], _WIDER
             while widths[k] < self.room[k]:
                 wider = self._widened(widths, k, factor)
-                found = self.verdict(wider, self.bounds, leap=factor > _WIDER).excess(self.bounds)
+                found = self.verdict(wider, self.bounds, leap=widths[k] > before).excess(self.bounds)
                 misses = [name for name, ratio in found.items() if ratio > 1]
                 if misses and factor == _WIDER:
                     broken[k] = misses
