@@ -10,7 +10,7 @@ from orthocas.bases.family import JointSpace
 from orthocas.bases.products import Polynomial, ProductFamily
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
-from orthocas.charts.point_quality import in_the_metric
+from orthocas.charts.point_quality import in_the_metric, worst_points
 from orthocas.fitting.basis_gradients import gradients_of
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.starts import spectral_start
@@ -175,6 +175,18 @@ class Prober:
             return None
         quadratic = Polynomial(_DEGREE, self.cyclic).family(family.space, self.outputs)
         return family.embed(self._start.on(quadratic), quadratic)
+
+    def least(self, problem: Problem, seed: int) -> float:
+        """Least conditioning of the last coordinates on another domain, by descent; 1, the largest, if none are kept."""
+        if self._start is None:
+            return 1.0
+        parametrisation = Polynomial(_DEGREE, self.cyclic)
+        family = parametrisation.family(JointSpace.of(problem).restricted_to(self.active), self.outputs)
+        idle = tuple(k for k in range(problem.n) if k not in self.active)
+        zeros, ones = np.zeros(self.outputs), np.ones(self.outputs)
+        theta = self._start.on(family)
+        found = Coordinates(parametrisation, JointSpace.of(problem), idle, theta, zeros, ones)
+        return worst_points(problem, found, seed, thorough=True).least
 
     def _judged(self, problem: Problem, family: ProductFamily, theta: Array) -> Verdict:
         C = theta.reshape(self.outputs, family.width)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.bases.cyclic import cyclic_joints
 from orthocas.bases.family import Parametrisation
+from orthocas.charts.point_quality import worst_points
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.fit import Fit, fit_from
 from orthocas.fitting.probe import Bounds, Miss, Prober, Verdict, judged_chart
@@ -47,7 +48,8 @@ _MARGIN = 1.25  # trial charts keep a higher conditioning, since a fit is judged
 _FARTHEST = np.pi  # largest half-width of a revolute joint [rad]: a full turn
 _LONGEST = 1.0  # largest half-width of a prismatic joint without limits [m]
 _CHECKED = 200  # samples for whether the task can be regular at all, and which joints are idle
-_SHRINK, _TRIES = 0.92, 8  # after a fit that misses a bound
+_SHRINK, _TRIES = 0.92, 12  # after a fit that misses a bound
+_DESCENT = 0.5  # share of the bound on the conditioning that descents from the worst samples keep, too
 
 Reason = Literal["joint limit", "unlimited", "idle", "cyclic", "leak", "conditioning", "singularity", "half a turn"]
 _WORDS: dict[Reason, str] = {
@@ -409,14 +411,19 @@ def _confirmed(
     problem, robot = prober.problem, prober.problem.robot
     unbounded = [k for k in joints.idle if np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
     factors = np.where(np.isin(np.arange(robot.n), joints.free), _SHRINK, 1.0)
+    last, enough = "too small a conditioning", _DESCENT * bounds.conditioning
     for shrinkings in range(_TRIES):
         box = Box(problem.domain.centre, widths * factors**shrinkings, unbounded)
         trial = Problem(robot, problem.task, problem.metric, box, problem.name)
+        if not prober.least(trial, seed + 1) >= enough:  # a fit would take ten times as long to find that
+            continue
         found = fit_from(prober.start_on, trial, parametrisation, prober.weights, seed, monitor)
         verdict = judged_chart(found.chart, JUDGES, seed + 1)
-        if max(verdict.excess(bounds).values()) <= 1:
+        least = worst_points(found.chart.problem, found.chart.coordinates, seed + 1, thorough=True).least
+        if least >= enough and max(verdict.excess(bounds).values()) <= 1:
             return found, verdict
+        last = f"a leak of {verdict.leak_deg:.3g} deg and a conditioning of {min(least, verdict.conditioning):.3g}"
     raise DomainError(
-        f"fits of {parametrisation.label} miss the bounds on {_TRIES} ever smaller boxes around the home: the last one "
-        f"has a leak of {verdict.leak_deg:.3g} deg and a conditioning of {verdict.conditioning:.3g}; {REMEDIES}"
+        f"{parametrisation.label} misses the bounds on {_TRIES} ever smaller boxes around the home: the last one has "
+        f"{last}; {REMEDIES}"
     )
