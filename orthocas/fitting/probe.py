@@ -34,7 +34,7 @@ from orthocas.tools.interrupts import deferred
 _DEGREE = 2  # its conditioning is that of degree 4, its leak about a fifth larger
 _TRAINING, _HEAVY, _JUDGES = 700, 300, 3000  # numbers of samples: even, near faces and corners, and of a verdict
 _MANY = 6  # coordinates from which a fit starts from that of another box
-_OTHER = 1.5  # factor of a half-width from which the matrix of another box steers no more
+_OTHER = 2.0  # factor of a half-width from which the matrix of another box steers no more
 _SEED = 0
 _TINY = 1e-4
 
@@ -177,7 +177,7 @@ class Prober:
         return family.embed(self._start.on(quadratic), quadratic)
 
     def least(self, problem: Problem, seed: int) -> float:
-        """Least conditioning of the last coordinates on another domain, by descent; 1, the largest, if none are kept."""
+        """Least conditioning of the last coordinates on another domain, by descent; 1 if none are kept."""
         if self._start is None:
             return 1.0
         parametrisation = Polynomial(_DEGREE, self.cyclic)
