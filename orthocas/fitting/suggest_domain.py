@@ -224,7 +224,7 @@ class WidestBox:
         return np.clip(costs, -_LARGEST_EXCHANGE, _LARGEST_EXCHANGE)
 
     def _grown(self, widths: Array) -> tuple[Array, dict[int, list[Miss]]]:
-        """Widen each joint alone while the bounds are kept, and say what breaks then."""
+        """Widen each joint alone while the bounds are kept, and say what breaks then. Its first step may need a fit."""
         broken: dict[int, list[Miss]] = {k: [] for k in self.free}
         for k in self.free:
             before, factor = widths[k], _WIDER
@@ -262,7 +262,7 @@ def suggest_domain(
 
     Quadratic charts on trial boxes give leak and conditioning in a fraction of a second. A search over the half-widths
     of the joints takes the box with the largest volume that keeps both bounds, and a fit confirms it: if the fit misses
-    a bound, the box shrinks by 8 %. Idle and cyclic joints take their whole range. The result is deterministic.
+    a bound, or has less than half of the conditioning anywhere that descents reach, the box shrinks by 8 %. Idle and cyclic joints take their whole range. The result is deterministic.
 
     Args:
         robot: the robot.
