@@ -262,7 +262,8 @@ def suggest_domain(
 
     Quadratic charts on trial boxes give leak and conditioning in a fraction of a second. A search over the half-widths
     of the joints takes the box with the largest volume that keeps both bounds, and a fit confirms it: if the fit misses
-    a bound, or has less than half of the conditioning anywhere that descents reach, the box shrinks by 8 %. Idle and cyclic joints take their whole range. The result is deterministic.
+    a bound, or has less than half of the conditioning anywhere that descents reach, the box shrinks by 8 %. Idle and
+    cyclic joints take their whole range. The result is deterministic.
 
     Args:
         robot: the robot.
