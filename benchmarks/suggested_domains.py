@@ -1,14 +1,23 @@
-"""Suggested domains of real arms from their URDFs, without tuning: what ends them, and quality at many samples."""
+"""Suggested domains of real arms from their URDFs, without tuning: what ends them, and quality at many samples.
 
+Then those of long planar arms and of two hands, with the time of a core, and a search for folds with another seed.
+"""
+
+import time
+from collections.abc import Iterator
 from importlib.metadata import files
 from pathlib import Path
 
+import many_joints
+import numpy as np
 from benchmark import run, table
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.charts.point_quality import worst_points
 from orthocas.errors import DomainError
 from orthocas.fitting.probe import judged_chart
+from orthocas.tools.checks import Array
 
 CASES = (  # robot, task, metric
     ("iiwa", "position", "euclidean"),
@@ -39,6 +48,11 @@ HEADER = (
     "| robot, task, metric | home | half-widths [rad or m] | leak [deg] | least conditioning |\n"
     "| --- | --- | --- | --- | --- |"
 )
+MANY = (
+    "| many joints | n, m, r | time of a core [s] | mean half-width [rad] | leak [deg] | at samples | by descent |\n"
+    "| --- | --- | --- | --- | --- | --- | --- |"
+)
+OTHER_SEED = 100
 MARKS = {"leak": "L", "conditioning": "C", "singularity": "S", "joint limit": "J", "half a turn": "H"}
 
 
@@ -67,11 +81,37 @@ def row(name: str, task: str, metric: str, degree: int, samples: int) -> str:
     return f"| {name}, {task}, {metric} | {home} | {widths} | {verdicts[0].leak_deg:.2f} | {shown} |"
 
 
+def long_arms() -> Iterator[tuple[str, oc.Robot, oc.Task, Array]]:
+    """Names, robots, tasks and homes of robots with many joints."""
+    for n in (12, 16, 20):
+        arm = oc.Robot.planar([3.0 / n] * n, [1.0] * n)
+        yield f"planar, {n} joints", arm, oc.Task.position(arm, "xy"), np.full(n, many_joints.HALF_WIDTH)
+    for case in many_joints.cases(quick=False):
+        if case.name == "talos, both hands":
+            yield case.name, case.problem.robot, case.problem.task, case.problem.domain.centre
+
+
+def row_of_many(name: str, robot: oc.Robot, task: oc.Task, home: Array) -> str:
+    """One row of the table of many joints; the mean is the geometric one of joints that are neither idle nor cyclic."""
+    began = time.process_time()
+    found = oc.suggest_domain(robot, task, home)
+    seconds = time.process_time() - began
+    chart = found.fit.chart
+    widths = [joint.half_width for joint in found.joints if joint.reason not in ("idle", "cyclic")]
+    verdict = judged_chart(chart, 100_000, OTHER_SEED)
+    least = worst_points(chart.problem, chart.coordinates, OTHER_SEED, thorough=True).least
+    return (
+        f"| {name} | {chart.n}, {chart.m}, {chart.r} | {seconds:.0f} | {np.exp(np.mean(np.log(widths))):.2f} "
+        f"| {verdict.leak_deg:.1f} | {verdict.conditioning:.2f} | {least:.2f} |"
+    )
+
+
 def main(quick: bool = False) -> list[str]:
     """All rows; `quick` takes one arm, quadratic coordinates and few samples."""
     cases = [("ur10", "position", "euclidean")] if quick else CASES
     size = (2, 50_000) if quick else (4, 1_000_000)
-    return table(HEADER, (row(*case, *size) for case in cases))
+    rows = table(HEADER, (row(*case, *size) for case in cases))
+    return rows if quick else rows + table(MANY, (row_of_many(*case) for case in long_arms()))
 
 
 if __name__ == "__main__":

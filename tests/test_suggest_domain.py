@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import casadi as ca
 import numpy as np
 import pytest
 from conftest import ROBOTS, robot_data
@@ -11,6 +12,7 @@ from public_objects import suggestion
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.bases.family import JointSpace
 from orthocas.charts.quality import evaluate
 from orthocas.errors import DomainError, InvalidValueError, NotRedundantError, SingularTaskError, UnknownNameError
 from orthocas.fitting.probe import Prober, judged_chart, leak_and_conditioning
@@ -181,6 +183,47 @@ def test_progress_is_reported_and_ctrl_c_ends_the_search() -> None:
         suggested(monitor=stop)
     assert [progress.stage for progress in seen] == ["suggest a domain"] * 3
     assert 0 < seen[0].fraction < seen[2].fraction < 1
+
+
+@pytest.mark.slow
+def test_coordinates_are_continued_to_another_box() -> None:
+    """They are the same functions, up to constants, outside of the first box as well."""
+    robot = oc.Robot.planar([0.3] * 8, [1.0] * 8)
+    problem = oc.Problem(robot, oc.Task.position(robot, "xy"), domain=oc.Box([0.3] * 8, 0.1))
+    prober = Prober(problem, list(range(8)), ("q1",))
+    assert prober.start_on(family_of(problem, 0.1)) is None
+    prober.verdict(problem.domain)
+    widths = np.linspace(0.05, 0.4, 8)
+    small, large = family_of(problem, 0.1), family_of(problem, widths)
+    q = sample_heavily(oc.Box([0.3] * 8, 0.5), 30, 1).T
+    gradients = []
+    for family in (small, large):
+        theta = prober.start_on(family)
+        assert theta is not None
+        q_symbol = ca.SX.sym("q", 8)
+        xi = theta.reshape(6, -1) @ family.basis(q_symbol)
+        gradients.append(np.array(ca.Function("J", [q_symbol], [ca.jacobian(xi, q_symbol)])(q)))
+    np.testing.assert_allclose(*gradients, atol=1e-9)
+
+
+def family_of(problem: oc.Problem, widths: object) -> object:
+    """Quadratic functions of a box around the problem's centre."""
+    box = oc.Box(problem.domain.centre, widths)
+    return oc.Polynomial(2).family(JointSpace.of(dataclasses.replace(problem, domain=box)), 6)
+
+
+@pytest.mark.slow
+def test_many_joints_get_a_box_without_folds() -> None:
+    """Judged by determinants in corners, with other samples, by other code."""
+    robot = oc.Robot.planar([0.3] * 9, [1.0] * 9)
+    found = oc.suggest_domain(robot, oc.Task.position(robot, "xy"), [0.3] * 9, parametrisation=oc.Polynomial(2))
+    assert found.conditioning >= 0.2
+    assert found.leak_deg <= 8.0
+    domain, chart = found.domain, found.fit.chart
+    corners = domain.centre + domain.half_width * np.random.default_rng(5).choice([-1.0, 1.0], (3000, 9))
+    signs = {float(np.linalg.slogdet(chart.jacobian(q))[0]) for q in corners}
+    assert len(signs) == 1
+    assert np.log(found.domain.half_width[1:]).mean() > np.log(0.2)
 
 
 @pytest.mark.slow

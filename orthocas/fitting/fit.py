@@ -1,7 +1,7 @@
 """`fit`: fits coordinates to a problem, along stages, and fixes what the loss leaves free."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from orthocas.bases.family import (
     ReorderableFamily,
 )
 from orthocas.bases.mobile import Mobile, anywhere
+from orthocas.bases.products import Polynomial, ProductFamily
 from orthocas.bases.registry import warn_unless_savable
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
@@ -52,6 +53,7 @@ _SEARCHED = 3  # degree from which worst points are searched: those of lower deg
 _ROUNDS = 4  # of the last degree
 _LEAST_GAIN = 0.01  # of the conditioning in a round
 _FIRST_SAMPLES = 1000  # seed tag of the samples that scale coordinates; stages use other tags
+Begin = Callable[[ProductFamily], Array | None]  #: parameters to start from, (size,), if some are known
 
 
 @dataclass(frozen=True)
@@ -206,10 +208,12 @@ class Continuation:
     Args:
         runner: runs single stages.
         r: number of coordinates of the active joints.
+        begin: gives parameters of polynomials to start from, instead of a spectral start. Without a mirror only, since
+            coordinates of another fit need not be even and odd.
     """
 
-    def __init__(self, runner: StageRunner, r: int) -> None:
-        self._runner, self._r = runner, r
+    def __init__(self, runner: StageRunner, r: int, begin: Begin | None = None) -> None:
+        self._runner, self._r, self._begin = runner, r, begin
         self._stages: list[Stage] = []
         self._reached: tuple[Parametrisation, Family] | None = None
 
@@ -247,9 +251,13 @@ class Continuation:
             runner.folds.search(stage, step, len(self._stages), runner.monitor)
 
     def _start(self, family: Family) -> Array | None:
-        """The last result, embedded."""
+        """The last result, embedded; at first that of `begin`."""
         if self._reached is None:
-            return None
+            polynomials = isinstance(self._runner.settings.parametrisation, Polynomial)
+            if self._begin is None or not polynomials or self._runner.mirror is not None:
+                return None
+            assert isinstance(family, ProductFamily)
+            return self._begin(family)
         theta, before = self._stages[-1].result.theta, self._reached[1]
         if theta.size == family.size:
             return theta
@@ -405,16 +413,44 @@ def fit(
     )
     if like is not None and align_to is not None:
         raise InvalidValueError("like", "given with align_to", "one of them: both define order and signs")
+    with using_threads(None if threads is None else require_count("threads", threads)):
+        return _finished(problem, settings, monitor, checkpoint, align_to, start)
+
+
+def fit_from(
+    begin: Begin,
+    problem: Problem,
+    parametrisation: Parametrisation,
+    weights: Weights,
+    seed: int,
+    monitor: Monitor,
+) -> Fit:
+    """The fit of `fit`, from known coordinates if there are some."""
+    start = time.perf_counter()
+    settings = FitSettings.checked(problem, parametrisation, None, weights, None, seed, None)
+    return _finished(problem, settings, monitor, None, None, start, begin)
+
+
+def _finished(
+    problem: Problem,
+    settings: FitSettings,
+    monitor: Monitor,
+    checkpoint: str | Path | None,
+    align_to: Chart | None,
+    start: float,
+    begin: Begin | None = None,
+) -> Fit:
+    """The fit on the domain that its parametrisation asks for, or Interrupted."""
     warn_unless_savable(settings.parametrisation)
     if isinstance(settings.parametrisation, CyclicParametrisation):
         problem = over_cyclic_joints(problem, tuple(settings.parametrisation.cyclic))
-    if problem.robot.tree.floating and (settings.parametrisation.closed_form is not None or not split_idle):
+    if problem.robot.tree.floating and (settings.parametrisation.closed_form is not None or not settings.split_idle):
         wanted_there = "one to fit in the arms' joints, such as Polynomial(1), with split_idle: the base floats"
         raise InvalidValueError("parametrisation", settings.parametrisation.label, wanted_there)
     if isinstance(settings.parametrisation, Mobile):
         problem = anywhere(problem, settings.parametrisation.base)
-    with remembered() as pressed, using_threads(None if threads is None else require_count("threads", threads)):
-        result = _fitted(problem, settings, monitor, checkpoint, align_to, start)
+    with remembered() as pressed:
+        result = _fitted(problem, settings, monitor, checkpoint, align_to, start, begin)
         if result.status is Status.INTERRUPTED or pressed():
             raise Interrupted(result)
     return result
@@ -427,6 +463,7 @@ def _fitted(
     checkpoint: str | Path | None,
     align_to: Chart | None,
     start: float,
+    begin: Begin | None,
 ) -> Fit:
     """Fit with settings that are checked; `start` is when the fit began."""
     found = check(problem, seed=settings.seed)
@@ -439,7 +476,7 @@ def _fitted(
     else:
         idle = tuple(idle_joints(problem, first)[-problem.r :]) if settings.split_idle else ()
         file = Checkpoint(None if checkpoint is None else as_path("checkpoint", checkpoint), settings.identity(problem))
-        stages, coordinates, worst = _minimised(problem, settings, idle, monitor, file, first)
+        stages, coordinates, worst = _minimised(problem, settings, idle, monitor, file, first, begin)
         if stages:
             coordinates = _arranged(coordinates, problem, settings, align_to, first)
     return Fit(
@@ -461,6 +498,7 @@ def _minimised(
     monitor: Monitor,
     checkpoint: Checkpoint,
     samples: Samples,
+    begin: Begin | None,
 ) -> tuple[tuple[Stage, ...], Coordinates, WorstPoints | None]:
     """Run the stages of the fit. Returns them, the coordinates, and their worst points."""
     space, r = JointSpace.of(problem), problem.r - len(idle)
@@ -470,7 +508,8 @@ def _minimised(
     like = None if settings.like is None else settings.like.term(problem, active)
     settings = settings if like is None else settings.with_term(like)
     folds = FoldSearch(problem, active, settings.fold_weight(problem))
-    solved = Continuation(StageRunner(problem, settings, active, monitor, checkpoint, folds, like), r).run()
+    runner = StageRunner(problem, settings, active, monitor, checkpoint, folds, like)
+    solved = Continuation(runner, r, begin).run()
     raw = Coordinates(solved.parametrisation, space, idle, solved.theta, np.zeros(r), np.ones(r))
     return solved.stages, normalised(raw, problem.domain.centre, samples), solved.worst
 

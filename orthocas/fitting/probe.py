@@ -6,17 +6,18 @@ from typing import Literal
 
 import numpy as np
 
-from orthocas.bases.family import JointSpace, LinearFamily
-from orthocas.bases.products import Polynomial
+from orthocas.bases.family import JointSpace
+from orthocas.bases.products import Polynomial, ProductFamily
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
-from orthocas.charts.point_quality import in_the_metric
+from orthocas.charts.point_quality import in_the_metric, worst_points
 from orthocas.fitting.basis_gradients import gradients_of
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.starts import spectral_start
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Weights
 from orthocas.solvers.gauss_newton import GaussNewton
-from orthocas.solvers.protocol import Status
+from orthocas.solvers.lbfgs import QuasiNewton
+from orthocas.solvers.protocol import SolveResult, Status
 from orthocas.tasks.domains import Box, sample_evenly, sample_heavily
 from orthocas.tasks.problem import (
     NEAR_HALF_A_TURN,
@@ -32,7 +33,8 @@ from orthocas.tools.interrupts import deferred
 
 _DEGREE = 2  # its conditioning is that of degree 4, its leak about a fifth larger
 _TRAINING, _HEAVY, _JUDGES = 700, 300, 3000  # numbers of samples: even, near faces and corners, and of a verdict
-_MANY, _AGAIN = 6, 4  # coordinates from which a fit starts from that of another box, and its steps then
+_MANY = 6  # coordinates from which a fit starts from that of another box
+_OTHER = 2.0  # factor of a half-width from which the matrix of another box steers no more
 _SEED = 0
 _TINY = 1e-4
 
@@ -84,11 +86,47 @@ class Verdict:
         return words[miss]
 
 
+@dataclass(frozen=True, eq=False)
+class _Steered:
+    """A loss with the Gauss-Newton matrix of another box, which is nearly its own on the cube."""
+
+    loss: BasisObjective
+    half_width: Array  #: of the box of the matrix, (n,)
+    matrix: Array
+
+    def value(self, theta: Array) -> float:
+        """L(theta)."""
+        return self.loss.value(theta)
+
+    def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
+        """L(theta) and dL/dtheta."""
+        return self.loss.value_and_gradient(theta)
+
+    def curvature_estimate(self, theta: Array) -> Array:
+        """The matrix."""
+        return self.matrix
+
+
+@dataclass(frozen=True, eq=False)
+class _Start:
+    """Coordinates without folds on a box."""
+
+    half_width: Array  #: of the family's joints, (n,)
+    theta: Array  #: (size,)
+
+    def on(self, family: ProductFamily) -> Array:
+        """The same quadratic coordinates as functions of the joints of another box, up to constants, (size,)."""
+        growth = family.space.half_width / self.half_width
+        factors = np.prod(growth ** np.array(family.terms), axis=1)
+        moved: Array = self.theta.reshape(-1, family.width) * factors
+        return moved.ravel()
+
+
 @dataclass(eq=False)
 class Prober:
     """Fits quadratic coordinates of the active joints on trial boxes.
 
-    Many coordinates take a second, so they start from those of an earlier box, which are nearly the best already.
+    Many coordinates take seconds, so they start from those of an earlier box, which are nearly the best already.
     """
 
     problem: Problem  #: robot, task and metric; trial boxes replace its domain
@@ -96,15 +134,21 @@ class Prober:
     cyclic: tuple[str, ...] = ()  #: joints that enter linearly
     weights: Weights = DEFAULT_WEIGHTS  #: of the fit that confirms the box; lengths and terms of others do not count
     _objective: BasisObjective | None = None  #: of the last box; others only move it
-    _start: Array | None = None  #: parameters of the last box without folds, on its cube; None: a spectral start
+    _start: _Start | None = None  #: of the last box without folds; None: a spectral start
+    _steered: _Steered | None = None  #: of the last box whose matrix was computed
 
     @property
     def outputs(self) -> int:
         """Number of coordinates to fit."""
         return len(self.active) - self.problem.m
 
-    def verdict(self, box: Box) -> Verdict:
+    def verdict(self, box: Box, enough: Bounds | None = None, leap: bool = False) -> Verdict:
         """Fit and judge on a box.
+
+        Args:
+            box: the box.
+            enough: bounds that coordinates of an earlier box may keep, too; then they need no fit.
+            leap: whether coordinates of an earlier box are not fitted in any case, if there are some.
 
         Raises:
             KeyboardInterrupt: after Ctrl-C.
@@ -115,39 +159,75 @@ class Prober:
         space = JointSpace.of(problem).restricted_to(self.active)
         family = Polynomial(_DEGREE, self.cyclic).family(space, self.outputs)
         with one_blas_thread():
+            if self._start is not None and (enough is not None or leap):
+                found = self._judged(problem, family, self._start.on(family))
+                if leap or (enough is not None and max(found.excess(enough).values()) <= 1):
+                    return found
             theta = self._fitted(problem, family)
-            C = theta.reshape(self.outputs, family.width)
-
-            def jacobian(points: Array) -> Array:
-                basis = gradients_of(family, len(self.active))
-                G = basis.dense(basis.at(points[:, self.active]), len(points))
-                J: Array = (G @ C.T).transpose(0, 2, 1)
-                return J
-
-            found = judged(problem, sample_heavily(box, _JUDGES, _SEED), jacobian, self.active)
+            found = self._judged(problem, family, theta)
         if self.outputs >= _MANY and found.conditioning > 0:
-            self._start = theta
+            self._start = _Start(space.half_width, theta)
         return found
 
-    def _fitted(self, problem: Problem, family: LinearFamily) -> Array:
+    def start_on(self, family: ProductFamily) -> Array | None:
+        """Coefficients (size,) of the last coordinates without folds in a family of other degrees on another box."""
+        if self._start is None:
+            return None
+        quadratic = Polynomial(_DEGREE, self.cyclic).family(family.space, self.outputs)
+        return family.embed(self._start.on(quadratic), quadratic)
+
+    def least(self, problem: Problem, seed: int) -> float:
+        """Least conditioning of the last coordinates on another domain, by descent; 1 if none are kept."""
+        if self._start is None:
+            return 1.0
+        parametrisation = Polynomial(_DEGREE, self.cyclic)
+        family = parametrisation.family(JointSpace.of(problem).restricted_to(self.active), self.outputs)
+        idle = tuple(k for k in range(problem.n) if k not in self.active)
+        zeros, ones = np.zeros(self.outputs), np.ones(self.outputs)
+        theta = self._start.on(family)
+        found = Coordinates(parametrisation, JointSpace.of(problem), idle, theta, zeros, ones)
+        return worst_points(problem, found, seed, thorough=True).least
+
+    def _judged(self, problem: Problem, family: ProductFamily, theta: Array) -> Verdict:
+        C = theta.reshape(self.outputs, family.width)
+
+        def jacobian(points: Array) -> Array:
+            basis = gradients_of(family, len(self.active))
+            G = basis.dense(basis.at(points[:, self.active]), len(points))
+            J: Array = (G @ C.T).transpose(0, 2, 1)
+            return J
+
+        return judged(problem, sample_heavily(problem.domain, _JUDGES, _SEED), jacobian, self.active)
+
+    def _fitted(self, problem: Problem, family: ProductFamily) -> Array:
         """Parameters, (size,)."""
         even = sample_evenly(problem.domain, _TRAINING, _SEED)
         heavy = sample_heavily(problem.domain, _HEAVY, _SEED + 1)
         samples = samples_at(problem, np.vstack([even, heavy])).restricted_to(self.active)
-        solver = GaussNewton().coarser()
         with deferred():
-            if self._start is None:
-                start = spectral_start(family, samples[: len(even)])
-            else:
-                start, solver = self._start, replace(solver, max_iterations=_AGAIN)
+            fresh = self._start is None
+            start = spectral_start(family, samples[: len(even)]) if self._start is None else self._start.on(family)
             objective = self._loss(problem, family, samples, start)
-        result = solver.minimise(objective, start)
+        result = self._minimised(objective, start, fresh, family.space.half_width)
         if result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         theta: Array = result.theta
         return theta
 
-    def _loss(self, problem: Problem, family: LinearFamily, samples: Samples, start: Array) -> BasisObjective:
+    def _minimised(self, objective: BasisObjective, start: Array, fresh: bool, half_width: Array) -> SolveResult:
+        if self.outputs < _MANY:
+            return GaussNewton().coarser().minimise(objective, start)
+        solver = QuasiNewton().coarser()
+        if fresh:
+            return solver.minimise(objective, start)
+        known = self._steered
+        if known is None or np.abs(np.log(half_width / known.half_width)).max() > np.log(_OTHER):
+            self._steered = _Steered(objective, half_width, objective.curvature_estimate(start))
+        else:
+            self._steered = replace(known, loss=objective)
+        return solver.minimise(self._steered, start)
+
+    def _loss(self, problem: Problem, family: ProductFamily, samples: Samples, start: Array) -> BasisObjective:
         """The loss of the fit that confirms the box."""
         known = self._objective
         if known is None:

@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike
 
 from orthocas.bases.cyclic import cyclic_joints
 from orthocas.bases.family import Parametrisation
+from orthocas.charts.point_quality import worst_points
 from orthocas.errors import DomainError, InvalidValueError
-from orthocas.fitting.fit import Fit, fit
+from orthocas.fitting.fit import Fit, fit_from
 from orthocas.fitting.probe import Bounds, Miss, Prober, Verdict, judged_chart
 from orthocas.fitting.settings import default_parametrisation, require_parametrisation
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
@@ -47,7 +48,8 @@ _MARGIN = 1.25  # trial charts keep a higher conditioning, since a fit is judged
 _FARTHEST = np.pi  # largest half-width of a revolute joint [rad]: a full turn
 _LONGEST = 1.0  # largest half-width of a prismatic joint without limits [m]
 _CHECKED = 200  # samples for whether the task can be regular at all, and which joints are idle
-_SHRINK, _TRIES = 0.92, 8  # after a fit that misses a bound
+_SHRINK, _TRIES = 0.92, 12  # after a fit that misses a bound
+_DESCENT = 0.5  # share of the bound on the conditioning that descents from the worst samples keep, too
 
 Reason = Literal["joint limit", "unlimited", "idle", "cyclic", "leak", "conditioning", "singularity", "half a turn"]
 _WORDS: dict[Reason, str] = {
@@ -170,13 +172,13 @@ class WidestBox:
             widths = trial
         return self._grown(widths)
 
-    def verdict(self, widths: Array) -> Verdict:
-        """Fit and judge the box of the given half-widths."""
+    def verdict(self, widths: Array, enough: Bounds | None = None, leap: bool = False) -> Verdict:
+        """Fit and judge the box of the given half-widths, see `Prober.verdict`."""
         self.probes += 1
         detail = f"trial {self.probes}: mean half-width {widths[self.free].mean():.3g}"
         expected = _PROBES + _PROBES_OF_A_JOINT * len(self.free)
         self.monitor(Progress(_STAGE, min(0.99, self.probes / expected), detail))
-        return self.prober.verdict(Box(self.home, widths))
+        return self.prober.verdict(Box(self.home, widths), enough, leap)
 
     def _clipped(self, widths: Array) -> Array:
         clipped = self.room.copy()
@@ -184,7 +186,7 @@ class WidestBox:
         return clipped
 
     def _excess(self, widths: Array) -> float:
-        return max(self.verdict(widths).excess(self.bounds).values())
+        return max(self.verdict(widths, leap=True).excess(self.bounds).values())
 
     def _refusal(self, widths: Array) -> DomainError:
         """Which bound breaks even on a box of these half-widths (n,), and what may help."""
@@ -200,7 +202,7 @@ class WidestBox:
         low, high = 0.0, np.inf
         while high > _CLOSE * low:
             widths = self._clipped(scale * unit)
-            if self._excess(widths) <= 1:
+            if max(self.verdict(widths, self.bounds).excess(self.bounds).values()) <= 1:
                 low = scale
                 if np.array_equal(widths, self.room):
                     break
@@ -222,13 +224,14 @@ class WidestBox:
         return np.clip(costs, -_LARGEST_EXCHANGE, _LARGEST_EXCHANGE)
 
     def _grown(self, widths: Array) -> tuple[Array, dict[int, list[Miss]]]:
-        """Widen each joint alone while the bounds are kept, and say what breaks then."""
+        """Widen each joint alone while the bounds are kept, and say what breaks then. Its first step may need a fit."""
         broken: dict[int, list[Miss]] = {k: [] for k in self.free}
         for k in self.free:
-            factor = _WIDER
+            before, factor = widths[k], _WIDER
             while widths[k] < self.room[k]:
                 wider = self._widened(widths, k, factor)
-                misses = [name for name, ratio in self.verdict(wider).excess(self.bounds).items() if ratio > 1]
+                found = self.verdict(wider, self.bounds, leap=widths[k] > before).excess(self.bounds)
+                misses = [name for name, ratio in found.items() if ratio > 1]
                 if misses and factor == _WIDER:
                     broken[k] = misses
                     break
@@ -259,7 +262,8 @@ def suggest_domain(
 
     Quadratic charts on trial boxes give leak and conditioning in a fraction of a second. A search over the half-widths
     of the joints takes the box with the largest volume that keeps both bounds, and a fit confirms it: if the fit misses
-    a bound, the box shrinks by 8 %. Idle and cyclic joints take their whole range. The result is deterministic.
+    a bound, or has less than half of the conditioning anywhere that descents reach, the box shrinks by 8 %. Idle and
+    cyclic joints take their whole range. The result is deterministic.
 
     Args:
         robot: the robot.
@@ -309,7 +313,7 @@ def suggest_domain(
     stricter = replace(bounds, conditioning=min(1.0, _MARGIN * bounds.conditioning))
     widths, broken = WidestBox(prober, posture.q, room, joints.free, stricter, monitor).found(_unit(robot))
     wanted = default_parametrisation(problem, bounded=True) if parametrisation is None else parametrisation
-    found, verdict = _confirmed(problem, wanted, joints, widths, bounds, loss, seed, monitor)
+    found, verdict = _confirmed(prober, wanted, joints, widths, bounds, seed, monitor)
     return DomainSuggestion(
         fit=found,
         home=posture.q,
@@ -396,27 +400,31 @@ def _farthest(robot: Robot) -> Array:
 
 
 def _confirmed(
-    problem: Problem,
+    prober: Prober,
     parametrisation: Parametrisation,
     joints: _Joints,
     widths: Array,
     bounds: Bounds,
-    weights: Weights,
     seed: int,
     monitor: Monitor,
 ) -> tuple[Fit, Verdict]:
     """A fit that keeps the bounds, and its quality. The box shrinks until there is one."""
-    robot = problem.robot
+    problem, robot = prober.problem, prober.problem.robot
     unbounded = [k for k in joints.idle if np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
     factors = np.where(np.isin(np.arange(robot.n), joints.free), _SHRINK, 1.0)
+    last, enough = "too small a conditioning", _DESCENT * bounds.conditioning
     for shrinkings in range(_TRIES):
         box = Box(problem.domain.centre, widths * factors**shrinkings, unbounded)
         trial = Problem(robot, problem.task, problem.metric, box, problem.name)
-        found = fit(trial, parametrisation, weights=weights, seed=seed, monitor=monitor)
+        if not prober.least(trial, seed + 1) >= enough:  # a fit would take ten times as long to find that
+            continue
+        found = fit_from(prober.start_on, trial, parametrisation, prober.weights, seed, monitor)
         verdict = judged_chart(found.chart, JUDGES, seed + 1)
-        if max(verdict.excess(bounds).values()) <= 1:
+        least = worst_points(found.chart.problem, found.chart.coordinates, seed + 1, thorough=True).least
+        if least >= enough and max(verdict.excess(bounds).values()) <= 1:
             return found, verdict
+        last = f"a leak of {verdict.leak_deg:.3g} deg and a conditioning of {min(least, verdict.conditioning):.3g}"
     raise DomainError(
-        f"fits of {parametrisation.label} miss the bounds on {_TRIES} ever smaller boxes around the home: the last one "
-        f"has a leak of {verdict.leak_deg:.3g} deg and a conditioning of {verdict.conditioning:.3g}; {REMEDIES}"
+        f"{parametrisation.label} misses the bounds on {_TRIES} ever smaller boxes around the home: the last one has "
+        f"{last}; {REMEDIES}"
     )
