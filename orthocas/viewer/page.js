@@ -11,8 +11,7 @@
   if (software) withoutAntialiasing();
   document.addEventListener("DOMContentLoaded", () => {
     styled();
-    once(() => document.querySelector('[data-dock-region-collapse="left"][aria-expanded="true"]'),
-      button => innerWidth < NARROW && button.click());
+    if (innerWidth < NARROW) fold();
     if (software) once(warning, button => button.click());
   });
   if (!new URLSearchParams(location.search).has("fixedDpr"))
@@ -56,6 +55,17 @@
     const found = find();
     if (found) act(found);
     else if (tries) setTimeout(() => once(find, act, tries - 1), 100);
+  }
+
+  // The readings, again if viser opens them while it places the panels, unless the user has done something by then.
+  function fold() {
+    const open = () => document.querySelector('[data-dock-region-collapse="left"][aria-expanded="true"]');
+    let alone = true;
+    addEventListener("pointerdown", () => { alone = false; }, {once: true});
+    once(open, button => {
+      button.click();
+      for (let k = 1; k <= 10; ++k) setTimeout(() => alone && open()?.click(), 200 * k);
+    });
   }
 
   // Pixels follow the time of the pictures while something moves; a still scene is drawn sharply.
