@@ -63,6 +63,7 @@ LOCAL = "127.0.0.1"
 TITLES = ("<title>Viser</title>", "<title>orthocas</title>")  #: of the page: viser's and ours
 BRAND = (31, 95, 168)
 _SCRIPT = Path(__file__).with_name("page.js")
+_ON_ITS_WAY = 0.5  # [s] that a camera may be somewhere else before it is where it was placed
 _PANELS = 320, 300  # [px] widths of readings and sliders
 _VIEW_ANGLE = 0.7  # [rad] of the camera
 _ROOM = 1.15  # around the arms in the picture
@@ -525,15 +526,18 @@ class Framing:
 
     def keep(self, client: Any) -> None:
         """Place the camera of a browser anew when its picture changes its shape."""
-        size, places = (0, 0), [np.array(client.camera.position)]
+        size, places, elsewhere = (0, 0), [np.array(client.camera.position)], float("inf")
 
         def changed(camera: Any) -> None:
-            nonlocal size
+            nonlocal size, elsewhere
             if min(camera.image_width, camera.image_height) < 1 or np.allclose(camera.look_at, camera.position):
                 return  # no picture
             if not any(np.allclose(camera.position, place, atol=_NEAR * self.distance) for place in places):
-                places.clear()  # somebody has turned the scene
+                elsewhere = min(elsewhere, time.monotonic())
+                if time.monotonic() - elsewhere > _ON_ITS_WAY:
+                    places.clear()  # somebody has turned the scene
                 return
+            elsewhere = float("inf")
             if size != (camera.image_width, camera.image_height):
                 size = camera.image_width, camera.image_height
                 position, look_at = self.seen_from(*size)
