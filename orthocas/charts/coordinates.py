@@ -312,7 +312,9 @@ class Coordinates:
             J_active = parts["jacobian"](q[active]) * ca.repmat(scale, 1, len(active))
             J.append(J_active @ ca.DM(unit[active]) if idle else J_active)
             if "jacobian_rate" in parts:
-                at, along = (ca.MX.sym(name, n) for name in ("q", "v"))  # a call with its own symbols would be opened
+                # A function of its own, so that C computes it once for several w. CasADi writes out what is called with
+                # its own symbols, so it has others.
+                at, along = (ca.MX.sym(name, n) for name in ("q", "v"))
                 rate = parts["jacobian_rate"](at[active], along[active])
                 second.append((ca.Function("dJ_xi", [at, along], [rate])(q, v) @ w[active]) * scale)
             else:

@@ -44,8 +44,8 @@ _INVERSE = """{
   if (res[1] != 0) res[1][0] = volume;
   return 0;
 }"""
-# The rounds of `orthocas.control.linear_algebra.root_times`, until what they leave of X = I + E, in the series
-# X^-1/2 = I - E/2 + 3/8 E^2 - ..., is below rounding after its second term. Its arrays are beyond those of the rounds.
+# The rounds of `orthocas.control.linear_algebra.root_times`. They end as soon as X = I + E is so near to I that
+# I - E/2 + 3/8 E^2 is X^-1/2 to rounding. The arrays lie behind those that a round uses.
 _ROOT_TIMES = """{
   casadi_real *X = w + BELOW, *found = X + SIZE * SIZE, *other = found + SIZE * COUNT, rest = 1.0;
   casadi_int i, j, round;
@@ -342,12 +342,12 @@ def _without_warnings(block: str) -> str:
 def with_shared_calls(
     functions: list[ca.Function], states: Mapping[str, int], kept: Collection[str] = ()
 ) -> list[ca.Function]:
-    """The same graphs, and a graph `shared` of q and dq: what some of them call more than once in all for these alone.
+    """The same graphs after a graph `shared` of (q, dq), which computes what they call several times for these alone.
 
     Args:
         functions: graphs whose first inputs are joint positions (n, 1).
-        states: by name, of those that share: 1 if only that input is of the state (q, dq), 2 if the second one is, too.
-            They take what `shared` computes as an additional last input.
+        states: which graphs share, by name: 1 if only their first input is of the state (q, dq), 2 if the second one is
+            dq. They take what `shared` computes as an additional last input.
         kept: names of called functions that stay as they are.
     """
     sharing = {function.name(): function for function in functions if function.name() in states}

@@ -147,8 +147,8 @@ class Prober:
 
         Args:
             box: the box.
-            enough: bounds that coordinates of an earlier box may keep, too; then they need no fit.
-            leap: whether coordinates of an earlier box are not fitted in any case, if there are some.
+            enough: if the coordinates of an earlier box keep these bounds, they are judged without a fit.
+            leap: whether to judge the coordinates of an earlier box without a fit, if there are some.
 
         Raises:
             KeyboardInterrupt: after Ctrl-C.

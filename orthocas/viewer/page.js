@@ -57,7 +57,7 @@
     else if (tries) setTimeout(() => once(find, act, tries - 1), 100);
   }
 
-  // The readings, again if viser opens them while it places the panels, unless the user has done something by then.
+  // Folds the readings, and again if viser opens them while it places the panels, unless the user has acted by then.
   function fold() {
     const open = () => document.querySelector('[data-dock-region-collapse="left"][aria-expanded="true"]');
     let alone = true;
