@@ -1,7 +1,6 @@
 """Branches of the joint range, and charts that are regular on a whole one."""
 
 import json
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ from chart_files import header_of, resealed
 from conftest import robot_data
 from numpy.typing import NDArray
 from programs import Run, needs_c
-from scipy.optimize import minimize
 
 import orthocas as oc
 from orthocas import control
@@ -25,7 +23,7 @@ from orthocas.charts.self_motion import StopKind
 from orthocas.codegen import check_c
 from orthocas.errors import ChartFileError, DomainError, Interrupted, InvalidValueError, ShapeError, UnknownNameError
 from orthocas.fitting.basis_gradients import gradients_of
-from orthocas.fitting.wide import least_hinge
+from orthocas.fitting.wide import _Field, _Shortfall, _Wish
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.domains import sample_heavily, sample_uniform
 from orthocas.tools.progress import Progress
@@ -111,7 +109,8 @@ def test_branches_of_arms_are_cut_where_geometry_says() -> None:
     assert len(found) == 8
     np.testing.assert_allclose([item.share for item in found], 1 / 8, atol=5e-3)
     offset = oc.branches(panda())  # axes of its elbow do not meet
-    assert [(cut.joint_name, cut.singular) for cut in offset.cuts] == [("panda_joint2", False), ("panda_joint4", True)]
+    known = [("panda_joint2", False, True), ("panda_joint4", True, False), ("panda_joint6", False, False)]
+    assert [(cut.joint_name, cut.singular, cut.exact) for cut in offset.cuts] == known
     stretched = -2 * np.arctan2(0.0825, 0.384) + 0.0  # both links, seen from the offset elbow
     assert abs(offset.cuts[1].value - stretched) < 0.05
 
@@ -252,7 +251,7 @@ def test_base_and_tool_count_like_other_joints_where_linear_terms_are_poor() -> 
         {"torso_1_joint": 0.0, "torso_2_joint": 0.0},
     )
     fit = oc.fit_wide(robot, oc.Task.pose(robot), samples=3000)
-    assert fit.chart.coordinates.parametrisation.label == oc.Polynomial(4).label
+    assert fit.chart.coordinates.parametrisation.label == oc.Polynomial(5).label
     assert fit.regular_share > 0.999
     q = sample_uniform(fit.chart.problem.domain, 2000, 6)
     slopes = np.einsum("sn,sn->s", fit.chart.coordinates.jacobian(q)[:, 0], self_motions(robot, q))
@@ -347,25 +346,42 @@ def test_several_coordinates_follow_several_quantities() -> None:
     assert list(fits[0].like) == ["q3 [rad]", "height"]
 
 
-@pytest.mark.parametrize("margin", [0.0, 0.3])
-def test_the_hinge_has_the_least_value(margin: float) -> None:
-    rng = np.random.default_rng(0)
-    D, G = rng.normal(size=(60, 5)) + 0.4, rng.normal(size=(60, 3, 5))  # G c: gradients of three joints
-    energy, pull = np.diag([0.1, 0.2, 0.3, 0.4, 0.5]), rng.normal(size=5) * 0.1
-
-    def lengths(c: Numbers) -> tuple[Numbers, Callable[[NDArray[np.bool_]], Numbers]]:
-        slopes = G @ c
-        long = np.linalg.norm(slopes, axis=1) + 1e-300
-        return margin * long, lambda kept: margin * np.einsum("si,sik->sk", slopes / long[:, None], G)[kept]
-
-    def value(c: Numbers) -> float:
-        short = np.maximum(0, 1 + margin * np.linalg.norm(G @ c, axis=1) - D @ c)
-        return float(short @ short / 60 + c @ energy @ c - 2 * pull @ c)
-
-    c, least = least_hinge(D, energy, pull, lengths=lengths if margin else None, gain=1e-13)
-    peer = minimize(value, np.full(5, 0.1), method="BFGS", options={"gtol": 1e-10})
-    assert abs(least - peer.fun) < 1e-8
-    np.testing.assert_allclose(c, peer.x, atol=1e-4)
+@pytest.mark.parametrize("metric", ["euclidean", "inertia"])
+def test_the_shortfall_is_that_of_volumes_and_its_slopes_are_differences(metric: Any) -> None:
+    robot = oc.Robot.planar([1.0, 0.8, 0.6, 0.5], [3.0, 2.0, 2.0, 1.0])
+    problem, rng = (
+        oc.Problem(robot, oc.Task.position(robot, "xy"), metric, oc.Box(np.full(4, 0.7), 0.6)),
+        np.random.default_rng(0),
+    )
+    basis = gradients_of(oc.Polynomial(2).family(JointSpace.of(problem), 2), 4)
+    q = [sample_uniform(problem.domain, count, seed) for seed, count in enumerate((300, 700))]
+    fields, C = [_Field(problem, points, basis) for points in q], rng.normal(size=(2, 14))
+    wish = _Wish(np.diag(rng.uniform(size=14)), rng.normal(size=14), 0.3)
+    factor = np.linalg.cholesky(fields[0].energy() + 1e-6 * np.eye(14))
+    loss = _Shortfall(fields, 0.4, -1.0, factor, [wish], C)
+    theta = loss.variables(C)
+    np.testing.assert_allclose(loss.coefficients(theta), C, atol=1e-12)
+    value, slopes = loss.value_and_gradient(theta)
+    parts = []
+    for points in q:
+        J = np.stack(
+            [(robot.tip_position(points + e) - robot.tip_position(points - e))[:, :2] / 2e-6 for e in 1e-6 * np.eye(4)],
+            2,
+        )
+        G = basis.jacobian(basis.at(points), C, len(points))
+        A = (
+            np.array([np.array(robot.mass_matrix(p)) for p in points])
+            if metric == "inertia"
+            else np.broadcast_to(np.eye(4), (len(points), 4, 4))
+        )
+        gram = np.concatenate([J, G], axis=1) @ np.linalg.inv(A) @ np.concatenate([J, G], axis=1).transpose(0, 2, 1)
+        lengths = np.linalg.det(gram[:, :2, :2]) * gram[:, 2, 2] * gram[:, 3, 3]
+        v = -np.sign(np.linalg.det(np.concatenate([J, G], axis=1))) * np.sqrt(np.linalg.det(gram) / lengths)
+        parts.append(np.maximum(0.0, 1 - v / 0.4) ** 2)
+    assert abs(value - np.concatenate(parts).mean() - (C[0] @ wish.E @ C[0] - 2 * wish.g @ C[0] + 0.3)) < 1e-6
+    moved = rng.normal(size=(6, len(theta)))
+    ends = [[loss.value(theta + side * 1e-6 * a) for side in (-1, 1)] for a in moved]
+    np.testing.assert_allclose(np.diff(ends, axis=1)[:, 0] / 2e-6, moved @ slopes, rtol=1e-5)
 
 
 @pytest.mark.parametrize("parametrisation", [oc.Polynomial(3, ["q1"]), oc.Fourier(2)])
@@ -373,17 +389,19 @@ def test_derivatives_along_directions_are_those_of_coordinates(parametrisation: 
     problem, rng = oc.problems.get("planar_3r_xy"), np.random.default_rng(1)
     family = parametrisation.for_problem(problem).family(JointSpace.of(problem), 2)
     q, a, C = rng.normal(size=(1500, 3)), rng.normal(size=(1500, 3)), rng.normal(size=(2, family.width))
-    basis, kept = gradients_of(family, 3), rng.uniform(size=1500) < 0.3
+    basis = gradients_of(family, 3)
     known = basis.at(q)
     own = Coordinates(
         parametrisation.for_problem(problem), JointSpace.of(problem), (), C.ravel(), np.zeros(2), np.ones(2)
     )
     moved = (own.once("xi", q + 1e-6 * a) - own.once("xi", q - 1e-6 * a)) / 2e-6
     np.testing.assert_allclose(basis.along(known, a) @ C.T, moved, atol=1e-7 * np.abs(moved).max())
-    np.testing.assert_allclose(basis.along(known, a, kept), basis.along(known, a)[kept])
     np.testing.assert_allclose(
         np.einsum("sri,si->sr", basis.jacobian(known, C, 1500), a), moved, atol=1e-7 * np.abs(moved).max()
     )
+    slopes = rng.normal(size=(1500, 2, 3))
+    pulled = (basis.pullback(known, slopes) * C).sum()
+    np.testing.assert_allclose(pulled, (slopes * basis.jacobian(known, C, 1500)).sum(), rtol=1e-9)
 
 
 @needs_c
@@ -456,7 +474,7 @@ def test_command_fits_a_branch(run: Run) -> None:
     assert json.loads(out)["branch"] == "shoulder+ elbow- wrist+"
     assert run(*words, "--solver", "lbfgs")[::2] == (
         2,
-        "orthocas: --domain branch solves a convex problem of its own: leave out --solver\n",
+        "orthocas: --domain branch has a solver of its own: leave out --solver\n",
     )
     assert run("fit", "iiwa", "--branch", "up")[::2] == (2, "orthocas: --branch requires --domain branch\n")
 

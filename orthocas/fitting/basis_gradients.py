@@ -81,14 +81,21 @@ class BasisGradients(ABC):
         J: Array = rows.reshape(B, self.n, len(C), c).transpose(0, 3, 2, 1).reshape(B * c, len(C), self.n)
         return J[:samples]
 
-    def along(self, X: Array, directions: Array, kept: NDArray[np.bool_] | None = None) -> Array:
-        """Derivatives a . d psi / dq along directions a (N, n) at samples, or at some of them (N,), (kept, K)."""
+    def pullback(self, X: Array, slopes: Array) -> Array:
+        """dL/dC, (r, K), of a function L of J_xi at all samples, with slopes dL/dJ_xi (N, r, n)."""
+        B, g, _, c = X.shape
+        padded = np.zeros((B * c, self.n * slopes.shape[1]))
+        padded[: len(slopes)] = slopes.transpose(0, 2, 1).reshape(len(slopes), -1)
+        rows = padded.reshape(B, c, g, -1).transpose(0, 2, 3, 1)  # (B, g, n r / g, c)
+        return self.collected(np.matmul(rows, X.transpose(0, 1, 3, 2)).sum(axis=0))
+
+    def along(self, X: Array, directions: Array) -> Array:
+        """Derivatives a . d psi / dq along directions a (N, n) at samples, (N, K)."""
         found, c = [], X.shape[3]
-        chosen = np.ones(len(directions), dtype=bool) if kept is None else kept
         for b in range(0, len(X), _PART):
             part = slice(b * c, min((b + _PART) * c, len(directions)))
             G = self.dense(X[b : b + _PART], part.stop - part.start)
-            found.append(np.einsum("si,sik->sk", directions[part], G)[chosen[part]])
+            found.append(np.einsum("si,sik->sk", directions[part], G))
         return np.concatenate(found)
 
     @abstractmethod
@@ -145,13 +152,11 @@ class ProductGradients(BasisGradients):
         found = self._part(kept, kind) @ values.astype(kind, copy=False)  # (n kept, samples)
         return np.ascontiguousarray(found.T).reshape(found.shape[1], self.n, int(kept.sum()))
 
-    def along(self, X: Array, directions: Array, kept: NDArray[np.bool_] | None = None) -> Array:
+    def along(self, X: Array, directions: Array) -> Array:
         """The sum over the joints of D_i (a_i psi')."""
         K, N = self.family.width, len(directions)
         values = X[:, 0].transpose(1, 0, 2).reshape(X.shape[2], -1)[:, :N]
-        if kept is not None:
-            values, directions = values[:, kept], directions[kept]
-        total = np.zeros((K, len(directions)))
+        total = np.zeros((K, N))
         for i in range(self.n):
             D = self._upright[i * K : (i + 1) * K]
             if D.nnz:

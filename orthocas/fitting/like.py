@@ -87,15 +87,27 @@ class Like:
         """A name for the quantities, the same in every process."""
         return _digest(self.function)
 
+    def require_at_most(self, count: int) -> None:
+        """Raise InvalidValueError if there are more quantities than coordinates."""
+        if len(self.names) > count:
+            raise InvalidValueError("like", f"{len(self.names)} quantities", f"at most {count}, one for a coordinate")
+
+    def slopes(self, points: Array) -> Array:
+        """dy/dq at points (N, n), (N, k, n)."""
+        return np.asarray(self._slopes(points)[0].reshape(len(points), len(self.names), -1))
+
+    @cached_property
+    def _slopes(self) -> BlockedFunction:
+        q = ca.SX.sym("q", self.function.numel_in(0))
+        return BlockedFunction(dense_function("slopes", [q], [ca.jacobian(self.function(q), q)]))
+
     def term(self, problem: Problem, active: list[int]) -> "LikeTerm":
         """The term of the loss for coordinates of the active joints; the others stay at the centre of the domain.
 
         Raises:
             InvalidValueError: if there are fewer coordinates to fit than quantities.
         """
-        fitted = problem.r - (problem.n - len(active))
-        if len(self.names) > fitted:
-            raise InvalidValueError("like", f"{len(self.names)} quantities", f"at most {fitted}, one for a coordinate")
+        self.require_at_most(problem.r - (problem.n - len(active)))
         q = ca.SX.sym("q", len(active))
         whole = ca.SX(ca.DM(problem.domain.centre))
         whole[active] = q
@@ -114,10 +126,8 @@ class Like:
     def distances(self, problem: Problem, coordinates: Coordinates, seed: int) -> dict[str, float]:
         """Root mean square angles between gradients of coordinates and what the task leaves of quantities' [deg]."""
         samples, k = sample_problem(problem, _HELD_OUT, (seed, _HELD_OUT)), len(self.names)
-        q = ca.SX.sym("q", problem.n)
-        slopes = BlockedFunction(dense_function("J", [q], [ca.jacobian(self.function(q), q)]))(samples.points)[0]
         J, Z = coordinates.jacobian(samples.points)[:, :k], samples.null_basis
-        left = slopes.reshape(len(samples), k, -1) @ Z
+        left = self.slopes(samples.points) @ Z
         lengths = np.sqrt(np.einsum("skn,skn->sk", J, samples.raised(J))) * np.linalg.norm(left, axis=2)
         cosines = np.einsum("skz,skz->sk", J @ Z, left) / np.maximum(lengths, _STILL)
         angles = np.degrees(np.sqrt((np.arccos(np.clip(cosines, -1, 1)) ** 2).mean(axis=0)))

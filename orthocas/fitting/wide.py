@@ -1,9 +1,10 @@
 """Wide charts: coordinates that are regular on a whole branch of the joint range."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from functools import partial
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -13,8 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from orthocas.bases.cyclic import leaves_stay, over_cyclic_joints
 from orthocas.bases.family import (
     CyclicParametrisation,
-    GradedFamily,
-    GradedParametrisation,
     JointSpace,
     LinearFamily,
     Parametrisation,
@@ -27,13 +26,13 @@ from orthocas.charts.regular_part import RegularPart
 from orthocas.errors import DomainError, Interrupted, InvalidValueError, RobotError
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
 from orthocas.fitting.checkpoint import Stage
-from orthocas.fitting.fit import Fit, fit, in_gauge, normalised
+from orthocas.fitting.fit import Fit, in_gauge, normalised
 from orthocas.fitting.like import SWIVEL, Like, Likeness, quantity_of
 from orthocas.fitting.settings import require_parametrisation
-from orthocas.fitting.terms import Weights
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import require_driven
-from orthocas.solvers.protocol import SolveResult, Status
+from orthocas.solvers.lbfgs import LBFGS
+from orthocas.solvers.protocol import Status
 from orthocas.tasks.branches import Branch, Branches, branches
 from orthocas.tasks.domains import Box, sample_evenly, sample_heavily, sample_uniform
 from orthocas.tasks.metric import Metric, MetricSpec, metric_matrices
@@ -42,41 +41,35 @@ from orthocas.tasks.regular_box import home_posture
 from orthocas.tasks.samples import sample_problem
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_number, require_count, require_kind
 from orthocas.tools.interrupts import remembered
-from orthocas.tools.progress import Monitor, Progress, silent
+from orthocas.tools.progress import Monitor, Watch, silent
 
 CLEARANCE = 0.1  #: default least relative singular value
 LEAST_VOLUME = 0.05  #: over r, of the coordinates in domains of wide charts; see `RegularPart`
 DEGREE = 6
-_DEGREE_OF_ALL = 4  # where base and tool joints count like all others
+_DEGREE_OF_ALL = 5  # where base and tool joints count like all others
 _EVEN = 0.5  # share of samples that are uniform; the others are heavy near limits
 _PER_TERM, _LEAST_SAMPLES, _MOST_SAMPLES = 30, 5000, 20_000
 _TAG, _JUDGED_TAG, _FIRST_TAG = 3000, 3001, 1000  # seed tags; other samples use other ones
 _FIRST = 200  # samples that scale coordinates
 _JUDGED = 20_000
-_FIRST_STEP = (0.0, 1e-2)  # margin, and weight of the mean squared gradient
-_EASY, _HARDER = ((0.2, 1e-3), (0.2, 1e-4)), ((0.05, 1e-4), (0.05, 1e-5))  # further ones
-_HARD = 0.01  # share of bad positions after the first step with which a large margin asks too much
+_TARGET, _ITERATIONS = 0.5, 100  # of the first descent: the volume that is enough at a sample
+_FURTHER_TARGET, _FURTHER = 0.3, 60  # of further ones
+_ROUNDS, _FRESH, _WORST, _FRESH_TAG = 3, 50_000, 5000, 3002  # further descents, each with the worst of fresh samples
+_TOLERANCE, _RIDGE = 1e-6, 1e-8
 _POOR, _POOR_SEVERAL = 1e-3, 5e-3  # share of bad positions with which another family is tried; if r > 1
 _ENOUGH = 5e-4  # share of bad positions, many near limits, that is as good as none
 _WELL = 0.28  # over r, volume of all but 1 % of positions that is enough; a conditioning of 0.2
-_ROUNDS, _FRESH, _WORST, _FRESH_TAG = 2, 50_000, 5000, 3002  # rounds with the worst of fresh samples
 _UNIFORM_TAG = 1  # within the other tags
 _EVERY = 4  # samples whose gradients count as long
 _TINY = 1e-12  # length of a row
-_NEWTON_STEPS, _GAIN, _RIDGE = 30, 5e-3, 1e-10
 _MEANT = 100.0  # weight of the mean squared error of a meaning, relative to the slope
 _STEP, _MOST_STEPS, _FEWEST = 0.02, 400, 5  # of unit self-motions, along which a meaning is taken
 _ALIKE = 0.01  # weight of the mean squared distance to gradients of quantities, with r > 1
 _STILL = 1e-3  # change of a quantity for a unit self-motion
-_START = 3  # degree of the start, if there are several coordinates
-_START_WEIGHTS = Weights(100.0, 3.0, 1000.0, 0.0, 10_000.0, angles="paper")  # better than in the metric on TIAGo Pro
 _MIDDLES, _CLEARER = 20_000, 1.5  # positions that may be the middle of a domain, and their clearance over the bound
-
-
-Rows = Callable[[NDArray[np.bool_]], Array]  #: samples that are kept (N,) -> rows (kept, K)
-Lengths = Callable[[Array], tuple[Array, Rows]]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -115,26 +108,24 @@ def fit_wide(
 ) -> WideFit:
     """Find coordinates that are regular on a whole branch of the joint range, and as orthogonal as that permits.
 
-    Let z(q), with z^T A z = 1, be the direction of the self-motion; with r > 1, of the self-motion along which the
-    other coordinates stay. A coordinate is regular if and only if dxi/dq . z > 0 everywhere, which is linear in its
-    coefficients. So the fit solves a convex problem, the least
+    Coordinates are regular where their volume v(q) is not zero: det of an orthonormal basis of the task's gradients and
+    of the unit gradients of xi, all in the metric; for r = 1 it is the cosine between the gradient and the self-motion.
+    The fit looks for the least
 
-        mean max(0, 1 + c |dxi/dq|_A^-1 - dxi/dq . z)^2 + s mean |dxi/dq|^2_A^-1
+        mean max(0, 1 - v(q) / t)^2
 
-    over samples of the branch that are clear of singular positions, half of them uniform and half boundary-heavy, by
-    Newton's method. A coordinate loses nothing where the cosine between its gradient and the self-motion is above the
-    margin c, as far as its gradient is long enough. The second mean is least where gradients point along z, that is
-    where coordinates are orthogonal to the task and to each other. First c = 0, then c = 0.2, or c = 0.05 if more than
-    1 % of other samples are not regular yet, each with two weights s. As long as more than 0.05 % are not regular after
-    that, the worst of 50,000 fresh samples join, twice at most. The best of these results is kept: fewest bad
-    positions, as far as these are more than 0.05 %, then the largest 1 % quantile of the volume of `RegularPart`. With
-    r > 1 the problem is solved for one coordinate after the other, from a fit of degree 3. The domain of the chart is
-    the part of the branch where coordinates are regular with a margin, see `RegularPart`.
+    over samples of the branch that are clear of singular positions, half of them uniform and half boundary-heavy. It
+    descends with L-BFGS from linear coordinates across the task in the middle of the branch, whose v has one sign, so
+    no fold has to be undone but those that samples show. First t = 0.5. As long as more than 0.05 % of other samples
+    are not regular after that, or 1 % of them have a volume below 0.28 / r, the worst of 50,000 fresh samples join and
+    t = 0.3, three times at most. The best of these results is kept: fewest bad positions, as far as these are more than
+    0.05 %, then the largest 1 % quantile of the volume. The domain of the chart is the part of the branch where
+    coordinates are regular with a margin, see `RegularPart`.
 
     Coordinates that are linear in the first and the last joint are best to prove and hold at any turn of them. They ask
     that self-motions turn base and tool in one sense on the whole branch, as far as the other joints do not outweigh
     that. Without `parametrisation`, if more than 0.1 % of samples (0.5 % with r > 1) are bad before the worst ones
-    join, polynomials of degree 4 in all joints are tried, too, and the better ones are kept. Where these are, a joint
+    join, polynomials of degree 5 in all joints are tried, too, and the better ones are kept. Where these are, a joint
     without limits has one turn in which samples lie; beyond it, positions belong to the domain as far as coordinates
     are regular there.
 
@@ -155,7 +146,7 @@ def fit_wide(
         clearance: least relative singular value of the task, > 0; see `orthocas.ClearBox`.
         parametrisation: a family that is linear in its parameters. Default: Polynomial(6), with one linear
             term for each joint on whose position self-motions do not depend, such as the first and the last one; or
-            Polynomial(4), see above.
+            Polynomial(5), see above.
         home: posture whose branch is meant, (n,) or its name. Default: as for `suggest_domain`.
         like: what coordinates are to mean: a function of an SX column q, the name of a joint, or "swivel", the angle
             of the elbow about the line from shoulder to wrist [rad]. With r = 1, xi then has nearly the values of that
@@ -201,12 +192,13 @@ def fit_wide(
     problem, _ = cases[0]
     count = None if samples is None else require_count("samples", samples, least=2)
     posture = chosen.posture if home is None else home_posture(robot, task, home).q
-    if problem.r > 1:
-        meaning, several = None, like
-    else:
+    meaning, quantities = None, None
+    if problem.r == 1:
         meaning = Meaning.by_default(problem, posture) if like is None else Meaning.of(problem, like, posture)
-        several = None
-    searches = [_Search(*case, count, seed, monitor, meaning, several) for case in cases]
+    elif like is not None:
+        quantities = Like.of(robot, like)
+        quantities.require_at_most(problem.r)
+    searches = [_Search(*case, count, seed, monitor, meaning, quantities) for case in cases]
     with remembered() as pressed:
         stopped = False
         try:
@@ -254,11 +246,13 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
     centre, status = clear.domain.centre, Status.INTERRUPTED if interrupted else Status.CONVERGED
     first = sample_problem(clear, _FIRST, (seed, _FIRST_TAG))
     raw = search.coordinates(search.best[2])
-    meaning, alike = search.meaning, search.alike
-    coordinates = in_gauge(normalised(raw, centre, first), centre) if meaning is None else meaning.named(raw)
-    if alike is not None:
-        scaled = search.coordinates(alike.scaled(search.best[2]))
-        coordinates = alike.quantities.named(normalised(scaled, centre, first), clear)
+    meaning, quantities = search.meaning, search.quantities
+    if meaning is not None:
+        coordinates = meaning.named(raw)
+    elif quantities is not None:
+        coordinates = quantities.named(normalised(raw, centre, first), clear)
+    else:
+        coordinates = in_gauge(normalised(raw, centre, first), centre)
     try:
         domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
     except DomainError as error:
@@ -269,7 +263,7 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
     worst = worst_points(problem, coordinates, seed, thorough=True)
     notes: dict[str, str | float] = {
-        "solver": "convex",
+        "solver": "lbfgs",
         "seed": seed,
         "samples": search.samples,
         "status": status.value,
@@ -277,7 +271,7 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
         "regular share": share,
         "least conditioning": worst.least,
         **({} if meaning is None else {"meaning": meaning.name, "error of its meaning": meaning.error(coordinates)}),
-        **({} if alike is None else {"meaning": "; ".join(alike.quantities.names)}),
+        **({} if quantities is None else {"meaning": "; ".join(quantities.names)}),
     }
     return WideFit(
         chart=Chart(problem, coordinates, notes),
@@ -288,8 +282,16 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
         seconds=time.perf_counter() - start,
         branch=branch,
         regular_share=share,
-        like={} if alike is None else alike.quantities.distances(problem, coordinates, seed),
+        like={} if quantities is None else quantities.distances(problem, coordinates, seed),
     )
+
+
+class _Wish(NamedTuple):
+    """The term c^T E c - 2 g^T c + a of a coordinate's coefficients c (K,)."""
+
+    E: Array
+    g: Array
+    a: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,7 +301,7 @@ class Meaning:
     points: Array  #: (k, n), the posture in the middle
     values: Array  #: (k,), monotone
     middle: int  #: place of the posture
-    slope: float  #: mean change of the value for a unit self-motion, in the sense of `_Field.directions`
+    slope: float  #: mean change of the value for a unit self-motion, in the sense of `_self_motion`
     name: str  #: with its unit
     wanted: bool  #: whether coordinates are fitted to the values; otherwise they only get their scale and offset
 
@@ -345,18 +347,20 @@ class Meaning:
             raise InvalidValueError("like", "a quantity that stands still at the home", "one that self-motions change")
         return cls(points[low : high + 1], values[low : high + 1], middle - low, float(slope), name, True)
 
-    def equations(self, family: LinearFamily) -> tuple[Array, Array]:
-        """Rows (k, K) and right sides (k,) of the coefficients, over the slope."""
+    def wish(self, family: LinearFamily) -> _Wish:
+        """The mean squared difference from the values, over the squared slope, for coefficients of a family."""
         q = ca.SX.sym("q", self.points.shape[1])
         psi = Batched(dense_function("psi", [q], [family.basis(q)]))(self.points)[0].reshape(len(self.points), -1)
-        return psi - psi[self.middle], (self.values - self.values[self.middle]) / self.slope
+        rows, sides = psi - psi[self.middle], self.values - self.values[self.middle]
+        weight = _MEANT / len(rows) / self.slope**2
+        return _Wish(weight * rows.T @ rows, weight * rows.T @ sides, weight * float(sides @ sides))
 
     def named(self, raw: Coordinates) -> Coordinates:
         """Coordinates in units of the quantity, with its value at the posture.
 
         The scale is that for which they were fitted, or the best one.
         """
-        xi, scale = raw.once("xi", self.points)[:, 0], self.slope
+        xi, scale = raw.once("xi", self.points)[:, 0], 1.0
         away, values = xi - xi[self.middle], self.values - self.values[self.middle]
         if not self.wanted:
             scale = float(away @ values / max(away @ away, _TINY))
@@ -371,12 +375,7 @@ class Meaning:
 
 def _followed(problem: Problem, posture: Array, step: float) -> Array:
     """The self-motion from a posture in steps of unit self-motions, up to the boundary of the domain, (k, n)."""
-    found = [posture]
-
-    def slope(q: Array) -> Array:
-        found: Array = _Field(problem, q[None]).directions(np.zeros((1, 1, problem.n)), 0)[0]
-        return found
-
+    found, slope = [posture], partial(_self_motion, problem)
     while len(found) < _MOST_STEPS and problem.domain.contains(found[-1]):
         q = found[-1]
         middle = q + step / 2 * slope(q)
@@ -440,58 +439,122 @@ def _problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Bran
 
 
 class _Field:
-    """Samples with the rows and the metric that self-motions are orthogonal to."""
+    """Samples, with what the volume of coordinates there needs."""
 
-    def __init__(self, problem: Problem, points: Array, basis: BasisGradients | None = None) -> None:
-        task = problem.task
+    def __init__(self, problem: Problem, points: Array, basis: BasisGradients) -> None:
+        self.points, self._basis, self._known = points, basis, basis.at(points)
+        task, metric = problem.task, problem.metric
         J = task.batched_frame_jacobian(points)[0].reshape(len(points), task.m, problem.n)
-        self.points, self.basis = points, basis
-        self.rows = J / np.maximum(np.linalg.norm(J, axis=2, keepdims=True), _TINY)
-        self.metric = None if problem.metric.is_identity else metric_matrices(problem.metric, points)
-        self._inverse = None if self.metric is None else np.linalg.inv(self.metric)
-        self._known = None if basis is None else basis.at(points)
+        #: R with A^-1 = R R^T, (N, n, n); None for the identity
+        self.root = None if metric.is_identity else np.linalg.cholesky(np.linalg.inv(metric_matrices(metric, points)))
+        self._judged, self._own = _orthonormal(J), _orthonormal(J if self.root is None else J @ self.root)
 
     def jacobian(self, C: Array) -> Array:
         """dxi/dq of coefficients (r, K), (N, r, n)."""
-        assert self.basis is not None
-        assert self._known is not None
-        return self.basis.jacobian(self._known, C, len(self.points))
+        return self._basis.jacobian(self._known, C, len(self.points))
 
-    def along(self, directions: Array, kept: NDArray[np.bool_] | None = None) -> Array:
-        """dpsi/dq . a for directions a (N, n), of some samples (N,), (kept, K)."""
-        assert self.basis is not None
-        assert self._known is not None
-        return self.basis.along(self._known, directions, kept)
-
-    def lengths(self, c: Array) -> tuple[Array, Array]:
-        """|dxi/dq| of one coordinate (K,), (N,), and its derivative after dxi/dq, (N, n)."""
-        slopes = self.jacobian(c[None])[:, 0]
-        raised = slopes if self._inverse is None else np.einsum("sij,sj->si", self._inverse, slopes)
-        long = np.sqrt(np.maximum(np.einsum("si,si->s", slopes, raised), _TINY**2))
-        return long, raised / long[:, None]
+    def along(self, directions: Array) -> Array:
+        """dpsi/dq . a for directions a (N, n), (N, K)."""
+        return self._basis.along(self._known, directions)
 
     def energy(self) -> Array:
         """Mean of dpsi_i/dq A^-1 dpsi_j/dq, (K, K)."""
-        N, n = self.rows.shape[0], self.rows.shape[2]
-        root = np.broadcast_to(np.eye(n), (N, n, n)) if self._inverse is None else np.linalg.cholesky(self._inverse)
+        N, n = self.points.shape
+        root = np.broadcast_to(np.eye(n), (N, n, n)) if self.root is None else self.root
         parts = (self.along(root[:, :, i]) for i in range(n))
         return np.asarray(sum((G.T @ G for G in parts), start=np.zeros(())) / N)
 
-    def directions(self, J: Array, k: int) -> Array:
-        """z (N, n) along which the task and all rows of J (N, r, n) but row k stay, with det [J_x; J] > 0 for row z."""
-        unit = J / np.maximum(np.linalg.norm(J, axis=2, keepdims=True), _TINY)
-        others = np.concatenate([self.rows, np.delete(unit, k, axis=1)], axis=1)
-        z = np.linalg.svd(others)[2][:, -1]
-        z = z * np.sign(np.linalg.det(np.insert(others, self.rows.shape[1] + k, z, axis=1)))[:, None]
-        squares = 1.0 if self.metric is None else np.einsum("si,sij,sj->s", z, self.metric, z)[:, None]
-        return np.asarray(z / np.sqrt(squares))
+    def volumes(self, C: Array) -> Array:
+        """The volumes of `RegularPart` for coefficients (r, K), (N,)."""
+        return np.asarray(np.linalg.det(np.concatenate([self._judged, _unit(self.jacobian(C))[0]], axis=1)))
 
-    def volumes(self, J: Array) -> Array:
-        """The volumes of `RegularPart` for gradients J (N, r, n), (N,)."""
-        N = np.linalg.qr(self.rows.transpose(0, 2, 1))[0].transpose(0, 2, 1)
-        N[:, 0] *= np.sign(np.linalg.det(N @ self.rows.transpose(0, 2, 1)))[:, None]
-        unit = J / np.maximum(np.linalg.norm(J, axis=2, keepdims=True), _TINY)
-        return np.asarray(np.linalg.det(np.concatenate([N, unit], axis=1)))
+    def shortfall(self, C: Array, target: float, sense: float) -> tuple[float, Array]:
+        """Sum of max(0, 1 - sense v / target)^2 with volumes v in the metric, and its derivative after C (r, K)."""
+        J = self.jacobian(C)
+        unit, lengths = _unit(J if self.root is None else J @ self.root)
+        rows = np.concatenate([self._own, unit], axis=1)
+        volumes = sense * np.linalg.det(rows)
+        short = np.maximum(0.0, 1 - volumes / target)
+        some = short > 0
+        inverse = np.linalg.inv(rows[some] + (volumes[some] == 0)[:, None, None] * _TINY * np.eye(rows.shape[2]))
+        G = volumes[some, None, None] * inverse[:, :, -J.shape[1] :].transpose(0, 2, 1)  # dv after unit gradients
+        G -= np.einsum("sri,sri->sr", G, unit[some])[:, :, None] * unit[some]
+        G *= (-2 / target * short[some])[:, None, None] / lengths[some]
+        slopes = np.zeros_like(J)
+        slopes[some] = G if self.root is None else G @ self.root[some].transpose(0, 2, 1)
+        return float(short @ short), self._basis.pullback(self._known, slopes)
+
+
+def _unit(rows: Array) -> tuple[Array, Array]:
+    """Rows (N, k, n) of length 1, and their lengths (N, k, 1)."""
+    lengths = np.maximum(np.linalg.norm(rows, axis=2, keepdims=True), _TINY)
+    return rows / lengths, lengths
+
+
+def _orthonormal(rows: Array) -> Array:
+    """An orthonormal basis of the span of rows (N, m, n), in their sense."""
+    N = np.linalg.qr(rows.transpose(0, 2, 1))[0].transpose(0, 2, 1)
+    N[:, 0] *= np.sign(np.linalg.det(N @ rows.transpose(0, 2, 1)))[:, None]
+    return np.asarray(N)
+
+
+def _self_motion(problem: Problem, q: Array) -> Array:
+    """The unit self-motion z (n,) of a position for r = 1, with z^T A z = 1 and det [J_x; z^T] > 0."""
+    J = problem.task.batched_frame_jacobian(q[None])[0].reshape(problem.m, problem.n)
+    z = np.linalg.svd(J)[2][-1]
+    z = z * np.sign(np.linalg.det(np.vstack([J, z])))
+    square = 1.0 if problem.metric.is_identity else z @ metric_matrices(problem.metric, q[None])[0] @ z
+    return np.asarray(z / np.sqrt(square))
+
+
+class _Shortfall:
+    """Mean of max(0, 1 - v / target)^2 over samples, and terms of what coordinates mean.
+
+    Its variables Y are in a basis of functions whose gradients are orthonormal in the mean, C = Y L^-1. Coordinates
+    begin with gradients of length 1 in the mean there.
+
+    Args:
+        fields: the samples.
+        target: the volume beyond which nothing is lost.
+        sense: sign of the volumes.
+        factor: L (K, K), lower triangular, with the mean L L^T of products of gradients.
+        wishes: terms of the first coordinates.
+        start: coefficients (r, K) that give the lengths.
+    """
+
+    def __init__(
+        self, fields: list[_Field], target: float, sense: float, factor: Array, wishes: list[_Wish], start: Array
+    ) -> None:
+        self._fields, self._target, self._sense, self._factor, self._wishes = fields, target, sense, factor, wishes
+        self._lengths = np.linalg.norm(start @ factor, axis=1)[:, None]
+        self._count = sum(len(field.points) for field in fields)
+
+    def variables(self, C: Array) -> Array:
+        """Y of coefficients (r, K), (r K,)."""
+        return np.asarray((C @ self._factor / self._lengths).ravel())
+
+    def coefficients(self, theta: Array) -> Array:
+        """C (r, K)."""
+        return self._solved((theta.reshape(len(self._lengths), -1) * self._lengths).T, trans="T").T
+
+    def value(self, theta: Array) -> float:
+        """The mean and the terms."""
+        return self.value_and_gradient(theta)[0]
+
+    def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
+        """The mean and the terms, and the derivative (r K,)."""
+        C = self.coefficients(theta)
+        parts = [field.shortfall(C, self._target, self._sense) for field in self._fields]
+        value = sum(part for part, _ in parts) / self._count
+        slopes = sum((part for _, part in parts), start=np.zeros(())) / self._count
+        for k, (E, g, a) in enumerate(self._wishes):
+            value += float(C[k] @ E @ C[k] - 2 * g @ C[k] + a)
+            slopes[k] += 2 * (E @ C[k] - g)
+        return value, (self._solved(slopes.T).T * self._lengths).ravel()
+
+    def _solved(self, columns: Array, trans: str = "N") -> Array:
+        """L^-1 or L^-T times columns."""
+        return np.asarray(scipy.linalg.solve_triangular(self._factor, columns, lower=True, trans=trans))
 
 
 class _Search:
@@ -505,42 +568,40 @@ class _Search:
         seed: int,
         monitor: Monitor,
         meaning: Meaning | None,
-        quantities: Likeness | None,
+        quantities: Like | None,
     ) -> None:
         self.problem, self.parametrisation, self.seed, self.monitor = problem, parametrisation, seed, monitor
-        self.meaning, self._quantities = meaning, quantities
-        self.alike: _Alike | None = None  #: once the search runs
+        self.meaning, self.quantities = meaning, quantities
         family = parametrisation.family(JointSpace.of(problem), problem.r)
         assert isinstance(family, LinearFamily)
         self._family: LinearFamily = family
         self.samples = samples or int(np.clip(_PER_TERM * family.width, _LEAST_SAMPLES, _MOST_SAMPLES))
         self.best: tuple[float, float, Array] | None = None  #: share of bad positions, -1 % volume, coefficients
         self.stages: list[Stage] = []
+        self._done = False  # whether coordinates are as regular as they need to be
 
     def begin(self) -> None:
-        """Solve with a larger margin and less smoothness."""
+        """Descend from coordinates that are linear, as far as the family has such."""
         self._basis: BasisGradients = gradients_of(self._family, self.problem.n)  # not before this family is tried
         self._judged = self._field(_JUDGED, _JUDGED_TAG)
-        self._fields, self._last = [self._field(self.samples, _TAG)], self._first()
+        self._fields = [self._field(self.samples, _TAG)]
         some = _Field(self.problem, self._fields[0].points[::_EVERY], self._basis)
-        self._energy = some.energy()
-        if self._quantities is not None:
-            self.alike = _Alike(Like.of(self.problem.robot, self._quantities), some)
-        self._sweep(_FIRST_STEP)
-        self._steps = _EASY if self.rank[0] <= _HARD else _HARDER
-        for step in self._steps:
-            if self._sweep(step):
-                return
+        energy, K = some.energy(), self._family.width
+        self._factor = np.linalg.cholesky(energy + _RIDGE * np.trace(energy) / K * np.eye(K))
+        self._last = self._first(some)
+        self._sense = 1.0 if self._middle.volumes(self._last)[0] > 0 else -1.0
+        self._wishes = self._meant(some)
+        self._descend(_TARGET, _ITERATIONS, "whole branch")
 
     def go_on(self) -> None:
-        """Solve with the worst of fresh samples, if that was not enough."""
+        """Descend with the worst of fresh samples, as long as coordinates are not regular enough."""
         for turn in range(1, 1 + _ROUNDS):
-            if self.rank[0] <= _ENOUGH:
+            if self._done:
                 return
             fresh = self._field(_FRESH, _FRESH_TAG + turn)
-            worst = fresh.points[np.argsort(self._volumes(fresh, self._last))[:_WORST]]
+            worst = fresh.points[np.argsort(self._sense * fresh.volumes(self._last))[:_WORST]]
             self._fields.append(_Field(self.problem, worst, self._basis))
-            self._sweep(self._steps[-1], f", worst samples, round {turn}")
+            self._descend(_FURTHER_TARGET, _FURTHER, f"worst positions, round {turn} of {_ROUNDS}")
 
     @property
     def rank(self) -> tuple[float, float]:
@@ -551,68 +612,36 @@ class _Search:
     def holds_in_the_middle(self) -> bool:
         """Whether the best coordinates are regular at the centre of the domain."""
         assert self.best is not None
-        middle = _Field(self.problem, self.problem.domain.centre[None], self._basis)
-        return abs(float(middle.volumes(middle.jacobian(self.best[2]))[0])) > LEAST_VOLUME / self.problem.r
+        return abs(float(self._middle.volumes(self.best[2])[0])) > LEAST_VOLUME / self.problem.r
 
     def coordinates(self, C: Array) -> Coordinates:
         """Coordinates of coefficients (r, K), not normalised."""
         r, space = self.problem.r, JointSpace.of(self.problem)
         return Coordinates(self.parametrisation, space, (), C.ravel(), np.zeros(r), np.ones(r))
 
-    def _sweep(self, step: tuple[float, float], more: str = "") -> bool:
-        """Solve the problem of each coordinate once; whether coordinates are regular enough then."""
-        started, C, (margin, smooth) = time.perf_counter(), self._last.copy(), step
-        fields, energy = self._fields, self._energy
-        name = f"margin {margin:g}, smoothness {smooth:g}{more}"
-        value, E, pull = 0.0, smooth * energy + _RIDGE * np.trace(energy) / len(energy) * np.eye(len(energy)), None
-        if self.meaning is not None and self.meaning.wanted:
-            rows, sides = self.meaning.equations(self._family)
-            E, pull = E + _MEANT / len(rows) * rows.T @ rows, _MEANT / len(rows) * rows.T @ sides
-        for k in range(len(C)):
-            own, towards = (E, pull) if self.alike is None else self.alike.added(E, C, k)
-            C[k], value = _Hinge(fields, C, k, margin).least(own, towards, C[k])
-            self.monitor(Progress(name, (k + 1) / len(C), f"loss {value:.5g}", value))
-        samples = sum(len(field.points) for field in fields)
-        result = SolveResult(C.ravel(), value, Status.CONVERGED, len(C), len(C), time.perf_counter() - started)
-        self.stages.append(Stage(name, C.size, samples, result))
-        self._last = C
-        return self._keep(C)
+    @cached_property
+    def _middle(self) -> _Field:
+        """The centre of the domain."""
+        return _Field(self.problem, self.problem.domain.centre[None], self._basis)
 
-    def _volumes(self, field: _Field, C: Array) -> Array:
-        """Volumes of coordinates at samples, (N,), positive at most."""
-        volumes = field.volumes(field.jacobian(C))
-        return volumes if np.median(volumes) >= 0 else -volumes
+    def _descend(self, target: float, limit: int, name: str) -> None:
+        """Minimise from the last coefficients."""
+        objective = _Shortfall(self._fields, target, self._sense, self._factor, self._wishes, self._last)
+        solver = LBFGS(limit, _TOLERANCE)
+        result = solver.minimise(objective, objective.variables(self._last), Watch(self.monitor, name))
+        self._last = objective.coefficients(result.theta)
+        samples = sum(len(field.points) for field in self._fields)
+        self.stages.append(Stage(name, result.theta.size, samples, replace(result, theta=self._last.ravel())))
+        self._keep(self._last)
+        result.finished()
 
-    def _keep(self, C: Array) -> bool:
-        """Keep coefficients if they are the best so far; whether they are regular enough."""
-        volumes = self._volumes(self._judged, C)
-        bad = float(np.mean(volumes <= LEAST_VOLUME / self.problem.r))
-        low = float(np.quantile(volumes, 0.01))
+    def _keep(self, C: Array) -> None:
+        """Keep coefficients if they are the best so far."""
+        volumes, r = self._sense * self._judged.volumes(C), self.problem.r
+        bad, low = float(np.mean(volumes <= LEAST_VOLUME / r)), float(np.quantile(volumes, 0.01))
         if self.best is None or (max(bad, _ENOUGH), -low) < self.rank:
             self.best = bad, -low, C
-        return bad <= _ENOUGH and low >= _WELL / self.problem.r
-
-    def _first(self) -> Array:
-        """Where the search starts, (r, K): anywhere with one coordinate, otherwise at a fit of low degree."""
-        r, wanted = self.problem.r, self.parametrisation
-        if r == 1:
-            return np.zeros((1, self._family.width))
-        low = wanted.of_degree(min(wanted.degree, _START)) if isinstance(wanted, GradedParametrisation) else wanted
-        found = fit(
-            self.problem,
-            low,
-            weights=_START_WEIGHTS,
-            seed=self.seed,
-            split_idle=False,
-            like=self._quantities,
-            monitor=self.monitor,
-        )
-        coarse = found.chart.coordinates
-        assert isinstance(coarse, Coordinates)
-        theta = coarse.theta
-        if isinstance(self._family, GradedFamily):
-            theta = self._family.embed(theta, cast(Any, coarse.family))
-        return np.asarray(theta.reshape(r, -1) * coarse.scale[:, None])
+        self._done = bad <= _ENOUGH and low >= _WELL / r
 
     def _field(self, count: int, tag: int) -> _Field:
         """Samples, half of them uniform like positions that count for the share, the others heavy near limits."""
@@ -621,123 +650,44 @@ class _Search:
         points = np.vstack([uniform, sample_heavily(domain, count - even, (self.seed, tag))])
         return _Field(self.problem, points[_beside_the_middle(self.problem, points)], self._basis)
 
+    def _first(self, field: _Field) -> Array:
+        """Coefficients (r, K) of the functions nearest to a^T q, with directions a across the task in the middle.
 
-class _Alike:
-    """Adds mean |Z^T (dxi_k/dq - g_k / slope_k)|^2 to the problems of the first coordinates, with a basis Z of ker J_x.
-
-    The g_k are the gradients of the quantities, and slope_k is the median of g_k along the self-motion of coordinate k.
-
-    Args:
-        quantities: what coordinates are to be like.
-        field: some samples.
-    """
-
-    def __init__(self, quantities: Like, field: _Field) -> None:
-        self.quantities, self._field = quantities, field
-        N, count, n = len(field.points), len(quantities.names), field.points.shape[1]
-        q = ca.SX.sym("q", n)
-        slopes = dense_function("slopes", [q], [ca.jacobian(quantities.function(q), q)])
-        self._gradients, self._slopes = Batched(slopes)(field.points)[0].reshape(N, count, n), np.ones(count)
-        Z = np.linalg.svd(field.rows)[2][:, field.rows.shape[1] :]
-        parts = [field.along(Z[:, j]) for j in range(Z.shape[1])]
-        self._square = sum((part.T @ part for part in parts), start=np.zeros(())) / N
-        sides = (np.einsum("si,ski->sk", Z[:, j], self._gradients) / N for j in range(Z.shape[1]))
-        self._pulls = sum((part.T @ side for part, side in zip(parts, sides, strict=True)), start=np.zeros(()))
-
-    def added(self, E: Array, C: Array, k: int) -> tuple[Array, Array | None]:
-        """E and the pull for coordinate k of coefficients (r, K), with the term.
-
-        Raises:
-            InvalidValueError: if the task leaves nothing of the quantity.
+        The first ones are the projected gradients of the quantities that coordinates are to be like.
         """
-        if k >= len(self._slopes):
-            return E, None
-        along = np.einsum("si,si->s", self._gradients[:, k], self._field.directions(self._field.jacobian(C), k))
-        self._slopes[k] = np.median(along)
-        if not abs(self._slopes[k]) > _STILL * np.linalg.norm(self._gradients[:, k], axis=1).max():
-            wanted = "others, in another order, or another task"
-            raise InvalidValueError("like", "quantities that the task leaves nothing of", wanted)
-        return E + _ALIKE * self._square, _ALIKE * self._pulls[:, k] / self._slopes[k]
+        problem, centre = self.problem, self.problem.domain.centre
+        J = problem.task.batched_frame_jacobian(centre[None])[0].reshape(problem.m, problem.n)
+        directions = scipy.linalg.null_space(J).T
+        if self.quantities is not None:
+            wanted = self.quantities.slopes(centre[None])[0] @ directions.T  # (k, r)
+            directions = np.vstack([wanted, scipy.linalg.null_space(wanted).T]) @ directions
+        if self.meaning is not None:
+            directions = self.meaning.slope * _self_motion(problem, centre)[None]
+        parts = [field.along(np.broadcast_to(a, field.points.shape)).mean(axis=0) for a in directions]
+        return np.asarray(scipy.linalg.cho_solve((self._factor, True), np.array(parts).T).T)
 
-    def scaled(self, C: Array) -> Array:
-        """Coefficients (r, K) in the units of the quantities."""
-        found = C.copy()
-        found[: len(self._slopes)] *= self._slopes[:, None]
-        return found
+    def _meant(self, field: _Field) -> list[_Wish]:
+        """Terms of what coordinates mean."""
+        if self.meaning is not None and self.meaning.wanted:
+            return [self.meaning.wish(self._family)]
+        return [] if self.quantities is None else _alike(self.problem, self.quantities, field)
 
 
-class _Hinge:
-    """Mean of max(0, 1 + margin |dxi/dq| - dxi/dq . z)^2 over samples, for one coordinate; convex in its coefficients.
+def _alike(problem: Problem, quantities: Like, field: _Field) -> list[_Wish]:
+    """Mean |Z^T (dxi_k/dq - g_k)|^2 over mean |Z^T g_k|^2 for quantities with gradients g_k, and a basis Z of ker J_x.
 
-    Args:
-        fields: the samples.
-        C: coefficients of all coordinates, (r, K).
-        k: which one.
-        margin: the least cosine between dxi/dq and z beyond which nothing is lost, 0 <= margin < 1.
+    Raises:
+        InvalidValueError: if the task leaves nothing of a quantity.
     """
-
-    def __init__(self, fields: list[_Field], C: Array, k: int, margin: float) -> None:
-        self._fields, self._margin = fields, margin
-        self._rows = np.concatenate([field.along(field.directions(field.jacobian(C), k)) for field in fields])
-
-    def least(self, E: Array, pull: Array | None, start: Array) -> tuple[Array, float]:
-        """The c with the least mean + c^T E c - 2 pull^T c, see `least_hinge`."""
-        return least_hinge(self._rows, E, pull, start, self._lengths if self._margin else None)
-
-    def _lengths(self, c: Array) -> tuple[Array, Rows]:
-        """margin |dxi/dq|, (N,), and its derivative after c at some samples."""
-        pairs = [field.lengths(c) for field in self._fields]
-        ends = np.cumsum([len(field.points) for field in self._fields])[:-1]
-
-        def slopes(kept: NDArray[np.bool_]) -> Array:
-            parts = zip(self._fields, pairs, np.split(kept, ends), strict=True)
-            return self._margin * np.concatenate([field.along(pair[1], some) for field, pair, some in parts])
-
-        return self._margin * np.concatenate([long for long, _ in pairs]), slopes
-
-
-def least_hinge(
-    D: Array,
-    E: Array,
-    pull: Array | None = None,
-    start: Array | None = None,
-    lengths: Lengths | None = None,
-    gain: float = _GAIN,
-) -> tuple[Array, float]:
-    """The c (K,) with the least mean of max(0, 1 + l_s(c) - D_s c)^2 + c^T E c - 2 g^T c, and that value.
-
-    Newton's method without the curvature of l, with halved steps. The function is convex if l is.
-
-    Args:
-        D: (N, K).
-        E: (K, K), positive definite.
-        pull: g, (K,). Default: 0.
-        start: (K,). Default: 0.
-        lengths: c -> l (N,), convex in c and >= 0, and what gives rows of dl/dc for samples that are kept (N,).
-            Default: 0.
-        gain: relative decrease of the value in a step at which the search ends.
-    """
-    g, N = np.zeros(len(E)) if pull is None else pull, len(D)
-
-    def state(c: Array) -> tuple[float, Array, Rows | None]:
-        long, slopes = (np.zeros(()), None) if lengths is None else lengths(c)
-        short = np.maximum(0.0, 1 + long - D @ c)
-        return float(short @ short / N + c @ E @ c - 2 * g @ c), short, slopes
-
-    c = np.zeros(len(E)) if start is None else start
-    last, short, slopes = state(c)
-    for _ in range(_NEWTON_STEPS):
-        active = short > 0
-        rows = D[active] if slopes is None else D[active] - slopes(active)
-        factor = scipy.linalg.cho_factor(rows.T @ rows / N + E)
-        step = scipy.linalg.cho_solve(factor, rows.T @ short[active] / N - E @ c + g)
-        size, now = 1.0, state(c + step)
-        while not now[0] < last and size > 1e-3:
-            size /= 2
-            now = state(c + size * step)
-        if not now[0] < last:
-            break
-        gained, (last, short, slopes), c = last - now[0], now, c + size * step
-        if gained <= gain * abs(last):
-            break
-    return c, last
+    N, task = len(field.points), problem.task
+    J = task.batched_frame_jacobian(field.points)[0].reshape(N, task.m, problem.n)
+    Z, slopes = np.linalg.svd(J)[2][:, task.m :], quantities.slopes(field.points)
+    left = np.einsum("sji,ski->skj", Z, slopes)
+    squares = (left**2).sum(axis=2).mean(axis=0)
+    if not (squares > _STILL**2 * (slopes**2).sum(axis=2).max(axis=0)).all():
+        wanted = "others, in another order, or another task"
+        raise InvalidValueError("like", "quantities that the task leaves nothing of", wanted)
+    parts = [field.along(Z[:, j]) for j in range(problem.r)]
+    E = sum((part.T @ part for part in parts), start=np.zeros(())) / N
+    pulls = sum((part.T @ left[:, :, j] for j, part in enumerate(parts)), start=np.zeros(())) / N
+    return [_Wish(_ALIKE / a * E, _ALIKE / a * pulls[:, k], _ALIKE) for k, a in enumerate(squares)]

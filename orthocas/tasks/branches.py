@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 CLEAR = 0.1  #: relative singular value above which a position counts as clear where shares are counted
 _SLICES, _ON_SLICE, _FINER, _SEED = 61, 200, 400, 0  # slices q_k = v, and positions on each
-_NOT_SINGULAR = 0.02  # relative singular value of the positions that count for crossing
 _FEW = 8  # positions on a slice; fewer say nothing about it
 _QUANTILE = 0.9  # of the positions of a slice that must be singular, or that self-motions must not leave
 _LOW = 0.12  # of that quantile, relative to the largest one of the joint's slices
@@ -239,7 +238,7 @@ class _Arm:
         points = sample_evenly(Box(self.whole.centre, self.whole.half_width), count, (_SEED, k))
         points[:, k] = value
         s, moved = self.judged(points)
-        clear = moved[s > _NOT_SINGULAR, k]
+        clear = moved[s > CLEAR, k]
         moves = float(np.quantile(clear, _QUANTILE)) if len(clear) >= _FEW else np.nan
         return float(np.quantile(s, _QUANTILE)), moves
 
