@@ -177,7 +177,7 @@ def _require_none(given: dict[str, Any]) -> None:
     """Raise OptionError for options that wide charts do not have."""
     for option, value in given.items():
         if value is not None:
-            raise OptionError(f"--domain branch solves a convex problem of its own: leave out --{option}")
+            raise OptionError(f"--domain branch has a solver of its own: leave out --{option}")
 
 
 def _confirming(

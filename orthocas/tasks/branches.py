@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from orthocas.errors import InvalidValueError, SingularTaskError, UnknownNameError
 from orthocas.robots.robot import Robot
 from orthocas.tasks.clear_box import row_scale
 from orthocas.tasks.domains import Box, sample_evenly
+from orthocas.tasks.problem import Problem, relative_singular_values
 from orthocas.tasks.regular_box import joint_range
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, as_point, require_kind
@@ -144,13 +145,14 @@ def branches(robot: Robot, task: Task | None = None) -> Branches:
     and the last of the arm, then refined; nearly so counts too, because offsets between axes move such places a little.
     They are found from samples, not proved.
 
-    Self-motions are those of the tip's pose, by the last seven joints: charts of its position keep to the same
-    branches. With fewer than six joints they are those of the task. Joints that can turn farther than a full turn are
-    taken from -pi to pi.
+    Self-motions are those of the tip's pose, by the last seven joints: charts of its position keep to the same cuts.
+    With fewer than six joints they are those of the task. Branches are the parts with positions where the task is
+    clear. Joints that can turn farther than a full turn are taken from -pi to pi.
 
     Args:
         robot: the robot.
-        task: a task of that robot, needed with fewer than six joints. Default: the pose of the tip.
+        task: a task of that robot, needed with fewer than six joints. Default: the pose of the tip, by the last seven
+            joints.
 
     Raises:
         SingularTaskError: if no position is clear.
@@ -173,7 +175,7 @@ def branches(robot: Robot, task: Task | None = None) -> Branches:
     arm = _Arm.of(robot, task, whole)
     cuts = tuple(cut for k in arm.inner for cut in arm.cuts(k))
     points = sample_evenly(Box(whole.centre, whole.half_width), _SAMPLES, _SEED)
-    clear = points[arm.judged(points)[0] > CLEAR]
+    clear = points[_clear(robot, task, whole, points) if task is not None else arm.judged(points)[0] > CLEAR]
     if not len(clear):
         raise SingularTaskError("no position of the joint range is clear of singular ones")
     items = [item for sides in product(*_sides(cuts)) if (item := _branch(whole, cuts, sides, points, clear))]
@@ -257,6 +259,12 @@ class _Arm:
         part = _PARTS.get(len(self.joints), {}).get(k - self.joints[0], name)
         least = size(value)
         return Cut(k, name, part, value, singular, least < _EXACT), least
+
+
+def _clear(robot: Robot, task: Task, whole: Box, points: Array) -> NDArray[np.bool_]:
+    """Whether the task is clear at points, (N,)."""
+    judged = Problem(robot, task, domain=Box(whole.centre, whole.half_width))
+    return relative_singular_values(judged, points) > CLEAR
 
 
 def _jacobians(task: Task, points: Array) -> Array:
