@@ -115,12 +115,11 @@ def fit_wide(
         mean max(0, 1 - v(q) / t)^2
 
     over samples of the branch that are clear of singular positions, half of them uniform and half boundary-heavy. It
-    descends with L-BFGS from linear coordinates across the task in the middle of the branch, whose v has one sign, so
-    no fold has to be undone but those that samples show. First t = 0.5. As long as more than 0.05 % of other samples
-    are not regular after that, or 1 % of them have a volume below 0.28 / r, the worst of 50,000 fresh samples join and
-    t = 0.3, three times at most. The best of these results is kept: fewest bad positions, as far as these are more than
-    0.05 %, then the largest 1 % quantile of the volume. The domain of the chart is the part of the branch where
-    coordinates are regular with a margin, see `RegularPart`.
+    descends with L-BFGS from linear coordinates across the task in the middle of the branch, first with t = 0.5. As
+    long as more than 0.05 % of other samples are not regular after that, or 1 % of them have a volume below 0.28 / r,
+    the worst of 50,000 fresh samples join and t = 0.3, three times at most. The best of these results is kept: fewest
+    bad positions, as far as these are more than 0.05 %, then the largest 1 % quantile of the volume. The domain of the
+    chart is the part of the branch where coordinates are regular with a margin, see `RegularPart`.
 
     Coordinates that are linear in the first and the last joint are best to prove and hold at any turn of them. They ask
     that self-motions turn base and tool in one sense on the whole branch, as far as the other joints do not outweigh
