@@ -341,6 +341,10 @@ def test_several_coordinates_follow_several_quantities() -> None:
         off.append(np.degrees(np.arccos(np.abs((own * wanted).sum(axis=2)) / lengths)).mean(axis=0))
     assert (off[0] < 25.0).all(), off
     assert (off[0] < off[1] / 2).all(), off
+    with pytest.raises(InvalidValueError, match="like is quantities that the task leaves nothing of"):
+        oc.fit_wide(robot, task, box, like=["q3", "q3"], samples=500)
+    with pytest.raises(InvalidValueError, match="like is 4 quantities, expected at most 3"):
+        oc.fit_wide(robot, task, box, like=["q1", "q2", "q3", "q4"], samples=500)
     middle = fits[0].chart.problem.domain.centre
     np.testing.assert_allclose(fits[0].chart.xi(middle)[:2], [middle[2], float(height(ca.DM(middle)))], atol=1e-9)
     assert list(fits[0].like) == ["q3 [rad]", "height"]

@@ -650,16 +650,17 @@ class _Search:
         return _Field(self.problem, points[_beside_the_middle(self.problem, points)], self._basis)
 
     def _first(self, field: _Field) -> Array:
-        """Coefficients (r, K) of the functions nearest to a^T q, with directions a across the task in the middle.
+        """Coefficients (r, K) of the functions nearest to a^T q, with orthonormal a across the task in the middle.
 
-        The first ones are the projected gradients of the quantities that coordinates are to be like.
+        The first ones are those of the gradients of quantities that coordinates are to be like.
         """
         problem, centre = self.problem, self.problem.domain.centre
         J = problem.task.batched_frame_jacobian(centre[None])[0].reshape(problem.m, problem.n)
         directions = scipy.linalg.null_space(J).T
         if self.quantities is not None:
             wanted = self.quantities.slopes(centre[None])[0] @ directions.T  # (k, r)
-            directions = np.vstack([wanted, scipy.linalg.null_space(wanted).T]) @ directions
+            Q, R = np.linalg.qr(np.vstack([wanted, np.eye(problem.r)]).T)
+            directions = (Q * np.where(R.diagonal() < 0, -1.0, 1.0)).T @ directions
         if self.meaning is not None:
             directions = self.meaning.slope * _self_motion(problem, centre)[None]
         parts = [field.along(np.broadcast_to(a, field.points.shape)).mean(axis=0) for a in directions]
@@ -676,16 +677,17 @@ def _alike(problem: Problem, quantities: Like, field: _Field) -> list[_Wish]:
     """Mean |Z^T (dxi_k/dq - g_k)|^2 over mean |Z^T g_k|^2 for quantities with gradients g_k, and a basis Z of ker J_x.
 
     Raises:
-        InvalidValueError: if the task leaves nothing of a quantity.
+        InvalidValueError: if the task leaves nothing of a quantity, or what it leaves of some depends on the others.
     """
     N, task = len(field.points), problem.task
     J = task.batched_frame_jacobian(field.points)[0].reshape(N, task.m, problem.n)
     Z, slopes = np.linalg.svd(J)[2][:, task.m :], quantities.slopes(field.points)
     left = np.einsum("sji,ski->skj", Z, slopes)
-    squares = (left**2).sum(axis=2).mean(axis=0)
-    if not (squares > _STILL**2 * (slopes**2).sum(axis=2).max(axis=0)).all():
-        wanted = "others, in another order, or another task"
-        raise InvalidValueError("like", "quantities that the task leaves nothing of", wanted)
+    gram = np.einsum("ski,sli->kl", left, left) / N
+    squares = gram.diagonal()
+    moving = (squares > _STILL**2 * (slopes**2).sum(axis=2).max(axis=0)).all()
+    if not moving or np.linalg.eigvalsh(gram / np.sqrt(np.outer(squares, squares)))[0] < _STILL**2:
+        raise InvalidValueError("like", "quantities that the task leaves nothing of", "others, or another task")
     parts = [field.along(Z[:, j]) for j in range(problem.r)]
     E = sum((part.T @ part for part in parts), start=np.zeros(())) / N
     pulls = sum((part.T @ left[:, :, j] for j, part in enumerate(parts)), start=np.zeros(())) / N
