@@ -97,7 +97,10 @@ def everywhere(name: str, task: str, quick: bool) -> str:
     found = 0
     for branch in list(whole)[:1] if quick else whole:
         own = q[branch.box.contains(q)]
-        chart = oc.fit_wide(robot, oc.Task.named(robot, task), branch, parametrisation=polynomial).chart
+        try:
+            chart = oc.fit_wide(robot, oc.Task.named(robot, task), branch, parametrisation=polynomial).chart
+        except oc.errors.DomainError:
+            continue  # none of its targets is found
         found += int(chart.solve(chart.phi(own)).found.sum())
     return f"| {name}, {task} | {len(whole)} | {len(q):,} | {found / len(q):.2%} |"
 
