@@ -62,7 +62,8 @@ def cases(quick: bool) -> Iterator[Case]:
     yield Case("baxter, relative pose of the hands", grip, oc.Polynomial(2))
     if quick:
         return
-    yield Case("baxter, relative pose of the hands", grip, oc.Polynomial(3))
+    for parametrisation in (oc.Polynomial(3), oc.Polynomial(3, joints=2), oc.Polynomial(4, joints=2)):
+        yield Case("baxter, relative pose of the hands", grip, parametrisation)
     apart = oc.Problem(two, oc.Task.relative_position(two, *two.tips), domain=grip.domain)
     yield Case("baxter, relative position of the hands", apart, oc.Polynomial(2))
     for name, arms, centre in (

@@ -12,7 +12,7 @@ from orthocas.bases.family import Parametrisation
 from orthocas.bases.given import SEW, Given, SEWKind
 from orthocas.bases.mlp import MLP
 from orthocas.bases.mobile import Mobile
-from orthocas.bases.products import Fourier, Linear, Polynomial
+from orthocas.bases.products import JOINTS, Fourier, Linear, Polynomial
 from orthocas.errors import InvalidValueError, NotSavableWarning
 from orthocas.tools.checks import require_kind, require_known
 
@@ -52,7 +52,7 @@ def register_parametrisation(
         ...     degree: int = 3
         >>> oc.register_parametrisation("cubic", Cubic, parse=lambda text: Cubic())
         >>> oc.bases.parse_parametrisation("cubic")
-        Cubic(degree=3, cyclic=())
+        Cubic(degree=3, cyclic=(), joints=None)
     """
     require_kind("name", name, str)
     known = _REGISTERED.get(name)
@@ -126,7 +126,7 @@ def parametrisation_from_data(data: Mapping[str, Any]) -> Parametrisation:
 
 
 def parse_parametrisation(label: str) -> Parametrisation:
-    """Parse a label: 'polynomial:4', 'fourier:2:cyclic', 'mlp:64x64:raw', 'circle:mlp:32x32', 'linear', or your own.
+    """Parse a label: 'polynomial:4:joints=2', 'fourier:2:cyclic', 'mlp:64x64:raw', 'circle:mlp:32x32', 'linear', yours.
 
     Raises:
         UnknownNameError: if there is no such parametrisation.
@@ -149,9 +149,13 @@ def _whole(text: str) -> int:
         ) from None
 
 
-def _degree_and_cyclic(text: str) -> tuple[int, Cyclic]:
+def _degree_cyclic_joints(text: str) -> tuple[int, Cyclic, int | None]:
     degree, _, rest = text.partition(":")
-    return _whole(degree), parse_suffix(rest)
+    most = None
+    if rest.startswith(f"{JOINTS}="):
+        number, _, rest = rest.removeprefix(f"{JOINTS}=").partition(":")
+        most = _whole(number)
+    return _whole(degree), parse_suffix(rest), most
 
 
 def _mlp(text: str) -> MLP:
@@ -168,8 +172,8 @@ def _linear(text: str) -> Linear:
 
 
 register_parametrisation("linear", Linear, _linear)
-register_parametrisation("polynomial", Polynomial, lambda text: Polynomial(*_degree_and_cyclic(text)))
-register_parametrisation("fourier", Fourier, lambda text: Fourier(*_degree_and_cyclic(text)))
+register_parametrisation("polynomial", Polynomial, lambda text: Polynomial(*_degree_cyclic_joints(text)))
+register_parametrisation("fourier", Fourier, lambda text: Fourier(*_degree_cyclic_joints(text)))
 register_parametrisation("mlp", MLP, _mlp)
 register_parametrisation("sew", SEW, lambda text: SEW(cast(SEWKind, text or "stereographic")))
 register_parametrisation("circle", Circle, lambda text: Circle(parse_parametrisation(text)))
