@@ -1,7 +1,7 @@
 """Bases of products of one-joint functions: polynomials, Fourier terms, and linear coordinates."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import comb, sqrt
 from typing import Any, Literal, Self
 
@@ -186,7 +186,7 @@ class Products:
 
     degree: int
     cyclic: Cyclic = ()
-    joints: int | None = None
+    joints: int | None = field(default=None, metadata={"stored": "if given"})  # others keep their fingerprints
     linear = True
     closed_form = None
 

@@ -84,6 +84,9 @@ def warn_unless_savable(parametrisation: Parametrisation) -> None:
 def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
     """Convert a parametrisation to plain data: kind and settings.
 
+    A setting that came later may have the metadata {"stored": "if given"}: data leave it out while it is None, so
+    that charts of before keep their fingerprints.
+
     Raises:
         InvalidValueError: if it is not registered, or its settings are not plain data.
     """
@@ -97,6 +100,9 @@ def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
     parts = {part.name: getattr(parametrisation, part.name) for part in fields(parametrisation)}
     inner = {name: parametrisation_to_data(part) for name, part in parts.items() if isinstance(part, Parametrisation)}
     settings = {**asdict(parametrisation), **inner}
+    for part in fields(parametrisation):
+        if part.metadata.get("stored") == "if given" and parts[part.name] is None:
+            del settings[part.name]
     try:
         json.dumps(settings)
     except (TypeError, ValueError) as error:
