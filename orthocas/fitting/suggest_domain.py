@@ -217,7 +217,7 @@ class WidestBox:
 
     def _to_boundary(self, unit: Array, scale: float) -> Array:
         """The widest multiple of half-widths that keeps the bounds."""
-        low, high, down = 0.0, np.inf, _STEP
+        low, high = 0.0, np.inf
         while high > _CLOSE * low:
             widths = self._clipped(scale * unit)
             if self.verdict(widths, self.bounds).keeps(self.bounds):
@@ -228,12 +228,7 @@ class WidestBox:
                 high = scale
             if high < _SMALLEST:
                 raise self._refusal(widths)
-            if low and np.isfinite(high):
-                scale = float(np.sqrt(low * high))
-            elif low:
-                scale = low * _STEP
-            else:
-                scale, down = high / down, down * _STEP
+            scale = low * _STEP if np.isinf(high) else high / _STEP if low == 0 else float(np.sqrt(low * high))
         self.prober.go_back()
         return self._clipped(low * unit)
 
