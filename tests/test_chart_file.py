@@ -15,7 +15,7 @@ from orthocas.errors import InvalidValueError, NotSavableWarning, OrthocasError
 from orthocas.fitting.fit import Fit
 
 KINDS = {
-    "polynomial, inertia": lambda r: (oc.Task.position(r, "x"), "inertia", oc.Polynomial(2)),
+    "polynomial, inertia": lambda r: (oc.Task.position(r, "x"), "inertia", oc.Polynomial(2, joints=1)),
     "mlp, constant metric": lambda r: (oc.Task.position(r, "xy"), np.diag([1.0, 2.0, 3.0]), oc.MLP((4,))),
     "fourier, polar": lambda r: (oc.Task.polar(r), "euclidean", oc.Fourier(1)),
     "linear, custom task": lambda r: (

@@ -145,19 +145,23 @@ def test_damping_generates_to_c_that_agrees(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("size", [2, 3, 7, 12])
 def test_roots_in_generated_c_stop_when_they_are_exact(tmp_path: Path, size: int) -> None:
-    """On eigenvalues up to 1e6 apart, in any units, and no further in the work array than it is long."""
+    """On eigenvalues up to 1e6 apart, in any units, and no further in arrays than they are long."""
     A, V = ca.MX.sym("A", size, size), ca.MX.sym("V", size, 2)
     kernels = generate_kernels([ca.Function("root", [A, V], [root_times(A, V)])], "own")
     source, library = tmp_path / "root.c", tmp_path / "root.so"
     source.write_text(f"#include <math.h>\n{kernels.code.replace('static int own_root', 'int own_root')}\n")
-    run_program([compilers()[0], "-std=c99", "-O1", "-fPIC", "-shared", "-o", str(library), str(source), "-lm"])
-    _, _, _, length = kernels.work["root"]
+    strict = ["-std=c99", "-O2", "-Warray-bounds", "-Werror"]
+    run_program([compilers()[0], *strict, "-fPIC", "-shared", "-o", str(library), str(source), "-lm"])
+    given_places, found_places, _, length = kernels.work["root"]
     run = ctypes.CDLL(str(library)).own_root
     for condition in (1.0, 1e2, 1e4, 1e6):
         for scale in (1e-9, 1.0, 1e9):
             given, columns, found = scale * spd(size, condition), RNG.normal(size=(2, size)), np.zeros((2, size))
             places = [array.ctypes.data for array in (given, columns, found)]
-            arg, res = (ctypes.c_void_p * 8)(*places[:2]), (ctypes.c_void_p * 8)(places[2])
+            arg, res = (
+                (ctypes.c_void_p * (given_places + 4))(*places[:2]),
+                (ctypes.c_void_p * (found_places + 4))(places[2]),
+            )
             work = np.full(length + 64, 7.0)
             assert run(arg, res, (ctypes.c_int * 8)(), ctypes.c_void_p(work.ctypes.data), 0) == 0
             want = sqrtm(given).real @ columns.T
@@ -165,3 +169,4 @@ def test_roots_in_generated_c_stop_when_they_are_exact(tmp_path: Path, size: int
                 found.T, want, atol=1e-14 * np.sqrt(condition) * np.sqrt(scale * condition) * size
             )
             assert (work[length:] == 7.0).all()
+            assert not any((*arg[given_places:], *res[found_places:]))

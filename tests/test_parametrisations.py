@@ -1,5 +1,7 @@
 """Parametrisations: Jacobians against finite differences, bases against closed forms, names."""
 
+import itertools
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -16,7 +18,8 @@ SPACE = JointSpace(np.array([0.1, -0.3, 0.2]), np.array([0.5, 0.7, 0.4]), (False
 SLIDING = JointSpace(SPACE.centre, SPACE.half_width, (False, True, False), SPACE.joint_names)
 GIVEN = oc.Given.from_function("by hand", 3, lambda q: ca.vertcat(ca.sin(q[0]) * q[1], q[2] + 2))
 REDUCED = [oc.Polynomial(3, cyclic=["b"]), oc.Fourier(2, cyclic=("a", "c"))]
-ALL = [oc.Linear(), oc.Polynomial(3), oc.Fourier(2), *REDUCED, oc.MLP((5, 4)), GIVEN]
+SPARSE = [oc.Polynomial(4, joints=2), oc.Fourier(3, ("b",), joints=1)]
+ALL = [oc.Linear(), oc.Polynomial(3), oc.Fourier(2), *REDUCED, *SPARSE, oc.MLP((5, 4)), GIVEN]
 
 
 def values(parametrisation: object, space: JointSpace, points: np.ndarray, theta: np.ndarray, r: int = 2) -> np.ndarray:
@@ -97,6 +100,19 @@ def test_basis_has_the_counted_terms_and_is_orthonormal(parametrisation: object)
     psi = np.array([np.array(basis(p)).ravel() for p in grid])
     np.testing.assert_allclose((psi * mass[:, None]).T @ psi, np.eye(len(family.terms)), atol=1e-10)
     np.testing.assert_allclose(mass @ psi, 0, atol=1e-10)  # no constant among them
+
+
+@pytest.mark.parametrize("joints", [1, 2, 3])
+def test_products_of_few_joints_are_those_of_all_that_have_no_more_joints(joints: int) -> None:
+    whole, sparse = (oc.Polynomial(4, joints=most).family(SPACE, 1).terms for most in (None, joints))
+    assert sparse == tuple(term for term in whole if sum(k > 0 for k in term) <= joints)
+    for n in range(1, 6):
+        terms = [term for term in itertools.product(range(4), repeat=n) if 0 < sum(term) <= 3]
+        few = sum(np.count_nonzero(term) <= joints for term in terms)
+        assert oc.Polynomial(3, joints=joints).term_count(n) == few
+        assert oc.Fourier(3, joints=joints).term_count(n) == sum(
+            2 ** np.count_nonzero(term) for term in terms if np.count_nonzero(term) <= joints
+        )
 
 
 def test_fourier_is_periodic() -> None:
@@ -212,7 +228,9 @@ def test_linear_normals_at_bad_bases_are_refused() -> None:
         oc.Linear(normals="best")
 
 
-@pytest.mark.parametrize("label", ["linear", "polynomial:4", "fourier:2", "mlp:64x64", "mlp:8"])
+@pytest.mark.parametrize(
+    "label", ["linear", "polynomial:4", "polynomial:4:joints=2", "fourier:2:joints=1:cyclic=a,b", "mlp:64x64"]
+)
 def test_labels_are_read_back(label: str) -> None:
     assert parse_parametrisation(label).label == label
 
@@ -225,6 +243,9 @@ def test_labels_are_read_back(label: str) -> None:
         ("polynomial:x", InvalidValueError, "whole numbers"),
         ("polynomial:0", InvalidValueError, "degree is 0"),
         ("fourier:-1", InvalidValueError, "degree is -1"),
+        ("polynomial:3:joints=0", InvalidValueError, "joints is 0"),
+        ("polynomial:3:joints=two", InvalidValueError, "whole numbers"),
+        ("polynomial:3:cyclic:joints=2", InvalidValueError, "'joints=2', then 'cyclic'"),
         ("mlp:64x", InvalidValueError, "whole numbers"),
         ("mlp:0", InvalidValueError, "hidden is 0"),
         ("sew:left", UnknownNameError, "known: conventional, stereographic"),

@@ -186,6 +186,36 @@ def test_progress_is_reported_and_ctrl_c_ends_the_search() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("joints", [6, 10])
+def test_progress_rises_to_the_end_of_the_search_and_waits_nowhere(joints: int) -> None:
+    seen: list[Progress] = []
+    robot = oc.Robot.planar([3.0 / joints] * joints, [1.0] * joints)
+    oc.suggest_domain(
+        robot,
+        oc.Task.position(robot, "xy"),
+        np.full(joints, 0.3),
+        parametrisation=oc.Polynomial(2),
+        monitor=seen.append,
+    )
+    fractions = np.array([progress.fraction for progress in seen if progress.stage == "suggest a domain"])
+    assert (np.diff(fractions) > 0).all()
+    assert 0.9 < fractions[-1] < 1
+    assert np.abs(fractions - np.arange(1, len(fractions) + 1) / len(fractions)).max() < 0.35
+
+
+@pytest.mark.slow
+def test_boxes_of_light_wrists_do_not_depend_on_the_luck_of_single_trials() -> None:
+    """With a start of its own for every trial, the box of the ur10 with A = M had a mean half-width of 0.21 rad."""
+    robot = arm("ur10")
+    found = oc.suggest_domain(
+        robot, oc.Task.position(robot), metric="inertia", parametrisation=oc.Polynomial(2, "auto")
+    )
+    free = [joint.half_width for joint in found.joints if joint.reason != "cyclic"]
+    assert np.exp(np.mean(np.log(free))) > 0.35
+    assert judged_chart(found.fit.chart, 50_000, 11).conditioning > 0.15
+
+
+@pytest.mark.slow
 def test_coordinates_are_continued_to_another_box() -> None:
     """They are the same functions, up to constants, outside of the first box as well."""
     robot = oc.Robot.planar([0.3] * 8, [1.0] * 8)

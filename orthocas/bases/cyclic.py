@@ -256,12 +256,13 @@ def suffix(cyclic: Cyclic) -> str:
 
 
 def parse_suffix(text: str) -> Cyclic:
-    """Parse what follows the degree in a label: '', 'cyclic' or 'cyclic=NAME,NAME'."""
+    """Parse what ends a label: '', 'cyclic' or 'cyclic=NAME,NAME'."""
     word, equals, names = text.partition("=")
     if not text:
         return ()
     if word != _WORD or (equals and not names):
-        raise InvalidValueError("parametrisation", repr(text), "'cyclic' or 'cyclic=JOINT,JOINT' after the degree")
+        wanted = "'joints=2', then 'cyclic' or 'cyclic=JOINT,JOINT' after the degree"
+        raise InvalidValueError("parametrisation", repr(text), wanted)
     return tuple(names.split(",")) if equals else "auto"
 
 

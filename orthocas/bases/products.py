@@ -1,7 +1,7 @@
 """Bases of products of one-joint functions: polynomials, Fourier terms, and linear coordinates."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import comb, sqrt
 from typing import Any, Literal, Self
 
@@ -19,6 +19,7 @@ from orthocas.tasks.problem import Problem, task_jacobians
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, frozen_array, require_count, require_known
 
+JOINTS = "joints"  #: names the most joints of a product in labels
 Term = tuple[int, ...]  #: index of the one-joint function of every joint; 0 is the constant 1
 
 
@@ -150,30 +151,33 @@ def split(term: Term) -> tuple[Term, int, int]:
     return (*term[:joint], 0, *term[joint + 1 :]), joint, term[joint]
 
 
-def reduced_terms(degrees: list[list[int]], total: int, linear: list[int]) -> tuple[Term, ...]:
+def reduced_terms(
+    degrees: list[list[int]], total: int, linear: list[int], joints: int | None = None
+) -> tuple[Term, ...]:
     """The terms of `terms_up_to` without those in the joints `linear`, then the term linear in each of these."""
     kept = [[0] if k in linear else own for k, own in enumerate(degrees)]
-    return (*terms_up_to(kept, total), *(tuple(int(i == k) for i in range(len(degrees))) for k in linear))
+    return (*terms_up_to(kept, total, joints), *(tuple(int(i == k) for i in range(len(degrees))) for k in linear))
 
 
-def terms_up_to(degrees: list[list[int]], total: int) -> Iterator[Term]:
+def terms_up_to(degrees: list[list[int]], total: int, joints: int | None = None) -> Iterator[Term]:
     """All non-constant choices of one function per joint whose degrees add up to at most `total`.
 
     Args:
         degrees: the degrees of the functions of every joint. The first is 0.
         total: largest sum of degrees.
+        joints: most joints with another function than the constant. Default: all.
     """
 
-    def extend(prefix: Term, left: int) -> Iterator[Term]:
+    def extend(prefix: Term, left: int, others: int) -> Iterator[Term]:
         if len(prefix) == len(degrees):
             if any(prefix):
                 yield prefix
             return
         for k, degree in enumerate(degrees[len(prefix)]):
-            if degree <= left:
-                yield from extend((*prefix, k), left - degree)
+            if degree <= left and (others or not k):
+                yield from extend((*prefix, k), left - degree, others - (k > 0))
 
-    return extend((), total)
+    return extend((), total, len(degrees) if joints is None else joints)
 
 
 @dataclass(frozen=True)
@@ -182,12 +186,15 @@ class Products:
 
     degree: int
     cyclic: Cyclic = ()
+    joints: int | None = field(default=None, metadata={"stored": "if given"})  # others keep their fingerprints
     linear = True
     closed_form = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "degree", require_count("degree", self.degree))
         object.__setattr__(self, "cyclic", cyclic_choice.checked_cyclic(self.cyclic))
+        if self.joints is not None:
+            object.__setattr__(self, "joints", require_count("joints", self.joints))
 
     def for_problem(self, problem: "Problem") -> Self:
         """The parametrisation with the names of the problem's cyclic joints, if it reduces any."""
@@ -196,6 +203,19 @@ class Products:
     def of_degree(self, degree: int) -> Self:
         """The same parametrisation with another degree."""
         return replace(self, degree=degree)
+
+    @property
+    def _settings(self) -> str:
+        """The label after its name: 'DEGREE', with the most joints of a product and the cyclic joints if given."""
+        most = "" if self.joints is None else f":{JOINTS}={self.joints}"
+        return f"{self.degree}{most}{cyclic_choice.suffix(self.cyclic)}"
+
+    def _term_count(self, n: int, functions: int) -> int:
+        """Sum over j of C(n, j) C(d, j) f^j without the constant, for f functions of each degree of a joint."""
+        linear = min(n, cyclic_choice.count(self.cyclic))
+        most = min(n - linear, self.degree, self.degree if self.joints is None else self.joints)
+        terms: int = sum(comb(n - linear, j) * comb(self.degree, j) * functions**j for j in range(1, most + 1))
+        return terms + linear
 
 
 @dataclass(frozen=True)
@@ -206,6 +226,8 @@ class Polynomial(Products):
         degree: total degree, >= 1.
         cyclic: joints that appear in one linear term each, by name, or "auto" for all cyclic joints of the problem.
             Charts are then valid for all positions of these joints; see `orthocas.cyclic_joints`.
+        joints: most joints in one product, >= 1. Default: all. With 2, terms of three joints and more are left out:
+            that is most of them with many joints, and they gain little.
 
     Example:
         >>> import orthocas as oc
@@ -214,17 +236,18 @@ class Polynomial(Products):
         ('polynomial:4', 329)
         >>> oc.Polynomial(degree=4, cyclic=["A1"]).term_count(7)
         210
+        >>> oc.Polynomial(degree=4, joints=2).term_count(7)
+        154
     """
 
     @property
     def label(self) -> str:
-        """'polynomial:DEGREE', with the cyclic joints if there are any."""
-        return f"polynomial:{self.degree}{cyclic_choice.suffix(self.cyclic)}"
+        """'polynomial:DEGREE', with most joints of a product and cyclic joints if there are any."""
+        return f"polynomial:{self._settings}"
 
     def term_count(self, n: int) -> int:
-        """C(n + d, d) - 1, with n the number of joints that are not cyclic, plus one term for each that is."""
-        linear = min(n, cyclic_choice.count(self.cyclic))
-        return comb(n - linear + self.degree, self.degree) - 1 + linear
+        """C(n + d, d) - 1 with all products of n joints that are not cyclic, plus one term for each that is."""
+        return self._term_count(n, 1)
 
     def family(self, space: JointSpace, outputs: int) -> ProductFamily:
         """Polynomials in u_i = (q_i - centre_i) / half_width_i."""
@@ -244,8 +267,8 @@ class Polynomial(Products):
             return values
 
         degrees = [list(range(self.degree + 1))] * space.n
-        linear = cyclic_choice.indices(self.cyclic, space)
-        return product_family(space, outputs, reduced_terms(degrees, self.degree, linear), legendre, derivatives)
+        terms = reduced_terms(degrees, self.degree, cyclic_choice.indices(self.cyclic, space), self.joints)
+        return product_family(space, outputs, terms, legendre, derivatives)
 
 
 @dataclass(frozen=True)
@@ -256,6 +279,7 @@ class Fourier(Products):
         degree: total degree, >= 1.
         cyclic: joints that appear in one linear term each instead of sines and cosines, by name, or "auto" for all
             cyclic joints of the problem; see `orthocas.cyclic_joints`.
+        joints: most joints in one product, >= 1. Default: all.
 
     Example:
         >>> import orthocas as oc
@@ -266,15 +290,12 @@ class Fourier(Products):
 
     @property
     def label(self) -> str:
-        """'fourier:DEGREE', with the cyclic joints if there are any."""
-        return f"fourier:{self.degree}{cyclic_choice.suffix(self.cyclic)}"
+        """'fourier:DEGREE', with most joints of a product and cyclic joints if there are any."""
+        return f"fourier:{self._settings}"
 
     def term_count(self, n: int) -> int:
         """Sum over j of C(n, j) C(d, j) 2^j, without the constant. Cyclic joints do not count in n, but add a term."""
-        linear = min(n, cyclic_choice.count(self.cyclic))
-        n, d = n - linear, self.degree
-        terms: int = sum(comb(n, j) * comb(d, j) * 2**j for j in range(1, min(n, d) + 1))
-        return terms + linear
+        return self._term_count(n, 2)
 
     def family(self, space: JointSpace, outputs: int) -> ProductFamily:
         """Fourier terms of the joint angles.
@@ -304,7 +325,8 @@ class Fourier(Products):
             return D
 
         degrees = [[0] + [k for k in range(1, self.degree + 1) for _ in range(2)]] * space.n
-        return product_family(space, outputs, reduced_terms(degrees, self.degree, linear), waves, derivatives)
+        terms = reduced_terms(degrees, self.degree, linear, self.joints)
+        return product_family(space, outputs, terms, waves, derivatives)
 
 
 Normals = Literal["orthonormal", "paper"]

@@ -12,7 +12,7 @@ from orthocas.bases.family import Parametrisation
 from orthocas.bases.given import SEW, Given, SEWKind
 from orthocas.bases.mlp import MLP
 from orthocas.bases.mobile import Mobile
-from orthocas.bases.products import Fourier, Linear, Polynomial
+from orthocas.bases.products import JOINTS, Fourier, Linear, Polynomial
 from orthocas.errors import InvalidValueError, NotSavableWarning
 from orthocas.tools.checks import require_kind, require_known
 
@@ -52,7 +52,7 @@ def register_parametrisation(
         ...     degree: int = 3
         >>> oc.register_parametrisation("cubic", Cubic, parse=lambda text: Cubic())
         >>> oc.bases.parse_parametrisation("cubic")
-        Cubic(degree=3, cyclic=())
+        Cubic(degree=3, cyclic=(), joints=None)
     """
     require_kind("name", name, str)
     known = _REGISTERED.get(name)
@@ -84,6 +84,9 @@ def warn_unless_savable(parametrisation: Parametrisation) -> None:
 def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
     """Convert a parametrisation to plain data: kind and settings.
 
+    A setting that came later may have the metadata {"stored": "if given"}: data leave it out while it is None, so
+    that charts of before keep their fingerprints.
+
     Raises:
         InvalidValueError: if it is not registered, or its settings are not plain data.
     """
@@ -97,6 +100,9 @@ def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
     parts = {part.name: getattr(parametrisation, part.name) for part in fields(parametrisation)}
     inner = {name: parametrisation_to_data(part) for name, part in parts.items() if isinstance(part, Parametrisation)}
     settings = {**asdict(parametrisation), **inner}
+    for part in fields(parametrisation):
+        if part.metadata.get("stored") == "if given" and parts[part.name] is None:
+            del settings[part.name]
     try:
         json.dumps(settings)
     except (TypeError, ValueError) as error:
@@ -126,7 +132,7 @@ def parametrisation_from_data(data: Mapping[str, Any]) -> Parametrisation:
 
 
 def parse_parametrisation(label: str) -> Parametrisation:
-    """Parse a label: 'polynomial:4', 'fourier:2:cyclic', 'mlp:64x64:raw', 'circle:mlp:32x32', 'linear', or your own.
+    """Parse a label: 'polynomial:4:joints=2', 'fourier:2:cyclic', 'mlp:64x64:raw', 'circle:mlp:32x32', 'linear', yours.
 
     Raises:
         UnknownNameError: if there is no such parametrisation.
@@ -149,9 +155,13 @@ def _whole(text: str) -> int:
         ) from None
 
 
-def _degree_and_cyclic(text: str) -> tuple[int, Cyclic]:
+def _degree_cyclic_joints(text: str) -> tuple[int, Cyclic, int | None]:
     degree, _, rest = text.partition(":")
-    return _whole(degree), parse_suffix(rest)
+    most = None
+    if rest.startswith(f"{JOINTS}="):
+        number, _, rest = rest.removeprefix(f"{JOINTS}=").partition(":")
+        most = _whole(number)
+    return _whole(degree), parse_suffix(rest), most
 
 
 def _mlp(text: str) -> MLP:
@@ -168,8 +178,8 @@ def _linear(text: str) -> Linear:
 
 
 register_parametrisation("linear", Linear, _linear)
-register_parametrisation("polynomial", Polynomial, lambda text: Polynomial(*_degree_and_cyclic(text)))
-register_parametrisation("fourier", Fourier, lambda text: Fourier(*_degree_and_cyclic(text)))
+register_parametrisation("polynomial", Polynomial, lambda text: Polynomial(*_degree_cyclic_joints(text)))
+register_parametrisation("fourier", Fourier, lambda text: Fourier(*_degree_cyclic_joints(text)))
 register_parametrisation("mlp", MLP, _mlp)
 register_parametrisation("sew", SEW, lambda text: SEW(cast(SEWKind, text or "stereographic")))
 register_parametrisation("circle", Circle, lambda text: Circle(parse_parametrisation(text)))

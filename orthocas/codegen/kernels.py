@@ -48,13 +48,13 @@ _INVERSE = """{
 # I - E/2 + 3/8 E^2 is X^-1/2 to rounding. The arrays lie behind those that a round uses.
 _ROOT_TIMES = """{
   casadi_real *X = w + BELOW, *found = X + SIZE * SIZE, *other = found + SIZE * COUNT, rest = 1.0;
+  const casadi_real** from = arg + 2;
+  casadi_real** to = res + 1;
   casadi_int i, j, round;
   for (i = 0; i < SIZE * SIZE; ++i) X[i] = arg[0][i];
   for (i = 0; i < SIZE * COUNT; ++i) found[i] = 0.0;
   casadi_product_SIZE_SIZE_COUNT(X, arg[1], found);
   for (round = 0; round < ROUNDS; ++round) {
-    const casadi_real* from[2];
-    casadi_real* to[2];
     for (rest = 0.0, i = 0; i < SIZE; ++i)
       for (j = 0; j <= i; ++j) {
         const casadi_real size = fabs(i == j ? X[i * SIZE + j] - 1.0 : X[i * SIZE + j]);

@@ -33,7 +33,7 @@ from orthocas.tools.interrupts import deferred
 
 _DEGREE = 2  # its conditioning is that of degree 4, its leak about a fifth larger
 _TRAINING, _HEAVY, _JUDGES = 700, 300, 3000  # numbers of samples: even, near faces and corners, and of a verdict
-_MANY = 6  # coordinates from which a fit starts from that of another box
+_MANY = 6  # coordinates from which fits and their matrices take seconds
 _OTHER = 2.0  # factor of a half-width from which the matrix of another box steers no more
 _SEED = 0
 _TINY = 1e-4
@@ -73,6 +73,10 @@ class Verdict:
             "half a turn": NEAR_HALF_A_TURN / max(self.turn_value, _TINY),
         }
         return dict(sorted(ratios.items(), key=lambda pair: -pair[1]))
+
+    def keeps(self, bounds: Bounds | None) -> bool:
+        """Whether no bound is missed; False without bounds."""
+        return bounds is not None and max(self.excess(bounds).values()) <= 1
 
     def explained(self, miss: Miss, bounds: Bounds) -> str:
         """The value that misses a bound, and the bound, in words."""
@@ -126,7 +130,8 @@ class _Start:
 class Prober:
     """Fits quadratic coordinates of the active joints on trial boxes.
 
-    Many coordinates take seconds, so they start from those of an earlier box, which are nearly the best already.
+    Fits start from the coordinates of an earlier box, which are nearly the best already. From spectral starts of their
+    own, boxes that differ by a few percent end in different minima.
     """
 
     problem: Problem  #: robot, task and metric; trial boxes replace its domain
@@ -135,6 +140,7 @@ class Prober:
     weights: Weights = DEFAULT_WEIGHTS  #: of the fit that confirms the box; lengths and terms of others do not count
     _objective: BasisObjective | None = None  #: of the last box; others only move it
     _start: _Start | None = None  #: of the last box without folds; None: a spectral start
+    _kept: _Start | None = None  #: the start that kept the bounds last
     _steered: _Steered | None = None  #: of the last box whose matrix was computed
 
     @property
@@ -161,13 +167,19 @@ class Prober:
         with one_blas_thread():
             if self._start is not None and (enough is not None or leap):
                 found = self._judged(problem, family, self._start.on(family))
-                if leap or (enough is not None and max(found.excess(enough).values()) <= 1):
+                if leap or found.keeps(enough):
+                    self._kept = self._start if found.keeps(enough) else self._kept
                     return found
             theta = self._fitted(problem, family)
             found = self._judged(problem, family, theta)
-        if self.outputs >= _MANY and found.conditioning > 0:
+        if found.conditioning > 0:
             self._start = _Start(space.half_width, theta)
+            self._kept = self._start if found.keeps(enough) else self._kept
         return found
+
+    def go_back(self) -> None:
+        """Start from the coordinates that kept their bounds last, if there are any."""
+        self._start = self._start if self._kept is None else self._kept
 
     def start_on(self, family: ProductFamily) -> Array | None:
         """Coefficients (size,) of the last coordinates without folds in a family of other degrees on another box."""
@@ -177,8 +189,8 @@ class Prober:
         return family.embed(self._start.on(quadratic), quadratic)
 
     def least(self, problem: Problem, seed: int) -> float:
-        """Least conditioning of the last coordinates on another domain, by descent; 1 if none are kept."""
-        if self._start is None:
+        """Least conditioning of the last coordinates on another domain, by descent; 1 if a fit finds it as soon."""
+        if self._start is None or self.outputs < _MANY:
             return 1.0
         parametrisation = Polynomial(_DEGREE, self.cyclic)
         family = parametrisation.family(JointSpace.of(problem).restricted_to(self.active), self.outputs)

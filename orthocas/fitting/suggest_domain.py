@@ -33,11 +33,13 @@ JUDGES = 30_000  #: samples that judge the fit
 _START, _STEP = 0.5, 1.6  # first scale of the box, and factor to the next while the boundary is unknown
 _CLOSE = 1.06  # the boundary is found within this factor
 _SMALLEST = 1e-3  # scale of a box that is too small to be of use
-_ROUNDS, _FEW_JOINTS = 2, 12  # exchanges of width between joints; one for so many joints, whose trials take a second
+_EXCHANGED = 28  # joints that exchanges of width look at in all: five exchanges of five joints, one of many
+_LEAST_STEP = 0.25  # share of an exchange; after one without gain, the next has half its step
 _WIDER = 1.2  # factor by which one joint alone is widened
 _LARGEST_EXCHANGE = np.log(1.5)
 _STAGE = "suggest a domain"
-_PROBES, _PROBES_OF_A_JOINT = 15, 3  # about as many as a search needs
+_FIRST, _NEXT, _GROWTH = 24, 14, 5  # time of a first scale, a next one and a joint's growth, in trials without a fit
+_TRIALS = 6  # of a scale, about
 #: what helps if no box keeps the bounds
 REMEDIES = (
     "another home (home=..., --centre or --home), another metric (metric=..., --metric), a larger leak_deg "
@@ -150,6 +152,8 @@ class WidestBox:
     bounds: Bounds
     monitor: Monitor
     probes: int = 0
+    _fraction: float = 0.0  #: of the time of the search, about
+    _next: tuple[float, int] = (0.0, 1)  #: the fraction after some more trials, and about how many they are
 
     def found(self, unit: Array) -> tuple[Array, dict[int, list[Miss]]]:
         """Half-widths (n,), and for every free joint the bounds that break if it alone becomes a fifth wider.
@@ -164,20 +168,34 @@ class WidestBox:
         """
         if not self.free:
             return self.room.copy(), {}
-        widths = self._to_boundary(unit, _START)
-        for _ in range(_ROUNDS if len(self.free) < _FEW_JOINTS else 1):
-            trial = self._to_boundary(widths * np.exp(-self._exchange(widths)), 1.0)
-            if np.log(trial[self.free]).sum() <= np.log(widths[self.free]).sum():
+        count, rounds = len(self.free), max(1, _EXCHANGED // len(self.free))
+        ends = np.cumsum([_FIRST, *[count + _NEXT] * rounds]) / (_FIRST + rounds * (count + _NEXT) + _GROWTH * count)
+        self._next = ends[0], _TRIALS
+        return self._grown(self._exchanged(self._to_boundary(unit, _START), ends[1:]))
+
+    def _exchanged(self, widths: Array, ends: Array) -> Array:
+        """Half-widths after rounds of exchange, each of which ends at a fraction of the search."""
+        exchange, step = None, 1.0
+        for end in ends:
+            self._next = end, len(self.free) + _TRIALS
+            exchange = self._exchange(widths) if exchange is None else exchange
+            trial = self._to_boundary(widths * np.exp(-step * exchange), 1.0)
+            if np.log(trial[self.free]).sum() > np.log(widths[self.free]).sum():
+                widths, exchange = trial, None
+                continue
+            step /= 2
+            if step < _LEAST_STEP:
                 break
-            widths = trial
-        return self._grown(widths)
+        return widths
 
     def verdict(self, widths: Array, enough: Bounds | None = None, leap: bool = False) -> Verdict:
         """Fit and judge the box of the given half-widths, see `Prober.verdict`."""
         self.probes += 1
         detail = f"trial {self.probes}: mean half-width {widths[self.free].mean():.3g}"
-        expected = _PROBES + _PROBES_OF_A_JOINT * len(self.free)
-        self.monitor(Progress(_STAGE, min(0.99, self.probes / expected), detail))
+        until, trials = self._next
+        self._fraction += (until - self._fraction) / max(2, trials)
+        self._next = until, trials - 1
+        self.monitor(Progress(_STAGE, self._fraction, detail))
         return self.prober.verdict(Box(self.home, widths), enough, leap)
 
     def _clipped(self, widths: Array) -> Array:
@@ -202,7 +220,7 @@ class WidestBox:
         low, high = 0.0, np.inf
         while high > _CLOSE * low:
             widths = self._clipped(scale * unit)
-            if max(self.verdict(widths, self.bounds).excess(self.bounds).values()) <= 1:
+            if self.verdict(widths, self.bounds).keeps(self.bounds):
                 low = scale
                 if np.array_equal(widths, self.room):
                     break
@@ -210,7 +228,8 @@ class WidestBox:
                 high = scale
             if high < _SMALLEST:
                 raise self._refusal(widths)
-            scale = low * _STEP if np.isinf(high) else high / _STEP**2 if low == 0 else float(np.sqrt(low * high))
+            scale = low * _STEP if np.isinf(high) else high / _STEP if low == 0 else float(np.sqrt(low * high))
+        self.prober.go_back()
         return self._clipped(low * unit)
 
     def _exchange(self, widths: Array) -> Array:
@@ -226,7 +245,9 @@ class WidestBox:
     def _grown(self, widths: Array) -> tuple[Array, dict[int, list[Miss]]]:
         """Widen each joint alone while the bounds are kept, and say what breaks then. Its first step may need a fit."""
         broken: dict[int, list[Miss]] = {k: [] for k in self.free}
-        for k in self.free:
+        begin = self._fraction
+        for done, k in enumerate(self.free, 1):
+            self._next = begin + (1 - begin) * done / len(self.free), 2
             before, factor = widths[k], _WIDER
             while widths[k] < self.room[k]:
                 wider = self._widened(widths, k, factor)
@@ -237,6 +258,7 @@ class WidestBox:
                     break
                 widths = widths if misses else wider
                 factor = _WIDER if misses else factor**2
+        self.prober.go_back()
         return widths, broken
 
     def _widened(self, widths: Array, k: int, factor: float = _WIDER) -> Array:
@@ -421,7 +443,7 @@ def _confirmed(
         found = fit_from(prober.start_on, trial, parametrisation, prober.weights, seed, monitor)
         verdict = judged_chart(found.chart, JUDGES, seed + 1)
         least = worst_points(found.chart.problem, found.chart.coordinates, seed + 1, thorough=True).least
-        if least >= enough and max(verdict.excess(bounds).values()) <= 1:
+        if least >= enough and verdict.keeps(bounds):
             return found, verdict
         last = f"a leak of {verdict.leak_deg:.3g} deg and a conditioning of {min(least, verdict.conditioning):.3g}"
     raise DomainError(
