@@ -351,7 +351,7 @@ def test_several_coordinates_follow_several_quantities() -> None:
 
 
 @pytest.mark.parametrize("metric", ["euclidean", "inertia"])
-def test_the_shortfall_is_that_of_volumes_and_its_slopes_are_differences(metric: Any) -> None:
+def test_the_loss_has_volumes_and_lengths_and_its_slopes_are_differences(metric: Any) -> None:
     robot = oc.Robot.planar([1.0, 0.8, 0.6, 0.5], [3.0, 2.0, 2.0, 1.0])
     problem, rng = (
         oc.Problem(robot, oc.Task.position(robot, "xy"), metric, oc.Box(np.full(4, 0.7), 0.6)),
@@ -381,7 +381,8 @@ def test_the_shortfall_is_that_of_volumes_and_its_slopes_are_differences(metric:
         gram = np.concatenate([J, G], axis=1) @ np.linalg.inv(A) @ np.concatenate([J, G], axis=1).transpose(0, 2, 1)
         lengths = np.linalg.det(gram[:, :2, :2]) * gram[:, 2, 2] * gram[:, 3, 3]
         v = -np.sign(np.linalg.det(np.concatenate([J, G], axis=1))) * np.sqrt(np.linalg.det(gram) / lengths)
-        parts.append(np.maximum(0.0, 1 - v / 0.4) ** 2)
+        uneven = np.log(gram[:, [2, 3], [2, 3]] / np.einsum("ki,ij,kj->k", C, factor @ factor.T, C)) / 2
+        parts.append(np.maximum(0.0, 1 - v / 0.4) ** 2 + 0.03 * (uneven**2).sum(axis=1))
     assert abs(value - np.concatenate(parts).mean() - (C[0] @ wish.E @ C[0] - 2 * wish.g @ C[0] + 0.3)) < 1e-6
     moved = rng.normal(size=(6, len(theta)))
     ends = [[loss.value(theta + side * 1e-6 * a) for side in (-1, 1)] for a in moved]
