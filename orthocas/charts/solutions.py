@@ -345,7 +345,8 @@ class ReachingTracker(Tracker):
             if promised <= _CONVERGED * cost:
                 break
             for halvings in range(_HALVINGS + 1):
-                change = np.clip(now + move * 0.5**halvings - start, -self._limit, self._limit)
+                change = now + move * 0.5**halvings - start
+                change /= max(1.0, float(np.abs(change / self._limit).max()))  # joints cut alone would move x
                 after = self._cost(start + change) + float(pull @ change**2) / 2
                 if after < cost - _DECREASE * 0.5**halvings * promised and self._domain.contains(self._at[None])[0]:
                     break
