@@ -80,7 +80,7 @@ def test_recording_with_other_columns_is_refused(tmp_path: Path) -> None:
 
 
 def test_elbow_of_a_joystick_meets_its_boundary_and_the_hand_stays() -> None:
-    """By MuJoCo; where the elbow is pushed beyond its boundary, the small weight of xi takes micrometres of the hand."""
+    """By MuJoCo; where the elbow is pushed beyond its boundary, the weight of xi takes micrometres of the hand."""
     found = joystick.main(iter(np.tile(np.eye(7)[6], (1000, 1))))
     assert found["reached"] + found["nearest"] == 1
     assert found["nearest"] > 0.1
