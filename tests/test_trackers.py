@@ -167,7 +167,7 @@ def test_it_rests_where_a_target_pushes_it_against_the_boundary() -> None:
         path.append(tracker.step(np.concatenate([x, xi])).copy())
     assert tracker.status == oc.TrackerStatus.NEAREST
     room = np.minimum(path[-1] - robot.lower, robot.upper - path[-1]).min()
-    assert 0 <= room < 0.005
+    assert 0 <= room < 0.07  # in the zone of 2 % of a joint
     assert np.ptp(path[-300:], axis=0).max() < 1e-4
     np.testing.assert_allclose(robot.tip_position(np.array(path)), np.tile(x[:3], (1200, 1)), atol=5e-6)
 

@@ -211,7 +211,7 @@ class InverseMethods(PhiFunctions):
         self._require_expression("a tracker")
         require_kind("nearest", nearest, bool)
         parts = self._point_functions, self.problem.domain, q0, largest_step
-        return ReachingTracker(*parts, self.reaching) if nearest else Tracker(*parts)
+        return ReachingTracker(*parts, self.reaching, self.m) if nearest else Tracker(*parts)
 
     def function(self, name: str) -> ca.Function:
         """A CasADi function: xi, phi, jacobian, task, task_jacobian, second_derivative or inverse.

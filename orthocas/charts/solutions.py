@@ -22,9 +22,8 @@ _FEW = 5  # rows that a message names
 _ROUNDED = 1e-9  # error up to which only rounding may have stopped the decrease
 _STEP = 0.1  # of the half-widths: default of the largest change of q in a call
 _WEIGHT = 1e-3  # of errors of xi, relative to those of x
+KEPT = 1e-5  # error of x over its size, with which xi gives way before x is
 ZONE = 0.02  # next to the boundary, in half-widths of joints and in relative room of conditions
-LEAST_ZONE = 3e-4  # as far as q has gone into it
-INSIDE = 1 + 1e-6  # a zone over its room, so that q lies within
 DESCENTS, _HALVINGS = 12, 20  # steps of Gauss and Newton in a call, and halvings of one
 INERTIA = 1e-3  # weight of the way from the last q, in half-widths
 _CONVERGED = 1e-10  # relative decrease of the cost at which a call ends
@@ -286,10 +285,10 @@ class ReachingTracker(Tracker):
 
         |D^-1 e_x|^2 + w^2 |e_xi|^2 + sum over boundaries of max(0, 1 - room / zone)^2
 
-    by damped Gauss-Newton steps, with the sizes D of x, w = 0.001 and a zone of 2 % next to the boundaries; from within
-    it, of the room there is, so that nothing draws q back from a boundary that it has reached. The cost is smooth. A
-    phi that is reached inside the domain is met to rounding, as by `Tracker`; otherwise `status` is NEAREST: x has
-    priority, xi gives way. q never leaves the domain, and no joint moves more than `largest_step` in a call.
+    by damped Gauss-Newton steps, with the sizes D of x, w = 0.001 and a zone of 2 % next to the boundaries. The cost is
+    smooth, so q is smooth in phi where the minimum is. A phi that is reached is met to rounding, as by `Tracker`,
+    unless xi alone leads deeper into a zone; otherwise `status` is NEAREST: x has priority, xi gives way. q never
+    leaves the domain, and no joint moves more than `largest_step` in a call.
     """
 
     def __init__(
@@ -299,8 +298,9 @@ class ReachingTracker(Tracker):
         q0: ArrayLike,
         largest_step: ArrayLike | None,
         parts: tuple[ca.Function, ca.Function],
+        m: int,
     ) -> None:
-        self._parts = parts
+        self._parts, self._m = parts, m
         super().__init__(functions, domain, q0, largest_step)
         n, rooms = len(domain.centre), parts[1].size1_out(0)
         self._at, self._to, self._e, self._rooms = np.empty(n), np.empty(n), np.empty(n), np.empty(rooms)
@@ -313,18 +313,24 @@ class ReachingTracker(Tracker):
 
     def __getstate__(self) -> dict[str, object]:
         """Without scratch memory."""
-        return {**super().__getstate__(), "parts": self._parts}
+        return {**super().__getstate__(), "parts": self._parts, "m": self._m}
 
     def __setstate__(self, state: dict[str, object]) -> None:
-        names = ("functions", "domain", "q", "limit", "parts")
+        names = ("functions", "domain", "q", "limit", "parts", "m")
         self.__init__(*(state[name] for name in names))  # type: ignore[misc]
 
     def step(self, phi: ArrayLike) -> Array:
         """As `Tracker.step`; where that stays, the nearest q (n,) that a search from the last one finds."""
+        start = self.q.copy()
         q = super().step(phi)
-        if self.status in (TrackerStatus.OK, TrackerStatus.BAD_INPUT):
+        reached = self.status is TrackerStatus.OK
+        if self.status is TrackerStatus.BAD_INPUT or (reached and not self._goes_deeper(start, q)):
             return q
-        found = self._descended(q)
+        found = self._descended(start if reached else q)
+        if reached:
+            self._cost(found)
+            if np.abs(self._e[: self._m]).max() > KEPT:  # x leads there, too
+                return q
         self._solver.q[:] = found
         if not self._solver.refresh():
             self._solver.q[:] = q
@@ -338,9 +344,6 @@ class ReachingTracker(Tracker):
         start, now = q, q
         self._to[:] = self._solver.target
         pull = (INERTIA / self._domain.half_width) ** 2
-        self._zones = np.full(2 * len(self._bounded) + len(self._rooms), ZONE)
-        self._cost(now)
-        self._zones = np.clip(INSIDE * self._room(), LEAST_ZONE, ZONE)
         cost = self._cost(now)
         for _ in range(DESCENTS):
             r, J = self._model()
@@ -360,6 +363,16 @@ class ReachingTracker(Tracker):
             now, cost = start + change, after
         return np.asarray(now)
 
+    def _goes_deeper(self, start: Array, end: Array) -> bool:
+        """Whether a way ends deeper in a zone than it begins."""
+        self._to[:] = self._solver.target
+        self._cost(end)
+        short = self._short()
+        if not short.any():
+            return False
+        self._cost(start)
+        return bool((short > self._short()).any())
+
     def _cost(self, q: Array) -> float:
         """Half the sum of squares at q (n,), without the way from the last q."""
         self._at[:] = q
@@ -368,13 +381,10 @@ class ReachingTracker(Tracker):
         return squares / 2 if np.isfinite(squares) else np.inf
 
     def _short(self) -> Array:
-        """How deep the last q lies in the zones, (k,); 0 outside them."""
-        return np.maximum(0.0, 1 - self._room() / self._zones)
-
-    def _room(self) -> Array:
-        """Of the last q, to the limits of joints above and below, relative to half-widths, and of conditions, (k,)."""
+        """How deep the last q lies in the zones of joints, below and above, and of conditions, (k,); 0 outside them."""
         away = (self._at - self._domain.centre)[self._bounded] / self._widths
-        return np.concatenate([1 - away, 1 + away, self._rooms])
+        rooms = np.concatenate([1 - away, 1 + away, self._rooms])
+        return np.maximum(0.0, 1 - rooms / ZONE)
 
     def _model(self) -> tuple[Array, Array]:
         """The residuals other than 0 at the last q, and their Jacobian."""
@@ -387,7 +397,7 @@ class ReachingTracker(Tracker):
             self._inwards.run()
             rows[2 * k :] = -self._slopes.T
         r = np.concatenate([self._e, short[active]])
-        return r, np.vstack([self._J.T, rows[active] / self._zones[active, None]])
+        return r, np.vstack([self._J.T, rows[active] / ZONE])
 
 
 def parts_of(
