@@ -343,6 +343,8 @@ def test_several_coordinates_follow_several_quantities() -> None:
     assert (off[0] < off[1] / 2).all(), off
     with pytest.raises(InvalidValueError, match="like is quantities that the task leaves nothing of"):
         oc.fit_wide(robot, task, box, like=["q3", "q3"], samples=500)
+    with pytest.raises(InvalidValueError, match="like is quantities without a finite gradient in the domain"):
+        oc.fit_wide(robot, task, box, like=[lambda q: ca.sqrt(q[0])], samples=500)
     with pytest.raises(InvalidValueError, match="like is 4 quantities, expected at most 3"):
         oc.fit_wide(robot, task, box, like=["q1", "q2", "q3", "q4"], samples=500)
     middle = fits[0].chart.problem.domain.centre

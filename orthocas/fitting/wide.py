@@ -195,7 +195,7 @@ def fit_wide(
     if problem.r == 1:
         meaning = Meaning.by_default(problem, posture) if like is None else Meaning.of(problem, like, posture)
     elif like is not None:
-        quantities = Like.of(robot, like)
+        quantities = Like.of(problem, like)
         quantities.require_at_most(problem.r)
     searches = [_Search(*case, count, seed, monitor, meaning, quantities) for case in cases]
     with remembered() as pressed:
@@ -320,7 +320,7 @@ class Meaning:
             InvalidValueError: if there is more than one quantity, or it stands still there.
         """
         if isinstance(like, Task) or (isinstance(like, Sequence) and not isinstance(like, str)):
-            several = Like.of(problem.robot, like)
+            several = Like.of(problem, like)
             if len(several.names) != 1:
                 raise InvalidValueError("like", f"{len(several.names)} quantities", "one, as r = 1")
             name, quantity = several.names[0], several.function
