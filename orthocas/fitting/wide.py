@@ -79,7 +79,7 @@ class WideFit(Fit):
     branch: Branch | None = None  #: the branch of the chart
     regular_share: float = float(
         "nan"
-    )  #: of the branch's clear positions, the share in the chart's domain, from 20,000 samples
+    )  #: of the clear positions of the branch, or the box in its place, the share in the domain, from 20,000 samples
 
     def facts(self) -> dict[str, str]:
         """The facts of a fit, with branch and regular share."""
@@ -140,7 +140,8 @@ def fit_wide(
         robot: the robot.
         task: a task of that robot. A missing reference orientation is taken at the centre of the branch.
         branch: a branch of `orthocas.branches`, its name, or a box of your own. Default: the branch of the home; with
-            none there, the largest.
+            none there, the largest. If its middle is not clear, the largest box around a clear position takes its
+            place.
         metric: as in `Problem`.
         clearance: least relative singular value of the task, > 0; see `orthocas.ClearBox`.
         parametrisation: a family that is linear in its parameters. Default: Polynomial(6), with one linear
@@ -161,7 +162,8 @@ def fit_wide(
         The chart, the branch, and the regular share.
 
     Raises:
-        DomainError: if there is no clear position near the middle of the branch.
+        DomainError: if no position of the branch is clear by 1.5 times `clearance`, or if coordinates are not regular
+            in the middle.
         InvalidValueError, UnknownNameError, NotRedundantError: if an argument is invalid.
         Interrupted: after Ctrl-C, once there are coordinates; before that, KeyboardInterrupt.
 
@@ -431,7 +433,8 @@ def _problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Bran
     middles = points[values > _CLEARER * clearance]
     room = box.half_width - np.abs(middles - box.centre)
     if not len(middles):
-        raise DomainError(f"branch '{branch.name}' has no position clear by clearance = {clearance:g}, expected less")
+        missing = f"no position clear by {_CLEARER * clearance:g}"
+        raise DomainError(f"branch '{branch.name}' has {missing}, expected one for clearance = {clearance:g}")
     best = int(np.argmax(np.log(room).sum(axis=1)))
     domain = Box(middles[best], room[best], box.unbounded)
     return Problem(robot, task, metric, domain, branch.name, clearance)
