@@ -250,8 +250,12 @@ def test_base_and_tool_count_like_other_joints_where_linear_terms_are_poor() -> 
         "arm_left_7_link",
         {"torso_1_joint": 0.0, "torso_2_joint": 0.0},
     )
-    fit = oc.fit_wide(robot, oc.Task.pose(robot), samples=3000)
+    reports: list[Progress] = []
+    fit = oc.fit_wide(robot, oc.Task.pose(robot), samples=3000, monitor=reports.append)
     assert fit.chart.coordinates.parametrisation.label == oc.Polynomial(5).label
+    stages = {name: [each.fraction for each in reports if each.stage == name] for name in (r.stage for r in reports)}
+    assert list(stages)[:2] == ["whole branch", "whole branch, all joints"]
+    assert all(fractions == sorted(fractions) for fractions in stages.values())
     assert fit.regular_share > 0.999
     q = sample_uniform(fit.chart.problem.domain, 2000, 6)
     slopes = np.einsum("sn,sn->s", fit.chart.coordinates.jacobian(q)[:, 0], self_motions(robot, q))
@@ -496,21 +500,21 @@ def test_decoupled_laws_are_warned_of_the_leak() -> None:
 @pytest.mark.slow
 def test_interrupted_fits_keep_the_best_so_far() -> None:
     known = oc.problems.get("planar_3r_xy")
-    reports = []
+    whole = oc.Box([0.0, 1.0, 1.0], [3.0, 1.8, 1.8])  # nothing is regular enough there, so all descents are begun
+    for later in (0, 1):  # stages before the one that is interrupted
+        reports: list[str] = []
 
-    def stop(progress: Progress) -> None:
-        reports.append(progress.stage)
-        if len(reports) == 2:
-            raise KeyboardInterrupt
+        def stop(progress: Progress, reports: list[str] = reports, later: int = later) -> None:
+            reports.append(progress.stage)
+            if len(set(reports)) > later:
+                raise KeyboardInterrupt
 
-    whole = oc.Box([0.0, 1.0, 1.0], [3.0, 1.8, 1.8])  # nothing is regular enough there, so all steps are taken
-    with pytest.raises(Interrupted) as stopped:
-        oc.fit_wide(known.robot, known.task, whole, monitor=stop)
-    fit = stopped.value.result
-    assert fit.status is Status.INTERRUPTED
-    assert len(fit.stages) == 1  # the second was not finished
-    with pytest.raises(KeyboardInterrupt):
-        oc.fit_wide(known.robot, known.task, BENT, monitor=lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(Interrupted) as stopped:
+            oc.fit_wide(known.robot, known.task, whole, parametrisation=oc.Polynomial(3), monitor=stop)
+        fit = stopped.value.result
+        assert fit.status is Status.INTERRUPTED
+        assert [stage.label for stage in fit.stages] == list(dict.fromkeys(reports))
+        assert 0 < fit.stages[-1].result.iterations < 3
 
 
 def test_bad_settings_are_named() -> None:

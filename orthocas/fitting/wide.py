@@ -65,6 +65,7 @@ _WELL = 0.28  # over r, volume of all but 1 % of positions that is enough; a con
 _UNIFORM_TAG = 1  # within the other tags
 _EVERY = 4  # samples whose gradients count as long
 _TINY = 1e-12  # length of a row
+_STAGES = ("whole branch", "whole branch, all joints")  # names of their stages, which progress tells apart
 _MEANT = 100.0  # weight of the mean squared error of a meaning, relative to the slope
 _STEP, _MOST_STEPS, _FEWEST = 0.02, 400, 5  # of unit self-motions, along which a meaning is taken
 _ALIKE = 0.01  # weight of the mean squared distance to gradients of quantities, with r > 1
@@ -227,8 +228,8 @@ def _case(problem: Problem, family: Parametrisation) -> tuple[Problem, Parametri
 
 def _run(searches: Sequence["_Search"]) -> None:
     """Search in one family after the other, as long as results are poor, then go on in the best one."""
-    for search in searches:
-        search.begin()
+    for name, search in zip(_STAGES, searches, strict=False):
+        search.begin(name)
         if search.rank[0] <= (_POOR if search.problem.r == 1 else _POOR_SEVERAL):
             break
     _better(searches).go_on()
@@ -582,8 +583,8 @@ class _Search:
         self.stages: list[Stage] = []
         self._done = False  # whether coordinates are as regular as they need to be
 
-    def begin(self) -> None:
-        """Descend from coordinates that are linear, as far as the family has such."""
+    def begin(self, name: str) -> None:
+        """Descend from coordinates that are linear, as far as the family has such, in a stage of some name."""
         self._basis: BasisGradients = gradients_of(self._family, self.problem.n)  # not before this family is tried
         self._judged = self._field(_JUDGED, _JUDGED_TAG)
         self._fields = [self._field(self.samples, _TAG)]
@@ -593,7 +594,7 @@ class _Search:
         self._last = self._first(some)
         self._sense = 1.0 if self._middle.volumes(self._last)[0] > 0 else -1.0
         self._wishes = self._meant(some)
-        self._descend(_TARGET, _ITERATIONS, "whole branch")
+        self._descend(_TARGET, _ITERATIONS, name)
 
     def go_on(self) -> None:
         """Descend with the worst of fresh samples, as long as coordinates are not regular enough."""
@@ -603,7 +604,7 @@ class _Search:
             fresh = self._field(_FRESH, _FRESH_TAG + turn)
             worst = fresh.points[np.argsort(self._sense * fresh.volumes(self._last))[:_WORST]]
             self._fields.append(_Field(self.problem, worst, self._basis))
-            self._descend(_FURTHER_TARGET, _FURTHER, f"worst positions, round {turn} of {_ROUNDS}")
+            self._descend(_FURTHER_TARGET, _FURTHER, f"worst samples, round {turn} of {_ROUNDS}")
 
     @property
     def rank(self) -> tuple[float, float]:
