@@ -23,10 +23,10 @@ from orthocas.charts.self_motion import StopKind
 from orthocas.codegen import check_c
 from orthocas.errors import ChartFileError, DomainError, Interrupted, InvalidValueError, ShapeError, UnknownNameError
 from orthocas.fitting.basis_gradients import gradients_of
-from orthocas.fitting.wide import _Field, _Shortfall, _Wish
+from orthocas.fitting.wide import _Field, _Search, _Shortfall, _Wish
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.domains import sample_heavily, sample_uniform
-from orthocas.tools.progress import Progress
+from orthocas.tools.progress import Progress, silent
 
 Numbers = NDArray[np.float64]
 BENT = oc.Box([0.0, 1.3, 1.3], [3.0, 1.2, 1.2])  # of the planar arm, which has no branches
@@ -515,6 +515,18 @@ def test_interrupted_fits_keep_the_best_so_far() -> None:
         assert fit.status is Status.INTERRUPTED
         assert [stage.label for stage in fit.stages] == list(dict.fromkeys(reports))
         assert 0 < fit.stages[-1].result.iterations < 3
+
+
+def test_coordinates_hold_in_the_middle_in_the_sense_of_the_search_only() -> None:
+    known = oc.problems.get("planar_3r_xy")
+    problem = oc.Problem(known.robot, known.task, domain=BENT, least_singular_value=0.1)
+    search = _Search(problem, oc.Polynomial(1), 500, 0, silent, None, None)
+    search.begin("linear")
+    assert search.best is not None
+    assert search.holds_in_the_middle()
+    bad, low, C = search.best
+    search.best = bad, low, -C
+    assert not search.holds_in_the_middle()
 
 
 def test_bad_settings_are_named() -> None:

@@ -613,9 +613,9 @@ class _Search:
         return max(self.best[0], _ENOUGH), self.best[1]
 
     def holds_in_the_middle(self) -> bool:
-        """Whether the best coordinates are regular at the centre of the domain."""
+        """Whether the best coordinates are regular at the centre of the domain, in the sense of the search."""
         assert self.best is not None
-        return abs(float(self._middle.volumes(self.best[2])[0])) > LEAST_VOLUME / self.problem.r
+        return self._sense * float(self._middle.volumes(self.best[2])[0]) > LEAST_VOLUME / self.problem.r
 
     def coordinates(self, C: Array) -> Coordinates:
         """Coordinates of coefficients (r, K), not normalised."""
