@@ -244,6 +244,18 @@ def test_several_coordinates_are_regular_together() -> None:
 
 
 @pytest.mark.slow
+def test_coordinates_in_the_metric_of_the_inertia_are_regular_in_the_domain() -> None:
+    """Orthogonal in M, four coordinates of the arm are nearly parallel otherwise, and the domain would be empty."""
+    task, cubic = oc.Task.position(iiwa()), oc.Polynomial(3, ["A1"])
+    fit = oc.fit_wide(iiwa(), task, home_branch(), "inertia", parametrisation=cubic, samples=2500)
+    assert fit.regular_share > 0.99
+    q = sample_uniform(fit.chart.problem.domain, 2000, 6)
+    J = np.concatenate([geometric_jacobians(iiwa(), q)[:, :3], fit.chart.coordinates.jacobian(q)], axis=1)
+    signs = np.sign(np.linalg.det(J))
+    assert signs.min() == signs.max()
+
+
+@pytest.mark.slow
 def test_base_and_tool_count_like_other_joints_where_linear_terms_are_poor() -> None:
     robot = oc.Robot.from_urdf(
         robot_data("talos_data/robots/talos_reduced.urdf"),
@@ -384,10 +396,13 @@ def test_the_shortfall_is_that_of_volumes_and_its_slopes_are_differences(metric:
             if metric == "inertia"
             else np.broadcast_to(np.eye(4), (len(points), 4, 4))
         )
-        gram = np.concatenate([J, G], axis=1) @ np.linalg.inv(A) @ np.concatenate([J, G], axis=1).transpose(0, 2, 1)
-        lengths = np.linalg.det(gram[:, :2, :2]) * gram[:, 2, 2] * gram[:, 3, 3]
-        v = -np.sign(np.linalg.det(np.concatenate([J, G], axis=1))) * np.sqrt(np.linalg.det(gram) / lengths)
-        parts.append(np.maximum(0.0, 1 - v / 0.4) ** 2)
+        rows, losses = np.concatenate([J, G], axis=1), np.zeros(len(points))
+        for B, bound in ((A, 0.4), (np.eye(4), 0.03)) if metric == "inertia" else ((A, 0.4),):
+            gram = rows @ np.linalg.inv(B) @ rows.transpose(0, 2, 1)
+            lengths = np.linalg.det(gram[:, :2, :2]) * gram[:, 2, 2] * gram[:, 3, 3]
+            v = -np.sign(np.linalg.det(rows)) * np.sqrt(np.linalg.det(gram) / lengths)
+            losses += np.maximum(0.0, 1 - v / bound) ** 2
+        parts.append(losses)
     assert abs(value - np.concatenate(parts).mean() - (C[0] @ wish.E @ C[0] - 2 * wish.g @ C[0] + 0.3)) < 1e-6
     moved = rng.normal(size=(6, len(theta)))
     ends = [[loss.value(theta + side * 1e-6 * a) for side in (-1, 1)] for a in moved]

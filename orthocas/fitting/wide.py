@@ -57,6 +57,7 @@ _FIRST = 200  # samples that scale coordinates
 _JUDGED = 20_000
 _TARGET, _ITERATIONS = 0.5, 100  # of the first descent: the volume that is enough at a sample
 _FURTHER_TARGET, _FURTHER = 0.3, 60  # of further ones
+_BEYOND = 1.2  # over the bound of the domain, the volume in the identity metric that is enough beside another metric
 _ROUNDS, _FRESH, _WORST, _FRESH_TAG = 3, 50_000, 5000, 3002  # further descents, each with the worst of fresh samples
 _TOLERANCE, _RIDGE = 1e-6, 1e-8
 _POOR, _POOR_SEVERAL = 1e-3, 5e-3  # share of bad positions with which another family is tried; if r > 1
@@ -120,7 +121,8 @@ def fit_wide(
     long as more than 0.05 % of other samples are not regular after that, or 1 % of them have a volume below 0.28 / r,
     the worst of 50,000 fresh samples join and t = 0.3, three times at most. The best of these results is kept: fewest
     bad positions, as far as these are more than 0.05 %, then the largest 1 % quantile of the volume. The domain of the
-    chart is the part of the branch where coordinates are regular with a margin, see `RegularPart`.
+    chart is the part of the branch where coordinates are regular with a margin, see `RegularPart`. It is judged in the
+    identity metric; with another one, the same mean for the volume in the identity metric and t = 0.06 / r is added.
 
     Coordinates that are linear in the first and the last joint are best to prove and hold at any turn of them. They ask
     that self-motions turn base and tool in one sense on the whole branch, as far as the other joints do not outweigh
@@ -472,20 +474,35 @@ class _Field:
         return np.asarray(np.linalg.det(np.concatenate([self._judged, _unit(self.jacobian(C))[0]], axis=1)))
 
     def shortfall(self, C: Array, target: float, sense: float) -> tuple[float, Array]:
-        """Sum of max(0, 1 - sense v / target)^2 with volumes v in the metric, and its derivative after C (r, K)."""
+        """Sum of max(0, 1 - sense v / target)^2 with volumes v in the metric, and its derivative after C (r, K).
+
+        In another metric than the identity, the sum for the volumes of `RegularPart` and a little more than its bound
+        joins it: coordinates that are orthogonal in the inertia may be nearly parallel otherwise.
+        """
         J = self.jacobian(C)
-        unit, lengths = _unit(J if self.root is None else J @ self.root)
-        rows = np.concatenate([self._own, unit], axis=1)
-        volumes = sense * np.linalg.det(rows)
-        short = np.maximum(0.0, 1 - volumes / target)
-        some = short > 0
-        inverse = np.linalg.inv(rows[some] + (volumes[some] == 0)[:, None, None] * _TINY * np.eye(rows.shape[2]))
-        G = volumes[some, None, None] * inverse[:, :, -J.shape[1] :].transpose(0, 2, 1)  # dv after unit gradients
-        G -= np.einsum("sri,sri->sr", G, unit[some])[:, :, None] * unit[some]
-        G *= (-2 / target * short[some])[:, None, None] / lengths[some]
-        slopes = np.zeros_like(J)
-        slopes[some] = G if self.root is None else G @ self.root[some].transpose(0, 2, 1)
-        return float(short @ short), self._basis.pullback(self._known, slopes)
+        value, slopes = _shortfall_and_slopes(J, self._own, self.root, target, sense)
+        if self.root is not None:
+            own, more = _shortfall_and_slopes(J, self._judged, None, _BEYOND * LEAST_VOLUME / J.shape[1], sense)
+            value, slopes = value + own, slopes + more
+        return value, self._basis.pullback(self._known, slopes)
+
+
+def _shortfall_and_slopes(
+    J: Array, basis: Array, root: Array | None, target: float, sense: float
+) -> tuple[float, Array]:
+    """Sum of max(0, 1 - sense v / target)^2 with v = det [basis; unit J root], and its derivative after J (N, r, n)."""
+    unit, lengths = _unit(J if root is None else J @ root)
+    rows = np.concatenate([basis, unit], axis=1)
+    volumes = sense * np.linalg.det(rows)
+    short = np.maximum(0.0, 1 - volumes / target)
+    some = short > 0
+    inverse = np.linalg.inv(rows[some] + (volumes[some] == 0)[:, None, None] * _TINY * np.eye(rows.shape[2]))
+    G = volumes[some, None, None] * inverse[:, :, -J.shape[1] :].transpose(0, 2, 1)  # dv after unit gradients
+    G -= np.einsum("sri,sri->sr", G, unit[some])[:, :, None] * unit[some]
+    G *= (-2 / target * short[some])[:, None, None] / lengths[some]
+    slopes = np.zeros_like(J)
+    slopes[some] = G if root is None else G @ root[some].transpose(0, 2, 1)
+    return float(short @ short), slopes
 
 
 def _unit(rows: Array) -> tuple[Array, Array]:
