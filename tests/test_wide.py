@@ -532,16 +532,17 @@ def test_interrupted_fits_keep_the_best_so_far() -> None:
         assert 0 < fit.stages[-1].result.iterations < 3
 
 
-def test_coordinates_hold_in_the_middle_in_the_sense_of_the_search_only() -> None:
+def test_coordinates_of_the_other_sense_in_the_middle_miss_it() -> None:
     known = oc.problems.get("planar_3r_xy")
     problem = oc.Problem(known.robot, known.task, domain=BENT, least_singular_value=0.1)
     search = _Search(problem, oc.Polynomial(1), 500, 0, silent, None, None)
     search.begin("linear")
-    assert search.best is not None
-    assert search.holds_in_the_middle()
-    bad, low, C = search.best
-    search.best = bad, low, -C
-    assert not search.holds_in_the_middle()
+    (missed, *_), C = search.rank, search.best
+    assert not missed
+    assert C is not None
+    search.best = None
+    search._keep(-C)
+    assert search.rank[0]
 
 
 def test_bad_settings_are_named() -> None:

@@ -119,10 +119,11 @@ def fit_wide(
     over samples of the branch that are clear of singular positions, half of them uniform and half boundary-heavy. It
     descends with L-BFGS from linear coordinates across the task in the middle of the branch, first with t = 0.5. As
     long as more than 0.05 % of other samples are not regular after that, or 1 % of them have a volume below 0.28 / r,
-    the worst of 50,000 fresh samples join and t = 0.3, three times at most. The best of these results is kept: fewest
-    bad positions, as far as these are more than 0.05 %, then the largest 1 % quantile of the volume. The domain of the
-    chart is the part of the branch where coordinates are regular with a margin, see `RegularPart`. It is judged in the
-    identity metric; with another one, the same mean for the volume in the identity metric and t = 0.06 / r is added.
+    the worst of 50,000 fresh samples join and t = 0.3, three times at most. The best of these results is kept:
+    regular in the middle, fewest bad positions, as far as these are more than 0.05 %, then the largest 1 % quantile of
+    the volume. The domain of the chart is the part of the branch where coordinates are regular with a margin, see
+    `RegularPart`. It is judged in the identity metric; with another one, the same mean for the volume in the identity
+    metric and t = 0.06 / r is added.
 
     Coordinates that are linear in the first and the last joint are best to prove and hold at any turn of them. They ask
     that self-motions turn base and tool in one sense on the whole branch, as far as the other joints do not outweigh
@@ -232,15 +233,15 @@ def _run(searches: Sequence["_Search"]) -> None:
     """Search in one family after the other, as long as results are poor, then go on in the best one."""
     for name, search in zip(_STAGES, searches, strict=False):
         search.begin(name)
-        if search.rank[0] <= (_POOR if search.problem.r == 1 else _POOR_SEVERAL):
+        missed, bad, _ = search.rank
+        if not missed and bad <= (_POOR if search.problem.r == 1 else _POOR_SEVERAL):
             break
     _better(searches).go_on()
 
 
 def _better(searches: Sequence["_Search"]) -> "_Search":
-    """The search with the best coordinates, regular in the middle if there are such."""
-    found = (search for search in searches if search.best is not None)
-    return min(found, key=lambda search: (not search.holds_in_the_middle(), *search.rank))
+    """The search with the best coordinates."""
+    return min((search for search in searches if search.best is not None), key=lambda search: search.rank)
 
 
 def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: bool) -> WideFit:
@@ -249,7 +250,7 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
     clear, seed = search.problem, search.seed
     centre, status = clear.domain.centre, Status.INTERRUPTED if interrupted else Status.CONVERGED
     first = sample_problem(clear, _FIRST, (seed, _FIRST_TAG))
-    raw = search.coordinates(search.best[2])
+    raw = search.coordinates(search.best)
     meaning, quantities = search.meaning, search.quantities
     if meaning is not None:
         coordinates = meaning.named(raw)
@@ -260,7 +261,7 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
     try:
         domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
     except DomainError as error:
-        advice = "give a smaller box as branch, or another branch"
+        advice = "give a smaller box as branch, another branch, or another parametrisation"
         raise DomainError(f"in the middle of branch '{branch.name}', {error}: {advice}") from None
     judged = sample_uniform(clear.domain, _JUDGED, (seed, _JUDGED_TAG))
     share = float(domain.is_clear(judged[_beside_the_middle(clear, judged)]).mean())
@@ -596,7 +597,9 @@ class _Search:
         assert isinstance(family, LinearFamily)
         self._family: LinearFamily = family
         self.samples = samples or int(np.clip(_PER_TERM * family.width, _LEAST_SAMPLES, _MOST_SAMPLES))
-        self.best: tuple[float, float, Array] | None = None  #: share of bad positions, -1 % volume, coefficients
+        self.best: Array | None = None  #: coefficients (r, K)
+        #: of the best: whether they miss the middle, share of bad positions, if too many, and minus their 1 % volume
+        self.rank = (True, np.inf, np.inf)
         self.stages: list[Stage] = []
         self._done = False  # whether coordinates are as regular as they need to be
 
@@ -623,17 +626,6 @@ class _Search:
             self._fields.append(_Field(self.problem, worst, self._basis))
             self._descend(_FURTHER_TARGET, _FURTHER, f"worst samples, round {turn} of {_ROUNDS}")
 
-    @property
-    def rank(self) -> tuple[float, float]:
-        """Share of bad positions with the best coefficients so far, if too many, and minus their 1 % volume."""
-        assert self.best is not None
-        return max(self.best[0], _ENOUGH), self.best[1]
-
-    def holds_in_the_middle(self) -> bool:
-        """Whether the best coordinates are regular at the centre of the domain, in the sense of the search."""
-        assert self.best is not None
-        return self._sense * float(self._middle.volumes(self.best[2])[0]) > LEAST_VOLUME / self.problem.r
-
     def coordinates(self, C: Array) -> Coordinates:
         """Coordinates of coefficients (r, K), not normalised."""
         r, space = self.problem.r, JointSpace.of(self.problem)
@@ -657,11 +649,13 @@ class _Search:
 
     def _keep(self, C: Array) -> None:
         """Keep coefficients if they are the best so far."""
-        volumes, r = self._sense * self._judged.volumes(C), self.problem.r
-        bad, low = float(np.mean(volumes <= LEAST_VOLUME / r)), float(np.quantile(volumes, 0.01))
-        if self.best is None or (max(bad, _ENOUGH), -low) < self.rank:
-            self.best = bad, -low, C
-        self._done = bad <= _ENOUGH and low >= _WELL / r
+        bound = LEAST_VOLUME / self.problem.r
+        middle, volumes = (self._sense * field.volumes(C) for field in (self._middle, self._judged))
+        missed, bad, low = bool(middle[0] <= bound), float(np.mean(volumes <= bound)), float(np.quantile(volumes, 0.01))
+        rank = missed, max(bad, _ENOUGH), -low
+        if self.best is None or rank < self.rank:
+            self.best, self.rank = C, rank
+        self._done = bad <= _ENOUGH and low >= _WELL / self.problem.r
 
     def _field(self, count: int, tag: int) -> _Field:
         """Samples, half of them uniform like positions that count for the share, the others heavy near limits."""
