@@ -116,6 +116,19 @@ def test_branches_of_arms_are_cut_where_geometry_says() -> None:
 
 
 @pytest.mark.slow
+def test_branches_of_a_task_are_where_it_is_clear() -> None:
+    """Beyond its stretched elbow, the panda reaches clear positions of the hand, but no clear poses."""
+    of_pose, of_position = oc.branches(panda()), oc.branches(panda(), oc.Task.position(panda()))
+    assert of_position.cuts == of_pose.cuts
+    assert {item.name for item in of_pose} == {item.name for item in of_position if "elbow-" in item.name}
+    beyond = np.array([item.posture for item in of_position if "elbow+" in item.name])
+    assert len(beyond) == 4
+    J = geometric_jacobians(panda(), beyond)
+    assert np.linalg.svd(J[:, :3])[1][:, -1].min() > 0.05  # [m/rad]
+    assert np.linalg.svd(J)[1][:, -1].max() < 0.05
+
+
+@pytest.mark.slow
 def test_self_motions_do_not_cross_cuts() -> None:
     q = sample_uniform(oc.Box(np.zeros(7), 2.0), 200, 3)
     for cut in branches().cuts:
