@@ -1,6 +1,7 @@
 """Branches of the joint range, and charts that are regular on a whole one."""
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from orthocas.bases.given import sew_angle
 from orthocas.charts.certificate import PROVED
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.self_motion import StopKind
+from orthocas.cli.fit import _rows
+from orthocas.cli.output import report_rows
 from orthocas.codegen import check_c
 from orthocas.errors import ChartFileError, DomainError, Interrupted, InvalidValueError, ShapeError, UnknownNameError
 from orthocas.fitting.basis_gradients import gradients_of
@@ -510,11 +513,20 @@ def test_command_fits_a_branch(run: Run) -> None:
     code, out, err = run(*words, "--branch", "shoulder+ elbow- wrist+", "--samples", "3000", "--json")
     assert (code, err) == (0, "")
     assert json.loads(out)["branch"] == "shoulder+ elbow- wrist+"
+    code, out, _ = run(*words, "--branch", "shoulder+ elbow- wrist+", "--samples", "3000", "--force")
+    assert code == 0
+    assert "xi1 is like swivel [rad], " in out
     assert run(*words, "--solver", "lbfgs")[::2] == (
         2,
         "orthocas: --domain branch has a solver of its own: leave out --solver\n",
     )
     assert run("fit", "iiwa", "--branch", "up")[::2] == (2, "orthocas: --branch requires --domain branch\n")
+
+
+def test_command_gives_no_advice_that_wide_fits_refuse() -> None:
+    uneven = replace(oc.evaluate(wide_plane().chart, 500), length_ratio=50.0)
+    assert "--weights" in report_rows(uneven)["lengths"]
+    assert "--weights" not in _rows(wide_plane(), uneven, Path("a.orthocas"))["lengths"]
 
 
 @pytest.mark.slow
