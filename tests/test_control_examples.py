@@ -80,12 +80,12 @@ def test_recording_with_other_columns_is_refused(tmp_path: Path) -> None:
 
 
 def test_elbow_of_a_joystick_meets_its_boundary_and_the_hand_stays() -> None:
-    """By MuJoCo; where only the elbow is pushed beyond its boundary, the hand is off by less than 1e-6 m."""
-    found = joystick.main(iter(np.tile(np.eye(7)[6], (700, 1))))
+    """By MuJoCo; where the elbow is pushed beyond its boundary, the weight of xi takes micrometres of the hand."""
+    found = joystick.main(iter(np.tile(np.eye(7)[6], (1000, 1))))
     assert found["reached"] + found["nearest"] == 1
     assert found["nearest"] > 0.1
     assert found["hand_error_m"] < 1e-9
-    assert found["at_boundary_m"] < 1e-6
+    assert found["at_boundary_m"] < 5e-6
     assert found["fastest"] < 1 + 1e-9
     assert found["room_rad"] > 0
 

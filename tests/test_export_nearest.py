@@ -62,7 +62,7 @@ def test_nearest_xi_is_that_of_the_chart(tmp_path: Path, name: str) -> None:
     """Inside, with x; and as near as what the chart finds, unless that lies on another piece of the self-motion."""
     chart = CHARTS[name]()
     module = module_of(chart, "numpy", tmp_path)
-    wishes, x = wishes_of(chart, 200, 0.1 if name == "pose, wide" else 0.3)
+    wishes, x = wishes_of(chart, 500, 0.1 if name == "pose, wide" else 0.3)
     q, status = module.nearest_xi(wishes, x)
     known = chart.nearest_xi(wishes, x)
     ended = status <= NEAREST

@@ -155,6 +155,23 @@ def test_xi_gives_way_to_x(planar_arm: oc.Chart) -> None:
     np.testing.assert_array_equal(again.step([phi[0], phi[1], 9.0]), tracker.step([phi[0], phi[1], 9.0]))
 
 
+@pytest.mark.slow
+def test_it_rests_where_a_target_pushes_it_against_the_boundary() -> None:
+    """The target stays a step ahead of where the arm is, as that of a stick that is held."""
+    chart = oc.charts.load("panda-wide")
+    robot, q = chart.problem.robot, chart.problem.domain.centre
+    tracker, x = chart.tracker(q, 0.01 * robot.velocity_limits, nearest=True), chart.task(q)
+    path = []
+    for _ in range(1200):
+        xi = chart.xi(tracker.q) + 0.01
+        path.append(tracker.step(np.concatenate([x, xi])).copy())
+    assert tracker.status == oc.TrackerStatus.NEAREST
+    room = np.minimum(path[-1] - robot.lower, robot.upper - path[-1]).min()
+    assert 0 <= room < 0.005
+    assert np.ptp(path[-300:], axis=0).max() < 1e-4
+    np.testing.assert_allclose(robot.tip_position(np.array(path)), np.tile(x[:3], (1200, 1)), atol=5e-6)
+
+
 def test_domains_without_a_nearest_x_are_named() -> None:
     known = oc.problems.get("planar_3r_xy")
     path = known.domain.centre + np.linspace(-0.2, 0.2, 5)[:, None] * np.ones(3)

@@ -385,7 +385,7 @@ def test_several_coordinates_follow_several_quantities() -> None:
 
 
 @pytest.mark.parametrize("metric", ["euclidean", "inertia"])
-def test_the_shortfall_is_that_of_volumes_and_its_slopes_are_differences(metric: Any) -> None:
+def test_the_loss_has_volumes_and_lengths_and_its_slopes_are_differences(metric: Any) -> None:
     robot = oc.Robot.planar([1.0, 0.8, 0.6, 0.5], [3.0, 2.0, 2.0, 1.0])
     problem, rng = (
         oc.Problem(robot, oc.Task.position(robot, "xy"), metric, oc.Box(np.full(4, 0.7), 0.6)),
@@ -413,12 +413,13 @@ def test_the_shortfall_is_that_of_volumes_and_its_slopes_are_differences(metric:
             else np.broadcast_to(np.eye(4), (len(points), 4, 4))
         )
         rows, losses = np.concatenate([J, G], axis=1), np.zeros(len(points))
-        for B, bound in ((A, 0.4), (np.eye(4), 0.03)) if metric == "inertia" else ((A, 0.4),):
+        for B, bound in ((np.eye(4), 0.03), (A, 0.4)) if metric == "inertia" else ((A, 0.4),):
             gram = rows @ np.linalg.inv(B) @ rows.transpose(0, 2, 1)
             lengths = np.linalg.det(gram[:, :2, :2]) * gram[:, 2, 2] * gram[:, 3, 3]
             v = -np.sign(np.linalg.det(rows)) * np.sqrt(np.linalg.det(gram) / lengths)
             losses += np.maximum(0.0, 1 - v / bound) ** 2
-        parts.append(losses)
+        uneven = np.log(gram[:, [2, 3], [2, 3]] / np.einsum("ki,ij,kj->k", C, factor @ factor.T, C)) / 2
+        parts.append(losses + 0.03 * (uneven**2).sum(axis=1))
     assert abs(value - np.concatenate(parts).mean() - (C[0] @ wish.E @ C[0] - 2 * wish.g @ C[0] + 0.3)) < 1e-6
     moved = rng.normal(size=(6, len(theta)))
     ends = [[loss.value(theta + side * 1e-6 * a) for side in (-1, 1)] for a in moved]

@@ -23,6 +23,8 @@ _ROUNDED = 1e-9  # error up to which only rounding may have stopped the decrease
 _STEP = 0.1  # of the half-widths: default of the largest change of q in a call
 _WEIGHT = 1e-3  # of errors of xi, relative to those of x
 ZONE = 0.02  # next to the boundary, in half-widths of joints and in relative room of conditions
+LEAST_ZONE = 3e-4  # as far as q has gone into it
+INSIDE = 1 + 1e-6  # a zone over its room, so that q lies within
 DESCENTS, _HALVINGS = 12, 20  # steps of Gauss and Newton in a call, and halvings of one
 INERTIA = 1e-3  # weight of the way from the last q, in half-widths
 _CONVERGED = 1e-10  # relative decrease of the cost at which a call ends
@@ -284,10 +286,10 @@ class ReachingTracker(Tracker):
 
         |D^-1 e_x|^2 + w^2 |e_xi|^2 + sum over boundaries of max(0, 1 - room / zone)^2
 
-    by damped Gauss-Newton steps, with the sizes D of x, w = 0.001 and a zone of 2 % next to the boundaries. The cost is
-    smooth, so q is smooth in phi where the minimum is. A phi that is reached outside the zones is met to rounding, as
-    by `Tracker`; otherwise `status` is NEAREST: x has priority, xi gives way. q never leaves the domain, and no joint
-    moves more than `largest_step` in a call.
+    by damped Gauss-Newton steps, with the sizes D of x, w = 0.001 and a zone of 2 % next to the boundaries; from within
+    it, of the room there is, so that nothing draws q back from a boundary that it has reached. The cost is smooth. A
+    phi that is reached inside the domain is met to rounding, as by `Tracker`; otherwise `status` is NEAREST: x has
+    priority, xi gives way. q never leaves the domain, and no joint moves more than `largest_step` in a call.
     """
 
     def __init__(
@@ -336,6 +338,9 @@ class ReachingTracker(Tracker):
         start, now = q, q
         self._to[:] = self._solver.target
         pull = (INERTIA / self._domain.half_width) ** 2
+        self._zones = np.full(2 * len(self._bounded) + len(self._rooms), ZONE)
+        self._cost(now)
+        self._zones = np.clip(INSIDE * self._room(), LEAST_ZONE, ZONE)
         cost = self._cost(now)
         for _ in range(DESCENTS):
             r, J = self._model()
@@ -345,7 +350,8 @@ class ReachingTracker(Tracker):
             if promised <= _CONVERGED * cost:
                 break
             for halvings in range(_HALVINGS + 1):
-                change = np.clip(now + move * 0.5**halvings - start, -self._limit, self._limit)
+                change = now + move * 0.5**halvings - start
+                change /= max(1.0, float(np.abs(change / self._limit).max()))  # joints cut alone would move x
                 after = self._cost(start + change) + float(pull @ change**2) / 2
                 if after < cost - _DECREASE * 0.5**halvings * promised and self._domain.contains(self._at[None])[0]:
                     break
@@ -362,10 +368,13 @@ class ReachingTracker(Tracker):
         return squares / 2 if np.isfinite(squares) else np.inf
 
     def _short(self) -> Array:
-        """How deep the last q lies in the zones of joints, below and above, and of conditions, (k,); 0 outside them."""
+        """How deep the last q lies in the zones, (k,); 0 outside them."""
+        return np.maximum(0.0, 1 - self._room() / self._zones)
+
+    def _room(self) -> Array:
+        """Of the last q, to the limits of joints above and below, relative to half-widths, and of conditions, (k,)."""
         away = (self._at - self._domain.centre)[self._bounded] / self._widths
-        rooms = np.concatenate([1 - away, 1 + away, self._rooms])
-        return np.maximum(0.0, 1 - rooms / ZONE)
+        return np.concatenate([1 - away, 1 + away, self._rooms])
 
     def _model(self) -> tuple[Array, Array]:
         """The residuals other than 0 at the last q, and their Jacobian."""
@@ -378,7 +387,7 @@ class ReachingTracker(Tracker):
             self._inwards.run()
             rows[2 * k :] = -self._slopes.T
         r = np.concatenate([self._e, short[active]])
-        return r, np.vstack([self._J.T, rows[active] / ZONE])
+        return r, np.vstack([self._J.T, rows[active] / self._zones[active, None]])
 
 
 def parts_of(

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.solutions import DESCENTS, INERTIA, ZONE
+from orthocas.charts.solutions import DESCENTS, INERTIA, INSIDE, LEAST_ZONE, ZONE
 from orthocas.codegen.boundary import boundary_units
 from orthocas.codegen.description import chart_values, filled, flags, numbers, words
 from orthocas.codegen.precision import Precision, bounds_inside
@@ -114,8 +114,9 @@ class ChartSource:
         everything["clear_c"] = values["clear_c"]
         if self.has_nearest:
             _, inwards = self.chart.reaching
-            size = {"rooms": str(max(1, inwards.size1_out(0))), "zone": repr(ZONE), "inertia": repr(INERTIA)}
-            filled_in = {**everything, **size, "descents": str(DESCENTS), "difference_step": precision.difference}
+            size = {"rooms": str(max(1, inwards.size1_out(0))), "inertia": repr(INERTIA), "descents": str(DESCENTS)}
+            zones = {"zone": repr(ZONE), "least_zone": repr(LEAST_ZONE), "within": repr(INSIDE)}
+            filled_in = {**everything, **size, **zones, "difference_step": precision.difference}
             values |= {f"nearest_{kind}": filled(f"nearest.{kind}", filled_in) for kind in ("h", "c")}
         for place, template in _PARTS.items():
             values[place] = filled(template, everything)

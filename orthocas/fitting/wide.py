@@ -59,6 +59,7 @@ _TARGET, _ITERATIONS = 0.5, 100  # of the first descent: the volume that is enou
 _FURTHER_TARGET, _FURTHER = 0.3, 60  # of further ones
 _BEYOND = 1.2  # over the bound of the domain, the volume in the identity metric that is enough beside another metric
 _ROUNDS, _FRESH, _WORST, _FRESH_TAG = 3, 50_000, 5000, 3002  # further descents, each with the worst of fresh samples
+_EVENNESS = 0.03  # weight of the mean squared logarithm of lengths of gradients
 _TOLERANCE, _RIDGE = 1e-6, 1e-8
 _POOR, _POOR_SEVERAL = 1e-3, 5e-3  # share of bad positions with which another family is tried; if r > 1
 _ENOUGH = 5e-4  # share of bad positions, many near limits, that is as good as none
@@ -114,15 +115,16 @@ def fit_wide(
     of the unit gradients of xi, all in the metric; for r = 1 it is the cosine between the gradient and the self-motion.
     The fit looks for the least
 
-        mean max(0, 1 - v(q) / t)^2
+        mean max(0, 1 - v(q) / t)^2 + 0.03 mean |log(l(q) / L)|^2
 
-    over samples of the branch that are clear of singular positions, half of them uniform and half boundary-heavy. It
+    over samples of the branch that are clear of singular positions, half of them uniform and half boundary-heavy. The
+    second mean keeps the lengths l of gradients near one length, so that xi is a similar motion everywhere. The fit
     descends with L-BFGS from linear coordinates across the task in the middle of the branch, first with t = 0.5. As
     long as more than 0.05 % of other samples are not regular after that, or 1 % of them have a volume below 0.28 / r,
     the worst of 50,000 fresh samples join and t = 0.3, three times at most. The best of these results is kept:
     regular in the middle, fewest bad positions, as far as these are more than 0.05 %, then the largest 1 % quantile of
     the volume. The domain of the chart is the part of the branch where coordinates are regular with a margin, see
-    `RegularPart`. It is judged in the identity metric; with another one, the same mean for the volume in the identity
+    `RegularPart`. It is judged in the identity metric; with another one, the first mean for the volume in the identity
     metric and t = 0.06 / r is added.
 
     Coordinates that are linear in the first and the last joint are best to prove and hold at any turn of them. They ask
@@ -474,35 +476,38 @@ class _Field:
         """The volumes of `RegularPart` for coefficients (r, K), (N,)."""
         return np.asarray(np.linalg.det(np.concatenate([self._judged, _unit(self.jacobian(C))[0]], axis=1)))
 
-    def shortfall(self, C: Array, target: float, sense: float) -> tuple[float, Array]:
-        """Sum of max(0, 1 - sense v / target)^2 with volumes v in the metric, and its derivative after C (r, K).
+    def shortfall(self, C: Array, target: float, sense: float, wanted: Array) -> tuple[float, Array]:
+        """Sum of max(0, 1 - sense v / target)^2 + w |log(l / wanted)|^2, and its derivative after C (r, K).
 
-        In another metric than the identity, the sum for the volumes of `RegularPart` and a little more than its bound
-        joins it: coordinates that are orthogonal in the inertia may be nearly parallel otherwise.
+        The volumes v and the lengths l (r,) of gradients are those in the metric. In another metric than the identity,
+        the sum for the volumes of `RegularPart` and a little more than its bound joins it: coordinates that are
+        orthogonal in the inertia may be nearly parallel otherwise.
         """
         J = self.jacobian(C)
-        value, slopes = _shortfall_and_slopes(J, self._own, self.root, target, sense)
+        unit, lengths = _unit(J if self.root is None else J @ self.root)
+        uneven = np.log(lengths / wanted[:, None])
+        value, slopes = _shortfall_and_slopes(unit, lengths, self._own, target, sense)
+        value, slopes = value + _EVENNESS * float((uneven**2).sum()), slopes + 2 * _EVENNESS * uneven * unit / lengths
         if self.root is not None:
-            own, more = _shortfall_and_slopes(J, self._judged, None, _BEYOND * LEAST_VOLUME / J.shape[1], sense)
-            value, slopes = value + own, slopes + more
+            bound = _BEYOND * LEAST_VOLUME / J.shape[1]
+            own, more = _shortfall_and_slopes(*_unit(J), self._judged, bound, sense)
+            value, slopes = value + own, slopes @ self.root.transpose(0, 2, 1) + more
         return value, self._basis.pullback(self._known, slopes)
 
 
 def _shortfall_and_slopes(
-    J: Array, basis: Array, root: Array | None, target: float, sense: float
+    unit: Array, lengths: Array, basis: Array, target: float, sense: float
 ) -> tuple[float, Array]:
-    """Sum of max(0, 1 - sense v / target)^2 with v = det [basis; unit J root], and its derivative after J (N, r, n)."""
-    unit, lengths = _unit(J if root is None else J @ root)
+    """Sum of max(0, 1 - sense v / target)^2 with v = det [basis; unit], and its derivative after unit * lengths."""
     rows = np.concatenate([basis, unit], axis=1)
     volumes = sense * np.linalg.det(rows)
     short = np.maximum(0.0, 1 - volumes / target)
     some = short > 0
     inverse = np.linalg.inv(rows[some] + (volumes[some] == 0)[:, None, None] * _TINY * np.eye(rows.shape[2]))
-    G = volumes[some, None, None] * inverse[:, :, -J.shape[1] :].transpose(0, 2, 1)  # dv after unit gradients
+    G = volumes[some, None, None] * inverse[:, :, -unit.shape[1] :].transpose(0, 2, 1)  # dv after unit gradients
     G -= np.einsum("sri,sri->sr", G, unit[some])[:, :, None] * unit[some]
-    G *= (-2 / target * short[some])[:, None, None] / lengths[some]
-    slopes = np.zeros_like(J)
-    slopes[some] = G if root is None else G @ root[some].transpose(0, 2, 1)
+    slopes = np.zeros_like(unit)
+    slopes[some] = G * (-2 / target * short[some])[:, None, None] / lengths[some]
     return float(short @ short), slopes
 
 
@@ -529,7 +534,7 @@ def _self_motion(problem: Problem, q: Array) -> Array:
 
 
 class _Shortfall:
-    """Mean of max(0, 1 - v / target)^2 over samples, and terms of what coordinates mean.
+    """Mean of max(0, 1 - v / target)^2 over samples, of uneven lengths, and terms of what coordinates mean.
 
     Its variables Y are in a basis of functions whose gradients are orthonormal in the mean, C = Y L^-1. Coordinates
     begin with gradients of length 1 in the mean there.
@@ -565,7 +570,8 @@ class _Shortfall:
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """The mean and the terms, and the derivative (r K,)."""
         C = self.coefficients(theta)
-        parts = [field.shortfall(C, self._target, self._sense) for field in self._fields]
+        wanted = self._lengths[:, 0]
+        parts = [field.shortfall(C, self._target, self._sense, wanted) for field in self._fields]
         value = sum(part for part, _ in parts) / self._count
         slopes = sum((part for _, part in parts), start=np.zeros(())) / self._count
         for k, (E, g, a) in enumerate(self._wishes):
