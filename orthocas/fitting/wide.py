@@ -506,8 +506,9 @@ def _shortfall_and_slopes(
     inverse = np.linalg.inv(rows[some] + (volumes[some] == 0)[:, None, None] * _TINY * np.eye(rows.shape[2]))
     G = volumes[some, None, None] * inverse[:, :, -unit.shape[1] :].transpose(0, 2, 1)  # dv after unit gradients
     G -= np.einsum("sri,sri->sr", G, unit[some])[:, :, None] * unit[some]
+    G *= (-2 / target * short[some])[:, None, None] / lengths[some]
     slopes = np.zeros_like(unit)
-    slopes[some] = G * (-2 / target * short[some])[:, None, None] / lengths[some]
+    slopes[some] = G
     return float(short @ short), slopes
 
 
