@@ -369,7 +369,8 @@ class ReachingTracker(Tracker):
 
     def _short(self) -> Array:
         """How deep the last q lies in the zones, (k,); 0 outside them."""
-        return np.maximum(0.0, 1 - self._room() / self._zones)
+        found: Array = np.maximum(0.0, 1 - self._room() / self._zones)
+        return found
 
     def _room(self) -> Array:
         """Of the last q, to the limits of joints above and below, relative to half-widths, and of conditions, (k,)."""
