@@ -90,9 +90,19 @@ def test_a_task_of_lower_priority() -> None:
     assert angle_deg(chart.jacobian(centre)[1], wanted, B) < 10
 
 
+def test_a_task_without_reference_has_that_of_the_centre() -> None:
+    known = problems.get("iiwa")
+    turned = oc.Box([0.0, np.pi / 3, 0.0, -np.pi / 3, 0.0, np.pi / 3, 0.0], 0.1)  # half a turn from joints at zero
+    problem = oc.Problem(known.robot, known.task, domain=turned)
+    like = Like.of(problem, oc.Task.named(known.robot, "orientation"))
+    np.testing.assert_allclose(np.asarray(like.function(turned.centre)), 0, atol=1e-12)
+    moved = like.slopes(turned.centre[None])[0]
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=0), 1, atol=1e-9)  # every joint turns the tip by its angle
+
+
 def test_the_term_vanishes_for_the_projected_gradient() -> None:
     problem = problems.get("iiwa")
-    like = Like.of(problem.robot, ["A3", "A1"])
+    like = Like.of(problem, ["A3", "A1"])
     term = like.term(problem, list(range(7)))
     samples = sample_problem(problem, 3, 4)
     J, Z = ca.SX.sym("J", 4, 7), ca.SX.sym("Z", 7, 4)
@@ -113,6 +123,7 @@ def test_the_term_vanishes_for_the_projected_gradient() -> None:
         ([], "at least one quantity"),
         (["A1", "A2", "A3", "A4", "A5"], "at most 3, one for a coordinate"),
         (lambda q: q, "like"),
+        (lambda q: ca.sqrt(q[2]), "without a finite gradient in the domain"),
     ],
 )
 def test_refused_meanings(like: object, message: str) -> None:

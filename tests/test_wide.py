@@ -1,6 +1,7 @@
 """Branches of the joint range, and charts that are regular on a whole one."""
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,13 +21,15 @@ from orthocas.bases.given import sew_angle
 from orthocas.charts.certificate import PROVED
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.self_motion import StopKind
+from orthocas.cli.fit import _rows
+from orthocas.cli.output import report_rows
 from orthocas.codegen import check_c
 from orthocas.errors import ChartFileError, DomainError, Interrupted, InvalidValueError, ShapeError, UnknownNameError
 from orthocas.fitting.basis_gradients import gradients_of
-from orthocas.fitting.wide import _Field, _Shortfall, _Wish
+from orthocas.fitting.wide import _Field, _Search, _Shortfall, _Wish
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.domains import sample_heavily, sample_uniform
-from orthocas.tools.progress import Progress
+from orthocas.tools.progress import Progress, silent
 
 Numbers = NDArray[np.float64]
 BENT = oc.Box([0.0, 1.3, 1.3], [3.0, 1.2, 1.2])  # of the planar arm, which has no branches
@@ -113,6 +116,19 @@ def test_branches_of_arms_are_cut_where_geometry_says() -> None:
     assert [(cut.joint_name, cut.singular, cut.exact) for cut in offset.cuts] == known
     stretched = -2 * np.arctan2(0.0825, 0.384) + 0.0  # both links, seen from the offset elbow
     assert abs(offset.cuts[1].value - stretched) < 0.05
+
+
+@pytest.mark.slow
+def test_branches_of_a_task_are_where_it_is_clear() -> None:
+    """Beyond its stretched elbow, the panda reaches clear positions of the hand, but no clear poses."""
+    of_pose, of_position = oc.branches(panda()), oc.branches(panda(), oc.Task.position(panda()))
+    assert of_position.cuts == of_pose.cuts
+    assert {item.name for item in of_pose} == {item.name for item in of_position if "elbow-" in item.name}
+    beyond = np.array([item.posture for item in of_position if "elbow+" in item.name])
+    assert len(beyond) == 4
+    J = geometric_jacobians(panda(), beyond)
+    assert np.linalg.svd(J[:, :3])[1][:, -1].min() > 0.05  # [m/rad]
+    assert np.linalg.svd(J)[1][:, -1].max() < 0.05
 
 
 @pytest.mark.slow
@@ -244,14 +260,30 @@ def test_several_coordinates_are_regular_together() -> None:
 
 
 @pytest.mark.slow
+def test_coordinates_in_the_metric_of_the_inertia_are_regular_in_the_domain() -> None:
+    """Orthogonal in M, four coordinates of the arm are nearly parallel otherwise, and the domain would be empty."""
+    task, cubic = oc.Task.position(iiwa()), oc.Polynomial(3, ["A1"])
+    fit = oc.fit_wide(iiwa(), task, home_branch(), "inertia", parametrisation=cubic, samples=2500)
+    assert fit.regular_share > 0.99
+    q = sample_uniform(fit.chart.problem.domain, 2000, 6)
+    J = np.concatenate([geometric_jacobians(iiwa(), q)[:, :3], fit.chart.coordinates.jacobian(q)], axis=1)
+    signs = np.sign(np.linalg.det(J))
+    assert signs.min() == signs.max()
+
+
+@pytest.mark.slow
 def test_base_and_tool_count_like_other_joints_where_linear_terms_are_poor() -> None:
     robot = oc.Robot.from_urdf(
         robot_data("talos_data/robots/talos_reduced.urdf"),
         "arm_left_7_link",
         {"torso_1_joint": 0.0, "torso_2_joint": 0.0},
     )
-    fit = oc.fit_wide(robot, oc.Task.pose(robot), samples=3000)
+    reports: list[Progress] = []
+    fit = oc.fit_wide(robot, oc.Task.pose(robot), samples=3000, monitor=reports.append)
     assert fit.chart.coordinates.parametrisation.label == oc.Polynomial(5).label
+    stages = {name: [each.fraction for each in reports if each.stage == name] for name in (r.stage for r in reports)}
+    assert list(stages)[:2] == ["whole branch", "whole branch, all joints"]
+    assert all(fractions == sorted(fractions) for fractions in stages.values())
     assert fit.regular_share > 0.999
     q = sample_uniform(fit.chart.problem.domain, 2000, 6)
     slopes = np.einsum("sn,sn->s", fit.chart.coordinates.jacobian(q)[:, 0], self_motions(robot, q))
@@ -343,6 +375,8 @@ def test_several_coordinates_follow_several_quantities() -> None:
     assert (off[0] < off[1] / 2).all(), off
     with pytest.raises(InvalidValueError, match="like is quantities that the task leaves nothing of"):
         oc.fit_wide(robot, task, box, like=["q3", "q3"], samples=500)
+    with pytest.raises(InvalidValueError, match="like is quantities without a finite gradient in the domain"):
+        oc.fit_wide(robot, task, box, like=[lambda q: ca.sqrt(q[0])], samples=500)
     with pytest.raises(InvalidValueError, match="like is 4 quantities, expected at most 3"):
         oc.fit_wide(robot, task, box, like=["q1", "q2", "q3", "q4"], samples=500)
     middle = fits[0].chart.problem.domain.centre
@@ -378,11 +412,14 @@ def test_the_loss_has_volumes_and_lengths_and_its_slopes_are_differences(metric:
             if metric == "inertia"
             else np.broadcast_to(np.eye(4), (len(points), 4, 4))
         )
-        gram = np.concatenate([J, G], axis=1) @ np.linalg.inv(A) @ np.concatenate([J, G], axis=1).transpose(0, 2, 1)
-        lengths = np.linalg.det(gram[:, :2, :2]) * gram[:, 2, 2] * gram[:, 3, 3]
-        v = -np.sign(np.linalg.det(np.concatenate([J, G], axis=1))) * np.sqrt(np.linalg.det(gram) / lengths)
+        rows, losses = np.concatenate([J, G], axis=1), np.zeros(len(points))
+        for B, bound in ((np.eye(4), 0.03), (A, 0.4)) if metric == "inertia" else ((A, 0.4),):
+            gram = rows @ np.linalg.inv(B) @ rows.transpose(0, 2, 1)
+            lengths = np.linalg.det(gram[:, :2, :2]) * gram[:, 2, 2] * gram[:, 3, 3]
+            v = -np.sign(np.linalg.det(rows)) * np.sqrt(np.linalg.det(gram) / lengths)
+            losses += np.maximum(0.0, 1 - v / bound) ** 2
         uneven = np.log(gram[:, [2, 3], [2, 3]] / np.einsum("ki,ij,kj->k", C, factor @ factor.T, C)) / 2
-        parts.append(np.maximum(0.0, 1 - v / 0.4) ** 2 + 0.03 * (uneven**2).sum(axis=1))
+        parts.append(losses + 0.03 * (uneven**2).sum(axis=1))
     assert abs(value - np.concatenate(parts).mean() - (C[0] @ wish.E @ C[0] - 2 * wish.g @ C[0] + 0.3)) < 1e-6
     moved = rng.normal(size=(6, len(theta)))
     ends = [[loss.value(theta + side * 1e-6 * a) for side in (-1, 1)] for a in moved]
@@ -477,11 +514,20 @@ def test_command_fits_a_branch(run: Run) -> None:
     code, out, err = run(*words, "--branch", "shoulder+ elbow- wrist+", "--samples", "3000", "--json")
     assert (code, err) == (0, "")
     assert json.loads(out)["branch"] == "shoulder+ elbow- wrist+"
+    code, out, _ = run(*words, "--branch", "shoulder+ elbow- wrist+", "--samples", "3000", "--force")
+    assert code == 0
+    assert "xi1 is like swivel [rad], " in out
     assert run(*words, "--solver", "lbfgs")[::2] == (
         2,
         "orthocas: --domain branch has a solver of its own: leave out --solver\n",
     )
     assert run("fit", "iiwa", "--branch", "up")[::2] == (2, "orthocas: --branch requires --domain branch\n")
+
+
+def test_command_gives_no_advice_that_wide_fits_refuse() -> None:
+    uneven = replace(oc.evaluate(wide_plane().chart, 500), length_ratio=50.0)
+    assert "--weights" in report_rows(uneven)["lengths"]
+    assert "--weights" not in _rows(wide_plane(), uneven, Path("a.orthocas"))["lengths"]
 
 
 @pytest.mark.slow
@@ -495,21 +541,34 @@ def test_decoupled_laws_are_warned_of_the_leak() -> None:
 @pytest.mark.slow
 def test_interrupted_fits_keep_the_best_so_far() -> None:
     known = oc.problems.get("planar_3r_xy")
-    reports = []
+    whole = oc.Box([0.0, 1.0, 1.0], [3.0, 1.8, 1.8])  # nothing is regular enough there, so all descents are begun
+    for later in (0, 1):  # stages before the one that is interrupted
+        reports: list[str] = []
 
-    def stop(progress: Progress) -> None:
-        reports.append(progress.stage)
-        if len(reports) == 2:
-            raise KeyboardInterrupt
+        def stop(progress: Progress, reports: list[str] = reports, later: int = later) -> None:
+            reports.append(progress.stage)
+            if len(set(reports)) > later:
+                raise KeyboardInterrupt
 
-    whole = oc.Box([0.0, 1.0, 1.0], [3.0, 1.8, 1.8])  # nothing is regular enough there, so all steps are taken
-    with pytest.raises(Interrupted) as stopped:
-        oc.fit_wide(known.robot, known.task, whole, monitor=stop)
-    fit = stopped.value.result
-    assert fit.status is Status.INTERRUPTED
-    assert len(fit.stages) == 1  # the second was not finished
-    with pytest.raises(KeyboardInterrupt):
-        oc.fit_wide(known.robot, known.task, BENT, monitor=lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(Interrupted) as stopped:
+            oc.fit_wide(known.robot, known.task, whole, parametrisation=oc.Polynomial(3), monitor=stop)
+        fit = stopped.value.result
+        assert fit.status is Status.INTERRUPTED
+        assert [stage.label for stage in fit.stages] == list(dict.fromkeys(reports))
+        assert 0 < fit.stages[-1].result.iterations < 3
+
+
+def test_coordinates_of_the_other_sense_in_the_middle_miss_it() -> None:
+    known = oc.problems.get("planar_3r_xy")
+    problem = oc.Problem(known.robot, known.task, domain=BENT, least_singular_value=0.1)
+    search = _Search(problem, oc.Polynomial(1), 500, 0, silent, None, None)
+    search.begin("linear")
+    (missed, *_), C = search.rank, search.best
+    assert not missed
+    assert C is not None
+    search.best = None
+    search._keep(-C)
+    assert search.rank[0]
 
 
 def test_bad_settings_are_named() -> None:

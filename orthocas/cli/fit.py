@@ -211,13 +211,14 @@ def _bounds(
 
 def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
     coordinates = result.chart.coordinates
-    rows = report_rows(report)
+    rows = report.facts() if isinstance(result, WideFit) else report_rows(report)  # wide fits have no --weights
     rows["fit"] = f"{coordinates.label}, {result.seconds:.2f} s, {result.status.value}"
     if isinstance(result, WideFit) and result.branch is not None:
         rows["branch"] = f"{result.branch.name}, {result.branch.share:.1%} of the clear positions of the joint range"
         rows["regular"] = f"{result.regular_share:.3%} of the clear positions of the branch, which are the domain"
         if (error := result.chart.notes.get("error of its meaning")) is not None:
-            rows["meaning"] = f"xi1 is what was asked, but for {float(error):.2g} rms along the home's self-motion"
+            meaning = result.chart.notes["meaning"]
+            rows["meaning"] = f"xi1 is like {meaning}, {float(error):.2g} off (rms) along the home's self-motion"
     if result.like:
         rows["like"] = ", ".join(f"{name} {angle:.3g} deg off" for name, angle in result.like.items())
     if result.idle_joints:

@@ -380,8 +380,9 @@ def fit(
             the gradients of a basis, which then take half of the memory. Losses and angles change by less than 1e-5 of
             their size at the same parameters. Parameters and charts are double.
         like: quantities that the first coordinates follow as far as they can be orthogonal to the task: a joint's name,
-            "swivel", a function of an SX column q, several of these, or a task of lower priority. Each has the units of
-            its quantity, and its value at the centre of the domain.
+            "swivel", a function of an SX column q, several of these, or a task of lower priority, whose missing
+            reference orientation is taken at the centre of the domain. Each has the units of its quantity, and its
+            value there.
 
     Returns:
         The chart, the result of each stage, and the seconds.

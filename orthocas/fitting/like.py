@@ -47,6 +47,15 @@ def quantity_of(robot: Robot, like: Quantity | str) -> tuple[str, ca.Function]:
     return name if name.isidentifier() else "a function of q", dense_function("like", [q], [found])
 
 
+def _finite(slopes: Array) -> Array:
+    """The gradients of quantities, if all numbers are finite."""
+    if not np.isfinite(slopes).all():
+        raise InvalidValueError(
+            "like", "quantities without a finite gradient in the domain", "others, or a smaller domain"
+        )
+    return slopes
+
+
 def _digest(function: ca.Function) -> str:
     return hashlib.sha256(json.dumps(to_tape(function)).encode()).hexdigest()[:12]
 
@@ -66,12 +75,17 @@ class Like:
     function: ca.Function  #: q (n, 1) -> y (k, 1)
 
     @classmethod
-    def of(cls, robot: Robot, like: Likeness) -> "Like":
-        """Of a task of lower priority, of a quantity, or of several."""
+    def of(cls, problem: Problem, like: Likeness) -> "Like":
+        """Of a task of lower priority, of a quantity, or of several.
+
+        A missing reference orientation of the task is taken at the centre of the domain.
+        """
+        robot = problem.robot
         q = ca.SX.sym("q", robot.n)
         if isinstance(like, Task):
             if like.robot.joint_names != robot.joint_names:
                 raise InvalidValueError("like", "a task of another robot", "one of the problem's robot")
+            like = like.with_reference_at(problem.domain.centre)
             labels = zip(like.labels, like.units, strict=True)
             names = tuple(f"{label} [{unit}]" if unit else label for label, unit in labels)
             return cls(names, _of_arms(robot, q, like.smooth_function(q)))
@@ -94,7 +108,7 @@ class Like:
 
     def slopes(self, points: Array) -> Array:
         """dy/dq at points (N, n), (N, k, n)."""
-        return np.asarray(self._slopes(points)[0].reshape(len(points), len(self.names), -1))
+        return _finite(self._slopes(points)[0].reshape(len(points), len(self.names), -1))
 
     @cached_property
     def _slopes(self) -> BlockedFunction:
@@ -175,7 +189,8 @@ class LikeTerm:
         G = gradients.dense(gradients.at(samples.points), len(samples))
         Z = samples.null_basis
         own = np.einsum("rk,snk,snz->szr", C, G, Z, optimize=True).reshape(-1, len(C))  # components across the task
-        wanted = (self.batched(samples.points)[0].reshape(len(samples), self.count, -1) @ Z).transpose(0, 2, 1)
+        slopes = _finite(self.batched(samples.points)[0].reshape(len(samples), self.count, -1))
+        wanted = (slopes @ Z).transpose(0, 2, 1)
         B = np.linalg.lstsq(own, wanted.reshape(-1, self.count), rcond=None)[0].T  # (k, r)
         if np.linalg.matrix_rank(B) < self.count:
             raise InvalidValueError("like", "quantities that the task leaves nothing of", "others, or another task")

@@ -81,7 +81,7 @@ class FitSettings:
         if like is not None and (max_mutual_deg is not None or bound.closed_form is not None):
             other = bound.label if max_mutual_deg is None else "max_mutual_deg"
             raise InvalidValueError("like", f"given with {other}", "a fit of the weighted loss")
-        known = None if like is None else Like.of(problem.robot, like)
+        known = None if like is None else Like.of(problem, like)
         return cls(bound, solver, loss, count, tag, max_mutual_deg, split_idle, precision, known)
 
     def with_term(self, term: LikeTerm) -> Self:

@@ -57,6 +57,7 @@ _FIRST = 200  # samples that scale coordinates
 _JUDGED = 20_000
 _TARGET, _ITERATIONS = 0.5, 100  # of the first descent: the volume that is enough at a sample
 _FURTHER_TARGET, _FURTHER = 0.3, 60  # of further ones
+_BEYOND = 1.2  # over the bound of the domain, the volume in the identity metric that is enough beside another metric
 _ROUNDS, _FRESH, _WORST, _FRESH_TAG = 3, 50_000, 5000, 3002  # further descents, each with the worst of fresh samples
 _EVENNESS = 0.03  # weight of the mean squared logarithm of lengths of gradients
 _TOLERANCE, _RIDGE = 1e-6, 1e-8
@@ -66,6 +67,7 @@ _WELL = 0.28  # over r, volume of all but 1 % of positions that is enough; a con
 _UNIFORM_TAG = 1  # within the other tags
 _EVERY = 4  # samples whose gradients count as long
 _TINY = 1e-12  # length of a row
+_STAGES = ("whole branch", "whole branch, all joints")  # of the families, one after the other
 _MEANT = 100.0  # weight of the mean squared error of a meaning, relative to the slope
 _STEP, _MOST_STEPS, _FEWEST = 0.02, 400, 5  # of unit self-motions, along which a meaning is taken
 _ALIKE = 0.01  # weight of the mean squared distance to gradients of quantities, with r > 1
@@ -80,7 +82,7 @@ class WideFit(Fit):
     branch: Branch | None = None  #: the branch of the chart
     regular_share: float = float(
         "nan"
-    )  #: of the branch's clear positions, the share in the chart's domain, from 20,000 samples
+    )  #: of the clear positions of the branch, or the box in its place, the share in the domain, from 20,000 samples
 
     def facts(self) -> dict[str, str]:
         """The facts of a fit, with branch and regular share."""
@@ -119,9 +121,11 @@ def fit_wide(
     second mean keeps the lengths l of gradients near one length, so that xi is a similar motion everywhere. The fit
     descends with L-BFGS from linear coordinates across the task in the middle of the branch, first with t = 0.5. As
     long as more than 0.05 % of other samples are not regular after that, or 1 % of them have a volume below 0.28 / r,
-    the worst of 50,000 fresh samples join and t = 0.3, three times at most. The best of these results is kept: fewest
-    bad positions, as far as these are more than 0.05 %, then the largest 1 % quantile of the volume. The domain of the
-    chart is the part of the branch where coordinates are regular with a margin, see `RegularPart`.
+    the worst of 50,000 fresh samples join and t = 0.3, three times at most. The best of these results is kept:
+    regular in the middle, fewest bad positions, as far as these are more than 0.05 %, then the largest 1 % quantile of
+    the volume. The domain of the chart is the part of the branch where coordinates are regular with a margin, see
+    `RegularPart`. It is judged in the identity metric; with another one, the first mean for the volume in the identity
+    metric and t = 0.06 / r is added.
 
     Coordinates that are linear in the first and the last joint are best to prove and hold at any turn of them. They ask
     that self-motions turn base and tool in one sense on the whole branch, as far as the other joints do not outweigh
@@ -142,7 +146,8 @@ def fit_wide(
         robot: the robot.
         task: a task of that robot. A missing reference orientation is taken at the centre of the branch.
         branch: a branch of `orthocas.branches`, its name, or a box of your own. Default: the branch of the home; with
-            none there, the largest.
+            none there, the largest. If its middle is not clear, the largest box around a clear position takes its
+            place.
         metric: as in `Problem`.
         clearance: least relative singular value of the task, > 0; see `orthocas.ClearBox`.
         parametrisation: a family that is linear in its parameters. Default: Polynomial(6), with one linear
@@ -163,7 +168,8 @@ def fit_wide(
         The chart, the branch, and the regular share.
 
     Raises:
-        DomainError: if there is no clear position near the middle of the branch.
+        DomainError: if no position of the branch is clear by 1.5 times `clearance`, or if coordinates are not regular
+            in the middle.
         InvalidValueError, UnknownNameError, NotRedundantError: if an argument is invalid.
         Interrupted: after Ctrl-C, once there are coordinates; before that, KeyboardInterrupt.
 
@@ -197,7 +203,7 @@ def fit_wide(
     if problem.r == 1:
         meaning = Meaning.by_default(problem, posture) if like is None else Meaning.of(problem, like, posture)
     elif like is not None:
-        quantities = Like.of(robot, like)
+        quantities = Like.of(problem, like)
         quantities.require_at_most(problem.r)
     searches = [_Search(*case, count, seed, monitor, meaning, quantities) for case in cases]
     with remembered() as pressed:
@@ -227,17 +233,17 @@ def _case(problem: Problem, family: Parametrisation) -> tuple[Problem, Parametri
 
 def _run(searches: Sequence["_Search"]) -> None:
     """Search in one family after the other, as long as results are poor, then go on in the best one."""
-    for search in searches:
-        search.begin()
-        if search.rank[0] <= (_POOR if search.problem.r == 1 else _POOR_SEVERAL):
+    for name, search in zip(_STAGES, searches, strict=False):
+        search.begin(name)
+        missed, bad, _ = search.rank
+        if not missed and bad <= (_POOR if search.problem.r == 1 else _POOR_SEVERAL):
             break
     _better(searches).go_on()
 
 
 def _better(searches: Sequence["_Search"]) -> "_Search":
-    """The search with the best coordinates, regular in the middle if there are such."""
-    found = (search for search in searches if search.best is not None)
-    return min(found, key=lambda search: (not search.holds_in_the_middle(), *search.rank))
+    """The search with the best coordinates."""
+    return min((search for search in searches if search.best is not None), key=lambda search: search.rank)
 
 
 def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: bool) -> WideFit:
@@ -246,7 +252,7 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
     clear, seed = search.problem, search.seed
     centre, status = clear.domain.centre, Status.INTERRUPTED if interrupted else Status.CONVERGED
     first = sample_problem(clear, _FIRST, (seed, _FIRST_TAG))
-    raw = search.coordinates(search.best[2])
+    raw = search.coordinates(search.best)
     meaning, quantities = search.meaning, search.quantities
     if meaning is not None:
         coordinates = meaning.named(raw)
@@ -257,7 +263,7 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
     try:
         domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
     except DomainError as error:
-        advice = "give a smaller box as branch, or another branch"
+        advice = "give a smaller box as branch, another branch, or another parametrisation"
         raise DomainError(f"in the middle of branch '{branch.name}', {error}: {advice}") from None
     judged = sample_uniform(clear.domain, _JUDGED, (seed, _JUDGED_TAG))
     share = float(domain.is_clear(judged[_beside_the_middle(clear, judged)]).mean())
@@ -322,7 +328,7 @@ class Meaning:
             InvalidValueError: if there is more than one quantity, or it stands still there.
         """
         if isinstance(like, Task) or (isinstance(like, Sequence) and not isinstance(like, str)):
-            several = Like.of(problem.robot, like)
+            several = Like.of(problem, like)
             if len(several.names) != 1:
                 raise InvalidValueError("like", f"{len(several.names)} quantities", "one, as r = 1")
             name, quantity = several.names[0], several.function
@@ -433,7 +439,8 @@ def _problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Bran
     middles = points[values > _CLEARER * clearance]
     room = box.half_width - np.abs(middles - box.centre)
     if not len(middles):
-        raise DomainError(f"branch '{branch.name}' has no position clear by clearance = {clearance:g}, expected less")
+        missing = f"no position clear by {_CLEARER * clearance:g}"
+        raise DomainError(f"branch '{branch.name}' has {missing}, expected one for clearance = {clearance:g}")
     best = int(np.argmax(np.log(room).sum(axis=1)))
     domain = Box(middles[best], room[best], box.unbounded)
     return Problem(robot, task, metric, domain, branch.name, clearance)
@@ -472,23 +479,37 @@ class _Field:
     def shortfall(self, C: Array, target: float, sense: float, wanted: Array) -> tuple[float, Array]:
         """Sum of max(0, 1 - sense v / target)^2 + w |log(l / wanted)|^2, and its derivative after C (r, K).
 
-        The volumes v and the lengths l (r,) of gradients are those in the metric.
+        The volumes v and the lengths l (r,) of gradients are those in the metric. In another metric than the identity,
+        the sum for the volumes of `RegularPart` and a little more than its bound joins it: coordinates that are
+        orthogonal in the inertia may be nearly parallel otherwise.
         """
         J = self.jacobian(C)
         unit, lengths = _unit(J if self.root is None else J @ self.root)
-        rows = np.concatenate([self._own, unit], axis=1)
-        volumes = sense * np.linalg.det(rows)
-        short = np.maximum(0.0, 1 - volumes / target)
-        some = short > 0
-        inverse = np.linalg.inv(rows[some] + (volumes[some] == 0)[:, None, None] * _TINY * np.eye(rows.shape[2]))
-        G = volumes[some, None, None] * inverse[:, :, -J.shape[1] :].transpose(0, 2, 1)  # dv after unit gradients
-        G -= np.einsum("sri,sri->sr", G, unit[some])[:, :, None] * unit[some]
-        G *= (-2 / target * short[some])[:, None, None] / lengths[some]
         uneven = np.log(lengths / wanted[:, None])
-        slopes = 2 * _EVENNESS * uneven * unit / lengths
-        slopes[some] += G
-        slopes = slopes if self.root is None else slopes @ self.root.transpose(0, 2, 1)
-        return float(short @ short + _EVENNESS * (uneven**2).sum()), self._basis.pullback(self._known, slopes)
+        value, slopes = _shortfall_and_slopes(unit, lengths, self._own, target, sense)
+        value, slopes = value + _EVENNESS * float((uneven**2).sum()), slopes + 2 * _EVENNESS * uneven * unit / lengths
+        if self.root is not None:
+            bound = _BEYOND * LEAST_VOLUME / J.shape[1]
+            own, more = _shortfall_and_slopes(*_unit(J), self._judged, bound, sense)
+            value, slopes = value + own, slopes @ self.root.transpose(0, 2, 1) + more
+        return value, self._basis.pullback(self._known, slopes)
+
+
+def _shortfall_and_slopes(
+    unit: Array, lengths: Array, basis: Array, target: float, sense: float
+) -> tuple[float, Array]:
+    """Sum of max(0, 1 - sense v / target)^2 with v = det [basis; unit], and its derivative after unit * lengths."""
+    rows = np.concatenate([basis, unit], axis=1)
+    volumes = sense * np.linalg.det(rows)
+    short = np.maximum(0.0, 1 - volumes / target)
+    some = short > 0
+    inverse = np.linalg.inv(rows[some] + (volumes[some] == 0)[:, None, None] * _TINY * np.eye(rows.shape[2]))
+    G = volumes[some, None, None] * inverse[:, :, -unit.shape[1] :].transpose(0, 2, 1)  # dv after unit gradients
+    G -= np.einsum("sri,sri->sr", G, unit[some])[:, :, None] * unit[some]
+    G *= (-2 / target * short[some])[:, None, None] / lengths[some]
+    slopes = np.zeros_like(unit)
+    slopes[some] = G
+    return float(short @ short), slopes
 
 
 def _unit(rows: Array) -> tuple[Array, Array]:
@@ -583,12 +604,14 @@ class _Search:
         assert isinstance(family, LinearFamily)
         self._family: LinearFamily = family
         self.samples = samples or int(np.clip(_PER_TERM * family.width, _LEAST_SAMPLES, _MOST_SAMPLES))
-        self.best: tuple[float, float, Array] | None = None  #: share of bad positions, -1 % volume, coefficients
+        self.best: Array | None = None  #: coefficients (r, K)
+        #: of the best: whether they miss the middle, share of bad positions, if too many, and minus their 1 % volume
+        self.rank = (True, np.inf, np.inf)
         self.stages: list[Stage] = []
         self._done = False  # whether coordinates are as regular as they need to be
 
-    def begin(self) -> None:
-        """Descend from coordinates that are linear, as far as the family has such."""
+    def begin(self, name: str) -> None:
+        """Descend from coordinates that are linear, as far as the family has such, in a stage of some name."""
         self._basis: BasisGradients = gradients_of(self._family, self.problem.n)  # not before this family is tried
         self._judged = self._field(_JUDGED, _JUDGED_TAG)
         self._fields = [self._field(self.samples, _TAG)]
@@ -598,7 +621,7 @@ class _Search:
         self._last = self._first(some)
         self._sense = 1.0 if self._middle.volumes(self._last)[0] > 0 else -1.0
         self._wishes = self._meant(some)
-        self._descend(_TARGET, _ITERATIONS, "whole branch")
+        self._descend(_TARGET, _ITERATIONS, name)
 
     def go_on(self) -> None:
         """Descend with the worst of fresh samples, as long as coordinates are not regular enough."""
@@ -608,18 +631,7 @@ class _Search:
             fresh = self._field(_FRESH, _FRESH_TAG + turn)
             worst = fresh.points[np.argsort(self._sense * fresh.volumes(self._last))[:_WORST]]
             self._fields.append(_Field(self.problem, worst, self._basis))
-            self._descend(_FURTHER_TARGET, _FURTHER, f"worst positions, round {turn} of {_ROUNDS}")
-
-    @property
-    def rank(self) -> tuple[float, float]:
-        """Share of bad positions with the best coefficients so far, if too many, and minus their 1 % volume."""
-        assert self.best is not None
-        return max(self.best[0], _ENOUGH), self.best[1]
-
-    def holds_in_the_middle(self) -> bool:
-        """Whether the best coordinates are regular at the centre of the domain."""
-        assert self.best is not None
-        return abs(float(self._middle.volumes(self.best[2])[0])) > LEAST_VOLUME / self.problem.r
+            self._descend(_FURTHER_TARGET, _FURTHER, f"worst samples, round {turn} of {_ROUNDS}")
 
     def coordinates(self, C: Array) -> Coordinates:
         """Coordinates of coefficients (r, K), not normalised."""
@@ -644,11 +656,13 @@ class _Search:
 
     def _keep(self, C: Array) -> None:
         """Keep coefficients if they are the best so far."""
-        volumes, r = self._sense * self._judged.volumes(C), self.problem.r
-        bad, low = float(np.mean(volumes <= LEAST_VOLUME / r)), float(np.quantile(volumes, 0.01))
-        if self.best is None or (max(bad, _ENOUGH), -low) < self.rank:
-            self.best = bad, -low, C
-        self._done = bad <= _ENOUGH and low >= _WELL / r
+        bound = LEAST_VOLUME / self.problem.r
+        middle, volumes = (self._sense * field.volumes(C) for field in (self._middle, self._judged))
+        missed, bad, low = bool(middle[0] <= bound), float(np.mean(volumes <= bound)), float(np.quantile(volumes, 0.01))
+        rank = missed, max(bad, _ENOUGH), -low
+        if self.best is None or rank < self.rank:
+            self.best, self.rank = C, rank
+        self._done = bad <= _ENOUGH and low >= _WELL / self.problem.r
 
     def _field(self, count: int, tag: int) -> _Field:
         """Samples, half of them uniform like positions that count for the share, the others heavy near limits."""
