@@ -364,8 +364,10 @@ def test_the_elbow_angle_leans_farther_into_the_task_than_fitted_coordinates() -
 @pytest.mark.nightly
 @pytest.mark.slow
 def test_benchmark_of_wide_charts_closes_loops() -> None:
-    row, loops = wide_charts.main(quick=True)
+    row, nearer, everywhere, loops = wide_charts.main(quick=True)
     assert float(row.split("|")[4].strip("% ")) > 99
+    assert float(nearer.split("|")[3].strip("% ")) > 99
+    assert float(everywhere.split("|")[4].strip("% ")) > 100 / 8 - 5  # the chart of one of eight branches
     words = [word.strip() for word in loops.split("|")]
-    assert words[3] == "3 of 3"
-    assert float(words[4]) < 1e-9
+    assert words[3] == words[5] == "3 of 3"
+    assert max(float(words[4]), float(words[6])) < 1e-9
