@@ -274,6 +274,7 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "width of a joint": lambda: suggestion().joints[0],
     "polynomial": lambda: oc.Polynomial(3),
     "cyclic polynomial": lambda: oc.Polynomial(3, cyclic="auto"),
+    "sparse polynomial": lambda: oc.Polynomial(3, joints=2),
     "linear": oc.Linear,
     "Fourier": lambda: oc.Fourier(2),
     "network": oc.MLP,

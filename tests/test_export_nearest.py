@@ -1,17 +1,16 @@
 """The nearest xi of exported modules: feasible, no worse than what others find, with derivatives."""
 
 import sys
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from public_objects import clear, fitted, planar, wide
+from public_objects import fitted, planar
 from scipy.optimize import minimize
 from test_export import array_of, module_of
-from test_export_inverse import in_blob, in_corridor, pose
+from test_export_inverse import CHARTS as CHARTS_OF_INVERSE
 
 import orthocas as oc
 from orthocas.charts.solutions import InverseStatus
@@ -28,15 +27,8 @@ def position() -> oc.Chart:
     return oc.charts.load("panda-position")
 
 
-CHARTS: dict[str, Callable[[], oc.Chart]] = {
-    "box": lambda: fitted().chart,
-    "clear box": clear,
-    "wide": lambda: wide().chart,
-    "corridor": in_corridor,
-    "a user's domain": in_blob,
-    "position": position,
-    "pose, wide": pose,
-}
+SHARED = ("box", "clear box", "wide", "corridor", "a user's domain", "pose, wide")
+CHARTS = {name: CHARTS_OF_INVERSE[name] for name in SHARED} | {"position": position}
 
 
 def wishes_of(chart: oc.Chart, count: int = 300, away: float = 0.3) -> tuple[Array, Array]:

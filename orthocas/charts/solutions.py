@@ -22,7 +22,7 @@ _FEW = 5  # rows that a message names
 _ROUNDED = 1e-9  # error up to which only rounding may have stopped the decrease
 _STEP = 0.1  # of the half-widths: default of the largest change of q in a call
 _WEIGHT = 1e-3  # of errors of xi, relative to those of x
-KEPT = 1e-5  # error of x over its size, with which xi gives way before x is
+KEPT = 1e-5  # error of x over its size up to which xi gives way instead of going deeper into a zone
 ZONE = 0.02  # next to the boundary, in half-widths of joints and in relative room of conditions
 DESCENTS, _HALVINGS = 12, 20  # steps of Gauss and Newton in a call, and halvings of one
 INERTIA = 1e-3  # weight of the way from the last q, in half-widths
@@ -321,7 +321,7 @@ class ReachingTracker(Tracker):
 
     def step(self, phi: ArrayLike) -> Array:
         """As `Tracker.step`; where that stays, the nearest q (n,) that a search from the last one finds."""
-        start = self.q.copy()
+        start = self.q
         q = super().step(phi)
         reached = self.status is TrackerStatus.OK
         if self.status is TrackerStatus.BAD_INPUT or (reached and not self._goes_deeper(start, q)):

@@ -12,12 +12,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from orthocas.bases.cyclic import leaves_stay, over_cyclic_joints
-from orthocas.bases.family import (
-    CyclicParametrisation,
-    JointSpace,
-    LinearFamily,
-    Parametrisation,
-)
+from orthocas.bases.family import CyclicParametrisation, JointSpace, LinearFamily, Parametrisation
 from orthocas.bases.products import Polynomial
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
@@ -455,7 +450,8 @@ class _Field:
         J = task.batched_frame_jacobian(points)[0].reshape(len(points), task.m, problem.n)
         #: R with A^-1 = R R^T, (N, n, n); None for the identity
         self.root = None if metric.is_identity else np.linalg.cholesky(np.linalg.inv(metric_matrices(metric, points)))
-        self._judged, self._own = _orthonormal(J), _orthonormal(J if self.root is None else J @ self.root)
+        self._judged = _orthonormal(J)
+        self._own = self._judged if self.root is None else _orthonormal(J @ self.root)
 
     def jacobian(self, C: Array) -> Array:
         """dxi/dq of coefficients (r, K), (N, r, n)."""

@@ -22,7 +22,7 @@ from orthocas.tools.display import Shown, listed
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-CLEAR = 0.1  #: relative singular value above which a position counts as clear where shares are counted
+CLEAR = 0.1  #: relative singular value above which positions are clear: those of shares, and of self-motions at cuts
 _SLICES, _ON_SLICE, _FINER, _SEED = 61, 200, 400, 0  # slices q_k = v, and positions on each
 _FEW = 8  # positions on a slice; fewer say nothing about it
 _QUANTILE = 0.9  # of the positions of a slice that must be singular, or that self-motions must not leave
