@@ -116,11 +116,11 @@ def fit_wide(
     second mean keeps the lengths l of gradients near one length, so that xi is a similar motion everywhere. The fit
     descends with L-BFGS from linear coordinates across the task in the middle of the branch, first with t = 0.5. As
     long as more than 0.05 % of other samples are not regular after that, or 1 % of them have a volume below 0.28 / r,
-    the worst of 50,000 fresh samples join and t = 0.3, three times at most. The best of these results is kept:
-    regular in the middle, fewest bad positions, as far as these are more than 0.05 %, then the largest 1 % quantile of
-    the volume. The domain of the chart is the part of the branch where coordinates are regular with a margin, see
-    `RegularPart`. It is judged in the identity metric; with another one, the first mean for the volume in the identity
-    metric and t = 0.06 / r is added.
+    the worst of 50,000 fresh samples join and t = 0.3, three times at most, and no more once that makes coordinates
+    worse. The best of these results is kept: regular in the middle, fewest bad positions, as far as these are more than
+    0.05 %, then the largest 1 % quantile of the volume. The domain of the chart is the part of the branch where
+    coordinates are regular with a margin, see `RegularPart`. It is judged in the identity metric; with another one, the
+    first mean for the volume in the identity metric and t = 0.06 / r is added.
 
     Coordinates that are linear in the first and the last joint are best to prove and hold at any turn of them. They ask
     that self-motions turn base and tool in one sense on the whole branch, as far as the other joints do not outweigh
@@ -620,9 +620,9 @@ class _Search:
         self._descend(_TARGET, _ITERATIONS, name)
 
     def go_on(self) -> None:
-        """Descend with the worst of fresh samples, as long as coordinates are not regular enough."""
+        """Descend with the worst of fresh samples, as long as coordinates are not regular enough and get better."""
         for turn in range(1, 1 + _ROUNDS):
-            if self._done:
+            if self._done or self._last is not self.best:
                 return
             fresh = self._field(_FRESH, _FRESH_TAG + turn)
             worst = fresh.points[np.argsort(self._sense * fresh.volumes(self._last))[:_WORST]]
