@@ -581,6 +581,13 @@ def test_bad_settings_are_named() -> None:
         oc.fit_wide(known.robot, known.task, "up")
 
 
+def test_a_middle_with_another_sign_than_the_rest_is_no_domain() -> None:
+    robot = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
+    box, task = oc.Box([0.0, 0.35, 0.35], [3.0, 2.9, 2.9]), oc.Task.position(robot, "xy")
+    with pytest.raises(DomainError, match="in the middle of branch 'box', coordinates fold or have another sign"):
+        oc.fit_wide(robot, task, box, parametrisation=oc.Polynomial(1), samples=2000)
+
+
 def test_damaged_files_are_refused(tmp_path: Path) -> None:
     wide_plane().chart.save(tmp_path / "a.orthocas")
     header = header_of(tmp_path / "a.orthocas")

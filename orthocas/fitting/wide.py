@@ -246,6 +246,9 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
     assert search.best is not None
     clear, seed = search.problem, search.seed
     centre, status = clear.domain.centre, Status.INTERRUPTED if interrupted else Status.CONVERGED
+    if search.rank[0]:
+        wrong = f"in the middle of branch '{branch.name}', coordinates fold or have another sign than on most of it"
+        raise DomainError(f"{wrong}: give a smaller box as branch, another branch, or another parametrisation")
     first = sample_problem(clear, _FIRST, (seed, _FIRST_TAG))
     raw = search.coordinates(search.best)
     meaning, quantities = search.meaning, search.quantities
@@ -255,11 +258,7 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
         coordinates = quantities.named(normalised(raw, centre, first), clear)
     else:
         coordinates = in_gauge(normalised(raw, centre, first), centre)
-    try:
-        domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
-    except DomainError as error:
-        advice = "give a smaller box as branch, another branch, or another parametrisation"
-        raise DomainError(f"in the middle of branch '{branch.name}', {error}: {advice}") from None
+    domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
     judged = sample_uniform(clear.domain, _JUDGED, (seed, _JUDGED_TAG))
     share = float(domain.is_clear(judged[_beside_the_middle(clear, judged)]).mean())
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
