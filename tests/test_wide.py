@@ -119,6 +119,24 @@ def test_branches_of_arms_are_cut_where_geometry_says() -> None:
 
 
 @pytest.mark.slow
+def test_parts_with_hardly_a_clear_position_belong_to_their_neighbour_if_it_is_beside_them() -> None:
+    """The folded elbow of the xarm7 is nearly singular up to 0.5 rad beyond the cut, where joint 4 stands still."""
+    xarm = oc.Robot.from_urdf(robot_data("xarm_description/urdf/xarm7.urdf"), "link_eef")
+    found = oc.branches(xarm)
+    assert [(cut.joint_name, cut.singular) for cut in found.cuts] == [
+        ("joint2", False),
+        ("joint4", True),
+        ("joint6", False),
+    ]
+    assert len(found) == 8
+    assert sum(item.share for item in found) == pytest.approx(1.0)
+    folded = np.array([2.0, 1.6, 2.4, 3.2, 0.0, 1.1, -1.2])
+    item = found.of(folded)
+    assert item is not None
+    assert item.name == "shoulder+ elbow+ wrist+"
+    assert item.box.contains(folded + [0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0])
+
+
 def test_branches_of_a_task_are_where_it_is_clear() -> None:
     """Beyond its stretched elbow, the panda reaches clear positions of the hand, but no clear poses."""
     of_pose, of_position = oc.branches(panda()), oc.branches(panda(), oc.Task.position(panda()))

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import pairwise, product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,6 +31,7 @@ _STILL = 0.02  # joints that self-motions move less are not cut where they move 
 _EXACT = 1e-4  # the quantile where a cut is one of geometry, not of offsets between axes
 _APART = 0.45  # [rad or m] cuts of one joint that are nearer are one
 _MOST_CUTS = 2  # of a joint
+_WELL_CLEAR = 0.15  # that quantile on some slice of a part that counts; others join their neighbour, if they may
 _NEIGHBOURS, _SAME = 5, 1e-8  # of a minimum; difference of poses that are equal [m and rad]
 _SAMPLES = 20_000
 _PANELS, _COLOUR = 4, "#1f5fa8"  # of pictures: side by side, of the arm
@@ -143,7 +144,8 @@ def branches(robot: Robot, task: Task | None = None) -> Branches:
     as the second joint of a shoulder with three intersecting axes at q2 = 0. A coordinate keeps its sense along
     self-motions on each side of a cut, and not across it. Each is looked for on 61 slices of every joint but the first
     and the last of the arm, then refined; nearly so counts too, because offsets between axes move such places a little.
-    They are found from samples, not proved.
+    A cut of the second kind is none if hardly a position beside it is clear, up to the next cut. Cuts are found from
+    samples, not proved.
 
     Self-motions are those of the tip's pose, by the last seven joints: charts of its position keep to the same cuts.
     With fewer than six joints they are those of the task. Branches are the parts with positions where the task is
@@ -233,7 +235,11 @@ class _Arm:
                 if all(abs(cut.value - other.value) > _APART for other, _ in found):
                     found.append((cut, size))
         strongest = sorted(found, key=lambda pair: pair[1])[:_MOST_CUTS]
-        return sorted((cut for cut, _ in strongest), key=lambda cut: cut.value)
+        cuts = sorted((cut for cut, _ in strongest), key=lambda cut: cut.value)
+        ends = [low, *(cut.value for cut in cuts), high]
+        parts = [of_slices[(values > start) & (values < end), 0] for start, end in pairwise(ends)]
+        wide = [part.max(initial=0.0) > _WELL_CLEAR for part in parts]
+        return [cut for i, cut in enumerate(cuts) if cut.singular or (wide[i] and wide[i + 1])]
 
     def _sizes(self, k: int, value: float, count: int) -> tuple[float, float]:
         """The 90 % quantiles, over a slice, of the singular value, and of how far self-motions move the joint."""
