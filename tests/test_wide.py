@@ -134,7 +134,7 @@ def test_parts_with_hardly_a_clear_position_belong_to_their_neighbour_if_it_is_b
     item = found.of(folded)
     assert item is not None
     assert item.name == "shoulder+ elbow+ wrist+"
-    assert item.box.contains(folded + [0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0])
+    assert item.box.contains(folded + np.eye(7)[3] * 0.5)
 
 
 def test_branches_of_a_task_are_where_it_is_clear() -> None:
