@@ -26,7 +26,10 @@ from orthocas.cli.output import report_rows
 from orthocas.codegen import check_c
 from orthocas.errors import ChartFileError, DomainError, Interrupted, InvalidValueError, ShapeError, UnknownNameError
 from orthocas.fitting.basis_gradients import gradients_of
-from orthocas.fitting.wide import _Field, _Search, _Shortfall, _Wish
+from orthocas.fitting.meaning import Wish
+from orthocas.fitting.regular_search import BasisSearch, Search
+from orthocas.fitting.volume_loss import BasisField, BasisShortfall, NetworkField, NetworkShortfall
+from orthocas.fitting.wide import _run
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.domains import sample_heavily, sample_uniform
 from orthocas.tools.progress import Progress, silent
@@ -411,10 +414,10 @@ def test_the_loss_has_volumes_and_lengths_and_its_slopes_are_differences(metric:
     )
     basis = gradients_of(oc.Polynomial(2).family(JointSpace.of(problem), 2), 4)
     q = [sample_uniform(problem.domain, count, seed) for seed, count in enumerate((300, 700))]
-    fields, C = [_Field(problem, points, basis) for points in q], rng.normal(size=(2, 14))
-    wish = _Wish(np.diag(rng.uniform(size=14)), rng.normal(size=14), 0.3)
+    fields, C = [BasisField(problem, points, basis) for points in q], rng.normal(size=(2, 14))
+    wish = Wish(np.diag(rng.uniform(size=14)), rng.normal(size=14), 0.3)
     factor = np.linalg.cholesky(fields[0].energy() + 1e-6 * np.eye(14))
-    loss = _Shortfall(fields, 0.4, -1.0, factor, [wish], C)
+    loss = BasisShortfall(fields, 0.4, -1.0, factor, [wish], C)
     theta = loss.variables(C)
     np.testing.assert_allclose(loss.coefficients(theta), C, atol=1e-12)
     value, slopes = loss.value_and_gradient(theta)
@@ -442,6 +445,35 @@ def test_the_loss_has_volumes_and_lengths_and_its_slopes_are_differences(metric:
     moved = rng.normal(size=(6, len(theta)))
     ends = [[loss.value(theta + side * 1e-6 * a) for side in (-1, 1)] for a in moved]
     np.testing.assert_allclose(np.diff(ends, axis=1)[:, 0] / 2e-6, moved @ slopes, rtol=1e-5)
+
+
+@pytest.mark.parametrize("metric", ["euclidean", "inertia"])
+def test_the_loss_of_networks_is_that_of_bases(metric: Any) -> None:
+    """A network of tanh(e q) / e with a small e is linear in q, as a polynomial of degree 1 is."""
+    robot, rng = oc.Robot.planar([1.0, 0.8, 0.6, 0.5], [3.0, 2.0, 2.0, 1.0]), np.random.default_rng(2)
+    problem = oc.Problem(robot, oc.Task.position(robot, "xy"), metric, oc.Box(np.full(4, 0.7), 0.6))
+    family = oc.MLP((4,), raw=True).family(JointSpace.of(problem), 2)
+    points, C, wanted, small = (
+        sample_uniform(problem.domain, 500, 0),
+        rng.normal(size=(2, 4)),
+        np.array([1.0, 2.0]),
+        1e-2,
+    )
+    theta = np.concatenate([small * np.eye(4).ravel(), np.zeros(4), (C / small).ravel(order="F"), np.zeros(2)])
+    field = NetworkField(problem, points, family)
+    basis = gradients_of(oc.Polynomial(1).family(JointSpace.of(problem), 2), 4)
+    D = basis.jacobian(basis.at(points[:1]), np.eye(4), 1)[0]
+    same = BasisField(problem, points, basis).shortfall(C @ np.linalg.inv(D), 0.4, -1.0, wanted)
+    found, known = field.shortfall(theta, 0.4, -1.0, wanted)[0], same[0]
+    assert abs(found - known) < 2e-3 * known
+    loss = NetworkShortfall(field, 0.4, -1.0, wanted)
+    parts = list(loss.batches(100, 200, (3,)))
+    assert abs(np.mean([part.value(theta) for part in parts]) - found / 500) < 0.05 * found / 500
+    theta = family.initial(0)
+    moved = rng.normal(size=(4, len(theta)))
+    ends = [[loss.value(theta + side * 1e-3 * a) for side in (-1, 1)] for a in moved]
+    slopes = loss.value_and_gradient(theta)[1]
+    np.testing.assert_allclose(np.diff(ends, axis=1)[:, 0] / 2e-3, moved @ slopes, atol=0.01 * np.linalg.norm(slopes))
 
 
 @pytest.mark.parametrize("parametrisation", [oc.Polynomial(3, ["q1"]), oc.Fourier(2)])
@@ -579,22 +611,67 @@ def test_interrupted_fits_keep_the_best_so_far() -> None:
 def test_coordinates_of_the_other_sense_in_the_middle_miss_it() -> None:
     known = oc.problems.get("planar_3r_xy")
     problem = oc.Problem(known.robot, known.task, domain=BENT, least_singular_value=0.1)
-    search = _Search(problem, oc.Polynomial(1), 500, 0, silent, None, None)
+    search = BasisSearch(problem, oc.Polynomial(1), 500, 0, silent, None, None)
     search.begin("linear")
     (missed, *_), C = search.rank, search.best
     assert not missed
     assert C is not None
     search.best = None
-    search._keep(-C)
+    search._take("mirrored", search.stages[0].result, -C, 500)
     assert search.rank[0]
+
+
+@pytest.mark.slow
+def test_networks_are_regular_on_a_whole_box() -> None:
+    known, network = oc.problems.get("planar_3r_xy"), oc.MLP((16, 16), raw=True)
+    wide = oc.Box([0.0, 0.9, 0.9], [3.0, 1.3, 1.3])
+    fit = oc.fit_wide(known.robot, known.task, wide, parametrisation=network)
+    assert fit.regular_share > 0.995, fit
+    assert fit.stages[0].result.iterations > 10
+    assert fit.chart.notes["solver"] == "adam"
+    domain = fit.chart.problem.domain
+    points = sample_uniform(domain, 20_000, 8)
+    steps = 1e-6 * np.eye(3)
+    x = [(known.robot.tip_position(points + e) - known.robot.tip_position(points - e))[:, :2] for e in steps]
+    xi = [fit.chart.xi(points + e) - fit.chart.xi(points - e) for e in steps]
+    signs = np.sign(np.linalg.det(np.concatenate([np.stack(x, 2), np.stack(xi, 2)], axis=1) / 2e-6))
+    assert abs(signs.sum()) == len(points)
+
+    def stop(progress: Progress) -> None:
+        if progress.fraction > 0.2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted) as stopped:
+        oc.fit_wide(known.robot, known.task, wide, parametrisation=network, monitor=stop)
+    assert stopped.value.result.status is Status.INTERRUPTED
+    assert 0.3 < stopped.value.result.regular_share < 1
+
+
+@pytest.mark.parametrize(("bad", "begun"), [(5e-4, [0]), (5e-3, [0, 1]), (0.1, [0, 2])])
+def test_poor_results_ask_for_another_polynomial_and_very_poor_ones_for_a_network(bad: float, begun: list[int]) -> None:
+    problem, tried = oc.problems.get("planar_3r_xy"), list[int]()
+
+    class Known(BasisSearch):
+        def begin(self, name: str) -> None:
+            self.best, self.rank = np.zeros(1), (False, bad / (1 + len(tried)), -0.1)
+            tried.append(searches.index(self))
+
+        def go_on(self) -> None:
+            tried.append(-searches.index(self))
+
+    searches: list[Search] = [Known(problem, oc.Polynomial(1), 9, 0, silent, None, None) for _ in range(3)]
+    _run(searches)
+    assert tried == [*begun, -begun[-1]]
 
 
 def test_bad_settings_are_named() -> None:
     known = oc.problems.get("planar_3r_xy")
     with pytest.raises(InvalidValueError, match="clearance"):
         oc.fit_wide(known.robot, known.task, clearance=float("nan"))
-    with pytest.raises(InvalidValueError, match=r"parametrisation is mlp:4x4, expected a family to fit that is linear"):
-        oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.MLP((4, 4)))
+    with pytest.raises(InvalidValueError, match=r"parametrisation is linear.*, expected a family to fit"):
+        oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.Linear())
+    with pytest.raises(InvalidValueError, match=r"parametrisation is mlp:4x4, expected .* linear in .*, for like"):
+        oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.MLP((4, 4)), like="q3")
     with pytest.raises(UnknownNameError, match="unknown branch 'up'"):
         oc.fit_wide(known.robot, known.task, "up")
 

@@ -11,6 +11,7 @@ from orthocas.charts.point_quality import least_in_domain
 from orthocas.errors import InvalidValueError
 from orthocas.robots.robot import Robot
 from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.metric import require_mass
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import (
     Array,
@@ -33,6 +34,7 @@ SPRING_FREQUENCY = 12 * np.pi  #: [rad/s], 6 Hz; what it holds: docs/measurement
 FASTEST = 36 * np.pi  #: [rad/s], 18 Hz: stable with a delay of 6.5 ms at a damping ratio of 0.7
 MARGIN = np.pi / 6  #: [rad], 30 degrees of phase that are left to the fastest mode at a stated delay
 _SAMPLES, _SEED = 512, 0
+_NEED = "gains by modes"  # what needs a mass matrix that is not singular
 _ROUNDS, _CLOSE = 12, 1.05  # of descents for a delay; how much of a bound on squared frequencies is left to scaling
 _TOO_FAST = 3000.0  # weight of the squared logarithm by which a mode exceeds the fastest frequency
 
@@ -134,12 +136,14 @@ def matched_stiffness(
 
     Raises:
         InvalidValueError: for other values, and a damping ratio that leaves less than 30 deg without any delay.
+        MetricError: if a joint moves no mass.
 
     Source:
         ours, docs/explanation/derivations_control.md#stiffness
     """
     require_kind("chart", chart, Chart)
     chart.function("xi")  # raises for grown charts
+    require_mass(chart.problem.robot, _NEED)
     if not 0 <= as_number("delay", delay) < np.inf:
         raise InvalidValueError("delay", delay, "a finite number >= 0")
     bearable = _bearable(delay, damping_ratio, chart.n) if delay else np.inf
@@ -187,6 +191,7 @@ def fastest_posture(chart: Chart, stiffness: Array, robot: Robot) -> Array:
 def matched_posture_stiffness(problem: Problem, frequency: float = SPRING_FREQUENCY, fastest: float = FASTEST) -> Array:
     """Stiffness of springs in the joints, from the modes of (K_q, M) in the same way, (n,)."""
     require_kind("problem", problem, Problem)
+    require_mass(problem.robot, _NEED)
     return _matched(np.linalg.inv(problem.robot.mass_matrix(_points(problem))), frequency, fastest)
 
 

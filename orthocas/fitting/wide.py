@@ -2,71 +2,48 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import NamedTuple
+from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
-import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from orthocas.bases.cyclic import leaves_stay, over_cyclic_joints
-from orthocas.bases.family import CyclicParametrisation, JointSpace, LinearFamily, Parametrisation
+from orthocas.bases.family import ArrayFamily, CyclicParametrisation, JointSpace, LinearFamily, Parametrisation
+from orthocas.bases.mlp import MLP
 from orthocas.bases.products import Polynomial
 from orthocas.charts.chart import Chart
-from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import worst_points
 from orthocas.charts.regular_part import RegularPart
-from orthocas.errors import DomainError, Interrupted, InvalidValueError, RobotError
-from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
-from orthocas.fitting.checkpoint import Stage
+from orthocas.errors import DomainError, Interrupted, InvalidValueError
 from orthocas.fitting.fit import Fit, in_gauge, normalised
-from orthocas.fitting.like import SWIVEL, Like, Likeness, quantity_of
+from orthocas.fitting.like import Like, Likeness
+from orthocas.fitting.meaning import Meaning
+from orthocas.fitting.regular_search import BasisSearch, NetworkSearch, Search, beside_the_middle
 from orthocas.fitting.settings import require_parametrisation
+from orthocas.fitting.volume_loss import LEAST_VOLUME
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import require_driven
-from orthocas.solvers.lbfgs import LBFGS
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.branches import Branch, Branches, branches
-from orthocas.tasks.domains import Box, sample_evenly, sample_heavily, sample_uniform
-from orthocas.tasks.metric import Metric, MetricSpec, metric_matrices
+from orthocas.tasks.domains import Box, sample_evenly, sample_uniform
+from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.problem import Problem, check, relative_singular_values
 from orthocas.tasks.regular_box import home_posture
 from orthocas.tasks.samples import sample_problem
 from orthocas.tasks.task import Task
-from orthocas.tools.batch import Batched, dense_function
-from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_number, require_count, require_kind
+from orthocas.tools.checks import as_number, require_count, require_kind
 from orthocas.tools.interrupts import remembered
-from orthocas.tools.progress import Monitor, Watch, silent
+from orthocas.tools.progress import Monitor, silent
 
 CLEARANCE = 0.1  #: default least relative singular value
-LEAST_VOLUME = 0.05  #: over r, of the coordinates in domains of wide charts; see `RegularPart`
 DEGREE = 6
 _DEGREE_OF_ALL = 5  # where base and tool joints count like all others
-_EVEN = 0.5  # share of samples that are uniform; the others are heavy near limits
-_PER_TERM, _LEAST_SAMPLES, _MOST_SAMPLES = 30, 5000, 20_000
-_TAG, _JUDGED_TAG, _FIRST_TAG = 3000, 3001, 1000  # seed tags; other samples use other ones
-_FIRST = 200  # samples that scale coordinates
-_JUDGED = 20_000
-_TARGET, _ITERATIONS = 0.5, 100  # of the first descent: the volume that is enough at a sample
-_FURTHER_TARGET, _FURTHER = 0.3, 60  # of further ones
-_BEYOND = 1.2  # over the bound of the domain, the volume in the identity metric that is enough beside another metric
-_ROUNDS, _FRESH, _WORST, _FRESH_TAG = 3, 50_000, 5000, 3002  # further descents, each with the worst of fresh samples
-_EVENNESS = 0.03  # weight of the mean squared logarithm of lengths of gradients
-_TOLERANCE, _RIDGE = 1e-6, 1e-8
-_POOR, _POOR_SEVERAL = 1e-3, 5e-3  # share of bad positions with which another family is tried; if r > 1
-_ENOUGH = 5e-4  # share of bad positions, many near limits, that is as good as none
-_WELL = 0.28  # over r, volume of all but 1 % of positions that is enough; a conditioning of 0.2
-_UNIFORM_TAG = 1  # within the other tags
-_EVERY = 4  # samples whose gradients count as long
-_TINY = 1e-12  # length of a row
-_STAGES = ("whole branch", "whole branch, all joints")  # of the families, one after the other
-_MEANT = 100.0  # weight of the mean squared error of a meaning, relative to the slope
-_STEP, _MOST_STEPS, _FEWEST = 0.02, 400, 5  # of unit self-motions, along which a meaning is taken
-_ALIKE = 0.01  # weight of the mean squared distance to gradients of quantities, with r > 1
-_STILL = 1e-3  # change of a quantity for a unit self-motion
+_NETWORK = MLP((64, 64, 64), raw=True)
+_FIRST, _FIRST_TAG = 200, 1000  # samples that scale coordinates, and their seed tag
+_JUDGED, _JUDGED_TAG = 20_000, 3001  # samples of the share
+_POOR, _POOR_SEVERAL = 1e-3, 5e-3  # share of bad positions with which another polynomial is tried; if r > 1
+_VERY_POOR = 2e-2  # with which a network is
+_STAGES = ("whole branch", "whole branch, all joints", "whole branch, network")  # of the families
 _MIDDLES, _CLEARER = 20_000, 1.5  # positions that may be the middle of a domain, and their clearance over the bound
 
 
@@ -189,8 +166,9 @@ def fit_wide(
     require_count("seed", seed, least=0)
     chosen = _chosen(robot, task, branch, home)
     problem = _problem(robot, task, metric, chosen, bound)
-    wanted = _families(problem) if parametrisation is None else (parametrisation,)
-    cases = [_case(problem, family) for family in wanted]
+    meant = like is not None
+    wanted = _families(problem, meant) if parametrisation is None else (parametrisation,)
+    cases = [_case(problem, family, meant) for family in wanted]
     problem, _ = cases[0]
     count = None if samples is None else require_count("samples", samples, least=2)
     posture = chosen.posture if home is None else home_posture(robot, task, home).q
@@ -200,7 +178,7 @@ def fit_wide(
     elif like is not None:
         quantities = Like.of(problem, like)
         quantities.require_at_most(problem.r)
-    searches = [_Search(*case, count, seed, monitor, meaning, quantities) for case in cases]
+    searches = [_search(*case, count, seed, monitor, meaning, quantities) for case in cases]
     with remembered() as pressed:
         stopped = False
         try:
@@ -209,39 +187,61 @@ def fit_wide(
             if searches[0].best is None:
                 raise
             stopped = True
-        result = _finished(_better(searches), chosen, start, interrupted=stopped or pressed())
+        best = _better(searches)
+        result = _finished(best, meaning, quantities, chosen, start, interrupted=stopped or pressed())
         if result.status is Status.INTERRUPTED or pressed():
             raise Interrupted(result)
     return result
 
 
-def _case(problem: Problem, family: Parametrisation) -> tuple[Problem, Parametrisation]:
+def _case(problem: Problem, family: Parametrisation, meant: bool) -> tuple[Problem, Parametrisation]:
     """A problem and a family that suit each other."""
     require_parametrisation(family)
     family = family.for_problem(problem)
     if isinstance(family, CyclicParametrisation):
         problem = over_cyclic_joints(problem, tuple(family.cyclic))
-    if family.closed_form is not None or not isinstance(family.family(JointSpace.of(problem), problem.r), LinearFamily):
-        raise InvalidValueError("parametrisation", family.label, "a family to fit that is linear in its parameters")
+    kind = None if family.closed_form is not None else family.family(JointSpace.of(problem), problem.r)
+    if not isinstance(kind, LinearFamily | ArrayFamily):
+        raise InvalidValueError("parametrisation", family.label, "a family to fit")
+    if meant and not isinstance(kind, LinearFamily):
+        raise InvalidValueError("parametrisation", family.label, "a family that is linear in its parameters, for like")
     return problem, family
 
 
-def _run(searches: Sequence["_Search"]) -> None:
-    """Search in one family after the other, as long as results are poor, then go on in the best one."""
-    for name, search in zip(_STAGES, searches, strict=False):
-        search.begin(name)
-        missed, bad, _ = search.rank
-        if not missed and bad <= (_POOR if search.problem.r == 1 else _POOR_SEVERAL):
-            break
+def _search(
+    problem: Problem,
+    family: Parametrisation,
+    samples: int | None,
+    seed: int,
+    monitor: Monitor,
+    meaning: Meaning | None,
+    quantities: Like | None,
+) -> Search:
+    """The search of a family."""
+    if isinstance(family.family(JointSpace.of(problem), problem.r), LinearFamily):
+        return BasisSearch(problem, family, samples, seed, monitor, meaning, quantities)
+    return NetworkSearch(problem, family, samples, seed, monitor)
+
+
+def _run(searches: Sequence[Search]) -> None:
+    """Search in the first family and, if results are poor, in another one, then go on in the better one."""
+    first, *others = searches
+    first.begin(_STAGES[0])
+    missed, bad, _ = first.rank
+    if others and (missed or bad > (_POOR if first.problem.r == 1 else _POOR_SEVERAL)):
+        k = len(others) if bad > _VERY_POOR else 1
+        searches[k].begin(_STAGES[k])
     _better(searches).go_on()
 
 
-def _better(searches: Sequence["_Search"]) -> "_Search":
+def _better(searches: Sequence[Search]) -> Search:
     """The search with the best coordinates."""
     return min((search for search in searches if search.best is not None), key=lambda search: search.rank)
 
 
-def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: bool) -> WideFit:
+def _finished(
+    search: Search, meaning: Meaning | None, quantities: Like | None, branch: Branch, start: float, *, interrupted: bool
+) -> WideFit:
     """The result of a search, normalised and judged."""
     assert search.best is not None
     clear, seed = search.problem, search.seed
@@ -251,7 +251,6 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
         raise DomainError(f"{wrong}: give a smaller box as branch, another branch, or another parametrisation")
     first = sample_problem(clear, _FIRST, (seed, _FIRST_TAG))
     raw = search.coordinates(search.best)
-    meaning, quantities = search.meaning, search.quantities
     if meaning is not None:
         coordinates = meaning.named(raw)
     elif quantities is not None:
@@ -260,11 +259,11 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
         coordinates = in_gauge(normalised(raw, centre, first), centre)
     domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
     judged = sample_uniform(clear.domain, _JUDGED, (seed, _JUDGED_TAG))
-    share = float(domain.is_clear(judged[_beside_the_middle(clear, judged)]).mean())
+    share = float(domain.is_clear(judged[beside_the_middle(clear, judged)]).mean())
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
     worst = worst_points(problem, coordinates, seed, thorough=True)
     notes: dict[str, str | float] = {
-        "solver": "lbfgs",
+        "solver": search.solver,
         "seed": seed,
         "samples": search.samples,
         "status": status.value,
@@ -287,104 +286,6 @@ def _finished(search: "_Search", branch: Branch, start: float, *, interrupted: b
     )
 
 
-class _Wish(NamedTuple):
-    """The term c^T E c - 2 g^T c + a of a coordinate's coefficients c (K,)."""
-
-    E: Array
-    g: Array
-    a: float
-
-
-@dataclass(frozen=True, eq=False)
-class Meaning:
-    """Values that a coordinate is to have along the self-motion of a posture."""
-
-    points: Array  #: (k, n), the posture in the middle
-    values: Array  #: (k,), monotone
-    middle: int  #: place of the posture
-    slope: float  #: mean change of the value for a unit self-motion, in the sense of `_self_motion`
-    name: str  #: with its unit
-    wanted: bool  #: whether coordinates are fitted to the values; otherwise they only get their scale and offset
-
-    @classmethod
-    def by_default(cls, problem: Problem, posture: Array) -> "Meaning | None":
-        """The scale of the angle of the elbow, if the arm has shoulder, elbow and wrist and r = 1."""
-        try:
-            return replace(cls.of(problem, SWIVEL, posture), wanted=False)
-        except (InvalidValueError, RobotError):
-            return None
-
-    @classmethod
-    def of(cls, problem: Problem, like: Likeness, posture: Array) -> "Meaning":
-        """Follow the self-motion of a posture both ways, as long as it is in the domain and the quantity is monotone.
-
-        Raises:
-            InvalidValueError: if there is more than one quantity, or it stands still there.
-        """
-        if isinstance(like, Task) or (isinstance(like, Sequence) and not isinstance(like, str)):
-            several = Like.of(problem, like)
-            if len(several.names) != 1:
-                raise InvalidValueError("like", f"{len(several.names)} quantities", "one, as r = 1")
-            name, quantity = several.names[0], several.function
-        else:
-            name, quantity = quantity_of(problem.robot, like)
-        sides = [_followed(problem, posture, sign * _STEP) for sign in (-1.0, 1.0)]
-        points = np.concatenate([sides[0][:0:-1], sides[1]])
-        middle = len(sides[0]) - 1
-        values = np.unwrap(Batched(quantity)(points)[0][:, 0])  # angles do not jump
-        if like == SWIVEL:
-            values -= 2 * np.pi * np.round(values[middle] / (2 * np.pi))
-        steps = np.diff(values)
-        if len(points) < _FEWEST or not np.isfinite(steps).all():
-            raise InvalidValueError(
-                "like", "of too short a self-motion at the home", "another home, farther from limits"
-            )
-        k = min(middle, len(steps) - 1)
-        same = np.sign(steps) == np.sign(steps[k])
-        low = k - int(np.argmin(same[k::-1])) + 1 if not same[: k + 1].all() else 0
-        high = k + int(np.argmin(same[k:])) if not same[k:].all() else len(steps)
-        slope = (values[high] - values[low]) / (_STEP * max(1, high - low))
-        if high - low < _FEWEST or abs(slope) < _STILL:
-            raise InvalidValueError("like", "a quantity that stands still at the home", "one that self-motions change")
-        return cls(points[low : high + 1], values[low : high + 1], middle - low, float(slope), name, True)
-
-    def wish(self, family: LinearFamily) -> _Wish:
-        """The mean squared difference from the values, over the squared slope, for coefficients of a family."""
-        q = ca.SX.sym("q", self.points.shape[1])
-        psi = Batched(dense_function("psi", [q], [family.basis(q)]))(self.points)[0].reshape(len(self.points), -1)
-        rows, sides = psi - psi[self.middle], self.values - self.values[self.middle]
-        weight = _MEANT / len(rows) / self.slope**2
-        return _Wish(weight * rows.T @ rows, weight * rows.T @ sides, weight * float(sides @ sides))
-
-    def named(self, raw: Coordinates) -> Coordinates:
-        """Coordinates in units of the quantity, with its value at the posture.
-
-        The scale is that for which they were fitted, or the best one.
-        """
-        xi, scale = raw.once("xi", self.points)[:, 0], 1.0
-        away, values = xi - xi[self.middle], self.values - self.values[self.middle]
-        if not self.wanted:
-            scale = float(away @ values / max(away @ away, _TINY))
-        return replace(
-            raw, offset=np.array([xi[self.middle] - self.values[self.middle] / scale]), scale=np.array([scale])
-        )
-
-    def error(self, coordinates: Coordinates) -> float:
-        """Root mean square of what coordinates miss along the self-motion."""
-        return float(np.sqrt(np.mean((coordinates.once("xi", self.points)[:, 0] - self.values) ** 2)))
-
-
-def _followed(problem: Problem, posture: Array, step: float) -> Array:
-    """The self-motion from a posture in steps of unit self-motions, up to the boundary of the domain, (k, n)."""
-    found, slope = [posture], partial(_self_motion, problem)
-    while len(found) < _MOST_STEPS and problem.domain.contains(found[-1]):
-        q = found[-1]
-        middle = q + step / 2 * slope(q)
-        again = q + step / 2 * slope(middle)
-        found.append(q + step / 6 * (slope(q) + 2 * slope(middle) + 2 * slope(again) + slope(q + step * slope(again))))
-    return np.array(found[:-1] if len(found) > 1 else found)
-
-
 def _chosen(robot: Robot, task: Task, branch: Branch | Box | str | None, home: ArrayLike | str | None) -> Branch:
     """The branch that is meant."""
     if isinstance(branch, Branch):
@@ -397,10 +298,11 @@ def _chosen(robot: Robot, task: Task, branch: Branch | Box | str | None, home: A
     return found.of(home_posture(robot, task, home).q) or found[0]
 
 
-def _families(problem: Problem) -> tuple[Polynomial, ...]:
+def _families(problem: Problem, meant: bool) -> tuple[Polynomial | MLP, ...]:
     """Polynomials that are linear in the joints on whose position the self-motions do not depend, by proof.
 
     Then those that are so in such slides without limits only, if there are others: a joint that turns has one turn.
+    Then a network, but not for coordinates that are to mean something, nor with slides without limits.
     """
     robot = problem.robot
     free = [k for k in range(robot.n) if leaves_stay(problem, k)]
@@ -408,18 +310,10 @@ def _families(problem: Problem) -> tuple[Polynomial, ...]:
     endless = [k for k in free if slides[k] and np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
     names, fewer = (tuple(robot.joint_names[k] for k in joints) for joints in (free, endless))
     first = Polynomial(DEGREE, names)
-    return (first,) if names == fewer else (first, Polynomial(_DEGREE_OF_ALL, fewer))
-
-
-def _beside_the_middle(problem: Problem, points: Array) -> NDArray[np.bool_]:
-    """Whether points (N, n) are on the middle's side of singular positions, (N,), if r joints do not move the task."""
-    q, task = np.vstack([problem.domain.centre, points]), problem.task
-    J = task.batched_frame_jacobian(q)[0].reshape(len(q), task.m, problem.n)
-    moving = np.abs(J).max(axis=(0, 1)) > _TINY * np.abs(J).max()
-    if moving.sum() != task.m:
-        return np.ones(len(points), bool)
-    sides = np.linalg.det(J[:, :, moving]) > 0
-    return np.asarray(sides[1:] == sides[0])
+    if names == fewer:
+        return (first,)
+    both = (first, Polynomial(_DEGREE_OF_ALL, fewer))
+    return both if meant or endless else (*both, _NETWORK)
 
 
 def _problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Branch, clearance: float) -> Problem:
@@ -438,274 +332,3 @@ def _problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Bran
     best = int(np.argmax(np.log(room).sum(axis=1)))
     domain = Box(middles[best], room[best], box.unbounded)
     return Problem(robot, task, metric, domain, branch.name, clearance)
-
-
-class _Field:
-    """Samples, with what the volume of coordinates there needs."""
-
-    def __init__(self, problem: Problem, points: Array, basis: BasisGradients) -> None:
-        self.points, self._basis, self._known = points, basis, basis.at(points)
-        task, metric = problem.task, problem.metric
-        J = task.batched_frame_jacobian(points)[0].reshape(len(points), task.m, problem.n)
-        #: R with A^-1 = R R^T, (N, n, n); None for the identity
-        self.root = None if metric.is_identity else np.linalg.cholesky(np.linalg.inv(metric_matrices(metric, points)))
-        self._judged = _orthonormal(J)
-        self._own = self._judged if self.root is None else _orthonormal(J @ self.root)
-
-    def jacobian(self, C: Array) -> Array:
-        """dxi/dq of coefficients (r, K), (N, r, n)."""
-        return self._basis.jacobian(self._known, C, len(self.points))
-
-    def along(self, directions: Array) -> Array:
-        """dpsi/dq . a for directions a (N, n), (N, K)."""
-        return self._basis.along(self._known, directions)
-
-    def energy(self) -> Array:
-        """Mean of dpsi_i/dq A^-1 dpsi_j/dq, (K, K)."""
-        N, n = self.points.shape
-        root = np.broadcast_to(np.eye(n), (N, n, n)) if self.root is None else self.root
-        parts = (self.along(root[:, :, i]) for i in range(n))
-        return np.asarray(sum((G.T @ G for G in parts), start=np.zeros(())) / N)
-
-    def volumes(self, C: Array) -> Array:
-        """The volumes of `RegularPart` for coefficients (r, K), (N,)."""
-        return np.asarray(np.linalg.det(np.concatenate([self._judged, _unit(self.jacobian(C))[0]], axis=1)))
-
-    def shortfall(self, C: Array, target: float, sense: float, wanted: Array) -> tuple[float, Array]:
-        """Sum of max(0, 1 - sense v / target)^2 + w |log(l / wanted)|^2, and its derivative after C (r, K).
-
-        The volumes v and the lengths l (r,) of gradients are those in the metric. In another metric than the identity,
-        the sum for the volumes of `RegularPart` and a little more than its bound joins it: coordinates that are
-        orthogonal in the inertia may be nearly parallel otherwise.
-        """
-        J = self.jacobian(C)
-        unit, lengths = _unit(J if self.root is None else J @ self.root)
-        uneven = np.log(lengths / wanted[:, None])
-        value, slopes = _shortfall_and_slopes(unit, lengths, self._own, target, sense)
-        value, slopes = value + _EVENNESS * float((uneven**2).sum()), slopes + 2 * _EVENNESS * uneven * unit / lengths
-        if self.root is not None:
-            bound = _BEYOND * LEAST_VOLUME / J.shape[1]
-            own, more = _shortfall_and_slopes(*_unit(J), self._judged, bound, sense)
-            value, slopes = value + own, slopes @ self.root.transpose(0, 2, 1) + more
-        return value, self._basis.pullback(self._known, slopes)
-
-
-def _shortfall_and_slopes(
-    unit: Array, lengths: Array, basis: Array, target: float, sense: float
-) -> tuple[float, Array]:
-    """Sum of max(0, 1 - sense v / target)^2 with v = det [basis; unit], and its derivative after unit * lengths."""
-    rows = np.concatenate([basis, unit], axis=1)
-    volumes = sense * np.linalg.det(rows)
-    short = np.maximum(0.0, 1 - volumes / target)
-    some = short > 0
-    inverse = np.linalg.inv(rows[some] + (volumes[some] == 0)[:, None, None] * _TINY * np.eye(rows.shape[2]))
-    G = volumes[some, None, None] * inverse[:, :, -unit.shape[1] :].transpose(0, 2, 1)  # dv after unit gradients
-    G -= np.einsum("sri,sri->sr", G, unit[some])[:, :, None] * unit[some]
-    G *= (-2 / target * short[some])[:, None, None] / lengths[some]
-    slopes = np.zeros_like(unit)
-    slopes[some] = G
-    return float(short @ short), slopes
-
-
-def _unit(rows: Array) -> tuple[Array, Array]:
-    """Rows (N, k, n) of length 1, and their lengths (N, k, 1)."""
-    lengths = np.maximum(np.linalg.norm(rows, axis=2, keepdims=True), _TINY)
-    return rows / lengths, lengths
-
-
-def _orthonormal(rows: Array) -> Array:
-    """An orthonormal basis of the span of rows (N, m, n), in their sense."""
-    N = np.linalg.qr(rows.transpose(0, 2, 1))[0].transpose(0, 2, 1)
-    N[:, 0] *= np.sign(np.linalg.det(N @ rows.transpose(0, 2, 1)))[:, None]
-    return np.asarray(N)
-
-
-def _self_motion(problem: Problem, q: Array) -> Array:
-    """The unit self-motion z (n,) of a position for r = 1, with z^T A z = 1 and det [J_x; z^T] > 0."""
-    J = problem.task.batched_frame_jacobian(q[None])[0].reshape(problem.m, problem.n)
-    z = np.linalg.svd(J)[2][-1]
-    z = z * np.sign(np.linalg.det(np.vstack([J, z])))
-    square = 1.0 if problem.metric.is_identity else z @ metric_matrices(problem.metric, q[None])[0] @ z
-    return np.asarray(z / np.sqrt(square))
-
-
-class _Shortfall:
-    """Mean of max(0, 1 - v / target)^2 over samples, of uneven lengths, and terms of what coordinates mean.
-
-    Its variables Y are in a basis of functions whose gradients are orthonormal in the mean, C = Y L^-1. Coordinates
-    begin with gradients of length 1 in the mean there.
-
-    Args:
-        fields: the samples.
-        target: the volume beyond which nothing is lost.
-        sense: sign of the volumes.
-        factor: L (K, K), lower triangular, with the mean L L^T of products of gradients.
-        wishes: terms of the first coordinates.
-        start: coefficients (r, K) that give the lengths.
-    """
-
-    def __init__(
-        self, fields: list[_Field], target: float, sense: float, factor: Array, wishes: list[_Wish], start: Array
-    ) -> None:
-        self._fields, self._target, self._sense, self._factor, self._wishes = fields, target, sense, factor, wishes
-        self._lengths = np.linalg.norm(start @ factor, axis=1)[:, None]
-        self._count = sum(len(field.points) for field in fields)
-
-    def variables(self, C: Array) -> Array:
-        """Y of coefficients (r, K), (r K,)."""
-        return np.asarray((C @ self._factor / self._lengths).ravel())
-
-    def coefficients(self, theta: Array) -> Array:
-        """C (r, K)."""
-        return self._solved((theta.reshape(len(self._lengths), -1) * self._lengths).T, trans="T").T
-
-    def value(self, theta: Array) -> float:
-        """The mean and the terms."""
-        return self.value_and_gradient(theta)[0]
-
-    def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
-        """The mean and the terms, and the derivative (r K,)."""
-        C = self.coefficients(theta)
-        wanted = self._lengths[:, 0]
-        parts = [field.shortfall(C, self._target, self._sense, wanted) for field in self._fields]
-        value = sum(part for part, _ in parts) / self._count
-        slopes = sum((part for _, part in parts), start=np.zeros(())) / self._count
-        for k, (E, g, a) in enumerate(self._wishes):
-            value += float(C[k] @ E @ C[k] - 2 * g @ C[k] + a)
-            slopes[k] += 2 * (E @ C[k] - g)
-        return value, (self._solved(slopes.T).T * self._lengths).ravel()
-
-    def _solved(self, columns: Array, trans: str = "N") -> Array:
-        """L^-1 or L^-T times columns."""
-        return np.asarray(scipy.linalg.solve_triangular(self._factor, columns, lower=True, trans=trans))
-
-
-class _Search:
-    """A search for regular coordinates of a problem."""
-
-    def __init__(
-        self,
-        problem: Problem,
-        parametrisation: Parametrisation,
-        samples: int | None,
-        seed: int,
-        monitor: Monitor,
-        meaning: Meaning | None,
-        quantities: Like | None,
-    ) -> None:
-        self.problem, self.parametrisation, self.seed, self.monitor = problem, parametrisation, seed, monitor
-        self.meaning, self.quantities = meaning, quantities
-        family = parametrisation.family(JointSpace.of(problem), problem.r)
-        assert isinstance(family, LinearFamily)
-        self._family: LinearFamily = family
-        self.samples = samples or int(np.clip(_PER_TERM * family.width, _LEAST_SAMPLES, _MOST_SAMPLES))
-        self.best: Array | None = None  #: coefficients (r, K)
-        #: of the best: whether they miss the middle, share of bad positions, if too many, and minus their 1 % volume
-        self.rank = (True, np.inf, np.inf)
-        self.stages: list[Stage] = []
-        self._done = False  # whether coordinates are as regular as they need to be
-
-    def begin(self, name: str) -> None:
-        """Descend from coordinates that are linear, as far as the family has such, in a stage of some name."""
-        self._basis: BasisGradients = gradients_of(self._family, self.problem.n)  # not before this family is tried
-        self._judged = self._field(_JUDGED, _JUDGED_TAG)
-        self._fields = [self._field(self.samples, _TAG)]
-        some = _Field(self.problem, self._fields[0].points[::_EVERY], self._basis)
-        energy, K = some.energy(), self._family.width
-        self._factor = np.linalg.cholesky(energy + _RIDGE * np.trace(energy) / K * np.eye(K))
-        self._last = self._first(some)
-        self._sense = 1.0 if self._middle.volumes(self._last)[0] > 0 else -1.0
-        self._wishes = self._meant(some)
-        self._descend(_TARGET, _ITERATIONS, name)
-
-    def go_on(self) -> None:
-        """Descend with the worst of fresh samples, as long as coordinates are not regular enough and get better."""
-        for turn in range(1, 1 + _ROUNDS):
-            if self._done or self._last is not self.best:
-                return
-            fresh = self._field(_FRESH, _FRESH_TAG + turn)
-            worst = fresh.points[np.argsort(self._sense * fresh.volumes(self._last))[:_WORST]]
-            self._fields.append(_Field(self.problem, worst, self._basis))
-            self._descend(_FURTHER_TARGET, _FURTHER, f"worst samples, round {turn} of {_ROUNDS}")
-
-    def coordinates(self, C: Array) -> Coordinates:
-        """Coordinates of coefficients (r, K), not normalised."""
-        r, space = self.problem.r, JointSpace.of(self.problem)
-        return Coordinates(self.parametrisation, space, (), C.ravel(), np.zeros(r), np.ones(r))
-
-    @cached_property
-    def _middle(self) -> _Field:
-        """The centre of the domain."""
-        return _Field(self.problem, self.problem.domain.centre[None], self._basis)
-
-    def _descend(self, target: float, limit: int, name: str) -> None:
-        """Minimise from the last coefficients."""
-        objective = _Shortfall(self._fields, target, self._sense, self._factor, self._wishes, self._last)
-        solver = LBFGS(limit, _TOLERANCE)
-        result = solver.minimise(objective, objective.variables(self._last), Watch(self.monitor, name))
-        self._last = objective.coefficients(result.theta)
-        samples = sum(len(field.points) for field in self._fields)
-        self.stages.append(Stage(name, result.theta.size, samples, replace(result, theta=self._last.ravel())))
-        self._keep(self._last)
-        result.finished()
-
-    def _keep(self, C: Array) -> None:
-        """Keep coefficients if they are the best so far."""
-        bound = LEAST_VOLUME / self.problem.r
-        middle, volumes = (self._sense * field.volumes(C) for field in (self._middle, self._judged))
-        missed, bad, low = bool(middle[0] <= bound), float(np.mean(volumes <= bound)), float(np.quantile(volumes, 0.01))
-        rank = missed, max(bad, _ENOUGH), -low
-        if self.best is None or rank < self.rank:
-            self.best, self.rank = C, rank
-        self._done = bad <= _ENOUGH and low >= _WELL / self.problem.r
-
-    def _field(self, count: int, tag: int) -> _Field:
-        """Samples, half of them uniform like positions that count for the share, the others heavy near limits."""
-        domain, even = self.problem.domain, int(_EVEN * count)
-        uniform = sample_uniform(domain, even, (self.seed, tag, _UNIFORM_TAG))
-        points = np.vstack([uniform, sample_heavily(domain, count - even, (self.seed, tag))])
-        return _Field(self.problem, points[_beside_the_middle(self.problem, points)], self._basis)
-
-    def _first(self, field: _Field) -> Array:
-        """Coefficients (r, K) of the functions nearest to a^T q, with orthonormal a across the task in the middle.
-
-        The first ones are those of the gradients of quantities that coordinates are to be like.
-        """
-        problem, centre = self.problem, self.problem.domain.centre
-        J = problem.task.batched_frame_jacobian(centre[None])[0].reshape(problem.m, problem.n)
-        directions = scipy.linalg.null_space(J).T
-        if self.quantities is not None:
-            wanted = self.quantities.slopes(centre[None])[0] @ directions.T  # (k, r)
-            Q, R = np.linalg.qr(np.vstack([wanted, np.eye(problem.r)]).T)
-            directions = (Q * np.where(R.diagonal() < 0, -1.0, 1.0)).T @ directions
-        if self.meaning is not None:
-            directions = self.meaning.slope * _self_motion(problem, centre)[None]
-        parts = [field.along(np.broadcast_to(a, field.points.shape)).mean(axis=0) for a in directions]
-        return np.asarray(scipy.linalg.cho_solve((self._factor, True), np.array(parts).T).T)
-
-    def _meant(self, field: _Field) -> list[_Wish]:
-        """Terms of what coordinates mean."""
-        if self.meaning is not None and self.meaning.wanted:
-            return [self.meaning.wish(self._family)]
-        return [] if self.quantities is None else _alike(self.problem, self.quantities, field)
-
-
-def _alike(problem: Problem, quantities: Like, field: _Field) -> list[_Wish]:
-    """Mean |Z^T (dxi_k/dq - g_k)|^2 over mean |Z^T g_k|^2 for quantities with gradients g_k, and a basis Z of ker J_x.
-
-    Raises:
-        InvalidValueError: if the task leaves nothing of a quantity, or what it leaves of some depends on the others.
-    """
-    N, task = len(field.points), problem.task
-    J = task.batched_frame_jacobian(field.points)[0].reshape(N, task.m, problem.n)
-    Z, slopes = np.linalg.svd(J)[2][:, task.m :], quantities.slopes(field.points)
-    left = np.einsum("sji,ski->skj", Z, slopes)
-    gram = np.einsum("ski,sli->kl", left, left) / N
-    squares = gram.diagonal()
-    moving = (squares > _STILL**2 * (slopes**2).sum(axis=2).max(axis=0)).all()
-    if not moving or np.linalg.eigvalsh(gram / np.sqrt(np.outer(squares, squares)))[0] < _STILL**2:
-        raise InvalidValueError("like", "quantities that the task leaves nothing of", "others, or another task")
-    parts = [field.along(Z[:, j]) for j in range(problem.r)]
-    E = sum((part.T @ part for part in parts), start=np.zeros(())) / N
-    pulls = sum((part.T @ left[:, :, j] for j, part in enumerate(parts)), start=np.zeros(())) / N
-    return [_Wish(_ALIKE / a * E, _ALIKE / a * pulls[:, k], _ALIKE) for k, a in enumerate(squares)]

@@ -49,7 +49,7 @@ class Metric(HoldsFunctions):
         if isinstance(spec, str):
             require_known("metric", spec, (*METRIC_KINDS, *_REGISTERED))
             if spec == "inertia":
-                _require_mass(robot)
+                require_mass(robot, "the inertia metric")
             A = robot.function("mass_matrix")(q) if spec == "inertia" else ca.SX.eye(robot.n)
             return cls(spec, dense_function("metric", [q], [A]), {"kind": spec})
         if callable(spec):
@@ -174,13 +174,13 @@ def require_spd(matrices: Array, points: Array) -> None:
         )
 
 
-def _require_mass(robot: Robot) -> None:
-    """Raise MetricError, with the name of the joint, if M(q) is singular at several postures."""
+def require_mass(robot: Robot, use: str) -> None:
+    """Raise MetricError, with the name of the joint and what needs its mass, if M(q) is singular at several postures."""
     M = robot.mass_matrix(np.random.default_rng(0).uniform(-1, 1, (4, robot.n)))
     values, vectors = np.linalg.eigh(M)
     if np.all(values[:, 0] <= _SINGULAR * np.abs(M).max(axis=(1, 2))):
         joint = robot.joint_names[int(np.argmax(np.abs(vectors[0, :, 0])))]
         raise MetricError(
-            f"joint '{joint}' moves no mass, so M(q) is singular, expected mass or armature for the inertia metric: "
+            f"joint '{joint}' moves no mass, so M(q) is singular, expected mass or armature for {use}: "
             f"give the joint's link a mass in the robot file, or {remedy(joint)}"
         )
