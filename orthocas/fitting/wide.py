@@ -104,8 +104,8 @@ def fit_wide(
     that. Without `parametrisation`, if more than 0.1 % of samples (0.5 % with r > 1) are bad before the worst ones
     join, polynomials of degree 5 in all joints are tried, too, and the better ones are kept. If more than 2 % are, as
     on arms whose axes pass each other at a distance, it is a network instead, MLP((64, 64, 64), raw=True), but not with
-    `like`: it takes five to ten times as long to evaluate. Where either is kept, a joint without limits has one turn in which
-    samples lie; beyond it, positions belong to the domain as far as coordinates are regular there.
+    `like`: it takes five to ten times as long to evaluate. Where either is kept, a joint without limits has one turn in
+    which samples lie; beyond it, positions belong to the domain as far as coordinates are regular there.
 
     Networks begin at random. 8,000 steps of Adam in single precision, each with 512 of the samples, lower the same two
     means with t = 0.3.

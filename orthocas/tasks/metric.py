@@ -175,7 +175,7 @@ def require_spd(matrices: Array, points: Array) -> None:
 
 
 def require_mass(robot: Robot, use: str) -> None:
-    """Raise MetricError, with the name of the joint and what needs its mass, if M(q) is singular at several postures."""
+    """Raise MetricError, naming the joint and what its mass is needed for, if M(q) is singular at several postures."""
     M = robot.mass_matrix(np.random.default_rng(0).uniform(-1, 1, (4, robot.n)))
     values, vectors = np.linalg.eigh(M)
     if np.all(values[:, 0] <= _SINGULAR * np.abs(M).max(axis=(1, 2))):
