@@ -627,7 +627,7 @@ def test_networks_are_regular_on_a_whole_box() -> None:
     wide = oc.Box([0.0, 0.9, 0.9], [3.0, 1.3, 1.3])
     fit = oc.fit_wide(known.robot, known.task, wide, parametrisation=network)
     assert fit.regular_share > 0.995, fit
-    assert fit.stages[0].result.iterations > 10
+    assert fit.stages[0].result.iterations == 8  # epochs
     assert fit.chart.notes["solver"] == "adam"
     domain = fit.chart.problem.domain
     points = sample_uniform(domain, 20_000, 8)

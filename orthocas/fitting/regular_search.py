@@ -34,7 +34,9 @@ _TARGET, _ITERATIONS = 0.5, 100  # of the first descent: the volume that is enou
 _FURTHER_TARGET, _FURTHER = 0.3, 60  # of further ones, and of networks
 _ROUNDS, _FRESH, _WORST, _FRESH_TAG = 3, 50_000, 5000, 3002  # further descents, each with the worst of fresh samples
 _TOLERANCE, _RIDGE = 1e-6, 1e-8
-_ADAM = Adam(epochs=16, steps=500, batch=512, learning_rate=1e-2)
+_ADAM = Adam(epochs=8, steps=500, batch=512, learning_rate=1e-2)
+_SLOWER = replace(_ADAM, learning_rate=5e-3)  # with the worst of more fresh samples
+_FRESH_OF_NETWORKS, _WORST_OF_NETWORKS = 200_000, 30_000
 _ENOUGH = 5e-4  # share of bad positions, many near limits, that is as good as none
 _WELL = 0.28  # over r, volume of all but 1 % of positions that is enough; a conditioning of 0.2
 _EVERY = 4  # samples whose gradients count as long
@@ -236,14 +238,24 @@ class NetworkSearch(Search):
 
     def begin(self, name: str) -> None:
         """Descend from a random network, in a stage of some name."""
-        start, field = self._family.initial(self.seed), self._at(self._points(self.samples, _TAG))
-        wanted = field.part(slice(None, None, _SOME)).lengths(start)
-        objective = NetworkShortfall(field, _FURTHER_TARGET, self._sense, wanted)
-        result = _ADAM.minimise(objective, start, Watch(self.monitor, name))
-        self._take(name, result, result.theta, len(field.points))
+        self._field, start = self._at(self._points(self.samples, _TAG)), self._family.initial(self.seed)
+        self._lengths = self._field.part(slice(None, None, _SOME)).lengths(start)
+        self._descend(_ADAM, start, name)
 
     def go_on(self) -> None:
-        """Nothing: steps have taken all samples."""
+        """Descend once more with the worst of fresh samples, if coordinates are not regular enough."""
+        if self._done or self.best is None:
+            return
+        fresh = self._at(self._points(_FRESH_OF_NETWORKS, _FRESH_TAG))
+        worst = fresh.points[np.argsort(self._sense * fresh.volumes(self.best))[:_WORST_OF_NETWORKS]]
+        self._field = self._at(np.vstack([self._field.points, worst]))
+        self._descend(_SLOWER, self.best, "worst samples")
+
+    def _descend(self, solver: Adam, start: Array, name: str) -> None:
+        """Minimise from parameters."""
+        objective = NetworkShortfall(self._field, _FURTHER_TARGET, self._sense, self._lengths)
+        result = solver.minimise(objective, start, Watch(self.monitor, name))
+        self._take(name, result, result.theta, len(self._field.points))
 
     def _at(self, points: Array) -> NetworkField:
         return NetworkField(self.problem, points, self._family)

@@ -20,7 +20,7 @@ LEAST_VOLUME = 0.05  #: over r, of the coordinates in domains of wide charts; se
 _BEYOND = 1.2  # over that bound, the volume in the identity metric that is enough beside another metric
 _EVENNESS = 0.03  # weight of the mean squared logarithm of lengths of gradients
 _TINY = 1e-12  # length of a row
-_WATCHED = 5000  # samples on which the loss of a network is watched
+_WATCHED = 5000  # samples on which the loss of a network is watched, and which it takes at a time
 
 Back = Callable[[Array], Array]
 
@@ -111,6 +111,11 @@ class NetworkField(Field):
             return pulled(slopes, np.empty(theta.size, np.float32)).astype(float)
 
         return J, back
+
+    def volumes(self, theta: Array) -> Array:
+        """The volumes of `RegularPart`, (N,), of some samples at a time: arrays of networks are large."""
+        parts = (self.part(slice(k, k + _WATCHED)) for k in range(0, len(self.points), _WATCHED))
+        return np.concatenate([Field.volumes(part, theta) for part in parts])
 
     def part(self, rows: NDArray[np.int_] | slice) -> Self:
         """Some of the samples. Parts share the arrays of the network."""
