@@ -27,11 +27,13 @@ from orthocas.codegen import check_c
 from orthocas.errors import ChartFileError, DomainError, Interrupted, InvalidValueError, ShapeError, UnknownNameError
 from orthocas.fitting.basis_gradients import gradients_of
 from orthocas.fitting.meaning import Wish
-from orthocas.fitting.regular_search import BasisSearch, Search
+from orthocas.fitting.regular_search import BasisSearch, NetworkSearch, Search
 from orthocas.fitting.volume_loss import BasisField, BasisShortfall, NetworkField, NetworkShortfall
 from orthocas.fitting.wide import _run
 from orthocas.solvers.protocol import Status
+from orthocas.tasks.branches import _Arm
 from orthocas.tasks.domains import sample_heavily, sample_uniform
+from orthocas.tasks.regular_box import joint_range
 from orthocas.tools.progress import Progress, silent
 
 Numbers = NDArray[np.float64]
@@ -140,6 +142,7 @@ def test_parts_with_hardly_a_clear_position_belong_to_their_neighbour_if_it_is_b
     assert item.box.contains(folded + np.eye(7)[3] * 0.5)
 
 
+@pytest.mark.slow
 def test_branches_of_a_task_are_where_it_is_clear() -> None:
     """Beyond its stretched elbow, the panda reaches clear positions of the hand, but no clear poses."""
     of_pose, of_position = oc.branches(panda()), oc.branches(panda(), oc.Task.position(panda()))
@@ -321,6 +324,10 @@ def test_a_tool_that_turns_alone_is_on_one_side_of_singular_positions() -> None:
     fit = oc.fit_wide(robot, oc.Task.named(robot, "position+axis:x"), parametrisation=oc.Polynomial(3))
     domain = fit.chart.problem.domain
     whole = oc.Box(domain.centre, domain.half_width)
+    problem = oc.Problem(robot, fit.chart.problem.task, domain=whole, least_singular_value=0.1)
+    searches = [BasisSearch(problem, oc.Polynomial(1), 2, seed, silent, None, None) for seed in range(20)]
+    with pytest.raises(InvalidValueError, match="samples is 2, expected more: none lies on the middle's side"):
+        [search._points(2, 0) for search in searches]
     q = np.vstack([domain.centre, sample_uniform(whole, 4000, 3)])
     moved = geometric_jacobians(robot, q)
     axis = robot.tip_rotation(q)[:, :, 0]
@@ -627,7 +634,6 @@ def test_networks_are_regular_on_a_whole_box() -> None:
     wide = oc.Box([0.0, 0.9, 0.9], [3.0, 1.3, 1.3])
     fit = oc.fit_wide(known.robot, known.task, wide, parametrisation=network)
     assert fit.regular_share > 0.995, fit
-    assert fit.stages[0].result.iterations == 8  # epochs
     assert fit.chart.notes["solver"] == "adam"
     domain = fit.chart.problem.domain
     points = sample_uniform(domain, 20_000, 8)
@@ -644,31 +650,77 @@ def test_networks_are_regular_on_a_whole_box() -> None:
     with pytest.raises(Interrupted) as stopped:
         oc.fit_wide(known.robot, known.task, wide, parametrisation=network, monitor=stop)
     assert stopped.value.result.status is Status.INTERRUPTED
-    assert 0.3 < stopped.value.result.regular_share < 1
+    assert 0.3 < stopped.value.result.regular_share <= 1
 
 
-@pytest.mark.parametrize(("bad", "begun"), [(5e-4, [0]), (5e-3, [0, 1]), (0.1, [0, 2])])
-def test_poor_results_ask_for_another_polynomial_and_very_poor_ones_for_a_network(bad: float, begun: list[int]) -> None:
-    problem, tried = oc.problems.get("planar_3r_xy"), list[int]()
+@pytest.mark.parametrize(
+    ("ranks", "begun", "kept"),
+    [
+        ([(False, 5e-4)], [0], 0),
+        ([(False, 5e-3), (False, 1e-3)], [0, 1], 1),
+        ([(False, 5e-3), (False, 8e-3)], [0, 1], 0),
+        ([(False, 0.1), (False, 0.01)], [0, 2], 2),
+        ([(True, 0.1), (True, 1e-3), (False, 0.2)], [0, 2, 1], 1),
+    ],
+)
+def test_poor_results_ask_for_another_polynomial_and_very_poor_ones_for_a_network(
+    ranks: list[tuple[bool, float]], begun: list[int], kept: int
+) -> None:
+    problem, tried, went_on, given = oc.problems.get("planar_3r_xy"), list[int](), list[int](), iter(ranks)
 
-    class Known(BasisSearch):
+    class Known(Search):
         def begin(self, name: str) -> None:
-            self.best, self.rank = np.zeros(1), (False, bad / (1 + len(tried)), -0.1)
+            self.best, self.rank = np.zeros(1), (*next(given), -0.1)
             tried.append(searches.index(self))
 
         def go_on(self) -> None:
-            tried.append(-searches.index(self))
+            went_on.append(searches.index(self))
 
-    searches: list[Search] = [Known(problem, oc.Polynomial(1), 9, 0, silent, None, None) for _ in range(3)]
+    class KnownBasis(Known, BasisSearch):
+        pass
+
+    class KnownNetwork(Known, NetworkSearch):
+        pass
+
+    searches: list[Search] = [KnownBasis(problem, oc.Polynomial(1), 9, 0, silent, None, None) for _ in range(2)]
+    searches.append(KnownNetwork(problem, oc.MLP((4,)), 9, 0, silent))
     _run(searches)
-    assert tried == [*begun, -begun[-1]]
+    assert (tried, went_on) == (begun, [kept])
+
+
+def test_ctrl_c_before_a_network_has_a_middle_is_no_error_of_the_domain(monkeypatch: pytest.MonkeyPatch) -> None:
+    def pressed(self: NetworkShortfall, size: int, count: int, seed: tuple[int, ...]) -> Any:
+        raise KeyboardInterrupt
+
+    known, ends = oc.problems.get("planar_3r_xy"), set[type]()
+    monkeypatch.setattr(NetworkShortfall, "batches", pressed)
+    for seed in range(6):  # random networks have either sign in the middle
+        with pytest.raises((KeyboardInterrupt, Interrupted)) as stopped:
+            oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.MLP((4,), raw=True), samples=500, seed=seed)
+        ends.add(stopped.type)
+    assert ends == {KeyboardInterrupt, Interrupted}
+
+
+def test_slivers_join_one_neighbour(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cuts at -0.4 and 0.4 that self-motions do not cross, with nothing clear between them: the weaker one goes."""
+    robot = oc.problems.get("iiwa").robot
+    whole = joint_range(robot, 0)
+    arm = _Arm.of(robot, None, whole)
+
+    def sizes(self: _Arm, k: int, value: float, count: int) -> tuple[float, float]:
+        clear = 0.05 if abs(value) < 0.4 else 0.3
+        return clear, min(abs(value + 0.4), abs(value - 0.4) + 1e-3)
+
+    monkeypatch.setattr(_Arm, "_sizes", sizes)
+    found = arm.cuts(3)
+    assert [(cut.value, cut.singular) for cut in found] == [(pytest.approx(-0.4, abs=1e-3), False)]
 
 
 def test_bad_settings_are_named() -> None:
     known = oc.problems.get("planar_3r_xy")
     with pytest.raises(InvalidValueError, match="clearance"):
         oc.fit_wide(known.robot, known.task, clearance=float("nan"))
-    with pytest.raises(InvalidValueError, match=r"parametrisation is linear.*, expected a family to fit"):
+    with pytest.raises(InvalidValueError, match=r"parametrisation is linear.*, expected one that is .*, or an MLP"):
         oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.Linear())
     with pytest.raises(InvalidValueError, match=r"parametrisation is mlp:4x4, expected .* linear in .*, for like"):
         oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.MLP((4, 4)), like="q3")

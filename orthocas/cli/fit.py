@@ -70,8 +70,8 @@ def fit(
         typer.Option(
             "--param",
             help="Parametrisation: polynomial:5, polynomial:5:cyclic, polynomial:4:joints=2, fourier:2, mlp:64x64, "
-            "linear or sew; default: polynomial:5, or polynomial:4 for more than seven joints; polynomial:3:cyclic "
-            "with --corridor; polynomial:6 with --domain branch.",
+            "mlp:64x64:raw, linear or sew; default: polynomial:5, or polynomial:4 for more than seven joints; "
+            "polynomial:3:cyclic with --corridor; what is regular on the branch with --domain branch.",
         ),
     ] = None,
     solver: Annotated[

@@ -18,7 +18,7 @@ from orthocas.fitting.volume_loss import LEAST_VOLUME, BasisField, BasisShortfal
 from orthocas.solvers.adam import Adam
 from orthocas.solvers.lbfgs import LBFGS
 from orthocas.solvers.protocol import SolveResult
-from orthocas.tasks.domains import sample_heavily, sample_uniform
+from orthocas.tasks.domains import Box, sample_heavily, sample_uniform
 from orthocas.tasks.problem import Problem
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
@@ -27,9 +27,9 @@ from orthocas.tools.progress import Monitor, Watch
 _EVEN = 0.5  # share of samples that are uniform; the others are heavy near limits
 _PER_TERM, _LEAST_SAMPLES, _MOST_SAMPLES = 30, 5000, 20_000
 _NETWORK_SAMPLES = 100_000
-_TAG, _JUDGED_TAG = 3000, 3001  # seed tags; other samples use other ones
-_UNIFORM_TAG = 1  # within these
-_JUDGED = 20_000
+JUDGED, JUDGED_TAG = 20_000, 3001  #: samples that judge, and their seed tag
+_TAG, _UNIFORM_TAG, _MIDDLE_TAG = 3000, 1, 2  # seed tags of others; of uniform ones and the middle, within tags
+_NEAR = 0.03  # share of samples of networks that lie near the middle, and of the half-widths there
 _TARGET, _ITERATIONS = 0.5, 100  # of the first descent: the volume that is enough at a sample
 _FURTHER_TARGET, _FURTHER = 0.3, 60  # of further ones, and of networks
 _ROUNDS, _FRESH, _WORST, _FRESH_TAG = 3, 50_000, 5000, 3002  # further descents, each with the worst of fresh samples
@@ -68,7 +68,7 @@ class Search(ABC):
         monitor: called with progress.
     """
 
-    solver: str  #: name
+    solver: str  #: name of the minimiser, for the notes of the chart
 
     def __init__(
         self, problem: Problem, parametrisation: Parametrisation, samples: int, seed: int, monitor: Monitor
@@ -107,14 +107,18 @@ class Search(ABC):
     @cached_property
     def _judged(self) -> Field:
         """Samples that judge."""
-        return self._at(self._points(_JUDGED, _JUDGED_TAG))
+        return self._at(self._points(JUDGED, JUDGED_TAG))
 
     def _points(self, count: int, tag: int) -> Array:
         """Samples, half of them uniform like positions that count for the share, the others heavy near limits."""
         domain, even = self.problem.domain, int(_EVEN * count)
         uniform = sample_uniform(domain, even, (self.seed, tag, _UNIFORM_TAG))
         points = np.vstack([uniform, sample_heavily(domain, count - even, (self.seed, tag))])
-        return np.asarray(points[beside_the_middle(self.problem, points)])
+        points = points[beside_the_middle(self.problem, points)]
+        if not len(points):
+            wanted = "more: none lies on the middle's side of singular positions"
+            raise InvalidValueError("samples", count, wanted)
+        return points
 
     def _take(self, name: str, result: SolveResult, theta: Array, samples: int) -> None:
         """Take the result of a stage, and keep its parameters if they are the best so far."""
@@ -238,18 +242,29 @@ class NetworkSearch(Search):
 
     def begin(self, name: str) -> None:
         """Descend from a random network, in a stage of some name."""
-        self._field, start = self._at(self._points(self.samples, _TAG)), self._family.initial(self.seed)
+        points = np.vstack([self._points(self.samples, _TAG), self._around_the_middle()])
+        self._field, start = self._at(points), self._family.initial(self.seed)
         self._lengths = self._field.part(slice(None, None, _SOME)).lengths(start)
         self._descend(_ADAM, start, name)
 
     def go_on(self) -> None:
         """Descend once more with the worst of fresh samples, if coordinates are not regular enough."""
-        if self._done or self.best is None:
+        if self._done:
             return
-        fresh = self._at(self._points(_FRESH_OF_NETWORKS, _FRESH_TAG))
-        worst = fresh.points[np.argsort(self._sense * fresh.volumes(self.best))[:_WORST_OF_NETWORKS]]
+        assert self.best is not None
+        fresh = self._points(_FRESH_OF_NETWORKS, _FRESH_TAG)
+        parts = np.array_split(fresh, -(-len(fresh) // JUDGED))  # matrices of all would take a gigabyte
+        volumes = np.concatenate([self._sense * self._at(part).volumes(self.best) for part in parts])
+        worst = fresh[np.argsort(volumes)[:_WORST_OF_NETWORKS]]
         self._field = self._at(np.vstack([self._field.points, worst]))
         self._descend(_SLOWER, self.best, "worst samples")
+
+    def _around_the_middle(self) -> Array:
+        """Clear samples near the centre of the domain, whose sign decides which part of it is kept."""
+        domain = self.problem.domain
+        near = Box(domain.centre, _NEAR * domain.half_width)
+        points = sample_uniform(near, max(2, int(_NEAR * self.samples)), (self.seed, _TAG, _MIDDLE_TAG))
+        return np.asarray(points[domain.contains(points)])
 
     def _descend(self, solver: Adam, start: Array, name: str) -> None:
         """Minimise from parameters."""

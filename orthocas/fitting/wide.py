@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +19,14 @@ from orthocas.errors import DomainError, Interrupted, InvalidValueError
 from orthocas.fitting.fit import Fit, in_gauge, normalised
 from orthocas.fitting.like import Like, Likeness
 from orthocas.fitting.meaning import Meaning
-from orthocas.fitting.regular_search import BasisSearch, NetworkSearch, Search, beside_the_middle
+from orthocas.fitting.regular_search import (
+    JUDGED,
+    JUDGED_TAG,
+    BasisSearch,
+    NetworkSearch,
+    Search,
+    beside_the_middle,
+)
 from orthocas.fitting.settings import require_parametrisation
 from orthocas.fitting.volume_loss import LEAST_VOLUME
 from orthocas.robots.robot import Robot
@@ -40,10 +48,9 @@ DEGREE = 6
 _DEGREE_OF_ALL = 5  # where base and tool joints count like all others
 _NETWORK = MLP((64, 64, 64), raw=True)
 _FIRST, _FIRST_TAG = 200, 1000  # samples that scale coordinates, and their seed tag
-_JUDGED, _JUDGED_TAG = 20_000, 3001  # samples of the share
 _POOR, _POOR_SEVERAL = 1e-3, 5e-3  # share of bad positions with which another polynomial is tried; if r > 1
 _VERY_POOR = 2e-2  # with which a network is
-_STAGES = ("whole branch", "whole branch, all joints", "whole branch, network")  # of the families
+_STAGE = "whole branch"  # its name
 _MIDDLES, _CLEARER = 20_000, 1.5  # positions that may be the middle of a domain, and their clearance over the bound
 
 
@@ -101,11 +108,12 @@ def fit_wide(
 
     Coordinates that are linear in the first and the last joint are best to prove and hold at any turn of them. They ask
     that self-motions turn base and tool in one sense on the whole branch, as far as the other joints do not outweigh
-    that. Without `parametrisation`, if more than 0.1 % of samples (0.5 % with r > 1) are bad before the worst ones
-    join, polynomials of degree 5 in all joints are tried, too, and the better ones are kept. If more than 2 % are, as
-    on arms whose axes pass each other at a distance, it is a network instead, MLP((64, 64, 64), raw=True), but not with
-    `like`: it takes five to ten times as long to evaluate. Where either is kept, a joint without limits has one turn in
-    which samples lie; beyond it, positions belong to the domain as far as coordinates are regular there.
+    that. Without `parametrisation`, if more than 0.1 % of these samples (0.5 % with r > 1) are bad before the worst
+    ones join, polynomials of degree 5 in all joints are tried, too, and the better ones are kept. If more than 2 % are,
+    as on arms whose axes pass each other at a distance, it is a network instead, MLP((64, 64, 64), raw=True), but not
+    with `like` or slides without limits: it takes five to ten times as long to evaluate. Where either is kept, a joint
+    without limits has one turn in which samples lie; beyond it, positions belong to the domain as far as coordinates
+    are regular there.
 
     Networks begin at random. 4,000 steps of Adam in single precision, each with 512 of the samples, lower the same two
     means with t = 0.3. If coordinates are not regular enough then, the worst 30,000 of 200,000 fresh samples join for
@@ -138,7 +146,7 @@ def fit_wide(
             are held against the parts of theirs that are orthogonal to the task. Default: with shoulder, elbow and
             wrist and r = 1, the scale and the sense of the swivel there.
         samples: number of samples. Default: 30 for each function, 5,000 to 20,000; 100,000 for a network.
-        seed: seed of the samples.
+        seed: seed of the samples, and of the first network.
         monitor: called with progress.
 
     Returns:
@@ -185,15 +193,14 @@ def fit_wide(
         quantities.require_at_most(problem.r)
     searches = [_search(*case, count, seed, monitor, meaning, quantities) for case in cases]
     with remembered() as pressed:
-        stopped = False
+        finish = partial(_finished, searches, meaning, quantities, chosen, start)
         try:
             _run(searches)
+            result = finish(interrupted=pressed())
         except KeyboardInterrupt:
             if searches[0].best is None:
                 raise
-            stopped = True
-        best = _better(searches)
-        result = _finished(best, meaning, quantities, chosen, start, interrupted=stopped or pressed())
+            result = finish(interrupted=True)
         if result.status is Status.INTERRUPTED or pressed():
             raise Interrupted(result)
     return result
@@ -207,9 +214,10 @@ def _case(problem: Problem, family: Parametrisation, meant: bool) -> tuple[Probl
         problem = over_cyclic_joints(problem, tuple(family.cyclic))
     kind = None if family.closed_form is not None else family.family(JointSpace.of(problem), problem.r)
     if not isinstance(kind, LinearFamily | ArrayFamily):
-        raise InvalidValueError("parametrisation", family.label, "a family to fit")
+        known = "one that is linear in its parameters, or an MLP"
+        raise InvalidValueError("parametrisation", family.label, known)
     if meant and not isinstance(kind, LinearFamily):
-        raise InvalidValueError("parametrisation", family.label, "a family that is linear in its parameters, for like")
+        raise InvalidValueError("parametrisation", family.label, "one that is linear in its parameters, for like")
     return problem, family
 
 
@@ -229,13 +237,17 @@ def _search(
 
 
 def _run(searches: Sequence[Search]) -> None:
-    """Search in the first family and, if results are poor, in another one, then go on in the better one."""
+    """Search in the first family and, if results are poor, in another one, then go on in the best one."""
     first, *others = searches
-    first.begin(_STAGES[0])
+    first.begin(_STAGE)
     missed, bad, _ = first.rank
-    if others and (missed or bad > (_POOR if first.problem.r == 1 else _POOR_SEVERAL)):
-        k = len(others) if bad > _VERY_POOR else 1
-        searches[k].begin(_STAGES[k])
+    if missed or bad > (_POOR if first.problem.r == 1 else _POOR_SEVERAL):
+        networks = [search for search in others if isinstance(search, NetworkSearch)] if bad > _VERY_POOR else []
+        polynomials = [search for search in others if isinstance(search, BasisSearch)]
+        for search in (*networks, *polynomials):
+            search.begin(f"{_STAGE}, network" if search in networks else f"{_STAGE}, all joints")
+            if not search.rank[0]:
+                break
     _better(searches).go_on()
 
 
@@ -245,13 +257,22 @@ def _better(searches: Sequence[Search]) -> Search:
 
 
 def _finished(
-    search: Search, meaning: Meaning | None, quantities: Like | None, branch: Branch, start: float, *, interrupted: bool
+    searches: Sequence[Search],
+    meaning: Meaning | None,
+    quantities: Like | None,
+    branch: Branch,
+    start: float,
+    *,
+    interrupted: bool,
 ) -> WideFit:
-    """The result of a search, normalised and judged."""
+    """The result of the best search, normalised and judged."""
+    search = _better(searches)
     assert search.best is not None
     clear, seed = search.problem, search.seed
     centre, status = clear.domain.centre, Status.INTERRUPTED if interrupted else Status.CONVERGED
     if search.rank[0]:
+        if interrupted:
+            raise KeyboardInterrupt
         wrong = f"in the middle of branch '{branch.name}', coordinates fold or have another sign than on most of it"
         raise DomainError(f"{wrong}: give a smaller box as branch, another branch, or another parametrisation")
     first = sample_problem(clear, _FIRST, (seed, _FIRST_TAG))
@@ -263,7 +284,7 @@ def _finished(
     else:
         coordinates = in_gauge(normalised(raw, centre, first), centre)
     domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
-    judged = sample_uniform(clear.domain, _JUDGED, (seed, _JUDGED_TAG))
+    judged = sample_uniform(clear.domain, JUDGED, (seed, JUDGED_TAG))
     share = float(domain.is_clear(judged[beside_the_middle(clear, judged)]).mean())
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
     worst = worst_points(problem, coordinates, seed, thorough=True)
@@ -314,11 +335,12 @@ def _families(problem: Problem, meant: bool) -> tuple[Polynomial | MLP, ...]:
     slides = robot.tree.prismatic
     endless = [k for k in free if slides[k] and np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
     names, fewer = (tuple(robot.joint_names[k] for k in joints) for joints in (free, endless))
-    first = Polynomial(DEGREE, names)
-    if names == fewer:
-        return (first,)
-    both = (first, Polynomial(_DEGREE_OF_ALL, fewer))
-    return both if meant or endless else (*both, _NETWORK)
+    found: list[Polynomial | MLP] = [Polynomial(DEGREE, names)]
+    if names != fewer:
+        found.append(Polynomial(_DEGREE_OF_ALL, fewer))
+    if not (meant or endless):
+        found.append(_NETWORK)
+    return tuple(found)
 
 
 def _problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Branch, clearance: float) -> Problem:

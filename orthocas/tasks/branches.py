@@ -31,7 +31,7 @@ _STILL = 0.02  # joints that self-motions move less are not cut where they move 
 _EXACT = 1e-4  # the quantile where a cut is one of geometry, not of offsets between axes
 _APART = 0.45  # [rad or m] cuts of one joint that are nearer are one
 _MOST_CUTS = 2  # of a joint
-_WELL_CLEAR = 0.15  # that quantile on some slice of a part that counts; others join their neighbour, if they may
+_WELL_CLEAR, _WELL = 0.15, 0.6  # that quantile on some slice of a part that counts, at most that share of all
 _NEIGHBOURS, _SAME = 5, 1e-8  # of a minimum; difference of poses that are equal [m and rad]
 _SAMPLES = 20_000
 _PANELS, _COLOUR = 4, "#1f5fa8"  # of pictures: side by side, of the arm
@@ -235,11 +235,9 @@ class _Arm:
                 if all(abs(cut.value - other.value) > _APART for other, _ in found):
                     found.append((cut, size))
         strongest = sorted(found, key=lambda pair: pair[1])[:_MOST_CUTS]
-        cuts = sorted((cut for cut, _ in strongest), key=lambda cut: cut.value)
-        ends = [low, *(cut.value for cut in cuts), high]
-        parts = [of_slices[(values > start) & (values < end), 0] for start, end in pairwise(ends)]
-        wide = [part.max(initial=0.0) > _WELL_CLEAR for part in parts]
-        return [cut for i, cut in enumerate(cuts) if cut.singular or (wide[i] and wide[i + 1])]
+        while weakest := _beside_a_sliver(strongest, low, high, values, of_slices[:, 0]):
+            strongest.remove(weakest)
+        return sorted((cut for cut, _ in strongest), key=lambda cut: cut.value)
 
     def _sizes(self, k: int, value: float, count: int) -> tuple[float, float]:
         """The 90 % quantiles, over a slice, of the singular value, and of how far self-motions move the joint."""
@@ -265,6 +263,18 @@ class _Arm:
         part = _PARTS.get(len(self.joints), {}).get(k - self.joints[0], name)
         least = size(value)
         return Cut(k, name, part, value, singular, least < _EXACT), least
+
+
+def _beside_a_sliver(
+    cuts: list[tuple[Cut, float]], low: float, high: float, values: Array, sizes: Array
+) -> tuple[Cut, float] | None:
+    """The weakest cut that self-motions do not cross and that has hardly a clear slice on one side, up to the next."""
+    placed = sorted(cuts, key=lambda pair: pair[0].value)
+    ends = [low, *(cut.value for cut, _ in placed), high]
+    enough = min(_WELL_CLEAR, _WELL * float(sizes.max()))
+    slivers = [sizes[(values > start) & (values < end)].max(initial=0.0) <= enough for start, end in pairwise(ends)]
+    found = [pair for i, pair in enumerate(placed) if not pair[0].singular and (slivers[i] or slivers[i + 1])]
+    return max(found, key=lambda pair: pair[1], default=None)
 
 
 def _clear(robot: Robot, task: Task, whole: Box, points: Array) -> NDArray[np.bool_]:
