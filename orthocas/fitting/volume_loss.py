@@ -34,8 +34,8 @@ class Field(ABC):
         J = task.batched_frame_jacobian(points)[0].reshape(len(points), task.m, problem.n)
         #: R with A^-1 = R R^T, (N, n, n); None for the identity
         self.root = None if metric.is_identity else np.linalg.cholesky(np.linalg.inv(metric_matrices(metric, points)))
-        self.judged = _orthonormal(J)  #: basis of the task's rows, (N, m, n)
-        self.own = self.judged if self.root is None else _orthonormal(J @ self.root)  #: the same in the metric
+        self.judged = _across(J)  #: orthonormal basis across the task's rows, (N, n, r)
+        self.own = self.judged if self.root is None else _across(J @ self.root)  #: the same in the metric
 
     @abstractmethod
     def gradients(self, theta: Array) -> tuple[Array, Back]:
@@ -43,7 +43,7 @@ class Field(ABC):
 
     def volumes(self, theta: Array) -> Array:
         """The volumes of `RegularPart`, (N,)."""
-        return np.asarray(np.linalg.det(np.concatenate([self.judged, _unit(self.gradients(theta)[0])[0]], axis=1)))
+        return np.asarray(np.linalg.det(_unit(self.gradients(theta)[0])[0] @ self.judged))
 
     def lengths(self, theta: Array) -> Array:
         """Root mean square of the lengths of gradients in the metric, (r,)."""
@@ -126,15 +126,15 @@ class NetworkField(Field):
 
 
 def _shortfall_and_slopes(
-    unit: Array, lengths: Array, basis: Array, target: float, sense: float
+    unit: Array, lengths: Array, across: Array, target: float, sense: float
 ) -> tuple[float, Array]:
-    """Sum of max(0, 1 - sense v / target)^2 with v = det [basis; unit], and its derivative after unit * lengths."""
-    rows = np.concatenate([basis, unit], axis=1)
-    volumes = sense * np.linalg.det(rows)
+    """Sum of max(0, 1 - sense v / target)^2 with v = det(unit across), and its derivative after unit * lengths."""
+    inner = unit @ across
+    volumes = sense * np.linalg.det(inner)
     short = np.maximum(0.0, 1 - volumes / target)
     some = short > 0
-    inverse = np.linalg.inv(rows[some] + (volumes[some] == 0)[:, None, None] * _TINY * np.eye(rows.shape[2]))
-    G = volumes[some, None, None] * inverse[:, :, -unit.shape[1] :].transpose(0, 2, 1)  # dv after unit gradients
+    inverse = np.linalg.inv(inner[some] + (volumes[some] == 0)[:, None, None] * _TINY * np.eye(unit.shape[1]))
+    G = volumes[some, None, None] * (across[some] @ inverse).transpose(0, 2, 1)  # dv after unit gradients
     G -= np.einsum("sri,sri->sr", G, unit[some])[:, :, None] * unit[some]
     G *= (-2 / target * short[some])[:, None, None] / lengths[some]
     slopes = np.zeros_like(unit)
@@ -148,11 +148,13 @@ def _unit(rows: Array) -> tuple[Array, Array]:
     return rows / lengths, lengths
 
 
-def _orthonormal(rows: Array) -> Array:
-    """An orthonormal basis of the span of rows (N, m, n), in their sense."""
-    N = np.linalg.qr(rows.transpose(0, 2, 1))[0].transpose(0, 2, 1)
-    N[:, 0] *= np.sign(np.linalg.det(N @ rows.transpose(0, 2, 1)))[:, None]
-    return np.asarray(N)
+def _across(rows: Array) -> Array:
+    """An orthonormal basis Z (N, n, r) across rows (N, m, n), with det [rows; G] > 0 just where det(G Z) > 0."""
+    m = rows.shape[1]
+    Q, R = np.linalg.qr(rows.transpose(0, 2, 1), mode="complete")
+    Z = Q[:, :, m:]
+    Z[:, :, 0] *= np.sign(np.linalg.det(Q) * np.linalg.det(R[:, :m]))[:, None]
+    return np.asarray(Z)
 
 
 class BasisShortfall:
