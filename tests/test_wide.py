@@ -658,7 +658,8 @@ def test_networks_are_regular_on_a_whole_box() -> None:
     [
         ([(False, 5e-4)], [0], 0),
         ([(False, 5e-3), (False, 1e-3)], [0, 1], 1),
-        ([(False, 5e-3), (False, 8e-3)], [0, 1], 0),
+        ([(False, 5e-3), (False, 5.5e-3)], [0, 1], 0),
+        ([(False, 5e-3), (False, 8e-3), (False, 1e-3)], [0, 1, 2], 2),
         ([(False, 0.1), (False, 0.01)], [0, 2], 2),
         ([(True, 0.1), (True, 1e-3), (False, 0.2)], [0, 2, 1], 1),
     ],

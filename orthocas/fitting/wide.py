@@ -48,8 +48,8 @@ DEGREE = 6
 _DEGREE_OF_ALL = 5  # where base and tool joints count like all others
 _NETWORK = MLP((64, 64, 64), raw=True)
 _FIRST, _FIRST_TAG = 200, 1000  # samples that scale coordinates, and their seed tag
-_POOR, _POOR_SEVERAL = 1e-3, 5e-3  # share of bad positions with which another polynomial is tried; if r > 1
-_VERY_POOR = 2e-2  # with which a network is
+_POOR, _POOR_SEVERAL = 1e-3, 4e-3  # share of bad positions with which another polynomial is tried; if r > 1
+_STILL_POOR, _VERY_POOR = 6e-3, 2e-2  # with which a network is tried: after that polynomial; in its place
 _STAGE = "whole branch"  # its name
 _MIDDLES, _CLEARER = 20_000, 1.5  # positions that may be the middle of a domain, and their clearance over the bound
 
@@ -108,12 +108,12 @@ def fit_wide(
 
     Coordinates that are linear in the first and the last joint are best to prove and hold at any turn of them. They ask
     that self-motions turn base and tool in one sense on the whole branch, as far as the other joints do not outweigh
-    that. Without `parametrisation`, if more than 0.1 % of these samples (0.5 % with r > 1) are bad before the worst
-    ones join, polynomials of degree 5 in all joints are tried, too, and the better ones are kept. If more than 2 % are,
-    as on arms whose axes pass each other at a distance, it is a network instead, MLP((64, 64, 64), raw=True), but not
-    with `like` or slides without limits: it takes five to ten times as long to evaluate. Where either is kept, a joint
-    without limits has one turn in which samples lie; beyond it, positions belong to the domain as far as coordinates
-    are regular there.
+    that. Without `parametrisation`, if more than 0.1 % of these samples (0.4 % with r > 1) are bad before the worst
+    ones join, polynomials of degree 5 in all joints are tried, too. If more than 0.6 % are bad with these, or more than
+    2 % with the first ones, as on arms whose axes pass each other at a distance, it is a network,
+    MLP((64, 64, 64), raw=True), but not with `like` or slides without limits: it takes five to ten times as long to
+    evaluate. The best ones are kept. Where these are not the first, a joint without limits has one turn in which
+    samples lie; beyond it, positions belong to the domain as far as coordinates are regular there.
 
     Networks begin at random. 4,000 steps of Adam in single precision, each with 512 of the samples, lower the same two
     means with t = 0.3. If coordinates are not regular enough then, the worst 30,000 of 200,000 fresh samples join for
@@ -237,16 +237,17 @@ def _search(
 
 
 def _run(searches: Sequence[Search]) -> None:
-    """Search in the first family and, if results are poor, in another one, then go on in the best one."""
+    """Search in the first family and, as long as results are poor, in others, then go on in the best one."""
     first, *others = searches
     first.begin(_STAGE)
     missed, bad, _ = first.rank
     if missed or bad > (_POOR if first.problem.r == 1 else _POOR_SEVERAL):
-        networks = [search for search in others if isinstance(search, NetworkSearch)] if bad > _VERY_POOR else []
+        networks = [search for search in others if isinstance(search, NetworkSearch)]
         polynomials = [search for search in others if isinstance(search, BasisSearch)]
-        for search in (*networks, *polynomials):
+        for search in (*networks, *polynomials) if bad > _VERY_POOR else (*polynomials, *networks):
             search.begin(f"{_STAGE}, network" if search in networks else f"{_STAGE}, all joints")
-            if not search.rank[0]:
+            missed, bad, _ = search.rank
+            if not missed and (search in networks or bad <= _STILL_POOR):
                 break
     _better(searches).go_on()
 
