@@ -21,7 +21,7 @@ from orthocas.tools.checks import Array
 _MEANT = 100.0  # weight of the mean squared error of a meaning, relative to the slope
 _STEP, _MOST_STEPS, _FEWEST = 0.02, 400, 5  # of unit self-motions, along which a meaning is taken
 _STILL = 1e-3  # change of a quantity for a unit self-motion
-_TINY = 1e-12
+_TINY = 1e-12  # least sum of squares to divide by
 
 
 class Wish(NamedTuple):

@@ -39,11 +39,10 @@ _SLOWER = replace(_ADAM, learning_rate=5e-3)  # with the worst of more fresh sam
 _FRESH_OF_NETWORKS, _WORST_OF_NETWORKS = 200_000, 30_000
 _ENOUGH = 5e-4  # share of bad positions, many near limits, that is as good as none
 _WELL = 0.28  # over r, volume of all but 1 % of positions that is enough; a conditioning of 0.2
-_EVERY = 4  # samples whose gradients count as long
+_EVERY, _EVERY_OF_NETWORKS = 4, 50  # steps through samples, to those that give the mean lengths of gradients
 _ALIKE = 0.01  # weight of the mean squared distance to gradients of quantities, with r > 1
 _STILL = 1e-3  # change of a quantity for a unit self-motion
-_SOME = 50  # samples of a network whose gradients count as long
-_TINY = 1e-12
+_TINY = 1e-12  # over the largest entry, of columns of joints that do not move the task
 
 
 def beside_the_middle(problem: Problem, points: Array) -> NDArray[np.bool_]:
@@ -244,7 +243,7 @@ class NetworkSearch(Search):
         """Descend from a random network, in a stage of some name."""
         points = np.vstack([self._points(self.samples, _TAG), self._around_the_middle()])
         self._field, start = self._at(points), self._family.initial(self.seed)
-        self._lengths = self._field.part(slice(None, None, _SOME)).lengths(start)
+        self._lengths = self._field.part(slice(None, None, _EVERY_OF_NETWORKS)).lengths(start)
         self._descend(_ADAM, start, name)
 
     def go_on(self) -> None:

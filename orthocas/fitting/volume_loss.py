@@ -22,7 +22,7 @@ _EVENNESS = 0.03  # weight of the mean squared logarithm of lengths of gradients
 _TINY = 1e-12  # length of a row
 _WATCHED = 5000  # samples on which the loss of a network is watched, and which it takes at a time
 
-Back = Callable[[Array], Array]
+Back = Callable[[Array], Array]  #: from derivatives after dxi/dq, (N, r, n), to those after the parameters
 
 
 class Field(ABC):
@@ -35,11 +35,11 @@ class Field(ABC):
         #: R with A^-1 = R R^T, (N, n, n); None for the identity
         self.root = None if metric.is_identity else np.linalg.cholesky(np.linalg.inv(metric_matrices(metric, points)))
         self.judged = _across(J)  #: orthonormal basis across the task's rows, (N, n, r)
-        self.own = self.judged if self.root is None else _across(J @ self.root)  #: the same in the metric
+        self.own = self.judged if self.root is None else _across(self._in_metric(J))  #: the same in the metric
 
     @abstractmethod
     def gradients(self, theta: Array) -> tuple[Array, Back]:
-        """dxi/dq of parameters, (N, r, n), and the map from derivatives after it to those after the parameters."""
+        """dxi/dq of parameters, (N, r, n), and the way back."""
 
     def volumes(self, theta: Array) -> Array:
         """The volumes of `RegularPart`, (N,)."""
@@ -47,8 +47,7 @@ class Field(ABC):
 
     def lengths(self, theta: Array) -> Array:
         """Root mean square of the lengths of gradients in the metric, (r,)."""
-        J = self.gradients(theta)[0]
-        return np.asarray(np.sqrt(((J if self.root is None else J @ self.root) ** 2).sum(axis=2).mean(axis=0)))
+        return np.asarray(np.sqrt((self._in_metric(self.gradients(theta)[0]) ** 2).sum(axis=2).mean(axis=0)))
 
     def shortfall(self, theta: Array, target: float, sense: float, wanted: Array) -> tuple[float, Array]:
         """Sum of max(0, 1 - sense v / target)^2 + w |log(l / wanted)|^2, and its derivative after the parameters.
@@ -58,7 +57,7 @@ class Field(ABC):
         orthogonal in the inertia may be nearly parallel otherwise.
         """
         J, back = self.gradients(theta)
-        unit, lengths = _unit(J if self.root is None else J @ self.root)
+        unit, lengths = _unit(self._in_metric(J))
         uneven = np.log(lengths / wanted[:, None])
         value, slopes = _shortfall_and_slopes(unit, lengths, self.own, target, sense)
         value, slopes = value + _EVENNESS * float((uneven**2).sum()), slopes + 2 * _EVENNESS * uneven * unit / lengths
@@ -67,6 +66,10 @@ class Field(ABC):
             own, more = _shortfall_and_slopes(*_unit(J), self.judged, bound, sense)
             value, slopes = value + own, slopes @ self.root.transpose(0, 2, 1) + more
         return value, back(slopes)
+
+    def _in_metric(self, rows: Array) -> Array:
+        """Rows (N, k, n) times R, which have the products of the metric."""
+        return rows if self.root is None else np.asarray(rows @ self.root)
 
 
 class BasisField(Field):
@@ -97,7 +100,7 @@ class BasisField(Field):
 
 
 class NetworkField(Field):
-    """Samples for a family whose gradients NumPy computes; in single precision, of parameters theta (size,)."""
+    """Samples for a family of networks, of parameters theta (size,). Products are computed in single precision."""
 
     def __init__(self, problem: Problem, points: Array, family: ArrayFamily) -> None:
         super().__init__(problem, points)

@@ -48,9 +48,11 @@ DEGREE = 6
 _DEGREE_OF_ALL = 5  # where base and tool joints count like all others
 _NETWORK = MLP((64, 64, 64), raw=True)
 _FIRST, _FIRST_TAG = 200, 1000  # samples that scale coordinates, and their seed tag
-_POOR, _POOR_SEVERAL = 1e-3, 4e-3  # share of bad positions with which another polynomial is tried; if r > 1
-_STILL_POOR, _VERY_POOR = 6e-3, 2e-2  # with which a network is tried: after that polynomial; in its place
-_STAGE = "whole branch"  # its name
+# of the positions that judge coordinates, those that are not regular; above these shares another family is tried:
+_POOR, _POOR_SEVERAL = 1e-3, 4e-3  # polynomials in all joints; the same with r > 1
+_VERY_POOR = 2e-2  # a network in place of these
+_STILL_POOR = 6e-3  # a network after these
+_STAGE = "whole branch"  # begins the names of stages
 _MIDDLES, _CLEARER = 20_000, 1.5  # positions that may be the middle of a domain, and their clearance over the bound
 
 
@@ -111,7 +113,7 @@ def fit_wide(
     that. Without `parametrisation`, if more than 0.1 % of these samples (0.4 % with r > 1) are bad before the worst
     ones join, polynomials of degree 5 in all joints are tried, too. If more than 0.6 % are bad with these, or more than
     2 % with the first ones, as on arms whose axes pass each other at a distance, it is a network,
-    MLP((64, 64, 64), raw=True), but not with `like` or slides without limits: it takes five to ten times as long to
+    MLP((64, 64, 64), raw=True), but not with `like` or slides without limits: it takes several times as long to
     evaluate. The best ones are kept. Where these are not the first, a joint without limits has one turn in which
     samples lie; beyond it, positions belong to the domain as far as coordinates are regular there.
 
@@ -154,7 +156,7 @@ def fit_wide(
 
     Raises:
         DomainError: if no position of the branch is clear by 1.5 times `clearance`, or if coordinates are not regular
-            in the middle.
+            in the middle with the sign that they have on most of the branch.
         InvalidValueError, UnknownNameError, NotRedundantError: if an argument is invalid.
         Interrupted: after Ctrl-C, once there are coordinates; before that, KeyboardInterrupt.
 

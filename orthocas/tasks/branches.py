@@ -31,7 +31,10 @@ _STILL = 0.02  # joints that self-motions move less are not cut where they move 
 _EXACT = 1e-4  # the quantile where a cut is one of geometry, not of offsets between axes
 _APART = 0.45  # [rad or m] cuts of one joint that are nearer are one
 _MOST_CUTS = 2  # of a joint
-_WELL_CLEAR, _WELL = 0.15, 0.6  # that quantile on some slice of a part that counts, at most that share of all
+_WELL_CLEAR, _WELL = (
+    0.15,
+    0.6,
+)  # that quantile on the clearest slice of a part that counts, or over that of the joint
 _NEIGHBOURS, _SAME = 5, 1e-8  # of a minimum; difference of poses that are equal [m and rad]
 _SAMPLES = 20_000
 _PANELS, _COLOUR = 4, "#1f5fa8"  # of pictures: side by side, of the arm
@@ -144,8 +147,8 @@ def branches(robot: Robot, task: Task | None = None) -> Branches:
     as the second joint of a shoulder with three intersecting axes at q2 = 0. A coordinate keeps its sense along
     self-motions on each side of a cut, and not across it. Each is looked for on 61 slices of every joint but the first
     and the last of the arm, then refined; nearly so counts too, because offsets between axes move such places a little.
-    A cut of the second kind is none if hardly a position beside it is clear, up to the next cut. Cuts are found from
-    samples, not proved.
+    A cut of the second kind does not count if hardly any position between it and the next cut is clear. Cuts are found
+    from samples, not proved.
 
     Self-motions are those of the tip's pose, by the last seven joints: charts of its position keep to the same cuts.
     With fewer than six joints they are those of the task. Branches are the parts with positions where the task is
@@ -268,7 +271,7 @@ class _Arm:
 def _beside_a_sliver(
     cuts: list[tuple[Cut, float]], low: float, high: float, values: Array, sizes: Array
 ) -> tuple[Cut, float] | None:
-    """The weakest cut that self-motions do not cross and that has hardly a clear slice on one side, up to the next."""
+    """The weakest cut, of those that self-motions do not cross, that bounds a part with hardly any clear slice."""
     placed = sorted(cuts, key=lambda pair: pair[0].value)
     ends = [low, *(cut.value for cut, _ in placed), high]
     enough = min(_WELL_CLEAR, _WELL * float(sizes.max()))
