@@ -33,11 +33,11 @@ from orthocas.bases import JointSpace
 from orthocas.bases.circle import CircleFamily
 from orthocas.bases.products import ProductFamily
 from orthocas.charts.coordinates import Coordinates
-from orthocas.charts.phi import shortest
 from orthocas.charts.singularities import singular_points
 from orthocas.solvers import GaussNewton
 from orthocas.tasks.samples import samples_at
 from orthocas.tools.checks import Array
+from orthocas.tools.expressions import shortest
 
 DEGREES = (8, 16, 24, 32)  # total degree in both angles
 LEVELS = {"euclidean": 1.0, "inertia": 0.05}  # of the leaves whose arc length labels flow lines at the start [m]

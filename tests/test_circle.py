@@ -12,11 +12,11 @@ from orthocas import solvers
 from orthocas.bases import JointSpace
 from orthocas.bases.circle import CircleFamily
 from orthocas.charts.coordinates import Coordinates
-from orthocas.charts.phi import shortest
 from orthocas.codegen import check_c
 from orthocas.control import Kinematic, Reference
 from orthocas.control.errors import without_turns
 from orthocas.errors import InvalidValueError
+from orthocas.tools.expressions import shortest
 
 RING = oc.Box([0.0, 1.2], [np.pi, 0.4], unbounded=[0])  # joint 1 turns without end
 

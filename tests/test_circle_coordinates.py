@@ -6,7 +6,7 @@ import pytest
 from paper.planar_flow import deviations, planar_problem
 
 import orthocas as oc
-from orthocas.charts.phi import shortest
+from orthocas.tools.expressions import shortest
 
 
 @pytest.fixture(scope="module")

@@ -14,26 +14,10 @@ from orthocas.tasks.problem import Problem, task_jacobians
 from orthocas.tasks.relative import Relative
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_point_set, require_shape
-from orthocas.tools.expressions import fast_form
+from orthocas.tools.expressions import fast_form, shortest
 
 ROUNDING = 1e-5  #: of phi: 1e-9 of it are 45 units in the last place
 _SINGULAR = 1e-8  # ratio of singular values of J below which the inverse map fails
-
-
-def shortest(difference: Any, turns: Array) -> Any:
-    """Differences of phi without whole turns of its periodic components.
-
-    Args:
-        difference: NumPy rows (N, k) or (k,), or a CasADi column (k, 1).
-        turns: periods of the components, (k,); 0 for those that have none.
-    """
-    if not turns.any():
-        return difference
-    periods = np.where(turns > 0, turns, 1.0)
-    if isinstance(difference, ca.SX | ca.MX | ca.DM):
-        whole: Any = ca.floor(difference / ca.DM(periods) + 0.5)
-        return difference - ca.DM(turns) * whole
-    return difference - turns * np.round(difference / periods)
 
 
 def counted_on(rows: Array, turns: Array) -> Array:

@@ -14,7 +14,7 @@ from orthocas.charts.angles import triangle
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.tasks.clear_box import ClearBox
-from orthocas.tasks.domains import Box, Domain, register_domain
+from orthocas.tasks.domains import Box, Domain, StopKind, Wall, register_domain
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
@@ -126,6 +126,11 @@ class RegularPart(ClearBox):
         points, single = as_point_set("q", q, len(self.centre))
         values: NDArray[np.float64] = self.orientation * self._batched_volume(points)[0][:, 0]
         return values[0] if single else values
+
+    @property
+    def walls(self) -> tuple[Wall, ...]:
+        """That of the clear box, then v(q) - bound."""
+        return (*super().walls, Wall(StopKind.FOLD, lambda q: float(self.room_to_fold(q)), self.volumes, self.heading))
 
     @property
     def fold_bound(self) -> Self:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from enum import Enum
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -13,7 +12,7 @@ from numpy.typing import ArrayLike
 from orthocas.charts.newton import Newton
 from orthocas.charts.phi import counted_on, largest, require_no_turns
 from orthocas.errors import InvalidValueError, degrees_hint
-from orthocas.tasks.domains import bounds_of, contains
+from orthocas.tasks.domains import StopKind, bounds_of, contains
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, Indices, as_number, as_point, frozen_array, require_count
 from orthocas.tools.display import Shown, listed
@@ -34,30 +33,23 @@ _FARTHEST = 3.0  # distance of a point from its neighbour, in lengths of the pre
 _MOST = 4  # times as many points as wanted, at most
 
 
-class StopKind(Enum):
-    """Why a motion ends."""
-
-    JOINT = "joint"  #: a joint is at the boundary of the domain, or at its limit
-    NEAR_SINGULAR = "near singular"  #: the relative singular value of the task is at the bound of a `ClearBox`
-    FOLD = "fold"  #: the coordinate turns back, or would: J = dphi/dq is singular, or at the bound of a `RegularPart`
-    SINGULAR = "singular"  #: no way on: the task is singular there, or grown coordinates end
-    ENDLESS = "endless"  #: nothing: the motion returns to its start up to full turns of unbounded joints
-
-
 @dataclass(frozen=True)
 class Stop:
     """What ends a motion, and where."""
 
     kind: StopKind
     joint: str = ""  #: name of the joint, for JOINT
-    value: float = np.nan  #: position of that joint [rad] or [m], or the relative singular value of the task
+    value: float = np.nan  #: position of that joint [rad] or [m], or what a condition of the domain bounds
     is_limit: bool = False  #: whether the boundary of the domain is the limit of the joint
+    condition: str = ""  #: in one line, for conditions of the domain
 
     def __str__(self) -> str:
         if self.kind is StopKind.JOINT:
             return f"joint '{self.joint}' at {self.value:.4g}{', its limit' if self.is_limit else ''}"
         if self.kind is StopKind.NEAR_SINGULAR:
             return f"the task near singular, with a relative singular value of {self.value:.3g}"
+        if self.kind is StopKind.CONDITION:
+            return f"the boundary of the domain ({self.condition})"
         return {
             StopKind.FOLD: "a fold of the chart",
             StopKind.SINGULAR: "a singularity or the end of the chart",
@@ -68,38 +60,32 @@ class Stop:
 class Walls:
     """The boundaries of a problem's domain as functions that are positive inside.
 
-    They are (q_i - low_i) and (high_i - q_i), divided by the half-width of the domain, for every bounded joint; and for
-    a `ClearBox` also s(q) - bound, for a `RegularPart` v(q) - bound.
+    They are (q_i - low_i) and (high_i - q_i), divided by the half-width of the domain, for every joint; then what the
+    domain itself names as its `walls`.
     """
 
     def __init__(self, problem: Problem) -> None:
         domain = problem.domain
         self._domain, self._robot = domain, problem.robot
         self._low, self._high = bounds_of(domain)
-        self._clear, self._room = domain.singular_bound, domain.room_to_fold
+        self._curved = domain.walls
         endless = np.isinf(self._low) & ~np.array(problem.robot.tree.prismatic)
         self.turning = endless  #: unbounded revolute joints, (n,): they are at the same place after a full turn
 
     def values(self, q: Array) -> Array:
         """All functions at one joint position (n,), positive inside; infinite for unbounded joints."""
         width = self._domain.half_width
-        parts = [(q - self._low) / width, (self._high - q) / width]
-        if self._clear is not None:
-            value = self._clear.singular_values(q) - self._clear.least_singular_value
-            parts.append(np.array([value if np.isfinite(value) else -1.0]))
-        if self._room is not None:
-            room = float(self._room(q))
-            parts.append(np.array([room if np.isfinite(room) else -1.0]))
+        rooms = np.array([wall.room(q) for wall in self._curved])
+        parts = [(q - self._low) / width, (self._high - q) / width, np.where(np.isfinite(rooms), rooms, -1.0)]
         return np.concatenate(parts)
 
     def stop(self, k: int, q: Array) -> Stop:
         """What the k-th function stands for, at q (n,)."""
         n = len(q)
-        if k > 2 * n:
-            return Stop(StopKind.FOLD)
-        if k == 2 * n:
-            assert self._clear is not None
-            return Stop(StopKind.NEAR_SINGULAR, value=float(self._clear.singular_values(q)))
+        if k >= 2 * n:
+            wall = self._curved[k - 2 * n]
+            value = np.nan if wall.value is None else float(wall.value(q))
+            return Stop(wall.kind, value=value, condition=wall.heading)
         i = k % n
         boundary, limit = (self._low, self._robot.lower) if k < n else (self._high, self._robot.upper)
         at_limit = bool(abs(boundary[i] - limit[i]) <= _AT_LIMIT * self._domain.half_width[i])
@@ -227,10 +213,12 @@ class LevelCurve:
 
         s = 0.0
         if self._margin(q, t, signs) > 0:
-            s = max(0.0, scipy.optimize.brentq(margin, 0.0, h, xtol=_ROUNDING) - 2 * _ROUNDING)
-        point, onward = self._stepped(q, t, s, target) or (q, t)
-        values = self.walls.values(point)
-        if signs is not None and signs(point, onward) < values.min():
+            s = scipy.optimize.brentq(margin, 0.0, h, xtol=_ROUNDING)
+        point, onward = self._stepped(q, t, max(0.0, s - 2 * _ROUNDING), target) or (q, t)
+        # What ends the curve is told just beyond its end: a domain that only answers `contains` has no slope inside.
+        beyond, further = self._stepped(q, t, min(h, s + 2 * _ROUNDING), target) or (point, onward)
+        values = self.walls.values(beyond)
+        if signs is not None and signs(beyond, further) < values.min():
             return (point, onward), Stop(StopKind.FOLD)
         return (point, onward), self.walls.stop(int(np.argmin(values)), point)
 

@@ -5,12 +5,12 @@ import numpy as np
 
 from orthocas.codegen.export_forms import Form, function_code
 from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, ControlStatus
-from orthocas.control.errors import without_turns
 from orthocas.control.linear_algebra import ROUNDS, SOFTEST
 from orthocas.control.operational_space import Impedance, PDPlus
 from orthocas.errors import InvalidValueError
 from orthocas.tasks.domains import reach
 from orthocas.tools.batch import dense_function
+from orthocas.tools.expressions import shortest
 
 TORQUE_LAWS = (Impedance, PDPlus)  #: that can be exported
 _STATUSES = ("OK", "OUTSIDE_DOMAIN", "SINGULAR", "NOT_FINITE", "SATURATED")
@@ -49,7 +49,10 @@ def law_form(law: Impedance | PDPlus) -> Form:
         raise InvalidValueError("model of the law", ", ".join(model.gains(law.problem, law.feed_forward)), "its own")
     bound, domain = reach(law.problem.domain), law.problem.domain
     stiffness = law.stiffness if law.damping_stiffness is None else law.damping_stiffness
+    turn = np.zeros(law.problem.n)
+    turn[list(law.problem.turning)] = 2 * np.pi
     columns = {
+        "turn": turn,
         "stiffness": law.stiffness,
         "damping_stiffness": stiffness,
         "damping_ratio": law.damping_ratio,
@@ -83,9 +86,9 @@ def _functions(law: Impedance | PDPlus) -> list[str]:
     found = [
         _code("_task_errors", "e, then de/dq row by row, of q, x_d.", [q, x_d], [error, ca.vec(slope.T)]),
         function_code(
-            "_without_turns",
-            "Errors less whole turns of joints without end and of circle-valued coordinates, (n, N).",
-            dense_function("f", [e], [without_turns(chart, e)]),
+            "_shortest",
+            "Errors by the shorter way around for coordinates that are angles, (n, N).",
+            dense_function("f", [e], [shortest(e, chart.turns)]),
         ),
         _code(
             "_mass_matrix", "Entries of M row by row, (n n, N).", [q], [ca.vec(law.model.mass_matrix(robot, inputs))]

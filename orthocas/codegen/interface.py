@@ -12,10 +12,10 @@ from orthocas.codegen.description import control_values, description_values, fil
 from orthocas.codegen.kernels import Kernels
 from orthocas.codegen.precision import Precision, check_values
 from orthocas.control.controller import Controller
-from orthocas.control.errors import without_turns
 from orthocas.control.memory import memory_of
 from orthocas.control.safety import SIGNED, UNBOUNDED, Safety
 from orthocas.tasks.relative import Relative
+from orthocas.tools.expressions import shortest
 from orthocas.version import VERSION
 
 _TORQUE = """It compensates gravity and the load that it has felt, damps
@@ -52,6 +52,9 @@ _OF_CORRECTION = {  # and of those whose memory is a torque
     "learn_blind": "    if (state->fresh == 2) learn_from_start(state, gains);\n",
     "learn_from_start": "  if (command != 0 && all_finite(command, N)) state->fresh = 2;\n",
 }
+_TURNS = """ * Joints that turn without end count from the centre of the domain, so q and q + 2 pi give the same
+ * command. The law under supervision counts them from the last measurement, so nothing jumps where they have turned half a turn.
+"""
 _ORDER = "{0}catch_margin < {0}near_margin && {0}near_margin < {0}return_margin && {0}return_margin < 1.0".format(
     "safety->"
 )
@@ -102,7 +105,7 @@ def _apart(controller: Controller, relative: Relative, end: ca.MX, start: ca.MX)
         unit = ca.sumsqr(relative.task.quaternion_function(end[:m])) < _UNIT
         difference = ca.if_else(unit, difference, ca.MX.nan(len(controller.labels)))
     if controller.chart is not None and controller.labels == controller.chart.labels:
-        difference = without_turns(controller.chart, difference)
+        difference = shortest(difference, controller.chart.turns)
     return ca.densify(difference)
 
 
@@ -168,6 +171,24 @@ def _turning(controller: Controller, known: Mapping[str, str]) -> dict[str, str]
     places = ("turn_reference", "turn_step")
     found = {place: filled(f"{place}.c", known) if relative.turned else "" for place in places}
     return {"turned_first": str(relative.first), "turned_end": str(m), **found}
+
+
+def _counted_turns(controller: Controller, known: Mapping[str, str]) -> dict[str, str]:
+    """Code of the law without supervision: it counts turns from the centre, see `count_turns_from_centre`."""
+    turning = controller.problem.turning
+    if not turning:
+        return {"count_turns": "", "turns_declared": "", "turns_counted": "", "q_of_law": "q", "turns_told": ""}
+    turn = np.zeros(controller.problem.n)
+    turn[list(turning)] = 2 * np.pi
+    centre = numbers(controller.problem.domain.centre)
+    code = filled("count_turns.c", {**known, "turn_of_joint": numbers(turn), "turns_from": centre})
+    return {
+        "count_turns": code,
+        "turns_declared": ", counted[N]",
+        "turns_counted": "  count_turns(q, counted);\n",
+        "q_of_law": "counted",
+        "turns_told": _TURNS,
+    }
 
 
 def _memory_values(controller: Controller, known: Mapping[str, str]) -> dict[str, str]:
@@ -287,7 +308,8 @@ def template_values(
     values["difference"] = filled("turned.c", values) if chart.relative.turned else ""
     if controller is not None and safety is not None:
         condition = boundary_condition(source, controller)
-        values |= control_values(controller) | supervision_values(controller, safety, condition, values)
+        values |= control_values(controller) | _counted_turns(controller, values)
+        values |= supervision_values(controller, safety, condition, values)
         values["clearance_c"] = "" if condition is None else _clearance(condition, values)
         values |= source.law_values(controller, values)
         values["compose"] = filled(f"compose_{controller.command}.c", values)

@@ -9,14 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.phi import shortest
 from orthocas.codegen.library import CompiledLibrary, GeneratedC, compile_shared, compilers, gain_numbers
 from orthocas.codegen.precision import DOUBLE, SINGLE, Precision, bounds_inside
-from orthocas.control.controller import FROM_THE_LAW, Controller, ControlStatus, squared_volume
+from orthocas.control.controller import (
+    FROM_THE_LAW,
+    Controller,
+    ControlStatus,
+    count_turns_from_centre,
+    squared_volume,
+)
 from orthocas.errors import InvalidValueError, ProofError
 from orthocas.tasks.domains import Domain, contains
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
+from orthocas.tools.expressions import shortest
 from orthocas.tools.files import draft_folder
 
 _BAD = (np.nan, np.inf, -np.inf, 1e200)
@@ -259,7 +265,7 @@ def _control(library: CompiledLibrary, controller: Controller, q: Array, dq: Arr
     if not np.array_equal(library.default_gains(len(numbers)), numbers):
         raise ProofError("the default gains in C differ from the gains of the controller")
     inputs = _law_inputs(library.precision, controller, q, dq, rng)
-    law = Batched(library.precision.graph(controller))
+    law = Batched(count_turns_from_centre(library.precision.graph(controller), controller.problem))
     command, status = law(*inputs)
     if not (status == ControlStatus.OK).any():
         raise ProofError(f"{controller.name} is well defined at none of {len(q)} states, expected at least one")
@@ -295,7 +301,7 @@ def _amplification(precision: Precision, controller: Controller, law: Batched, i
         same = (status_there == status)[:, 0]
         change = np.where(same, np.maximum(change, _differences(moved, command)), change)
     found: Array = change.clip(precision.sensitive, 1) / precision.sensitive
-    volume = squared_volume(controller.graph)
+    volume = squared_volume(controller.graph)  # it does not depend on whole turns
     if precision is SINGLE and volume is not None:
         squares = np.where(np.isin(status, FROM_THE_LAW), Batched(volume)(*inputs)[0], 1.0)[:, 0]
         found /= squares.clip(precision.smallest_volume**2, 1)

@@ -183,12 +183,18 @@ class Controller(Protocol):
 
     @property
     def function(self) -> ca.Function:
-        """q, dq (n, 1), reference and two derivatives (k, 1), gains -> command (n, 1), status (1, 1)."""
+        """q, dq (n, 1), reference and two derivatives (k, 1), gains -> command (n, 1), status (1, 1).
+
+        Joints that turn without end count from the domain's centre, so that q and q + 2 pi give the same command.
+        """
         ...
 
     @property
     def graph(self) -> ca.Function:
-        """The same function as a graph with shared subexpressions; C is generated from it."""
+        """The same function as a graph with shared subexpressions, whole turns of joints counted by the caller.
+
+        C is generated from it, and simulations use it.
+        """
         ...
 
     @property
@@ -271,6 +277,27 @@ def guarded_graph(
     smallest = ca.MX(SMALLEST_VOLUME**2)
     safe, status = check(command, fallback, inputs["limit"], inputs["q"], numbers, volume, smallest)
     return named_function(name, inputs, {"command": safe, "status": status})
+
+
+def count_turns_from_centre(graph: ca.Function, problem: Problem) -> ca.Function:
+    """The same function of q and other inputs, with turns of the joints that turn counted from the domain's centre.
+
+    A function without a memory cannot know the last position of a joint. With this, sensors may report q or q + 2 pi,
+    and the result is the same. It jumps where such a joint is half a turn from the centre, if coordinates depend on its
+    turns; `Remembering` and the supervised law in C count from the last position instead.
+    """
+    if not problem.turning:
+        return graph
+    inputs = graph.mx_in()
+    k = graph.name_in().index("q")
+    counted = [*inputs[:k], problem.unwrap(inputs[k], ca.DM(problem.domain.centre)), *inputs[k + 1 :]]
+    return ca.Function(graph.name(), inputs, graph.call(counted), graph.name_in(), graph.name_out())
+
+
+def counted_function(controller: Controller, name: Literal["function", "energy"] = "function") -> Any:
+    """The function or energy of a law for joint positions whose turns are counted already, as in simulations."""
+    graph = {"function": "graph", "energy": "energy_graph"}[name]
+    return getattr(controller, graph if controller.problem.turning else name)
 
 
 def with_smallest_volume(graph: ca.Function, smallest: float) -> ca.Function:

@@ -9,7 +9,14 @@ import casadi as ca
 from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
-from orthocas.control.controller import Command, fallback_function, guarded_graph, law_facts, named_inputs
+from orthocas.control.controller import (
+    Command,
+    count_turns_from_centre,
+    fallback_function,
+    guarded_graph,
+    law_facts,
+    named_inputs,
+)
 from orthocas.control.errors import drift, errors
 from orthocas.control.gains import FEEDBACK, FEEDBACK_SETTING, LIMIT, Setting, command_limit, non_negative_gains
 from orthocas.control.linear_algebra import block_inertia, median_volume
@@ -96,7 +103,7 @@ class Kinematic(Shown):
     @cached_property
     def function(self) -> ca.Function:
         """q, dq (n, 1), reference and its derivatives (n, 1), gains -> command (n, 1), status (1, 1)."""
-        return self.chart.runnable(self.graph)
+        return self.chart.runnable(count_turns_from_centre(self.graph, self.problem))
 
     @cached_property
     def graph(self) -> ca.Function:

@@ -9,7 +9,15 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.control.controller import LARGEST, Controller, ControlStatus, named_function, named_inputs
+from orthocas.control.controller import (
+    LARGEST,
+    Controller,
+    ControlStatus,
+    counted_function,
+    named_function,
+    named_inputs,
+    require_controller,
+)
 from orthocas.control.errors import bend
 from orthocas.control.linear_algebra import block_inertia
 from orthocas.errors import InvalidValueError
@@ -112,13 +120,13 @@ def memory_of(controller: Controller) -> Memory | None:
 
 
 class Remembering(Shown):
-    """A law with its memory, tick by tick, in Python; the supervised law does the same in C.
+    """A law tick by tick, in Python, with what a function cannot know; the supervised law does the same in C.
+
+    It keeps the law's memory, if it has one, and counts the turns of joints that turn without end from the last
+    position. So sensors may report angles with or without whole turns, and nothing jumps at half a turn.
 
     Args:
-        controller: a law with a memory.
-
-    Raises:
-        InvalidValueError: for a law without one.
+        controller: the law.
 
     Example:
         >>> import orthocas as oc
@@ -133,12 +141,13 @@ class Remembering(Shown):
     """
 
     def __init__(self, controller: Controller) -> None:
+        require_controller(controller)
         memory = memory_of(controller)
-        if memory is None:
-            raise InvalidValueError("controller", controller.name, "a law with a memory")
         self._controller, self._memory = controller, memory
-        self._law, self._step = _on_arrays(controller.function), _on_arrays(memory.step)
+        self._law = _on_arrays(counted_function(controller))
+        self._step = None if memory is None else _on_arrays(memory.step)
         self.fields: dict[str, Array] = {}  #: what it remembers
+        self.q: Array | None = None  #: the last position with its turns counted, (n,); None before the first tick
         self.start()
 
     def facts(self) -> dict[str, str]:
@@ -148,9 +157,10 @@ class Remembering(Shown):
     def start(self, q: ArrayLike | None = None, command: ArrayLike | None = None) -> None:
         """Begin anew, at joint positions (n,) that a command (n,) has held until now, if both are given."""
         law, memory, n = self._controller, self._memory, self._controller.problem.n
-        self.fields = {name: value.copy() for name, value in memory.start.items()}
-        if memory.torque is not None and q is not None and command is not None:
-            fallback = law.fallback(as_point("q", q, n), *law.gains.values()).full().ravel()
+        self.q = None if q is None else as_point("q", q, n)
+        self.fields = {} if memory is None else {name: value.copy() for name, value in memory.start.items()}
+        if memory is not None and memory.torque is not None and self.q is not None and command is not None:
+            fallback = law.fallback(self.q, *law.gains.values()).full().ravel()
             self.fields[memory.torque] = as_point("command", command, n) - fallback - law.gains["extra_torque"]
         self._fresh = True
 
@@ -158,22 +168,25 @@ class Remembering(Shown):
         """Command (n,) and status at a measured state.
 
         Args:
-            q: joint positions (n,).
+            q: joint positions (n,), those of joints that turn without end up to whole turns.
             dq: joint velocities (n,).
             reference: value, velocity and acceleration, (3, k).
             period: time since the last tick [s].
         """
-        law, memory, n = self._controller, self._memory, self._controller.problem.n
-        wanted = as_float_array("reference", reference)
-        require_shape("reference", wanted.shape, (3, len(law.labels)))
-        state = as_point("q", q, n), as_point("dq", dq, n), *wanted
-        gains = law.gains
-        used = gains | {gain: gains[gain] + self.fields[name] for gain, name in memory.adds.items()}
+        law, n = self._controller, self._controller.problem.n
+        targets = as_float_array("reference", reference)
+        require_shape("reference", targets.shape, (3, len(law.labels)))
+        position = as_point("q", q, n)
+        self.q = position if self.q is None else law.problem.unwrap(position, self.q)
+        state = self.q, as_point("dq", dq, n), *targets
+        adds = {} if self._memory is None else self._memory.adds
+        used = law.gains | {gain: law.gains[gain] + self.fields[name] for gain, name in adds.items()}
         command, (number,) = _values(self._law, *state, *used.values())
         status = ControlStatus(int(number))
-        active, since = float(status == ControlStatus.OK), 0.0 if self._fresh else as_number("period", period)
-        found = _values(self._step, *state, *gains.values(), command, active, since, *self.fields.values())
-        self.fields = dict(zip(self.fields, found, strict=True))
+        if self._step is not None:
+            active, since = float(status == ControlStatus.OK), 0.0 if self._fresh else as_number("period", period)
+            fields = _values(self._step, *state, *law.gains.values(), command, active, since, *self.fields.values())
+            self.fields = dict(zip(self.fields, fields, strict=True))
         self._fresh = False
         return command, status
 

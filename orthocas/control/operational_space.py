@@ -13,6 +13,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.point_quality import Judged
 from orthocas.control.controller import (
     Command,
+    count_turns_from_centre,
     fallback_function,
     guarded_graph,
     law_facts,
@@ -365,7 +366,7 @@ class _OperationalSpace(Shown):
     @cached_property
     def function(self) -> ca.Function:
         """q, dq (n, 1), reference and its derivatives (n, 1), gains -> command (n, 1), status (1, 1)."""
-        return self.chart.runnable(self.graph)
+        return self.chart.runnable(count_turns_from_centre(self.graph, self.problem))
 
     @cached_property
     def graph(self) -> ca.Function:
@@ -387,7 +388,7 @@ class _OperationalSpace(Shown):
     @cached_property
     def energy(self) -> ca.Function:
         """The fast form of `energy_graph`."""
-        return self.chart.runnable(self.energy_graph)
+        return self.chart.runnable(count_turns_from_centre(self.energy_graph, self.problem))
 
     @cached_property
     def energy_graph(self) -> ca.Function:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from orthocas.charts.chart import Chart
 from orthocas.control.controller import (
     Command,
+    count_turns_from_centre,
     fallback_function,
     guarded_graph,
     law_facts,
@@ -340,7 +341,7 @@ class Projector(TwoTaskLaw):
     @cached_property
     def energy(self) -> ca.Function:
         """The fast form of `energy_graph`."""
-        return self._second.runnable(self.energy_graph)
+        return self._second.runnable(count_turns_from_centre(self.energy_graph, self.problem))
 
     @cached_property
     def energy_graph(self) -> ca.Function:

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.charts.chart import Chart
-from orthocas.control.errors import without_turns
+from orthocas.control.controller import count_turns_from_centre
 from orthocas.control.linear_algebra import block_inertia, damped, median_volume
 from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
@@ -22,7 +22,7 @@ from orthocas.tasks.task import Task
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_known
 from orthocas.tools.display import Shown
-from orthocas.tools.expressions import fast_form
+from orthocas.tools.expressions import fast_form, shortest
 
 SecondName = Literal["joints", "xi"]  #: second tasks by name, for laws that are built on a chart
 _SAMPLES, _RANK_LOST = 32, 1e-9
@@ -237,7 +237,7 @@ class _ExtraCoordinates:
         return self.chart.coordinates.functions["second_derivative"](q, dq, dq)
 
     def shortest(self, difference: ca.MX) -> ca.MX:
-        shorter: ca.MX = without_turns(self.chart, difference)
+        shorter: ca.MX = shortest(difference, self.chart.turns)
         return shorter
 
     def runnable(self, graph: ca.Function) -> ca.Function:
@@ -339,7 +339,7 @@ class TwoTaskLaw(Shown, ABC):
     @cached_property
     def function(self) -> ca.Function:
         """q, dq (n, 1), reference and its derivatives (m + k_2, 1), gains -> command (n, 1), status (1, 1)."""
-        return self._second.runnable(self.graph)
+        return self._second.runnable(count_turns_from_centre(self.graph, self.problem))
 
     @cached_property
     @abstractmethod

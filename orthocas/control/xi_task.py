@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.phi import shortest
 from orthocas.control.gains import non_negative_gains
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.robots.tree import require_driven
 from orthocas.tools.checks import Array, as_float_array, require_at_least, require_kind
 from orthocas.tools.display import Shown, listed, number_list
+from orthocas.tools.expressions import shortest
 
 
 class XiTask(Shown):
@@ -62,6 +62,7 @@ class XiTask(Shown):
         if len(self.joints) != chart.n:
             raise ShapeError("joints", (len(self.joints),), (chart.n,))
         self.target_xi: Array | None = None
+        self._last: Array | None = None  # the last position: turns of joints that turn without end count from there
         self._known: tuple[Any, list[tuple[Any, int]]] = (None, [])  # the last model, and the places of joints in it
 
     def facts(self) -> dict[str, str]:
@@ -114,7 +115,9 @@ class XiTask(Shown):
         """The chart's joint positions, (n,)."""
         q = configuration.q
         values = (q[place] for place, _ in self._places(configuration.model))
-        return np.array([value if np.ndim(value) == 0 else np.arctan2(value[1], value[0]) for value in values])
+        q = np.array([value if np.ndim(value) == 0 else np.arctan2(value[1], value[0]) for value in values])
+        self._last = q if self._last is None else np.asarray(self.chart.problem.unwrap(q, self._last))
+        return self._last
 
     def _places(self, model: Any) -> list[tuple[Any, int]]:
         """The places of joints; looking them up takes longer than xi."""

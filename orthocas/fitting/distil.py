@@ -12,7 +12,6 @@ from orthocas.bases.family import Family, JointSpace, LinearFamily, Parametrisat
 from orthocas.bases.products import Polynomial
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
-from orthocas.charts.phi import shortest
 from orthocas.charts.quality import Report, evaluate
 from orthocas.errors import GrowError, InvalidValueError
 from orthocas.exact.flow import GrownCoordinates
@@ -23,6 +22,7 @@ from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.blas_graph import NumpyGraph
 from orthocas.tools.checks import Array, require_count, require_kind, require_memory
 from orthocas.tools.display import Shown, number_list
+from orthocas.tools.expressions import shortest
 from orthocas.tools.progress import Monitor, Progress, Watch, silent
 
 _PER_PARAMETER = 4  # samples per parameter of a coordinate

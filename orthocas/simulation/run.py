@@ -10,8 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.charts.phi import shortest
-from orthocas.control.controller import Controller, require_controller
+from orthocas.control.controller import Controller, counted_function, require_controller
 from orthocas.control.memory import memory_of
 from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
@@ -24,6 +23,7 @@ from orthocas.simulation.physics import LawWithMemory, SupervisedLaw, law_in_tic
 from orthocas.simulation.trajectory import Outcome, Trajectory
 from orthocas.tools.batch import THREADS, Batched
 from orthocas.tools.checks import Array, as_number, as_point, require_executor, require_kind, require_known
+from orthocas.tools.expressions import shortest
 from orthocas.tools.progress import Monitor, Progress, silent
 
 _MOST_TICKS = 1e7  # of a sampled run
@@ -263,7 +263,7 @@ class Prepared:
         controller = self.loop.controller
         if name == "measured":
             return Batched(controller.measured)(*arguments)
-        function = controller.function if name == "command" else controller.energy
+        function = counted_function(controller, "function" if name == "command" else "energy")
         assert function is not None
         gains = [np.tile(gain, (len(arguments[0]), 1)) for gain in controller.gains.values()]
         return Batched(function)(*arguments, *gains)

@@ -13,7 +13,6 @@ import scipy
 from numpy.typing import NDArray
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.phi import shortest
 from orthocas.control.controller import FROM_THE_LAW, ControlStatus
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError, OrthocasError, TrajectoryFileError
@@ -31,6 +30,7 @@ from orthocas.tools.checks import (
     require_text,
 )
 from orthocas.tools.display import Shown, listed, number_list
+from orthocas.tools.expressions import shortest
 from orthocas.tools.files import is_numpy_archive, published, require_replaceable, require_writable
 from orthocas.tools.interrupts import deferred
 from orthocas.tools.json import from_strict_json, part

@@ -12,6 +12,8 @@ from orthocas.errors import DomainError, InvalidValueError, SingularTaskError
 from orthocas.tasks.domains import (
     Box,
     Domain,
+    StopKind,
+    Wall,
     register_domain,
     require_within_limits,
     sample_evenly,
@@ -131,6 +133,12 @@ class ClearBox(Box):
     def singular_bound(self) -> Self:
         """Itself."""
         return self
+
+    @property
+    def walls(self) -> tuple[Wall, ...]:
+        """s(q) - bound."""
+        room = lambda q: float(self.singular_values(q)) - self.least_singular_value  # noqa: E731
+        return (Wall(StopKind.NEAR_SINGULAR, room, self.singular_values, self.heading),)
 
     def facts_of_condition(self) -> dict[str, str]:
         """The condition in one line."""

@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
 
@@ -35,6 +36,27 @@ _LEAST_SHARE, _TRIED = 1e-3, 10_000  # of the points of a box, at least so many,
 _BLOCK = 1000  # fewest points to draw at once, after the first ones
 NARROWEST = 1e-9  #: [rad] or [m]; boxes of this half-width and less drown in rounding
 WIDEST = 1e6  #: [rad] or [m]; wider boxes are mistakes, and overflow later
+
+
+class StopKind(Enum):
+    """Why a motion ends."""
+
+    JOINT = "joint"  #: a joint is at the boundary of the domain, or at its limit
+    NEAR_SINGULAR = "near singular"  #: the relative singular value of the task is at the bound of a `ClearBox`
+    FOLD = "fold"  #: the coordinate turns back, or would: J = dphi/dq is singular, or at the bound of a `RegularPart`
+    CONDITION = "condition"  #: another condition of the domain holds no more, such as the distance to a path
+    SINGULAR = "singular"  #: no way on: the task is singular there, or grown coordinates end
+    ENDLESS = "endless"  #: nothing: the motion returns to its start up to full turns of unbounded joints
+
+
+@dataclass(frozen=True, eq=False)
+class Wall:
+    """A curved boundary of a domain: what holds inside besides its box."""
+
+    kind: StopKind
+    room: Callable[[Array], float]  #: q (n,) -> a number that is positive inside and 0 at the boundary
+    value: Callable[[Array], float] | None = None  #: q (n,) -> what is bounded, for messages; None: nothing to show
+    heading: str = ""  #: the condition in one line
 
 
 class Domain(ABC):
@@ -90,6 +112,24 @@ class Domain(ABC):
     def fold_bound(self) -> "FoldBound | None":
         """What `room_to_fold` is made of, for code that evaluates it in other libraries."""
         return None
+
+    @property
+    def walls(self) -> tuple[Wall, ...]:
+        """What ends a motion inside the box: the conditions of the domain, each as a function that is 0 at its end.
+
+        Ranges, self-motions, paths and messages ask a domain in this way only. Without an expression of the condition,
+        `contains` answers.
+        """
+        if self.is_box:
+            return ()
+        try:
+            condition = self.condition
+        except DomainError:
+            condition = None
+        if condition is None:
+            return (Wall(StopKind.CONDITION, lambda q: 1.0 if self.contains(q) else -1.0, heading=f"the {self.name}"),)
+        pivots = condition.pivots
+        return (Wall(StopKind.CONDITION, lambda q: float(pivots(q).full().min()), heading=condition.heading),)
 
     def require_bounds(self, what: str) -> None:
         """Raise DomainError unless proofs and C know the form of the condition."""

@@ -19,7 +19,7 @@ from orthocas.tasks.task import Task
 from orthocas.tools.archive import Stored
 from orthocas.tools.checks import Array, require_kind, require_shape, require_text
 from orthocas.tools.display import Shown, listed, number_list
-from orthocas.tools.expressions import from_tape, require_tape, to_tape
+from orthocas.tools.expressions import from_tape, require_tape, shortest, to_tape
 from orthocas.tools.json import part
 
 NEAR_SINGULAR = 0.01  #: smallest relative singular value of the task below which a sample counts as singular
@@ -115,6 +115,34 @@ class Problem(Shown):
     def r(self) -> int:
         """Degree of redundancy n - m."""
         return self.n - self.m
+
+    @property
+    def turning(self) -> tuple[int, ...]:
+        """Joints whose whole turns lead nowhere else: revolute ones that are unbounded in the domain.
+
+        Task, mass matrix and domain do not change with a turn of theirs, but coordinates may: a term b q_k grows by
+        2 pi b. None on a torus, where coordinates repeat as well.
+        """
+        prismatic = self.robot.tree.prismatic
+        return () if self.domain.full_turns else tuple(k for k in self.domain.unbounded if not prismatic[k])
+
+    def unwrap(self, q: Any, near: Any) -> Any:
+        """q - 2 pi round((q - near) / (2 pi)) for the joints that turn, q for the others.
+
+        So a sensor may report angles with or without whole turns: counted from the last position, they are continuous.
+
+        Args:
+            q: joint positions, NumPy rows (..., n), or a CasADi column (n, 1).
+            near: positions to count from, of the same kind; (n,) serves all rows.
+
+        Returns:
+            As q, with |q_k - near_k| <= pi for the joints in `turning`.
+        """
+        if not self.turning:
+            return q
+        period = np.zeros(self.n)
+        period[list(self.turning)] = 2 * np.pi
+        return near + shortest(q - near, period)
 
     def facts(self) -> dict[str, str]:
         """Sizes, task, metric, domain and robot."""

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.errors import InvalidValueError, OrthocasError
-from orthocas.tools.checks import require_count
+from orthocas.tools.checks import Array, require_count
 from orthocas.tools.interrupts import deferred
 
 _LARGEST = 1e300  # of finite constants
@@ -330,3 +330,19 @@ def determinant(matrix: ca.SX) -> ca.SX:
             for columns in combinations(range(rows), k + 1)
         }
     return minors[tuple(range(rows))]
+
+
+def shortest(difference: Any, turns: Array) -> Any:
+    """Differences without whole periods of the components that have one, each by the shorter way around.
+
+    Args:
+        difference: NumPy rows (N, k) or (k,), or a CasADi column (k, 1).
+        turns: periods of the components, (k,); 0 for those that have none.
+    """
+    if not turns.any():
+        return difference
+    periods = np.where(turns > 0, turns, 1.0)
+    if isinstance(difference, ca.SX | ca.MX | ca.DM):
+        whole: Any = ca.floor(difference / ca.DM(periods) + 0.5)
+        return difference - ca.DM(turns) * whole
+    return difference - turns * np.round(difference / periods)
