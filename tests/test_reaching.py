@@ -10,8 +10,9 @@ from scipy.optimize import fsolve
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.charts.self_motion import SelfMotionCurve, StopKind
+from orthocas.charts.self_motion import SelfMotionCurve
 from orthocas.errors import InvalidValueError
+from orthocas.tasks.domains import StopKind
 from orthocas.tools.checks import Array
 
 LINKS = 3

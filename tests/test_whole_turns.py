@@ -192,3 +192,48 @@ def test_errors_of_a_shipped_chart_reach_the_law() -> None:
         forces.append(np.asarray(tau).ravel())
     pull = 10.0 * 1.17 * chart.jacobian(home)[chart.m]
     assert forces[1] - forces[0] == pytest.approx(pull, abs=1e-9)
+
+
+def turned_about(axis: str, chart: oc.Chart, q: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Poses of the tool at q turned about its own axis, or with the hand around the base, (N, 6)."""
+    robot, task = chart.problem.robot, chart.problem.task
+    R, p, rows = robot.tip_rotation(q), robot.tip_position(q), []
+    for a in angles:
+        turn = np.array([[np.cos(a), -np.sin(a), 0.0], [np.sin(a), np.cos(a), 0.0], [0.0, 0.0, 1.0]])
+        rows.append(task.value(p, R @ turn) if axis == "tool" else task.value(turn @ p, turn @ R))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("axis", ["tool", "base"])
+def test_a_path_around_a_turn_says_what_it_leaves_over(chart: oc.Chart, axis: str) -> None:
+    """The same joints as those of a tracker, which takes small steps of its own."""
+    path, tracker = turned_about(axis, chart, HOME, np.linspace(0.0, 2 * np.pi, 200)), chart.tracker(HOME)
+    motion = oc.follow(chart, path, q_start=HOME, velocity_limits=1.4)
+    for x in path:
+        tracker.step(np.r_[x, chart.xi(HOME)])
+    apart = tracker.q - HOME
+    apart -= 2 * np.pi * np.round(apart / (2 * np.pi)) * np.isin(np.arange(7), ENDLESS)
+    assert np.abs(apart).max() > 0.1
+    assert motion.left_over == pytest.approx(apart, abs=1e-6)
+    assert not motion.closed
+    assert motion.kind.startswith("path around a turn: x and xi end where they began, joint 'j")
+    assert chart.left_over(HOME, tracker.q) == pytest.approx(apart, abs=1e-6)
+
+
+def test_a_loop_that_can_be_shrunk_closes_and_an_open_path_leaves_nothing_to_say(chart: oc.Chart) -> None:
+    there = turned_about("tool", chart, HOME, np.linspace(0.0, 2.0, 40))
+    back = oc.follow(chart, np.vstack([there, there[-2::-1]]), q_start=HOME, velocity_limits=1.4)
+    assert back.closed
+    assert back.kind == "closed path"
+    assert back.left_over == pytest.approx(np.zeros(7), abs=1e-7)
+    once = oc.follow(chart, there, q_start=HOME, velocity_limits=1.4)
+    assert (once.closed, once.left_over, once.kind) == (False, None, "open path")
+
+
+def test_what_a_turn_adds_to_xi_is_said(chart: oc.Chart) -> None:
+    shifts = chart.turn_shifts
+    assert list(shifts) == ["j1", "j7"]
+    for name, k in (("j1", 0), ("j7", 6)):
+        q = BENT + 2 * np.pi * np.eye(7)[k]
+        assert shifts[name] == pytest.approx(chart.xi(q) - chart.xi(BENT), abs=1e-9)
+    assert "a turn of j1" in str(chart.xi_range(HOME))

@@ -20,7 +20,6 @@ from orthocas.bases.family import JointSpace
 from orthocas.bases.given import sew_angle
 from orthocas.charts.certificate import PROVED
 from orthocas.charts.coordinates import Coordinates
-from orthocas.charts.self_motion import StopKind
 from orthocas.cli.fit import _rows
 from orthocas.cli.output import report_rows
 from orthocas.codegen import check_c
@@ -32,7 +31,7 @@ from orthocas.fitting.volume_loss import BasisField, BasisShortfall, NetworkFiel
 from orthocas.fitting.wide import _run
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.branches import _Arm
-from orthocas.tasks.domains import sample_heavily, sample_uniform
+from orthocas.tasks.domains import StopKind, sample_heavily, sample_uniform
 from orthocas.tasks.regular_box import joint_range
 from orthocas.tools.progress import Progress, silent
 

@@ -14,7 +14,7 @@ from orthocas.charts.newton import FewRows, LocalSolver, Newton, OwnInverse, Poi
 from orthocas.charts.phi import Differences, PhiFunctions, PhiMap
 from orthocas.charts.solutions import ReachingTracker, Solutions, Tracker, parts_of
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError
-from orthocas.tasks.domains import bounds_of
+from orthocas.tasks.domains import bounds_of, sample_uniform
 from orthocas.tasks.problem import task_sizes
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
@@ -28,6 +28,8 @@ from orthocas.tools.checks import (
     require_known,
 )
 
+_TURNED = 8  # samples that show whether a turn changes xi by the same everywhere
+_SAME_SHIFT = 1e-9  # of xi
 FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian", "inverse")
 
 
@@ -212,6 +214,39 @@ class InverseMethods(PhiFunctions):
         require_kind("nearest", nearest, bool)
         parts = self._point_functions, self.problem.domain, q0, largest_step
         return ReachingTracker(*parts, self.reaching, self.m) if nearest else Tracker(*parts)
+
+    def left_over(self, q_start: ArrayLike, q: ArrayLike, tolerance: float = 1e-9) -> Array | None:
+        """What a loop in (x, xi) leaves over in the joints: q - q_start (n,), less full turns of endless joints.
+
+        phi is one-to-one near each point only, so x and xi may come back while the joints do not. A loop that can be
+        shrunk to a point, while its joints stay in the domain, leaves nothing over. A loop around a full turn of the
+        tool or the base cannot be shrunk, and closes only if xi does not change with the joint that turns.
+
+        Args:
+            q_start: where the loop began, (n,).
+            q: where it ended, (n,).
+            tolerance: of phi, relative to `phi_sizes`.
+
+        Returns:
+            (n,) [rad] or [m]; None if x or xi differ, so that the path is open.
+        """
+        start, end = as_point("q_start", q_start, self.n), as_point("q", q, self.n)
+        apart = self.phi_map.difference(self.phi(end), self.phi(start)) / self.phi_sizes
+        return None if np.abs(apart).max() > tolerance else np.asarray(self.problem.unwrap(end, start) - start)
+
+    @cached_property
+    def turn_shifts(self) -> dict[str, Array]:
+        """What a full turn of a joint that turns without end adds to xi everywhere, (r,) by the joint's name.
+
+        One posture then has many values of xi, these apart. Joints whose turns do not change xi are missing, and so are
+        those whose turns change it by different amounts in different postures.
+        """
+        q, found = sample_uniform(self.problem.domain, _TURNED, 0), {}
+        for k in self.problem.turning:
+            shift = self.phi_map.difference(self.phi(q + 2 * np.pi * np.eye(self.n)[k]), self.phi(q))[:, self.m :]
+            if np.abs(shift[0]).max() > _SAME_SHIFT and np.ptp(shift, axis=0).max() < _SAME_SHIFT:
+                found[self.problem.robot.joint_names[k]] = np.asarray(shift[0])
+        return found
 
     def function(self, name: str) -> ca.Function:
         """A CasADi function: xi, phi, jacobian, task, task_jacobian, second_derivative or inverse.

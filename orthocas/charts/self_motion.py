@@ -1,7 +1,7 @@
 """What can move at a task value: ranges of the coordinates, curves, and self-motions."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,7 @@ from orthocas.errors import InvalidValueError, degrees_hint
 from orthocas.tasks.domains import StopKind, bounds_of, contains
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, Indices, as_number, as_point, frozen_array, require_count
-from orthocas.tools.display import Shown, listed
+from orthocas.tools.display import Shown, listed, number_list
 
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
@@ -291,6 +291,7 @@ class XiRange(Shown):
     """
 
     intervals: tuple[Interval, ...]
+    turn_shifts: Mapping[str, Array] = field(default_factory=dict)  #: as `Chart.turn_shifts`
 
     def __getitem__(self, label: str | int) -> Interval:
         names = {interval.label: interval for interval in self.intervals}
@@ -325,13 +326,14 @@ class XiRange(Shown):
                 f"stopped by {interval.low_stop} and by {interval.high_stop}"
                 for interval in self.intervals
             },
+            **{f"a turn of {joint}": f"adds {number_list(shift)}" for joint, shift in self.turn_shifts.items()},
         }
 
 
 def xi_range(chart: "Chart", q: ArrayLike) -> XiRange:
     """How far each coordinate reaches alone; see `Chart.xi_range`."""
     start = start_inside(chart, q)
-    return XiRange(tuple(_interval(chart, start, k) for k in range(chart.r)))
+    return XiRange(tuple(_interval(chart, start, k) for k in range(chart.r)), chart.turn_shifts)
 
 
 def too_far(chart: "Chart", q: Array, wanted: Array) -> str:

@@ -134,6 +134,7 @@ def _report(motion: JointMotion, seconds: float, out: Path) -> dict[str, Any]:
         "period": motion.period,
         "time_stamps": len(motion.times),
         "closed": motion.closed,
+        "left_over": None if motion.left_over is None else motion.left_over.tolist(),
         "xi": {
             label: [float(values.min()), float(values.max())]
             for label, values in zip(motion.labels[-r:], motion.xi.T, strict=True)

@@ -53,7 +53,7 @@ _OF_CORRECTION = {  # and of those whose memory is a torque
     "learn_from_start": "  if (command != 0 && all_finite(command, N)) state->fresh = 2;\n",
 }
 _TURNS = """ * Joints that turn without end count from the centre of the domain, so q and q + 2 pi give the same
- * command. The law under supervision counts them from the last measurement, so nothing jumps where they have turned half a turn.
+ * command. The law under supervision counts them from the last measurement, so nothing jumps at half a turn.
 """
 _ORDER = "{0}catch_margin < {0}near_margin && {0}near_margin < {0}return_margin && {0}return_margin < 1.0".format(
     "safety->"

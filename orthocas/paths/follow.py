@@ -46,6 +46,7 @@ _TO_FULL_SPEED = 0.5  # [s] that a joint takes to its velocity limit with the de
 _STRETCHES, _MARGIN = 20, 1.001  # how often time is stretched, and a little more than needed
 _INSTANTS = 2001  # at which the limits are kept besides
 _MOST_STAMPS = 1_000_000
+_RETURNS = 1e-8  # of phi, relative to its sizes: a path ends where it began
 
 
 @dataclass(frozen=True, eq=False)
@@ -472,7 +473,8 @@ def _on_stamps(plan: Plan, curve: JointCurve, law: TimeLaw, limits: Limits, peri
         raise SolveError("no speed along the path keeps the limits at all time stamps")
     x, xi = plan.x(s), plan.xi(s)
     names = limits.chart.labels, limits.chart.problem.robot.joint_names
-    return JointMotion(*names, times, q, dq, ddq, x, xi, s, plan.closed, limits.margins(q, dq, ddq))
+    over = limits.chart.left_over(q[0], q[-1], _RETURNS)
+    return JointMotion(*names, times, q, dq, ddq, x, xi, s, over, limits.margins(q, dq, ddq))
 
 
 def _motion(curve: JointCurve, law: TimeLaw, times: Array) -> tuple[Array, Array, Array, Array]:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _HEAD = "time_s"  # first column of our files
+_CLOSED = 1e-6  # [rad] or [m]; what a closed loop leaves over is rounding
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class JointMotion(Shown):
     x: Array  #: (N, m) task values
     xi: Array  #: (N, r)
     s: Array  #: (N,) parameter of the path, from 0 to 1
-    closed: bool  #: whether the last joint position is the first one
+    left_over: Array | None  #: (n,) what the path leaves over in the joints, see `Chart.left_over`; None: it is open
     margins: Margins
 
     def __post_init__(self) -> None:
@@ -54,6 +55,24 @@ class JointMotion(Shown):
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("q", "dq", "ddq"), (N, n))
         for name, shape in {**shapes, "times": (N,), "s": (N,), "x": (N, m), "xi": (N, n - m)}.items():
             object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
+        if self.left_over is not None:
+            object.__setattr__(self, "left_over", frozen_array("left_over", self.left_over, (n,)))
+
+    @property
+    def closed(self) -> bool:
+        """Whether x, xi and the joints end where they began, joints that turn without end up to full turns."""
+        return self.left_over is not None and bool(np.abs(self.left_over).max() < _CLOSED)
+
+    @property
+    def kind(self) -> str:
+        """Open, closed, or around a turn: then x and xi come back and the joints do not."""
+        if self.left_over is None or self.closed:
+            return f"{'closed' if self.closed else 'open'} path"
+        k = int(np.argmax(np.abs(self.left_over)))
+        return (
+            "path around a turn: x and xi end where they began, "
+            f"joint '{self.joint_names[k]}' {self.left_over[k]:.4g} away"
+        )
 
     @property
     def duration(self) -> float:
@@ -69,10 +88,9 @@ class JointMotion(Shown):
         """Length, what moves, and what is left to the limits."""
         kept, r = self.margins, self.xi.shape[1]
         ranges = zip(self.labels[-r:], self.xi.min(axis=0), self.xi.max(axis=0), strict=True)
-        kind = "closed" if self.closed else "open"
         near = f" (joint '{kept.boundary_joint}')" if kept.boundary_joint else ""
         return {
-            "motion": f"{self.duration:.4g} s in {len(self.times)} time stamps, {kind} path",
+            "motion": f"{self.duration:.4g} s in {len(self.times)} time stamps, {self.kind}",
             "coordinates": listed(f"{label} from {low:.4g} to {high:.4g}" for label, low, high in ranges),
             "boundary": f"{kept.boundary:.3g} half-widths away{near}",
             "speed": f"{100 * kept.velocity:.3g} % of the limits, acceleration {100 * kept.acceleration:.3g} %",

@@ -28,8 +28,8 @@ class Corridor(Box):
     The path consists of the straight lines between successive postures. A joint with an infinite radius does not count.
     `corridor_problem` finds out which joints need not count, and builds the box.
 
-    A chart of a corridor has one xi, so it closes every loop inside. Its leak grows with the radius, hardly with the
-    length of the path.
+    A chart of a corridor has one xi, so it closes every loop inside that can be shrunk to a point there. Its leak grows
+    with the radius, hardly with the length of the path.
 
     Args:
         box: a box; the corridor is that part of it.

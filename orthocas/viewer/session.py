@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.self_motion import Stop, StopKind, Walls, fan_along
+from orthocas.charts.self_motion import Stop, Walls, fan_along
 from orthocas.charts.solutions import TrackerStatus
 from orthocas.errors import InvalidValueError
 from orthocas.robots.robot import Robot
