@@ -11,6 +11,7 @@ from orthocas.charts.solutions import TrackerStatus
 from orthocas.errors import InvalidValueError
 from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import Branches
+from orthocas.tasks.domains import StopKind
 from orthocas.tools.checks import Array, as_number, as_point, require_kind, require_known
 from orthocas.viewer.panel import Readers, Readings
 
