@@ -120,7 +120,7 @@ def test_a_stream_towards_a_place_outside_ends_inside_the_boundary(
     reference, arm = begun(supervisor, chart, domain.centre), Arm(chart.problem.robot, domain.centre)
     target = reference[:3] + 3.0 * chart.jacobian(domain.centre) @ (domain.half_width * np.array([1.0, 0.2, -0.3]))
     for _ in range(5000):
-        supervisor.stream(reference, target, 4.0, TICK)
+        assert supervisor.stream(reference, target, 4.0, TICK) is ControlStatus.NEAR_BOUNDARY  # it stops before
         command, status = supervisor.step(arm.q, arm.dq, reference, TICK)
         arm.move(command)
         assert status in (ControlStatus.OK, ControlStatus.SATURATED, ControlStatus.NEAR_BOUNDARY)
@@ -128,7 +128,7 @@ def test_a_stream_towards_a_place_outside_ends_inside_the_boundary(
     assert 0.08 < room < 0.12  # return_margin is 0.1
     home = chart.phi(domain.centre)
     for _ in range(9000):  # and comes back
-        supervisor.stream(reference, home, 4.0, TICK)
+        assert supervisor.stream(reference, home, 4.0, TICK) is ControlStatus.OK
         command, status = supervisor.step(arm.q, arm.dq, reference, TICK)
         arm.move(command)
     np.testing.assert_allclose(arm.q, domain.centre, atol=1e-3)

@@ -93,7 +93,10 @@ class Supervisor:
     def stream(
         self, reference: Array | ChartReference, target: ArrayLike, omega: float, period: float = 1e-3
     ) -> ControlStatus:
-        """Move a reference by one tick towards a target (k,), with poles at omega [1/s]; the status."""
+        """Move a reference by one tick towards a target (k,), with poles at omega [1/s]; the status.
+
+        OK, NEAR_BOUNDARY if the target lies beyond the boundary, so that the stream stops before it, or NOT_FINITE.
+        """
         numbers, asked = self._asked(reference)
         wanted, speed, time = (
             self._numbers("target", target, self._k),
