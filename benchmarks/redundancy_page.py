@@ -145,7 +145,8 @@ def not_run(result: Mapping[str, Any]) -> str:
     for row in rows_of(result, result["seeds"]):
         if not row.cases:
             reasons.setdefault(row.why, []).append(row.method)
-    return "Not run: " + ", ".join(f"{' and '.join(names)} ({why})" for why, names in reasons.items()) + "."
+    told = ", ".join(f"{' and '.join(names)} ({why})" for why, names in reasons.items())
+    return f"Not run: {told}." if told else "All methods ran."
 
 
 def picture(scenario: Scenario, result: Mapping[str, Any]) -> Figure:

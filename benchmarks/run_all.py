@@ -27,8 +27,6 @@ SCRIPTS = (
     "certificates",
     "wide_certificates",
     "one_to_one",
-    "atlas",
-    "atlas_c",
     "suggested_domains",
     "many_joints",
     "priorities",

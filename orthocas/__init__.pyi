@@ -11,13 +11,6 @@ from orthocas import problems as problems
 from orthocas import simulation as simulation
 from orthocas import solvers as solvers
 from orthocas import viewer as viewer
-from orthocas.atlas.atlas import Atlas as Atlas
-from orthocas.atlas.atlas import AtlasPart as AtlasPart
-from orthocas.atlas.building import build_atlas as build_atlas
-from orthocas.atlas.chart_along import chart_along as chart_along
-from orthocas.atlas.coverage import Coverage as Coverage
-from orthocas.atlas.coverage import evaluate_atlas as evaluate_atlas
-from orthocas.atlas.plan import AtlasSettings as AtlasSettings
 from orthocas.bases.circle import Circle as Circle
 from orthocas.bases.cyclic import cyclic_joints as cyclic_joints
 from orthocas.bases.given import SEW as SEW
@@ -53,7 +46,6 @@ from orthocas.exact.involutivity import involutivity as involutivity
 from orthocas.exact.involutivity import lie_bracket as lie_bracket
 from orthocas.fitting.compare import Comparison as Comparison
 from orthocas.fitting.compare import compare as compare
-from orthocas.fitting.corridor_problem import corridor_problem as corridor_problem
 from orthocas.fitting.distil import distil as distil
 from orthocas.fitting.fit import Fit as Fit
 from orthocas.fitting.fit import fit as fit
@@ -63,6 +55,8 @@ from orthocas.fitting.terms import Weights as Weights
 from orthocas.fitting.terms import register_loss_term as register_loss_term
 from orthocas.fitting.wide import WideFit as WideFit
 from orthocas.fitting.wide import fit_wide as fit_wide
+from orthocas.paths.chart_along import chart_along as chart_along
+from orthocas.paths.chart_along import corridor_problem as corridor_problem
 from orthocas.paths.follow import follow as follow
 from orthocas.robots import obstacles as obstacles
 from orthocas.robots.robot import Robot as Robot

@@ -214,10 +214,6 @@ class ChartFileError(ArchiveError):
     """A chart file is missing, truncated, edited, not a chart file, or from a newer version."""
 
 
-class AtlasFileError(ArchiveError):
-    """An atlas file is missing, truncated, edited, not an atlas file, from a newer version, or of another build."""
-
-
 class StepsFileError(OrthocasError, ValueError):
     """A steps file is missing, is not valid JSON, or contains invalid steps."""
 

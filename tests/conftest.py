@@ -12,7 +12,6 @@ import json
 import signal
 import sys
 import threading
-from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
 from pathlib import Path
 
@@ -23,7 +22,6 @@ from charts import with_metric
 from matplotlib.figure import Figure
 from paper import FIGURES, Drawing
 from paper.__main__ import main as draw_paper
-from planar_atlas import built
 from programs import Run
 from simulate_command import SHORT
 
@@ -149,30 +147,6 @@ def arm_chart() -> oc.Chart:
     problem = oc.problems.get("iiwa")
     inertial = with_metric(problem, "inertia")
     return oc.fit(inertial, oc.Polynomial(2), samples=1000).chart
-
-
-@pytest.fixture(scope="session")
-def way_atlas(planar_x: oc.Problem, tmp_path_factory: pytest.TempPathFactory) -> oc.Atlas:
-    """Charts of the planar arm, A = M, around a way that leads through several of them."""
-    path = tmp_path_factory.mktemp("atlas") / "arm.orthocas-atlas"
-    asked = oc.AtlasSettings(degree=2, leak_deg=14.0, half_width=0.6, splits=4)
-    way = np.linspace([0.6, 2.6, 0.9], [0.6, 3.6, -0.9], 40)
-    with ThreadPoolExecutor(1) as executor:
-        problem = with_metric(planar_x, "inertia")
-        return oc.build_atlas(problem, path, asked, region=way, radius=0.5, executor=executor)
-
-
-@pytest.fixture(scope="session")
-def planar_atlas(tmp_path_factory: pytest.TempPathFactory) -> oc.Atlas:
-    """The whole joint range of the planar arm, A = I."""
-    return built(tmp_path_factory.mktemp("atlas") / "arm.orthocas-atlas")
-
-
-@pytest.fixture(scope="session")
-def covered(planar_atlas: oc.Atlas) -> Array:
-    """Positions that have a chart of it."""
-    q = np.random.default_rng(7).uniform(-np.pi, np.pi, (500, 3))
-    return np.asarray(q[planar_atlas.chart_at(q) >= 0])
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, is_dataclass, replace
 from enum import Enum
 from functools import cache, singledispatch
@@ -165,23 +164,6 @@ def generated_c() -> Any:
 
 
 @cache
-def atlas() -> oc.Atlas:
-    """Two joints of a planar arm around one posture. Its file lasts as long as this process."""
-    known = problems.get("planar_3r_xy")
-    problem = oc.Problem(known.robot, known.task, domain=known.domain)
-    asked = oc.AtlasSettings(degree=2, leak_deg=8.0, half_width=0.5, splits=4)
-    _folders.append(TemporaryDirectory())
-    path = Path(_folders[-1].name) / "arm.orthocas-atlas"
-    with ThreadPoolExecutor(1) as executor:
-        return oc.build_atlas(problem, path, asked, executor=executor, **AROUND)
-
-
-_folders: list[TemporaryDirectory[str]] = []
-AROUND: dict[str, Any] = {"region": [[0.0, 0.9, 0.9]], "radius": 0.3}  #: what the atlas covers
-IN_ATLAS = np.array([0.0, 0.9, 0.9])  #: a covered posture
-
-
-@cache
 def branches() -> oc.Branches:
     return oc.branches(problems.get("iiwa").robot)
 
@@ -241,10 +223,6 @@ CONTROLLERS: dict[str, Callable[[], Controller]] = {
 OBJECTS: dict[str, Callable[[], Any]] = {
     **CHARTS,
     **CONTROLLERS,
-    "atlas": atlas,
-    "part of an atlas": lambda: oc.AtlasPart.whole(atlas()),
-    "settings of an atlas": oc.AtlasSettings,
-    "coverage": lambda: oc.evaluate_atlas(atlas(), 200),
     "certificate": certificate,
     "card of a ready chart": lambda: oc.charts.card("ur5-position"),
     "fit": fitted,
@@ -376,17 +354,6 @@ def _of_chart(chart: oc.Chart) -> Iterator[Any]:
     yield chart.inverse(phi[known], q[known] + 1e-3)
     if not isinstance(chart, oc.GrownChart):
         yield from (np.asarray(chart.function(name)(q[0])) for name in ("xi", "phi", "jacobian"))
-
-
-@_numbers.register
-def _of_atlas(atlas: oc.Atlas) -> Iterator[Any]:
-    q = np.array([[0.0, 0.9, 0.9], [1.0, 0.7, 1.1], [0.0, -2.0, 0.9]])
-    yield from (atlas.chart_at(q), atlas.xi(q), atlas.jacobian(q), atlas.chart(0).xi(q[0]), str(atlas.as_dict()))
-
-
-@_numbers.register
-def _of_part(part: oc.AtlasPart) -> Iterator[Any]:
-    yield from (part.charts, str(part))
 
 
 @_numbers.register

@@ -21,7 +21,7 @@ MODULES = {name.removesuffix(".__init__"): path for name, path in SOURCES.items(
 FACES = ("orthocas.__main__", "orthocas.plotting")  # what nothing else may import
 ORDER = (  # packages import what stands before them, and nothing else
     *("errors", "version", "tools", "solvers", "robots", "tasks", "bases", "exact", "charts", "certificates"),
-    *("control", "paths", "learn", "codegen", "simulation", "fitting", "problems", "viewer", "cli", "atlas"),
+    *("control", "learn", "codegen", "simulation", "fitting", "paths", "problems", "viewer", "cli"),
 )
 
 
@@ -153,15 +153,14 @@ def test_domains_answer_for_themselves() -> None:
         if package(name) != "tasks" and any(isinstance(n, ast.Name) and n.id in kinds for n in ast.walk(tree(path)))
     }
     assert known - {"orthocas.charts.regular_part"} == {  # a kind that is defined above the coordinates that it needs
-        "orthocas.atlas.box_fit",
-        "orthocas.fitting.corridor_problem",
         "orthocas.fitting.fit",
+        "orthocas.paths.chart_along",
         "orthocas.problems.planar",
     }
 
 
 def test_modules_are_not_named_by_strings() -> None:
-    """But for commands, which are imported when they are called; plug-ins are named in pyproject.toml."""
+    """But for commands, which are imported when they are called."""
     named = {
         name for name, path in SOURCES.items() if re.search(r"""import_module\(f?["']orthocas""", path.read_text())
     }

@@ -207,3 +207,26 @@ def test_command_line_fits_along_postures(run: Run) -> None:
     code, _, err = run("fit", "planar_3r_xy", "--radius", "0.2")
     assert code == 2
     assert "--radius requires --corridor" in err
+
+
+@pytest.mark.slow
+def test_one_chart_along_a_path_closes_a_loop_that_the_pseudo_inverse_leaves_open() -> None:
+    known, start = problems.get("planar_3r_xy"), np.array([0.6, 0.8, 0.8])
+    problem = oc.Problem(known.robot, known.task, domain=known.domain)  # A = I, so least-norm steps are horizontal
+    task, turn = problem.task, np.linspace(0, 2 * np.pi, 200)
+    path = task.batched(start[None])[0][0] + 0.4 * np.column_stack([np.cos(turn) - 1, np.sin(turn)])
+    postures = [start]
+    for x in path[1:]:  # the path of least-norm steps
+        q = postures[-1]
+        for _ in range(5):
+            J = task.batched_jacobian(q[None])[0].reshape(2, 3)
+            q = q + np.linalg.pinv(J) @ (x - task.batched(q[None])[0][0])
+        postures.append(q)
+    assert np.abs(postures[-1] - start).max() > 1e-3
+    chart = oc.chart_along(problem, postures, radius=0.3)
+    q, xi = start, chart.xi(start)
+    for x in path:
+        q = chart.inverse(np.concatenate([x, xi]), q_start=q)
+    assert np.abs(q - start).max() < 1e-9
+    assert chart.problem.domain.contains(np.array(postures)).all()
+    assert oc.evaluate(chart, samples=2000).leak.rms < 2.0  # degrees

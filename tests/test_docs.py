@@ -72,16 +72,9 @@ def test_python_blocks_of_the_page_on_domains_run(tmp_path: Path) -> None:
     parts = blocks("python", "how-to/domains.md")
     printed = printed_here("\n".join(parts), tmp_path).splitlines()
     assert printed[0].startswith("DomainSuggestion: half-width 3.142")
-    assert printed[-2] == "('q1',) True"
-    assert 0.81 < float(printed[-1]) < 0.84  # the share of the box that is clear
-
-
-@pytest.mark.slow
-def test_python_blocks_of_the_page_on_atlases_run(tmp_path: Path) -> None:
-    corridor, code = blocks("python", "how-to/atlas.md")
-    (tmp_path / "program.py").write_text(code)  # processes start by importing it
-    assert output_of(sys.executable, "program.py", folder=tmp_path).splitlines() == ["('x', 'y', 'xi1') (1,)", "1.0"]
-    assert printed_here(corridor, tmp_path) == "True True\n"
+    assert printed[-3] == "('q1',) True"
+    assert 0.81 < float(printed[-2]) < 0.84  # the share of the box that is clear
+    assert printed[-1] == "True True"  # along a path
 
 
 @pytest.mark.slow

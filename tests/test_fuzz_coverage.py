@@ -40,15 +40,13 @@ def commands_of(app: typer.Typer, before: str = "") -> set[str]:
 
 def test_every_command_belongs_to_the_campaign_of_commands() -> None:
     tested = {" ".join(word for word in line.split() if not word.startswith("-")) for line in _COMMANDS}
-    missing = {name for words in ([], ["atlas"]) for name in commands_of(app_for(words)) if name != "atlas"}
+    missing = commands_of(app_for([]))
     missing -= {name for name in missing if any(line == name or line.startswith(f"{name} ") for line in tested)}
     assert missing == set()
 
 
 def test_every_command_is_stopped_by_signals() -> None:
-    wanted = {name for words in ([], ["atlas"]) for name in commands_of(app_for(words)) if name != "atlas"}
-    stopped = {words[0] if words[0] != "atlas" else " ".join(words[:2]) for words in signals.COMMANDS.values()}
-    assert {name for name in wanted if name not in stopped} == set()
+    assert commands_of(app_for([])) <= {words[0] for words in signals.COMMANDS.values()}
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 """A quick part of the campaigns of files: dozens of mutants a kind. `make fuzz` runs as many as you like."""
 
 import pytest
-from fuzz.atlases import atlases
 from fuzz.certificates import certificates
 from fuzz.charts import charts
 from fuzz.checkpoints import checkpoints
@@ -11,11 +10,6 @@ from fuzz.paths import logs, paths, postures
 from fuzz.runs import runs
 from fuzz.steps import steps
 from programs import needs_c
-
-
-@pytest.mark.slow
-def test_mutated_atlases_are_usable_or_refused_in_one_line() -> None:
-    assert atlases(50) == []
 
 
 @pytest.mark.slow

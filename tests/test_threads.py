@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from programs import needs_c
 from public_objects import (
-    atlas,
     circle,
     disk,
     fitted,
@@ -29,7 +28,6 @@ from public_objects import (
 
 import orthocas as oc
 from orthocas import solvers
-from orthocas.atlas import atlas as atlas_module
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.control import Controller
 from orthocas.simulation import MuJoCoPlant, simulate
@@ -86,32 +84,18 @@ def calls_of_law(law: Controller) -> list[Call]:
     return [command]
 
 
-def calls_of_atlas(atlas: oc.Atlas) -> list[Call]:
-    """An atlas at positions in different charts."""
-    q = np.array([0.0, 0.9, 0.9]) + np.random.default_rng(8).uniform(-0.25, 0.25, (12, 3))
-    charts = atlas.chart_at(q)
-    return [
-        lambda k: atlas.chart_at(q[k % 12 :]),
-        lambda k: atlas.xi(q[k % 12 :]),
-        lambda k: atlas.jacobian(q[k % 12]),
-        lambda k: atlas.chart(int(charts[k % 12]), q[k % 12]).phi(q[k % 12]),
-    ]
-
-
 SERIES: dict[str, tuple[Callable[[], list[Call]], int]] = {  #: of 5,000 calls
     "polynomial": (lambda: calls_of_chart(copy.deepcopy(fitted().chart)), 2400),
     "network": (lambda: calls_of_chart(copy.deepcopy(network())), 1200),
     "circle": (lambda: calls_of_chart(copy.deepcopy(circle())), 60),
     "disk": (lambda: calls_of_chart(copy.deepcopy(disk())), 40),
-    "atlas": (lambda: calls_of_atlas(copy.deepcopy(atlas())), 400),
     "law": (lambda: calls_of_law(copy.deepcopy(impedance())), 1300),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SERIES)
-def test_threads_share(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(atlas_module, "_KEPT", 2)  # charts of an atlas that stay built
+def test_threads_share(name: str) -> None:
     build, count = SERIES[name]
     calls = build()
     expected = [calls[k % len(calls)](k) for k in range(12 * len(calls))]  # after that they repeat

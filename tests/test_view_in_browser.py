@@ -201,17 +201,3 @@ def test_blocks_of_the_page_on_views_run(run: Run, tmp_path: Path) -> None:
     code_, out, err = run(*export.split()[1:])
     assert (code_, err) == (0, "")
     assert out.startswith("page  page.html\nsize ")
-
-
-def test_sliders_lead_through_an_atlas(page: Page, planar_atlas: oc.Atlas) -> None:
-    with oc.view(planar_atlas, port=0) as view:
-        opened(page, view.url)
-        shown = "document.querySelector('.oc .about').textContent"
-        first = page.value(shown)
-        to_the_end(page, 0)
-        page.wait(f"{shown} !== {first!r}")
-        page.wait(f"({button('Undo')}).disabled === false")
-        number = int(re.findall(r"chart (\d+) of 56", page.value(shown))[0])
-        q = np.array([page.value(NUMBERS)[name] for name in planar_atlas.problem.robot.joint_names])
-        assert planar_atlas.box(number, near=q).contains(q)
-        assert page.value(NUMBERS)["drift"] <= 1e-6

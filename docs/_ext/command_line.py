@@ -10,7 +10,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 from typer.main import get_command
 
-from orthocas.cli.commands import app_for, helped
+from orthocas.cli.commands import COMMANDS, app_for
 
 OPTION = re.compile(r"(--[a-z][a-z-]*)")
 
@@ -53,7 +53,7 @@ class CommandLine(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """Called by Sphinx for the directive."""
-        program = get_command(app_for(list(helped())))
+        program = get_command(app_for(list(COMMANDS)))
         texts = [described(name, command) for name, command in leaves(program, "orthocas")]
         return self.parse_text_to_nodes("\n".join(texts), allow_section_headings=True)
 

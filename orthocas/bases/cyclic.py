@@ -49,24 +49,11 @@ def cyclic_joints(problem: Problem) -> tuple[str, ...]:
         (('q1',), ())
     """
     require_kind("problem", problem, Problem)
-    return _cyclic(problem, 2)
-
-
-def leaf_cyclic_joints(problem: Problem) -> tuple[str, ...]:
-    """Names of the joints at whose position A and the leaves do not depend, also if the size of task gradients does.
-
-    Such as the first and the last joint for the pose of a tool, with gradients as in `atlases.local_task.LocalTask`.
-    """
-    return _cyclic(problem, 1)
-
-
-def _cyclic(problem: Problem, invariants: int) -> tuple[str, ...]:
-    """Joints at whose position A and the first of `_invariants` do not depend."""
     points = sample_uniform(problem.domain, _SAMPLES, _SEED)
     points = points[is_regular(problem, points)]
     names = problem.robot.joint_names
     driven = (k for k in range(problem.n) if k not in problem.robot.tree.floating)
-    sampled = (k for k in driven if len(points) and _is_cyclic(problem, points, k, invariants))
+    sampled = (k for k in driven if len(points) and _is_cyclic(problem, points, k))
     return tuple(names[k] for k in sampled if leaves_stay(problem, k))
 
 
@@ -100,7 +87,7 @@ def _range(problem: Problem, k: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _is_cyclic(problem: Problem, points: Array, k: int, invariants: int) -> bool:
+def _is_cyclic(problem: Problem, points: Array, k: int) -> bool:
     """Whether nothing that matters changes when joint k moves."""
     robot, (low, high) = problem.robot, _range(problem, k)
     if robot.tree.prismatic[k] and np.isinf([robot.lower[k], robot.upper[k]]).any():
@@ -115,7 +102,7 @@ def _is_cyclic(problem: Problem, points: Array, k: int, invariants: int) -> bool
     if not (np.isfinite(J_there).all() and np.isfinite(A_there).all() and _same(A, A_there)):
         return False
     try:
-        pairs = zip(_invariants(J, A)[:invariants], _invariants(J_there, A_there)[:invariants], strict=True)
+        pairs = zip(_invariants(J, A), _invariants(J_there, A_there), strict=True)
         return all(_same(*pair) for pair in pairs)
     except np.linalg.LinAlgError:  # the task loses rank where the joint moves
         return False

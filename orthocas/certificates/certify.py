@@ -110,15 +110,6 @@ def certify(
     return so_far()
 
 
-def folds_nowhere(chart: Chart, time_limit: float) -> bool:
-    """Whether a processor time [s] is enough to prove that a chart does not fold. No one-to-one box is looked for."""
-    base, limits = whole_domain(chart.problem.domain), Limits(time_limit, time.thread_time)
-    search = Search(judge_of(chart, chart_rows(chart), 0.0), base, limits, largest_first(base))
-    search.visit(_suspects(chart))
-    search.run(lambda _: None)
-    return search.finished
-
-
 def certified_box(
     chart: Chart,
     bound: float = 0.0,

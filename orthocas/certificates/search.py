@@ -31,7 +31,6 @@ class Limits:
     """When a search ends before all is proved."""
 
     seconds: float = np.inf
-    clock: Callable[[], float] = time.monotonic  #: of the seconds
     boxes: int = MOST_BOXES // 4
     smallest: float = 2.0**-12  #: share of the width of the whole below which a joint's interval is not halved
     first_failure: bool = False  #: whether boxes that rank behind one that is too small to halve do not matter
@@ -76,12 +75,11 @@ class Search:
 
     def run(self, look: Look) -> None:
         """Search until all is proved, a fold is found, or a limit is reached. An interrupted search keeps its state."""
-        clock = self.limits.clock
-        end = clock() + self.limits.seconds
+        end = time.monotonic() + self.limits.seconds
         pending: dict[Future[Verdicts], list[tuple[float, int, Array, Array]]] = {}
         try:
             while self._waiting or pending:
-                if self._decided or clock() > end or self.judged >= self.limits.boxes or self._hopeless:
+                if self._decided or time.monotonic() > end or self.judged >= self.limits.boxes or self._hopeless:
                     break
                 self._step(pending)
                 look(self)

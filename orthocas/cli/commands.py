@@ -2,17 +2,15 @@
 
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from orthocas.cli.entry import INTERRUPTED
 from orthocas.errors import OrthocasError, one_line
 from orthocas.tools.interrupts import ended_in_order, remembered
-from orthocas.tools.plugins import plug_ins
 from orthocas.version import VERSION
 
-_GROUP = "orthocas.commands"
 COMMANDS = {
     "demo": "Fit coordinates for the 7-DoF arm of the paper, print their quality, save a chart and pictures (10 s).",
     "fit": "Fit extra coordinates to a problem and save the chart.",
@@ -24,15 +22,9 @@ COMMANDS = {
     "follow": "Follow a tool path; write joint positions, velocities and accelerations on time stamps.",
     "codegen": "Write a chart, the robot's dynamics, the inverse map and a controller as C99.",
     "export": "Write task, xi, phi, Jacobian and inverse of a chart as one Python module that needs the library only.",
-    "view": "Show a chart, an atlas, a robot or a motion in the browser, until Ctrl-C.",
+    "view": "Show a chart, a robot or a motion in the browser, until Ctrl-C.",
     "charts": "List the ready charts of known arms, show the card of one, or write it to a file.",
-}  #: names of our own commands, modules of this package, and the first lines of their help
-
-
-def helped() -> dict[str, str]:
-    """The first line of the help of every command, those of plug-ins last."""
-    added = {name: (make.__doc__ or "").partition("\n")[0] for name, make in plug_ins(_GROUP).items()}
-    return COMMANDS | added
+}  #: names of the commands, modules of this package, and the first lines of their help
 
 
 def app_for(words: Sequence[str]) -> typer.Typer:
@@ -46,20 +38,10 @@ def app_for(words: Sequence[str]) -> typer.Typer:
         rich_markup_mode=None,
     )
     app.callback()(_options)
-    for name, summary in helped().items():
-        command = _command(name) if name in words else _idle
-        if isinstance(command, typer.Typer):
-            app.add_typer(command, name=name)
-        else:
-            app.command(name, help=None if name in words else summary)(command)
+    for name, summary in COMMANDS.items():
+        command = getattr(import_module(f"{__package__}.{name}"), name) if name in words else _idle
+        app.command(name, help=None if name in words else summary)(command)
     return app
-
-
-def _command(name: str) -> Any:
-    """One of our own commands, or that of a plug-in."""
-    if name in COMMANDS:
-        return getattr(import_module(f"{__package__}.{name}"), name)
-    return plug_ins(_GROUP)[name]()
 
 
 def _say_version(wanted: bool) -> None:

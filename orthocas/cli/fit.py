@@ -29,8 +29,6 @@ from orthocas.cli.problem_argument import (
     WEIGHTS_TEXT,
     AnglesName,
     BranchName,
-    CorridorPath,
-    CorridorRadius,
     DomainText,
     LikeName,
     PrecisionName,
@@ -38,7 +36,7 @@ from orthocas.cli.problem_argument import (
     ProblemOptions,
     SampleCount,
     WeightsText,
-    corridor_or_box,
+    build_problem,
     parse_weights,
     suggested,
     wide_fit,
@@ -51,6 +49,8 @@ from orthocas.fitting.probe import Bounds
 from orthocas.fitting.settings import PRECISIONS, Precision, default_parametrisation
 from orthocas.fitting.suggest_domain import CONDITIONING, LEAK_DEG, DomainSuggestion
 from orthocas.fitting.wide import WideFit
+from orthocas.paths.chart_along import RADIUS, corridor_problem
+from orthocas.robots.homes import read_postures
 from orthocas.solvers import get as get_solver
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.problem import Problem
@@ -85,8 +85,18 @@ def fit(
     domain: DomainText = None,
     branch: BranchName = None,
     like: LikeName = None,
-    corridor: CorridorPath = None,
-    radius: CorridorRadius = None,
+    corridor: Annotated[
+        Path | None,
+        typer.Option(
+            "--corridor",
+            metavar="POSTURES.csv",
+            help="Domain: the surroundings of a path of postures, one a line, with the joint names in the first line.",
+        ),
+    ] = None,
+    radius: Annotated[
+        float | None,
+        typer.Option("--radius", parser=number, help=f"Of the corridor [rad]; default {RADIUS:g}."),
+    ] = None,
     leak_deg: Annotated[
         float | None, typer.Option("--leak-deg", parser=number, help="Largest leak for --domain auto [deg]; default 8.")
     ] = None,
@@ -130,7 +140,7 @@ def fit(
         usual_loss = weights == WEIGHTS_TEXT and angles is None and precision == PRECISIONS[0]
         _require_none({"solver": solver, "max-mutual-deg": max_mutual_deg, "checkpoint": checkpoint})
         _require_none({"weights, --angles and --precision": None if usual_loss else weights})
-    built = corridor_or_box(problem, words, corridor, radius) if bounds is None and not wide else None
+    built = _corridor_or_box(problem, words, corridor, radius) if bounds is None and not wide else None
     target = out or Path(f"{Path(problem).stem if built is None else built.name}.orthocas")
     require_free(target, CHART, force)
     param = _IN_CORRIDOR if param is None and corridor is not None else param
@@ -188,6 +198,24 @@ def _confirming(
     if suggestion is None or (parametrisation is None and not default):
         return None
     return replace(suggestion.fit, chart=replace(suggestion.fit.chart, problem=built))
+
+
+def _corridor_or_box(name: str, options: ProblemOptions, path: Path | None, radius: float | None) -> Problem:
+    """The problem of a command line, near the postures of a file if one is given.
+
+    Raises:
+        OrthocasError: if anything does not fit together.
+    """
+    if path is None:
+        if radius is not None:
+            raise OptionError("--radius requires --corridor")
+        return build_problem(name, options)
+    for option in ("centre", "home", "half_width", "least_singular_value"):
+        value = getattr(options, option)
+        if value is not None:
+            raise OptionError(f"--corridor is a domain: leave out --{option.replace('_', '-')}")
+    known = build_problem(name, options)
+    return corridor_problem(known, read_postures(path, known.robot), RADIUS if radius is None else radius)
 
 
 def _bounds(

@@ -12,12 +12,10 @@ from orthocas import problems
 from orthocas.bases.family import Parametrisation
 from orthocas.cli.output import number, spread, whole_number
 from orthocas.errors import InvalidValueError, OptionError, UnknownNameError
-from orthocas.fitting.corridor_problem import RADIUS, corridor_problem
 from orthocas.fitting.probe import Bounds
 from orthocas.fitting.suggest_domain import DomainSuggestion, suggest_domain
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Angles, Weights
 from orthocas.fitting.wide import CLEARANCE, WideFit, fit_wide
-from orthocas.robots.homes import read_postures
 from orthocas.robots.robot import Robot
 from orthocas.tasks.domains import default_box
 from orthocas.tasks.metric import Metric
@@ -330,35 +328,3 @@ def wide_fit(
         seed=seed,
         monitor=monitor,
     )
-
-
-CorridorPath = Annotated[
-    Path | None,
-    typer.Option(
-        "--corridor",
-        metavar="POSTURES.csv",
-        help="Domain: the surroundings of a path of postures, one a line, with the joint names in the first line.",
-    ),
-]
-CorridorRadius = Annotated[
-    float | None,
-    typer.Option("--radius", parser=number, help=f"Of the corridor [rad]; default {RADIUS:g}."),
-]
-
-
-def corridor_or_box(name: str, options: ProblemOptions, path: Path | None, radius: float | None) -> Problem:
-    """The problem of a command line, near the postures of a file if one is given.
-
-    Raises:
-        OrthocasError: if anything does not fit together.
-    """
-    if path is None:
-        if radius is not None:
-            raise OptionError("--radius requires --corridor")
-        return build_problem(name, options)
-    for option in ("centre", "home", "half_width", "least_singular_value"):
-        value = getattr(options, option)
-        if value is not None:
-            raise OptionError(f"--corridor is a domain: leave out --{option.replace('_', '-')}")
-    known = build_problem(name, options)
-    return corridor_problem(known, read_postures(path, known.robot), RADIUS if radius is None else radius)

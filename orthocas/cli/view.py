@@ -15,7 +15,6 @@ from orthocas.errors import OptionError
 from orthocas.paths.plan import read_path
 from orthocas.robots.robot import Robot
 from orthocas.tools.interrupts import deferred
-from orthocas.tools.plugins import opened
 from orthocas.viewer import view as open_view
 from orthocas.viewer.motion import cyclic_motions, read_joint_motion, read_run
 from orthocas.viewer.view import PORT, View, export_page, require_page
@@ -39,8 +38,8 @@ def view(
     target: Annotated[
         str,
         typer.Argument(
-            metavar="CHART|ATLAS|RUN|FILE.urdf",
-            help="A chart or atlas file; trajectory.npz or folder of simulate; CSV file of follow; robot or problem.",
+            metavar="CHART|RUN|FILE.urdf",
+            help="A chart file; trajectory.npz or folder of simulate; CSV file of follow; robot or problem.",
         ),
     ],
     words: ProblemOptions,
@@ -66,7 +65,7 @@ def view(
     force: Force = False,
     json: AsJson = False,
 ) -> None:
-    """Show a chart, an atlas, a robot or a motion in the browser, until Ctrl-C."""
+    """Show a chart, a robot or a motion in the browser, until Ctrl-C."""
     if export is None:
         require_free(host, port)
     else:
@@ -101,7 +100,7 @@ def _asked(target: str, chart: Path | None, meshes: Path | None, words: ProblemO
         return _Asked(motion, owner, meshes, locked)
     if chart is not None:
         raise OptionError(f"{target} is a chart: leave out --chart")
-    return _Asked(opened(place) or Chart.load(place), None, meshes, locked)
+    return _Asked(Chart.load(place), None, meshes, locked)
 
 
 def _owner(chart: Path | None, meshes: Path | None, words: ProblemOptions) -> Robot | Chart:

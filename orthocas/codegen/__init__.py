@@ -2,13 +2,12 @@
 
 from orthocas.codegen.compiled_inverse import CompiledInverse, compile_inverse
 from orthocas.codegen.generate import generate_c
-from orthocas.codegen.library import ChartReference, CompiledLibrary, GeneratedC, compile_shared, gain_numbers
+from orthocas.codegen.library import CompiledLibrary, GeneratedC, compile_shared, gain_numbers
 from orthocas.codegen.proof import Proof, check_c
 from orthocas.codegen.supervisor import Supervisor
 from orthocas.codegen.ticks import Ticks, control_tick, time_ticks
 
 __all__ = [
-    "ChartReference",
     "CompiledInverse",
     "CompiledLibrary",
     "GeneratedC",

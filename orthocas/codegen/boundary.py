@@ -1,86 +1,23 @@
-"""What C is written from, and the condition of the domain's boundary in C."""
+"""The domain of a chart in C: its bounds, its condition, and how far a position is inside."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from orthocas.charts.chart import Chart
-from orthocas.codegen.description import numbers
-from orthocas.codegen.precision import Precision
+from orthocas.charts.solutions import DESCENTS, INERTIA, KEPT, ZONE
+from orthocas.codegen.description import chart_values, filled, flags, numbers, words
+from orthocas.codegen.precision import Precision, bounds_inside
 from orthocas.control.controller import Controller
-from orthocas.control.safety import Safety
-from orthocas.tasks.domains import Domain, PathBound, SingularBound, sample_uniform
+from orthocas.tasks.domains import Domain, PathBound, SingularBound, bounds_of, contains, reach, sample_uniform
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import scalar_code
 
 _USUAL = 256  # positions of a domain whose median room to a fold is the usual one
-
-
-class Source(Protocol):
-    """A chart or several ones, as templates see them."""
-
-    @property
-    def chart(self) -> Chart:
-        """The chart that kernels and sizes are taken from."""
-        ...
-
-    @property
-    def own_code(self) -> Mapping[str, str]:
-        """C bodies by name of the functions that are written by hand; the number of the chart is `mem`."""
-        ...
-
-    @property
-    def condition(self) -> Domain | None:
-        """The condition of the domain beside its box, if there is one."""
-        ...
-
-    @property
-    def has_nearest(self) -> bool:
-        """Whether the library has the function that goes to the nearest x."""
-        ...
-
-    @property
-    def somewhere(self) -> Array:
-        """A position of the domain at which the library checks itself, (n,)."""
-        ...
-
-    @property
-    def title(self) -> str:
-        """What kind of coordinates."""
-        ...
-
-    def law(self, controller: Controller) -> Controller:
-        """The law on `chart`, for one of the charts; raises InvalidValueError for a law of another chart."""
-        ...
-
-    def safety(self, controller: Controller) -> Safety:
-        """The default settings of the supervised law."""
-        ...
-
-    def law_values(self, controller: Controller, known: Mapping[str, str]) -> dict[str, str]:
-        """Values of the placeholders in the templates of laws that depend on the boundary or on the chart."""
-        ...
-
-    def graph(self, graph: ca.Function) -> ca.Function:
-        """The graph of a law, less the boundary of a domain that C code looks after."""
-        ...
-
-    def stack_bytes(self, size: int) -> int:
-        """Additional use of the stack by functions of the domain and the charts, with numbers of a size [bytes]."""
-        ...
-
-    def values(self, known: Mapping[str, str], precision: Precision) -> dict[str, str]:
-        """Values of the placeholders that describe domain and charts, and of the code that belongs to them.
-
-        Args:
-            known: values of the other placeholders.
-            precision: the number type.
-        """
-        ...
 
 
 @dataclass(frozen=True)
@@ -94,17 +31,94 @@ class BoundaryCondition:
     inwards: str = ""  #: code that brings `inner` inside, before the boundaries of the box do
 
 
-def boundary_condition(source: Source, controller: Controller) -> BoundaryCondition | None:
+def condition_of(chart: Chart) -> Domain | None:
+    """The domain of a chart, if it has a condition beside its box.
+
+    Raises:
+        DomainError: if that condition has no form in C.
+    """
+    domain = chart.problem.domain
+    domain.require_bounds("form in C")
+    return None if domain.is_box else domain
+
+
+def has_nearest(chart: Chart) -> bool:
+    """Whether the library has the function that goes to the nearest x."""
+    domain = chart.problem.domain
+    return domain.is_box or domain.singular_bound is not None
+
+
+def position_within(domain: Domain) -> Array:
+    """A joint position of a domain between its centre and a corner, (n,); of a corridor one on the path."""
+    near = domain.path_bound
+    if near is not None:
+        inside = near.postures[near.contains(near.postures)]
+        return np.asarray(inside[len(inside) // 2])
+    shares = [0.5**k for k in range(1, 20) if contains(domain, domain.centre + 0.5**k * domain.half_width)]
+    return np.round(domain.centre + (shares[0] if shares else 0.0) * domain.half_width, 3)
+
+
+def domain_values(chart: Chart, known: Mapping[str, str], precision: Precision) -> dict[str, str]:
+    """Values of the placeholders that describe the domain, and of the code that belongs to it.
+
+    Args:
+        chart: the chart.
+        known: values of the other placeholders.
+        precision: the number type.
+    """
+    domain, condition = chart.problem.domain, condition_of(chart)
+    lowest, highest = bounds_inside(domain, precision)
+    values = {
+        **chart_values(chart),
+        "domain_lower": numbers(lowest),
+        "domain_upper": numbers(highest),
+        "domain_centre": numbers(domain.centre),
+        "domain_reach": numbers(reach(domain)),
+        "is_clear": "1" if condition is None else "is_clear(q)",
+        "clear_c": "" if condition is None else _condition_code(condition, known),
+        "nearest_h": "",
+        "nearest_c": "",
+    }
+    if has_nearest(chart):
+        _, inwards = chart.reaching
+        size = {"rooms": str(max(1, inwards.size1_out(0))), "m": str(chart.m), "descents": str(DESCENTS)}
+        bounds = {"zone": repr(ZONE), "inertia": repr(INERTIA), "kept": repr(KEPT)}
+        filled_in = {**known, **values, **size, **bounds, "difference_step": precision.difference}
+        values |= {f"nearest_{kind}": filled(f"nearest.{kind}", filled_in) for kind in ("h", "c")}
+    return values
+
+
+def _condition_code(domain: Domain, values: Mapping[str, str]) -> str:
+    """The test of the condition of a domain that has one."""
+    known = domain.condition
+    assert known is not None
+    condition = {"pivots": str(known.pivots.size1_out(0)), "condition": "\n * ".join(words([known.heading]))}
+    return filled("clear.c", {**values, **condition})
+
+
+def bound_values(controller: Controller) -> dict[str, str]:
+    """The boundary of the box, which is none for laws without a chart."""
+    domain = controller.problem.domain
+    lower, upper = bounds_of(domain)
+    bounded = np.isfinite(lower) & np.isfinite(upper) & (controller.chart is not None)
+    return {
+        "domain_half_width": numbers(domain.half_width),
+        "boundary_unit": numbers(_boundary_units(domain)),
+        "bounded": flags(bounded),
+    }
+
+
+def boundary_condition(controller: Controller) -> BoundaryCondition | None:
     """The condition of the law's domain as a part of its boundary, if it has one."""
-    domain = source.condition
-    if controller.chart is None or domain is None:
+    domain = None if controller.chart is None else condition_of(controller.chart)
+    if domain is None:
         return None
     if domain.singular_bound is not None:
         return _clear(domain, domain.singular_bound)
     return None if domain.path_bound is None else _near_path(domain.path_bound)
 
 
-def boundary_units(domain: Domain) -> Any:
+def _boundary_units(domain: Domain) -> Any:
     """What distances to the boundaries of the box count in, (n,): half-widths, or the radius of a corridor if smaller.
 
     A path of a corridor ends one radius before the boundary of its box, which may be many radii wide.

@@ -11,10 +11,9 @@ from numpy.typing import ArrayLike
 from orthocas.charts.chart import Chart
 from orthocas.charts.newton import SUSPICIOUS, Attempt, Newton
 from orthocas.charts.solutions import Solutions
-from orthocas.codegen.chart_source import ChartSource
 from orthocas.codegen.compiled import kept_library, loaded, template
+from orthocas.codegen.generate import generate_c
 from orthocas.codegen.library import STRICT
-from orthocas.codegen.library_files import write_library
 from orthocas.tools.batch import in_threads
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_kind
@@ -99,7 +98,7 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
     """
     require_kind("chart", chart, Chart)
     with draft_folder() as drafts:
-        write_library(ChartSource(chart), drafts, name="arm")
+        generate_c(chart, drafts, name="arm")
         sources = {name: (drafts / name).read_text(encoding="utf-8") for name in ("arm.h", "arm.c")}
     sources[_ROWS] = template(_ROWS)
     return CompiledInverse(chart, kept_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder))

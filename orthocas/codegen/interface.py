@@ -7,7 +7,13 @@ import casadi as ca
 import numpy as np
 
 from orthocas.charts.chart import Chart
-from orthocas.codegen.boundary import BoundaryCondition, Source, boundary_condition
+from orthocas.codegen.boundary import (
+    BoundaryCondition,
+    bound_values,
+    boundary_condition,
+    domain_values,
+    position_within,
+)
 from orthocas.codegen.description import control_values, description_values, filled, flags, numbers, words
 from orthocas.codegen.kernels import Kernels
 from orthocas.codegen.precision import Precision, check_values
@@ -273,7 +279,7 @@ def _literal(value: object) -> str:
 
 
 def template_values(
-    source: Source,
+    chart: Chart,
     controller: Controller | None,
     safety: Safety | None,
     name: str,
@@ -282,13 +288,12 @@ def template_values(
     precision: Precision,
 ) -> dict[str, str]:
     """The values of all placeholders in the templates."""
-    chart = source.chart
-    somewhere = precision.rounded(source.somewhere)
+    somewhere = precision.rounded(position_within(chart.problem.domain))
     joints = words(chart.problem.robot.joint_names)
     values = {
         "name": name,
         "NAME": name.upper(),
-        "title": _title(source, controller),
+        "title": _title(chart, controller),
         "version": VERSION,
         "casadi_version": ca.CasadiMeta.version(),
         **_sizes(chart),
@@ -304,14 +309,14 @@ def template_values(
         "kernels": kernels.code,
         **kernels.sizes(),
     }
-    values |= source.values(values, precision)
+    values |= domain_values(chart, values, precision)
     values["difference"] = filled("turned.c", values) if chart.relative.turned else ""
     if controller is not None and safety is not None:
-        condition = boundary_condition(source, controller)
+        condition = boundary_condition(controller)
         values |= control_values(controller) | _counted_turns(controller, values)
         values |= supervision_values(controller, safety, condition, values)
         values["clearance_c"] = "" if condition is None else _clearance(condition, values)
-        values |= source.law_values(controller, values)
+        values |= bound_values(controller)
         values["compose"] = filled(f"compose_{controller.command}.c", values)
     for template in ("control.h", "control.c", "check_control.c", "control.md", "supervisor.h", "supervisor.c"):
         values[template.replace(".", "_")] = "" if controller is None else filled(template, values)
@@ -345,8 +350,8 @@ def _shortest_way(chart: Chart) -> dict[str, str]:
     return {"turn_table": table, "shortest": plain}
 
 
-def _title(source: Source, controller: Controller | None) -> str:
-    what = source.title if controller is None else f"{controller.name} controller"
-    problem, label = source.chart.problem, source.chart.coordinates.label
+def _title(chart: Chart, controller: Controller | None) -> str:
+    what = "chart" if controller is None else f"{controller.name} controller"
+    problem, label = chart.problem, chart.coordinates.label
     title = f"{what} of {problem.name}: {label}, task {problem.task.name}, metric {problem.metric.name}"
     return words([title])[0]

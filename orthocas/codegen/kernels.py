@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from types import MappingProxyType
 from typing import Any
 
 import casadi as ca
@@ -18,7 +17,6 @@ from orthocas.errors import CompileError
 _VERSION = f"by CasADi {ca.CasadiMeta.version()}"
 _PLACE = re.compile(r"\*w(\d+)=w\+(\d+)")
 _CALL = re.compile(r"\bcasadi_f\d+(?=\(arg1, res1, iw, w, 0\))")
-_HAND_ON = re.compile(r"(?<=\(arg1, res1, iw, w), 0\)")
 # The sweeps of `orthocas.control.linear_algebra`, in place, on the lower triangle. It takes less of `w` than the graph.
 _INVERSE = """{
   casadi_real *a = w, *column = w + SIZE * SIZE, volume = 1.0;
@@ -176,18 +174,17 @@ def _place_sizes(function: ca.Function) -> dict[int, int]:
     return {place: size for place, size in found.items() if place >= 0}
 
 
-def with_own_code(blocks: dict[str, str], functions: list[ca.Function], bodies: Mapping[str, str]) -> dict[str, str]:
-    """C code by name, with that of inverses and of functions with given bodies replaced.
+def with_own_code(blocks: dict[str, str], functions: list[ca.Function]) -> dict[str, str]:
+    """C code by name, with that of inverses and roots replaced.
 
     Args:
         blocks: as in `work_arrays.compacted`.
         functions: as in `work_arrays.compacted`.
-        bodies: C bodies by name of the function. If there are any, calls hand `mem` on.
     """
-    changed = {name: _HAND_ON.sub(", mem)", block) for name, block in blocks.items()} if bodies else dict(blocks)
+    changed = dict(blocks)
     for number, function in enumerate(in_order_of_generation(functions)):
         name = f"casadi_f{number}"
-        body = bodies.get(function.name(), _body(function, blocks[name]))
+        body = _body(function, blocks[name])
         if body is not None:
             changed[name] = blocks[name].split("{", 1)[0] + body
     return changed
@@ -228,21 +225,18 @@ class Kernels:
         return 8 * (arg + res) + number_size * w + 4 * iw
 
 
-def generate_kernels(
-    functions: list[ca.Function], prefix: str, own_code: Mapping[str, str] = MappingProxyType({})
-) -> Kernels:
+def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
     """Generate C99 for functions. Shared code appears once, and unused code is left out.
 
     Args:
         functions: functions with different names.
         prefix: prefix of every C name that the code defines.
-        own_code: C bodies for functions by name, instead of those that CasADi writes; all functions hand `mem` on.
     """
     generator = ca.CodeGenerator("kernels.c", _OPTIONS)
     for function in functions:
         generator.add(function)
     items, doubles = compacted(_definitions(_with_products_of_known_sizes(generator.dump())), functions)
-    items = with_own_code(items, functions, own_code)
+    items = with_own_code(items, functions)
     names = [function.name() for function in functions]
     code = "\n\n".join(_without_warnings(items[name]) for name in _needed(items, names))
     code = re.sub(r"\bcasadi_inf\b", "INFINITY", re.sub(r"\bcasadi_nan\b", "NAN", code))
@@ -339,23 +333,20 @@ def _without_warnings(block: str) -> str:
     return f"{static}{{{silenced}{body}"
 
 
-def with_shared_calls(
-    functions: list[ca.Function], states: Mapping[str, int], kept: Collection[str] = ()
-) -> list[ca.Function]:
+def with_shared_calls(functions: list[ca.Function], states: Mapping[str, int]) -> list[ca.Function]:
     """The same graphs after a graph `shared` of (q, dq), which computes what they call several times for these alone.
 
     Args:
         functions: graphs whose first inputs are joint positions (n, 1).
         states: which graphs share, by name: 1 if only their first input is of the state (q, dq), 2 if the second one is
             dq. They take what `shared` computes as an additional last input.
-        kept: names of called functions that stay as they are.
     """
     sharing = {function.name(): function for function in functions if function.name() in states}
     while True:
         called = [found for name, function in sharing.items() for found in _called_for(function, states[name])]
         times = Counter(hash(function) for function, _ in called)
         several = {key for key, count in times.items() if count > 1}
-        opened = partial(_content, kept=kept, but=several)
+        opened = partial(_content, but=several)
         changed = {name: found for name, function in sharing.items() if (found := _replaced(function, opened))}
         if not changed:
             break
@@ -398,19 +389,18 @@ def _are_first(arguments: list[ca.MX], given: list[ca.MX]) -> bool:
     return len(arguments) <= len(given) and all(hash(a) == hash(b) for a, b in zip(arguments, given, strict=False))
 
 
-def with_turns_once(functions: list[ca.Function], kept: Collection[str] = ()) -> list[ca.Function]:
+def with_turns_once(functions: list[ca.Function]) -> list[ca.Function]:
     """The same graphs, in which sines and cosines of joint positions are computed once for all that is called.
 
     Args:
         functions: graphs whose first inputs are joint positions (n, 1); others are returned as they are.
-        kept: names of called functions that stay as they are.
     """
     made: dict[int, ca.Function | None] = {}  # one form of each called function, so that its code appears once
     at = ca.SX.sym("q", max((function.size1_in(0) for function in functions), default=0))
     turns = ca.Function("turns", [at], [ca.sin(at), ca.cos(at)])
 
     def given_turns(called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
-        if called.name() in kept or called.size1_in(0) != at.shape[0]:
+        if called.size1_in(0) != at.shape[0]:
             return None
         if hash(called) not in made:
             made[hash(called)] = _given_turns(called)
@@ -418,17 +408,15 @@ def with_turns_once(functions: list[ca.Function], kept: Collection[str] = ()) ->
         return None if form is None else form(*turns(arguments[0]), *arguments)
 
     def rewritten(function: ca.Function) -> ca.Function:
-        within = _replaced(function, partial(_content, kept=kept))
+        within = _replaced(function, _content)
         return (_replaced(function, given_turns) or function) if within is None else rewritten(within)
 
     return [rewritten(function) for function in functions]
 
 
-def _content(
-    called: ca.Function, arguments: list[ca.MX], kept: Collection[str], but: Collection[int] = ()
-) -> ca.MX | None:
-    """What a called graph consists of; None for other functions, and for those with the given names and hashes."""
-    whole = called.name() in kept or hash(called) in but or not called.is_a("MXFunction")
+def _content(called: ca.Function, arguments: list[ca.MX], but: Collection[int] = ()) -> ca.MX | None:
+    """What a called graph consists of; None for other functions, and for those with the given hashes."""
+    whole = hash(called) in but or not called.is_a("MXFunction")
     return None if whole else called.call(arguments, True, False)[0]
 
 

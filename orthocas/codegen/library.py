@@ -13,7 +13,7 @@ from orthocas.codegen.precision import DOUBLE, SINGLE, Precision
 from orthocas.control.controller import Controller
 from orthocas.errors import CompileError
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, require_shape
+from orthocas.tools.checks import Array, require_shape
 from orthocas.tools.processes import run_program
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
@@ -69,34 +69,16 @@ class CompiledLibrary:
     name: str
     n: int
     single_precision: bool = False
-    r: int = 0  #: number of extra coordinates, for the functions that only libraries of an atlas have
-
-    @property
-    def of_atlas(self) -> bool:
-        """Whether its functions take the number of a chart."""
-        return hasattr(self._c, f"{self.name}_chart_at")
 
     @property
     def precision(self) -> Precision:
         """The number type of the library."""
         return SINGLE if self.single_precision else DOUBLE
 
-    def chart(self, q: Array, *which: int) -> tuple[Array, Array, int]:
-        """phi (n,), J (n, n), status. Libraries of an atlas take the number of the chart last, here and below."""
+    def chart(self, q: Array) -> tuple[Array, Array, int]:
+        """phi (n,), J (n, n), status."""
         phi, J = self._zeros(self.n), self._zeros(self.n, self.n)
-        return phi, J, self._call("chart", [q], [phi, J], which)
-
-    def chart_at(self, q: Array, current: int = -1) -> int:
-        """Of an atlas: the number of the chart for q, or -1."""
-        point = self.numbers(q)
-        require_shape("q", point.shape, (self.n,))
-        return int(self.function("chart_at")(point.ctypes.data_as(ctypes.c_void_p), current))
-
-    def xi(self, q: Array, which: int) -> tuple[Array, Array, int]:
-        """Of an atlas: xi (r,), J_xi (r, n) of a chart, status."""
-        xi, J = self._zeros(self.r), self._zeros(self.r, self.n)
-        self._call("xi", [q], [xi], (which,))
-        return xi, J, self._call("jacobian", [q], [J], (which,))
+        return phi, J, self._call("chart", [q], [phi, J])
 
     def check(self) -> float:
         """Largest relative difference that the library finds between itself and the numbers it was generated with."""
@@ -104,18 +86,18 @@ class CompiledLibrary:
         run.restype = self.precision.c_type
         return float(run())
 
-    def curvature(self, q: Array, dq: Array, v: Array, *which: int) -> tuple[Array, int]:
+    def curvature(self, q: Array, dq: Array, v: Array) -> tuple[Array, int]:
         """dJ/dt v (n,), status."""
         curvature = self._zeros(self.n)
-        return curvature, self._call("chart_curvature", [q, dq, v], [curvature], which)
+        return curvature, self._call("chart_curvature", [q, dq, v], [curvature])
 
-    def inverse(self, phi: Array, q_start: Array, *which: int, max_iterations: int = 100) -> tuple[Array, int]:
+    def inverse(self, phi: Array, q_start: Array, *, max_iterations: int = 100) -> tuple[Array, int]:
         """q (n,), status; after at most so many evaluations of phi."""
         q, arrays = self._zeros(self.n), [self.numbers(array) for array in (phi, q_start)]
         for name, array in zip(("phi", "q_start"), arrays, strict=True):
             require_shape(name, array.shape, (self.n,))
         places = [array.ctypes.data_as(_POINTER) for array in (*arrays, q)]
-        return q, int(self.function("inverse")(*which, *places[:2], int(max_iterations), places[2]))
+        return q, int(self.function("inverse")(*places[:2], int(max_iterations), places[2]))
 
     def nearest(self, phi: Array, q_start: Array, largest_step: float) -> tuple[Array, int]:
         """q (n,), status; for boxes, clear or not."""
@@ -131,10 +113,10 @@ class CompiledLibrary:
         M, bias, gravity = self._zeros(self.n, self.n), self._zeros(self.n), self._zeros(self.n)
         return M, bias, gravity, self._call("dynamics", [q, dq], [M, bias, gravity])
 
-    def control(self, q: Array, dq: Array, reference: Array, gains: Array, *which: int) -> tuple[Array, int]:
+    def control(self, q: Array, dq: Array, reference: Array, gains: Array) -> tuple[Array, int]:
         """Command (n,), status. Reference (3 k,) and gains hold the numbers of the C structs in order."""
         command = self._zeros(self.n)
-        return command, self._call("control", [q, dq, reference, gains], [command], which)
+        return command, self._call("control", [q, dq, reference, gains], [command])
 
     def spline(self, start: Array, target: Array, duration: float, time: float, last: Array | None = None) -> Array:
         """The reference (3 k,) at a time on the spline from a reference to rest at a target (k,).
@@ -184,61 +166,14 @@ class CompiledLibrary:
     def _c(self) -> ctypes.CDLL:
         return ctypes.CDLL(str(self.path))
 
-    def _call(self, function: str, inputs: list[Array], outputs: list[Array], which: tuple[int, ...] = ()) -> int:
+    def _call(self, function: str, inputs: list[Array], outputs: list[Array]) -> int:
         run = getattr(self._c, f"{self.name}_{function}")
         arrays = [self.numbers(array) for array in inputs] + outputs
         for array in arrays[: len(inputs)][:2]:  # q and dq; C would read beyond the end of a short array
             require_shape(f"an argument of {function}", array.shape[:1], (self.n,))
-        return int(run(*map(int, which), *(array.ctypes.data_as(ctypes.c_void_p) for array in arrays)))
+        return int(run(*(array.ctypes.data_as(ctypes.c_void_p) for array in arrays)))
 
 
 def gain_numbers(controller: Controller) -> Array:
     """The gains of a controller in the order of the C struct."""
     return np.concatenate(list(controller.gains.values()))
-
-
-class ChartReference:
-    """A reference (3 k,) in one chart. `Supervisor.step` changes it when the arm goes over to another chart.
-
-    Args:
-        library: a compiled library of an atlas with a controller.
-        values: [value, velocity, acceleration].
-        chart: the number of the chart in C.
-    """
-
-    def __init__(self, library: CompiledLibrary, values: ArrayLike, chart: int) -> None:
-        number, given = library.precision.c_type, as_float_array("values", values)
-        require_shape("values", given.shape, (3 * library.n,))
-        layout = [("values", number * (3 * library.n)), ("chart", ctypes.c_int)]
-        self._library = library
-        self._struct = type("Reference", (ctypes.Structure,), {"_fields_": layout})(tuple(given), chart)
-
-    @classmethod
-    def at(cls, library: CompiledLibrary, q: Array, chart: int) -> "ChartReference":
-        """At rest at joint positions (n,)."""
-        reference, point = cls(library, np.zeros(3 * library.n), chart), library.numbers(q)
-        require_shape("q", point.shape, (library.n,))
-        library.function("reference_at")(chart, point.ctypes.data_as(_POINTER), reference.address)
-        return reference
-
-    @property
-    def values(self) -> Array:
-        """The numbers (3 k,); changes go to C."""
-        found: Array = np.ctypeslib.as_array(self._struct.values)
-        return found
-
-    @property
-    def chart(self) -> int:
-        """The chart that xi and its derivatives belong to."""
-        return int(self._struct.chart)
-
-    @property
-    def address(self) -> Any:
-        """The C struct."""
-        return ctypes.byref(self._struct)
-
-    def hand_over(self, chart: int, q: Array) -> int:
-        """Ask for the same posture and motion in another chart, found from joint positions (n,); the status."""
-        point = self._library.numbers(q)
-        require_shape("q", point.shape, (self._library.n,))
-        return int(self._library.function("hand_over")(self.address, chart, point.ctypes.data_as(_POINTER)))

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +17,10 @@ from orthocas.control.controller import (
     count_turns_from_centre,
     squared_volume,
 )
-from orthocas.errors import InvalidValueError, ProofError
+from orthocas.errors import ProofError
 from orthocas.tasks.domains import Domain, contains
 from orthocas.tools.batch import Batched
-from orthocas.tools.checks import Array
+from orthocas.tools.checks import Array, require_kind
 from orthocas.tools.expressions import shortest
 from orthocas.tools.files import draft_folder
 
@@ -94,17 +93,9 @@ class Proof:
     differences: dict[str, float]
 
 
-class CheckedCharts(Protocol):
-    """Several charts that compare their library with Python themselves."""
-
-    def check_c(self, generated: GeneratedC, controller: Controller | None, states: int, seed: int) -> Proof:
-        """As `check_c`."""
-        ...
-
-
 def check_c(
     generated: GeneratedC,
-    chart: Chart | CheckedCharts,
+    chart: Chart,
     controller: Controller | None = None,
     states: int = 1000,
     seed: int = 0,
@@ -113,7 +104,7 @@ def check_c(
 
     Args:
         generated: what `generate_c` returned.
-        chart: the chart that it was made from; or an atlas or a part of one, which have a comparison of their own.
+        chart: the chart that it was made from.
         controller: the law of the library, if it has one.
         states: number of random states.
         seed: of the states.
@@ -130,10 +121,7 @@ def check_c(
             grows with the inverse square of the volume of the gradients, relative to its median, and their status may
             be that of a place within 0.01 half-widths.
     """
-    if not isinstance(chart, Chart):
-        if not hasattr(chart, "check_c"):
-            raise InvalidValueError("chart", f"a {type(chart).__name__}", "a Chart, an Atlas or a part of one")
-        return chart.check_c(generated, controller, states, seed)
+    require_kind("chart", chart, Chart)
     n, precision = chart.n, SINGLE if generated.single_precision else DOUBLE
     q = _positions(chart.problem.domain, np.random.default_rng(seed).uniform(-1, 1, (states, n)), precision)
     differences: dict[str, float] = {}

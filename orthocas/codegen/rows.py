@@ -1,7 +1,6 @@
-"""phi of many joint positions in C: loops for vector instructions, and tables of charts."""
+"""phi of many joint positions in C: loops for vector instructions."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -9,71 +8,19 @@ import numpy as np
 
 from orthocas.bases.family import LinearFamily
 from orthocas.charts.chart import Chart
-from orthocas.charts.coordinates import CoordinateMap, Coordinates
+from orthocas.charts.coordinates import Coordinates
 from orthocas.codegen.description import filled, numbers
 from orthocas.codegen.kernels import POWER
 from orthocas.codegen.precision import DOUBLE, Precision
 from orthocas.errors import InvalidValueError
-from orthocas.tools.batch import dense_function
-from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import ARITHMETIC, scalar_code, to_tape
 
-#: C bodies of the functions; `mem` is the number of the chart, and templates/tables.c.in has what they call
-TABLE_CODE = {
-    "table_xi": "{ (void)iw; (void)w; if (res[0] != 0) xi_at(mem, arg[0], res[0]); return 0; }",
-    "table_jacobian": "{ (void)iw; (void)w; if (res[0] != 0) jacobian_at(mem, arg[0], res[0]); return 0; }",
-    "table_second_derivative": (
-        "{ (void)iw; (void)w; if (res[0] != 0) bend_at(mem, arg[0], arg[1], arg[2], res[0]); return 0; }"
-    ),
-}
 _LANES = 8  # rows side by side: a line of the cache for each number
 _LOCALS = 4096  # bytes of stack for other variables
 _MOST = 20_000  # operations; beyond, compilers take minutes
 _OF_THE_LIBRARY = """#define lane_sin(x) sin(x)
 #define lane_cos(x) cos(x)"""
-
-
-@dataclass(frozen=True, eq=False)
-class TableCoordinates:
-    """The coordinates of one chart, which stand for those of all charts of an atlas.
-
-    In Python they are those of the one chart. Their functions have names by which generated C replaces them.
-    """
-
-    own: CoordinateMap
-
-    @property
-    def r(self) -> int:
-        """Number of coordinates."""
-        return self.own.r
-
-    @property
-    def label(self) -> str:
-        """That of the one chart."""
-        return self.own.label
-
-    @property
-    def size(self) -> int:
-        """Number of parameters of the one chart."""
-        return self.own.size
-
-    @cached_property
-    def functions(self) -> dict[str, ca.Function]:
-        """The functions of the one chart, each in a call that can be replaced."""
-        found = {}
-        for name, function in self.own.functions.items():
-            inputs = function.mx_in()
-            found[name] = dense_function(f"table_{name}", inputs, [function(*inputs)])
-        return found
-
-    def xi(self, points: Array) -> Array:
-        """Coordinates (N, r) of the one chart at points (N, n)."""
-        return self.own.xi(points)
-
-    def jacobian(self, points: Array) -> Array:
-        """J_xi (N, r, n) of the one chart at points (N, n)."""
-        return self.own.jacobian(points)
 
 
 _OPERATIONS = {

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.codegen.library import ChartReference, CompiledLibrary, gain_numbers
+from orthocas.codegen.library import CompiledLibrary, gain_numbers
 from orthocas.codegen.precision import Precision
 from orthocas.control.controller import Controller, ControlStatus, require_controller
 from orthocas.control.memory import memory_of
@@ -44,7 +44,7 @@ class Supervisor:
         self._safety = library.address("default_safety") if safety is None else _packed(values, settings)
         memory = memory_of(controller)
         remembered = {} if memory is None else {name: len(value) for name, value in memory.start.items()}
-        self._state = _state_type(self._n, self._k, library.precision, library.of_atlas, settings, remembered)()
+        self._state = _state_type(self._n, self._k, library.precision, settings, remembered)()
         self._command = library.numbers(np.zeros(self._n))
         self.gains = gain_numbers(controller)  #: numbers of the gains in the order of the C struct
 
@@ -69,51 +69,41 @@ class Supervisor:
         """Brakes open: the catcher holds the arm until `resume`."""
         self._begin("release", q, command)
 
-    def step(
-        self, q: Array, dq: Array, reference: Array | ChartReference, period: float = 1e-3
-    ) -> tuple[Array, ControlStatus]:
+    def step(self, q: Array, dq: Array, reference: Array, period: float = 1e-3) -> tuple[Array, ControlStatus]:
         """Command (n,) and status of one control period.
 
         Args:
             q: joint positions (n,).
             dq: joint velocities (n,).
-            reference: [value, velocity, acceleration], (3 k,); of an atlas a `ChartReference`, which goes over to
-                another chart with the arm.
+            reference: [value, velocity, acceleration], (3 k,).
             period: time since the last call [s].
         """
         inputs = [self._numbers(name, value, self._n) for name, value in (("q", q), ("dq", dq))]
-        gains, time = self._library.numbers(self.gains), as_number("period", period)
-        numbers, asked = self._asked(reference)
-        status = self._functions["step"](
-            self._here, self._safety, *map(_pointer, inputs), asked, _pointer(gains), time, _pointer(self._command)
-        )
-        del numbers  # C has read them
+        inputs += [self._reference(reference), self._library.numbers(self.gains)]
+        time, command = as_number("period", period), _pointer(self._command)
+        status = self._functions["step"](self._here, self._safety, *map(_pointer, inputs), time, command)
         return self._command.copy(), ControlStatus(status)
 
-    def stream(
-        self, reference: Array | ChartReference, target: ArrayLike, omega: float, period: float = 1e-3
-    ) -> ControlStatus:
+    def stream(self, reference: Array, target: ArrayLike, omega: float, period: float = 1e-3) -> ControlStatus:
         """Move a reference by one tick towards a target (k,), with poles at omega [1/s]; the status.
 
         OK, NEAR_BOUNDARY if the target lies beyond the boundary, so that the stream stops before it, or NOT_FINITE.
         """
-        numbers, asked = self._asked(reference)
+        numbers = self._reference(reference)
         wanted, speed, time = (
             self._numbers("target", target, self._k),
             as_number("omega", omega),
             as_number("period", period),
         )
-        status = self._functions["stream"](self._here, asked, _pointer(wanted), speed, time)
-        if isinstance(reference, np.ndarray):
-            reference[:] = numbers
+        status = self._functions["stream"](self._here, _pointer(numbers), _pointer(wanted), speed, time)
+        reference[:] = numbers
         return ControlStatus(status)
 
-    def pace(self, reference: Array | ChartReference, period: float = 1e-3) -> float:
+    def pace(self, reference: Array, period: float = 1e-3) -> float:
         """Scale the derivatives of a reference to what joints can follow; the pace at which time goes on, 0 to 1."""
-        numbers, asked = self._asked(reference)
-        pace = float(self._functions["pace"](self._here, asked, as_number("period", period)))
-        if isinstance(reference, np.ndarray):
-            reference[:] = numbers
+        numbers = self._reference(reference)
+        pace = float(self._functions["pace"](self._here, _pointer(numbers), as_number("period", period)))
+        reference[:] = numbers
         return pace
 
     def __getattr__(self, name: str) -> Any:
@@ -125,14 +115,8 @@ class Supervisor:
             return {field[0]: np.array(getattr(value, field[0])) for field in value._fields_}
         return np.array(value) if isinstance(value, ctypes.Array) else value
 
-    def _asked(self, reference: Array | ChartReference) -> tuple[Array, Any]:
-        """Numbers of a reference in the library's type, and their address in C."""
-        if self._library.of_atlas:
-            require_kind("reference", reference, ChartReference)
-        if isinstance(reference, ChartReference):
-            return reference.values, reference.address
-        numbers = self._numbers("reference", reference, 3 * self._k)
-        return numbers, _pointer(numbers)
+    def _reference(self, reference: Array) -> Array:
+        return self._numbers("reference", reference, 3 * self._k)
 
     def _begin(self, name: str, q: ArrayLike, command: ArrayLike | None) -> None:
         point, given = self._point("q", q), None if command is None else self._point("command", command)
@@ -156,7 +140,6 @@ def _state_type(
     n: int,
     k: int,
     precision: Precision,
-    of_atlas: bool,
     settings: type[ctypes.Structure],
     remembered: dict[str, int],
 ) -> type[ctypes.Structure]:
@@ -168,17 +151,14 @@ def _state_type(
             (name, ctypes.c_int)
             for name in ("mode", "cause", "asked", "bad_ticks", "fresh", "stale_ticks", "same_ticks")
         ),
-        *((name, ctypes.c_int) for name in ("chart", "hand_overs") if of_atlas),
         *((name, precision.c_type) for name in ("weight", "brake", "unseen")),
         *((name, joints) for name in names),
         *((name, quantities) for name in ("offset", "integral")),
         *((name, joints) for name in ("load", "drive", "speed") if has_spring),
         *(("inertia", precision.c_type * n**2) for _ in range(has_spring)),
         *((name, joints) for name in ("expected", "unexplained") if has_spring),
-        *((name, joints) for name in ("carry",) if of_atlas),
         *(("memory", _memory_type(remembered, precision)) for _ in range(bool(remembered))),
         *((name, quantities) for name in ("value", "velocity", "acceleration")),
-        *((name, ctypes.c_int) for name in ("reference_chart",) if of_atlas),
         ("safety", settings),
         ("limit", joints),
     ]

@@ -7,9 +7,8 @@ from importlib.resources import files
 import numpy as np
 
 from orthocas.charts.chart import Chart
-from orthocas.codegen.chart_source import ChartSource
+from orthocas.codegen.generate import generate_c
 from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
-from orthocas.codegen.library_files import write_library
 from orthocas.control.controller import Controller
 from orthocas.control.operational_space import PDPlus
 from orthocas.tasks.domains import contains
@@ -41,7 +40,7 @@ def control_tick(chart: Chart) -> float:
     with draft_folder() as folder:
         with deferred():  # CasADi may lose Ctrl-C while it builds functions
             law = PDPlus(chart, 50.0, coupling="decoupled")
-            generated = write_library(ChartSource(chart), folder, law, "tick")
+            generated = generate_c(chart, folder, law, "tick")
         library = CompiledLibrary(compile_shared(generated, folder), "tick", chart.n)
         about = time_ticks([(law, library)], 200)[0].median
         calls = int(np.clip(_MICROSECONDS / about, 1_000, 100_000))

@@ -310,17 +310,6 @@ def with_smallest_volume(graph: ca.Function, smallest: float) -> ca.Function:
     return ca.Function(graph.name(), inputs, list(outputs), graph.name_in(), graph.name_out())
 
 
-def without_boundary(graph: ca.Function, inside: Array) -> ca.Function:
-    """The same graph of a controller, whose guard sees a position inside the domain, (n,), whatever q is."""
-    inputs, call = _guard_call(graph)
-    if call is None:
-        return graph
-    check = call.which_function()
-    given = [call.dep(i) for i in range(check.n_in())]
-    given[check.index_in("q")] = ca.MX(ca.DM(inside))
-    return ca.Function(graph.name(), inputs, list(check(*given)), graph.name_in(), graph.name_out())
-
-
 def squared_volume(graph: ca.Function) -> ca.Function | None:
     """Inputs of a controller -> squared volume of its gradients, relative to the median; None without a guard."""
     inputs, call = _guard_call(graph)

@@ -174,53 +174,6 @@ class ProductGradients(BasisGradients):
         return ca.vertcat(1, self.family.basis(q))[self._places.tolist()]
 
 
-class BoxGradients(BasisGradients):
-    """Those of a family on the cube [-1, 1]^n in the units of one box: d psi / dq_i = d psi / du_i / half_width_i.
-
-    Boxes share the compiled basis, and the numbers at points of the cube that all of them use.
-
-    Args:
-        cube: gradients on the cube.
-        half_width: of the box, (n,).
-        shared: points of the cube, (N, n); `at` recognises this array.
-        known: the result of `cube.at(shared)`.
-    """
-
-    def __init__(self, cube: ProductGradients, half_width: Array, shared: Array, known: Array) -> None:
-        super().__init__(cube.family, cube.n, cube.dtype)
-        self._cube, self._scale, self._shared, self._known = cube, 1 / half_width, shared, known
-
-    @property
-    def groups(self) -> int:
-        """As on the cube."""
-        return self._cube.groups
-
-    def at(self, points: Array) -> Array:
-        """The numbers at points of the cube (N, n)."""
-        return self._known if points is self._shared else self._cube.at(points)
-
-    def table(self, C: Array) -> Array:
-        """That of the cube, in the units of the box."""
-        table = self._cube.table(C)
-        return table * np.repeat(self._scale, len(C))[:, None]
-
-    def collected(self, slopes: Array) -> Array:
-        """The same for slopes."""
-        r = slopes.shape[1] // self.n
-        return self._cube.collected(slopes * np.repeat(self._scale, r)[:, None])
-
-    def dense_part(
-        self, X: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike | None = None
-    ) -> Array:
-        """The gradients in the units of the box."""
-        dense = self._cube.dense_part(X, samples, kept, every, dtype)
-        dense *= self._scale[:, None].astype(dense.dtype)
-        return dense
-
-    def _numbers(self, q: ca.SX) -> ca.SX:
-        return self._cube._numbers(q)
-
-
 class SparseGradients(BasisGradients):
     """X holds d psi_k / dq_i for the functions that depend on joint i, a group for each joint.
 

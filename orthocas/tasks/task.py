@@ -447,12 +447,6 @@ class Task(Shown, HoldsFunctions):
         assert self.turn is not None
         return self._turned(self.robot, self.turn, self._frames.rotation(self.robot, q), self._frames)
 
-    def without_reference(self) -> Self:
-        """The task of the same kind whose reference orientation is not given."""
-        if self.turn is None:
-            return self
-        return self._turned(self.robot, self.turn, None, self._frames)
-
     @property
     def m(self) -> int:
         """Number of task components."""

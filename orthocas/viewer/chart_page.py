@@ -245,11 +245,7 @@ class ChartPage:
         self._fans = [fan_along(self._chart, self.session.q, k) for k in range(self._chart.r)]
         for fan in self._fans:
             slider = self._sliders[fan.label]
-            room = self.session.beyond * (fan.xi[-1] - fan.xi[0])
-            low, high = (
-                np.ceil((fan.xi[0] - room) / _STEP) * _STEP,
-                np.floor((fan.xi[-1] + room) / _STEP) * _STEP,
-            )
+            low, high = np.ceil(fan.xi[0] / _STEP) * _STEP, np.floor(fan.xi[-1] / _STEP) * _STEP
             if np.isfinite([low, high]).all():
                 slider.min, slider.max = round(float(min(low, high)), 3), round(float(max(low, high)), 3)
         self._show()

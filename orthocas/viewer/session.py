@@ -48,7 +48,6 @@ class Session:
 
     flips: tuple[int, ...] = ()  #: cuts of `branches` at which the arm is mirrored
     branches: Branches | None = None  #: of the robot, once they were asked for
-    beyond = 0.0  #: how far a wish for a coordinate may lie beyond its ends in the chart, as a share of their distance
     _wished: Array  #: phi, (n,)
 
     def __init__(self, chart: Chart, q: Array | None = None) -> None:

@@ -76,10 +76,10 @@ def view(
     host: str = LOCAL,
     port: int = PORT,
 ) -> View:
-    """Open a page for the browser: a chart to play with, an atlas from chart to chart, a robot, or a motion.
+    """Open a page for the browser: a chart to play with, a robot, or a motion.
 
     Args:
-        shown: a fitted chart, an atlas, a robot, a `Trajectory` of `simulate`, a `JointMotion` of `follow`, or a
+        shown: a fitted chart, a robot, a `Trajectory` of `simulate`, a `JointMotion` of `follow`, or a
             sequence of `Motion` of one robot, which move side by side.
         robot: for motions: whose they are, or a chart of that robot.
         robot_file: URDF file of the robot with its meshes. Default: drums and rods, made from the kinematic tree.
@@ -106,8 +106,6 @@ def view(
             page = PlayerPage(server, arm, shape.look, motions)
         elif isinstance(shown, Chart):
             page = ChartPage(server, Session(shown), shape.look)
-        elif _is_several(shown):
-            page = ChartPage(server, shown.view_session(), shape.look)
         else:
             page = RobotPage(server, arm, shape.look)
     except BaseException:
@@ -130,7 +128,7 @@ def export_page(
     A chart moves each coordinate to its ends and back. Sliders need `view`.
 
     Args:
-        shown: as in `view`, but no atlas: sliders lead through it.
+        shown: as in `view`.
         path: the file.
         robot: as in `view`.
         robot_file: as in `view`.
@@ -142,8 +140,6 @@ def export_page(
     """
     target = as_path("path", path)
     require_page(target, force)
-    if _is_several(shown):
-        raise InvalidValueError("shown", "an atlas", "one of its charts, a robot or a motion; `view` shows atlases")
     arm, motions = subject(shown, robot)
     shape = shape_of(arm, robot_file, locked)
     scene: Scene
@@ -174,9 +170,8 @@ def subject(shown: Any, robot: Robot | Chart | None) -> tuple[Robot, Sequence[Mo
     """The robot to draw, and what moves it; no motions for a chart and a robot."""
     if isinstance(shown, GrownChart):
         raise NoExpressionError("a view needs coordinates with a CasADi expression; received grown coordinates")
-    if isinstance(shown, Chart) or _is_several(shown):
-        robot_of: Robot = shown.problem.robot
-        return robot_of, ()
+    if isinstance(shown, Chart):
+        return shown.problem.robot, ()
     if isinstance(shown, Robot):
         return shown, ()
     motions = _motions(shown)
@@ -188,11 +183,6 @@ def subject(shown: Any, robot: Robot | Chart | None) -> tuple[Robot, Sequence[Mo
     return arm, motions
 
 
-def _is_several(shown: Any) -> bool:
-    """Whether it consists of several charts, such as an atlas, and brings a session of its own."""
-    return hasattr(shown, "view_session")
-
-
 def _motions(shown: Any) -> tuple[Motion, ...]:
     """A motion, or several."""
     if isinstance(shown, Trajectory):
@@ -201,9 +191,7 @@ def _motions(shown: Any) -> tuple[Motion, ...]:
         return (Motion.of_path(shown),)
     several = shown if isinstance(shown, list | tuple) else [shown]
     if not several or not all(isinstance(part, Motion) for part in several):
-        raise InvalidValueError(
-            "shown", f"a {type(shown).__name__}", "a chart, an atlas, a robot, a run or a joint motion"
-        )
+        raise InvalidValueError("shown", f"a {type(shown).__name__}", "a chart, a robot, a run or a joint motion")
     return tuple(several)
 
 

@@ -24,25 +24,11 @@ static void *mathematics(void *unused) { /* the first call of a function of libm
   vector[0] = sin(q[0]) + cos(q[0]) + tanh(q[0]) + pow(2.0 + q[0], 0.3) + sqrt(2.0 + q[0]);
   return unused;
 }
-#ifdef ARM_CHARTS /* -DPOSITION= has a chart; the step hands over from another one */
-static const NUMBER position[N] = {POSITION};
-#define IN_CHART state.chart,
-#else
-#define IN_CHART
-#endif
-static void *chart(void *unused) { return arm_chart(IN_CHART q, phi, matrix), unused; }
-static void *inverse(void *unused) { return arm_inverse(IN_CHART phi, q, 100, vector), unused; }
+static void *chart(void *unused) { return arm_chart(q, phi, matrix), unused; }
+static void *inverse(void *unused) { return arm_inverse(phi, q, 100, vector), unused; }
 static void *dynamics(void *unused) { return arm_dynamics(q, dq, matrix, vector, phi), unused; }
-static void *control(void *unused) { return arm_control(IN_CHART q, dq, &reference, &arm_default_gains, vector), unused; }
+static void *control(void *unused) { return arm_control(q, dq, &reference, &arm_default_gains, vector), unused; }
 static void *supervised(void *unused) {
-#ifdef ARM_CHARTS
-  const int here = arm_chart_at(q, ARM_NO_CHART), hand_overs = state.hand_overs;
-  state.mode = ARM_LAW;
-  state.chart = reference.chart = (here + 1) % ARM_CHARTS;
-  arm_step(&state, &arm_default_safety, q, dq, &reference, &arm_default_gains, (NUMBER)1e-3, vector);
-  if (state.hand_overs != hand_overs + 1) printf("-1 ");
-  return unused;
-#endif
   return arm_step(&state, &arm_default_safety, q, dq, &reference, &arm_default_gains, (NUMBER)1e-3, vector), unused;
 }
 
@@ -64,9 +50,6 @@ int main(void) {
   int i;
   long empty;
   for (i = 0; i < N; ++i) q[i] = 0.1 * (i + 1);
-#ifdef ARM_CHARTS
-  memcpy(q, position, sizeof q);
-#endif
   used(mathematics);
   arm_start(&state, q, 0);
   for (i = 0; i < 5; ++i) used(calls[i]);

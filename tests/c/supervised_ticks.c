@@ -20,14 +20,7 @@
 #define NUMBER double
 #endif
 
-#ifdef ARM_CHARTS /* an atlas: -DMIDDLE= is a position to wander around, and the reference stays in the chart it began in */
-static const double middle[N] = {MIDDLE};
-#define REFERENCE_AT(q, reference) arm_reference_at(state.chart, q, reference)
-#define MIDDLE_OF(i) middle[i]
-#else
-#define REFERENCE_AT(q, reference) arm_reference_at(q, reference)
 #define MIDDLE_OF(i) (0.5 * (arm_domain_lower[i] + arm_domain_upper[i]))
-#endif
 
 static uint64_t seed = 88172645463325252ULL;
 
@@ -52,11 +45,6 @@ static int state_makes_sense(const arm_state *state) {
     if (!isfinite(state->q[i]) || !isfinite(state->dq[i]) || !isfinite(state->anchor[i]) || !isfinite(state->law[i])) return 0;
   for (i = 0; i < K; ++i)
     if (!isfinite(state->offset[i]) || !isfinite(state->integral[i]) || !isfinite(state->reference.value[i])) return 0;
-#ifdef ARM_CHARTS
-  if (state->chart < ARM_NO_CHART || state->chart >= ARM_CHARTS || state->hand_overs < 0) return 0;
-  for (i = 0; i < N; ++i)
-    if (!isfinite(state->carry[i])) return 0;
-#endif
   return 1;
 }
 
@@ -143,7 +131,7 @@ int main(void) {
       measured_q[i] = q[i] += 1e-3 * dq[i];
       measured_dq[i] = dq[i];
     }
-    if (k % 1000 == 0) REFERENCE_AT(q, &reference);
+    if (k % 1000 == 0) arm_reference_at(q, &reference);
     if (k % 1000 == 0) led = reference;
     if (!references_stay_finite(&state, &led)) return 5;
     for (i = 0; i < K; ++i) reference.velocity[i] = k % 7000 < 100 ? 0.1 : 0.0; /* stands still and claims to move */
@@ -191,9 +179,6 @@ int main(void) {
     memcpy(before, command, sizeof before);
   }
   for (i = 0; i < 11; ++i) printf("%ld ", counts[i]);
-#ifdef ARM_CHARTS
-  printf("%d", state.hand_overs);
-#endif
   printf("\n");
   return 0;
 }

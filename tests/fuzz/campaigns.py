@@ -4,7 +4,6 @@ import inspect
 from collections.abc import Callable
 
 from fuzz import signals
-from fuzz.atlases import atlases
 from fuzz.calls import calls
 from fuzz.certificates import certificates
 from fuzz.charts import charts
@@ -24,7 +23,6 @@ from fuzz.ticks import ticks
 from fuzz.views import views
 
 CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
-    "atlases": atlases,
     "calls": calls,
     "certificates": certificates,
     "charts": charts,
@@ -47,8 +45,6 @@ CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
 }
 
 READERS = {  #: functions that read files, by module and name, with the campaign that gives them mutants
-    "atlas.atlas.load": "atlases",
-    "atlas.atlas_file.read_stock": "atlases",
     "charts.chart.load": "charts",
     "charts.chart_file.read_chart": "charts",
     "charts.ready.load": "calls",
@@ -72,7 +68,6 @@ READERS = {  #: functions that read files, by module and name, with the campaign
     "viewer.motion.read_run": "runs",
 }
 RESULTS = {  #: public classes whose objects only the library makes, with the campaign that makes and reads them
-    **dict.fromkeys(("Atlas", "Coverage"), "atlases"),
     **dict.fromkeys(("Branch", "Branches", "Comparison", "Fit", "WideFit", "Involutivity", "Report"), "calls"),
     **dict.fromkeys(("Solutions", "Tracker", "InverseStatus", "TrackerStatus"), "calls"),
     **dict.fromkeys(("Breakdown", "Coupling", "DampingCheck", "JointMotion", "Margins", "Modes", "Setting"), "calls"),

@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from public_objects import atlas, circle, fitted, joint_motion
+from public_objects import circle, fitted, joint_motion
 
 from fuzz.child import Finding, run
 from fuzz.robots import text_of, urdf_chain
@@ -152,16 +152,6 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
         (*_LAW_OPTIONS, *_RUN_OPTIONS),
     ),
     "charts": (("ur5-position", "ur5", "chart.orthocas", ""), {}, ("--out",)),
-    "atlas build": (
-        _PROBLEMS,
-        {"--out": "new.orthocas-atlas", "--share": "0.001", "--seconds": "0.2", "--degree": "1", "--workers": "1"},
-        (
-            *("--leak-deg", "--conditioning", "--half-width", "--splits", "--margin-deg", "--radius"),
-            *(*_PROBLEM_OPTIONS, "--task", "--metric"),
-        ),
-    ),
-    "atlas info": (("arm.orthocas-atlas", *_FILES), {}, ("--seed",)),
-    "atlas evaluate": (("arm.orthocas-atlas", *_FILES), {"--samples": "20"}, ("--seed",)),
     "export": (_FILES, {"--to": "numpy", "--out": "module.py"}, ()),
     "follow": (
         _FILES,
@@ -177,9 +167,9 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
         ("--chart", "--path", "--robot", "--cycles", "--host", "--port", *_PROBLEM_OPTIONS),
     ),
     "codegen": (
-        ("arm.orthocas-atlas", *_FILES),
+        _FILES,
         {"--controller": "pd_plus", "--out": "out"},
-        (*_LAW_OPTIONS, "--name", "--model", "--gravity", "--inputs", "--along", "--radius"),
+        (*_LAW_OPTIONS, "--name", "--model", "--gravity", "--inputs"),
     ),
 }
 
@@ -232,7 +222,6 @@ def _files() -> Path:
     chart = fitted().chart
     chart.save(folder / "chart.orthocas")
     circle().save(folder / "grown.orthocas")
-    shutil.copy(atlas().path, folder)
     (folder / "cut.orthocas").write_bytes((folder / "chart.orthocas").read_bytes()[:500])
     start = [round(float(value), 3) for value in chart.problem.domain.centre]
     steps = [{"time": 0.1, "move": {"x": 0.01}}]

@@ -1,7 +1,6 @@
 """Calls of the public functions, classes and methods that work, for the campaign that changes their arguments."""
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -10,7 +9,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from public_objects import (
-    atlas,
     circle,
     clear,
     fitted,
@@ -40,27 +38,12 @@ def good_calls() -> dict[str, Call]:
 
 
 def _searches() -> dict[str, Call]:
-    """What looks for branches, wide charts and atlases, registers, or compiles."""
+    """What looks for branches, wide charts and charts along paths, registers, or compiles."""
     problem, chart, q = planar(), fitted().chart, np.array([0.3, 0.4, 0.5])
     robot, task = problem.robot, problem.task
     wide_box = oc.ClearBox(problem.domain, task, 0.1)
-    settings = oc.AtlasSettings(degree=1, leak_deg=20.0, half_width=0.5, splits=1)
     return {
         "branches": (oc.branches, {"robot": robot, "task": task}),
-        "build_atlas": (
-            _build_atlas,
-            {
-                "problem": problem,
-                "path": "a.orthocas-atlas",
-                "settings": settings,
-                "region": [[0.0, 0.9, 0.9]],
-                "radius": 0.1,
-                "margin_deg": 1.0,
-                "share": 0.1,
-                "time_limit": 1.0,
-                "force": False,
-            },
-        ),
         "ClearBox": (
             oc.ClearBox,
             {"box": problem.domain, "task": task, "least_singular_value": 0.1, "scale": None, "rows": "frame"},
@@ -85,6 +68,7 @@ def _searches() -> dict[str, Call]:
             },
         ),
         "chart.nearest_xi": (chart.nearest_xi, {"q_wish": q, "x": chart.task(q), "tolerance": 1e-9}),
+        "chart_along": (oc.chart_along, {"problem": problem, "postures": [q, q + 0.1], "radius": 0.2}),
         "compile_inverse": (oc.compile_inverse, {"chart": chart, "folder": "kept"}),
         "progress": (lambda monitor: oc.fit(problem, oc.Linear(), samples=50, monitor=monitor), {"monitor": None}),
         "register_domain": (oc.register_domain, {"kind": oc.Box}),
@@ -98,29 +82,12 @@ def _searches() -> dict[str, Call]:
     }
 
 
-def _build_atlas(**given: Any) -> oc.Atlas:
-    """In a thread: processes would take a second each."""
-    with ThreadPoolExecutor(1) as executor:
-        return oc.build_atlas(**given, executor=executor)
-
-
 def _physics() -> dict[str, Call]:
     """MuJoCo as plant."""
     robot, q = planar().robot, np.array([0.3, 0.4, 0.5])
     payload, wall = simulation.Payload(1.0), simulation.Wall([9.0, 0, 0], [-1.0, 0, 0])
     options = {"stops": True, "effort_limits": True, "payload": payload, "wall": wall, "timestep": 1e-3}
     return {
-        "AtlasSettings": (oc.AtlasSettings, {"degree": 3, "leak_deg": 5.0, "half_width": 0.5, "splits": 4}),
-        "AtlasPart": (oc.AtlasPart, {"atlas": atlas(), "charts": [0, 1]}),
-        "AtlasPart.along": (oc.AtlasPart.along, {"atlas": atlas(), "q": [[0.0, 0.9, 0.9]], "radius": 0.1}),
-        "atlas.chart_at": (atlas().chart_at, {"q": q, "current": 0}),
-        "atlas.xi": (atlas().xi, {"q": q, "charts": 0}),
-        "atlas.chart": (atlas().chart, {"number": 0, "near": q}),
-        "atlas.inverse": (atlas().inverse, {"x": q[:2], "xi": q[2:], "charts": 0, "q_start": q}),
-        "atlas.handed_over": (atlas().handed_over, {"q": q, "dq": q, "ddq": q, "number": 0}),
-        "evaluate_atlas": (oc.evaluate_atlas, {"atlas": atlas(), "samples": 20, "seed": 0}),
-        "atlas.with_reference": (atlas().with_reference, {"q": q}),
-        "chart_along": (oc.chart_along, {"atlas": atlas(), "x": [[1.0, 1.0]], "q_start": q, "radius": 0.2}),
         "Stops": (lambda **given: _stopped(robot, simulation.Stops(**given)), {"stiffness": 1e4, "damping": [1.0] * 3}),
         "Payload": (simulation.Payload, {"mass": 1.0, "centre": q, "inertia": np.eye(3)}),
         "Wall": (simulation.Wall, {"point": q, "normal": q, "tip_radius": 0.1, "size": 1.0, "time_constant": 0.01}),

@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 import trimesh
 from PIL import Image
-from public_objects import atlas
 
 import orthocas as oc
 from fuzz.child import Finding, run
@@ -52,7 +51,6 @@ _CONTROLLED = ("--controller", "pd_plus", "--out", "out")
 _PATH = "x\n0.85\n0.9\n0.95\n0.9\n0.85\n"
 _CHOSEN = ("--xi", "objective", "--velocity-limit", "0.2", "--period", "0.002")
 _SMALL_GRID = ("--param", "linear", "--param", "polynomial:2", "--jobs", "2", "--held-out", "500", "--samples", "200")
-_TILES = ("--half-width", "0.9", "--splits", "1", "--degree", "2", "--leak-deg", "20", "--workers", "2")
 COMMANDS: dict[str, tuple[str, ...]] = {  #: words after `orthocas`; the loop is a program of a user
     "info": ("info", "planar_3r_x"),
     "fit": ("fit", "planar_3r_x", "--param", "polynomial:4", "--samples", "2000", "--out", "out/c.orthocas", "--json"),
@@ -63,9 +61,6 @@ COMMANDS: dict[str, tuple[str, ...]] = {  #: words after `orthocas`; the loop is
     "simulate": ("simulate", "chart.orthocas", *_CONTROLLED, "--steps", "steps.json"),
     "follow": ("follow", "chart.orthocas", "path.csv", *_CHOSEN, "--out", "out/q.csv", "--json"),
     "codegen": ("codegen", "chart.orthocas", *_CONTROLLED, "--check"),
-    "atlas": ("atlas", "build", "planar_3r_x", *_TILES, "--out", "out/a.orthocas-atlas", "--json"),
-    "atlas evaluate": ("atlas", "evaluate", "arm.orthocas-atlas", "--samples", "20000", "--pictures", "out", "--json"),
-    "atlas info": ("atlas", "info", "arm.orthocas-atlas", "--json"),
     "export": ("export", "chart.orthocas", "--to", "numpy", "--out", "out/arm.py"),
     "charts": ("charts", "ur5-position", "--out", "out/ur5.orthocas"),
     "demo": ("demo", "--out", "out"),
@@ -78,7 +73,7 @@ _PYTHON_BEGINS = (  # what Python says of Ctrl-C before it reads a line of ours
     "Error processing line 1 of",
     "Exception ignored in: <function _get_module_lock",
 )
-_MEASURED = ("seconds", "fit_seconds", "control_tick_us", "history", "atlas", "bytes")  # keys of what differs
+_MEASURED = ("seconds", "fit_seconds", "control_tick_us", "history", "bytes")  # keys of what differs
 
 
 def campaign(count: int) -> list[Finding]:
@@ -190,7 +185,6 @@ def place() -> Iterator[Path]:
         (folder / "steps.json").write_text(json.dumps(_STEPS))
         (folder / "path.csv").write_text(_PATH)
         shutil.copy(_chart(), folder / "chart.orthocas")
-        shutil.copy(atlas().path, folder / "arm.orthocas-atlas")
         yield folder
 
 
@@ -264,8 +258,7 @@ def numbers(folder: Path, out: str) -> dict[str, Any]:
         found[path.name] = list(csv.DictReader(io.StringIO(path.read_text())))
     for path in sorted(folder.glob("out/*.[ch]")):
         found[path.name] = path.read_text()
-    kept = [path for path in folder.glob("out/*") if not path.suffix.startswith(".rest")]  # of a killed atlas build
-    found["files"] = sorted(path.name for path in kept)
+    found["files"] = sorted(path.name for path in folder.glob("out/*"))
     if out.startswith(("{", "[")):
         found["out"] = json.loads(out)
     return dict(plain(_without_times(found)))
@@ -301,11 +294,6 @@ def _read_pdf(path: Path) -> None:
         raise ValueError("no whole PDF")
 
 
-def _read_atlas(atlas: oc.Atlas) -> None:
-    for k in range(len(atlas)):
-        atlas.chart(k)
-
-
 def _read_page(path: Path) -> None:
     if "</html>" not in path.read_text()[-100:]:
         raise ValueError("no whole page")
@@ -313,7 +301,6 @@ def _read_page(path: Path) -> None:
 
 _READERS: dict[str, Callable[[Path], object]] = {
     ".orthocas": oc.load,
-    ".orthocas-atlas": lambda path: _read_atlas(oc.Atlas.load(path)),
     ".html": _read_page,
     ".npz": Trajectory.load,
     ".json": lambda path: json.loads(path.read_text()),

@@ -1,4 +1,4 @@
-"""Campaign of sixteen threads that share charts, atlases and laws: each number is that of one thread."""
+"""Campaign of sixteen threads that share charts and laws: each number is that of one thread."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

@@ -1,4 +1,4 @@
-"""Campaign of ticks in generated C: laws on a box, a corridor and an atlas, supervised or not, get hostile numbers."""
+"""Campaign of ticks in generated C: laws on a box and a corridor, supervised or not, get hostile numbers."""
 
 import subprocess
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 
 from charts import in_a_corridor
 from programs import built, path_flags
-from public_objects import IN_ATLAS, atlas, fitted
+from public_objects import fitted
 
 import orthocas as oc
 from fuzz.child import Finding
@@ -22,10 +22,6 @@ def _law(chart: Callable[[], oc.Chart], folder: Path) -> GeneratedC:
     return oc.generate_c(chart(), folder, PDPlus.on_chart(chart(), limit=_LIMIT), "arm")
 
 
-def _law_of_atlas(folder: Path) -> GeneratedC:
-    return oc.generate_c(atlas(), folder, PDPlus.on_chart(atlas().chart(0), limit=_LIMIT), "arm")
-
-
 _corridor = cache(in_a_corridor)
 _in_a_box, _in_a_corridor = (partial(_law, chart) for chart in (lambda: fitted().chart, _corridor))
 PROGRAMS: tuple[tuple[str, Callable[[Path], GeneratedC], str], ...] = (
@@ -34,24 +30,14 @@ PROGRAMS: tuple[tuple[str, Callable[[Path], GeneratedC], str], ...] = (
     ("a law and its inverse in a corridor", _in_a_corridor, "random_ticks.c"),
     ("a supervised law", _in_a_box, "supervised_ticks.c"),
     ("a supervised law in a corridor", _in_a_corridor, "supervised_ticks.c"),
-    ("an atlas", lambda folder: oc.generate_c(atlas(), folder, name="arm"), "atlas_calls.c"),
-    ("a supervised law on an atlas", _law_of_atlas, "supervised_ticks.c"),
 )
 
 
 def ticks(count: int) -> list[Finding]:
     """Run so many ticks, as many in each program."""
     found, each = [], max(1, count // len(PROGRAMS))
-    middle = ",".join(map(str, IN_ATLAS))
     level = "-O2" if each > 10_000 else "-O0"  # few ticks take less time than to compile them well
-    flags = (
-        level,
-        f"-DTICKS={each}L",
-        f"-DCALLS={each}L",
-        f"-DLIMIT={_LIMIT}",
-        "-DSINGULAR=0,0,0",
-        f"-DMIDDLE={middle}",
-    )
+    flags = (level, f"-DTICKS={each}L", f"-DLIMIT={_LIMIT}", "-DSINGULAR=0,0,0")
     for seed, (name, make, program) in enumerate(PROGRAMS):
         path = path_flags(_corridor().problem.domain) if make is _in_a_corridor else ()
         with TemporaryDirectory() as folder:

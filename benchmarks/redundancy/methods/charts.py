@@ -1,4 +1,4 @@
-"""Charts of orthocas: tight, wide, along a known path, with the elbow's angle as coordinate, and many in an atlas."""
+"""Charts of orthocas: tight, wide, along a known path, and with the elbow's angle as coordinate."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -166,15 +166,4 @@ class Elbow(OnChart):
         super().__init__(arm, oc.fit(problem, given).chart)
 
 
-class Atlas:
-    """Not run: docs/atlas.md measures one."""
-
-    name = "chart, atlas"
-    packages = ("orthocas",)
-    grid = ({},)
-
-    def __init__(self, arm: Arm) -> None:
-        raise Unsuited("no atlas of poses is built here: see the page of atlases")
-
-
-METHODS = (Tight, Wide, Corridor, Elbow, Atlas)
+METHODS = (Tight, Wide, Corridor, Elbow)

@@ -1,10 +1,13 @@
-"""The problem of one chart for a whole path of postures."""
+"""One chart for a whole path of postures: the corridor around the path, and the chart that is fitted there."""
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.bases.cyclic import cyclic_joints, over_cyclic_joints
+from orthocas.bases.products import Polynomial
+from orthocas.charts.chart import Chart
 from orthocas.errors import DomainError, InvalidValueError
+from orthocas.fitting.fit import fit
 from orthocas.tasks.corridor import Corridor
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem
@@ -12,10 +15,44 @@ from orthocas.tasks.regular_box import joint_range
 from orthocas.tasks.samples import idle_joints, sample_problem
 from orthocas.tools.checks import Array, as_number, as_point_set, require_kind
 
+RADIUS = 0.2  #: [rad]
+_DEGREE = 3  # of the polynomial, with an angle for each cyclic joint
 _THINNED = 0.5  # of the radius, between postures that are kept
 _PRISMATIC = 0.25  # [m] that count like 1 rad
 _SAMPLES, _SEED = 200, 0
-RADIUS = 0.2  #: [rad]
+
+
+def chart_along(problem: Problem, postures: ArrayLike, radius: float = RADIUS) -> Chart:
+    """Fit one chart to the surroundings of a path of postures.
+
+    The domain is the corridor of `corridor_problem`, the coordinates are polynomials of degree 3 with an angle for
+    each cyclic joint. One chart has one xi: with xi held, every closed path of the tool that can be shrunk to a point
+    in the corridor brings the posture back. Postures come from `follow` in a chart of less orthogonal coordinates, such
+    as a wide one, from a planner or from a log.
+
+    Args:
+        problem: robot, task and metric; its domain does not matter.
+        postures: the path in steps that are small against the radius, (N, n) [rad] or [m].
+        radius: largest distance from the path [rad]; see `corridor_problem`.
+
+    Raises:
+        ShapeError, InvalidValueError, DomainError: as in `corridor_problem`.
+        SingularTaskError: if the task is singular in the corridor.
+
+    Example:
+        >>> import numpy as np
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> problem, q = problems.get("planar_3r_xy"), np.array([0.6, 0.8, 0.8])
+        >>> first = oc.fit(problem, oc.Polynomial(2), samples=300).chart
+        >>> turn = np.linspace(0, 2 * np.pi, 50)[:, None]
+        >>> circle = first.task(q) + 0.1 * np.hstack([np.cos(turn) - 1, np.sin(turn)])
+        >>> chart = oc.chart_along(problem, oc.follow(first, circle, q_start=q, velocity_limits=1.0).q)
+        >>> motion = oc.follow(chart, circle, q_start=q, velocity_limits=1.0)
+        >>> bool(np.abs(motion.q[-1] - q).max() < 1e-6)
+        True
+    """
+    return fit(corridor_problem(problem, postures, radius), Polynomial(_DEGREE, "auto")).chart
 
 
 def corridor_problem(problem: Problem, postures: ArrayLike, radius: float = RADIUS, margin_deg: float = 0.0) -> Problem:
