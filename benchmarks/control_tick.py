@@ -10,13 +10,14 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from baselines import Projector
 from benchmark import run
 
 import orthocas as oc
 from orthocas import problems
 from orthocas.codegen import CompiledLibrary, compile_shared, time_ticks
 from orthocas.codegen.library import compilers
-from orthocas.control import Controller, Impedance, Kinematic, PDPlus, Projector
+from orthocas.control import Controller, Impedance, Kinematic, PDPlus
 
 _PLAIN = """
 int plain_control(const double *q, const double *dq, const double *reference, const double *gains, double *command) {

@@ -12,11 +12,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from baselines import Projector
 from benchmark import run, table
 from many_joints import TALOS, TALOS_MIRRORED, posture, robot
 
 import orthocas as oc
-from orthocas.control import PDPlus, Projector, Reference, matched_stiffness
+from orthocas.control import PDPlus, Reference, matched_stiffness
 from orthocas.simulation import Friction
 from orthocas.tools.checks import Array
 

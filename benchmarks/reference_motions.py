@@ -4,9 +4,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
+from baselines import posture_reference
 
 import orthocas as oc
-from orthocas.control import Reference, posture_reference
+from orthocas.control import Reference
 from orthocas.errors import UnreachableReferenceError
 from orthocas.tools.checks import Array
 

@@ -6,23 +6,20 @@ coordinate from its reference while only another is commanded, divided by the co
 """
 
 import argparse
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.control import (
-    Controller,
-    Impedance,
-    Kinematic,
-    KinematicProjector,
-    PDPlus,
-    Projector,
-    Reference,
-    posture_reference,
-)
+from orthocas.control import Controller, Impedance, Kinematic, PDPlus, Reference
 from orthocas.simulation import coupling_index
+
+sys.path.append(str(Path(__file__).parent.parent / "benchmarks"))
+
+from baselines import KinematicProjector, Projector, posture_reference
 
 STIFFNESS = 200.0  # of x [N/m], of xi [N m], and of postures [N m/rad]
 STEPS = {  # [m], [rad]: small enough for the boxes of the problems

@@ -6,6 +6,7 @@ feedback keeps it from growing.
 """
 
 import argparse
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +15,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import orthocas as oc
-from orthocas.control import Kinematic, KinematicProjector, Reference
+from orthocas.control import Kinematic, Reference
 from orthocas.simulation import Trajectory
+
+sys.path.append(str(Path(__file__).parent.parent / "benchmarks"))
+
+from baselines import KinematicProjector
 
 RADIUS, PERIOD, POINTS = 0.1, 4.0, 16  # horizontal circle: radius [m], period [s], points of its spline
 CYCLES = 50

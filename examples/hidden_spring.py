@@ -7,6 +7,7 @@ control in the chart has no such minimum: it is loaded while the arm moves, and 
 """
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,12 @@ from matplotlib.figure import Figure
 from paper.hidden_spring import POSTURE_STIFFNESS, XI_STIFFNESS, HiddenSpring
 
 import orthocas as oc
-from orthocas.control import Impedance, Projector, Reference
+from orthocas.control import Impedance, Reference
 from orthocas.simulation import Trajectory
+
+sys.path.append(str(Path(__file__).parent.parent / "benchmarks"))
+
+from baselines import Projector
 
 TASK_STIFFNESS = 500.0  # [N/m]
 POSTURE_AT, TIP_AT, DURATION = 1.0, 8.0, 16.0  # [s]

@@ -11,6 +11,7 @@ with the coordinates (or joint positions) of another.
 """
 
 import argparse
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +21,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import orthocas as oc
-from orthocas.control import Impedance, Projector, Reference
+from orthocas.control import Impedance, Reference
 from orthocas.control.operational_space import Coupling
 from orthocas.simulation import Trajectory
+
+sys.path.append(str(Path(__file__).parent.parent / "benchmarks"))
+
+from baselines import Projector
 
 DURATION, STEP = 3.0, 0.01  # [s]
 TOLERANCE = 1e-10  # of CVODES

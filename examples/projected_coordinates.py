@@ -15,6 +15,7 @@ start at random postures in the inner 30 % or 80 % of the domain:
 """
 
 import argparse
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,10 +27,14 @@ from matplotlib.figure import Figure
 from paper.hidden_spring import POSTURE_STIFFNESS, HiddenSpring
 
 import orthocas as oc
-from orthocas.control import Controller, Impedance, Kinematic, KinematicProjector, PDPlus, Projector, Reference
+from orthocas.control import Controller, Impedance, Kinematic, PDPlus, Reference
 from orthocas.simulation import Trajectory
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.metric import metric_matrices
+
+sys.path.append(str(Path(__file__).parent.parent / "benchmarks"))
+
+from baselines import KinematicProjector, Projector
 
 SIZES = (0.3, 0.8)  # of the part of the domain, relative to its half-widths
 BOXES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)

@@ -212,13 +212,6 @@ CONTROLLERS: dict[str, Callable[[], Controller]] = {
     "PD+ that adapts": lambda: control.PDPlus(fitted().chart, 60.0, limit=50.0, remembers=control.Adaptation()),
     "PD+ of a network": lambda: control.PDPlus(network(), 60.0),
     "kinematic": lambda: control.Kinematic(fitted().chart, 1.0),
-    "projector": lambda: control.Projector(planar(), 80.0, 10.0),
-    "kinematic projector": lambda: control.KinematicProjector(planar(), 1.0, 0.5),
-    "projected coordinates": lambda: control.Projector(
-        planar(), 80.0, 10.0, second=fitted().chart, second_force=0.1, feed_forward=True
-    ),
-    "kinematic projected coordinates": lambda: control.KinematicProjector(planar(), 1.0, 0.5, second=fitted().chart),
-    "projector of a task": lambda: control.Projector(planar(), 80.0, 10.0, second=second()),
 }
 OBJECTS: dict[str, Callable[[], Any]] = {
     **CHARTS,
@@ -435,5 +428,5 @@ def _of_controller(law: Controller) -> Iterator[Any]:
         yield from Batched(law.energy)(*states)
 
 
-for _law in (control.Impedance, control.PDPlus, control.Kinematic, control.Projector, control.KinematicProjector):
+for _law in (control.Impedance, control.PDPlus, control.Kinematic):
     _numbers.register(_law, _of_controller)

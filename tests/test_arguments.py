@@ -128,8 +128,6 @@ WRONG: dict[str, Callable[[], Any]] = {
     "problem of grow": lambda: oc.grow(fitted().chart),  # type: ignore[arg-type]
     "problem of singular_points": lambda: oc.singular_points(fitted().chart),  # type: ignore[arg-type]
     "problem of a chart": lambda: oc.Chart("iiwa", fitted().chart.coordinates),  # type: ignore[arg-type]
-    "problem of Projector": lambda: control.Projector(fitted().chart, 1.0, 1.0),  # type: ignore[arg-type]
-    "problem of KinematicProjector": lambda: control.KinematicProjector("iiwa"),  # type: ignore[arg-type]
     "chart of evaluate": lambda: oc.evaluate(planar()),  # type: ignore[arg-type]
     "chart of distil": lambda: oc.distil(planar()),  # type: ignore[arg-type]
     "chart of jumps": lambda: oc.jumps(planar()),  # type: ignore[arg-type]

@@ -13,7 +13,7 @@ from simulate_command import FILES, report_of, written
 
 import orthocas as oc
 from orthocas.cli.controller_argument import build_controller
-from orthocas.control import ControlStatus, matched_posture_stiffness, matched_stiffness
+from orthocas.control import ControlStatus, matched_stiffness
 from orthocas.fitting.fit import Fit
 from orthocas.simulation import Trajectory
 from orthocas.tasks.domains import sample_uniform
@@ -69,49 +69,25 @@ def test_rows_name_units_angles_and_the_folder(run_simulate: Run, chart: oc.Char
 
 
 @pytest.mark.usefixtures("blank_pictures")
-@pytest.mark.parametrize("name", ["kinematic", "projector", "kinematic_projector"])
-def test_other_controllers_follow_the_same_file_and_are_judged_in_the_chart(run_simulate: Run, name: str) -> None:
-    report = report_of(run_simulate, name)
+def test_a_velocity_law_follows_the_same_file(run_simulate: Run) -> None:
+    report = report_of(run_simulate, "kinematic")
     assert set(report["tracking_error"]) == {"x", "xi1", "xi2"}
-    assert report["tracking_error"]["x"] < (0.05 if name == "projector" else 1e-3)
-    assert (report["energy"] is None) == (name != "projector")
+    assert report["tracking_error"]["x"] < 1e-3
+    assert report["energy"] is None
     trajectory = Trajectory.load("out/trajectory.npz")
-    assert trajectory.labels == (("x", "xi1", "xi2") if name == "kinematic" else ("x", "q1", "q2", "q3"))
-    assert trajectory.kind == ("torque" if name == "projector" else "velocity")
-
-
-@pytest.mark.usefixtures("blank_pictures")
-@pytest.mark.parametrize("name", ["projector", "kinematic_projector"])
-def test_projectors_move_extra_coordinates_on_request(run_simulate: Run, chart: oc.Chart, name: str) -> None:
-    """They follow the reference of the chart itself, with the stiffness of the chart's springs."""
-    report = report_of(run_simulate, name, "--second", "xi")
-    assert report["second"] == "xi"
-    assert report["tracking_error"]["x"] < (0.05 if name == "projector" else 1e-6)
-    assert Trajectory.load("out/trajectory.npz").labels == ("x", "xi1", "xi2")
-
-
-def test_gains_of_projectors_of_extra_coordinates(chart: oc.Chart) -> None:
-    options = {"second": "xi"}
-    law = build_controller("projector", chart, options, None)
-    direct = build_controller("impedance", chart, {}, None)
-    np.testing.assert_array_equal(law.gains["stiffness"], direct.gains["stiffness"])
-    options = {"second": "xi", "feedback": "1,2,3"}
-    assert build_controller("kinematic_projector", chart, options, None).gains["feedback"].tolist() == [1, 2, 3]
+    assert (trajectory.labels, trajectory.kind) == (("x", "xi1", "xi2"), "velocity")
 
 
 def test_springs_that_are_not_given_are_matched(chart: oc.Chart) -> None:
-    """In the chart's coordinates and in the joints, no mode is much faster than 18 Hz."""
+    """No mode is much faster than 18 Hz."""
     points = sample_uniform(chart.problem.domain, 256, 0)
     J, M = chart.jacobian(points), np.array([chart.problem.robot.mass_matrix(q) for q in points])
     half = np.linalg.inv(J)
     stiffness = build_controller("pd_plus", chart, {}, None).gains["stiffness"]
-    projector = build_controller("projector", chart, {}, None).gains["stiffness"]
     np.testing.assert_array_equal(stiffness, matched_stiffness(chart))
-    np.testing.assert_array_equal(projector[1:], matched_posture_stiffness(chart.problem))
-    for K, inertias in ((stiffness, half.transpose(0, 2, 1) @ M @ half), (projector[1:], M)):
-        frequencies = np.sqrt([eigvalsh(np.diag(K), inertia) for inertia in inertias]) / (2 * np.pi)
-        assert 15 < frequencies.max() < 21
-    assert projector[0] == stiffness[0]
+    inertias = half.transpose(0, 2, 1) @ M @ half
+    frequencies = np.sqrt([eigvalsh(np.diag(stiffness), inertia) for inertia in inertias]) / (2 * np.pi)
+    assert 15 < frequencies.max() < 21
 
 
 @pytest.mark.slow
@@ -121,13 +97,9 @@ def test_gains_and_limits_are_those_given(run_simulate: Run, chart: oc.Chart) ->
     report = report_of(run_simulate, "impedance", *words)
     assert report["gains"] == {"stiffness": [100, 2000, 3000], "damping_ratio": [0.9] * 3, "limit": [400] * 3}
     assert report["coupling"] == "decoupled"
-    options = {"stiffness": "300", "posture_stiffness": "30,20,10"}
-    projector = build_controller("projector", chart, options, "50,60,70").gains
-    assert projector["stiffness"].tolist() == [300, 30, 20, 10]
-    assert projector["limit"].tolist() == [50, 60, 70]
-    each, all_of_them = {"feedback": "1,2,3,4"}, {"feedback": "5"}
-    assert build_controller("kinematic_projector", chart, each, None).gains["feedback"].tolist() == [1, 2, 3, 4]
-    assert build_controller("kinematic", chart, all_of_them, None).gains["feedback"].tolist() == [5, 5, 5]
+    assert build_controller("impedance", chart, {}, "50,60,70").gains["limit"].tolist() == [50, 60, 70]
+    assert build_controller("kinematic", chart, {"feedback": "1,2,3"}, None).gains["feedback"].tolist() == [1, 2, 3]
+    assert build_controller("kinematic", chart, {"feedback": "5"}, None).gains["feedback"].tolist() == [5, 5, 5]
 
 
 @pytest.mark.slow

@@ -22,24 +22,21 @@ from orthocas.tools.progress import Monitor, Progress
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("pid",), "unknown controller 'pid', known: impedance, pd_plus, kinematic, projector, kinematic_projector"),
+        (("pid",), "unknown controller 'pid', known: impedance, pd_plus, kinematic"),
         (
             ("kinematic", "--stiffness", "1"),
             "kinematic has no --stiffness, which belongs to",
         ),
-        (("pd_plus", "--feedback", "1"), "which belongs to kinematic, kinematic_projector"),
-        (("pd_plus", "--posture-stiffness", "1"), "which belongs to projector"),
-        (("projector", "--second", "xi2"), "unknown second task 'xi2', known: joints, xi"),
-        (("impedance", "--second", "xi"), "which belongs to projector, kinematic_projector"),
-        (("projector", "--coupling", "coupled"), "which belongs to impedance, pd_plus"),
+        (("pd_plus", "--feedback", "1"), "which belongs to kinematic"),
+        (("kinematic", "--coupling", "coupled"), "which belongs to impedance, pd_plus"),
         (("kinematic", "--mass-factor", "1.1"), "kinematic has no --mass-factor"),
-        (("kinematic", "--friction", "1,1"), "which belongs to impedance, pd_plus, projector"),
+        (("kinematic", "--friction", "1,1"), "which belongs to impedance, pd_plus"),
         (("pd_plus", "--coupling", "both"), "unknown coupling 'both', known: coupled, decoupled"),
         (("pd_plus", "--stiffness", "1,2"), "stiffness has shape (2,), expected (3,)"),
         (("pd_plus", "--stiffness", "-1"), "stiffness[0] is -1.0, expected positive numbers"),
         (("pd_plus", "--stiffness", "soft"), "--stiffness is ['soft'], expected an array of numbers"),
         (("pd_plus", "--limit", "0"), "limit[0] is 0.0, expected positive numbers"),
-        (("kinematic_projector", "--feedback", "1,2"), "feedback (task, then joints) has shape (2,), expected (4,)"),
+        (("kinematic", "--feedback", "1,2"), "feedback has shape (2,), expected (3,)"),
         (("pd_plus", "--rate", "0"), "control_rate is 0.0, expected a finite number > 0"),
         (("pd_plus", "--noise", "1,1"), "--noise requires --rate"),
         (("pd_plus", "--noise", "1", "--rate", "100"), "--noise is '1', expected two numbers"),
@@ -78,7 +75,7 @@ def test_mp4_without_ffmpeg_is_refused_before_the_run(run_simulate: Run, monkeyp
     assert not Path("out").exists()
 
 
-@pytest.mark.parametrize("name", ["pd_plus", "kinematic_projector"])
+@pytest.mark.parametrize("name", ["pd_plus", "kinematic"])
 def test_a_reference_that_leaves_the_domain_is_reported_before_the_run(run_simulate: Run, name: str) -> None:
     Path("far.json").write_text(json.dumps({"duration": 2, "steps": [{"time": 1, "move": {"x": 0.6}}]}))
     code, out, err = run_simulate(name, steps="far.json")
@@ -88,7 +85,7 @@ def test_a_reference_that_leaves_the_domain_is_reported_before_the_run(run_simul
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["pd_plus", "kinematic_projector"])
+@pytest.mark.parametrize("name", ["pd_plus", "kinematic"])
 def test_grown_charts_are_refused(run_simulate: Run, name: str, planar_x: oc.Problem) -> None:
     oc.grow(planar_x, leaf="linear").save("grown.orthocas")
     code, out, err = run_simulate(name, chart="grown.orthocas")

@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
+from baselines import KinematicProjector, Projector
 from charts import linear_on_the_torus
 from conftest import ROBOTS, arm, pinocchio_position
 from programs import needs_c, nightly
@@ -17,15 +18,7 @@ from programs import needs_c, nightly
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared, gain_numbers
 from orthocas.codegen.kernels import with_shared_calls, with_turns_once
-from orthocas.control import (
-    Controller,
-    ControlStatus,
-    Impedance,
-    Kinematic,
-    KinematicProjector,
-    PDPlus,
-    Projector,
-)
+from orthocas.control import Controller, ControlStatus, Impedance, Kinematic, PDPlus
 from orthocas.errors import CompileError, ProofError
 from orthocas.tasks.domains import sample_uniform
 

@@ -11,12 +11,13 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from baselines import Projector
 from programs import Run, needs_c, needs_cmake, output_of
 
 import orthocas as oc
 from orthocas.codegen import GeneratedC, check_c
 from orthocas.codegen.library import STRICT, compilers
-from orthocas.control import PDPlus, Projector
+from orthocas.control import PDPlus
 from orthocas.errors import InvalidValueError, NoExpressionError, one_line
 from orthocas.fitting.fit import Fit
 

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from baselines import Projector
 from programs import needs_c
 from public_objects import impedance, planar, second, steps
 
 import orthocas as oc
-from orthocas.control import ControlStatus, Kinematic, PDPlus, Projector, Reference, Safety
+from orthocas.control import ControlStatus, Kinematic, PDPlus, Reference, Safety
 from orthocas.control.controller import Controller
 from orthocas.errors import InvalidValueError, UnknownNameError
 from orthocas.fitting.fit import Fit

@@ -6,20 +6,13 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from baselines import KinematicProjector, Projector
 from charts import with_metric
 from laws import torque
 from scipy.linalg import block_diag, sqrtm
 
 import orthocas as oc
-from orthocas.control import (
-    ControlStatus,
-    Impedance,
-    Kinematic,
-    KinematicProjector,
-    PDPlus,
-    Projector,
-    Reference,
-)
+from orthocas.control import ControlStatus, Impedance, Kinematic, PDPlus, Reference
 from orthocas.control.controller import Controller
 from orthocas.errors import (
     NoExpressionError,

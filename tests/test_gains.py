@@ -9,7 +9,7 @@ from laws import torque
 from scipy.linalg import eigvalsh
 
 import orthocas as oc
-from orthocas.control import Impedance, PDPlus, matched_posture_stiffness, matched_stiffness
+from orthocas.control import Impedance, PDPlus, matched_stiffness
 from orthocas.errors import (
     InvalidValueError,
 )
@@ -45,7 +45,6 @@ def test_matched_stiffness_is_exact_where_the_inertia_is_constant_and_diagonal()
     problem = oc.Problem(robot, oc.Task.position(robot, "x"), "inertia", oc.Box(np.zeros(2), 1.0))
     chart = oc.fit(problem, oc.Linear()).chart
     np.testing.assert_allclose(matched_stiffness(chart, 5.0), [75.0, 50.0 / chart.jacobian(np.zeros(2))[1, 1] ** 2])
-    np.testing.assert_allclose(matched_posture_stiffness(problem, 5.0), [75.0, 50.0])
     with pytest.raises(InvalidValueError, match="frequency"):
         matched_stiffness(chart, 0.0)
     with pytest.raises(InvalidValueError, match="fastest"):

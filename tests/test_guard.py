@@ -4,18 +4,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from baselines import KinematicProjector, Projector
 from charts import linear_on_the_torus
 from laws import torque
 
 import orthocas as oc
-from orthocas.control import (
-    ControlStatus,
-    Impedance,
-    Kinematic,
-    KinematicProjector,
-    PDPlus,
-    Projector,
-)
+from orthocas.control import ControlStatus, Impedance, Kinematic, PDPlus
 from orthocas.control.controller import FROM_THE_LAW, Controller
 from orthocas.errors import (
     InvalidValueError,

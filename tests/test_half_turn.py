@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from baselines import KinematicProjector, Projector
 from numpy.typing import NDArray
 from programs import needs_c, nightly
 from scipy.spatial.transform import Rotation
@@ -240,8 +241,8 @@ def laws(kind: str, turned_deg: float) -> list[control.Controller]:
         control.PDPlus(known, K, damping, limit=1e5),
         control.Impedance(known, K, damping, limit=1e5),
         control.Kinematic(known, 3.0, limit=1e5),
-        control.KinematicProjector(known.problem, 3.0, 2.0, second=known, limit=1e5),
-        control.Projector(known.problem, K[:6], 20.0, limit=1e5, feed_forward=True),
+        KinematicProjector(known.problem, 3.0, 2.0, second=known, limit=1e5),
+        Projector(known.problem, K[:6], 20.0, limit=1e5, feed_forward=True),
     ]
 
 

@@ -95,7 +95,7 @@ def test_joint_that_moves_no_mass_is_named_when_inertia_is_the_metric() -> None:
         oc.Problem(robot, oc.Task.position(robot), "inertia")
     problem = oc.Problem(robot, oc.Task.position(robot), "euclidean")  # needs no mass
     with pytest.raises(MetricError, match="joint 'wrist_3_joint' moves no mass.*for gains by modes"):
-        oc.control.matched_posture_stiffness(problem)
+        oc.control.matched_stiffness(oc.fit(problem, oc.Linear()).chart)
     rotor = massless(ur5, 5, armatures=np.full(6, 0.01))
     oc.check(oc.Problem(rotor, oc.Task.position(rotor), "inertia"))
     carried = massless(ur5, 2)  # carries what has mass

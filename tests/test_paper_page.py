@@ -22,7 +22,7 @@ def rows(section: str) -> list[list[str]]:
 
 
 def test_every_module_and_test_named_in_the_table_exists() -> None:
-    modules = re.findall(r"`((?:orthocas|problems|solvers|examples)/[\w/]+\.py)`", PAGE)
+    modules = re.findall(r"`((?:orthocas|problems|solvers|examples|benchmarks)/[\w/]+\.py)`", PAGE)
     tests = re.findall(r"`(test_\w+\.py)::(\w+)`", PAGE)
     assert len(modules) > 100
     assert len(tests) > 100

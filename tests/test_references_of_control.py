@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from baselines import posture_reference
 from scipy.integrate import solve_ivp
 
 import orthocas as oc
-from orthocas.control import Reference, joint_path, posture_reference
+from orthocas.control import Reference, joint_path
 from orthocas.errors import InvalidValueError, OrthocasError, ShapeError, UnknownNameError, UnreachableReferenceError
 
 STEPS = [(0.5, {"x": 1.0}), (0.9, {"xi1": -2.0}), (3.0, {"x": 0.0, "xi1": 0.5})]

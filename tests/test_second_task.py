@@ -6,13 +6,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from baselines import KinematicProjector, Projector
 from charts import with_metric
 from programs import needs_c
 from scipy.linalg import sqrtm
 
 import orthocas as oc
 from orthocas.codegen import check_c
-from orthocas.control import ControlStatus, Impedance, KinematicProjector, Projector, Reference
+from orthocas.control import ControlStatus, Impedance, Reference
 from orthocas.control.controller import Controller
 from orthocas.errors import (
     InvalidValueError,

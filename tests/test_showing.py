@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from baselines import KinematicProjector
 from conftest import arm
 from public_objects import CONTROLLERS, OBJECTS, comparison, fitted, impedance, planar, trajectory
 
@@ -36,7 +37,7 @@ def many_joints() -> oc.Robot:
 
 LARGE = {
     "hostile names": wicked,
-    "law of hostile names": lambda: control.KinematicProjector(wicked().problem),
+    "law of hostile names": lambda: KinematicProjector(wicked().problem),
     "many joints": many_joints,
     "iiwa": lambda: problems.get("iiwa"),
     "box of the iiwa": lambda: problems.get("iiwa").domain,

@@ -6,12 +6,13 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from baselines import Projector
 from charts import with_metric
 from closed_loops import K, resting, torque_at
 from scipy.integrate import solve_ivp
 
 import orthocas as oc
-from orthocas.control import ControlStatus, Impedance, Kinematic, PDPlus, Projector, Reference
+from orthocas.control import ControlStatus, Impedance, Kinematic, PDPlus, Reference
 from orthocas.errors import InvalidValueError
 from orthocas.problems.iiwa import urdf_path
 from orthocas.robots.pinocchio_model import planar_model

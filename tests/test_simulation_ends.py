@@ -4,10 +4,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from baselines import KinematicProjector, Projector
 from closed_loops import K, resting
 
 import orthocas as oc
-from orthocas.control import ControlStatus, Impedance, Kinematic, KinematicProjector, PDPlus, Projector, Reference
+from orthocas.control import ControlStatus, Impedance, Kinematic, PDPlus, Reference
 from orthocas.errors import Interrupted, InvalidValueError, ShapeError, UnreachableReferenceError
 from orthocas.simulation import (
     Friction,

@@ -10,22 +10,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from baselines import KinematicProjector, Projector
 from programs import Run, built, needs_c, output_of
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, check_c, compile_shared, gain_numbers
 from orthocas.codegen.library import compilers
 from orthocas.codegen.precision import SINGLE
-from orthocas.control import (
-    Controller,
-    ControlStatus,
-    Impedance,
-    Kinematic,
-    KinematicProjector,
-    PDPlus,
-    Projector,
-    Safety,
-)
+from orthocas.control import Controller, ControlStatus, Impedance, Kinematic, PDPlus, Safety
 from orthocas.errors import ProofError
 from orthocas.fitting.fit import Fit
 from orthocas.tasks.domains import bounds_of

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from baselines import Projector
 from programs import Run, needs_c
 
 import orthocas as oc
 from orthocas.codegen import library
-from orthocas.control import ControlStatus, Kinematic, PDPlus, Projector, Reference, Safety, matched_stiffness
+from orthocas.control import ControlStatus, Kinematic, PDPlus, Reference, Safety, matched_stiffness
 from orthocas.errors import CompileError, InvalidValueError, ShapeError
 from orthocas.simulation import Outcome, Push, Trajectory, simulate
 from orthocas.simulation.figure import trajectory_figure
@@ -166,7 +167,7 @@ def test_arguments_that_do_not_fit_are_named(law: PDPlus, chart: oc.Chart, monke
         simulate(law, reference, q, control_rate=RATE, safety=law)  # type: ignore[arg-type]
     with pytest.raises(ShapeError, match="rest_speed"):
         simulate(law, reference, q, control_rate=RATE, safety=replace(safety, rest_speed=[0.5, 0.5]))
-    projector = Projector.on_chart(chart)
+    projector = Projector(chart.problem, 100.0, 10.0)
     posture = Reference.steps(projector.labels, projector.measured(q).full().ravel(), [], 0.2)
     with pytest.raises(InvalidValueError, match="without a chart"):
         simulate(projector, posture, q, control_rate=RATE, safety=Safety.of(projector))

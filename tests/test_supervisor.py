@@ -5,12 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from baselines import Projector
 from programs import needs_c
 from supervised import TICK, Arm, at_rest, moving, run
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
-from orthocas.control import Controller, ControlStatus, Impedance, Kinematic, PDPlus, Projector, Safety
+from orthocas.control import Controller, ControlStatus, Impedance, Kinematic, PDPlus, Safety
 
 pytestmark = needs_c
 
@@ -149,8 +150,12 @@ def test_another_chart_takes_over_while_the_arm_moves(
     np.testing.assert_allclose(arm.q, q + 400 * TICK * wanted, atol=2e-3)
 
 
+def without_a_chart(chart: oc.Chart) -> Controller:
+    return Projector(chart.problem, 100.0, 10.0)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [Impedance.on_chart, Kinematic.on_chart, Projector.on_chart])
+@pytest.mark.parametrize("make", [Impedance.on_chart, Kinematic.on_chart, without_a_chart])
 def test_every_law_can_be_supervised(
     planar_for_control: oc.Chart, tmp_path: Path, make: Callable[..., Controller]
 ) -> None:

@@ -4,12 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from baselines import Projector
 from programs import needs_c
 from supervised import TICK, Arm, at_rest, moving
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
-from orthocas.control import Controller, ControlStatus, Projector, Safety
+from orthocas.control import Controller, ControlStatus, Safety
 from orthocas.tools.checks import Array
 
 pytestmark = needs_c
@@ -195,7 +196,7 @@ def test_pace_keeps_a_path_that_is_asked_for_too_fast(
 def test_a_stream_of_poses_turns_the_shorter_way(tmp_path: Path) -> None:
     """From 2.8 rad about x on one side of the reference orientation to 2.8 rad on the other side: 0.68 rad, not 5.6."""
     chart = oc.charts.load("panda-pose")
-    law, task = Projector.on_chart(chart), chart.problem.task  # without a domain
+    law, task = Projector(chart.problem, 100.0, 10.0), chart.problem.task  # without a domain
     free = Safety.of(law, reference_speed=np.inf, reference_acceleration=np.inf)
     generated = oc.generate_c(chart, tmp_path, law, "arm", safety=free)
     supervisor = Supervisor(CompiledLibrary(compile_shared(generated, tmp_path), "arm", 7), law, free)

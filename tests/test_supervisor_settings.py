@@ -5,13 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from baselines import Projector
 from programs import needs_c
 from supervised import TICK, Arm, at_rest, run
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.codegen.library import GeneratedC
-from orthocas.control import Controller, ControlStatus, Kinematic, Projector, Safety
+from orthocas.control import Controller, ControlStatus, Kinematic, Safety
 from orthocas.errors import InvalidValueError, ShapeError
 
 pytestmark = needs_c
@@ -32,7 +33,7 @@ def test_settings_are_checked(supervised_law: Controller, planar_for_control: oc
             tmp_path,
             supervised_law,
             "arm",
-            safety=Safety.of(Projector.on_chart(planar_for_control)),
+            safety=Safety.of(Projector(planar_for_control.problem, 100.0, 10.0)),
         )
 
 

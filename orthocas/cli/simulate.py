@@ -1,7 +1,6 @@
 """`orthocas simulate`: a controller in the coordinates of a chart, run in closed loop."""
 
 import time
-from dataclasses import replace
 from functools import partial
 from math import isfinite
 from pathlib import Path
@@ -33,7 +32,6 @@ from orthocas.cli.output import (
 )
 from orthocas.cli.problem_argument import parse_numbers
 from orthocas.control.controller import Controller, ControlStatus
-from orthocas.control.posture import posture_reference
 from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
 from orthocas.errors import ArchiveError, Interrupted, InvalidValueError, OptionError, SingularTaskError
@@ -286,15 +284,15 @@ def simulate(
     }
     begin = time.perf_counter()
     with terminal_monitor() as monitor:
-        run = _run(law, loaded, plan, conditions, monitor)
+        run = _run(law, plan, conditions, monitor)
         finish = partial(_finish, law, loaded, plan, run, time.perf_counter() - begin, out, force)
         interrupted = run.outcome is Outcome.INTERRUPTED
         try:
-            seen, report = finish()
+            report = finish()
             if animation != "none" and not interrupted:
-                save_animation(out / f"animation.{animation}", seen, loaded.problem, monitor, force)
+                save_animation(out / f"animation.{animation}", run, loaded.problem, monitor, force)
         except KeyboardInterrupt:  # the run is complete: keep it
-            seen, report = finish()
+            report = finish()
             interrupted = True
     if json:
         print_json(report)
@@ -353,49 +351,28 @@ def _noise(law: Controller, text: str | None, seed: int | None, rate: float | No
     return Noise(position, velocity, 0 if seed is None else seed)
 
 
-def _run(law: Controller, chart: Chart, plan: Plan, conditions: dict[str, Any], monitor: Monitor) -> Trajectory:
-    """Run the closed loop. Projectors follow the joint positions that correspond to the reference."""
-    reference = plan.reference
-    if law.labels != chart.labels:
-        reference = posture_reference(chart, reference, plan.q_start)
+def _run(law: Controller, plan: Plan, conditions: dict[str, Any], monitor: Monitor) -> Trajectory:
+    """Run the closed loop, or what there is of it at Ctrl-C."""
     try:
-        return run_closed_loop(law, reference, plan.q_start, pushes=plan.pushes, monitor=monitor, **conditions)
+        return run_closed_loop(law, plan.reference, plan.q_start, pushes=plan.pushes, monitor=monitor, **conditions)
     except Interrupted as stop:
         run: Trajectory = stop.result
         return run
 
 
-def _in_chart(chart: Chart, reference: Reference, run: Trajectory) -> Trajectory:
-    """The run with the chart's coordinates as its quantities, even if the controller does not use them."""
-    value, velocity, acceleration = reference.sample(run.times.clip(0, reference.duration))
-    return replace(
-        run,
-        labels=chart.labels,
-        value=chart.phi(run.q),
-        reference=value,
-        reference_velocity=velocity,
-        reference_acceleration=acceleration,
-    )
-
-
 def _finish(
     law: Controller, chart: Chart, plan: Plan, run: Trajectory, seconds: float, out: Path, force: bool
-) -> tuple[Trajectory, dict[str, Any]]:
-    """Write the run, its picture and its report, and remove the animation of an earlier run.
-
-    Returns:
-        The run in the chart's coordinates, and the report.
-    """
-    seen = _in_chart(chart, plan.reference, run)
-    report = run_report(law, chart, plan, seen, seconds)
+) -> dict[str, Any]:
+    """Write the run, its picture and its report, which is returned, and remove the animation of an earlier run."""
+    report = run_report(law, chart, plan, run, seconds)
     with output_folder("--out", out) as folder, published(folder, listed=True, force=force) as drafts:
         run.save(drafts / "trajectory.npz")
-        trajectory_figure(seen, units_of(chart.problem)).savefig(drafts / "coordinates.png", dpi=130)
+        trajectory_figure(run, units_of(chart.problem)).savefig(drafts / "coordinates.png", dpi=130)
         (drafts / "report.json").write_text(to_json(report, indent=1) + "\n")
     for old in (out / f"animation.{kind}" for kind in FORMATS):
         if is_listed(old):
             old.unlink()
-    return seen, report
+    return report
 
 
 def _notes(law: Controller, report: dict[str, Any], interrupted: bool) -> None:

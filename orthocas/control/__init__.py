@@ -1,12 +1,11 @@
 """Controllers as CasADi functions of state, reference and gains, with the references they follow."""
 
 from orthocas.control.controller import Controller, ControlStatus, Law
-from orthocas.control.gains import Setting, matched_posture_stiffness, matched_stiffness
+from orthocas.control.gains import Setting, matched_stiffness
 from orthocas.control.kinematic import Kinematic
 from orthocas.control.memory import Adaptation, Memory, MomentumObserver, Remembering
 from orthocas.control.operational_space import DampingCheck, Impedance, Modes, PDPlus
-from orthocas.control.posture import joint_path, posture_reference
-from orthocas.control.projector import KinematicProjector, Projector
+from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
 from orthocas.control.registry import law_names, law_of, register
 from orthocas.control.run_time_model import RunTimeModel
@@ -20,13 +19,11 @@ __all__ = [
     "DampingCheck",
     "Impedance",
     "Kinematic",
-    "KinematicProjector",
     "Law",
     "Memory",
     "Modes",
     "MomentumObserver",
     "PDPlus",
-    "Projector",
     "Reference",
     "Remembering",
     "RunTimeModel",
@@ -36,8 +33,6 @@ __all__ = [
     "joint_path",
     "law_names",
     "law_of",
-    "matched_posture_stiffness",
     "matched_stiffness",
-    "posture_reference",
     "register",
 ]

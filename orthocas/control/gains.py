@@ -12,7 +12,6 @@ from orthocas.errors import InvalidValueError
 from orthocas.robots.robot import Robot
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.metric import require_mass
-from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import (
     Array,
     as_float_array,
@@ -23,18 +22,16 @@ from orthocas.tools.checks import (
     require_shape,
 )
 
-STIFFNESS, DAMPING_RATIO, FEEDBACK, LIMIT, SECOND_FORCE = (  #: units of gains, in words
+STIFFNESS, DAMPING_RATIO, FEEDBACK, LIMIT = (  #: units of gains, in words
     "J per squared unit of the quantity, > 0",
     ">= 0, 1 is critical damping",
     "1/s, >= 0",
     "largest command per joint, > 0; INFINITY for no limit",
-    "J per unit of the second quantity",
 )
 SPRING_FREQUENCY = 12 * np.pi  #: [rad/s], 6 Hz; what it holds: docs/measurements/control.md
 FASTEST = 36 * np.pi  #: [rad/s], 18 Hz: stable with a delay of 6.5 ms at a damping ratio of 0.7
 MARGIN = np.pi / 6  #: [rad], 30 degrees of phase that are left to the fastest mode at a stated delay
 _SAMPLES, _SEED = 512, 0
-_NEED = "gains by modes"  # what needs a mass matrix that is not singular
 _ROUNDS, _CLOSE = 12, 1.05  # of descents for a delay; how much of a bound on squared frequencies is left to scaling
 _TOO_FAST = 3000.0  # weight of the squared logarithm by which a mode exceeds the fastest frequency
 
@@ -72,11 +69,6 @@ def non_negative_gains(name: str, value: ArrayLike, length: int) -> Array:
     gains = _spread(name, value, length)
     _require(name, gains, gains >= 0, "numbers >= 0")
     return gains
-
-
-def finite_gains(name: str, value: ArrayLike, length: int) -> Array:
-    """Finite numbers, (length,), from one number or (length,)."""
-    return _spread(name, value, length)
 
 
 def command_limit(name: str, value: ArrayLike | None, default: Array) -> Array:
@@ -143,12 +135,13 @@ def matched_stiffness(
     """
     require_kind("chart", chart, Chart)
     chart.function("xi")  # raises for grown charts
-    require_mass(chart.problem.robot, _NEED)
+    require_mass(chart.problem.robot, "gains by modes")
     if not 0 <= as_number("delay", delay) < np.inf:
         raise InvalidValueError("delay", delay, "a finite number >= 0")
     bearable = _bearable(delay, damping_ratio, chart.n) if delay else np.inf
     bound = min(as_number("fastest", fastest), bearable)
-    known = mobility(chart, _points(chart.problem), chart.problem.robot)
+    points = sample_uniform(chart.problem.domain, _SAMPLES, _SEED)
+    known = mobility(chart, points, chart.problem.robot)
     return _matched(known, frequency, bound) if not delay else _kept_everywhere(chart, known, frequency, bound)
 
 
@@ -188,21 +181,10 @@ def fastest_posture(chart: Chart, stiffness: Array, robot: Robot) -> Array:
     return least_in_domain(slowness, chart.problem.domain)
 
 
-def matched_posture_stiffness(problem: Problem, frequency: float = SPRING_FREQUENCY, fastest: float = FASTEST) -> Array:
-    """Stiffness of springs in the joints, from the modes of (K_q, M) in the same way, (n,)."""
-    require_kind("problem", problem, Problem)
-    require_mass(problem.robot, _NEED)
-    return _matched(np.linalg.inv(problem.robot.mass_matrix(_points(problem))), frequency, fastest)
-
-
 def mobility(chart: Chart, points: ArrayLike, robot: Robot) -> Array:
     """M_phi^-1 = J M^-1 J^T of a robot at points (N, n), (N, n, n)."""
     J, M = chart.batched_rates(as_point_set("points", points, chart.n)[0]), robot.mass_matrix(points)
     return np.asarray(J @ np.linalg.solve(M, J.transpose(0, 2, 1)))
-
-
-def _points(problem: Problem) -> Array:
-    return sample_uniform(problem.domain, _SAMPLES, _SEED)
 
 
 def _matched(mobilities: Array, frequency: float, fastest: float, bounded: Array | None = None) -> Array:

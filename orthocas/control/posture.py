@@ -1,4 +1,4 @@
-"""Which references a law can reach, and references from postures."""
+"""Which references a law can reach."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -86,22 +86,3 @@ def _outside(chart: Chart, q: Array) -> str:
 
 def _list(labels: tuple[str, ...], value: Array) -> str:
     return ", ".join(f"{label} = {number:.3g}" for label, number in zip(labels, value, strict=True))
-
-
-def posture_reference(chart: Chart, reference: Reference, q_start: ArrayLike) -> Reference:
-    """The reference [x_d; q_d] with phi(q_d) = phi_d at every instant, for a fair comparison with a `Projector`.
-
-    Args:
-        chart: the chart whose coordinates the reference is given in.
-        reference: the motion of phi = [x; xi].
-        q_start: joint position at the start, (n,).
-
-    Raises:
-        UnreachableReferenceError: if the reference leaves the domain.
-    """
-    require_kind("chart", chart, Chart)
-    path = joint_path(chart, reference, q_start)
-    times = reference.grid()
-    task = reference.sample(times)[0][:, : chart.m]
-    labels = (*chart.problem.task.labels, *chart.problem.robot.joint_names)
-    return Reference.through(labels, times, np.hstack([task, path]))

@@ -6,7 +6,6 @@ from orthocas.control.controller import Law
 from orthocas.control.gains import Setting
 from orthocas.control.kinematic import Kinematic
 from orthocas.control.operational_space import Impedance, PDPlus
-from orthocas.control.projector import KinematicProjector, Projector
 from orthocas.errors import InvalidValueError
 from orthocas.tools.checks import require_known
 
@@ -45,5 +44,5 @@ def law_of(name: str) -> type[Law]:
     return _LAWS[name]
 
 
-for _law in (Impedance, PDPlus, Kinematic, Projector, KinematicProjector):
+for _law in (Impedance, PDPlus, Kinematic):
     register(_law)

@@ -49,13 +49,13 @@ _SOLVERS = (
     "ipopt",
     "newton",
 )  # Adam takes the paper's 10,000 steps, 20 s, for any fit
-_LAWS = ("impedance", "pd_plus", "kinematic", "projector", "kinematic_projector", "none", "pid")
+_LAWS = ("impedance", "pd_plus", "kinematic", "none", "pid")
 _COUNTS = ("0", "1", "2", "-1", "20", "99999999999999999999", "1.5", "")
 _VALUES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("--tip", "--home"), ("l1", "tip", "nowhere", *NAMES)),
     **dict.fromkeys(("--lock",), ("j1=0", "j1", "=", "j1=nan", "j1=x", "nowhere=1", "l1=0=1", "j1=1e300")),
     **dict.fromkeys(("--tool", "--centre", "--half-width", "--weights", "--friction", "--noise"), _LISTS),
-    **dict.fromkeys(("--stiffness", "--damping-ratio", "--posture-stiffness", "--feedback", "--limit"), _LISTS),
+    **dict.fromkeys(("--stiffness", "--damping-ratio", "--feedback", "--limit"), _LISTS),
     "--damping-stiffness": _LISTS,
     "--model": ("own", "given", "", "x"),
     "--gravity": ("law", "robot", "", "9.81"),
@@ -75,11 +75,10 @@ _VALUES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("--splits", "--degree"), _COUNTS),
     **dict.fromkeys(("--out", "--checkpoint"), ("out", "out/x/y", ".", "", "chart.orthocas", "/dev/null/x", "x" * 300)),
     **dict.fromkeys(("--coupling", "--damping", "--animation"), ("coupled", "square_root", "none", "mp5", "")),
-    "--second": ("joints", "xi", "x2", ""),
     "--task": ("position:x", "position", "polar", "axis:z", "axis:w", "pose:z", "position:xx", "position+axis", ""),
     "--metric": ("euclidean", "inertia", "identity"),
     "--param": _WORDS,
-    **dict.fromkeys(("--corridor", "--along"), ("postures.csv", "path.csv", "nothing.csv", "steps.json", "")),
+    **dict.fromkeys(("--corridor",), ("postures.csv", "path.csv", "nothing.csv", "steps.json", "")),
     "--radius": (*NUMBERS, "0.2"),
     "--log": ("path.csv", "nothing.csv", "steps.json", ""),
     "--chart": (*_FILES, "grown.orthocas", "cut.orthocas"),
@@ -105,8 +104,6 @@ _LAW_OPTIONS = (
     "--damping-ratio",
     "--coupling",
     "--damping",
-    "--posture-stiffness",
-    "--second",
     "--feedback",
     "--limit",
     "--damping-stiffness",

@@ -439,23 +439,6 @@ def _control() -> dict[str, Call]:
         ),
         "PDPlus": (control.PDPlus, {**gains, "limit": [1.0, 2.0, 3.0]}),
         "Kinematic": (control.Kinematic, {"chart": chart, "feedback": 1.0, "limit": None}),
-        "Projector": (
-            control.Projector,
-            {
-                "problem": problem,
-                "stiffness": 1.0,
-                "posture_stiffness": 1.0,
-                "damping_ratio": 0.7,
-                "limit": None,
-                "second": chart,
-                "second_force": 1.0,
-                "feed_forward": False,
-            },
-        ),
-        "KinematicProjector": (
-            control.KinematicProjector,
-            {"problem": problem, "feedback": 1.0, "posture_feedback": 1.0, "limit": None, "second": chart},
-        ),
         "Reference.steps": (
             control.Reference.steps,
             {"labels": ("x", "y"), "start": [0.0, 0.0], "changes": changes, "duration": 0.5, "natural_frequency": 6.0},
@@ -466,9 +449,7 @@ def _control() -> dict[str, Call]:
         ),
         "reference.sample": (reference.sample, {"times": np.array([0.1, 0.2])}),
         "joint_path": (control.joint_path, {"chart": chart, "reference": reference, "q_start": centre}),
-        "posture_reference": (control.posture_reference, {"chart": chart, "reference": reference, "q_start": centre}),
         "matched_stiffness": (control.matched_stiffness, {"chart": chart}),
-        "matched_posture_stiffness": (control.matched_posture_stiffness, {"problem": problem}),
         "law_of": (control.law_of, {"name": "impedance"}),
         "control.register": (control.register, {"law": None}),
         "Push": (
