@@ -91,6 +91,7 @@ def _robot(robot: Robot) -> dict[str, Any]:
         "tip": robot.tree.tip_name,
         **({"tips": list(robot.tips)} if robot.tree.tips else {}),
         "mass_kg": float(robot.tree.masses.sum()),
+        "gravity": plain(robot.tree.gravity),
     }
 
 

@@ -46,6 +46,14 @@ _OPTIONS: dict[str, Any] = {
         str | None,
         typer.Option("--tool", help='Pose of a tool on the tip, "x,y,z" or "x,y,z,roll,pitch,yaw" [m, rad].'),
     ],
+    "gravity": Annotated[
+        str | None,
+        typer.Option(
+            "--gravity",
+            help='Gravity in the axes of the base of a robot file, "x,y,z" [m/s^2]; default: that of an MJCF file, '
+            "or 0,0,-9.81.",
+        ),
+    ],
     "task": Annotated[
         str | None,
         typer.Option(
@@ -72,7 +80,7 @@ _OPTIONS: dict[str, Any] = {
         ),
     ],
 }  #: command-line options of the fields of `ProblemOptions`
-ROBOT = ("tip", "lock", "tool", "base")
+ROBOT = ("tip", "lock", "tool", "base", "gravity")
 CHAIN = (*ROBOT, "task", "metric")
 DOMAIN = ("centre", "home", "half_width")
 _NUMBERS = ("task", "mutual", "regularity", "length", "folds")
@@ -105,6 +113,7 @@ class ProblemOptions:
     lock: tuple[str, ...] = ()
     tool: str | None = None
     base: str | None = None
+    gravity: str | None = None
     task: str | None = None
     metric: str | None = None
     centre: str | None = None
@@ -118,9 +127,8 @@ class ProblemOptions:
 
     def require_no_robot(self, owner: str) -> None:
         """Raise OptionError if an option describes a robot, because `owner` has its own."""
-        locked = ", ".join(self.lock) or None
-        for option, value in (("tip", self.tip), ("lock", locked), ("tool", self.tool), ("base", self.base)):
-            if value is not None:
+        for option in ROBOT:
+            if getattr(self, option):
                 raise OptionError(f"{owner} has its own robot: leave out --{option}")
 
 
@@ -142,8 +150,10 @@ def build_robot(path: str, options: ProblemOptions) -> Robot:
         OrthocasError: if anything does not fit together.
     """
     tool = None if options.tool is None else parse_numbers("--tool", options.tool)
+    gravity = None if options.gravity is None else parse_numbers("--gravity", options.gravity)
     tips = [name.strip() for name in (options.tip or "").split(",") if name.strip()]
-    return Robot.from_file(path, None, locked_joints(options.lock), tool, tips=tips, base=options.base)
+    locked = locked_joints(options.lock)
+    return Robot.from_file(path, None, locked, tool, tips=tips, base=options.base, gravity=gravity)
 
 
 def build_problem(name: str, options: ProblemOptions) -> Problem:
