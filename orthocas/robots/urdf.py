@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 
-from orthocas.errors import InvalidValueError, RobotError, one_line
+from orthocas.errors import InvalidValueError, RobotError, degrees_hint, one_line
 from orthocas.robots.pinocchio_model import LINKS, frame_index, joint_axis, leader_of, remedy
 from orthocas.robots.xml import MOST_LINKS, read_xml
 from orthocas.tools.checks import Array, require_known
@@ -293,7 +293,7 @@ def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
 
     Raises:
         UnknownNameError: if there is no such joint.
-        InvalidValueError: if a position is not finite.
+        InvalidValueError: if a position is not finite, or an angle looks like degrees.
         RobotError: if the joint mimics another one, or has several degrees of freedom and a position other than 0.
     """
     if not isinstance(locked, Mapping):
@@ -427,4 +427,7 @@ def _set_position(model: pin.Model, i: int, value: float, position: Array) -> No
                 f"a joint with {joint.nv} degrees of freedom can only be locked at its neutral position"
             )
         return
+    turns = joint.shortname().startswith("JointModelR")
+    if turns and (hint := degrees_hint(value)):
+        raise InvalidValueError(f"locked position of joint '{name}'", f"{value:g}", f"an angle in radians{hint}")
     position[joint.idx_q : joint.idx_q + joint.nq] = (np.cos(value), np.sin(value)) if joint.nq == 2 else value
