@@ -121,9 +121,9 @@ def _require_tree(path: str | Path, root: ElementTree.Element) -> None:
     for i, name in enumerate(names):
         if not name or name in names[:i]:
             raise RobotError(f"{path}: two links are called '{name}'" if name else f"{path}: a link has no name")
-    joints = [(joint.get("name"), _link(joint, "parent"), _link(joint, "child")) for joint in root.findall("joint")]
+    joints = [(joint.get("name", ""), _link(joint, "parent"), _link(joint, "child")) for joint in root.findall("joint")]
     children: dict[str, list[str]] = {}
-    carriers: dict[str, str | None] = {}  # of a link: the joint that it hangs on
+    carriers: dict[str, str] = {}  # of a link: the joint that it hangs on
     for name, parent, child in joints:
         for end, link in (("parent", parent), ("child", child)):
             if link not in names:
@@ -141,7 +141,7 @@ def _require_tree(path: str | Path, root: ElementTree.Element) -> None:
 
 
 def _require_no_loop(
-    path: str | Path, joints: Sequence[tuple[str | None, str, str]], children: Mapping[str, list[str]], roots: list[str]
+    path: str | Path, joints: Sequence[tuple[str, str, str]], children: Mapping[str, list[str]], roots: list[str]
 ) -> None:
     """Every joint (name, parent, child) can be reached from a root."""
     reached, waiting = set(roots), list(roots)

@@ -407,7 +407,7 @@ class Task(Shown, HoldsFunctions):
         if name not in _REGISTERED or (name == "polar" and words):
             raise UnknownNameError("task", kind, task_kinds())
         wanted = f"'{name}' or '{name}:WORDS' with words that its builder takes"
-        task = called(f"task '{kind}'", wanted, _REGISTERED[name], robot, words)
+        task: Task = called(f"task '{kind}'", wanted, _REGISTERED[name], robot, words)
         require_kind(f"what the builder of task '{name}' returns", task, Task)
         return task
 

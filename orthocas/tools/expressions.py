@@ -296,7 +296,7 @@ def expression_of(what: str, function: Callable[[ca.SX], ca.SX] | ca.Function, q
     """
     if not callable(function):
         raise InvalidValueError(what, repr(function), "a function of an SX column q")
-    value = called(what, f"a function of an SX column q {q.shape}", lambda: ca.SX(function(q)))
+    value: ca.SX = called(what, f"a function of an SX column q {q.shape}", lambda: ca.SX(function(q)))
     known = {str(symbol) for symbol in ca.vertsplit(q)}
     free = [str(symbol) for symbol in ca.symvar(value) if str(symbol) not in known]
     if free:
