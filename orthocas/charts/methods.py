@@ -13,7 +13,7 @@ from orthocas.charts.inverse import Inverse
 from orthocas.charts.newton import FewRows, LocalSolver, Newton, OwnInverse, PointFunctions, Starts, inverse_function
 from orthocas.charts.phi import Differences, PhiFunctions, PhiMap
 from orthocas.charts.solutions import ReachingTracker, Solutions, Tracker, parts_of
-from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError
+from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, units_hint
 from orthocas.tasks.domains import bounds_of, sample_uniform
 from orthocas.tasks.problem import task_sizes
 from orthocas.tools.cached import cached_property
@@ -76,7 +76,12 @@ class InverseMethods(PhiFunctions):
         if q_start is not None:
             as_point_set("q_start", q_start, self.n)
         require_kind("outside", outside, bool)
-        found = self.solve(targets, q_start, tolerance=tolerance).require(inside=False)
+        found = self.solve(targets, q_start, tolerance=tolerance)
+        try:
+            found.require(inside=False)
+        except InverseError as error:
+            hint = units_hint(self.problem.task.units, np.abs(targets[:, : self.m]).max(axis=0).tolist())
+            raise InverseError(f"{error}{hint}") from None
         beyond = np.flatnonzero(~found.found)
         if beyond.size and not outside:
             raise self._outside_error(targets, q_start, found, beyond, single)

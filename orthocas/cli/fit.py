@@ -55,7 +55,7 @@ from orthocas.solvers import get as get_solver
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.problem import Problem
 from orthocas.tools.archive import require_free
-from orthocas.tools.display import number_list
+from orthocas.tools.display import listed, number_list
 from orthocas.tools.json import attributes
 
 _IN_CORRIDOR = "polynomial:3:cyclic"  # more terms gain little there
@@ -210,8 +210,9 @@ def _bounds(
 
 
 def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
-    coordinates = result.chart.coordinates
+    coordinates, robot = result.chart.coordinates, result.chart.problem.robot
     rows = report.facts() if isinstance(result, WideFit) else report_rows(report)  # wide fits have no --weights
+    rows["robot"] = f"{robot.n} joints, {'tip' if len(robot.tips) == 1 else 'tips'} {listed(robot.tips)}"
     rows["fit"] = f"{coordinates.label}, {result.seconds:.2f} s, {result.status.value}"
     if isinstance(result, WideFit) and result.branch is not None:
         rows["branch"] = f"{result.branch.name}, {result.branch.share:.1%} of the clear positions of the joint range"
@@ -258,6 +259,7 @@ def _as_dict(result: Fit, report: Report, target: Path, suggestion: DomainSugges
     return {
         **({} if suggestion is None else {"suggested_domain": suggestion.as_dict()}),
         "chart": str(target),
+        "tips": list(result.chart.problem.robot.tips),
         **reach_data(result.chart),
         "parametrisation": result.chart.coordinates.label,
         "status": result.status.value,

@@ -23,6 +23,7 @@ from orthocas.exact.involutivity import involutivity
 from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import branches as find_branches
 from orthocas.tasks.problem import Problem, check
+from orthocas.tasks.samples import NEGLIGIBLE
 from orthocas.tasks.task import Task
 from orthocas.tools.json import plain
 
@@ -91,6 +92,7 @@ def _robot(robot: Robot) -> dict[str, Any]:
         "tip": robot.tree.tip_name,
         **({"tips": list(robot.tips)} if robot.tree.tips else {}),
         "mass_kg": float(robot.tree.masses.sum()),
+        "gravity": plain(robot.tree.gravity),
     }
 
 
@@ -104,7 +106,8 @@ def _redundancy(robot: Robot) -> dict[str, Any]:
         J = task.batched_frame_jacobian(q[None])[0].reshape(task.m, robot.n)
         if np.linalg.matrix_rank(J) == task.m < robot.n - len(floating):
             columns = zip(robot.joint_names, J.T, strict=True)
-            idle = [] if floating else [name for name, column in columns if not column.any()]
+            still = NEGLIGIBLE * np.abs(J).max()
+            idle = [] if floating else [name for name, column in columns if np.abs(column).max() <= still]
             found[kind] = f"r = {robot.n - len(floating) - task.m}" + (f", idle: {', '.join(idle)}" if idle else "")
     return {"extra_coordinates": found}
 

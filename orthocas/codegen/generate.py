@@ -11,6 +11,7 @@ from orthocas.codegen.library_files import write_library
 from orthocas.control.controller import Controller
 from orthocas.control.safety import Safety
 from orthocas.errors import InvalidValueError
+from orthocas.tools.checks import part_hint
 
 
 class Charts(Protocol):
@@ -79,5 +80,6 @@ def _source(charts: Chart | Charts) -> Source:
     if isinstance(charts, Chart):
         return ChartSource(charts)
     if not hasattr(charts, "c_source"):
-        raise InvalidValueError("chart", f"a {type(charts).__name__}", "a Chart, an Atlas or a part of one")
+        wanted = f"a Chart, an Atlas or a part of one{part_hint(charts, Chart)}"
+        raise InvalidValueError("chart", f"a {type(charts).__name__}", wanted)
     return charts.c_source()

@@ -21,7 +21,7 @@ from orthocas.control.controller import (
 from orthocas.errors import InvalidValueError, ProofError
 from orthocas.tasks.domains import Domain, contains
 from orthocas.tools.batch import Batched
-from orthocas.tools.checks import Array
+from orthocas.tools.checks import Array, part_hint
 from orthocas.tools.expressions import shortest
 from orthocas.tools.files import draft_folder
 
@@ -132,7 +132,8 @@ def check_c(
     """
     if not isinstance(chart, Chart):
         if not hasattr(chart, "check_c"):
-            raise InvalidValueError("chart", f"a {type(chart).__name__}", "a Chart, an Atlas or a part of one")
+            wanted = f"a Chart, an Atlas or a part of one{part_hint(chart, Chart)}"
+            raise InvalidValueError("chart", f"a {type(chart).__name__}", wanted)
         return chart.check_c(generated, controller, states, seed)
     n, precision = chart.n, SINGLE if generated.single_precision else DOUBLE
     q = _positions(chart.problem.domain, np.random.default_rng(seed).uniform(-1, 1, (states, n)), precision)

@@ -23,6 +23,7 @@ from orthocas.fitting.regular_search import (
     JUDGED,
     JUDGED_TAG,
     BasisSearch,
+    IdleSearch,
     NetworkSearch,
     Search,
     beside_the_middle,
@@ -37,7 +38,7 @@ from orthocas.tasks.domains import Box, sample_evenly, sample_uniform
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.problem import Problem, check, relative_singular_values
 from orthocas.tasks.regular_box import home_posture
-from orthocas.tasks.samples import sample_problem
+from orthocas.tasks.samples import idle_joints, sample_problem
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import as_number, require_count, require_kind
 from orthocas.tools.interrupts import remembered
@@ -121,8 +122,9 @@ def fit_wide(
     means with t = 0.3. If coordinates are not regular enough then, the worst 30,000 of 200,000 fresh samples join for
     4,000 more steps.
 
-    If r joints do not move the task at all, such as the last one under a tool with an axis, singular positions divide
-    the branch once more, by the sign of det of the other joints' columns. Samples and share are of the middle's side.
+    If r joints do not move the task at all, such as the last one under a tool with an axis, they are the coordinates,
+    exact everywhere, unless `parametrisation` or `like` is given. Singular positions then divide the branch once more,
+    by the sign of det of the other joints' columns. Samples and share are of the middle's side.
 
     Wide charts hold on most of what the arm reaches without passing a singular position (`regular_share`), but their
     leaks are large, 20 to 70 degrees on the arms that were measured. They serve inverse kinematics, closed loops,
@@ -193,7 +195,12 @@ def fit_wide(
     elif like is not None:
         quantities = Like.of(problem, like)
         quantities.require_at_most(problem.r)
-    searches = [_search(*case, count, seed, monitor, meaning, quantities) for case in cases]
+    idle = idle_joints(problem, sample_problem(problem, _FIRST, (seed, _FIRST_TAG)))[-problem.r :]
+    if len(idle) == problem.r and parametrisation is None and not meant:
+        meaning = None
+        searches: list[Search] = [IdleSearch(problem, cases[0][1], tuple(idle), seed, monitor)]
+    else:
+        searches = [_search(*case, count, seed, monitor, meaning, quantities) for case in cases]
     with remembered() as pressed:
         finish = partial(_finished, searches, meaning, quantities, chosen, start)
         try:
@@ -285,7 +292,7 @@ def _finished(
     elif quantities is not None:
         coordinates = quantities.named(normalised(raw, centre, first), clear)
     else:
-        coordinates = in_gauge(normalised(raw, centre, first), centre)
+        coordinates = in_gauge(normalised(raw, centre, first), centre) if len(raw.offset) else raw
     domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
     judged = sample_uniform(clear.domain, JUDGED, (seed, JUDGED_TAG))
     share = float(domain.is_clear(judged[beside_the_middle(clear, judged)]).mean())
@@ -306,7 +313,7 @@ def _finished(
         chart=Chart(problem, coordinates, notes),
         stages=tuple(stage.interrupted() if interrupted else stage for stage in search.stages),
         problem_check=check(problem, seed=seed),
-        idle_joints=(),
+        idle_joints=tuple(problem.robot.joint_names[k] for k in coordinates.idle),
         worst=worst,
         seconds=time.perf_counter() - start,
         branch=branch,

@@ -27,7 +27,7 @@ from orthocas.tools.checks import (
 )
 from orthocas.tools.columns import BlockedFunction
 from orthocas.tools.display import Shown, listed
-from orthocas.tools.expressions import HoldsFunctions, expression_of
+from orthocas.tools.expressions import HoldsFunctions, called, expression_of
 
 TASK_KINDS = (
     "position",
@@ -405,8 +405,11 @@ class Task(Shown, HoldsFunctions):
             return cls.position(robot, asked.partition(":")[2] or "xyz", frames.frame, frames.relative_to)
         name, _, words = kind.partition(":")
         if name not in _REGISTERED or (name == "polar" and words):
-            raise UnknownNameError("task", kind, tuple(dict.fromkeys((*TASK_KINDS, *_REGISTERED))))
-        return _REGISTERED[name](robot, words)
+            raise UnknownNameError("task", kind, task_kinds())
+        wanted = f"'{name}' or '{name}:WORDS' with words that its builder takes"
+        task: Task = called(f"task '{kind}'", wanted, _REGISTERED[name], robot, words)
+        require_kind(f"what the builder of task '{name}' returns", task, Task)
+        return task
 
     @classmethod
     def from_recipe(cls, robot: Robot, recipe: Mapping[str, Any]) -> "Task":
@@ -726,6 +729,11 @@ _REGISTERED: dict[str, Callable[[Robot, str], Task]] = {
     "polar": lambda robot, _: Task.polar(robot),
     "centre_of_mass": lambda robot, axes: Task.centre_of_mass(robot, axes or "xyz"),
 }
+
+
+def task_kinds() -> tuple[str, ...]:
+    """The short names of tasks, those of `register_task` too."""
+    return tuple(dict.fromkeys((*TASK_KINDS, *_REGISTERED)))
 
 
 def register_task(name: str, build: Callable[[Robot, str], Task]) -> None:
