@@ -24,10 +24,14 @@ from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import branches as find_branches
 from orthocas.tasks.problem import Problem, check
 from orthocas.tasks.task import Task
+from orthocas.tools.display import percent
 from orthocas.tools.json import plain
 
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
+
+_FAULTS = ("near_singular_share", "half_turn_share")
+_SHARES = ("share", "clear_share", "share of the branch", "branches", *_FAULTS)  #: names of numbers to show in percent
 
 
 @with_options(*ROBOT)
@@ -62,7 +66,7 @@ def info(
     if json:
         print_json(data)
     else:
-        print_rows({name: _text(value) for name, value in data.items()})
+        print_rows({name: _text(value, name) for name, value in data.items()})
 
 
 def _load(path: Path) -> "Chart":
@@ -161,11 +165,13 @@ def _involutivity(problem: Problem) -> dict[str, Any]:
     }
 
 
-def _text(value: Any) -> str:
+def _text(value: Any, name: str = "") -> str:
     if isinstance(value, list):
         return ", ".join(_text(item) for item in value) or "none"
     if isinstance(value, dict):
-        return ", ".join(f"{name} {_text(item)}" for name, item in value.items())
+        return ", ".join(f"{key} {_text(item, name if name in _SHARES else key)}" for key, item in value.items())
     if value is None:
         return "unlimited"
+    if isinstance(value, float) and name in _SHARES:
+        return percent(value, 3, fault=name in _FAULTS)
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -40,6 +40,7 @@ from orthocas.tasks.regular_box import home_posture
 from orthocas.tasks.samples import sample_problem
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import as_number, require_count, require_kind
+from orthocas.tools.display import percent
 from orthocas.tools.interrupts import remembered
 from orthocas.tools.progress import Monitor, silent
 
@@ -71,7 +72,7 @@ class WideFit(Fit):
         branch = "" if self.branch is None else self.branch.name
         own = {
             "branch": branch,
-            "regular": f"{self.regular_share:.3%} of the branch's clear positions; the domain is this part",
+            "regular": f"{percent(self.regular_share, 3)} of the branch's clear positions; the domain is this part",
         }
         return {"fit": known.pop("fit"), "problem": known.pop("problem"), **own, **known}
 

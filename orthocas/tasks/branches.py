@@ -17,7 +17,7 @@ from orthocas.tasks.problem import Problem, relative_singular_values
 from orthocas.tasks.regular_box import joint_range
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, as_point, require_kind
-from orthocas.tools.display import Shown, listed
+from orthocas.tools.display import Shown, listed, percent
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -125,13 +125,13 @@ class Branches(Shown, Sequence[Branch]):
         for k, (item, points) in enumerate(zip(self, postures, strict=True)):
             panel = figure.add_subplot(rows, columns, k + 1, projection="3d")
             panel.plot(*points.T, "-o", color=_COLOUR, markersize=4, linewidth=2.2)
-            panel.set_title(f"{item.name}\n{item.share:.1%} of the clear positions", fontsize=9)
+            panel.set_title(f"{item.name}\n{percent(item.share)} of the clear positions", fontsize=9)
             equal_axes(panel, postures.reshape(-1, 3))
         return figure
 
     def facts(self) -> dict[str, str]:
         """Cuts and branches."""
-        shares = [f"{item.name} ({item.share:.1%})" for item in self.items]
+        shares = [f"{item.name} ({percent(item.share)})" for item in self.items]
         return {
             "branches": f"{len(self)} of {self.robot.heading}",
             "cuts": "; ".join(cut.explained for cut in self.cuts) or "none",
