@@ -272,7 +272,7 @@ def card_of(name: str, chart: oc.Chart) -> Card:
         fingerprint=fingerprint(chart.problem, chart.coordinates),
         commands=commands(name),
         branch=str(chart.notes.get("branch", "")),
-        regular_share=float(chart.notes.get("regular share", 1.0)),
+        regular_share=float(chart.notes.get("share of the branch", 1.0)),
     )
 
 

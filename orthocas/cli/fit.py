@@ -58,6 +58,7 @@ from orthocas.tools.archive import require_free
 from orthocas.tools.display import number_list, percent
 from orthocas.tools.json import attributes
 
+_WIDE_ROWS = ("regular", "left out", "meaning")  # facts of wide fits
 _IN_CORRIDOR = "polynomial:3:cyclic"  # more terms gain little there
 
 
@@ -162,6 +163,8 @@ def fit(
                 )
     except Interrupted as stop:
         result = stop.result
+    if isinstance(result, WideFit) and result.left_out:
+        note(f"the chart of branch '{result.chart.notes['branch']}' leaves out {result.left_out}")
     result.chart.save(target, force)
     report = evaluate(result.chart, seed=seed + 1)
     if json:
@@ -217,12 +220,7 @@ def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
         rows["branch"] = (
             f"{result.branch.name}, {percent(result.branch.share)} of the clear positions of the joint range"
         )
-        rows["regular"] = (
-            f"{percent(result.regular_share, 3)} of the clear positions of the branch, which are the domain"
-        )
-        if (error := result.chart.notes.get("error of its meaning")) is not None:
-            meaning = result.chart.notes["meaning"]
-            rows["meaning"] = f"xi1 is like {meaning}, {float(error):.2g} off (rms) along the home's self-motion"
+        rows |= {name: text for name, text in result.facts().items() if name in _WIDE_ROWS}
     if result.like:
         rows["like"] = ", ".join(f"{name} {angle:.3g} deg off" for name, angle in result.like.items())
     if result.idle_joints:
@@ -260,7 +258,12 @@ def _domain_rows(suggestion: DomainSuggestion) -> dict[str, str]:
 def _wide(result: Fit) -> dict[str, Any]:
     if not isinstance(result, WideFit) or result.branch is None:
         return {}
-    return {"branch": result.branch.name, "regular_share": result.regular_share}
+    meaning = None if result.meaning is None else {"like": result.chart.notes["meaning"], **asdict(result.meaning)}
+    return {
+        "branch": result.branch.name,
+        **attributes(result, "regular_share", "left_out"),
+        "meaning": meaning,
+    }
 
 
 def _as_dict(result: Fit, report: Report, target: Path, suggestion: DomainSuggestion | None) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from orthocas.cli.problem_argument import (
 from orthocas.errors import OptionError, RobotError, SingularTaskError
 from orthocas.exact.involutivity import involutivity
 from orthocas.robots.robot import Robot
+from orthocas.tasks.branches import CLEAR
 from orthocas.tasks.branches import branches as find_branches
 from orthocas.tasks.problem import Problem, check
 from orthocas.tasks.task import Task
@@ -114,11 +115,16 @@ def _redundancy(robot: Robot) -> dict[str, Any]:
 
 
 def _branches(robot: Robot, task: Task | None) -> dict[str, Any]:
-    """The branches of the joint range: what cuts it, and for each its share of the clear positions and a posture."""
+    """The branches of the joint range: what cuts it, and for each its share of the clear positions and a posture.
+
+    Branches that are too near to singular positions for the default clearance of wide charts have the one they allow.
+    """
     found = find_branches(robot, task)
+    lower = {item.name: item.clearance for item in found if item.clearance < CLEAR}
     return {
         "cuts": [cut.explained for cut in found.cuts],
         "branches": {item.name: item.share for item in found},
+        **({"clearance_at_most": lower} if lower else {}),
         "postures": {item.name: plain(item.posture) for item in found},
     }
 

@@ -542,5 +542,5 @@ def _notes(stages: Sequence[Stage], settings: FitSettings, worst: WorstPoints | 
         "lambda5": weights.folds,
         **extra,
         "angles": weights.angles or "paper",
-        **({} if settings.like is None else {"meaning": "; ".join(settings.like.names)}),
+        **({} if settings.like is None else {"meaning": settings.like.label}),
     }
