@@ -272,7 +272,8 @@ def test_progress_is_of_what_is_left() -> None:
     known = problems.get("planar_3r_xy")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        wide = oc.fit_wide(known.robot, known.task, oc.Box([0.0, 1.3, 1.3], [3.0, 1.2, 1.2])).chart
+        box = oc.Box([0.0, 1.0, 1.0], [3.0, 1.8, 1.8])
+        wide = oc.fit_wide(known.robot, known.task, box, parametrisation=oc.Polynomial(3), samples=2000).chart
     reports: list[Progress] = []
 
     def stop(progress: Progress) -> None:

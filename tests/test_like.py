@@ -154,4 +154,4 @@ def test_the_command_takes_meanings(run: Run) -> None:
     code, out, _ = run("fit", "iiwa", *words)
     assert code == 0
     assert "A3 [rad]" in out
-    assert oc.Chart.load("a.orthocas").named_coordinates[:2] == ("xi1: like A3 [rad]", "xi2: A1 [rad]")
+    assert oc.Chart.load("a.orthocas").named_coordinates[:2] == ("xi1: like A3 [rad]", "xi2: like A1 [rad]")

@@ -306,7 +306,7 @@ def test_the_printed_share_is_of_the_branch(centre: list[float], small: bool) ->
     assert fit.facts()["regular"].startswith(percent(fit.regular_share, 2))
     assert [entry.category for entry in told] == [BranchWarning] * small
     if small:
-        assert fit.regular_share < 0.5
+        assert fit.regular_share < 0.7
         half = ", ".join(f"{value:.4g}" for value in fit.chart.problem.domain.half_width)
         assert f"a smaller box, around q = ({number_list(fit.chart.problem.domain.centre)})" in str(told[0].message)
         assert half in str(told[0].message)
@@ -722,9 +722,9 @@ def test_networks_are_regular_on_a_whole_box() -> None:
     known, network = oc.problems.get("planar_3r_xy"), oc.MLP((16, 16), raw=True)
     wide = oc.Box([0.0, 0.9, 0.9], [3.0, 1.3, 1.3])
     fit = oc.fit_wide(known.robot, known.task, wide, parametrisation=network)
-    assert fit.regular_share > 0.995, fit
     assert fit.chart.notes["solver"] == "adam"
-    domain = fit.chart.problem.domain
+    domain, clear = fit.chart.problem.domain, oc.ClearBox(wide, known.task, 0.1)
+    assert np.mean(domain.contains(sample_uniform(clear, 20_000, 7))) > 0.995, fit
     points = sample_uniform(domain, 20_000, 8)
     steps = 1e-6 * np.eye(3)
     x = [(known.robot.tip_position(points + e) - known.robot.tip_position(points - e))[:, :2] for e in steps]

@@ -71,9 +71,10 @@ class WideFit(Fit):
         """The facts of a fit, with branch and regular share."""
         known = super().facts()
         branch = "" if self.branch is None else self.branch.name
+        share = percent(self.regular_share, 2)
         own = {
             "branch": branch,
-            "regular": f"{percent(self.regular_share, 2)} of the branch's clear positions (samples); the domain is this part",
+            "regular": f"{share} of the branch's clear positions (samples); the domain is this part",
             **({"left out": self.left_out} if self.left_out else {}),
             **({"meaning": f"{self.meaning.explained}: xi1, {self.chart.notes['meaning']}"} if self.meaning else {}),
         }
