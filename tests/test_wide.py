@@ -670,6 +670,21 @@ def test_command_fits_a_branch(run: Run) -> None:
     assert run("fit", "iiwa", "--branch", "up")[::2] == (2, "orthocas: --branch requires --domain branch\n")
 
 
+def test_command_notes_what_a_chart_leaves_out_of_its_branch(run: Run) -> None:
+    """Also in its rows and in JSON; a warning of Python would be an error here."""
+    file = robot_data("z1_description/urdf/z1.urdf")
+    words = ("fit", str(file), "--tip", "link06", "--task", "position+axis:x", "--domain", "branch", "--force")
+    words = (*words, "--param", "polynomial:1", "--samples", "500", "--out", "z.orthocas")
+    code, out, err = run(*words)
+    assert code == 0
+    assert "note: the chart of branch 'whole' leaves out all but " in err
+    assert "singular positions divide it, so the chart has one side of them" in out
+    data = json.loads(run(*words, "--json")[1])
+    assert 0.6 < data["regular_share"] < 0.8
+    assert data["left_out"].startswith("all but ")
+    assert f"{percent(data['regular_share'], 2)} of the branch's clear positions" in out
+
+
 def test_command_gives_no_advice_that_wide_fits_refuse() -> None:
     uneven = replace(oc.evaluate(wide_plane().chart, 500), length_ratio=50.0)
     assert "--weights" in report_rows(uneven)["lengths"]
