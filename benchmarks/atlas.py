@@ -20,6 +20,7 @@ from orthocas.atlas.plan import make_plan
 from orthocas.atlas.regions import joint_range_of
 from orthocas.tools.block_file import create
 from orthocas.tools.checks import Array
+from orthocas.tools.display import percent
 
 ROBOTS = {  # of the package example-robot-data: file and tip
     "panda": ("panda_description/urdf/panda.urdf", "panda_hand"),
@@ -62,7 +63,7 @@ def row(name: str, task: str, settings: oc.AtlasSettings, share: float) -> str:
     covered, values = float((found.chart >= 0)[built].mean()), found.as_dict()
     return (
         f"| {name}, {task}, {settings.leak_deg:g} deg | {done} of {tiles} | {data['fitted']}, {len(atlas)} "
-        f"| {data['bytes'] / 2**20:.2f} | {data['fit_seconds']:.0f} | {covered:.2%} "
+        f"| {data['bytes'] / 2**20:.2f} | {data['fit_seconds']:.0f} | {percent(covered, 2)} "
         f"| {values['leak_deg']['rms']:.2f}, {values['leak_deg']['p99']:.2f} | {values['conditioning']['min']:.2f} |"
     )
 

@@ -63,6 +63,10 @@ class LawWarning(UserWarning):
     """A control law is built with settings that are hardly meant."""
 
 
+class BranchWarning(UserWarning):
+    """A wide chart leaves out a part of its branch from the start."""
+
+
 class ShapeError(OrthocasError, ValueError):
     """An array has the wrong shape."""
 

@@ -13,7 +13,7 @@ from orthocas.atlas.lattice import Outcome
 from orthocas.charts.point_quality import in_the_metric
 from orthocas.tasks.samples import samples_at
 from orthocas.tools.checks import Array, Indices, require_count, require_kind, require_memory
-from orthocas.tools.display import Shown
+from orthocas.tools.display import Shown, percent
 from orthocas.tools.files import published
 
 _PIECE = 20_000  # joint positions at once
@@ -78,13 +78,13 @@ class Coverage(Shown):
         data = self.as_dict()
         leak, conditioning = data["leak_deg"], data["conditioning"]
         return {
-            "coverage": f"{self.share:.2%} of {len(self.q)} samples clear of singular positions have a chart",
+            "coverage": f"{percent(self.share, 2)} of {len(self.q)} samples clear of singular positions have a chart",
             "charts": f"{self.charts} in {self.bytes / 2**20:.3g} MiB",
-            "clear": f"{len(self.q) / self.drawn:.2%} of the region",
+            "clear": f"{percent(len(self.q) / self.drawn, 2)} of the region",
             "leak": ", ".join(f"{name} {value:.2f}" for name, value in leak.items()) + " deg",
             "conditioning": ", ".join(f"{name} {value:.3f}" for name, value in conditioning.items()),
-            "as asked": f"at {self.share_as_asked:.2%} of the samples leak and conditioning themselves are as asked",
-            **{f"hole {share:.2%}": text for text, share in self.holes.items()},
+            "as asked": f"at {percent(self.share_as_asked, 2)} of the samples leak and conditioning are as asked",
+            **{f"hole {percent(share, 2, fault=True)}": text for text, share in self.holes.items()},
         }
 
     def as_dict(self) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Arguments that describe a problem: a name or a robot file, task, metric, domain, weights."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import typer
 from orthocas import problems
 from orthocas.bases.family import Parametrisation
 from orthocas.cli.output import number, spread, whole_number
-from orthocas.errors import InvalidValueError, OptionError, UnknownNameError
+from orthocas.errors import BranchWarning, InvalidValueError, OptionError, UnknownNameError
 from orthocas.fitting.corridor_problem import RADIUS, corridor_problem
 from orthocas.fitting.probe import Bounds
 from orthocas.fitting.suggest_domain import DomainSuggestion, suggest_domain
@@ -98,7 +99,7 @@ BranchName = Annotated[
 ]
 LikeName = Annotated[
     str | None,
-    typer.Option("--like", help="What the first coordinates mean: a joint or swivel; several: NAME,NAME."),
+    typer.Option("--like", help="What the first coordinates are like: a joint or swivel; several: NAME,NAME."),
 ]
 BRANCH = "branch"  #: the word of --domain for wide charts
 
@@ -325,19 +326,21 @@ def wide_fit(
     robot = build_robot(name, options) if base is None else base.robot
     known = options.least_singular_value
     quantities = None if like is None else [word.strip() for word in like.split(",")]
-    return fit_wide(
-        robot,
-        Task.named(robot, options.task or "position") if base is None else base.task,
-        branch,
-        (options.metric or "euclidean") if base is None else base.metric,
-        clearance=CLEARANCE if known is None else known,
-        parametrisation=parametrisation,
-        home=options.home if base is None else base.domain.centre if branch is None else None,
-        like=quantities[0] if quantities and len(quantities) == 1 else quantities,
-        samples=samples,
-        seed=seed,
-        monitor=monitor,
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", BranchWarning)  # commands print a note
+        return fit_wide(
+            robot,
+            Task.named(robot, options.task or "position") if base is None else base.task,
+            branch,
+            (options.metric or "euclidean") if base is None else base.metric,
+            clearance=CLEARANCE if known is None else known,
+            parametrisation=parametrisation,
+            home=options.home if base is None else base.domain.centre if branch is None else None,
+            like=quantities[0] if quantities and len(quantities) == 1 else quantities,
+            samples=samples,
+            seed=seed,
+            monitor=monitor,
+        )
 
 
 CorridorPath = Annotated[

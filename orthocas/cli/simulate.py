@@ -46,6 +46,7 @@ from orthocas.simulation.trajectory import Outcome, Trajectory, coupling_index
 from orthocas.tasks.domains import contains
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import require_known
+from orthocas.tools.display import percent
 from orthocas.tools.files import is_listed, output_folder, published, require_replaceable_files, require_writable
 from orthocas.tools.interrupts import deferred
 from orthocas.tools.json import plain, to_json
@@ -129,7 +130,7 @@ def run_rows(report: dict[str, Any], problem: Problem) -> dict[str, str]:
         )
     rows["command"] = f"at most {command:.4g} {unit}, {joint}"
     if report["saturated_share"]:
-        rows["limit"] = f"reached for {report['saturated_share']:.1%} of the run"
+        rows["limit"] = f"reached for {percent(report['saturated_share'], fault=True)} of the run"
     if report["catches"]:
         rows["statuses"] = ", ".join(f"{name} {time:.3g} s" for name, time in report["seconds_in_status"].items())
     if energy := report["energy"]:
@@ -150,12 +151,12 @@ def fallback_text(report: dict[str, Any]) -> str | None:
         times = "once" if len(report["catches"]) == 1 else f"{len(report['catches'])} times"
         return (
             f"at t = {fallback['since']:.4g} s {fallback['reason']}: the catcher took over, {times} in all, "
-            f"and commanded for {fallback['share']:.1%} of the run"
+            f"and commanded for {percent(fallback['share'], fault=True)} of the run"
         )
     what = "the gravity torque" if report["command"] == "torque" else "zero velocity"
     return (
         f"at t = {fallback['since']:.4g} s {fallback['reason']}: the controller commanded only {what} "
-        f"for {fallback['share']:.1%} of the run"
+        f"for {percent(fallback['share'], fault=True)} of the run"
     )
 
 

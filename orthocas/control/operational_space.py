@@ -48,7 +48,7 @@ from orthocas.tasks.problem import Problem
 from orthocas.tools.batch import Batched
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_point_set, require_kind, require_known
-from orthocas.tools.display import Shown, number_list
+from orthocas.tools.display import Shown, number_list, percent
 
 _MODE_SAMPLES = 256
 _MUCH_DEG = 15.0  # leak from which on decoupled laws are warned of
@@ -319,10 +319,8 @@ class _OperationalSpace(Shown):
                 "both, which coupled ones do not; see docs/how-to/wide.md"
             )
         if share := self.check_damping().indefinite_share:
-            found.append(
-                f"the damping matrix (29) is indefinite in {share:.1%} of the domain with these gains; "
-                "the damping design double_diagonal never is"
-            )
+            where = f"in {percent(share, fault=True)} of the domain with these gains"
+            found.append(f"the damping matrix (29) is indefinite {where}; the damping design double_diagonal never is")
         return found + self.model.remarks()
 
     def _leak_deg(self) -> float:
