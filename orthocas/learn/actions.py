@@ -84,7 +84,7 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
         self._step = np.broadcast_to(sizes, chart.n)
         self._tracker: Tracker | None = None
         more, (low, high) = np.full(chart.r + 1, np.inf), _ends(outer)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (chart.n,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (chart.n,), np.float64)
         self.observation_space = gymnasium.spaces.Box(np.append(low, -more), np.append(high, more), dtype=np.float64)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
