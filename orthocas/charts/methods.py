@@ -12,7 +12,8 @@ from orthocas.charts.inside import Inside, Nearest
 from orthocas.charts.inverse import Inverse
 from orthocas.charts.newton import FewRows, LocalSolver, Newton, OwnInverse, PointFunctions, Starts, inverse_function
 from orthocas.charts.phi import Differences, PhiFunctions, PhiMap
-from orthocas.charts.solutions import ReachingTracker, Solutions, Tracker, parts_of
+from orthocas.charts.reaching import ReachingTracker, near_function
+from orthocas.charts.solutions import Solutions, Tracker
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, units_hint
 from orthocas.tasks.domains import bounds_of, sample_uniform
 from orthocas.tasks.problem import task_sizes
@@ -207,13 +208,13 @@ class InverseMethods(PhiFunctions):
             q0: a joint position inside the domain, (n,).
             largest_step: largest change of each joint in a call, (n,) or one number [rad] or [m]; default: a tenth of
                 the half-widths of the domain.
-            nearest: where phi is out of reach, go to the nearest x, and with that to the nearest xi, instead of staying
-                where it was; see `ReachingTracker`. For domains that are boxes, clear or not, and wide charts.
+            nearest: where phi is out of reach, descend to the nearest x, and with that to the nearest xi, instead of
+                staying where it was; see `ReachingTracker`.
 
         Raises:
             NoExpressionError: if the coordinates are grown.
             InvalidValueError: if q0 lies outside the domain, or J is singular there.
-            DomainError: for `nearest=True` on other domains.
+            DomainError: if the domain has a condition, but no expression of it.
         """
         self._require_expression("a tracker")
         require_kind("nearest", nearest, bool)
@@ -306,9 +307,9 @@ class InverseMethods(PhiFunctions):
         return PointFunctions.of(self.function("phi"), self.rates, self.phi_sizes, self.phi_map.difference)
 
     @cached_property
-    def reaching(self) -> tuple[ca.Function, ca.Function]:
-        """The functions of `ReachingTracker`."""
-        return parts_of(self.function("phi"), self.rates, self.m, self.phi_map, self.problem.domain)
+    def reaching(self) -> ca.Function:
+        """The function of `ReachingTracker`: see `near_function`."""
+        return near_function(self.function("phi"), self.rates, self.m, self.phi_map, self.problem.domain)
 
     def _outside_error(
         self, targets: Array, q_start: ArrayLike | None, found: Solutions, beyond: Indices, single: bool

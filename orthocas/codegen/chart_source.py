@@ -1,7 +1,7 @@
 """Generated C of one chart: its box, and the functions as CasADi writes them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from types import MappingProxyType
 from typing import ClassVar
 
@@ -9,7 +9,6 @@ import casadi as ca
 import numpy as np
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.solutions import DESCENTS, INERTIA, KEPT, ZONE
 from orthocas.codegen.boundary import boundary_units
 from orthocas.codegen.description import chart_values, filled, flags, numbers, words
 from orthocas.codegen.precision import Precision, bounds_inside
@@ -27,6 +26,7 @@ class ChartSource:
     chart: Chart
     own_code: ClassVar[Mapping[str, str]] = MappingProxyType({})
     title: ClassVar[str] = "chart"
+    has_nearest: ClassVar[bool] = True
 
     @property
     def condition(self) -> Domain | None:
@@ -43,12 +43,6 @@ class ChartSource:
     def somewhere(self) -> Array:
         """A joint position of the domain between its centre and a corner, (n,)."""
         return position_within(self.chart.problem.domain)
-
-    @property
-    def has_nearest(self) -> bool:
-        """Whether the library has the function that goes to the nearest x."""
-        domain = self.chart.problem.domain
-        return domain.is_box or domain.singular_bound is not None
 
     def law(self, controller: Controller) -> Controller:
         """The law as it is."""
@@ -103,8 +97,6 @@ class ChartSource:
             "is_clear": "1" if self.condition is None else "is_clear(q)",
             "mem": "0",
             "dynamics_status": "inside(q) ? {NAME}_OK : {NAME}_OUTSIDE_DOMAIN".format(**known),
-            "nearest_h": "",
-            "nearest_c": "",
             **dict.fromkeys(
                 ("which", "that", "check_that", "require_chart", "tables_c", "atlas_functions_h", "of_chart"), ""
             ),
@@ -112,12 +104,11 @@ class ChartSource:
         everything = {**known, **values}
         values["clear_c"] = "" if self.condition is None else condition_code(self.condition, everything)
         everything["clear_c"] = values["clear_c"]
-        if self.has_nearest:
-            _, inwards = self.chart.reaching
-            size = {"rooms": str(max(1, inwards.size1_out(0))), "m": str(self.chart.m), "descents": str(DESCENTS)}
-            bounds = {"zone": repr(ZONE), "inertia": repr(INERTIA), "kept": repr(KEPT)}
-            filled_in = {**everything, **size, **bounds, "difference_step": precision.difference}
-            values |= {f"nearest_{kind}": filled(f"nearest.{kind}", filled_in) for kind in ("h", "c")}
+        rules = {name: repr(number) for name, number in asdict(precision.reaching).items()}
+        rooms = max(1, self.chart.reaching.size1_out(2))
+        size = {"rooms": str(rooms), "m": str(self.chart.m), "domain_width": numbers(domain.half_width)}
+        filled_in = {**everything, **size, **rules}
+        values |= {f"nearest_{kind}": filled(f"nearest.{kind}", filled_in) for kind in ("h", "c")}
         for place, template in _PARTS.items():
             values[place] = filled(template, everything)
         return values

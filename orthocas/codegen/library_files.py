@@ -86,7 +86,7 @@ def _functions(source: Source, controller: Controller | None, precision: Precisi
         difference = ca.densify(chart.relative.difference(wanted, x))
         found.append(ca.Function("turned", [q, x, wanted], [difference, chart.relative.rates(q).T]))
     if source.has_nearest:
-        near = chart.reaching[0]
+        near = chart.reaching
         found.append(ca.Function("near", near.mx_in(), near.call(near.mx_in())))
     condition = None if source.condition is None else source.condition.condition
     if condition is not None:
@@ -122,9 +122,15 @@ def _stack_bytes(kernels: Kernels, source: Source, k: int, size: int) -> int:
     inner = [name for name in ("pivots", "gram", "room") if name in kernels.work]  # inside others
     clear = sum(kernels.array_bytes(name, size) for name in inner)
     work = max(kernels.array_bytes(name, size) for name in kernels.work)
-    rooms = 2  # at most
-    nearest = kernels.array_bytes("near", size) + size * n * (3 * n + 16 + rooms) if source.has_nearest else 0
+    nearest = kernels.array_bytes("near", size) + _reaching_bytes(source.chart, size) if source.has_nearest else 0
     return max(inverse, nearest, compose, work) + supervised + clear + locals_ + source.stack_bytes(size)
+
+
+def _reaching_bytes(chart: Chart, size: int) -> int:
+    """Of the two positions that the descent to the nearest x looks at, and of the equations of its steps."""
+    n, rooms = chart.n, max(1, chart.reaching.size1_out(2))
+    system = 2 * n + rooms
+    return size * (2 * n * (n + rooms + 3) + 2 * n * n + n * rooms + system**2 + 4 * system)
 
 
 def _require_identifier(name: str) -> None:
