@@ -304,7 +304,8 @@ class InverseMethods(PhiFunctions):
 
     @cached_property
     def _point_functions(self) -> PointFunctions:
-        return PointFunctions.of(self.function("phi"), self.rates, self.phi_sizes, self.phi_map.difference)
+        parts = self.function("phi"), self.rates, self.phi_sizes, self.phi_map.difference
+        return PointFunctions.of(*parts, self.problem.turning)
 
     @cached_property
     def reaching(self) -> ca.Function:

@@ -212,9 +212,12 @@ class PointFunctions:
 
     inverted: ca.Function  #: q -> phi, H = J^-1, and |D^-1 J| |H D| with the sizes D of the components
     chord: ca.Function  #: q, phi, H, target -> q and phi after 3 steps, and |residual| at each of the 4 points
+    turning: tuple[int, ...] = ()  #: joints that turn without end, as in `Problem.turning`
 
     @classmethod
-    def of(cls, phi: ca.Function, jacobian: ca.Function, sizes: Array, difference: Differences) -> "PointFunctions":
+    def of(
+        cls, phi: ca.Function, jacobian: ca.Function, sizes: Array, difference: Differences, turning: tuple[int, ...]
+    ) -> "PointFunctions":
         """For phi and J of a column q (n, 1), and the sizes and differences of phi, as in `PhiMap`."""
         n = len(sizes)
         q, known, target = (ca.MX.sym(name, n) for name in ("q", "phi", "target"))
@@ -229,7 +232,12 @@ class PointFunctions:
             left = difference(target, value)
             errors.append(ca.norm_2(left / scale))
         chord = dense_function("chord", [q, known, H, target], [now, value, ca.vertcat(*errors)])
-        return cls(inverted, chord)
+        return cls(inverted, chord, turning)
+
+    def distance(self, phi: Array, target: Array) -> float:
+        """|target - phi| relative to the sizes of the components, by the shorter way around."""
+        n = len(phi)
+        return float(self.chord(np.zeros(n), phi, np.zeros((n, n)), target)[2][0])
 
 
 class PointSolver:

@@ -15,10 +15,12 @@ from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, Indices, as_float_array, as_point, require_shape
 from orthocas.tools.display import Shown, listed, number_list
+from orthocas.tools.expressions import shortest
 from orthocas.tools.interrupts import deferred
 
 _FEW = 5  # rows that a message names
 _ROUNDED = 1e-9  # error up to which only rounding may have stopped the decrease
+_RETURNED = 1e-8  # of phi, relative to its sizes: the tracker is back
 _STEP = 0.1  # of the half-widths: default of the largest change of q in a call
 
 
@@ -182,6 +184,20 @@ class Tracker(Shown):
         return self._solver.q.copy()
 
     @property
+    def left_over(self) -> Array | None:
+        """What the way since the last reset leaves over in the joints, (n,), less full turns of endless joints.
+
+        None while x or xi differ from those of the start. A loop around a full turn of tool or base may leave
+        something over, see `Chart.left_over`.
+        """
+        q, phi = self._start
+        if self._functions.distance(phi, self._solver.phi) > _RETURNED:
+            return None
+        turns = np.zeros(len(q))
+        turns[list(self._functions.turning)] = 2 * np.pi
+        return np.asarray(shortest(self._solver.q - q, turns))
+
+    @property
     def largest_step(self) -> Array:
         """Largest change of each joint in a call, (n,) [rad] or [m]."""
         return self._limit
@@ -210,6 +226,7 @@ class Tracker(Shown):
         self._solver.q[:] = point
         if not self._solver.refresh():
             raise InvalidValueError("q", point.tolist(), "a point where J is regular")
+        self._start = self._solver.q.copy(), self._solver.phi.copy()
         self.status = TrackerStatus.OK  #: how the last call ended
 
     def step(self, phi: ArrayLike) -> Array:
