@@ -301,6 +301,11 @@ class Inside:
             found[undecided] = self._searched_by_ipopt(targets[undecided], found[undecided], allowed[undecided])
         return found
 
+    def nearer(self, targets: Array, q: Array) -> Array:
+        """Points of the domain as near to xi as those that steps from q (N, n), inside, lead to, (N, n)."""
+        found = self.boxed.points(nearest_xi(self.boxed, targets, self.boxed.of_points(q))[0])
+        return np.where(self.boxed.domain.contains(found)[:, None], found, q)
+
     def _searched_by_ipopt(self, targets: Array, q: Array, allowed: NDArray[np.bool_]) -> Array:
         """Better points than q (N, n), from q; where q is not allowed, any, and from other starts as well."""
         best, distance = q.copy(), np.where(allowed, self._distance(targets, q), np.inf)

@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.coordinates import Coordinates, InvertibleMap
+from orthocas.charts.continuation import Continuation
+from orthocas.charts.curves import SelfMotionCurves
 from orthocas.charts.in_domain import BoxedPhi, Cells, InDomain
 from orthocas.charts.inside import Inside, Nearest
 from orthocas.charts.inverse import Inverse
@@ -255,7 +257,8 @@ class InverseMethods(PhiFunctions):
         local = FewRows(phi_map, self._point_functions, Newton(phi_map))
         by_ipopt = Nearest(domain, self.m, self.function("phi"), phi_map)
         in_domain, inside = InDomain(boxed, Cells(boxed)), Inside(boxed, starts, by_ipopt)
-        return Inverse(self.problem, phi_map, local, starts, in_domain, inside)
+        curves = SelfMotionCurves(boxed, starts) if self.r == 1 else None
+        return Inverse(self.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves)
 
     @cached_property
     def _inverse_function(self) -> ca.Function:

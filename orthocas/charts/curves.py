@@ -1,0 +1,490 @@
+"""The self-motion curves of many task values at once, r = 1, and the points on them whose xi is nearest."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.charts.in_domain import KEPT, BoxedPhi
+from orthocas.charts.newton import Starts, inverses
+from orthocas.charts.phi import largest
+from orthocas.tasks.domains import bounds_of
+from orthocas.tasks.relative import Relative
+from orthocas.tools.batch import dense_function
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, Indices
+from orthocas.tools.columns import BlockedFunction
+
+
+@dataclass(frozen=True, slots=True)
+class CurveRules:
+    """Numbers of the search along curves. Chosen on panda-wide and xarm7-wide (benchmarks/nearest_xi.py)."""
+
+    starts: int = 12  #: stored positions near each x
+    reach: int = 25  #: steps from a start to its x
+    largest: float = 0.7  #: norm of one of those steps [rad] or [m]
+    missed: float = 0.05  #: largest correction of a step along a curve [rad] or [m]
+    step: float = 0.3  #: longest step along a curve [rad] or [m]
+    shortest: float = 3e-3  #: a curve that needs shorter ones ends, near a singular position
+    most: int = 250  #: steps of a curve in one direction
+    turned: float = 0.94  #: least cosine between the tangents at both ends of a step
+    straight: float = 0.985  #: cosine from which the next step may be longer
+    known: float = 0.03  #: distance [rad] or [m] from a curve up to which a start lies on it
+    parts: int = 4  #: points with xi on each step
+    sagitta: float = 1e-3  #: largest distance of those parts from their chords [rad] or [m]
+    sheets: int = 2  #: turns of a joint that are tried beyond the first one, where its range is wider than a turn
+    narrow: float = 1e-10  #: [rad] or [m]: brackets of an end of the domain
+    prismatic: float = 1.0  #: half-widths that a sliding joint may leave its range by
+
+
+RULES = CurveRules()
+
+
+@dataclass(frozen=True, eq=False)
+class Traces:
+    """Curves of K targets: points in order, at most `RULES.step` apart."""
+
+    row: Indices  #: number of the target, (K,)
+    q: Array  #: (K, P, n), unwrapped; the last point is repeated after the end
+    tangent: Array  #: unit tangents there, (K, P, n)
+    count: Indices  #: points of each curve, (K,)
+
+
+@dataclass(frozen=True, eq=False)
+class Nearest:
+    """The best point of each of N rows."""
+
+    q: Array  #: (N, n)
+    distance: Array  #: |xi - xi(q)|, (N,); 0 for solutions, infinite for rows without a point in the domain
+    between: NDArray[np.bool_]  #: rows whose q is neither a solution nor an end of an arc, (N,)
+
+    @classmethod
+    def empty(cls, starts: Array) -> "Nearest":
+        """No points yet; q holds the starts (N, n)."""
+        return cls(starts.copy(), np.full(len(starts), np.inf), np.zeros(len(starts), dtype=bool))
+
+    def take(self, rows: Indices, q: Array, distance: Array, between: bool = False) -> None:
+        """Take over points (M, n) that are nearer than those of their rows (M,), which may occur several times."""
+        farthest_first = np.argsort(-distance, kind="stable")  # what is written last stays
+        better = farthest_first[distance[farthest_first] < self.distance[rows[farthest_first]]]
+        self.q[rows[better]], self.distance[rows[better]] = q[better], distance[better]
+        self.between[rows[better]] = between
+
+
+@dataclass(frozen=True, eq=False)
+class SelfMotionCurves:
+    """Finds q in the domain with h(q) = x and the nearest xi, along all self-motion curves of x that it finds.
+
+    For charts with r = 1. All positions of a regular x form closed curves in the torus of the joints. The search
+
+    1. leads stored positions near x to x by damped least squares, whatever the limits,
+    2. traces the curve through each that does not lie on a known one, whatever the limits,
+    3. cuts the curves by the domain, and looks for xi on the parts inside.
+
+    On a part, the nearest xi is a root of xi(q) = xi_d, an end of the part, or a place where xi turns back. So the
+    result is the nearest one on all curves that were found, up to parts shorter than `RULES.step / RULES.parts`.
+    """
+
+    boxed: BoxedPhi
+    starts: Starts
+
+    def search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
+        """The nearest points for targets (N, n) of phi, from stored starts and one of the caller's (N, n)."""
+        best, ends = Nearest.empty(own), Ends.empty(own.shape[1])
+        with np.errstate(all="ignore"):
+            q, known = self._reached(targets, own)
+            for _ in range(q.shape[1]):
+                rows = np.flatnonzero(~known.all(axis=1) & (best.distance > 0))
+                if not rows.size:
+                    break
+                first = np.argmin(known[rows], axis=1)
+                traces = self._traced(targets[rows], q[rows, first], rows)
+                arcs = self._arcs(targets, traces)
+                self._take_roots(targets, arcs, tolerance, best)
+                ends = ends.joined(self._take_points(targets, arcs, best))
+                known[rows] |= _on_curves(q[rows], traces, self._turning)
+                known[rows, first] = True
+            self._take_ends(targets, ends, best)
+        return best
+
+    def _reached(self, targets: Array, own: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Positions (N, S, n) with the task values of targets, and which starts led to none, (N, S)."""
+        stored = self.starts.nearest(targets, RULES.starts, self.boxed.m)
+        starts = np.concatenate([own[None], stored]).transpose(1, 0, 2)
+        N, S, n = starts.shape
+        x = np.repeat(targets[:, : self.boxed.m], S, axis=0)
+        q, error = self._led_to(x, starts.reshape(-1, n))
+        return q.reshape(N, S, n), ~(error <= KEPT).reshape(N, S)
+
+    def _led_to(self, x: Array, starts: Array) -> tuple[Array, Array]:
+        """Where damped least squares lead from starts (M, n) to x (M, m), whatever the limits; and errors (M,)."""
+        q, error, left = starts.copy(), np.full(len(starts), np.inf), np.arange(len(starts))
+        for _ in range(RULES.reach):
+            found = self._damped_step(q[left], x[left])[0]
+            error[left] = found[:, -1]
+            going = (error[left] > KEPT / 10) & np.isfinite(error[left])
+            left = left[going]
+            if not left.size:
+                break
+            q[left] += found[going, :-1]
+        return q, error
+
+    def _traced(self, targets: Array, q: Array, rows: Indices) -> Traces:
+        """The curves through points q (K, n), from end to end."""
+        x = targets[:, : self.boxed.m]
+        J = self.boxed.phi_map.jacobian(q)[:, : self.boxed.m] / self.boxed.phi_map.sizes[: self.boxed.m, None]
+        t = np.linalg.qr(J.transpose(0, 2, 1), mode="complete")[0][:, :, -1]
+        ahead, tangents, count, closed = self._follow(x, q, t)
+        back = np.flatnonzero(~closed)
+        if not back.size:
+            return Traces(rows, ahead, tangents, count)
+        behind, behind_tangents, behind_count, _ = self._follow(x[back], q[back], -t[back])
+        before = np.zeros(len(q), dtype=np.int64)
+        before[back] = behind_count - 1
+        total = count + before
+        place = np.arange(total.max())
+        after = np.clip(place - before[:, None], 0, (count - 1)[:, None])
+        points, directions = (np.take_along_axis(part, after[:, :, None], axis=1) for part in (ahead, tangents))
+        turned_round = np.maximum(before[back, None] - place, 0)
+        early = (place < before[back, None])[:, :, None]
+        turned_round = np.minimum(turned_round, behind.shape[1] - 1)[:, :, None]
+        points[back] = np.where(early, np.take_along_axis(behind, turned_round, axis=1), points[back])
+        opposite = -np.take_along_axis(behind_tangents, turned_round, axis=1)
+        directions[back] = np.where(early, opposite, directions[back])
+        return Traces(rows, points, directions, total)
+
+    def _follow(self, x: Array, q0: Array, t0: Array) -> tuple[Array, Array, Indices, NDArray[np.bool_]]:
+        """Follow curves from q0 (K, n) along t0 until they close, leave the ranges of sliding joints, or fail.
+
+        Returns:
+            Points and unit tangents (K, P, n), their number (K,), and which curves are closed, (K,).
+        """
+        K, n = q0.shape
+        points, tangents = [q0], [t0]
+        count, closed = np.ones(K, dtype=np.int64), np.zeros(K, dtype=bool)
+        q, t, before = q0.copy(), t0.copy(), t0.copy()
+        h, h_before = np.full(K, RULES.step / 2), np.full(K, np.inf)
+        left = np.arange(K)
+        for _ in range(RULES.most):
+            new, onward, good = self._stepped(x[left], q[left], t[left], before[left], h[left], h_before[left])
+            turned = np.einsum("ki,ki->k", t[left], onward)
+            good &= turned > RULES.turned
+            moved = left[good]
+            passed = self._passed_start(q[moved], new[good], q0[moved], t0[moved]) & (count[moved] > 3)
+            before[moved], h_before[moved] = t[moved], h[moved]
+            q[moved], t[moved] = new[good], onward[good]
+            longer = turned[good] > RULES.straight
+            h[moved] = np.where(longer, np.minimum(1.6 * h[moved], RULES.step), h[moved])
+            h[left[~good]] /= 2
+            count[moved] += 1
+            closed[moved[passed]] = True
+            points.append(q.copy())
+            tangents.append(t.copy())
+            left = left[~closed[left] & (h[left] > RULES.shortest) & self._slides_near(q[left])]
+            if not left.size:
+                break
+        return *_compact(np.array(points), np.array(tangents), count), count, closed
+
+    def _stepped(
+        self, x: Array, q: Array, t: Array, before: Array, h: Array, h_before: Array
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Points about h (K,) ahead near curves, unit tangents there, and which are good."""
+        new = q + h[:, None] * t + (0.5 * h**2 / h_before)[:, None] * (t - before)
+        change, onward = self._corrected(x, new, t)
+        good = np.linalg.norm(change, axis=1) < RULES.missed
+        return new + change, onward / np.linalg.norm(onward, axis=1, keepdims=True), good
+
+    def _corrected(self, x: Array, q: Array, t: Array) -> tuple[Array, Array]:
+        """Newton's steps to x across directions t (K, n), and tangents with t . tangent = 1, (K, n) each."""
+        found = self._bordered_step(q, x, t)[0]
+        return found[:, : q.shape[1]], found[:, q.shape[1] :]
+
+    def _passed_start(self, q: Array, new: Array, q0: Array, t0: Array) -> NDArray[np.bool_]:
+        """Which steps from q to new pass q0, up to full turns."""
+        was, now = (_wrapped(part - q0, self._turning) for part in (q, new))
+        near = np.linalg.norm(now, axis=1) < 1.6 * RULES.step
+        behind, ahead = (np.einsum("ki,ki->k", part, t0) for part in (was, now))
+        return np.asarray(near & (behind < 0) & (ahead >= 0))
+
+    def _slides_near(self, q: Array) -> NDArray[np.bool_]:
+        """Whether sliding joints are in their ranges, or not far outside."""
+        low, high = bounds_of(self.boxed.domain)
+        room = RULES.prismatic * self.boxed.domain.half_width
+        return np.asarray((((q >= low - room) & (q <= high + room)) | self._turning).all(axis=1))
+
+    def _arcs(self, targets: Array, traces: Traces) -> "Arcs":
+        """Points on curves in and around the box of the domain, close to one another."""
+        fine, along = _subdivided(traces)
+        curve, shift = self._sheets(fine)
+        low, high = bounds_of(self.boxed.domain)
+        slack = np.where(np.isfinite(low), RULES.step / RULES.parts, 0.0)
+        G = fine.shape[1]
+        last = RULES.parts * (traces.count[curve] - 1)
+        q = fine[curve] + shift[:, None]
+        close = ((q >= low - slack) & (q <= high + slack)).all(axis=2) & (np.arange(G) <= last[:, None])
+        row = traces.row[curve]
+        at = np.nonzero(close)
+        points, row_of = q[at], row[at[0]]
+        x = targets[row_of, : self.boxed.m]
+        t = along[curve[at[0]], at[1]]
+        for _ in range(2):
+            points = points + self._corrected(x, points, t)[0]
+        q[at] = points
+        inside, xi_left = np.zeros(close.shape, dtype=bool), np.full(close.shape, np.nan)
+        inside[at] = self._contains(points)
+        xi_left[at] = self._xi_left(targets[row_of], points)
+        passing = close[:, :-1] & close[:, 1:] & ~inside[:, :-1] & ~inside[:, 1:]
+        arc, place = np.nonzero(passing)
+        first, last = self._shares_inside(q[arc, place], q[arc, place + 1])
+        passing[arc, place] = first < last
+        return Arcs(row, q, inside, passing, xi_left)
+
+    def _sheets(self, fine: Array) -> tuple[Indices, Array]:
+        """Which curves (of K) pass the box of the domain after which full turns: curve (L,), and shifts (L, n)."""
+        K, G, n = fine.shape
+        low, high = bounds_of(self.boxed.domain)
+        centre, turn = self.boxed.domain.centre, 2 * np.pi
+        slack = RULES.step / RULES.parts
+        first = np.where(np.isfinite(low), low - slack, centre - np.pi)
+        turns = np.where(self._turning, np.ceil((first - fine) / turn), 0.0)
+        close = (fine + turn * turns <= np.where(np.isfinite(high), high + slack, np.inf)).all(axis=2)
+        changes = close.copy()
+        changes[:, 1:] &= ~close[:, :-1] | (turns[:, 1:] != turns[:, :-1]).any(axis=2)
+        curve, place = np.nonzero(changes)
+        found = np.unique(np.column_stack([curve, turns[curve, place]]), axis=0)
+        for j in np.flatnonzero(self._turning & np.isfinite(high) & (high - low + 2 * slack > turn)):
+            extra = [found + k * np.eye(n + 1)[j + 1] for k in range(1, RULES.sheets + 1)]
+            found = np.unique(np.concatenate([found, *extra]), axis=0)
+        return found[:, 0].astype(np.int64), turn * found[:, 1:]
+
+    def _take_roots(self, targets: Array, arcs: "Arcs", tolerance: float, best: Nearest) -> None:
+        """Solutions of phi(q) = phi on arcs."""
+        left = arcs.xi_left
+        jump = np.abs(left[:, 1:] - left[:, :-1])
+        crossed = (left[:, :-1] * left[:, 1:] <= 0) & (arcs.inside[:, :-1] | arcs.inside[:, 1:] | arcs.passing)
+        crossed &= ~(jump > self._period / 2)
+        arc, place = np.nonzero(crossed)
+        if not arc.size:
+            return
+        a, b = left[arc, place], left[arc, place + 1]
+        share = np.where(a == b, 0.0, a / np.where(a == b, 1.0, a - b))[:, None]
+        q = (1 - share) * arcs.q[arc, place] + share * arcs.q[arc, place + 1]
+        rows, phi_map = arcs.row[arc], self.boxed.phi_map
+        for _ in range(4):
+            J = phi_map.jacobian(q) / phi_map.sizes[:, None]
+            q = q + _solutions(J, phi_map.difference(targets[rows], phi_map.phi(q))[:, :, None] / phi_map.sizes[:, None])[:, :, 0]
+        q = self._snapped(q)
+        q = np.where(np.isfinite(q), q, best.q[rows])
+        solved = (largest(phi_map.residual(targets[rows], q)) <= tolerance) & self.boxed.domain.contains(q)
+        best.take(rows[solved], q[solved], np.zeros(int(solved.sum())))
+
+    def _take_points(self, targets: Array, arcs: "Arcs", best: Nearest) -> "Ends":
+        """Points of arcs that lie in the domain; returns the ends that may be nearer."""
+        inside = arcs.inside & (best.distance > 0)[arcs.row][:, None]
+        arc, place = np.nonzero(inside)
+        rows, here = arcs.row[arc], arcs.xi_left[arc, place]
+        best.take(rows, arcs.q[arc, place], np.abs(here), between=True)
+        found = []
+        for side in (-1, 1):
+            beyond = np.clip(place + side, 0, inside.shape[1] - 1)
+            there = arcs.xi_left[arc, beyond]
+            least = np.where(here * there > 0, np.minimum(np.abs(here), np.abs(there)), 0.0)
+            ends = ~inside[arc, beyond] & np.isfinite(there) & (least < best.distance[rows])
+            points = arcs.q[arc[ends], place[ends]], arcs.q[arc[ends], beyond[ends]]
+            found.append(Ends(rows[ends], *points, least[ends]))
+        return found[0].joined(found[1]).joined(self._take_short(targets, arcs, best))
+
+    def _take_short(self, targets: Array, arcs: "Arcs", best: Nearest) -> "Ends":
+        """The same of arcs that lie between neighbouring points outside."""
+        arc, place = np.nonzero(arcs.passing & (best.distance > 0)[arcs.row][:, None])
+        a, b, rows = arcs.q[arc, place], arcs.q[arc, place + 1], arcs.row[arc]
+        low, high = self._shares_inside(a, b)
+        q, step = a + ((low + high) / 2)[:, None] * (b - a), b - a
+        for _ in range(2):
+            q = q + self._corrected(targets[rows, : self.boxed.m], q, step)[0]
+        good = self._contains(q)
+        a, b, q, rows = (part[good] for part in (a, b, q, rows))
+        left = self._xi_left(targets[rows], q)
+        best.take(rows, q, np.abs(left), between=True)
+        found = Ends.empty(q.shape[1])
+        for other, beyond in ((a, arcs.xi_left[arc, place][good]), (b, arcs.xi_left[arc, place + 1][good])):
+            least = np.where(left * beyond > 0, np.minimum(np.abs(left), np.abs(beyond)), 0.0)
+            found = found.joined(Ends(rows, q, other, least))
+        return found
+
+    def _shares_inside(self, a: Array, b: Array) -> tuple[Array, Array]:
+        """Where the chords from a to b (K, n) are in the box, or nearly so: between shares low and high (K,) if <."""
+        low, high = bounds_of(self.boxed.domain)
+        step = np.where(np.abs(b - a) > 1e-300, b - a, 1e-300)
+        one, other = (low - RULES.sagitta - a) / step, (high + RULES.sagitta - a) / step
+        first, last = np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
+        return np.maximum(first, 0.0), np.minimum(last, 1.0)
+
+    def _contains(self, q: Array) -> NDArray[np.bool_]:
+        """Which points (N, n) lie in the domain; they need not be finite."""
+        low, high = bounds_of(self.boxed.domain)
+        inside = ((q >= low) & (q <= high)).all(axis=1)
+        inside[inside] = self.boxed.domain.contains(q[inside])
+        return np.asarray(inside)
+
+    def _take_ends(self, targets: Array, ends: "Ends", best: Nearest) -> None:
+        """The ends of arcs, of rows in which they may be nearest."""
+        useful = np.flatnonzero(ends.least < best.distance[ends.row])
+        rows = ends.row[useful]
+        if rows.size:
+            q = self._end(targets[rows], ends.inside[useful], ends.outside[useful])
+            best.take(rows, q, np.abs(self._xi_left(targets[rows], q)))
+
+    def _end(self, targets: Array, inside: Array, outside: Array) -> Array:
+        """The last points of the domain between points of curves (M, n) inside and outside."""
+        x = targets[:, : self.boxed.m]
+        a, b = inside.copy(), outside.copy()
+        while np.abs(b - a).max(initial=0.0) > RULES.narrow:
+            along = b - a
+            middle = (a + b) / 2
+            t = along / np.linalg.norm(along, axis=1, keepdims=True)
+            middle = middle + self._corrected(x, middle, t)[0]
+            middle = np.where(np.isfinite(middle), middle, b)
+            within = self._contains(middle)
+            a, b = np.where(within[:, None], middle, a), np.where(within[:, None], b, middle)
+        return a
+
+    def _snapped(self, q: Array) -> Array:
+        """Points that miss the boundary by rounding, on it."""
+        moved = np.clip(q, *bounds_of(self.boxed.domain))
+        near = np.abs(moved - q) <= 1e-9 * self.boxed.domain.half_width
+        return np.where(near.all(axis=1, keepdims=True), moved, q)
+
+    def _xi_left(self, targets: Array, q: Array) -> Array:
+        """xi - xi(q), (N,)."""
+        phi_map = self.boxed.phi_map
+        return np.asarray(phi_map.difference(targets, phi_map.phi(q))[:, self.boxed.m])
+
+    @cached_property
+    def _bordered_step(self) -> BlockedFunction:
+        """q, x, t -> the solution dq of J dq = x - h(q), t . dq = 0, and that of J dq = 0, t . dq = 1, (2n, 1)."""
+        q, x, e, J = self._symbols
+        t = ca.SX.sym("t", q.shape[0])
+        right = ca.vertcat(ca.horzcat(e, ca.SX.zeros(e.shape[0])), ca.SX([[0.0, 1.0]]))
+        found = ca.solve(ca.vertcat(J, t.T), right)
+        return BlockedFunction(dense_function("bordered_step", [q, x, t], [ca.cse(ca.vec(found))]))
+
+    @cached_property
+    def _damped_step(self) -> BlockedFunction:
+        """q, x -> a step of damped least squares to x, and the largest error, (n + 1, 1)."""
+        q, x, e, J = self._symbols
+        error, gram = ca.norm_inf(e), J @ J.T
+        damping = ca.if_else(error > 0.1, 1e-2, ca.if_else(error > 1e-3, 1e-5, 1e-14)) * ca.trace(gram)
+        step = J.T @ ca.solve(gram + damping * ca.SX.eye(e.shape[0]), e)
+        step *= ca.fmin(1, RULES.largest / (ca.norm_2(step) + 1e-300))
+        return BlockedFunction(dense_function("damped_step", [q, x], [ca.cse(ca.vertcat(step, error))]))
+
+    @cached_property
+    def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+        """q (n, 1), x (m, 1), errors (x - h(q)) / scale (m, 1), and rates J / scale (m, n)."""
+        task, scale = self.boxed.task, ca.DM(self.boxed.phi_map.sizes[: self.boxed.m])
+        relative = Relative(task)
+        q, x = ca.SX.sym("q", task.robot.n), ca.SX.sym("x", task.m)
+        return q, x, relative.difference(x, task.function(q)) / scale, relative.rates(q) / ca.repmat(scale, 1, task.robot.n)
+
+    @cached_property
+    def _turning(self) -> NDArray[np.bool_]:
+        """Revolute joints, (n,)."""
+        return ~np.array(self.boxed.task.robot.tree.prismatic)
+
+    @cached_property
+    def _period(self) -> float:
+        """Of xi; infinite where it has none."""
+        turn = float(self.boxed.phi_map.difference.turns[self.boxed.m])
+        return turn if turn > 0 else np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Arcs:
+    """Parts of L curves around the domain, by G points each, close to one another."""
+
+    row: Indices  #: number of the target, (L,)
+    q: Array  #: (L, G, n)
+    inside: NDArray[np.bool_]  #: which points lie in the domain, (L, G)
+    passing: NDArray[np.bool_]  #: whether a chord between neighbours outside passes the box, (L, G - 1)
+    xi_left: Array  #: xi - xi(q), (L, G); NaN far from the domain
+
+
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """Where arcs leave the domain: between neighbouring points of K curves."""
+
+    row: Indices  #: number of the target, (K,)
+    inside: Array  #: the last point inside, (K, n)
+    outside: Array  #: the point after that, (K, n)
+    least: Array  #: about the least |xi - xi(q)| between them, (K,)
+
+    @classmethod
+    def empty(cls, n: int) -> "Ends":
+        """None."""
+        return cls(np.zeros(0, dtype=np.int64), np.zeros((0, n)), np.zeros((0, n)), np.zeros(0))
+
+    def joined(self, other: "Ends") -> "Ends":
+        """Both."""
+        parts = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Ends(*(np.concatenate(pair) for pair in parts))
+
+
+def _compact(points: Array, tangents: Array, count: Indices) -> tuple[Array, Array]:
+    """Points and tangents (P, K, n) of curves as (K, P, n), without those that repeat the one before."""
+    moved = np.ones(points.shape[:2], dtype=bool)
+    moved[1:] = (points[1:] != points[:-1]).any(axis=2)
+    place = np.where(moved, np.cumsum(moved, axis=0) - 1, count.max())
+    columns = np.broadcast_to(np.arange(points.shape[1]), moved.shape)
+    packed = []
+    for part in (points, tangents):
+        out = np.repeat(part[-1][:, None], count.max() + 1, axis=1)
+        out[columns, place] = part
+        out[:, count.max()] = part[-1]
+        packed.append(out[:, : count.max()])
+    return packed[0], packed[1]
+
+
+def _subdivided(traces: Traces) -> tuple[Array, Array]:
+    """Points on cubic curves through those of traces, with their tangents, and directions there, (K, G, n) each."""
+    q, t = traces.q, traces.tangent
+    step = q[:, 1:] - q[:, :-1]
+    length = np.linalg.norm(step, axis=2, keepdims=True)
+    points, directions = [], []
+    for part in range(RULES.parts):
+        s = part / RULES.parts
+        bend = (s - 2 * s**2 + s**3) * t[:, :-1] + (s**3 - s**2) * t[:, 1:]
+        points.append(q[:, :-1] + (3 * s**2 - 2 * s**3) * step + length * bend)
+        directions.append((1 - s) * t[:, :-1] + s * t[:, 1:])
+    K, _, n = q.shape
+    fine, along = (np.stack(pieces, axis=2).reshape(K, -1, n) for pieces in (points, directions))
+    return np.concatenate([fine, q[:, -1:]], axis=1), np.concatenate([along, t[:, -1:]], axis=1)
+
+
+def _on_curves(q: Array, traces: Traces, turning: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which of the positions q (K, S, n) lie on the curves, up to full turns, (K, S)."""
+    start, step = traces.q, np.diff(traces.q, axis=1, append=traces.q[:, -1:])
+    square = np.maximum((step**2).sum(axis=2), 1e-300)
+    found = np.zeros(q.shape[:2], dtype=bool)
+    for s in range(q.shape[1]):
+        away = _wrapped(q[:, s, None] - start, turning)
+        share = np.clip(np.einsum("kpi,kpi->kp", away, step) / square, 0.0, 1.0)
+        gap = np.linalg.norm(away - share[:, :, None] * step, axis=2)
+        found[:, s] = gap.min(axis=1) < RULES.known
+    return found
+
+
+def _wrapped(difference: Array, turning: NDArray[np.bool_]) -> Array:
+    """Differences of joint positions (..., n) without full turns of revolute joints."""
+    turns = 2 * np.pi * np.round(difference / (2 * np.pi))
+    return np.where(turning, difference - turns, difference)
+
+
+def _solutions(A: Array, right: Array) -> Array:
+    """A^-1 right, (N, n, k); the least-squares solution where A is singular."""
+    try:
+        return np.linalg.solve(A, right)
+    except np.linalg.LinAlgError:
+        found: Array = inverses(A)[0] @ right
+        return found
