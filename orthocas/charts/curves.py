@@ -31,9 +31,8 @@ class CurveRules:
     turned: float = 0.94  #: least cosine between the tangents at both ends of a step
     straight: float = 0.985  #: cosine from which the next step may be longer
     known: float = 0.03  #: distance [rad] or [m] from a curve up to which a start lies on it
-    parts: int = 4  #: points with xi on each step
+    parts: int = 3  #: points with xi on each step
     sagitta: float = 1e-3  #: largest distance of those parts from their chords [rad] or [m]
-    sheets: int = 2  #: turns of a joint that are tried beyond the first one, where its range is wider than a turn
     narrow: float = 1e-10  #: [rad] or [m]: brackets of an end of the domain
     prismatic: float = 1.0  #: half-widths that a sliding joint may leave its range by
 
@@ -214,49 +213,53 @@ class SelfMotionCurves:
         return np.asarray((((q >= low - room) & (q <= high + room)) | self._turning).all(axis=1))
 
     def _arcs(self, targets: Array, traces: Traces) -> "Arcs":
-        """Points on curves in and around the box of the domain, close to one another."""
-        fine, along = _subdivided(traces)
-        curve, shift = self._sheets(fine)
+        """Points on the steps of curves in and around the box of the domain."""
+        curve, shift = self._sheets(traces)
         low, high = bounds_of(self.boxed.domain)
-        slack = np.where(np.isfinite(low), RULES.step / RULES.parts, 0.0)
-        G = fine.shape[1]
-        last = RULES.parts * (traces.count[curve] - 1)
-        q = fine[curve] + shift[:, None]
-        close = ((q >= low - slack) & (q <= high + slack)).all(axis=2) & (np.arange(G) <= last[:, None])
-        row = traces.row[curve]
-        at = np.nonzero(close)
-        points, row_of = q[at], row[at[0]]
-        x = targets[row_of, : self.boxed.m]
-        t = along[curve[at[0]], at[1]]
-        for _ in range(2):
-            points = points + self._corrected(x, points, t)[0]
-        q[at] = points
+        near = traces.q[curve] + shift[:, None]
+        near = ((near >= low - RULES.step) & (near <= high + RULES.step)).all(axis=2)
+        at, place = np.nonzero((near[:, :-1] | near[:, 1:]) & (np.arange(1, near.shape[1]) < traces.count[curve, None]))
+        q, along = _subdivided(traces, curve[at], place)
+        q += shift[at][:, None]
+        row = traces.row[curve[at]]
+        slack = RULES.step / RULES.parts
+        close = ((q >= low - slack) & (q <= high + slack)).all(axis=2)
+        x = targets[np.repeat(row, close.sum(axis=1)), : self.boxed.m]
+        points, t = q[close], along[close]
+        points += self._corrected(x, points, t)[0]
+        within = ((points >= low - RULES.sagitta) & (points <= high + RULES.sagitta)).all(axis=1)
+        points[within] += self._corrected(x[within], points[within], t[within])[0]
+        q[close] = points
         inside, xi_left = np.zeros(close.shape, dtype=bool), np.full(close.shape, np.nan)
-        inside[at] = self._contains(points)
-        xi_left[at] = self._xi_left(targets[row_of], points)
+        inside[close] = self._contains(points)
+        xi_left[close] = self._xi_left(targets[np.repeat(row, close.sum(axis=1))], points)
         passing = close[:, :-1] & close[:, 1:] & ~inside[:, :-1] & ~inside[:, 1:]
         arc, place = np.nonzero(passing)
         first, last = self._shares_inside(q[arc, place], q[arc, place + 1])
         passing[arc, place] = first < last
         return Arcs(row, q, inside, passing, xi_left)
 
-    def _sheets(self, fine: Array) -> tuple[Indices, Array]:
+    def _sheets(self, traces: Traces) -> tuple[Indices, Array]:
         """Which curves (of K) pass the box of the domain after which full turns: curve (L,), and shifts (L, n)."""
-        K, G, n = fine.shape
         low, high = bounds_of(self.boxed.domain)
-        centre, turn = self.boxed.domain.centre, 2 * np.pi
-        slack = RULES.step / RULES.parts
-        first = np.where(np.isfinite(low), low - slack, centre - np.pi)
-        turns = np.where(self._turning, np.ceil((first - fine) / turn), 0.0)
-        close = (fine + turn * turns <= np.where(np.isfinite(high), high + slack, np.inf)).all(axis=2)
-        changes = close.copy()
-        changes[:, 1:] &= ~close[:, :-1] | (turns[:, 1:] != turns[:, :-1]).any(axis=2)
-        curve, place = np.nonzero(changes)
-        found = np.unique(np.column_stack([curve, turns[curve, place]]), axis=0)
-        for j in np.flatnonzero(self._turning & np.isfinite(high) & (high - low + 2 * slack > turn)):
-            extra = [found + k * np.eye(n + 1)[j + 1] for k in range(1, RULES.sheets + 1)]
-            found = np.unique(np.concatenate([found, *extra]), axis=0)
+        bounded, turn, room = np.isfinite(low), 2 * np.pi, RULES.step
+        low, high = np.where(bounded, low, self.boxed.domain.centre - np.pi), np.where(bounded, high, np.inf)
+        found = np.unique(
+            np.concatenate([self._turns(traces, low - below, high + room) for below in (0.0, room)]), axis=0
+        )
+        for j in np.flatnonzero(self._turning & bounded & (high - low > turn)):
+            more = range(1, int((high[j] - low[j]) / turn) + 1)
+            found = np.unique(np.concatenate([found, *(found + k * np.eye(len(low) + 1)[j + 1] for k in more)]), axis=0)
         return found[:, 0].astype(np.int64), turn * found[:, 1:]
+
+    def _turns(self, traces: Traces, low: Array, high: Array) -> Array:
+        """Curves that pass a box, and the turns that bring them there just above `low`, (L, 1 + n)."""
+        turns = np.where(self._turning, np.ceil((low - traces.q) / (2 * np.pi)), 0.0)
+        at = traces.q + 2 * np.pi * turns
+        changes = ((at >= low) & (at <= high)).all(axis=2)
+        changes[:, 1:] &= ~changes[:, :-1] | (turns[:, 1:] != turns[:, :-1]).any(axis=2)
+        curve, place = np.nonzero(changes)
+        return np.column_stack([curve, turns[curve, place]])
 
     def _take_roots(self, targets: Array, arcs: "Arcs", tolerance: float, best: Nearest) -> None:
         """Solutions of phi(q) = phi on arcs."""
@@ -402,13 +405,13 @@ class SelfMotionCurves:
 
 @dataclass(frozen=True, eq=False)
 class Arcs:
-    """Parts of L curves around the domain, by G points each, close to one another."""
+    """S steps of curves around the domain, by G points each, close to one another."""
 
-    row: Indices  #: number of the target, (L,)
-    q: Array  #: (L, G, n)
-    inside: NDArray[np.bool_]  #: which points lie in the domain, (L, G)
-    passing: NDArray[np.bool_]  #: whether a chord between neighbours outside passes the box, (L, G - 1)
-    xi_left: Array  #: xi - xi(q), (L, G); NaN far from the domain
+    row: Indices  #: number of the target, (S,)
+    q: Array  #: (S, G, n)
+    inside: NDArray[np.bool_]  #: which points lie in the domain, (S, G)
+    passing: NDArray[np.bool_]  #: whether a chord between neighbours outside passes the box, (S, G - 1)
+    xi_left: Array  #: xi - xi(q), (S, G); NaN far from the domain
 
 
 @dataclass(frozen=True, eq=False)
@@ -446,20 +449,15 @@ def _compact(points: Array, tangents: Array, count: Indices) -> tuple[Array, Arr
     return packed[0], packed[1]
 
 
-def _subdivided(traces: Traces) -> tuple[Array, Array]:
-    """Points on cubic curves through those of traces, with their tangents, and directions there, (K, G, n) each."""
-    q, t = traces.q, traces.tangent
-    step = q[:, 1:] - q[:, :-1]
-    length = np.linalg.norm(step, axis=2, keepdims=True)
-    points, directions = [], []
-    for part in range(RULES.parts):
-        s = part / RULES.parts
-        bend = (s - 2 * s**2 + s**3) * t[:, :-1] + (s**3 - s**2) * t[:, 1:]
-        points.append(q[:, :-1] + (3 * s**2 - 2 * s**3) * step + length * bend)
-        directions.append((1 - s) * t[:, :-1] + s * t[:, 1:])
-    K, _, n = q.shape
-    fine, along = (np.stack(pieces, axis=2).reshape(K, -1, n) for pieces in (points, directions))
-    return np.concatenate([fine, q[:, -1:]], axis=1), np.concatenate([along, t[:, -1:]], axis=1)
+def _subdivided(traces: Traces, curve: Indices, place: Indices) -> tuple[Array, Array]:
+    """Points on cubic curves between points of traces (S,) and the next ones, and directions, (S, parts + 1, n) each."""
+    q, t = traces.q[curve, place][:, None], traces.tangent[curve, place][:, None]
+    after, onward = traces.q[curve, place + 1][:, None], traces.tangent[curve, place + 1][:, None]
+    s = (np.arange(RULES.parts + 1) / RULES.parts)[:, None]
+    step = after - q
+    bend = (s - 2 * s**2 + s**3) * t + (s**3 - s**2) * onward
+    points = q + (3 * s**2 - 2 * s**3) * step + np.linalg.norm(step, axis=2, keepdims=True) * bend
+    return points, (1 - s) * t + s * onward
 
 
 def _on_curves(q: Array, traces: Traces, turning: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -15,7 +15,7 @@ from orthocas.tools.checks import Array
 from orthocas.tools.expressions import Tape, replay, to_tape
 
 COLUMNS = 256  #: samples in a block
-MANY = 64  #: joint positions from which blocks pay off
+MANY = 16  #: joint positions from which blocks pay off
 _PIECE = 8 * COLUMNS  # joint positions that a thread takes at once
 
 #: Evaluates contiguous inputs (entries, c), and writes contiguous outputs (entries, c).
