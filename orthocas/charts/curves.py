@@ -26,8 +26,8 @@ class CurveRules:
     largest: float = 0.7  #: norm of one of those steps [rad] or [m]
     missed: float = 0.05  #: largest correction of a step along a curve [rad] or [m]
     step: float = 0.3  #: longest step along a curve [rad] or [m]
-    shortest: float = 3e-3  #: a curve that needs shorter ones ends, near a singular position
-    most: int = 250  #: steps of a curve in one direction
+    shortest: float = 0.01  #: a curve that needs shorter ones ends, near a singular position
+    most: int = 150  #: steps of a curve in one direction
     turned: float = 0.94  #: least cosine between the tangents at both ends of a step
     straight: float = 0.985  #: cosine from which the next step may be longer
     known: float = 0.03  #: distance [rad] or [m] from a curve up to which a start lies on it
@@ -93,16 +93,17 @@ class SelfMotionCurves:
         best, ends = Nearest.empty(own), Ends.empty(own.shape[1])
         with np.errstate(all="ignore"):
             q, known = self._reached(targets, own)
+            away = self._away(q)
             for _ in range(q.shape[1]):
                 rows = np.flatnonzero(~known.all(axis=1) & (best.distance > 0))
                 if not rows.size:
                     break
-                first = np.argmin(known[rows], axis=1)
+                first = np.argmin(np.where(known[rows], np.inf, away[rows]), axis=1)
                 traces = self._traced(targets[rows], q[rows, first], rows)
                 arcs = self._arcs(targets, traces)
                 self._take_roots(targets, arcs, tolerance, best)
                 ends = ends.joined(self._take_points(targets, arcs, best))
-                known[rows] |= _on_curves(q[rows], traces, self._turning)
+                known[rows] |= self._on_curves(q[rows], traces)
                 known[rows, first] = True
             self._take_ends(targets, ends, best)
         return best
@@ -198,6 +199,34 @@ class SelfMotionCurves:
         """Newton's steps to x across directions t (K, n), and tangents with t . tangent = 1, (K, n) each."""
         found = self._bordered_step(q, x, t)[0]
         return found[:, : q.shape[1]], found[:, q.shape[1] :]
+
+    def _away(self, q: Array) -> Array:
+        """Largest distances of joints (N, S, n) from their ranges, up to full turns, (N, S)."""
+        low, high = bounds_of(self.boxed.domain)
+        bounded = np.isfinite(low)
+        centre, half = np.where(bounded, (low + high) / 2, 0.0), np.where(bounded, (high - low) / 2, np.inf)
+        return np.asarray((np.abs(_wrapped(q - centre, self._turning)) - half).max(axis=2).clip(0.0))
+
+    def _on_curves(self, q: Array, traces: Traces) -> NDArray[np.bool_]:
+        """Which of the positions q (K, S, n) lie on the curves, up to full turns, (K, S)."""
+        mine, points = self._on_circles(q), self._on_circles(traces.q)
+        squares = (points**2).sum(axis=2)[:, None] - 2 * mine @ points.transpose(0, 2, 1)
+        nearest = np.argmin(squares, axis=2)
+        found = np.zeros(nearest.shape, dtype=bool)
+        for place in (np.maximum(nearest - 1, 0), nearest):
+            start = np.take_along_axis(traces.q, place[:, :, None], axis=1)
+            after = np.minimum(place + 1, traces.q.shape[1] - 1)
+            step = np.take_along_axis(traces.q, after[:, :, None], axis=1) - start
+            away = _wrapped(q - start, self._turning)
+            share = (away * step).sum(axis=2) / np.maximum((step**2).sum(axis=2), 1e-300)
+            gap = away - np.clip(share, 0.0, 1.0)[:, :, None] * step
+            found |= (gap**2).sum(axis=2) < RULES.known**2
+        return found
+
+    def _on_circles(self, q: Array) -> Array:
+        """Cosines and sines of revolute joints, and positions of the others: near one another where q (..., n) is."""
+        turning, sliding = q[..., self._turning], q[..., ~self._turning]
+        return np.concatenate([np.cos(turning), np.sin(turning), sliding], axis=-1)
 
     def _passed_start(self, q: Array, new: Array, q0: Array, t0: Array) -> NDArray[np.bool_]:
         """Which steps from q to new pass q0, up to full turns."""
@@ -458,19 +487,6 @@ def _subdivided(traces: Traces, curve: Indices, place: Indices) -> tuple[Array, 
     bend = (s - 2 * s**2 + s**3) * t + (s**3 - s**2) * onward
     points = q + (3 * s**2 - 2 * s**3) * step + np.linalg.norm(step, axis=2, keepdims=True) * bend
     return points, (1 - s) * t + s * onward
-
-
-def _on_curves(q: Array, traces: Traces, turning: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which of the positions q (K, S, n) lie on the curves, up to full turns, (K, S)."""
-    start, step = traces.q, np.diff(traces.q, axis=1, append=traces.q[:, -1:])
-    square = np.maximum((step**2).sum(axis=2), 1e-300)
-    found = np.zeros(q.shape[:2], dtype=bool)
-    for s in range(q.shape[1]):
-        away = _wrapped(q[:, s, None] - start, turning)
-        share = np.clip(np.einsum("kpi,kpi->kp", away, step) / square, 0.0, 1.0)
-        gap = np.linalg.norm(away - share[:, :, None] * step, axis=2)
-        found[:, s] = gap.min(axis=1) < RULES.known
-    return found
 
 
 def _wrapped(difference: Array, turning: NDArray[np.bool_]) -> Array:
