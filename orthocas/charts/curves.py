@@ -1,6 +1,7 @@
 """The self-motion curves of many task values at once, r = 1, and the points on them whose xi is nearest."""
 
 from dataclasses import dataclass
+from itertools import product
 
 import casadi as ca
 import numpy as np
@@ -21,7 +22,8 @@ from orthocas.tools.columns import BlockedFunction
 class CurveRules:
     """Numbers of the search along curves. Chosen on panda-wide and xarm7-wide (benchmarks/nearest_xi.py)."""
 
-    starts: int = 12  #: stored positions near each x
+    starts: int = 10  #: stored positions near each x
+    near_phi: int = 4  #: stored positions near each phi
     reach: int = 25  #: steps from a start to its x
     largest: float = 0.7  #: norm of one of those steps [rad] or [m]
     missed: float = 0.05  #: largest correction of a step along a curve [rad] or [m]
@@ -31,8 +33,8 @@ class CurveRules:
     turned: float = 0.94  #: least cosine between the tangents at both ends of a step
     straight: float = 0.985  #: cosine from which the next step may be longer
     known: float = 0.03  #: distance [rad] or [m] from a curve up to which a start lies on it
-    parts: int = 3  #: points with xi on each step
-    sagitta: float = 1e-3  #: largest distance of those parts from their chords [rad] or [m]
+    parts: int = 2  #: points with xi on each step
+    sagitta: float = 3e-3  #: largest distance of those parts from their chords [rad] or [m]
     narrow: float = 1e-10  #: [rad] or [m]: brackets of an end of the domain
     prismatic: float = 1.0  #: half-widths that a sliding joint may leave its range by
 
@@ -110,8 +112,9 @@ class SelfMotionCurves:
 
     def _reached(self, targets: Array, own: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Positions (N, S, n) with the task values of targets, and which starts led to none, (N, S)."""
-        stored = self.starts.nearest(targets, RULES.starts, self.boxed.m)
-        starts = np.concatenate([own[None], stored]).transpose(1, 0, 2)
+        near_x = self.starts.nearest(targets, RULES.starts, self.boxed.m)
+        near_phi = self.starts.nearest(targets, RULES.near_phi, targets.shape[1])
+        starts = np.concatenate([own[None], near_phi, near_x]).transpose(1, 0, 2)
         N, S, n = starts.shape
         x = np.repeat(targets[:, : self.boxed.m], S, axis=0)
         q, error = self._led_to(x, starts.reshape(-1, n))
@@ -271,24 +274,21 @@ class SelfMotionCurves:
     def _sheets(self, traces: Traces) -> tuple[Indices, Array]:
         """Which curves (of K) pass the box of the domain after which full turns: curve (L,), and shifts (L, n)."""
         low, high = bounds_of(self.boxed.domain)
-        bounded, turn, room = np.isfinite(low), 2 * np.pi, RULES.step
-        low, high = np.where(bounded, low, self.boxed.domain.centre - np.pi), np.where(bounded, high, np.inf)
-        found = np.unique(
-            np.concatenate([self._turns(traces, low - below, high + room) for below in (0.0, room)]), axis=0
-        )
-        for j in np.flatnonzero(self._turning & bounded & (high - low > turn)):
-            more = range(1, int((high[j] - low[j]) / turn) + 1)
-            found = np.unique(np.concatenate([found, *(found + k * np.eye(len(low) + 1)[j + 1] for k in more)]), axis=0)
-        return found[:, 0].astype(np.int64), turn * found[:, 1:]
-
-    def _turns(self, traces: Traces, low: Array, high: Array) -> Array:
-        """Curves that pass a box, and the turns that bring them there just above `low`, (L, 1 + n)."""
-        turns = np.where(self._turning, np.ceil((low - traces.q) / (2 * np.pi)), 0.0)
-        at = traces.q + 2 * np.pi * turns
-        changes = ((at >= low) & (at <= high)).all(axis=2)
-        changes[:, 1:] &= ~changes[:, :-1] | (turns[:, 1:] != turns[:, :-1]).any(axis=2)
-        curve, place = np.nonzero(changes)
-        return np.column_stack([curve, turns[curve, place]])
+        turn, room, bounded = 2 * np.pi, RULES.step, np.isfinite(low)
+        low = np.where(bounded, low - room, self.boxed.domain.centre - np.pi)
+        high = np.where(bounded, high + room, np.inf)
+        first = np.where(self._turning, np.ceil((low - traces.q) / turn), 0.0)
+        more = [range(1 + int(k)) for k in np.where(self._turning & bounded, (high - low) // turn, 0)]
+        found = []
+        for extra in product(*more):
+            turns = first + np.array(extra)
+            at = traces.q + turn * turns
+            changes = ((at >= low) & (at <= high)).all(axis=2)
+            changes[:, 1:] &= ~changes[:, :-1] | (turns[:, 1:] != turns[:, :-1]).any(axis=2)
+            curve, place = np.nonzero(changes)
+            found.append(np.column_stack([curve, turns[curve, place]]))
+        sheets = np.unique(np.concatenate(found), axis=0)
+        return sheets[:, 0].astype(np.int64), turn * sheets[:, 1:]
 
     def _take_roots(self, targets: Array, arcs: "Arcs", tolerance: float, best: Nearest) -> None:
         """Solutions of phi(q) = phi on arcs."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from orthocas.charts.coordinates import InvertibleMap
 from orthocas.charts.phi import ROUNDING, Differences, PhiMap, largest
 from orthocas.errors import SingularTaskError
-from orthocas.tasks.domains import Domain, sample_uniform
+from orthocas.tasks.domains import Domain, sample_heavily
 from orthocas.tools.batch import dense_function, in_threads
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
@@ -381,7 +381,7 @@ class Starts:
     @cached_property
     def _table(self) -> tuple[Array, Array]:
         """Points of the domain where phi is defined, and phi, (K, n) each."""
-        return where_known(self._map, sample_uniform(self._domain, _POINTS, _SEED))
+        return where_known(self._map, sample_heavily(self._domain, _POINTS, _SEED))
 
     @cached_property
     def _range(self) -> tuple[Array, Array]:
