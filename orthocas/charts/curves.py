@@ -22,8 +22,9 @@ from orthocas.tools.columns import BlockedFunction
 class CurveRules:
     """Numbers of the search along curves. Chosen on panda-wide and xarm7-wide (benchmarks/nearest_xi.py)."""
 
-    starts: int = 10  #: stored positions near each x
-    near_phi: int = 4  #: stored positions near each phi
+    near_phi: int = 4  #: stored positions near each phi, from which curves are sought
+    near_x: int = 8  #: the same near each x
+    more: int = 24  #: the same, for rows without a solution
     reach: int = 25  #: steps from a start to its x
     largest: float = 0.7  #: norm of one of those steps [rad] or [m]
     missed: float = 0.05  #: largest correction of a step along a curve [rad] or [m]
@@ -50,6 +51,10 @@ class Traces:
     q: Array  #: (K, P, n), unwrapped; the last point is repeated after the end
     tangent: Array  #: unit tangents there, (K, P, n)
     count: Indices  #: points of each curve, (K,)
+
+    def part(self, curves: Indices) -> "Traces":
+        """Some of the curves."""
+        return Traces(*(array[curves] for array in vars(self).values()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,32 +97,56 @@ class SelfMotionCurves:
 
     def search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
         """The nearest points for targets (N, n) of phi, from stored starts and one of the caller's (N, n)."""
-        best, ends = Nearest.empty(own), Ends.empty(own.shape[1])
+        best, ends, traced = Nearest.empty(own), Ends.empty(own.shape[1]), list[Traces]()
         with np.errstate(all="ignore"):
-            q, known = self._reached(targets, own)
-            away = self._away(q)
-            for _ in range(q.shape[1]):
-                rows = np.flatnonzero(~known.all(axis=1) & (best.distance > 0))
-                if not rows.size:
-                    break
-                first = np.argmin(np.where(known[rows], np.inf, away[rows]), axis=1)
-                traces = self._traced(targets[rows], q[rows, first], rows)
-                arcs = self._arcs(targets, traces)
-                self._take_roots(targets, arcs, tolerance, best)
-                ends = ends.joined(self._take_points(targets, arcs, best))
-                known[rows] |= self._on_curves(q[rows], traces)
-                known[rows, first] = True
+            for stage in range(2):
+                rows = np.flatnonzero(best.distance > 0)
+                if rows.size:
+                    starts = self._first_starts(targets[rows], own[rows]) if stage == 0 else self._more(targets[rows])
+                    ends = ends.joined(self._search_from(targets, rows, starts, traced, tolerance, best))
             self._take_ends(targets, ends, best)
         return best
 
-    def _reached(self, targets: Array, own: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Positions (N, S, n) with the task values of targets, and which starts led to none, (N, S)."""
-        near_x = self.starts.nearest(targets, RULES.starts, self.boxed.m)
+    def _search_from(
+        self, targets: Array, rows: Indices, starts: Array, traced: list[Traces], tolerance: float, best: Nearest
+    ) -> "Ends":
+        """Search some rows from starts (S, rows, n), and add to the curves that are traced; returns ends of arcs."""
+        q, known = self._reached(targets[rows], starts)
+        place, ends = np.full(len(targets), -1), Ends.empty(q.shape[2])
+        place[rows] = np.arange(len(rows))
+        for traces in traced:
+            here = np.flatnonzero(place[traces.row] >= 0)
+            of = place[traces.row[here]]
+            known[of] |= self._on_curves(q[of], traces.part(here))
+        away = self._away(q)
+        for _ in range(q.shape[1]):
+            left = np.flatnonzero(~known.all(axis=1) & (best.distance[rows] > 0))
+            if not left.size:
+                break
+            first = np.argmin(np.where(known[left], np.inf, away[left]), axis=1)
+            traces = self._traced(targets[rows[left]], q[left, first], rows[left])
+            arcs = self._arcs(targets, traces)
+            self._take_roots(targets, arcs, tolerance, best)
+            ends = ends.joined(self._take_points(targets, arcs, best))
+            known[left] |= self._on_curves(q[left], traces)
+            known[left, first] = True
+            traced.append(traces)
+        return ends
+
+    def _first_starts(self, targets: Array, own: Array) -> Array:
+        """The caller's starts, and stored positions near phi and near x, (S, N, n)."""
         near_phi = self.starts.nearest(targets, RULES.near_phi, targets.shape[1])
-        starts = np.concatenate([own[None], near_phi, near_x]).transpose(1, 0, 2)
-        N, S, n = starts.shape
+        return np.concatenate([own[None], near_phi, self.starts.nearest(targets, RULES.near_x, self.boxed.m)])
+
+    def _more(self, targets: Array) -> Array:
+        """Further stored positions near x, (S, N, n)."""
+        return self.starts.nearest(targets, RULES.near_x + RULES.more, self.boxed.m)[RULES.near_x :]
+
+    def _reached(self, targets: Array, starts: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Positions (N, S, n) with the task values of targets, and which starts (S, N, n) led to none, (N, S)."""
+        S, N, n = starts.shape
         x = np.repeat(targets[:, : self.boxed.m], S, axis=0)
-        q, error = self._led_to(x, starts.reshape(-1, n))
+        q, error = self._led_to(x, starts.transpose(1, 0, 2).reshape(-1, n))
         return q.reshape(N, S, n), ~(error <= KEPT).reshape(N, S)
 
     def _led_to(self, x: Array, starts: Array) -> tuple[Array, Array]:
