@@ -1,5 +1,6 @@
 """The self-motion curves of many task values at once, r = 1, and the points on them whose xi is nearest."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from orthocas.charts.in_domain import KEPT, BoxedPhi
 from orthocas.charts.newton import Starts, inverses
-from orthocas.charts.phi import largest
+from orthocas.charts.phi import largest, shortest
 from orthocas.tasks.domains import bounds_of
 from orthocas.tasks.relative import Relative
 from orthocas.tools.batch import dense_function
@@ -94,6 +95,7 @@ class SelfMotionCurves:
 
     boxed: BoxedPhi
     starts: Starts
+    xi: Callable[[Array], Array]  #: coordinates (N, 1) of points (N, n)
 
     def search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
         """The nearest points for targets (N, n) of phi, from stored starts and one of the caller's (N, n)."""
@@ -195,37 +197,28 @@ class SelfMotionCurves:
         K, n = q0.shape
         points, tangents = [q0], [t0]
         count, closed = np.ones(K, dtype=np.int64), np.zeros(K, dtype=bool)
-        q, t, before = q0.copy(), t0.copy(), t0.copy()
-        h, h_before = np.full(K, RULES.step / 2), np.full(K, np.inf)
-        left = np.arange(K)
+        q, t, bend = q0.copy(), t0.copy(), np.zeros_like(q0)
+        h, before, left = np.full(K, RULES.step / 2), np.zeros(K), np.arange(K)
         for _ in range(RULES.most):
-            new, onward, good = self._stepped(x[left], q[left], t[left], before[left], h[left], h_before[left])
-            turned = np.einsum("ki,ki->k", t[left], onward)
-            good &= turned > RULES.turned
+            lengths = h[left, None]
+            state = np.concatenate([q[left], t[left], bend[left], lengths, q0[left], t0[left]], axis=1)
+            found = self._step(state, x[left])[0]
+            new, onward, (missed, turned, gap, ahead) = found[:, :n], found[:, n : 2 * n], found[:, 2 * n :].T
+            good = (missed < RULES.missed) & (turned > RULES.turned)
             moved = left[good]
-            passed = self._passed_start(q[moved], new[good], q0[moved], t0[moved]) & (count[moved] > 3)
-            before[moved], h_before[moved] = t[moved], h[moved]
-            q[moved], t[moved] = new[good], onward[good]
+            closed[moved] = ((gap < 1.6 * RULES.step) & (before[left] < 0) & (ahead >= 0))[good] & (count[moved] > 3)
+            bend[moved] = (onward[good] - t[moved]) / lengths[good]
+            q[moved], t[moved], before[moved] = new[good], onward[good], ahead[good]
             longer = turned[good] > RULES.straight
             h[moved] = np.where(longer, np.minimum(1.6 * h[moved], RULES.step), h[moved])
             h[left[~good]] /= 2
             count[moved] += 1
-            closed[moved[passed]] = True
             points.append(q.copy())
             tangents.append(t.copy())
             left = left[~closed[left] & (h[left] > RULES.shortest) & self._slides_near(q[left])]
             if not left.size:
                 break
         return *_compact(np.array(points), np.array(tangents), count), count, closed
-
-    def _stepped(
-        self, x: Array, q: Array, t: Array, before: Array, h: Array, h_before: Array
-    ) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Points about h (K,) ahead near curves, unit tangents there, and which are good."""
-        new = q + h[:, None] * t + (0.5 * h**2 / h_before)[:, None] * (t - before)
-        change, onward = self._corrected(x, new, t)
-        good = np.linalg.norm(change, axis=1) < RULES.missed
-        return new + change, onward / np.linalg.norm(onward, axis=1, keepdims=True), good
 
     def _corrected(self, x: Array, q: Array, t: Array) -> tuple[Array, Array]:
         """Newton's steps to x across directions t (K, n), and tangents with t . tangent = 1, (K, n) each."""
@@ -260,15 +253,10 @@ class SelfMotionCurves:
         turning, sliding = q[..., self._turning], q[..., ~self._turning]
         return np.concatenate([np.cos(turning), np.sin(turning), sliding], axis=-1)
 
-    def _passed_start(self, q: Array, new: Array, q0: Array, t0: Array) -> NDArray[np.bool_]:
-        """Which steps from q to new pass q0, up to full turns."""
-        was, now = (_wrapped(part - q0, self._turning) for part in (q, new))
-        near = np.linalg.norm(now, axis=1) < 1.6 * RULES.step
-        behind, ahead = (np.einsum("ki,ki->k", part, t0) for part in (was, now))
-        return np.asarray(near & (behind < 0) & (ahead >= 0))
-
     def _slides_near(self, q: Array) -> NDArray[np.bool_]:
         """Whether sliding joints are in their ranges, or not far outside."""
+        if self._turning.all():
+            return np.ones(len(q), dtype=bool)
         low, high = bounds_of(self.boxed.domain)
         room = RULES.prismatic * self.boxed.domain.half_width
         return np.asarray((((q >= low - room) & (q <= high + room)) | self._turning).all(axis=1))
@@ -419,17 +407,41 @@ class SelfMotionCurves:
 
     def _xi_left(self, targets: Array, q: Array) -> Array:
         """xi - xi(q), (N,)."""
-        phi_map = self.boxed.phi_map
-        return np.asarray(phi_map.difference(targets, phi_map.phi(q))[:, self.boxed.m])
+        left = targets[:, self.boxed.m :] - self.xi(q)
+        return np.asarray(shortest(left, self.boxed.phi_map.difference.turns[self.boxed.m :])[:, 0])
 
     @cached_property
     def _bordered_step(self) -> BlockedFunction:
+        """As `_bordered`, at many points."""
+        return BlockedFunction(self._bordered)
+
+    @cached_property
+    def _bordered(self) -> ca.Function:
         """q, x, t -> the solution dq of J dq = x - h(q), t . dq = 0, and that of J dq = 0, t . dq = 1, (2n, 1)."""
         q, x, e, J = self._symbols
         t = ca.SX.sym("t", q.shape[0])
         right = ca.vertcat(ca.horzcat(e, ca.SX.zeros(e.shape[0])), ca.SX([[0.0, 1.0]]))
         found = ca.solve(ca.vertcat(J, t.T), right)
-        return BlockedFunction(dense_function("bordered_step", [q, x, t], [ca.cse(ca.vec(found))]))
+        return dense_function("bordered_step", [q, x, t], [ca.cse(ca.vec(found))])
+
+    @cached_property
+    def _step(self) -> BlockedFunction:
+        """A step along a curve: q, t, bend, h, q0, t0 in one column, and x -> new q and t, and four numbers.
+
+        They are the length of the correction, the cosine between the tangents, and the distance of q from q0 up to full
+        turns, also along t0.
+        """
+        q, x = self._symbols[:2]
+        n = q.shape[0]
+        state = ca.SX.sym("state", 5 * n + 1)
+        at, t, bend, h, q0, t0 = ca.vertsplit(state, [0, n, 2 * n, 3 * n, 3 * n + 1, 4 * n + 1, 5 * n + 1])
+        ahead = at + h * t + h**2 / 2 * bend
+        change, onward = ca.horzsplit(ca.reshape(self._bordered(ahead, x, t), n, 2))
+        new, onward = ahead + change, onward / ca.norm_2(onward)
+        gap = new - q0
+        gap -= 2 * np.pi * ca.DM(self._turning.astype(float)) * ca.floor(gap / (2 * np.pi) + 0.5)
+        numbers = ca.vertcat(ca.norm_2(change), ca.dot(t, onward), ca.norm_2(gap), ca.dot(gap, t0))
+        return BlockedFunction(dense_function("step", [state, x], [ca.cse(ca.vertcat(new, onward, numbers))]))
 
     @cached_property
     def _damped_step(self) -> BlockedFunction:

@@ -257,7 +257,7 @@ class InverseMethods(PhiFunctions):
         local = FewRows(phi_map, self._point_functions, Newton(phi_map))
         by_ipopt = Nearest(domain, self.m, self.function("phi"), phi_map)
         in_domain, inside = InDomain(boxed, Cells(boxed)), Inside(boxed, starts, by_ipopt)
-        curves = SelfMotionCurves(boxed, starts) if self.r == 1 else None
+        curves = SelfMotionCurves(boxed, starts, self.xi) if self.r == 1 else None
         return Inverse(self.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves)
 
     @cached_property
