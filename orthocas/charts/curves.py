@@ -28,15 +28,15 @@ class CurveRules:
     more: int = 24  #: the same, for rows without a solution
     reach: int = 25  #: steps from a start to its x
     largest: float = 0.7  #: norm of one of those steps [rad] or [m]
-    missed: float = 0.05  #: largest correction of a step along a curve [rad] or [m]
-    step: float = 0.3  #: longest step along a curve [rad] or [m]
-    shortest: float = 0.01  #: a curve that needs shorter ones ends, near a singular position
-    most: int = 150  #: steps of a curve in one direction
-    turned: float = 0.94  #: least cosine between the tangents at both ends of a step
-    straight: float = 0.985  #: cosine from which the next step may be longer
-    known: float = 0.03  #: distance [rad] or [m] from a curve up to which a start lies on it
+    missed: float = 0.08  #: largest correction of a step along a curve [rad] or [m]
+    step: float = 0.4  #: longest step along a curve [rad] or [m]
+    shortest: float = 0.03  #: a curve that needs shorter ones ends, near a singular position
+    most: int = 80  #: steps of a curve in one direction
+    turned: float = 0.9  #: least cosine between the tangents at both ends of a step
+    straight: float = 0.96  #: cosine from which the next step may be longer
+    known: float = 0.05  #: distance [rad] or [m] from a curve up to which a start lies on it
     parts: int = 2  #: points with xi on each step
-    sagitta: float = 3e-3  #: largest distance of those parts from their chords [rad] or [m]
+    sagitta: float = 6e-3  #: largest distance of those parts from their chords [rad] or [m]
     narrow: float = 1e-10  #: [rad] or [m]: brackets of an end of the domain
     prismatic: float = 1.0  #: half-widths that a sliding joint may leave its range by
 
@@ -295,15 +295,18 @@ class SelfMotionCurves:
         low = np.where(bounded, low - room, self.boxed.domain.centre - np.pi)
         high = np.where(bounded, high + room, np.inf)
         first = np.where(self._turning, np.ceil((low - traces.q) / turn), 0.0)
-        more = [range(1 + int(k)) for k in np.where(self._turning & bounded, (high - low) // turn, 0)]
+        at = traces.q + turn * first
+        passed = np.ones(at.shape[:2], dtype=bool)
+        passed[:, 1:] = (first[:, 1:] != first[:, :-1]).any(axis=2)
+        choices = [range(1 + int(k)) for k in np.where(self._turning & bounded, (high - low) // turn, 0)]
+        near = [[(at[:, :, j] >= low[j]) & (at[:, :, j] <= high[j] - turn * k) for k in choices[j]] for j in range(len(low))]
         found = []
-        for extra in product(*more):
-            turns = first + np.array(extra)
-            at = traces.q + turn * turns
-            changes = ((at >= low) & (at <= high)).all(axis=2)
-            changes[:, 1:] &= ~changes[:, :-1] | (turns[:, 1:] != turns[:, :-1]).any(axis=2)
+        for extra in product(*choices):
+            close = np.logical_and.reduce([near[j][k] for j, k in enumerate(extra)])
+            changes = close & passed
+            changes[:, 1:] |= close[:, 1:] & ~close[:, :-1]
             curve, place = np.nonzero(changes)
-            found.append(np.column_stack([curve, turns[curve, place]]))
+            found.append(np.column_stack([curve, first[curve, place] + np.array(extra)]))
         sheets = np.unique(np.concatenate(found), axis=0)
         return sheets[:, 0].astype(np.int64), turn * sheets[:, 1:]
 
