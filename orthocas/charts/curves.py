@@ -21,7 +21,7 @@ from orthocas.tools.columns import BlockedFunction
 
 @dataclass(frozen=True, slots=True)
 class CurveRules:
-    """Numbers of the search along curves. Chosen on panda-wide and xarm7-wide (benchmarks/nearest_xi.py)."""
+    """Numbers of the search along curves. Chosen on panda-wide and xarm7-wide (benchmarks/round_trips.py)."""
 
     near_phi: int = 4  #: stored positions near each phi, from which curves are sought
     near_x: int = 8  #: the same near each x
@@ -35,13 +35,15 @@ class CurveRules:
     turned: float = 0.9  #: least cosine between the tangents at both ends of a step
     straight: float = 0.96  #: cosine from which the next step may be longer
     known: float = 0.05  #: distance [rad] or [m] from a curve up to which a start lies on it
-    parts: int = 2  #: points with xi on each step
+    parts: int = 3  #: points with xi on each step
     sagitta: float = 6e-3  #: largest distance of those parts from their chords [rad] or [m]
+    halvings: int = 5  #: of chords that pass the box between points outside
     narrow: float = 1e-10  #: [rad] or [m]: brackets of an end of the domain
     prismatic: float = 1.0  #: half-widths that a sliding joint may leave its range by
 
 
 RULES = CurveRules()
+_AT_ONCE = 2048  # rows whose curves are held in memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +101,12 @@ class SelfMotionCurves:
 
     def search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
         """The nearest points for targets (N, n) of phi, from stored starts and one of the caller's (N, n)."""
+        pieces = [slice(first, first + _AT_ONCE) for first in range(0, len(own), _AT_ONCE)]
+        found = [self._search(targets[rows], own[rows], tolerance) for rows in pieces]
+        parts = zip(*(vars(part).values() for part in (Nearest.empty(own[:0]), *found)), strict=True)
+        return Nearest(*(np.concatenate(arrays) for arrays in parts))
+
+    def _search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
         best, ends, traced = Nearest.empty(own), Ends.empty(own.shape[1]), list[Traces]()
         with np.errstate(all="ignore"):
             for stage in range(2):
@@ -265,14 +273,14 @@ class SelfMotionCurves:
         """Points on the steps of curves in and around the box of the domain."""
         curve, shift = self._sheets(traces)
         low, high = bounds_of(self.boxed.domain)
-        near = traces.q[curve] + shift[:, None]
-        near = ((near >= low - RULES.step) & (near <= high + RULES.step)).all(axis=2)
+        moved = traces.q[curve] + shift[:, None]
+        near = np.asarray(((moved >= low - RULES.step) & (moved <= high + RULES.step)).all(axis=2))
         at, place = np.nonzero((near[:, :-1] | near[:, 1:]) & (np.arange(1, near.shape[1]) < traces.count[curve, None]))
         q, along = _subdivided(traces, curve[at], place)
         q += shift[at][:, None]
         row = traces.row[curve[at]]
         slack = RULES.step / RULES.parts
-        close = ((q >= low - slack) & (q <= high + slack)).all(axis=2)
+        close = np.asarray(((q >= low - slack) & (q <= high + slack)).all(axis=2))
         x = targets[np.repeat(row, close.sum(axis=1)), : self.boxed.m]
         points, t = q[close], along[close]
         points += self._corrected(x, points, t)[0]
@@ -284,7 +292,7 @@ class SelfMotionCurves:
         xi_left[close] = self._xi_left(targets[np.repeat(row, close.sum(axis=1))], points)
         passing = close[:, :-1] & close[:, 1:] & ~inside[:, :-1] & ~inside[:, 1:]
         arc, place = np.nonzero(passing)
-        first, last = self._shares_inside(q[arc, place], q[arc, place + 1])
+        first, last = self._shares_inside(q[arc, place], q[arc, place + 1], RULES.sagitta)
         passing[arc, place] = first < last
         return Arcs(row, q, inside, passing, xi_left)
 
@@ -299,7 +307,9 @@ class SelfMotionCurves:
         passed = np.ones(at.shape[:2], dtype=bool)
         passed[:, 1:] = (first[:, 1:] != first[:, :-1]).any(axis=2)
         choices = [range(1 + int(k)) for k in np.where(self._turning & bounded, (high - low) // turn, 0)]
-        near = [[(at[:, :, j] >= low[j]) & (at[:, :, j] <= high[j] - turn * k) for k in choices[j]] for j in range(len(low))]
+        near = [
+            [(at[:, :, j] >= low[j]) & (at[:, :, j] <= high[j] - turn * k) for k in choices[j]] for j in range(len(low))
+        ]
         found = []
         for extra in product(*choices):
             close = np.logical_and.reduce([near[j][k] for j, k in enumerate(extra)])
@@ -325,7 +335,12 @@ class SelfMotionCurves:
         rows, phi_map = arcs.row[arc], self.boxed.phi_map
         for _ in range(4):
             J = phi_map.jacobian(q) / phi_map.sizes[:, None]
-            q = q + _solutions(J, phi_map.difference(targets[rows], phi_map.phi(q))[:, :, None] / phi_map.sizes[:, None])[:, :, 0]
+            q = (
+                q
+                + _solutions(J, phi_map.difference(targets[rows], phi_map.phi(q))[:, :, None] / phi_map.sizes[:, None])[
+                    :, :, 0
+                ]
+            )
         q = self._snapped(q)
         q = np.where(np.isfinite(q), q, best.q[rows])
         solved = (largest(phi_map.residual(targets[rows], q)) <= tolerance) & self.boxed.domain.contains(q)
@@ -348,37 +363,45 @@ class SelfMotionCurves:
         return found[0].joined(found[1]).joined(self._take_short(targets, arcs, best))
 
     def _take_short(self, targets: Array, arcs: "Arcs", best: Nearest) -> "Ends":
-        """The same of arcs that lie between neighbouring points outside."""
+        """The same of arcs that lie between neighbouring points outside: chords that pass the box are halved."""
         arc, place = np.nonzero(arcs.passing & (best.distance > 0)[arcs.row][:, None])
-        a, b, rows = arcs.q[arc, place], arcs.q[arc, place + 1], arcs.row[arc]
-        low, high = self._shares_inside(a, b)
-        q, step = a + ((low + high) / 2)[:, None] * (b - a), b - a
-        for _ in range(2):
-            q = q + self._corrected(targets[rows, : self.boxed.m], q, step)[0]
-        good = self._contains(q)
-        a, b, q, rows = (part[good] for part in (a, b, q, rows))
-        left = self._xi_left(targets[rows], q)
-        best.take(rows, q, np.abs(left), between=True)
-        found = Ends.empty(q.shape[1])
-        for other, beyond in ((a, arcs.xi_left[arc, place][good]), (b, arcs.xi_left[arc, place + 1][good])):
-            least = np.where(left * beyond > 0, np.minimum(np.abs(left), np.abs(beyond)), 0.0)
-            found = found.joined(Ends(rows, q, other, least))
+        a, b, rows, found = arcs.q[arc, place], arcs.q[arc, place + 1], arcs.row[arc], Ends.empty(arcs.q.shape[2])
+        for level in range(RULES.halvings):
+            first, last = self._shares_inside(a, b, RULES.sagitta / 4**level)
+            passing = first < last
+            a, b, rows, share = a[passing], b[passing], rows[passing], ((first + last) / 2)[passing, None]
+            if not rows.size:
+                break
+            q = a + share * (b - a)
+            for _ in range(2):
+                q = q + self._corrected(targets[rows, : self.boxed.m], q, b - a)[0]
+            good = self._contains(q)
+            left = np.abs(self._xi_left(targets[rows[good]], q[good]))
+            best.take(rows[good], q[good], left, between=True)
+            for other in (a[good], b[good]):
+                found = found.joined(Ends(rows[good], q[good], other, np.zeros(len(left))))
+            again = ~good & ~self._in_box(q)  # conditions are not looked at so closely
+            a, b, rows = np.concatenate([a[again], q[again]]), np.concatenate([q[again], b[again]]), np.tile(rows[again], 2)
         return found
 
-    def _shares_inside(self, a: Array, b: Array) -> tuple[Array, Array]:
-        """Where the chords from a to b (K, n) are in the box, or nearly so: between shares low and high (K,) if <."""
+    def _shares_inside(self, a: Array, b: Array, slack: float) -> tuple[Array, Array]:
+        """Where the chords from a to b (K, n) are in the box, or so near: between shares low and high (K,) if <."""
         low, high = bounds_of(self.boxed.domain)
         step = np.where(np.abs(b - a) > 1e-300, b - a, 1e-300)
-        one, other = (low - RULES.sagitta - a) / step, (high + RULES.sagitta - a) / step
+        one, other = (low - slack - a) / step, (high + slack - a) / step
         first, last = np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
         return np.maximum(first, 0.0), np.minimum(last, 1.0)
 
     def _contains(self, q: Array) -> NDArray[np.bool_]:
         """Which points (N, n) lie in the domain; they need not be finite."""
-        low, high = bounds_of(self.boxed.domain)
-        inside = ((q >= low) & (q <= high)).all(axis=1)
+        inside = self._in_box(q)
         inside[inside] = self.boxed.domain.contains(q[inside])
-        return np.asarray(inside)
+        return inside
+
+    def _in_box(self, q: Array) -> NDArray[np.bool_]:
+        """Which points (N, n) lie in the box of the domain."""
+        low, high = bounds_of(self.boxed.domain)
+        return np.asarray(((q >= low) & (q <= high)).all(axis=1))
 
     def _take_ends(self, targets: Array, ends: "Ends", best: Nearest) -> None:
         """The ends of arcs, of rows in which they may be nearest."""
@@ -462,7 +485,12 @@ class SelfMotionCurves:
         task, scale = self.boxed.task, ca.DM(self.boxed.phi_map.sizes[: self.boxed.m])
         relative = Relative(task)
         q, x = ca.SX.sym("q", task.robot.n), ca.SX.sym("x", task.m)
-        return q, x, relative.difference(x, task.function(q)) / scale, relative.rates(q) / ca.repmat(scale, 1, task.robot.n)
+        return (
+            q,
+            x,
+            relative.difference(x, task.function(q)) / scale,
+            relative.rates(q) / ca.repmat(scale, 1, task.robot.n),
+        )
 
     @cached_property
     def _turning(self) -> NDArray[np.bool_]:
@@ -523,7 +551,7 @@ def _compact(points: Array, tangents: Array, count: Indices) -> tuple[Array, Arr
 
 
 def _subdivided(traces: Traces, curve: Indices, place: Indices) -> tuple[Array, Array]:
-    """Points on cubic curves between points of traces (S,) and the next ones, and directions, (S, parts + 1, n) each."""
+    """Points on cubic curves from points of traces (S,) to the next ones, and directions, (S, parts + 1, n) each."""
     q, t = traces.q[curve, place][:, None], traces.tangent[curve, place][:, None]
     after, onward = traces.q[curve, place + 1][:, None], traces.tangent[curve, place + 1][:, None]
     s = (np.arange(RULES.parts + 1) / RULES.parts)[:, None]
