@@ -82,9 +82,7 @@ def test_curves_are_cut_by_the_limits_after_full_turns() -> None:
 
 def test_orientations_are_embedded_without_a_seam() -> None:
     """Numbers of orientations that differ little are as far apart as the error says, at half a turn too."""
-    robot = oc.charts.load("iiwa7-pose").problem.robot
     chart = oc.charts.load("iiwa7-wide")
-    assert chart.relative.turned and robot.n == 7
     rng = np.random.default_rng(0)
     q = sample_uniform(chart.problem.domain, 300, 4)
     x, y = chart.task(q), chart.task(q + 1e-3 * rng.normal(size=q.shape))
