@@ -251,7 +251,7 @@ def without_turns(difference: Array, turning: NDArray[np.bool_]) -> Array:
 def solutions_of(A: Array, right: Array) -> Array:
     """A^-1 right, (N, n, k); the least-squares solution where A is singular."""
     try:
-        found: Array = np.linalg.solve(A, right)
+        found: Array = np.asarray(np.linalg.solve(A, right), dtype=float)
     except np.linalg.LinAlgError:
         found = inverses(A)[0] @ right
     return found
