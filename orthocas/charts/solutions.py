@@ -28,10 +28,10 @@ class InverseStatus(IntEnum):
     """How the search for a q with phi(q) = phi ended, from best to worst."""
 
     FOUND = 0  #: a solution inside the domain
-    NEAREST = 1  #: no such q lies inside; this one does, has the same x, and its xi is as near as could be found
-    OUTSIDE_DOMAIN = 2  #: a solution within the joint limits, but outside the domain
-    LIMIT = 3  #: a solution beyond the joint limits
-    SINGULAR = 4  #: a solution at which J is singular, so that it is not unique
+    NEAREST = 1  #: none was found inside; this q lies inside, has the same x, and the nearest xi that was found
+    OUTSIDE_DOMAIN = 2  #: none was found inside; this solution lies within the joint limits, but outside the domain
+    LIMIT = 3  #: none was found within the joint limits; this solution lies beyond them
+    SINGULAR = 4  #: a solution at which J is singular, so that it need not be unique
     NOT_FOUND = 5  #: no solution was found, which does not prove that there is none; q has the smallest error found
     BAD_INPUT = 6  #: a number of phi or of the start is not finite; q is NaN
     OUT_OF_REACH = 7  #: no solution: x is farther from the first joint than the arm is long; q as for NOT_FOUND
@@ -110,10 +110,12 @@ class Solutions(Shown):
             )
         singular = np.flatnonzero(self.status == InverseStatus.SINGULAR)
         if singular.size:
-            raise InverseError(f"the Jacobian is singular at the solution of row {singular[0]}: q is not unique there")
+            raise InverseError(
+                f"the Jacobian is singular at the solution of row {singular[0]}: q need not be unique there"
+            )
         beyond = np.flatnonzero(~np.isin(self.status, accepted))
         if beyond.size:
-            raise InverseError(f"the only q with phi(q) = phi lies outside the domain for {self.named(beyond)}")
+            raise InverseError(f"q with phi(q) = phi was found only outside the domain for {self.named(beyond)}")
         return self
 
     def named(self, rows: Indices) -> str:
