@@ -137,7 +137,7 @@ def _style(axes: Axes, trajectory: "Trajectory") -> None:
 def _title(trajectory: "Trajectory") -> str:
     text = f"{trajectory.controller}, {trajectory.times[-1]:.4g} s"
     if trajectory.outcome.value != "complete":
-        text += f": {trajectory.outcome.value}, run ended early"
+        text += f": {trajectory.outcome.value}, {trajectory.reason or 'run ended early'}"
     lasting = trajectory.seconds_in_status
     cut, red = ([status for status in lasting if (status in FROM_THE_LAW) == kind] for kind in (True, False))
     if red:
