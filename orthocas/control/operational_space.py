@@ -220,7 +220,7 @@ class _OperationalSpace(Shown):
             object.__setattr__(self, name, value)
         if remembers is not None:
             _ = self.memory  # raises for bounds of another size
-        doubts = [*_like_a_percentage(self.damping_ratio), *self._holding_doubts]
+        doubts = [*_like_a_percentage(self.damping_ratio), *self._holding_doubts()]
         if coupling == "decoupled" and (metric := chart.problem.metric.name) != "inertia":
             doubts.append(f"a decoupled law relies on A = M (inertia), but the metric of this chart is {metric}")
         for doubt in doubts:
@@ -306,7 +306,7 @@ class _OperationalSpace(Shown):
         The motors cannot hold the arm, the metric does not decouple task and extra coordinates, a damping ratio looks
         like a percentage, a decoupled law has a chart that leaks much, or D is not positive semi-definite.
         """
-        found, metric = [*self._holding_doubts], self.problem.metric.name
+        found, metric = [*self._holding_doubts()], self.problem.metric.name
         if metric != "inertia":
             found.append(
                 f"the metric of this chart is {metric}, but task and extra coordinates are decoupled only for A = M "
@@ -325,7 +325,6 @@ class _OperationalSpace(Shown):
             )
         return found + self.model.remarks()
 
-    @cached_property
     def _holding_doubts(self) -> list[str]:
         """Of an arm that the motors cannot hold; none if the robot compensates gravity itself."""
         if self.model.gravity == "robot":

@@ -270,10 +270,6 @@ class Projector(TwoTaskLaw):
 
     def remarks(self) -> list[str]:
         """A warning if the motors cannot hold the arm."""
-        return self._holding_doubts
-
-    @cached_property
-    def _holding_doubts(self) -> list[str]:
         return holding_doubts(self.problem.robot, self.problem.domain, self.limit)
 
     @classmethod

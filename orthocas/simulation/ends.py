@@ -36,7 +36,7 @@ def why_lost(run: Trajectory, controller: Controller, pushes: Sequence[Push], su
         left = "was outside" if first == 0 else "left"
         return f"the arm {left} {what} at t = {run.times[first]:.4g} s"
     at_limit = np.abs(run.command) >= controller.gains["limit"]
-    for first, last in _stretches(at_limit.any(axis=1)):
+    for first, last in _stretches(np.asarray(at_limit.any(axis=1))):
         since, until = run.times[[first, last]]
         pushed = any(push.start < until and push.end > since for push in pushes)
         caught = (run.status[first : last + 1] == ControlStatus.CAUGHT).any() and not pushed
@@ -50,10 +50,10 @@ def why_lost(run: Trajectory, controller: Controller, pushes: Sequence[Push], su
 def _away(run: Trajectory, controller: Controller) -> tuple[NDArray[np.bool_], str]:
     """At which instants the arm is outside what the law respects, (N,), and what that is."""
     if controller.chart is not None:
-        return ~np.asarray(contains(controller.problem.domain, run.q)), "the domain of the chart"
+        return np.asarray(~contains(controller.problem.domain, run.q)), "the domain of the chart"
     robot = controller.problem.robot
     beyond = (run.q < robot.lower - _BEYOND) | (run.q > robot.upper + _BEYOND)
-    return beyond.any(axis=1), "the joint limits"
+    return np.asarray(beyond.any(axis=1)), "the joint limits"
 
 
 def _stretches(true: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:

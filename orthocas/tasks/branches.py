@@ -212,7 +212,7 @@ class _Arm:
             return [cls._of(robot, Task.pose(robot) if robot.n >= 6 or task is None else task, whole, joints, points)]
         moved = np.ones(robot.n, dtype=bool)
         if task is not None:
-            moved = _jacobians(task.with_reference_at(whole.centre), points[:20]).any(axis=(0, 1))
+            moved = np.asarray(_jacobians(task.with_reference_at(whole.centre), points[:20]).any(axis=(0, 1)))
         found = []
         for tip in robot.tips:
             joints = robot.tree.carriers(robot.tree.frame(tip).parent)[-_ARM:]

@@ -724,7 +724,8 @@ def _independent_frames(tasks: Sequence[Task]) -> list[tuple[Task, Frames]]:
     A whole pose that leads from a frame with a known pose to another one is as good as the pose of the latter in the
     world. What is seen from a frame with a known pose is as good as what the world sees of it.
     """
-    stands, known = {}, {None}
+    stands: dict[int, Frames] = {}
+    known: set[str | None] = {None}  # None: the world
     poses = [task for task in tasks if task.turn is not None and task.turn.whole and task.turn.with_position]
     for _ in poses:
         for task in poses:
