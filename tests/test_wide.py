@@ -809,7 +809,7 @@ def test_slivers_join_one_neighbour(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cuts at -0.4 and 0.4 that self-motions do not cross, with nothing clear between them: the weaker one goes."""
     robot = oc.problems.get("iiwa").robot
     whole = joint_range(robot, 0)
-    arm = _Arm.of(robot, None, whole)
+    arm = _Arm.all_of(robot, None, whole)[0]
 
     def sizes(self: _Arm, k: int, value: float, count: int) -> tuple[float, float]:
         clear = 0.05 if abs(value) < 0.4 else 0.3
@@ -880,3 +880,18 @@ def test_nearly_all_of_a_branch_is_proved_and_holds() -> None:
     assert (domain.volumes(points[clear]) > 0).all()
     far = robot.tip_rotation(points) @ robot.tip_rotation(domain.centre).T
     assert (np.trace(far, axis1=1, axis2=2) < 2 * np.cos(3.1) + 1).any()  # half a turn is no boundary of the proof
+
+
+@pytest.mark.slow
+def test_cuts_of_two_arms_are_those_of_each() -> None:
+    """The last seven joints of a robot with two tips carry one of them only."""
+    path = robot_data("baxter_description/urdf/baxter.urdf")
+    tips = ["left_gripper", "right_gripper"]
+    both = oc.Robot.from_urdf(path, tips=tips)
+    found = {(cut.joint_name, cut.singular): cut.value for cut in oc.branches(both).cuts}
+    alone = [cut for tip in tips for cut in oc.branches(oc.Robot.from_urdf(path, tip=tip)).cuts]
+    assert set(found) == {(cut.joint_name, cut.singular) for cut in alone}
+    for cut in alone:
+        assert found[cut.joint_name, cut.singular] == pytest.approx(cut.value, abs=0.05)
+    of_right = oc.branches(both, oc.Task.pose(both, frame=tips[1]))
+    assert {cut.joint_name.partition("_")[0] for cut in of_right.cuts} == {"right"}

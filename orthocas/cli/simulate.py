@@ -85,6 +85,7 @@ def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajector
         "second": controller.settings.get("second"),
         "gains": controller.gains,
         "outcome": seen.outcome.value,
+        "reason": seen.reason or None,
         "duration": float(seen.times[-1]),
         "tracking_error": dict(zip(seen.labels, seen.tracking_error, strict=True)),
         "coupling_index": _coupling(chart, plan.reference, seen) if judged else None,
@@ -219,7 +220,7 @@ def _text(value: float | None) -> str:
 
 _FILES = ("trajectory.npz", "coordinates.png", "report.json")
 CVODES = "cvodes"  #: the default plant
-_DIVERGED = 1  # exit code when the integrator gave up: the input was valid but the run failed
+_FAILED = (Outcome.DIVERGED, Outcome.LOST)  # the input was valid, but the run failed: exit code 1
 
 
 @with_settings(for_codegen=False)
@@ -302,7 +303,7 @@ def simulate(
     else:
         print_rows(run_rows(report, loaded.problem) | {"files": str(out)})
     _notes(law, report, interrupted)
-    if code := 130 if interrupted else _DIVERGED * (run.outcome is Outcome.DIVERGED):
+    if code := 130 if interrupted else int(run.outcome in _FAILED):
         raise typer.Exit(code)
 
 
@@ -406,6 +407,8 @@ def _notes(law: Controller, report: dict[str, Any], interrupted: bool) -> None:
     fallback = fallback_text(report)
     if fallback is not None:
         note(fallback)
+    if report["outcome"] == Outcome.LOST.value:
+        note(f"the law lost the arm: {report['reason']}")
     if report["outcome"] == Outcome.DIVERGED.value:
         note(f"the run diverged: the integrator gave up at t = {report['duration']:.4g} s, the run so far is saved")
     if interrupted:

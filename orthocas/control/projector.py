@@ -1,5 +1,6 @@
 """Null-space projectors on velocity and torque level: what the coordinates are compared with."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -36,6 +37,7 @@ from orthocas.control.gains import (
     non_negative_gains,
     positive_gains,
 )
+from orthocas.control.holding import holding_doubts
 from orthocas.control.linear_algebra import block_inertia, median_volume
 from orthocas.control.two_tasks import (
     SecondName,
@@ -45,6 +47,7 @@ from orthocas.control.two_tasks import (
     second_task,
     two_task_forces,
 )
+from orthocas.errors import LawWarning
 from orthocas.robots.tree import require_driven
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.relative import Relative
@@ -263,6 +266,12 @@ class Projector(TwoTaskLaw):
             "feed_forward": feed_forward,
         }.items():
             object.__setattr__(self, name, value)
+        for doubt in self.remarks():
+            warnings.warn(doubt, LawWarning, stacklevel=2)
+
+    def remarks(self) -> list[str]:
+        """A warning if the motors cannot hold the arm."""
+        return holding_doubts(self.problem.robot, self.problem.domain, self.limit)
 
     @classmethod
     def on_chart(

@@ -157,6 +157,7 @@ def branches(robot: Robot, task: Task | None = None) -> Branches:
     from samples, not proved.
 
     Self-motions are those of the tip's pose, by the last seven joints: charts of its position keep to the same cuts.
+    With several tips, they are those of each tip by the last seven joints that carry it, if these move the task.
     With fewer than six joints they are those of the task. Branches are the parts with positions where the task is
     clear. Joints that can turn farther than a full turn are taken from -pi to pi.
 
@@ -183,14 +184,19 @@ def branches(robot: Robot, task: Task | None = None) -> Branches:
     if task is not None:
         require_kind("task", task, Task)
     whole = joint_range(robot, 0)
-    arm = _Arm.of(robot, task, whole)
-    cuts = tuple(cut for k in arm.inner for cut in arm.cuts(k))
+    arms = _Arm.all_of(robot, task, whole)
+    cuts = tuple(cut for arm in arms for k in arm.inner for cut in arm.cuts(k))
     points = sample_evenly(Box(whole.centre, whole.half_width), _SAMPLES, _SEED)
-    values = arm.judged(points)[0] if task is None else _values_in_range(robot, task)(points)
+    if task is not None:
+        values = _values_in_range(robot, task)(points)
+    else:
+        values = np.min([arm.judged(points)[0] for arm in arms], axis=0)
     if not (values > CLEAR).any():
         raise SingularTaskError("no position of the joint range is clear of singular ones")
     found = [_branch(whole, cuts, sides, points, values) for sides in product(*_sides(cuts))]
-    items = [_with_clearance(item, robot, task or arm.task, points, values) for item in found if item]
+    items = [item for item in found if item]
+    if task is not None or len(arms) == 1:
+        items = [_with_clearance(item, robot, task or arms[0].task, points, values) for item in items]
     items.sort(key=lambda item: -item.share)
     mirrors = tuple(i for i, cut in enumerate(cuts) if _is_mirror(robot, cut, points[:50]))
     return Branches(robot, cuts, tuple(items), mirrors)
@@ -207,12 +213,26 @@ class _Arm:
     scale: Array
 
     @classmethod
-    def of(cls, robot: Robot, task: Task | None, whole: Box) -> "_Arm":
-        if robot.n >= 6 or task is None:
-            task = Task.pose(robot)
+    def all_of(cls, robot: Robot, task: Task | None, whole: Box) -> list["_Arm"]:
+        """The arm of a robot with one tip; of others, those of all tips whose joints move the task."""
+        points = sample_evenly(Box(whole.centre, whole.half_width), 2000, _SEED)
+        if len(robot.tips) == 1:
+            joints = list(range(max(0, robot.n - _ARM), robot.n))
+            return [cls._of(robot, Task.pose(robot) if robot.n >= 6 or task is None else task, whole, joints, points)]
+        moved = np.ones(robot.n, dtype=bool)
+        if task is not None:
+            moved = np.asarray(_jacobians(task.with_reference_at(whole.centre), points[:20]).any(axis=(0, 1)))
+        found = []
+        for tip in robot.tips:
+            joints = robot.tree.carriers(robot.tree.frame(tip).parent)[-_ARM:]
+            if joints and moved[joints].any():
+                found.append(cls._of(robot, Task.pose(robot, frame=tip), whole, joints, points))
+        return found
+
+    @classmethod
+    def _of(cls, robot: Robot, task: Task, whole: Box, joints: list[int], points: Array) -> "_Arm":
         judged = task.with_reference_at(whole.centre)
-        J = _jacobians(judged, sample_evenly(Box(whole.centre, whole.half_width), 2000, _SEED))
-        joints = list(range(max(0, robot.n - _ARM), robot.n))
+        J = _jacobians(judged, points)
         return cls(robot, judged, whole, joints, row_scale(J[:, :, joints], judged.units))
 
     @property
@@ -270,7 +290,8 @@ class _Arm:
         )
         value = 0.0 if size(0.0) <= found.fun + _EXACT and values[i - 1] < 0 < values[i + 1] else float(found.x)
         name = self.robot.joint_names[k]
-        part = _PARTS.get(len(self.joints), {}).get(k - self.joints[0], name)
+        parts = _PARTS.get(len(self.joints), {}) if len(self.robot.tips) == 1 else {}
+        part = parts.get(k - self.joints[0], name)
         least = size(value)
         return Cut(k, name, part, value, singular, least < _EXACT), least
 
@@ -398,5 +419,9 @@ def _is_mirror(robot: Robot, cut: Cut, points: Array) -> bool:
     if not cut.exact or any(prismatic[j] for j in near):
         return False
     moved = _reflected(robot, cut, points)
-    same = [np.abs(of(points) - of(moved)).max() < _SAME for of in (robot.tip_position, robot.tip_rotation)]
+    same = [
+        np.abs(of(points, tip) - of(moved, tip)).max() < _SAME
+        for of in (robot.frame_position, robot.frame_rotation)
+        for tip in robot.tips
+    ]
     return bool(all(same))

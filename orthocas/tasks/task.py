@@ -512,15 +512,27 @@ class Task(Shown, HoldsFunctions):
         its own axes, per unit joint velocity: rows of the geometric Jacobian, of which an axis task takes the two
         across its axis. J_x loses rank half a turn from the reference, where x ends; these rows do not. For other tasks
         they are J_x itself.
+
+        A stack has the rows of its parts. If it has the pose of a frame, and that of a second frame in the first, then
+        what the first one moves of the second is a combination of its own rows, and is left out: the rows are those of
+        both poses in the world, to which such a stack is equivalent.
         """
-        if self.parts:
-            return _stacked(self.parts, "frame_jacobian_function")
-        turn = self.turn
-        if turn is None:
+        if self.turn is None and not self.parts:
             return self.jacobian_function
         q = ca.SX.sym("q", self.robot.n)
-        J, R = self._frame("jacobian")(q), self._frame("rotation")(q)
-        return dense_function("frame_jacobian", [q], [ca.cse(turn.rates(R.T @ J[3:, :], R.T @ J[:3, :]))])
+        rows = [part._frame_rows(q, frames) for part, frames in _independent_frames(self.parts or (self,))]
+        return dense_function("frame_jacobian", [q], [ca.cse(ca.vertcat(*rows))])
+
+    def _frame_rows(self, q: ca.SX, frames: Frames) -> ca.SX:
+        """The rows at q of a task with one part, if it looked at these frames; positions stay in their own axes."""
+        turn = self.turn
+        if turn is None and frames == self._frames:
+            return self.jacobian_function(q)
+        J, R = (frames.function(self.robot, quantity)(q) for quantity in ("jacobian", "rotation"))
+        if turn is not None:
+            return turn.rates(R.T @ J[3:, :], R.T @ J[:3, :])
+        axes = Frames(self._frames.relative_to).function(self.robot, "rotation")(q)
+        return (axes.T @ J[:3, :])[_rows_of(self.recipe["kind"].partition(":")[2]), :]
 
     @cached_property
     def second_derivative_function(self) -> ca.Function:
@@ -707,6 +719,26 @@ def _stacked(tasks: Sequence[Task], name: str) -> ca.Function:
     """Functions of q (n, 1) that each task has, one below the other."""
     q = ca.SX.sym("q", tasks[0].robot.n)
     return dense_function("h", [q], [ca.vertcat(*(getattr(task, name)(q) for task in tasks))])
+
+
+def _independent_frames(tasks: Sequence[Task]) -> list[tuple[Task, Frames]]:
+    """Each task with the frames whose rows stand for its own beside those of the others.
+
+    A whole pose that leads from a frame with a known pose to another one is as good as the pose of the latter in the
+    world. What is seen from a frame with a known pose is as good as what the world sees of it.
+    """
+    stands: dict[int, Frames] = {}
+    known: set[str | None] = {None}  # None: the world
+    poses = [task for task in tasks if task.turn is not None and task.turn.whole and task.turn.with_position]
+    for _ in poses:
+        for task in poses:
+            ends = task._frames.relative_to, task._frames.frame or task.robot.tree.tip_name
+            new = [end for end in ends if end not in known]
+            if len(new) == 1:
+                stands[id(task)] = Frames(new[0])
+                known.add(new[0])
+    seen = {id(task): Frames(task._frames.frame) for task in tasks if task._frames.relative_to in known}
+    return [(task, stands.get(id(task), seen.get(id(task), task._frames))) for task in tasks]
 
 
 def _rotations(name: str, value: ArrayLike) -> tuple[Array, bool]:
