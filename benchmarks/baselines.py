@@ -33,6 +33,7 @@ from orthocas.control.gains import (
     non_negative_gains,
     positive_gains,
 )
+from orthocas.control.holding import holding_doubts
 from orthocas.control.linear_algebra import block_inertia, damped, median_volume
 from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
@@ -273,6 +274,10 @@ class Projector(TwoTaskLaw):
             "feed_forward": feed_forward,
         }.items():
             object.__setattr__(self, name, value)
+
+    def remarks(self) -> list[str]:
+        """A warning if the motors cannot hold the arm."""
+        return holding_doubts(self.problem.robot, self.problem.domain, self.limit)
 
     def facts(self) -> dict[str, str]:
         """Quantities, gains and problem."""

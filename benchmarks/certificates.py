@@ -12,6 +12,7 @@ from benchmark import run, table
 
 import orthocas as oc
 from orthocas.tasks.regular_box import regular_box
+from orthocas.tools.display import percent
 
 HEADER = (
     "| task | degree | half-width [rad] | boxes judged | parts | proved | find [s] | check [s] | one-to-one [rad] |\n"
@@ -51,7 +52,7 @@ def row(name: str, degree: int, half_width: float) -> str:
     width = "none" if one is None else f"{(one.high[1] - one.low[1]) / 2:.2f}"
     parts = found.regular.proved_count
     return (
-        f"| {name} | {degree} | {half_width:.3g} | {found.boxes:,} | {parts:,} | {found.share:.0%} "
+        f"| {name} | {degree} | {half_width:.3g} | {found.boxes:,} | {parts:,} | {percent(found.share, 0)} "
         f"| {middle - start:.1f} | {end - middle:.2f} | {width} |"
     )
 

@@ -6,6 +6,7 @@ from suggested_domains import robot_of
 
 import orthocas as oc
 from orthocas.tasks.regular_box import regular_box
+from orthocas.tools.display import percent
 
 HEADER = (
     "| robot, half-width [rad] | least singular value | share of the box | task / mutual std [deg] "
@@ -30,7 +31,7 @@ def row(name: str, half_width: float, bound: float | None, degree: int, samples:
     smallest, folds = least(fit.chart, samples, heavy=True)
     share = problem.domain.share if isinstance(problem.domain, oc.ClearBox) else 1.0
     return (
-        f"| {name}, {half_width:g} | {bound or 'none'} | {100 * share:.1f} % "
+        f"| {name}, {half_width:g} | {bound or 'none'} | {percent(share)} "
         f"| {report.task_angle.std:.2f} / {report.mutual_angle.std:.2f} | {report.leak.rms:.2f} "
         f"| {min(smallest, report.conditioning.min):.3f} | {folds} |"
     )

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 import orthocas as oc
 from orthocas.tasks.domains import sample_uniform
+from orthocas.tools.display import percent
 
 Numbers = NDArray[np.float64]
 HEADER = (
@@ -71,7 +72,7 @@ def row(rows: str, robot: oc.Robot, box: oc.Box, points: Numbers, clear: NDArray
     """What a ClearBox of the pose keeps, and what it gets wrong."""
     kept = oc.ClearBox(box, oc.Task.pose(robot), BOUND, rows=rows).contains(points)
     missed, wrong = (clear & ~kept).sum() / clear.sum(), (kept & ~clear).sum() / kept.sum()
-    return f"| {WORDS[rows]} | {100 * kept.mean():.1f} % | {100 * missed:.1f} % | {100 * wrong:.1f} % |"
+    return f"| {WORDS[rows]} | {percent(kept.mean())} | {percent(missed, fault=True)} | {percent(wrong, fault=True)} |"
 
 
 if __name__ == "__main__":

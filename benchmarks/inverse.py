@@ -17,6 +17,7 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.codegen import CompiledInverse
 from orthocas.tasks.domains import sample_uniform
+from orthocas.tools.display import percent
 
 REPEATS = 3
 TICKS = 100  # of the stream in C, timed together
@@ -61,7 +62,8 @@ def batch(
     title = "none" if near is None else f"near, {near}"
     change = np.abs(solutions.q - q)[good].max()
     print(
-        f"| {name} | {title} | {len(q)} | {min(seconds):.3f} | {good.mean():.4%} | {wrong} | {change:.1e} |", flush=True
+        f"| {name} | {title} | {len(q)} | {min(seconds):.3f} | {percent(good.mean(), 4)} | {wrong} | {change:.1e} |",
+        flush=True,
     )
     key = f"{name}, {title}"
     return {f"{key} s": min(seconds), f"{key} found": float(good.mean()), f"{key} wrong": wrong}

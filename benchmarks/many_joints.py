@@ -19,6 +19,7 @@ import orthocas as oc
 from orthocas.codegen import CompiledLibrary, compile_shared, generate_c
 from orthocas.codegen.ticks import time_ticks
 from orthocas.tools.checks import Array
+from orthocas.tools.display import percent
 
 BAXTER = [0.3, -0.4, -0.5, 1.2, 0.2, 0.8, 0.1, -0.3, -0.4, 0.5, 1.2, -0.2, 0.8, -0.1]
 G1 = {"shoulder_pitch": -0.4, "elbow": 0.6, "wrist_pitch": 0.3}
@@ -154,7 +155,7 @@ def proved(name: str, chart: oc.Chart, seconds: float) -> str:
     """The share of a domain on which a proof finds no fold within some seconds."""
     began = time.process_time()
     certificate = oc.certify(chart, time_limit=seconds)
-    return f"| {name} | {certificate.share:.0%} | {certificate.boxes:,} | {time.process_time() - began:.0f} |"
+    return f"| {name} | {percent(certificate.share, 0)} | {certificate.boxes:,} | {time.process_time() - began:.0f} |"
 
 
 def cycles(chart: oc.Chart, count: int) -> Iterator[str]:

@@ -26,6 +26,7 @@ from orthocas.simulation import Outcome, coupling_index
 from orthocas.tasks.problem import relative_singular_values, task_jacobians
 from orthocas.tasks.regular_box import regular_box
 from orthocas.tools.checks import Array
+from orthocas.tools.display import percent
 
 HALF_WIDTH = 0.5  # [rad] of boxes around places
 REGULAR = 0.05  # least relative singular value of the task at samples of a place
@@ -208,7 +209,7 @@ def main(
 
 def _row(arm: str, what: str, paper: float, metric: float, ratio: float, error: float, share: float) -> str:
     spread = f"{ratio:.2f} ± {ratio * error:.2f}" if np.isfinite(error) else f"{ratio:.2f}"
-    return f"| {arm} | {what} | {paper:.3g} | {metric:.3g} | {spread} | {share:.0%} |"
+    return f"| {arm} | {what} | {paper:.3g} | {metric:.3g} | {spread} | {percent(share, 0)} |"
 
 
 if __name__ == "__main__":

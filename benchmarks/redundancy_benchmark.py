@@ -1,4 +1,4 @@
-"""A benchmark of redundancy resolution, made of what users report: ten scenarios, all methods, eight arms (25 min).
+"""A benchmark of redundancy resolution, made of what users report: eleven scenarios, all methods, eight arms (25 min).
 
 Writes `benchmarks/redundancy/results/SCENARIO.json`; `redundancy_page.py` makes tables and pictures of them. How to add
 a method: `benchmarks/redundancy/README.md`.

@@ -3,7 +3,9 @@
 Round trips: q is drawn near faces and corners of the domain, a quarter of the points on faces exactly and some in
 corners; `solve(phi(q))` should find a q inside with this phi. Targets beyond: phi of points of a box 1.4 times as wide.
 All solutions: for targets phi(q) with a uniform q, Newton's method starts from 20,000 uniform points; what it finds
-inside the domain is compared with `solutions`. Times are processor times of one thread (10 min; quick: 10 s).
+inside the domain is compared with `solutions`. The nearest xi: wishes and task values of two uniform points each; what
+damped least squares lead to from 4,000 uniform points is compared with `nearest_xi`. Ends: targets at 90 and 99 % of
+`xi_range`, from its joint position. Times are processor times of one thread (30 min; quick: 20 s).
 """
 
 import time
@@ -12,12 +14,14 @@ import numpy as np
 from benchmark import run, table
 
 import orthocas as oc
+from orthocas.charts.phi import shortest
 from orthocas.tasks.domains import Domain, bounds_of, sample_uniform
 from orthocas.tools.checks import Array
 
 QUICK = ("panda-position", "ur5-position")
 SEVERAL = ("iiwa7-position", "ur5-position", "ur10-position", "xarm7-position", "panda-pose")  # for all solutions
-_STARTS, _SAME = 20_000, 1e-6
+WIDE = ("panda-wide", "iiwa7-wide", "xarm7-wide", "baxter-left-wide", "pr2-left-wide")  # for the nearest xi
+_STARTS, _SAME, _DENSE = 20_000, 1e-6, 4_000
 
 MISSES = (
     "| chart | missed, near corners | wrong | us a row | missed, uniform | us a row | us a row beyond | "
@@ -25,6 +29,10 @@ MISSES = (
 )
 RECALL = "| chart | targets | solutions: mean | most | missed by 20,000 starts | missed by `solutions` | ms |\n|" + (
     " --- |" * 7
+)
+NEAREST = (
+    "| chart | wishes | 4,000 starts lead nearer | ms a wish | near ends of ranges | of these missed |\n|"
+    + " --- |" * 6
 )
 
 
@@ -100,11 +108,67 @@ def different(points: Array) -> Array:
     return np.array(found).reshape(-1, points.shape[1])
 
 
+def nearest(name: str, count: int) -> str:
+    """One row of the third table."""
+    chart = oc.charts.load(name)
+    domain = chart.problem.domain
+    wishes, x = sample_uniform(domain, count, 0), chart.task(sample_uniform(domain, count, 1000))
+    chart.nearest_xi(wishes[:20], x[:20])
+    begin = time.process_time()
+    found = chart.nearest_xi(wishes, x)
+    seconds = time.process_time() - begin
+    pool, xi, worse = sample_uniform(domain, _DENSE, 77), chart.xi(wishes), 0
+    for k in range(count):
+        others = at_task_value(chart, x[k], pool)
+        turns = chart.turns[chart.m :]
+        away = np.linalg.norm(shortest(xi[k] - chart.xi(others), turns), axis=1) if len(others) else np.array([np.inf])
+        mine = found.distance[k] if found.status[k] <= oc.InverseStatus.NEAREST else np.inf
+        worse += bool(mine > away.min() + 1e-6)
+    starts, targets = ends(chart, count // 4)
+    missed = int((~chart.solve(targets, starts).found).sum())
+    return f"| {name} | {count} | {worse} | {1e3 * seconds / count:.2f} | {len(targets)} | {missed} |"
+
+
+def at_task_value(chart: oc.Chart, x: Array, pool: Array) -> Array:
+    """Positions of the domain with the task value x (m,) to which damped least squares lead from a pool (S, n)."""
+    m, sizes, (low, high) = chart.m, chart.phi_sizes[: chart.m], bounds_of(chart.problem.domain)
+    q, wanted = pool.copy(), np.broadcast_to(x, (len(pool), chart.m))
+    for _ in range(15):
+        e = chart.relative.difference(wanted, chart.task(q)) / sizes
+        J = chart.relative.batched_rates(q)[0].reshape(-1, m, chart.n) / sizes[:, None]
+        damping = np.where(np.abs(e).max(axis=1) > 0.1, 1e-3, 1e-13)
+        gram = J @ J.transpose(0, 2, 1) + damping[:, None, None] * np.eye(m)
+        step = (J.transpose(0, 2, 1) @ np.linalg.solve(gram, e[:, :, None]))[:, :, 0]
+        q += step * np.minimum(1.0, 0.7 / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-300))
+    e = chart.relative.difference(wanted, chart.task(q)) / sizes
+    turning = ~np.array(chart.problem.robot.tree.prismatic) & np.isfinite(low)
+    q[:, turning] = low[turning] + (q[:, turning] - low[turning]) % (2 * np.pi)
+    q = q[(np.abs(e).max(axis=1) < 1e-9) & (q >= low).all(axis=1) & (q <= high).all(axis=1)]
+    return np.asarray(q[chart.problem.domain.contains(q)])
+
+
+def ends(chart: oc.Chart, count: int) -> tuple[Array, Array]:
+    """Joint positions, and values near both ends of the range of each coordinate there."""
+    starts, targets = [], []
+    for q in sample_uniform(chart.problem.domain, count, 5):
+        reach = chart.xi_range(q)
+        for k in range(chart.r):
+            for end in (reach.low[k], reach.high[k]):
+                for share in (0.9, 0.99) if np.isfinite(end) else ():
+                    target = chart.phi(q)
+                    target[chart.m + k] += share * (end - target[chart.m + k])
+                    starts.append(q)
+                    targets.append(target)
+    return np.array(starts), np.array(targets)
+
+
 def main(quick: bool = False) -> list[str]:
-    """Both tables; `quick` takes two charts and few points."""
+    """All tables; `quick` takes two charts and few points."""
     rows = table(MISSES, (misses(name, 2_000 if quick else 50_000) for name in (QUICK if quick else oc.charts.names())))
     print()
-    return rows + table(RECALL, (recall(name, 2 if quick else 12) for name in (QUICK[1:] if quick else SEVERAL)))
+    rows += table(RECALL, (recall(name, 2 if quick else 12) for name in (QUICK[1:] if quick else SEVERAL)))
+    print()
+    return rows + table(NEAREST, (nearest(name, 8 if quick else 400) for name in (WIDE[:1] if quick else WIDE)))
 
 
 if __name__ == "__main__":

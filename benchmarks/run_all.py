@@ -51,6 +51,7 @@ SCRIPTS = (
     "inverse",
     "exported_inverse",
     "exported_nearest",
+    "beyond_reach",
     "default_gains",
     "safety",
     "faults",

@@ -1,23 +1,18 @@
 """Certificates of wide charts of poses: what is proved of a branch, boxes, and CPU seconds to find and to check."""
 
-import math
 import time
 
 from benchmark import run, table
 from wide_charts import robot_of
 
 import orthocas as oc
+from orthocas.tools.display import percent
 
 HEADER = (
     "| arm, task | proved of what is clear | proved of the box | boxes judged | parts | find [s] | check [s] |\n|"
     + " --- |" * 7
 )
 ARMS = {"iiwa": None, "panda": None, "xarm7": oc.Polynomial(6, ["joint1", "joint7"])}  # None: the default
-
-
-def at_least(share: float) -> str:
-    """A share in percent, rounded down: what is not all is not 100 %."""
-    return f"{math.floor(1e5 * share) / 1e3:.3f}%"
 
 
 def row(name: str, quick: bool) -> str:
@@ -32,7 +27,7 @@ def row(name: str, quick: bool) -> str:
     assert oc.check_certificate(chart, found)
     end = time.process_time()
     return (
-        f"| {name}, pose | {at_least(found.clear_share)} | {at_least(found.share)} | {found.boxes:,} "
+        f"| {name}, pose | {percent(found.clear_share, 3)} | {percent(found.share, 3)} | {found.boxes:,} "
         f"| {found.regular.proved_count:,} | {middle - start:.1f} | {end - middle:.1f} |"
     )
 

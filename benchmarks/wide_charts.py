@@ -13,6 +13,7 @@ from orthocas.errors import DomainError, PathError
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.problem import relative_singular_values
 from orthocas.tasks.regular_box import joint_range
+from orthocas.tools.display import percent
 
 Numbers = NDArray[np.float64]
 DATA, SUITE = "example-robot-data", "robosuite"
@@ -69,10 +70,11 @@ def row(name: str, task: str, quick: bool, charts: dict[str, oc.Chart]) -> str:
         charts[name] = chart
     report = oc.evaluate(chart, 2000 if quick else 20_000, seed=1)
     targets = chart.phi(sample_uniform(chart.problem.domain, 50 if quick else 2000, 2))
+    share, regular = percent(branch.share, 0), percent(fit.regular_share, 3)
     return (
-        f"| {name}, {task} | {branch.name}, {branch.share:.0%} | {seconds:.1f} | {fit.regular_share:.3%} "
+        f"| {name}, {task} | {branch.name}, {share} | {seconds:.1f} | {regular} "
         f"| {report.leak.rms:.1f} | {report.conditioning.mean:.2f}, {report.conditioning.p01:.2f} "
-        f"| {chart.solve(targets).found.mean():.2%} |"
+        f"| {percent(chart.solve(targets).found.mean(), 2)} |"
     )
 
 
@@ -83,7 +85,7 @@ def nearer(name: str, quick: bool) -> str:
     fit = oc.fit_wide(robot, oc.Task.pose(robot), clearance=NEARER, parametrisation=polynomial)
     found = oc.evaluate(fit.chart, 2000 if quick else 20_000, seed=1).conditioning
     assert fit.branch is not None
-    return f"| {name} | {fit.branch.name} | {fit.regular_share:.3%} | {found.mean:.2f}, {found.p01:.2f} |"
+    return f"| {name} | {fit.branch.name} | {percent(fit.regular_share, 3)} | {found.mean:.2f}, {found.p01:.2f} |"
 
 
 def everywhere(name: str, task: str, quick: bool) -> str:
@@ -103,7 +105,7 @@ def everywhere(name: str, task: str, quick: bool) -> str:
         except DomainError:
             continue  # none of its targets is found
         found += int(chart.solve(chart.phi(own)).found.sum())
-    return f"| {name}, {task} | {len(whole)} | {len(q):,} | {found / len(q):.2%} |"
+    return f"| {name}, {task} | {len(whole)} | {len(q):,} | {percent(found / len(q), 2)} |"
 
 
 def circle(robot: oc.Robot, q: Numbers, radius: float) -> Numbers:

@@ -41,6 +41,7 @@ from paper.planar_loop import (
 import orthocas as oc
 from orthocas import problems
 from orthocas.control.linear_algebra import DampingDesign
+from orthocas.tools.display import percent
 
 
 @dataclass(frozen=True)
@@ -189,7 +190,7 @@ def table(rows: list[Row]) -> Iterator[str]:
     for row in rows:
         pairs = "   ".join(f"{a:7.5f} {b:7.5f} {a / b:5.0f}" for a, b in zip(row.linear, row.fitted, strict=True))
         ends = f"{row.error_share:7.4f}  {row.mutual_feedback:8.2f}  {row.mutual_feed_forward:8.2f}"
-        note = "" if row.not_ok == 0 else f"  left the box ({row.not_ok:.0%})"
+        note = "" if row.not_ok == 0 else f"  left the box ({percent(row.not_ok, 0, fault=True)})"
         yield f"{row.choice.name:<22} {pairs}  {ends}{note}"
 
 

@@ -33,6 +33,7 @@ from spheres import Places, Query, World
 import orthocas as oc
 from orthocas.problems.iiwa import urdf_path
 from orthocas.tools.checks import Array
+from orthocas.tools.display import percent
 
 THIN = 1e-3  # radius of the links [m]; that of the spheres is the query's, less this
 LINKS = range(2, 8)  # those that can collide
@@ -120,7 +121,7 @@ def row(world: World, query: Query, samples: int) -> str:
     error = np.abs(world.chart.task(known) - places.x).max()
     low, high = places.box
     inside = [region.PointInSet(xi) for xi in np.random.default_rng(0).uniform(low, high, (20_000, places.size))]
-    return f"| {len(region.b())} | {seconds:.1f} | {np.mean(inside):.3f} | {100 * free / samples:.1f} % | {error:.0e} |"
+    return f"| {len(region.b())} | {seconds:.1f} | {np.mean(inside):.3f} | {percent(free / samples)} | {error:.0e} |"
 
 
 if __name__ == "__main__":

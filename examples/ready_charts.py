@@ -20,6 +20,7 @@ import orthocas as oc
 from orthocas.charts import Card, Model
 from orthocas.charts.chart_file import fingerprint
 from orthocas.charts.self_motion import fan_along
+from orthocas.tools.display import percent
 from orthocas.viewer.looks import urdf_look
 
 ROOT = Path(__file__).parent.parent
@@ -215,7 +216,7 @@ def table(data: Path = DATA) -> list[str]:
             quality = card.quality
             rows.append(
                 f"| `{name}` | {quality['n']}, {quality['m']}, {quality['r']} | {card.branch} "
-                f"| {card.regular_share:.2%} | {quality['leak_deg']['rms']:.0f} "
+                f"| {percent(card.regular_share, 2)} | {quality['leak_deg']['rms']:.0f} "
                 f"| {quality['conditioning']['mean']:.2f}, "
                 f"{quality['conditioning']['p01']:.2f} | {card.model.licence} |"
             )
@@ -271,7 +272,7 @@ def card_of(name: str, chart: oc.Chart) -> Card:
         fingerprint=fingerprint(chart.problem, chart.coordinates),
         commands=commands(name),
         branch=str(chart.notes.get("branch", "")),
-        regular_share=float(chart.notes.get("regular share", 1.0)),
+        regular_share=float(chart.notes.get("share of the branch", 1.0)),
     )
 
 

@@ -63,6 +63,10 @@ class LawWarning(UserWarning):
     """A control law is built with settings that are hardly meant."""
 
 
+class BranchWarning(UserWarning):
+    """A wide chart leaves out a part of its branch from the start."""
+
+
 class ShapeError(OrthocasError, ValueError):
     """An array has the wrong shape."""
 
@@ -101,12 +105,22 @@ class RobotError(OrthocasError, ValueError):
 
 _SMALLER_TASKS = {"position+axis:z": 5, "position": 3, "orientation": 3, "position:xy": 2, "axis:z": 2, "position:x": 1}
 _MOST_RADIANS = 7.0  # more than a turn: no bounded joint of an arm turns so far from its middle
+_MOST_METRES = 10.0  # no tool is so long, and few arms
 
 
 def degrees_hint(*values: float) -> str:
     """The end of a message about joint positions that look like degrees; "" for others."""
     largest = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
     return "; are these degrees? Joint positions are in radians" if largest > _MOST_RADIANS else ""
+
+
+def units_hint(units: Iterable[str], values: Iterable[float]) -> str:
+    """The end of a message about values whose units are "m" or "rad", if they look like millimetres or degrees."""
+    sized = [(unit, abs(value)) for unit, value in zip(units, values, strict=False) if math.isfinite(value)]
+    long = any(unit == "m" and value > _MOST_METRES for unit, value in sized)
+    far = any(unit == "rad" and value > _MOST_RADIANS for unit, value in sized)
+    millimetres = "; are these millimetres? Lengths are in metres" if long else ""
+    return millimetres + ("; are these degrees? Angles are in radians" if far else "")
 
 
 class DomainError(OrthocasError, ValueError):

@@ -1,6 +1,7 @@
 """Certificates are kept, checked, resumed and void when anything changes; the command."""
 
 import json
+import warnings
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -9,10 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from certified_charts import certified, chart
+from chart_files import header_of, resealed
 from public_objects import planar
 from typer.testing import CliRunner
 
 import orthocas as oc
+from orthocas import problems
 from orthocas.charts.certificate import OPEN, PROVED, Subdivision
 from orthocas.charts.coordinates import Coordinates
 from orthocas.cli.commands import app_for
@@ -195,7 +198,7 @@ def test_boxes_that_processes_die_over_stay_unproved(caplog: pytest.LogCaptureFi
         found = oc.certify(chart(), executor=executor)
         with pytest.raises(CertifyError, match="one of its processes died"):
             oc.check_certificate(chart(), certified(), executor=executor)
-    assert (found.proved, found.dead) == (False, 0)
+    assert (found.proved, found.regular.open_count > 0) == (False, True)
     assert len(caplog.messages) == 1
     assert "worker processes died over them" in caplog.text
     assert oc.certify(chart(), resume=found).proved
@@ -220,6 +223,70 @@ def test_the_command_certifies_checks_and_shows(tmp_path: Path) -> None:
     assert json.loads(command("info", path, "--json").stdout)["certificate"]["proved"] is True
     oc.generate_c(oc.load(path), tmp_path / "c", name="arm")
     assert "no fold everywhere on the domain (taylor-3/2" in (tmp_path / "c" / "arm.h").read_text()
+
+
+@pytest.mark.slow
+def test_the_command_says_first_what_is_not_proved(tmp_path: Path) -> None:
+    """Also for a check: a partial proof that holds is no proof, and no share of it is 100 %."""
+    path = tmp_path / "a.chart"
+    chart().save(path)
+    begun = command("certify", path, "--seconds", 0)
+    assert begun.exit_code == 1
+    assert begun.stdout.startswith("certificate   not proved, ")
+    checked = command("certify", path, "--check")
+    assert checked.exit_code == 1
+    assert "holds for the part that is proved" in checked.stdout
+    assert "100" not in checked.stdout.split("method")[0].replace("1000", "")
+    known = oc.load(path).certificate
+    assert known is not None
+    nearly = replace(known, regular=almost_whole(known.regular)).sealed()
+    assert nearly.share > 1 - 1e-12
+    assert "no fold on 99.9999% of the domain" in nearly.heading
+
+
+def almost_whole(tree: Subdivision) -> Subdivision:
+    """A box that is proved but for one part, which is 2^-50 of it."""
+    codes = [byte for k in range(50) for byte in (k % tree.n, PROVED)]
+    return Subdivision(tree.low, tree.high, np.array([*codes, OPEN], dtype=np.uint8))
+
+
+def test_numbers_that_no_check_covers_are_left_out_of_certificates(tmp_path: Path) -> None:
+    """Older files count parts that were given up: read with their digest, refused if that does not cover the count."""
+    known = replace(chart(), certificate=certified())
+    path = tmp_path / "a.chart"
+    for count, honest in ((7, True), (8, False)):
+        known.save(path)
+        header: Any = header_of(path)
+        header["certificate"] |= {"dead": count, "digest": certified()._content_digest(7)}
+        resealed(path, header)
+        if honest:
+            assert "dead" not in oc.load(path).certificate.as_dict()  # type: ignore[union-attr]
+            assert oc.check_certificate(oc.load(path))
+        else:
+            with pytest.raises(ChartFileError, match="void"):
+                oc.load(path)
+
+
+def test_progress_is_of_what_is_left() -> None:
+    """Where folds are kept out, the volume is soon proved and most boxes are left: it is no measure of the work."""
+    known = problems.get("planar_3r_xy")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        box = oc.Box([0.0, 1.0, 1.0], [3.0, 1.8, 1.8])
+        wide = oc.fit_wide(known.robot, known.task, box, parametrisation=oc.Polynomial(3), samples=2000).chart
+    reports: list[Progress] = []
+
+    def stop(progress: Progress) -> None:
+        reports.append(progress)
+        if len(reports) > 20:
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted) as stopped:
+        oc.certify(wide, monitor=stop)
+    certificate = stopped.value.result
+    assert certificate.share > 0.5
+    assert reports[-1].fraction == pytest.approx(certificate.boxes / 1e6, abs=1e-3)
+    assert f"{certificate.boxes:,} boxes, {certificate.regular.open_count:,} open" in reports[-1].detail
 
 
 def test_the_command_fails_for_a_chart_that_folds(tmp_path: Path) -> None:

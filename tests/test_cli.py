@@ -105,6 +105,7 @@ def test_urdf_with_every_option(run: Run) -> None:
     data = json.loads(out)
     assert (code, err) == (0, "")
     assert (data["n"], data["m"], data["metric"], data["seed"]) == (6, 3, "inertia", 4)
+    assert data["tips"] == ["tool0"]
     info = json.loads(run("info", "x.orthocas", "--json")[1])
     assert info["centre"] == [0, -1, 1, 0.1, 0.5, 0]
     assert info["notes"]["solver"] == "lbfgs"

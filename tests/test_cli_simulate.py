@@ -174,7 +174,7 @@ def test_a_run_that_diverges_is_written_and_said(run_simulate: Run) -> None:
 @pytest.mark.usefixtures("blank_pictures")
 def test_a_fallback_is_said_with_time_and_reason(run_simulate: Run) -> None:
     code, out, err = run_simulate("pd_plus", "--limit", "40", "--animation", "none")
-    assert code == 0
+    assert code == 1
     assert "coupling" not in out  # coordinates mean nothing outside the domain
     report = json.loads(Path("out/report.json").read_text())
     fallback, trajectory = report["fallback"], Trajectory.load("out/trajectory.npz")
@@ -188,6 +188,9 @@ def test_a_fallback_is_said_with_time_and_reason(run_simulate: Run) -> None:
         in err
     )
     assert (report["energy"], report["coupling_index"]) == (None, None)
+    assert report["outcome"] == "lost"
+    assert report["reason"] == f"the arm left the domain of the chart at t = {fallback['since']:.4g} s"
+    assert f"the law lost the arm: {report['reason']}" in err
 
 
 @pytest.mark.usefixtures("blank_pictures")

@@ -47,7 +47,8 @@ def require_same(runs: Sequence[Trajectory], atol: float) -> None:
         want, found = (np.asarray(getattr(run, name), dtype=float) for run in (one, other))
         scale = np.nan_to_num(np.abs(want)).max() + 1e-3
         np.testing.assert_allclose(found / scale, want / scale, atol=atol, err_msg=name)
-    assert one.outcome is other.outcome is Outcome.COMPLETE
+    assert one.outcome is other.outcome
+    assert one.reason == other.reason
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +97,8 @@ def test_sampled_runs_are_those_of_cvodes(law: PDPlus, reference: Reference, rat
     outside = both(law, reference, q0 + 0.5, control_rate=rate, must_be_reachable=False)
     require_same(outside, 1e-5)
     assert (outside[1].status[:3] == ControlStatus.OUTSIDE_DOMAIN).all()
+    assert (outside[1].outcome, runs[1].outcome) == (Outcome.LOST, Outcome.COMPLETE)
+    assert outside[1].reason == "the arm was outside the domain of the chart at t = 0 s"
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import batches
+import beyond_reach
 import c_timing
 import casadi as ca
 import certificates
@@ -302,6 +303,15 @@ def test_benchmark_of_exported_inverses_finds_the_answers_of_the_chart() -> None
 def test_benchmark_of_the_nearest_xi_finds_the_answers_of_the_chart() -> None:
     found = exported_nearest.main(quick=True)
     assert found["iiwa7-pose, numpy, as the chart [%]"] == 100.0
+
+
+@pytest.mark.slow
+def test_benchmark_beyond_reach_finds_nothing_nearer() -> None:
+    found = beyond_reach.main(quick=True)
+    assert found["panda-wide, nearer [m]"] < 1e-5
+    assert found["panda-wide, settled"] == 1
+    assert found["panda-wide, left"] == 0
+    assert found["panda-wide, way [m]"] > 0.05
 
 
 @pytest.mark.slow

@@ -206,6 +206,35 @@ def test_second_derivatives_are_right(tmp_path: Path, library: str) -> None:
     np.testing.assert_allclose(found, np.stack(sides, axis=2), rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("library", "name"), [("torch", "box"), ("torch", "wide"), ("torch", "a user's domain"), ("jax", "box")]
+)
+def test_rows_may_be_mapped_one_by_one(tmp_path: Path, library: str, name: str) -> None:
+    """vmap, once and twice, of both searches; and of their derivatives, where that of the inverse is J^-1."""
+    array, chart = array_of(library), CHARTS[name]()
+    module = module_of(chart, library, tmp_path)
+    own: Any = sys.modules["torch"].func if library == "torch" else sys.modules["jax"]
+    jitted: Any = own.jit if library == "jax" else lambda function: function
+    phi, starts = targets_of(chart, 12, away=0.01)
+    arguments = {"inverse": (phi, starts), "nearest_xi": (starts, phi[:, : chart.m])}
+    for function, sets in arguments.items():
+        search, rows = getattr(module, function), [array(values) for values in sets]
+        q, status = map(np.asarray, search(*rows))
+        mapped = jitted(own.vmap(search))(*rows)
+        np.testing.assert_array_equal(np.asarray(mapped[1]), status)
+        np.testing.assert_allclose(np.asarray(mapped[0]), q, rtol=0, atol=1e-12)
+        if library == "torch":  # JAX compiles each for half a minute
+            twice = own.vmap(own.vmap(search))(*(values.reshape(3, 4, -1) for values in rows))[0]
+            np.testing.assert_allclose(twice.numpy().reshape(q.shape), q, rtol=0, atol=1e-12)
+    solved = np.asarray(module.inverse(array(phi), array(starts))[1]) != NOT_FOUND
+    want = np.linalg.inv(chart.jacobian(np.asarray(module.inverse(array(phi), array(starts))[0])))
+    for derivative in (own.jacrev, own.jacfwd)[: 2 if library == "torch" else 1]:
+        slopes = jitted(own.vmap(derivative(lambda target, start: module.inverse(target, start)[0])))
+        found = np.asarray(slopes(array(phi), array(starts)))
+        np.testing.assert_allclose(found[solved], want[solved], rtol=0, atol=1e-9 * np.abs(want[solved]).max())
+
+
 def compiled(library: str, module: ModuleType) -> Callable[..., Any]:
     if library == "jax":
         return sys.modules["jax"].jit(module.inverse)  # type: ignore[no-any-return]

@@ -62,7 +62,7 @@ def test_nearest_xi_is_that_of_the_chart(tmp_path: Path, name: str) -> None:
     assert (error[ended] < 2e-9).all()
     assert chart.problem.domain.contains(q[ended]).all()
     assert (distance[status == FOUND] < 1e-8).all()
-    elsewhere = np.abs(known.q - q).max(axis=1) > 0.5
+    elsewhere = np.abs(known.q - q).max(axis=1) > 0.3  # the chart takes the best of several local minima
     other = ~ended | ((distance > known.distance + 1e-7) & ~elsewhere)
     assert other.mean() <= 0.005
     assert (elsewhere & (status == NEAREST)).mean() < 0.06

@@ -9,6 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from conftest import robot_data
 from public_objects import circle
 from scipy.integrate import trapezoid
 
@@ -354,3 +355,18 @@ def test_motions_are_saved_as_csv(tmp_path: Path) -> None:
 def test_motions_are_read_only() -> None:
     for name in ("times", "q", "dq", "ddq", "x", "xi", "s"):
         assert not getattr(motion(), name).flags.writeable
+
+
+def test_two_arms_follow_a_path_of_their_relative_pose() -> None:
+    """The path in x is met at every time stamp, with the links of both arms kept clear of a floor."""
+    tips = ["left_gripper", "right_gripper"]
+    robot = oc.Robot.from_urdf(robot_data("baxter_description/urdf/baxter.urdf"), tips=tips)
+    home = np.array([0.3, -0.4, -0.5, 1.2, 0.2, 0.8, 0.1, -0.3, -0.4, 0.5, 1.2, -0.2, 0.8, -0.1])
+    task = oc.Task.relative_pose(robot, *tips)
+    chart = oc.fit(oc.Problem(robot, task, domain=oc.Box(home, 0.3)), oc.Polynomial(2)).chart
+    path = chart.task(home) + np.linspace(0, 1, 10)[:, None] * [0.03, 0.02, 0, 0, 0, 0]
+    floor = oc.obstacles.Plane([0, 0, 1], [0, 0, -1.0])
+    motion = oc.follow(chart, path, q_start=home, obstacles=[floor])
+    np.testing.assert_allclose(chart.task(motion.q), motion.x, atol=1e-9)
+    np.testing.assert_allclose(motion.x[-1], path[-1], atol=1e-9)
+    assert len(oc.obstacles.LinkDistances(robot, [floor]).pairs) == robot.n

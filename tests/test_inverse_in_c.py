@@ -33,6 +33,8 @@ def test_compiled_c_gives_the_same_solutions(iiwa_fit: Fit, tmp_path: Path) -> N
         assert {0, 2, 6, 7} <= set(mine.statuses)
         same = theirs.status == mine.status
         assert np.count_nonzero(~same) <= most
+        if start is None:  # rows outside begin far away, and may end at another solution out there
+            same &= mine.found
         np.testing.assert_allclose(theirs.q[same], mine.q[same], atol=1e-9)
         assert theirs.error[theirs.found].max() <= 1e-9
 

@@ -6,6 +6,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 from public_objects import ring, wide
 from test_docs import blocks
 
@@ -65,6 +66,39 @@ def test_random_walks_break_no_joint_limit(name: str) -> None:
     refused = np.mean([status != TrackerStatus.OK for status in statuses])
     assert 0.001 < refused < 0.9  # the walk did meet boundaries, and went on
     assert np.ptp(q[-1000:], axis=0).max() > 0.05
+
+
+PAGE = 0.02  # the step of the page
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["panda-position", "panda-pose", "iiwa7-pose", "panda-wide"])
+def test_actions_that_need_several_steps_of_the_tracker_act(name: str) -> None:
+    """A whole one along each axis from home, by MuJoCo; and none of many random ones is dropped."""
+    chart = oc.charts.load(name)
+    env, rng = learn.PhiActions(Arm(chart), chart, PAGE), np.random.default_rng(0)
+    for axis in range(3):
+        first, _ = env.reset()
+        last, *_, info = env.step(np.eye(chart.n)[axis])
+        assert info["tracker"] == TrackerStatus.OK
+        np.testing.assert_allclose(last[:3] - first[:3], PAGE * np.eye(3)[axis], rtol=0, atol=1e-9)
+    env.reset()
+    data: Any = env.unwrapped.data  # type: ignore[attr-defined]
+    for _ in range(200):
+        before = data.qpos.copy()
+        *_, info = env.step(rng.uniform(-1, 1, chart.n))
+        assert info["tracker"] in (TrackerStatus.OK, TrackerStatus.NEAREST)
+        assert np.abs(data.qpos - before).max() > 1e-6
+        assert chart.problem.domain.contains(data.qpos)
+
+
+@pytest.mark.filterwarnings("ignore:.*(infinity|different from the unwrapped):UserWarning")
+def test_the_checker_of_gymnasium_accepts_it() -> None:
+    chart = oc.fit(oc.problems.get("planar_3r_xy"), oc.Polynomial(2), samples=300).chart
+    env = learn.PhiActions(Arm(chart), chart, PAGE)
+    check_env(env, skip_render_check=True)
+    first, _ = env.reset(seed=3, options={})
+    np.testing.assert_array_equal(first, env.reset(seed=3)[0])
 
 
 @pytest.mark.slow

@@ -6,12 +6,15 @@ from typing import Any
 
 import coal
 import numpy as np
+import pinocchio as pin
 import pytest
+from conftest import robot_data
 
 import orthocas as oc
 from orthocas import problems
 from orthocas.errors import InvalidValueError
 from orthocas.robots.obstacles import Capsule, LinkDistances, Obstacle, Plane, Sphere
+from orthocas.robots.tree import on_moving_base
 from orthocas.tools.checks import Array
 
 RADIUS = 0.04
@@ -116,6 +119,52 @@ def test_links_that_do_not_move_are_left_out() -> None:
     assert [pair.split("'")[1] for pair in pairs] == list(robot.joint_names)
     assert LinkDistances(robot, []).pairs == ()
     assert LinkDistances(robot, [])(np.zeros((3, 7))).shape == (3, 0)
+
+
+LEFT, RIGHT = "left_gripper", "right_gripper"
+
+
+def test_links_of_two_arms_are_those_between_joints_of_pinocchio() -> None:
+    """Every link of both arms once, none from the hand of one arm to the shoulder of the other."""
+    path = robot_data("baxter_description/urdf/baxter.urdf")
+    robot, model = oc.Robot.from_urdf(path, tips=[LEFT, RIGHT]), pin.buildModelFromUrdf(str(path))
+    data, rng = model.createData(), np.random.default_rng(6)
+    floor = Plane([0.3, 0.2, 1.0], [0.0, 0.0, -3.0])
+    distances = LinkDistances(robot, [floor], RADIUS)
+    names = [pair.split("'")[1] for pair in distances.pairs]
+    assert sorted(names) == sorted(robot.joint_names)
+    for q in rng.uniform(-1, 1, (5, robot.n)):
+        whole = pin.neutral(model)
+        for name, value in zip(robot.joint_names, q, strict=True):
+            whole[model.joints[model.getJointId(name)].idx_q] = value
+        pin.framesForwardKinematics(model, data, whole)
+        found = dict(zip(names, distances(q), strict=True))
+        for side, hand in (("left", LEFT), ("right", RIGHT)):
+            arm = [name for name in robot.joint_names if name.startswith(side)]
+            points = [data.oMi[model.getJointId(name)].translation for name in arm]
+            points.append(data.oMf[model.getFrameId(hand)].translation)
+            for name, (start, end) in zip(arm, pairwise(points), strict=True):
+                assert found[name] == pytest.approx(distance_of_coal(start, end, floor), abs=1e-6)
+
+
+def test_a_link_under_both_arms_counts_once() -> None:
+    path = robot_data("pr2_description/urdf/pr2.urdf")
+    robot = oc.Robot.from_urdf(path, tips=["l_gripper_tool_frame", "r_gripper_tool_frame"])
+    distances = LinkDistances(robot, [Plane([0, 0, 1], [0, 0, 0])])
+    # the column under the lift, and from the lift to both shoulders
+    assert [pair.split("'")[1] for pair in distances.pairs].count("torso_lift_joint") == 3
+    assert len(distances.pairs) == robot.n + 2
+
+
+def test_nothing_solid_joins_the_world_and_a_moving_base() -> None:
+    arm = problems.get("iiwa").robot
+    robot = oc.Robot(on_moving_base(arm.tree, "planar", 10.0, np.zeros(3), np.eye(3)))
+    q = np.array([3.0, 2.0, 0.5, *np.linspace(-0.5, 0.5, 7)])
+    pairs = LinkDistances(robot, [Sphere([1.5, 0.0, 0.0], 0.2), Sphere([3.0, 1.0, 0.0], 0.2)])
+    assert not any(name in pair for pair in pairs.pairs for name in ("base_x", "base_y"))
+    assert pairs(q).min() > 0.7
+    under = LinkDistances(robot, [Sphere([3.0, 2.0, 0.0], 0.1)])
+    assert under(q).min() == pytest.approx(-0.1, abs=1e-6)
 
 
 WRONG: dict[str, tuple[Callable[[], object], str]] = {

@@ -129,7 +129,7 @@ def test_coordinate_that_cannot_be_reached_is_named_with_its_range(planar_chart:
     stopped = f"xi1 = 0.6 is asked for, at the last x it reaches [{reach.low:.3g}"
     with pytest.raises(UnreachableReferenceError, match=re.escape(stopped)) as caught:
         joint_path(planar_chart, away, q0)
-    assert str(caught.value).endswith(f"stopped by joint '{reach.high_stop.joint}' at {reach.high_stop.value:.4g}")
+    assert f"stopped by joint '{reach.high_stop.joint}' at {reach.high_stop.value:.4g}; " in str(caught.value)
     within = Reference.steps(planar_chart.labels, start, [(1.0, {"xi1": 0.9 * reach.high})], 4.0)
     assert len(joint_path(planar_chart, within, q0)) == len(within.grid())
 

@@ -3,6 +3,7 @@
 import html
 import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ import orthocas as oc
 from orthocas import control, problems
 from orthocas.charts.quality import AngleStatistics, Conditioning
 from orthocas.cli.output import report_rows
-from orthocas.tools.display import Shown, as_html, as_text, listed, number_list
+from orthocas.tools.display import Shown, as_html, as_text, listed, number_list, percent
 
 EVIL = "<b>&'\"\n</td>"  # a text that a file of others may hold
 NAME = EVIL.replace("\n", "")  # names are printable
@@ -145,3 +146,36 @@ def test_objects_show_while_a_law_is_not_built() -> None:
     repr(law)
     assert "_built" not in vars(law)
     assert planar().name in repr(law)
+
+
+@pytest.mark.parametrize(
+    ("share", "digits", "text"),
+    [
+        (1.0, 3, "100.000%"),
+        (1 - 2**-53, 3, "99.999%"),
+        (0.999999, 0, "99%"),
+        (0.29, 1, "29.0%"),  # 100 * 0.29 is 28.999999999999996
+        (0.1064, 1, "10.6%"),
+        (1e-9, 2, "0.00%"),
+        (0.0, 2, "0.00%"),
+    ],
+)
+def test_shares_are_rounded_down(share: float, digits: int, text: str) -> None:
+    assert percent(share, digits) == percent(np.float64(share), digits) == text
+
+
+def test_shares_of_faults_are_rounded_up() -> None:
+    assert percent(1e-9, 2, fault=True) == "0.01%"
+    assert percent(0.0, 2, fault=True) == "0.00%"
+    assert percent(float("nan")) == "unknown"
+
+
+def test_no_text_of_the_library_rounds_a_share_to_the_nearest() -> None:
+    """All percentages come from `percent`, except those of pictures."""
+    found = [
+        f"{path.name}: {line.strip()}"
+        for path in sorted(Path(oc.__file__).parent.rglob("*.py"))
+        for line in path.read_text("utf-8").splitlines()
+        if re.search(r":\.\d%\}", line) and "_LEAST_SHARE" not in line
+    ]
+    assert not found

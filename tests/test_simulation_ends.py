@@ -29,8 +29,9 @@ def test_unreachable_reference_is_reported_before_the_run(planar_chart: oc.Chart
         simulate(Impedance(planar_chart, K), away, planar_q0, monitor=seen.append)
     assert not seen
     run = simulate(Impedance(planar_chart, K, limit=20.0), away, planar_q0, must_be_reachable=False)
-    assert run.outcome is Outcome.COMPLETE
+    assert run.outcome is Outcome.LOST
     first = np.flatnonzero(run.status == ControlStatus.OUTSIDE_DOMAIN)[0]
+    assert run.reason == f"the arm left the domain of the chart at t = {run.times[first]:.4g} s"
     assert not oc.contains(planar_chart.problem.domain, run.q[first])
     assert np.isfinite(run.command).all()
 

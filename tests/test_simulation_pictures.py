@@ -4,10 +4,12 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from conftest import robot_data
 from matplotlib.colors import to_rgb
 from PIL import Image
 
@@ -15,7 +17,7 @@ import orthocas as oc
 from orthocas.control import ControlStatus, Kinematic, PDPlus, Reference
 from orthocas.errors import ArchiveError, InvalidValueError, UnknownNameError
 from orthocas.fitting.fit import Fit
-from orthocas.simulation import Outcome, Trajectory
+from orthocas.simulation import Outcome, Trajectory, figure
 from orthocas.simulation.figure import ACTUAL, MovingPicture, save_animation, trajectory_figure, units_of
 from orthocas.tools.files import LIST, published
 from orthocas.tools.progress import Progress
@@ -229,3 +231,19 @@ def test_a_run_of_one_instant_can_be_drawn(planar_run: Trajectory, planar_fit: F
     save_animation(tmp_path / "a.gif", instant, planar_fit.chart.problem)
     with Image.open(tmp_path / "a.gif") as film:
         assert film.n_frames == 1  # type: ignore[attr-defined]
+
+
+def test_targets_are_drawn_for_positions_of_the_first_tip_only() -> None:
+    """A position of another hand, and of both, whose labels have numbers, have no target at the first one."""
+    robot = oc.Robot.from_urdf(
+        robot_data("baxter_description/urdf/baxter.urdf"), tips=["left_gripper", "right_gripper"]
+    )
+    q = np.zeros((3, robot.n))
+    own, other = oc.Task.position(robot), oc.Task.position(robot, frame="right_gripper")
+    for task, drawn in ((own, True), (other, False), (oc.Task.stack(own, other), False)):
+        problem = oc.Problem(robot, task, domain=oc.Box(robot.tree.middle, 0.1))
+        run: Any = SimpleNamespace(times=np.arange(3.0), q=q, reference=np.tile(task.batched(q[:1])[0], (3, 1)))
+        targets = figure._tip_targets(run, problem)
+        assert np.isfinite(targets).all() == drawn
+        if drawn:
+            np.testing.assert_allclose(targets, robot.tip_position(q), atol=1e-12)

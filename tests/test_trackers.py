@@ -3,6 +3,7 @@
 import pickle
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +12,11 @@ from public_objects import circle, clear, wide
 from scipy.optimize import minimize
 
 import orthocas as oc
+from orthocas.charts.regular_part import RegularPart
 from orthocas.codegen.library import CompiledLibrary, compile_shared
 from orthocas.errors import DomainError, InvalidValueError, NoExpressionError, ShapeError
 from orthocas.fitting.fit import Fit
-from orthocas.tasks.domains import bounds_of
+from orthocas.tasks.domains import Domain, bounds_of
 
 
 def circle_of_the_tool(chart: oc.Chart, count: int = 500) -> np.ndarray:
@@ -104,13 +106,107 @@ def wide_chart() -> oc.Chart:
 
 
 def cost(chart: oc.Chart, phi: np.ndarray, q: np.ndarray) -> float:
-    """What a tracker of the nearest x makes small, without the zones at the boundary."""
-    e = (phi - chart.phi(q)) / chart.phi_sizes
-    return float((e[: chart.m] ** 2).sum() + 1e-6 * (e[chart.m :] ** 2).sum())
+    """What a tracker of the nearest x makes small."""
+    e = chart.phi_map.difference(phi, chart.phi(q)) / chart.phi_sizes
+    return float((e[: chart.m] ** 2).sum() + 9e-8 * (e[chart.m :] ** 2).sum())
+
+
+def differences(f: Callable[[np.ndarray], Any], q: np.ndarray) -> np.ndarray:
+    """Central differences, (n,) or (k, n)."""
+    steps = 1e-6 * np.eye(len(q))
+    return np.stack([(np.asarray(f(q + step)) - np.asarray(f(q - step))) / 2e-6 for step in steps], axis=-1)
+
+
+def metres_nearer(chart: oc.Chart, phi: np.ndarray, q: np.ndarray) -> float:
+    """How much nearer SLSQP comes from q (n,), with the domain's own conditions: of |D^-1 e_x|, in sizes of a place."""
+    domain, scale = chart.problem.domain, 1 / cost(chart, phi, q)
+    low, high = bounds_of(domain)
+
+    def rooms(q: np.ndarray) -> np.ndarray:
+        bound = domain.singular_bound
+        found = [] if bound is None else [bound.singular_values(q) - bound.least_singular_value]
+        if isinstance(domain, RegularPart):
+            found.append(domain.volumes(q) - domain.least_volume)
+        if domain.path_bound is not None:
+            found.append(1 - domain.path_bound.squared_distance(q[None])[0])
+        return np.array(found)
+
+    constraint = {"type": "ineq", "fun": rooms, "jac": lambda q: differences(rooms, q)}
+    found = minimize(
+        lambda q: scale * cost(chart, phi, q),
+        q,
+        jac=lambda q: scale * differences(lambda q: cost(chart, phi, q), q),
+        bounds=list(zip(low, high, strict=True)),
+        constraints=[constraint] if len(rooms(q)) else [],
+        method="SLSQP",
+        options={"ftol": 1e-13, "maxiter": 300},
+    )
+    if not domain.contains(np.clip(found.x, low, high)) and rooms(found.x).min() < -1e-7:
+        return 0.0
+    return float((np.sqrt(cost(chart, phi, q)) - np.sqrt(cost(chart, phi, found.x))) * chart.phi_sizes[0])
+
+
+def led_along_the_border(chart: oc.Chart, away: float, aside: float, ticks: int) -> np.ndarray:
+    """Targets straight out of reach from the middle of the domain, then sideways, then at rest, (N, n)."""
+    home = chart.phi(chart.problem.domain.centre)
+    out = home[:3] / np.linalg.norm(home[:3])
+    side = np.cross(out, [0.0, 0.0, 1.0])
+    ways = [away * s * out for s in np.linspace(0, 1, ticks)]
+    ways += [away * out + aside * s * side for s in np.linspace(0, 1, ticks)]
+    ways += [ways[-1]] * ticks
+    return np.array([home + np.concatenate([way, np.zeros(chart.n - 3)]) for way in ways])
+
+
+BORDERS = ["panda-wide", "iiwa7-wide", "xarm7-wide", "baxter-left-wide", "panda-pose", "panda-position"]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [clear, lambda: oc.fit(oc.problems.get("planar_3r_xy"), oc.Polynomial(2)).chart])
+@pytest.mark.parametrize("name", BORDERS)
+def test_trackers_follow_along_the_border_and_come_to_rest_where_nothing_is_nearer(name: str) -> None:
+    chart = oc.charts.load(name)
+    domain, step = chart.problem.domain, 0.01 * chart.problem.robot.velocity_limits
+    ticks = 150
+    targets = led_along_the_border(chart, 0.5, 0.2, ticks)
+    tracker = chart.tracker(domain.centre, step, nearest=True)
+    q = np.array([tracker.step(phi) for phi in targets])
+    assert domain.contains(q).all()
+    assert (np.abs(np.diff(q, axis=0)) <= step * (1 + 1e-9)).all()
+    assert tracker.status == oc.TrackerStatus.NEAREST
+    np.testing.assert_array_equal(q[-1], q[-20])
+    places = chart.task(q)[:, :3]
+    assert np.linalg.norm(places[-1] - places[ticks - 1]) > 0.02  # one that froze at the border moves by 0
+    assert np.linalg.norm(places[-1] - targets[-1, :3]) > 0.05
+    assert metres_nearer(chart, targets[-1], q[-1]) < 1e-5
+
+
+def test_a_tracker_that_stands_at_no_minimum_says_so(planar_arm: oc.Chart) -> None:
+    """The largest step ends the first call; after enough of them it stands at a minimum."""
+    start = planar_arm.problem.domain.centre
+    away = planar_arm.phi(start) + np.array([9.0, 1.0, 0.0])
+    tracker, costs = planar_arm.tracker(start, 0.01, nearest=True), [cost(planar_arm, away, start)]
+    tracker.step(away)
+    assert tracker.status == oc.TrackerStatus.NEARER
+    while tracker.status == oc.TrackerStatus.NEARER:
+        costs.append(cost(planar_arm, away, tracker.step(away)))
+        assert costs[-1] <= costs[-2]
+    assert tracker.status == oc.TrackerStatus.NEAREST
+    assert len(costs) > 20
+    assert metres_nearer(planar_arm, away, tracker.q) < 1e-6
+
+
+def corridor() -> oc.Chart:
+    """A chart near a line of postures."""
+    known = oc.problems.get("planar_3r_xy")
+    path = known.domain.centre + np.linspace(-0.2, 0.2, 5)[:, None] * np.ones(3)
+    problem = oc.Problem(known.robot, known.task, domain=oc.Corridor(known.domain, path, 0.2))
+    return oc.fit(problem, oc.Polynomial(2), samples=300).chart
+
+
+KINDS = [clear, corridor, lambda: oc.fit(oc.problems.get("planar_3r_xy"), oc.Polynomial(2)).chart]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", KINDS)
 def test_trackers_go_to_the_nearest_x_and_come_back(make: Callable[[], oc.Chart]) -> None:
     """Far out of reach, the end is as near as what another method finds, inside; on the way nothing jumps."""
     chart = make()
@@ -129,17 +225,9 @@ def test_trackers_go_to_the_nearest_x_and_come_back(make: Callable[[], oc.Chart]
         if away == out[-1]:
             farthest = q
     assert statuses[0] == statuses[-1] == oc.TrackerStatus.OK
-    assert set(statuses) == {oc.TrackerStatus.OK, oc.TrackerStatus.NEAREST}
+    assert oc.TrackerStatus.NEAREST in statuses
     np.testing.assert_allclose(q, start, atol=1e-9)
-    wanted = home + out[-1] * direction
-    low, high = bounds_of(domain)
-    rooms = [{"type": "ineq", "fun": lambda q: -np.abs(q - start) + (high - low) / 2}]
-    if domain.condition is not None:
-        pivots = domain.condition.pivots
-        rooms.append({"type": "ineq", "fun": lambda q: np.array(pivots(q))[:, 0]})
-    other = minimize(lambda q: cost(chart, wanted, q), farthest, method="SLSQP", constraints=rooms, tol=1e-12)
-    sizes = np.linalg.norm(chart.phi_sizes[: chart.m])
-    assert np.sqrt(cost(chart, wanted, farthest)) < np.sqrt(other.fun) + 0.03 * sizes  # the zones
+    assert metres_nearer(chart, home + out[-1] * direction, farthest) < 1e-5
 
 
 def test_xi_gives_way_to_x(planar_arm: oc.Chart) -> None:
@@ -149,8 +237,8 @@ def test_xi_gives_way_to_x(planar_arm: oc.Chart) -> None:
     for xi in np.linspace(phi[2], reach.high + 1.0, 100):
         q = tracker.step([phi[0], phi[1], xi])
     assert tracker.status == oc.TrackerStatus.NEAREST
-    np.testing.assert_allclose(planar_arm.phi(q)[:2], phi[:2], atol=2e-3)
-    assert planar_arm.xi(q)[0] == pytest.approx(reach.high, abs=0.05 * (reach.high - reach.low))
+    np.testing.assert_allclose(planar_arm.phi(q)[:2], phi[:2], atol=1e-5)
+    assert planar_arm.xi(q)[0] == pytest.approx(reach.high, abs=1e-4 * (reach.high - reach.low))
     again = pickle.loads(pickle.dumps(tracker))
     np.testing.assert_array_equal(again.step([phi[0], phi[1], 9.0]), tracker.step([phi[0], phi[1], 9.0]))
 
@@ -167,23 +255,28 @@ def test_it_rests_where_a_target_pushes_it_against_the_boundary() -> None:
         path.append(tracker.step(np.concatenate([x, xi])).copy())
     assert tracker.status == oc.TrackerStatus.NEAREST
     room = np.minimum(path[-1] - robot.lower, robot.upper - path[-1]).min()
-    assert 0 <= room < 0.07  # in the zone of 2 % of a joint
-    assert np.ptp(path[-300:], axis=0).max() < 1e-4
+    assert 0 <= room < 1e-6
+    assert np.ptp(path[-300:], axis=0).max() < 1e-6
     np.testing.assert_allclose(robot.tip_position(np.array(path)), np.tile(x[:3], (1200, 1)), atol=5e-6)
 
 
-def test_domains_without_a_nearest_x_are_named() -> None:
+def test_domains_without_an_expression_are_named() -> None:
+    class Ball(oc.Box):
+        """Without an expression of its condition."""
+
+        name, is_box = "ball", False
+        condition = Domain.condition
+
     known = oc.problems.get("planar_3r_xy")
-    path = known.domain.centre + np.linspace(-0.2, 0.2, 5)[:, None] * np.ones(3)
-    problem = oc.Problem(known.robot, known.task, domain=oc.Corridor(known.domain, path, 0.2))
-    chart = oc.fit(problem, oc.Polynomial(2), samples=300).chart
-    with pytest.raises(DomainError, match="expected a box or a clear box"):
-        chart.tracker(chart.problem.domain.centre, nearest=True)
+    chart = oc.fit(known, oc.Polynomial(2), samples=300).chart
+    problem = oc.Problem(known.robot, known.task, domain=Ball(known.domain.centre, known.domain.half_width))
+    with pytest.raises(DomainError, match="kind 'ball' has no condition as an expression"):
+        oc.Chart(problem, chart.coordinates).tracker(known.domain.centre, nearest=True)
 
 
 @needs_c
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [clear, wide_chart])
+@pytest.mark.parametrize("make", [clear, wide_chart, corridor])
 def test_c_goes_to_the_same_nearest_x(make: Callable[[], oc.Chart], tmp_path: Path) -> None:
     chart = make()
     generated = oc.generate_c(chart, tmp_path, name="arm")
@@ -191,19 +284,18 @@ def test_c_goes_to_the_same_nearest_x(make: Callable[[], oc.Chart], tmp_path: Pa
     domain = chart.problem.domain
     q = domain.centre
     home, tracker = chart.phi(q), chart.tracker(q, largest_step=0.1, nearest=True)
-    known = {0: oc.TrackerStatus.OK, 1: oc.TrackerStatus.NEAREST}
+    known = {0: oc.TrackerStatus.OK, 1: oc.TrackerStatus.NEAREST, 12: oc.TrackerStatus.NEARER}
     found, alike = set(), []
     for s in np.linspace(0.0, 1.0, 800):
         phi = home + np.sin(np.pi * s) * np.array([4.0, 0.5 * np.sin(6 * s), 0.3])
         tracker.reset(q)
         q, status = library.nearest(phi, q, 0.1)
         other = tracker.step(phi)
-        alike.append(np.abs(q - other).max() < 1e-3)
-        assert known[status] == tracker.status or not alike[-1]
+        alike.append(known[status] == tracker.status and np.abs(q - other).max() < 1e-8)
         assert domain.contains(q)
         found.add(status)
-    assert found == {0, 1}
-    assert np.mean(alike) > 0.97  # descents of 12 steps end where they are
+    assert {0, 1} <= found
+    assert np.mean(alike) > 0.99  # C and Python search for phi in their own ways, before they descend
     for bad in (np.nan, np.inf, 1e200):
         assert library.nearest(np.full_like(home, bad), q, 0.1)[1] == 3
         assert library.nearest(home, q, bad if bad != np.inf else -1.0)[1] in (0, 3)

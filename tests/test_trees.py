@@ -273,7 +273,7 @@ def test_two_hands_on_one_object_move_it_by_the_names_of_coordinates(baxter: oc.
     home = np.array([0.3, -0.4, -0.5, 1.2, 0.2, 0.8, 0.1, -0.3, -0.4, 0.5, 1.2, -0.2, 0.8, -0.1])
     problem = oc.Problem(baxter, oc.Task.relative_pose(baxter, LEFT, RIGHT), domain=oc.Box(home, 0.3))
     chart = oc.fit(problem, oc.Polynomial(1), like=oc.Task.position(baxter), samples=600).chart
-    assert chart.named_coordinates[:4] == ("xi1: x [m]", "xi2: y [m]", "xi3: z [m]", "xi4")
+    assert chart.named_coordinates[:4] == ("xi1: like x [m]", "xi2: like y [m]", "xi3: like z [m]", "xi4")
     wanted = chart.phi(home)
     np.testing.assert_allclose(wanted[6:9], baxter.tip_position(home), atol=1e-9)
     wanted[6] += 0.05
@@ -288,3 +288,41 @@ def test_two_hands_on_one_object_move_it_by_the_names_of_coordinates(baxter: oc.
     moved = left[1].translation - left[0].translation
     assert 0.04 < moved[0] < 0.06
     assert np.abs(moved[1:]).max() < 0.02
+
+
+def test_equivalent_stacks_are_equally_far_from_singular_positions(baxter: oc.Robot) -> None:
+    """The poses of both hands, and one of them with the pose of the other in it: the same J up to a regular factor."""
+    q = postures(baxter, 40)
+    left, right = (oc.Task.pose(baxter, frame=name) for name in (LEFT, RIGHT))
+    stacks = [
+        oc.Task.stack(left, right),
+        oc.Task.stack(left, oc.Task.relative_pose(baxter, LEFT, RIGHT)),
+        oc.Task.stack(oc.Task.relative_pose(baxter, RIGHT, LEFT), right),
+        oc.Task.stack(oc.Task.relative_pose(baxter, RIGHT, LEFT), left),
+    ]
+    want, *found = (
+        np.linalg.svd(stack.batched_frame_jacobian(q)[0].reshape(40, 12, 14), compute_uv=False) for stack in stacks
+    )
+    for values in found:
+        np.testing.assert_allclose(values, want, atol=1e-12)
+
+
+def test_rows_of_a_stack_span_those_of_its_jacobian(baxter: oc.Robot) -> None:
+    """Also with positions in another frame, along some of its axes, where that one is seen from a third."""
+    q = 0.3 * postures(baxter, 10)  # near the references, where J_x has its rank
+    left = oc.Task.pose(baxter, frame=LEFT)
+    stacks = [
+        oc.Task.stack(left, oc.Task.relative_position(baxter, LEFT, RIGHT, "xz")),
+        oc.Task.stack(
+            oc.Task.position(baxter, "x", "right_upper_forearm", RIGHT),
+            left,
+            oc.Task.relative_pose(baxter, LEFT, RIGHT),
+        ),
+    ]
+    for stack in stacks:
+        shape = (len(q), stack.m, baxter.n)
+        several = stack.batched_frame_jacobian(q)[0].reshape(shape), stack.batched_jacobian(q)[0].reshape(shape)
+        for rows, J in zip(*several, strict=True):
+            combined = J @ np.linalg.pinv(rows)
+            np.testing.assert_allclose(combined @ rows, J, atol=1e-9)
+            assert np.linalg.matrix_rank(combined) == stack.m

@@ -1,5 +1,6 @@
-"""URDF files that Pinocchio's parser accepts although they describe no robot."""
+"""URDF files that Pinocchio's parser accepts although they describe no robot, and those that it need not refuse."""
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -71,6 +72,114 @@ def test_joint_that_hangs_from_its_own_child_is_named(tmp_path: Path) -> None:
         oc.Robot.from_urdf(path)
     path = write_joints(tmp_path, ("j", "a", "b"), ("k", "c", "d"), ("l", "d", "c"))
     with pytest.raises(RobotError, match="joint 'k' hangs from link 'c' to link 'd' in a loop"):
+        oc.Robot.from_urdf(path)
+
+
+ARM_OF_TWO = (("j", "a", "b"), ("k", "b", "c"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            '<parent link="b"/>',
+            '<parent link="pelvis"/>',
+            "joint 'k' has the parent link 'pelvis', which the file does",
+        ),
+        ('<child link="c"/>', '<child link="hand"/>', "joint 'k' has the child link 'hand', which the file does not"),
+        ('<parent link="b"/>', "", "joint 'k' has no parent link"),
+        ('<link name="c"/>', '<link name="c"/><link name="c"/>', "two links are called 'c'"),
+        ('<link name="c"/>', '<link name="c"/><link/>', "a link has no name"),
+        ('<link name="c"/>', '<link name="c"/><link name="d"/>', "the links 'a' and 'd' hang on no joint"),
+        ("</robot>", JOINT.format("l", "a", "c") + "</robot>", "link 'c' hangs on the joints 'k' and 'l', expected a"),
+        ('<limit lower="-1"', '<limit lower="x"', r"limit element for joint \[j\]: .*lower value \(x\) is not a valid"),
+    ],
+)
+def test_what_is_no_tree_of_joints_is_named(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = write_joints(tmp_path, *ARM_OF_TWO)
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(RobotError, match=rf"arm\.urdf.*{message}") as caught:
+        oc.Robot.from_urdf(path)
+    assert "/project/" not in str(caught.value)
+
+
+SHAPE = '<link name="c"><visual>{}</visual><collision>{}</collision></link>'
+BOX = '<geometry><box size="1 1 1"/></geometry>'
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        SHAPE.format(f"{BOX}<material><color rgba='1 0 0 1'/></material>", BOX),
+        SHAPE.format(BOX, '<geometry><capsule radius="1" length="1"/></geometry>'),
+        SHAPE.format("<geometry><mesh/></geometry>", BOX),
+        SHAPE.format(f"{BOX}<material name='m'><texture/></material>", BOX),
+        SHAPE.format('<origin xyz="0 0 0"/>', BOX),
+        SHAPE.format(BOX, '<geometry><box size="1 1"/></geometry>'),
+        '<link name="c"/><material name="m"><color rgba="1 0 0 1"/></material><material name="m"/>',
+    ],
+)
+def test_faults_in_what_kinematics_does_not_use_are_logged(
+    tmp_path: Path, part: str, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Unnamed and double materials, capsules, meshes and textures without files, and visuals without geometry."""
+    path = write_joints(tmp_path, *ARM_OF_TWO)
+    plain = oc.Robot.from_urdf(path)
+    path.write_text(path.read_text().replace('<link name="c"/>', part))
+    with caplog.at_level(logging.WARNING, "orthocas"):
+        robot = oc.Robot.from_urdf(path)
+    assert robot.joint_names == plain.joint_names
+    np.testing.assert_array_equal(robot.tip_position([0.3, 0.4]), plain.tip_position([0.3, 0.4]))
+    texture = "texture" in part  # of which the parser does not complain
+    assert [record.getMessage() for record in caplog.records] == [] if texture else "left out" in caplog.text
+    assert "/project/" not in caplog.text
+    assert "Error" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("what", ["effort", "velocity"])
+@pytest.mark.parametrize("kind", ["revolute", "continuous"])
+def test_missing_limits_of_effort_and_velocity_are_none(
+    tmp_path: Path, what: str, kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write_joints(tmp_path, *ARM_OF_TWO)
+    path.write_text(path.read_text().replace(f'{what}="1"', "", 1).replace("revolute", kind))
+    with caplog.at_level(logging.WARNING, "orthocas"):
+        robot = oc.Robot.from_urdf(path)
+    limits = {"effort": robot.effort_limits, "velocity": robot.velocity_limits}
+    np.testing.assert_array_equal(limits.pop(what), [np.inf, 1])
+    np.testing.assert_array_equal(*limits.values(), [1, 1])
+    assert caplog.messages == [f"{path}: limits of effort or velocity are missing, so there are none: j"]
+
+
+def test_mimic_of_a_mimic_off_the_chain_is_locked_and_one_of_nothing_named(tmp_path: Path) -> None:
+    """Of followers with multiplier 2 and offset 0.1 of one another, the second hangs at 0.1 + 2 * 0.1."""
+    mimic = '<mimic joint="{}" multiplier="2" offset="0.1"/></joint>'
+    path = write_joints(tmp_path, *ARM_OF_TWO, ("f", "c", "d"), ("g", "c", "e"), ("h", "c", "i"))
+    parts = path.read_text().split("</joint>")
+    path.write_text(
+        "</joint>".join(parts[:3]) + "</joint>" + mimic.format("f").join(parts[3:5]) + mimic.format("g") + parts[5]
+    )
+    robot = oc.Robot.from_urdf(path, "c")
+    assert robot.joint_names == ("j", "k")
+    for frame, angle in (("e", 0.1), ("i", 0.3)):
+        turn = robot.frame_rotation([0.0, 0.0], frame)
+        np.testing.assert_allclose([turn[0, 0], turn[1, 0]], [np.cos(angle), np.sin(angle)], atol=1e-12)
+    with pytest.raises(RobotError, match="'h' is a mimic joint, .*locked={'f': 0.0}"):
+        oc.Robot.from_urdf(path, "i")
+    path.write_text(path.read_text().replace('mimic joint="g"', 'mimic joint="nowhere"'))
+    with pytest.raises(RobotError, match="joint 'h' mimics joint 'nowhere', which the file does not have"):
+        oc.Robot.from_urdf(path, "i")
+
+
+def test_shapes_for_collision_checks_are_no_default_tips_and_lists_of_tips_have_every_end(tmp_path: Path) -> None:
+    fixed = '<link name="{1}"/><joint name="to_{1}" type="fixed"><parent link="{0}"/><child link="{1}"/></joint>'
+    path = write_joints(tmp_path, *ARM_OF_TWO)
+    ends = [fixed.format("c", name) for name in ("flange", "c_sc", "flange_collision")]
+    path.write_text(path.read_text().replace("</robot>", "".join(ends) + "</robot>"))
+    assert oc.Robot.from_urdf(path).tips == ("flange",)
+    more = [fixed.format("c", "grasp"), JOINT.format("l", "a", "d"), '<link name="d"/></robot>']
+    path.write_text(path.read_text().replace("</robot>", "".join(more)))
+    with pytest.raises(RobotError, match="has 2 chains, name the tip frame: grasp, flange; d$"):
         oc.Robot.from_urdf(path)
 
 

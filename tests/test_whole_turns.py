@@ -218,6 +218,9 @@ def test_a_path_around_a_turn_says_what_it_leaves_over(chart: oc.Chart, axis: st
     assert not motion.closed
     assert motion.kind.startswith("path around a turn: x and xi end where they began, joint 'j")
     assert chart.left_over(HOME, tracker.q) == pytest.approx(apart, abs=1e-6)
+    assert tracker.left_over == pytest.approx(apart, abs=1e-6)
+    tracker.step(np.r_[path[-2], chart.xi(HOME)])
+    assert tracker.left_over is None
 
 
 def test_a_loop_that_can_be_shrunk_closes_and_an_open_path_leaves_nothing_to_say(chart: oc.Chart) -> None:

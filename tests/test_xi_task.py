@@ -14,7 +14,7 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.control import XiTask
 from orthocas.errors import InvalidValueError, NoExpressionError, ShapeError
-from orthocas.simulation import MuJoCoPlant
+from orthocas.simulation import Elasticity, MuJoCoPlant
 from orthocas.tools.checks import Array
 
 FINGERS = 2
@@ -61,8 +61,28 @@ def test_joints_of_other_names_and_places_are_found_in_mujoco() -> None:
     J = task.compute_jacobian(configuration)
     np.testing.assert_array_equal(J[:, :6], 0.0)
     np.testing.assert_allclose(J[:, 6:], chart.jacobian(chart.problem.domain.centre)[chart.m :], atol=1e-14)
-    with pytest.raises(KeyError, match="q1"):
+    with pytest.raises(InvalidValueError, match="without a joint 'q1', expected one of .*arm/0, arm/1"):
         XiTask(chart, 1.0).compute_jacobian(configuration)
+
+
+@pytest.mark.parametrize("elasticity", [None, Elasticity(stiffness=1e4, inertia=0.1)], ids=["rigid", "elastic"])
+def test_joints_are_found_in_the_model_of_the_packages_own_plant(elasticity: Elasticity | None) -> None:
+    """Without names given: MuJoCo integrates a velocity, and the error changes as the Jacobian says."""
+    chart, _ = panda()
+    plant = MuJoCoPlant(chart.problem.robot, elasticity=elasticity)
+    model = plant.model
+    joints = [model.joint(name) for name in chart.problem.robot.joint_names]
+    q, velocity, step = np.zeros(model.nq), np.zeros(model.nv), 1e-6
+    q[[joint.qposadr[0] for joint in joints]] = chart.problem.domain.centre
+    velocity[[joint.dofadr[0] for joint in joints]] = np.random.default_rng(2).normal(size=chart.n)
+    task = XiTask(chart, 1.0)
+    task.set_target_from_configuration(SimpleNamespace(model=model, q=q))
+    moved = q.copy()
+    mujoco.mj_integratePos(model, moved, velocity, step)
+    J = task.compute_jacobian(SimpleNamespace(model=model, q=q))
+    error = task.compute_error(SimpleNamespace(model=model, q=moved))
+    np.testing.assert_allclose(error / step, J @ velocity, atol=1e-4)
+    assert np.abs(J @ velocity).max() > 0.1
 
 
 def test_joints_without_end_and_circles_take_the_shorter_way() -> None:
@@ -135,7 +155,7 @@ def test_mink_meets_tool_and_xi_together_as_a_constraint_too(others: str) -> Non
     model, q = MuJoCoPlant(chart.problem.robot).model, chart.problem.domain.centre
     configuration = mink.Configuration(model, q)
     tip = mink.FrameTask("tip", "body", position_cost=1.0, orientation_cost=0.0)
-    task = XiTask(chart, 0.1, joints=tuple(f"joint{k}" for k in range(chart.n)))
+    task = XiTask(chart, 0.1)
     task.set_target_from_configuration(configuration)
     home = configuration.get_transform_frame_to_world("tip", "body").as_matrix()
 

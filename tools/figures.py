@@ -8,7 +8,8 @@ A record is a JSON file. It says how its numbers were measured (`script`, `argum
 what they are (`values` of `main` by name, and the `tables` that it prints: headers and rows), how far they may move
 (`tolerance`, relative, by a part of the name, which for cells is that of column and row; "" is the rest), and
 what pages print of them (`printed`). A phrase of `printed` takes values as {name|format} or {name*factor|format}, and
-cells of the tables as {row ; column|format}; other numbers in it are settings. Rows are known by their numbers, so
+cells of the tables as {row ; column|format}; shares [%] that are better the larger take the format .2down, which rounds
+them down; other numbers in it are settings. Rows are known by their numbers, so
 pages may name them in other words. `source` is "measured" if the numbers come from a run by this tool, and
 "transcribed" if some were copied from a page: --write gives such a record new tables, and "measured" once its phrases
 take values. Numbers that nobody measured (settings, limits, versions) are the phrases of `constants.json`.
@@ -33,6 +34,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from orthocas.tools.display import percent
 
 ROOT = Path(__file__).resolve().parent.parent
 RECORDS = ROOT / "docs" / "records"
@@ -98,6 +101,9 @@ class Record:
 
     def _filled(self, found: re.Match[str]) -> str:
         name, factor, form = found.groups()
+        if form.endswith("down"):
+            share = round(self.values[name] * float(factor or 1) / 100, 12)  # without the rounding of the division
+            return percent(share, int(form[1:-4]))[:-1]
         return re.sub(r"e([-+])0(\d)", r"e\1\2", f"{self.values[name] * float(factor or 1):{form}}").replace("e+", "e")
 
     @property

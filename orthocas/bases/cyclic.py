@@ -13,6 +13,7 @@ from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.domains import Box, sample_uniform
 from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem import Problem, is_regular
+from orthocas.tasks.samples import NEGLIGIBLE
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, require_kind
 from orthocas.tools.expressions import gradient_dependences, to_tape
@@ -20,7 +21,6 @@ from orthocas.tools.expressions import gradient_dependences, to_tape
 _SAMPLES, _POSITIONS = 24, 6  # joint positions, and other positions of one joint at each of them
 _SEED = 0
 _AXES = "xyz"
-_NEGLIGIBLE = 1e-8  # relative; near-singular samples lose four digits
 _LARGEST_SLIDE = 10.0  # [m]; other positions of a prismatic joint without limits lie within
 _WORD = "cyclic"
 
@@ -96,7 +96,7 @@ def _is_cyclic(problem: Problem, points: Array, k: int) -> bool:
     moved = np.repeat(points[None], _POSITIONS, axis=0)
     moved[:, :, k] = places
     J, A = _task_and_metric(problem, points)
-    if not np.abs(J[:, :, k]).max() > _NEGLIGIBLE * np.abs(J).max():
+    if not np.abs(J[:, :, k]).max() > NEGLIGIBLE * np.abs(J).max():
         return False
     J_there, A_there = _task_and_metric(problem, moved.reshape(-1, problem.n))
     if not (np.isfinite(J_there).all() and np.isfinite(A_there).all() and _same(A, A_there)):
@@ -125,7 +125,7 @@ def _invariants(J: Array, A: Array) -> tuple[Array, Array]:
 def _same(here: Array, there: Array) -> bool:
     """Whether values at the points (N, ...) equal those at the other positions (positions N, ...)."""
     differences = there.reshape(_POSITIONS, *here.shape) - here
-    return bool(np.abs(differences).max() <= _NEGLIGIBLE * np.abs(here).max())
+    return bool(np.abs(differences).max() <= NEGLIGIBLE * np.abs(here).max())
 
 
 def require_cyclic(problem: Problem, names: Sequence[str]) -> None:

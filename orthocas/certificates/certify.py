@@ -20,6 +20,7 @@ from orthocas.errors import CertifyError, Interrupted, InvalidValueError
 from orthocas.robots.tree import require_driven
 from orthocas.tasks.domains import Box, Domain, contains, reach, sample_heavily, slack
 from orthocas.tools.checks import Array, as_number, require_at_least, require_executor, require_kind
+from orthocas.tools.display import percent
 from orthocas.tools.processes import in_order
 from orthocas.tools.progress import Monitor, Progress, silent
 
@@ -30,6 +31,7 @@ _MANY_BOXES = (500, 45_000)  # the least and the most
 _MORE_BOXES = {ELIMINATION: 3, COFACTORS: 30}  # between them, so many times what the proof without folds took
 _HELD_RANGE = 1.0  # half-width of a leading joint on which J does not depend, if its whole range is too wide
 _GUARDED_BOXES = 1_000_000  # for charts whose domain keeps folds out
+_MOMENT = 1e-9  # [s] to divide by
 _LARGEST_BOX = Limits(smallest=2.0**-6, first_failure=True, folds=False)
 
 
@@ -90,7 +92,8 @@ def certify(
     rows = chart_rows(chart)
     base = whole_domain(chart.problem.domain) if resume is None else _resumed(chart, bound, resume)
     judge = judge_of(chart, rows, bound, None if resume is None else resume.method)
-    if chart.problem.domain.room_to_fold is not None:  # near its boundary, there is always something left to prove
+    guarded = chart.problem.domain.room_to_fold is not None
+    if guarded:  # near its boundary, there is always something left to prove
         limits = replace(limits, boxes=_GUARDED_BOXES)
     search = Search(judge, base, limits, largest_first(base), executor)
     injective: Subdivision | None = None
@@ -100,7 +103,7 @@ def certify(
 
     try:
         search.visit(_suspects(chart))
-        search.run(_shown(monitor, "regular"))
+        search.run(_shown(monitor, "regular", guarded=guarded))
         left = limits.seconds - (time.monotonic() - start)
         if search.finished and left > 0:
             most = int(np.clip(_MORE_BOXES[judge.method] * search.judged, *_MANY_BOXES))
@@ -334,7 +337,6 @@ def _certificate(
         before[0] + search.judged,
         before[1] + seconds,
         getattr(domain, "least_singular_value", 0.0),
-        search.dead,
         getattr(domain, "least_volume", 0.0),
         _clear_share(domain, parts),
     ).sealed()
@@ -359,13 +361,25 @@ def _clear_share(domain: Domain, parts: Subdivision) -> float:
 
     chosen = rng.choice(len(low), _SAMPLES, p=volumes / volumes.sum())
     left = float(volumes.sum() / (parts.high - parts.low).prod()) * clear(low[chosen], high[chosen])
-    return max(0.0, 1 - left / clear(parts.low, parts.high))
+    return float(np.clip(1 - left / clear(parts.low, parts.high), 0.0, 1 - 2**-53))  # not all, whatever samples say
 
 
-def _shown(monitor: Monitor, stage: str) -> Look:
+def _shown(monitor: Monitor, stage: str, *, guarded: bool = False) -> Look:
+    """Reports what a search has spent of its boxes and its time or, if that is more, the volume that is proved.
+
+    Near the boundary of a domain that is `guarded` from folds, hardly any volume and most of the boxes are left. So the
+    volume says nothing of what is still to come there.
+    """
+    start = time.monotonic()
+
     def show(search: Search) -> None:
-        detail = f"{search.judged} boxes, {100 * search.proved_volume:.2f} % proved"
-        monitor(Progress(stage, min(search.proved_volume, 1.0), detail))
+        limits, share = search.limits, search.proved_volume
+        if search.open_count:
+            share = min(share, 1 - 2**-53)
+        spent = max(search.judged / limits.boxes, (time.monotonic() - start) / max(limits.seconds, _MOMENT))
+        done = 1.0 if not search.open_count else min(1.0, spent if guarded else max(share, spent))
+        detail = f"{search.judged:,} boxes, {search.open_count:,} open, {percent(share, 2)} proved"
+        monitor(Progress(stage, done, detail))
 
     return show
 

@@ -49,6 +49,7 @@ class Search:
     executor: Executor | None = None
     judged: int = 0
     proved_volume: float = 0.0  #: share of the whole
+    open_count: int = 0  #: number of boxes where nothing is proved so far
     dead: int = 0  #: number of boxes too small to halve, or of no use to halve
     failed: float = np.inf  #: least rank of these boxes
     conditioning: float = np.inf  #: least of the lower bounds on proved boxes
@@ -178,6 +179,7 @@ class Search:
         for k, (rank, place, a, b) in enumerate(batch):
             if proved[k]:
                 self._codes[place] = PROVED
+                self.open_count -= 1
                 continue
             shares = (b - a) / (self.base.high - self.base.low)
             joint = int(verdicts.widest[k])
@@ -194,9 +196,11 @@ class Search:
         top, bottom = high.copy(), low.copy()
         top[joint] = bottom[joint] = middle
         self._codes[place], self._children[place] = joint, len(self._codes)
+        self.open_count -= 1
         self._add(np.array([low, bottom]), np.array([top, high]))
 
     def _add(self, low: Array, high: Array) -> None:
+        self.open_count += len(low)
         for rank, a, b in zip(self.priority(low, high).tolist(), low, high, strict=True):
             heapq.heappush(self._waiting, (rank, len(self._codes), a, b))
             self._codes.append(OPEN)

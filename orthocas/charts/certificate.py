@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from orthocas.errors import CertifyError, InvalidValueError
 from orthocas.tools.checks import Array, frozen_array, require_kind, require_shape, require_text
-from orthocas.tools.display import Shown, number_list
+from orthocas.tools.display import Shown, number_list, percent
 from orthocas.tools.json import attributes
 
 OPEN, PROVED = 255, 254  #: codes of boxes that are not halved; others are the joint that is
@@ -154,7 +154,6 @@ class Certificate(Shown):
     boxes: int = 0  #: judged to find the proof
     seconds: float = field(default=0.0)
     least_singular_value: float = 0.0  #: of a ClearBox; parts proved to lie outside it count as proved. 0: no ClearBox
-    dead: int = 0  #: number of unproved parts that are too small to halve: a longer search does not help there
     least_volume: float = 0.0  #: of a RegularPart, which keeps folds out of what is not proved. 0: another domain
     clear_share: float = 0.0  #: of the clear positions of a RegularPart's box, the share in proved parts, from samples
     digest: str = ""  #: of all of the above, see `sealed`
@@ -172,9 +171,13 @@ class Certificate(Shown):
         """The same certificate with the digest of its content, which shows accidental changes. It is no signature."""
         return replace(self, digest=self._content_digest())
 
-    def _content_digest(self) -> str:
-        """SHA-256 of all numbers and texts but the digest."""
-        numbers = [self.bound, self.conditioning, self.boxes, self.seconds, self.least_singular_value, self.dead]
+    def without_given_up(self, count: int) -> Self:
+        """The same without a number of parts that were given up, which older files have and no check covers."""
+        return self.sealed() if self.digest == self._content_digest(count) else self
+
+    def _content_digest(self, given_up: int = 0) -> str:
+        """SHA-256 of all numbers and texts but the digest; older certificates also count parts that were given up."""
+        numbers = [self.bound, self.conditioning, self.boxes, self.seconds, self.least_singular_value, given_up]
         numbers += [self.least_volume, self.clear_share] if self.least_volume else []  # older ones have no such numbers
         points = [[float(value) for value in point] for point in self.fold]
         content = [self.fingerprint, self.method, [float(number) for number in numbers], points]
@@ -223,12 +226,7 @@ class Certificate(Shown):
         low, high = self.unproved
         if len(low) and not self.fold:
             largest = int(np.argmax((high - low).prod(axis=1)))
-            at = number_list((low[largest] + high[largest]) / 2)
-            facts["not proved"] = f"{len(low)} boxes, the largest at q = ({at})"
-        if self.dead and not self.fold:
-            facts["given up"] = (
-                f"{self.dead} boxes are too small to halve: J is nearly singular or folds there; more time is no help"
-            )
+            facts["largest open"] = f"at q = ({number_list((low[largest] + high[largest]) / 2)})"
         facts["boxes"] = f"{self.regular.proved_count} proved, {self.boxes} judged, {self.seconds:.3g} s"
         facts["method"] = f"{self.method}, chart {self.fingerprint[:12]}"
         return facts
@@ -240,7 +238,7 @@ class Certificate(Shown):
             **attributes(self, "proved", "share", "bound", "conditioning", "boxes"),
             "parts": self.regular.proved_count,
             "unproved": self.regular.open_count,
-            **attributes(self, "dead", "seconds"),
+            "seconds": self.seconds,
             "one_to_one_half_width": None if one is None else ((one.high - one.low) / 2).tolist(),
             **attributes(self, "fold", *(("least_volume", "clear_share") if self.least_volume else ())),
             **attributes(self, "method", "fingerprint"),
@@ -250,7 +248,10 @@ class Certificate(Shown):
         if self.fold:
             at = ", ".join(f"{value:.3f}" for value in self.fold[-1])
             return f"refuted, the chart folds at q = ({at})"
-        where = "everywhere on the domain" if self.proved else f"on {100 * self.share:.4f} % of the domain"
-        if self.least_volume > 0 and not self.proved:
-            where = f"on {100 * self.share:.3f} % of the box, {100 * self.clear_share:.3f} % of what is clear (samples)"
-        return f"no fold {where}, conditioning >= {self.bound:g}" if self.bound else f"no fold {where}"
+        verdict = "no fold everywhere on the domain"
+        if not self.proved:
+            share, clear = percent(self.share, 4), percent(self.clear_share, 3)
+            guarded = self.least_volume > 0
+            where = f"{share} of the box, {clear} of what is clear (samples)" if guarded else f"{share} of the domain"
+            verdict = f"not proved, {self.regular.open_count:,} boxes are open; no fold on {where}"
+        return f"{verdict}, conditioning >= {self.bound:g}" if self.bound else verdict

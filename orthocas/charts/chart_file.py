@@ -52,7 +52,6 @@ def certificate_to_data(certificate: Certificate) -> tuple[dict[str, Any], dict[
         "boxes": certificate.boxes,
         "seconds": certificate.seconds,
         **({"least_singular_value": certificate.least_singular_value} if certificate.least_singular_value else {}),
-        **({"dead": certificate.dead} if certificate.dead else {}),
         **({name: getattr(certificate, name) for name in _GUARDED} if certificate.least_volume else {}),
         **({"digest": certificate.digest} if certificate.digest else {}),
     }
@@ -70,7 +69,7 @@ def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored],
     fold = part(data, "fold", list)
     if len(fold) not in (0, 2) or any(not isinstance(point, list) or len(point) != n for point in fold):
         raise InvalidValueError("fold of a certificate", repr(fold)[:80], f"no or two joint positions of {n} numbers")
-    return Certificate(
+    known = Certificate(
         part(data, "fingerprint", str),
         part(data, "method", str),
         _number(data, "bound"),
@@ -81,11 +80,13 @@ def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored],
         require_count("boxes of a certificate", int(_number(data, "boxes")), least=0),
         _number(data, "seconds"),
         _number(data, "least_singular_value") if "least_singular_value" in data else 0.0,
-        require_count("dead boxes of a certificate", int(_number(data, "dead")), least=0) if "dead" in data else 0,
         _number(data, "least_volume") if "least_volume" in data else 0.0,
         _number(data, "clear_share") if "clear_share" in data else 0.0,
         part(data, "digest", str) if "digest" in data else "",  # missing in older files
     )
+    if "dead" not in data:
+        return known
+    return known.without_given_up(require_count("dead boxes of a certificate", int(_number(data, "dead")), least=0))
 
 
 def _tree(arrays: Mapping[str, Stored], name: str, n: int) -> Subdivision:

@@ -36,6 +36,10 @@ _OPTIONS: dict[str, Any] = {
 }
 _CLEAR = 1e-6  # least pivot over its bound: the domain is open there
 _STARTS = 8  # of the table, after a given one
+_NEAR_PHI, _NEAR_X, _DESCENTS = 8, 120, 5  # stored positions near phi and near x, and the best of them to go on from
+_AT_ONCE = 256  # rows whose starts are held in memory
+_FARTHEST = 1e300  # a distance that is finite
+_REACHED = 1e-9  # distance in xi up to which no other start is tried
 
 
 @dataclass(frozen=True)
@@ -292,14 +296,47 @@ class Inside:
         return self.boxed.points(u), np.asarray(error <= KEPT)
 
     def nearest(self, targets: Array, q: Array) -> Array:
-        """Points of the domain with task values as in targets (N, n), as q (N, n), and the nearest xi, (N, n)."""
-        u, minimal = nearest_xi(self.boxed, targets, self.boxed.of_points(q))
-        found = self.boxed.points(u)
-        allowed = self.boxed.domain.contains(found)
-        undecided = np.flatnonzero(~(minimal & allowed))
+        """Points of the domain with task values as in targets (N, n), as q (N, n), and the nearest xi, (N, n).
+
+        They are the nearest of those that searches from q and from stored positions find.
+        """
+        pieces = [slice(first, first + _AT_ONCE) for first in range(0, len(q), _AT_ONCE)]
+        return np.concatenate([q[:0], *(self._nearest(targets[rows], q[rows]) for rows in pieces)])
+
+    def _nearest(self, targets: Array, q: Array) -> Array:
+        N, n = q.shape
+        near_phi = self.starts.nearest(targets, _NEAR_PHI, n)
+        starts = np.concatenate([q[None], near_phi, self.starts.nearest(targets, _NEAR_X, self.boxed.m)])
+        wanted = np.tile(targets, (len(starts), 1))
+        u, error = solve_in_box(
+            self.boxed.task_equations, wanted[:, : self.boxed.m], self.boxed.of_points(starts.reshape(-1, n))
+        )
+        points = self.boxed.points(u)
+        away = np.where((error <= KEPT) & self.boxed.domain.contains(points), self._distance(wanted, points), np.inf)
+        away[:N] = np.minimum(away[:N], _FARTHEST)  # q itself has the task values
+        away, u, points = away.reshape(-1, N), u.reshape(-1, N, n), points.reshape(-1, N, n)
+        order, every = np.argsort(away, axis=0)[:_DESCENTS], np.arange(N)
+        best, distance, minimal = q.copy(), np.full(N, np.inf), np.zeros(N, dtype=bool)
+        for which in order:
+            rows = np.flatnonzero(np.isfinite(away[which, every]) & (distance > _REACHED))
+            start = u[which[rows], rows]
+            end, done = nearest_xi(self.boxed, targets[rows], start)
+            for at, ended in ((start, np.zeros(len(rows), dtype=bool)), (end, done)):
+                found = self.boxed.points(at)
+                gap = np.where(self.boxed.domain.contains(found), self._distance(targets[rows], found), np.inf)
+                better = gap < distance[rows]
+                best[rows[better]], minimal[rows[better]] = found[better], ended[better]
+                distance[rows[better]] = gap[better]
+        undecided = np.flatnonzero(~minimal)
         if undecided.size:
-            found[undecided] = self._searched_by_ipopt(targets[undecided], found[undecided], allowed[undecided])
-        return found
+            allowed = np.isfinite(distance[undecided])
+            best[undecided] = self._searched_by_ipopt(targets[undecided], best[undecided], allowed)
+        return best
+
+    def nearer(self, targets: Array, q: Array) -> Array:
+        """Points of the domain as near to xi as those that steps from q (N, n), inside, lead to, (N, n)."""
+        found = self.boxed.points(nearest_xi(self.boxed, targets, self.boxed.of_points(q))[0])
+        return np.where(self.boxed.domain.contains(found)[:, None], found, q)
 
     def _searched_by_ipopt(self, targets: Array, q: Array, allowed: NDArray[np.bool_]) -> Array:
         """Better points than q (N, n), from q; where q is not allowed, any, and from other starts as well."""

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocas.charts.continuation import Continuation
+from orthocas.charts.curves import SelfMotionCurves
 from orthocas.charts.in_domain import InDomain
 from orthocas.charts.inside import Inside
 from orthocas.charts.newton import Attempt, LocalSolver, Starts
@@ -80,8 +82,10 @@ class Inverse:
     phi_map: PhiMap
     local: LocalSolver
     starts: Starts
-    in_domain: InDomain | None = None  #: searches all of the domain; for fitted coordinates
+    along: Continuation | None = None  #: follows lines of values from given starts; for fitted coordinates
+    in_domain: InDomain | None = None  #: searches all of the domain; for fitted coordinates with r > 1
     inside: Inside | None = None  #: finds points inside that keep the task; for fitted coordinates
+    curves: SelfMotionCurves | None = None  #: finds the nearest xi at a task value; for fitted coordinates with r = 1
 
     def solve(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Solutions:
         """Solutions for targets (N, n), from starts (N, n) or our own. Rows that are not finite fail."""
@@ -105,12 +109,19 @@ class Inverse:
         best = self._attempt(targets, self.starts.guess(targets) if starts is None else starts, tolerance)
         self._tell_beyond(targets, best)
         if inside and self.inside is not None:
-            self._search_inside(self.inside, targets, best, tolerance)
+            own = best.q.copy() if starts is None else starts
+            if self.curves is not None:
+                self._search_curves(self.curves, self.inside, targets, best, own, tolerance)
+            else:
+                self._search_inside(self.inside, targets, best, tolerance)
         elif starts is None:
             self._restart(targets, best, self._open(best), _FIRST, InverseStatus.FOUND, tolerance)
             self._search_domain(targets, best, self._open(best), tolerance)
             rows = np.flatnonzero(best.status == InverseStatus.NOT_FOUND)
             self._restart(targets, best, rows, _RESTARTS, InverseStatus.SINGULAR, tolerance)
+        elif self.along is not None:
+            rows = self._open(best)
+            best.improve(rows, self._judged(self.along(targets[rows], starts[rows]), tolerance))
         return best
 
     def _tell_beyond(self, targets: Array, best: Found) -> None:
@@ -125,6 +136,11 @@ class Inverse:
 
     def _search_domain(self, targets: Array, best: Found, rows: Indices, tolerance: float) -> None:
         """Search all of the domain in some rows."""
+        if rows.size and self.curves is not None:
+            near = self.curves.search(targets[rows], best.q[rows], tolerance)
+            found = near.distance == 0
+            best.improve(rows[found], self._found(targets[rows[found]], near.q[found]))
+            return
         if rows.size and self.in_domain is not None:
             q, _ = self.in_domain.search(targets[rows], tolerance)
             attempt = Attempt(q, self.phi_map.residual(targets[rows], q), best.iterations[rows], np.ones(len(q), bool))
@@ -141,6 +157,39 @@ class Inverse:
             if not left.any():
                 break
             best.improve(rows[left], self._attempt(targets[rows[left]], start[left], tolerance))
+
+    def _search_curves(
+        self, curves: SelfMotionCurves, inside: Inside, targets: Array, best: Found, own: Array, tolerance: float
+    ) -> None:
+        """Replace what is not found by other solutions, or the nearest xi, on self-motion curves inside the domain."""
+        rows = np.flatnonzero(best.status != InverseStatus.FOUND)
+        missing = self._take_nearest(curves, inside, targets, best, rows, own[rows], tolerance)
+        q, in_reach = inside.with_task(targets[missing], best.q[missing])
+        again, own = missing[in_reach], q[in_reach]
+        left = self._take_nearest(curves, inside, targets, best, again, own, tolerance)
+        self._replace(targets, best, missing[~in_reach], q[~in_reach], tolerance)
+        self._replace(targets, best, left, own[np.isin(again, left)], tolerance)
+
+    def _take_nearest(
+        self,
+        curves: SelfMotionCurves,
+        inside: Inside,
+        targets: Array,
+        best: Found,
+        rows: Indices,
+        own: Array,
+        tolerance: float,
+    ) -> Indices:
+        """Put the nearest points on curves into some rows; returns the rows without any."""
+        if not rows.size:
+            return rows
+        near = curves.search(targets[rows], own, tolerance)
+        has = np.isfinite(near.distance)
+        between = np.flatnonzero(near.between & has)
+        if between.size:  # xi turns back there
+            near.q[between] = inside.nearer(targets[rows[between]], near.q[between])
+        self._replace(targets, best, rows[has], near.q[has], tolerance)
+        return np.asarray(rows[~has], dtype=np.int64)
 
     def _search_inside(self, inside: Inside, targets: Array, best: Found, tolerance: float) -> None:
         """Replace what is not found by other solutions, or the nearest coordinates, inside the domain."""
@@ -183,6 +232,11 @@ class Inverse:
         if doubtful.size:
             status[doubtful[self.phi_map.is_singular(attempt.q[doubtful])]] = InverseStatus.SINGULAR
         return Found(attempt.q, attempt.residual, attempt.iterations, status)
+
+    def _found(self, targets: Array, q: Array) -> Found:
+        """Solutions inside the domain (N, n)."""
+        status = np.full(len(q), int(InverseStatus.FOUND))
+        return Found(q, self.phi_map.residual(targets, q), np.zeros(len(q), dtype=np.int64), status)
 
     def _status(self, q: Array) -> Indices:
         """Where solutions (N, n) lie."""

@@ -6,14 +6,17 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from orthocas.charts.continuation import Continuation
 from orthocas.charts.coordinates import Coordinates, InvertibleMap
+from orthocas.charts.curves import SelfMotionCurves
 from orthocas.charts.in_domain import BoxedPhi, Cells, InDomain
 from orthocas.charts.inside import Inside, Nearest
 from orthocas.charts.inverse import Inverse
 from orthocas.charts.newton import FewRows, LocalSolver, Newton, OwnInverse, PointFunctions, Starts, inverse_function
 from orthocas.charts.phi import Differences, PhiFunctions, PhiMap
-from orthocas.charts.solutions import ReachingTracker, Solutions, Tracker, parts_of
-from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError
+from orthocas.charts.reaching import ReachingTracker, near_function
+from orthocas.charts.solutions import Solutions, Tracker
+from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, units_hint
 from orthocas.tasks.domains import bounds_of, sample_uniform
 from orthocas.tasks.problem import task_sizes
 from orthocas.tools.cached import cached_property
@@ -76,7 +79,12 @@ class InverseMethods(PhiFunctions):
         if q_start is not None:
             as_point_set("q_start", q_start, self.n)
         require_kind("outside", outside, bool)
-        found = self.solve(targets, q_start, tolerance=tolerance).require(inside=False)
+        found = self.solve(targets, q_start, tolerance=tolerance)
+        try:
+            found.require(inside=False)
+        except InverseError as error:
+            hint = units_hint(self.problem.task.units, np.abs(targets[:, : self.m]).max(axis=0).tolist())
+            raise InverseError(f"{error}{hint}") from None
         beyond = np.flatnonzero(~found.found)
         if beyond.size and not outside:
             raise self._outside_error(targets, q_start, found, beyond, single)
@@ -94,18 +102,21 @@ class InverseMethods(PhiFunctions):
         """Solve phi(q) = phi for q, with a status for each row: a row that fails does not disturb the others.
 
         Several q may have the same phi, inside the domain too. With `q_start`, Newton's method searches from there
-        only, and q is the solution that it reaches, inside the domain or not. Otherwise it starts at a rough inverse of
-        phi, a polynomial fitted to points of the domain, then at stored points of the domain whose phi is nearest. Rows
-        that still have no solution inside are searched for in all cells of the domain that may hold one. q is the first
-        solution inside that is found; `solutions` has all.
+        only, and q is the solution that it reaches. Where that is none inside the domain, q follows the straight line
+        from phi(q_start) to phi, so that every xi within `xi_range(q_start)` is found. Without a start, Newton's method
+        starts at a rough inverse of phi, a polynomial fitted to points of the domain, then at stored points of the
+        domain whose phi is nearest. Rows that still have no solution inside are searched for along the self-motion
+        curves of x (r = 1), or in all cells of the domain that may hold one. q is the first solution inside that is
+        found; `solutions` looks for all.
 
         Args:
             phi: target values, (n,) or (N, n). Rows that are not finite get the status BAD_INPUT.
             q_start: initial guess (n,), or (N, n) with one guess per row of phi.
             tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components, `phi_sizes`.
             inside: keep q in the domain, and so within the joint limits. Rows without a solution there, from q_start or
-                other starts, get the q inside with the same x and the nearest xi that is found, a local minimum, with
-                the status NEAREST, or NOT_FOUND if none with that x is found. Not for grown coordinates.
+                other starts, get the q inside with the same x and the nearest xi that is found, with the status
+                NEAREST, or NOT_FOUND if none with that x is found. With r = 1, it is the nearest one on all self-motion
+                curves of x that are found; with more coordinates, a local minimum. Not for grown coordinates.
             local: another solver of phi(q) = phi near given starts; `orthocas.compile_inverse` has one.
 
         Returns:
@@ -147,8 +158,8 @@ class InverseMethods(PhiFunctions):
             tolerance: as in `solve`.
 
         Returns:
-            As `solve`: FOUND where that xi is possible, NEAREST where another one had to be taken, NOT_FOUND where no
-            position with that x was found.
+            As `solve`: FOUND where a position with that xi was found, NEAREST where only others with that x were
+            found, NOT_FOUND where none was.
 
         Raises:
             ShapeError: if a row has another number of entries, or x another number of rows.
@@ -202,13 +213,13 @@ class InverseMethods(PhiFunctions):
             q0: a joint position inside the domain, (n,).
             largest_step: largest change of each joint in a call, (n,) or one number [rad] or [m]; default: a tenth of
                 the half-widths of the domain.
-            nearest: where phi is out of reach, go to the nearest x, and with that to the nearest xi, instead of staying
-                where it was; see `ReachingTracker`. For domains that are boxes, clear or not, and wide charts.
+            nearest: where phi is out of reach, descend to the nearest x, and with that to the nearest xi, instead of
+                staying where it was; see `ReachingTracker`.
 
         Raises:
             NoExpressionError: if the coordinates are grown.
             InvalidValueError: if q0 lies outside the domain, or J is singular there.
-            DomainError: for `nearest=True` on other domains.
+            DomainError: if the domain has a condition, but no expression of it.
         """
         self._require_expression("a tracker")
         require_kind("nearest", nearest, bool)
@@ -290,7 +301,8 @@ class InverseMethods(PhiFunctions):
         local = FewRows(phi_map, self._point_functions, Newton(phi_map))
         by_ipopt = Nearest(domain, self.m, self.function("phi"), phi_map)
         in_domain, inside = InDomain(boxed, Cells(boxed)), Inside(boxed, starts, by_ipopt)
-        return Inverse(self.problem, phi_map, local, starts, in_domain, inside)
+        curves = SelfMotionCurves(boxed, starts, self.xi) if self.r == 1 else None
+        return Inverse(self.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves)
 
     @cached_property
     def _inverse_function(self) -> ca.Function:
@@ -298,12 +310,13 @@ class InverseMethods(PhiFunctions):
 
     @cached_property
     def _point_functions(self) -> PointFunctions:
-        return PointFunctions.of(self.function("phi"), self.rates, self.phi_sizes, self.phi_map.difference)
+        parts = self.function("phi"), self.rates, self.phi_sizes, self.phi_map.difference
+        return PointFunctions.of(*parts, self.problem.turning)
 
     @cached_property
-    def reaching(self) -> tuple[ca.Function, ca.Function]:
-        """The functions of `ReachingTracker`."""
-        return parts_of(self.function("phi"), self.rates, self.m, self.phi_map, self.problem.domain)
+    def reaching(self) -> ca.Function:
+        """The function of `ReachingTracker`: see `near_function`."""
+        return near_function(self.function("phi"), self.rates, self.m, self.phi_map, self.problem.domain)
 
     def _outside_error(
         self, targets: Array, q_start: ArrayLike | None, found: Solutions, beyond: Indices, single: bool

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from orthocas.charts.coordinates import InvertibleMap
 from orthocas.charts.phi import ROUNDING, Differences, PhiMap, largest
 from orthocas.errors import SingularTaskError
-from orthocas.tasks.domains import Domain, sample_uniform
+from orthocas.tasks.domains import Domain, sample_heavily
 from orthocas.tools.batch import dense_function, in_threads
-from orthocas.tools.cached import cached_property
+from orthocas.tools.cached import BuiltOnUse, cached_property
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.interrupts import deferred
 
@@ -212,9 +212,12 @@ class PointFunctions:
 
     inverted: ca.Function  #: q -> phi, H = J^-1, and |D^-1 J| |H D| with the sizes D of the components
     chord: ca.Function  #: q, phi, H, target -> q and phi after 3 steps, and |residual| at each of the 4 points
+    turning: tuple[int, ...] = ()  #: joints that turn without end, as in `Problem.turning`
 
     @classmethod
-    def of(cls, phi: ca.Function, jacobian: ca.Function, sizes: Array, difference: Differences) -> "PointFunctions":
+    def of(
+        cls, phi: ca.Function, jacobian: ca.Function, sizes: Array, difference: Differences, turning: tuple[int, ...]
+    ) -> "PointFunctions":
         """For phi and J of a column q (n, 1), and the sizes and differences of phi, as in `PhiMap`."""
         n = len(sizes)
         q, known, target = (ca.MX.sym(name, n) for name in ("q", "phi", "target"))
@@ -229,7 +232,12 @@ class PointFunctions:
             left = difference(target, value)
             errors.append(ca.norm_2(left / scale))
         chord = dense_function("chord", [q, known, H, target], [now, value, ca.vertcat(*errors)])
-        return cls(inverted, chord)
+        return cls(inverted, chord, turning)
+
+    def distance(self, phi: Array, target: Array) -> float:
+        """|target - phi| relative to the sizes of the components, by the shorter way around."""
+        n = len(phi)
+        return float(self.chord(np.zeros(n), phi, np.zeros((n, n)), target)[2][0])
 
 
 class PointSolver:
@@ -371,17 +379,31 @@ class Starts:
             count: points for each target.
             components: how many components of phi count, the first ones.
         """
-        points, phi = self._table
-        known, wanted = self._normalised(phi)[:, :components], self._normalised(targets)[:, :components]
+        points, wanted = self._table[0], self._places(targets, components)
+        known = self._known[components]
         parts = [wanted[start : start + _AT_ONCE] for start in range(0, len(wanted), _AT_ONCE)]
         order = np.concatenate([_nearest(known, part, min(count, len(points))) for part in parts])
         nearest: Array = points[order.T]
         return nearest
 
     @cached_property
+    def _known(self) -> BuiltOnUse[int, Array]:
+        """Places of the table by the number of components that count."""
+        return BuiltOnUse(lambda components: self._places(self._table[1], components))
+
+    def _places(self, phi: Array, components: int) -> Array:
+        """Numbers (N, k) that are near one another where the first components of phi (N, n) are."""
+        normalised, relative = self._normalised(phi)[:, :components], self._map.difference.task
+        if relative is None or not relative.turned:
+            return normalised
+        first, last = relative.first, relative.task.m
+        orientations = relative.embedded(phi[:, :last]) / self._range[1][first:last].mean()
+        return np.concatenate([normalised[:, :first], orientations, normalised[:, last:]], axis=1)
+
+    @cached_property
     def _table(self) -> tuple[Array, Array]:
         """Points of the domain where phi is defined, and phi, (K, n) each."""
-        return where_known(self._map, sample_uniform(self._domain, _POINTS, _SEED))
+        return where_known(self._map, sample_heavily(self._domain, _POINTS, _SEED))
 
     @cached_property
     def _range(self) -> tuple[Array, Array]:

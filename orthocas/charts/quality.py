@@ -16,7 +16,7 @@ from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.samples import idle_joints, samples_at
 from orthocas.tools.batch import in_threads
 from orthocas.tools.checks import Array, Indices, as_point_set, require_count, require_kind, require_memory
-from orthocas.tools.display import Shown, listed
+from orthocas.tools.display import Shown, listed, percent
 from orthocas.tools.json import attributes, plain
 
 if TYPE_CHECKING:
@@ -275,13 +275,12 @@ class Report(Shown):
         faults = {}
         if self.folded_samples:
             at = ", ".join(f"{value:.2f}" for value in self.worst_point)
-            share = self.folded_samples / self.samples
-            faults["folded"] = (
-                f"{share:.3%} of the {self._where}, where det J changes sign; conditioning worst at q = ({at})"
-            )
+            share = percent(self.folded_samples / self.samples, 3, fault=True)
+            worst = f"conditioning worst at q = ({at})"
+            faults["folded"] = f"{share} of the {self._where}, where det J changes sign; {worst}"
         if self.singular_samples:
-            share = self.singular_samples / self.samples
-            faults["left out"] = f"{share:.3%} of the {self._where}: singular, or without a value"
+            share = percent(self.singular_samples / self.samples, 3, fault=True)
+            faults["left out"] = f"{share} of the {self._where}: singular, or without a value"
         if self.degenerate:
             advice = "another domain, a larger lambda2 of the fit, or another leaf of a grown chart may help"
             faults["DEGENERATE"] = f"coordinates are nearly parallel to each other or to the task: {advice}"

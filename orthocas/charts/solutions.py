@@ -9,35 +9,29 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocas.charts.newton import GOAL, REFRESHES, Bound, PointFunctions, PointSolver
-from orthocas.charts.phi import PhiMap
-from orthocas.errors import DomainError, InvalidValueError, InverseError, degrees_hint
+from orthocas.errors import InvalidValueError, InverseError, degrees_hint
 from orthocas.tasks.domains import Domain, bounds_of, contains, reach
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, Indices, as_float_array, as_point, require_shape
 from orthocas.tools.display import Shown, listed, number_list
+from orthocas.tools.expressions import shortest
 from orthocas.tools.interrupts import deferred
 
 _FEW = 5  # rows that a message names
 _ROUNDED = 1e-9  # error up to which only rounding may have stopped the decrease
+_RETURNED = 1e-8  # of phi, relative to its sizes: the tracker is back
 _STEP = 0.1  # of the half-widths: default of the largest change of q in a call
-_WEIGHT = 1e-3  # of errors of xi, relative to those of x
-KEPT = 1e-5  # error of x over its size up to which xi gives way instead of going deeper into a zone
-ZONE = 0.02  # next to the boundary, in half-widths of joints and in relative room of conditions
-DESCENTS, _HALVINGS = 12, 20  # steps of Gauss and Newton in a call, and halvings of one
-INERTIA = 1e-3  # weight of the way from the last q, in half-widths
-_CONVERGED = 1e-10  # relative decrease of the cost at which a call ends
-_DECREASE = 1e-4  # of the cost, relative to what the model promises
 
 
 class InverseStatus(IntEnum):
     """How the search for a q with phi(q) = phi ended, from best to worst."""
 
     FOUND = 0  #: a solution inside the domain
-    NEAREST = 1  #: no such q lies inside; this one does, has the same x, and its xi is as near as could be found
-    OUTSIDE_DOMAIN = 2  #: a solution within the joint limits, but outside the domain
-    LIMIT = 3  #: a solution beyond the joint limits
-    SINGULAR = 4  #: a solution at which J is singular, so that it is not unique
+    NEAREST = 1  #: none was found inside; this q lies inside, has the same x, and the nearest xi that was found
+    OUTSIDE_DOMAIN = 2  #: none was found inside; this solution lies within the joint limits, but outside the domain
+    LIMIT = 3  #: none was found within the joint limits; this solution lies beyond them
+    SINGULAR = 4  #: a solution at which J is singular, so that it need not be unique
     NOT_FOUND = 5  #: no solution was found, which does not prove that there is none; q has the smallest error found
     BAD_INPUT = 6  #: a number of phi or of the start is not finite; q is NaN
     OUT_OF_REACH = 7  #: no solution: x is farther from the first joint than the arm is long; q as for NOT_FOUND
@@ -116,10 +110,12 @@ class Solutions(Shown):
             )
         singular = np.flatnonzero(self.status == InverseStatus.SINGULAR)
         if singular.size:
-            raise InverseError(f"the Jacobian is singular at the solution of row {singular[0]}: q is not unique there")
+            raise InverseError(
+                f"the Jacobian is singular at the solution of row {singular[0]}: q need not be unique there"
+            )
         beyond = np.flatnonzero(~np.isin(self.status, accepted))
         if beyond.size:
-            raise InverseError(f"the only q with phi(q) = phi lies outside the domain for {self.named(beyond)}")
+            raise InverseError(f"q with phi(q) = phi was found only outside the domain for {self.named(beyond)}")
         return self
 
     def named(self, rows: Indices) -> str:
@@ -128,7 +124,7 @@ class Solutions(Shown):
 
 
 class TrackerStatus(IntEnum):
-    """How the last call of a tracker ended. With all but OK and NEAREST, q stays where it was."""
+    """How the last call of a tracker ended. With all but OK, NEAREST and NEARER, q stays where it was."""
 
     OK = 0  #: phi(q) = phi, inside the domain
     JUMP = 1  #: q would have moved by more than `largest_step`
@@ -136,7 +132,8 @@ class TrackerStatus(IntEnum):
     SINGULAR = 3  #: J is singular, or nearly so
     LOST = 4  #: no solution near the last q
     BAD_INPUT = 5  #: a number of phi is not finite
-    NEAREST = 6  #: q moved, as near to phi as it could; of trackers with `nearest=True`
+    NEAREST = 6  #: a local minimum of the distance to phi in the domain; of trackers with `nearest=True`
+    NEARER = 7  #: at least as near as before, but no minimum: `largest_step` or the work of a call ended the descent
 
 
 class Tracker(Shown):
@@ -189,6 +186,20 @@ class Tracker(Shown):
         return self._solver.q.copy()
 
     @property
+    def left_over(self) -> Array | None:
+        """What the way since the last reset leaves over in the joints, (n,), less full turns of endless joints.
+
+        None while x or xi differ from those of the start. A loop around a full turn of tool or base may leave
+        something over, see `Chart.left_over`.
+        """
+        q, phi = self._start
+        if self._functions.distance(phi, self._solver.phi) > _RETURNED:
+            return None
+        turns = np.zeros(len(q))
+        turns[list(self._functions.turning)] = 2 * np.pi
+        return np.asarray(shortest(self._solver.q - q, turns))
+
+    @property
     def largest_step(self) -> Array:
         """Largest change of each joint in a call, (n,) [rad] or [m]."""
         return self._limit
@@ -217,6 +228,7 @@ class Tracker(Shown):
         self._solver.q[:] = point
         if not self._solver.refresh():
             raise InvalidValueError("q", point.tolist(), "a point where J is regular")
+        self._start = self._solver.q.copy(), self._solver.phi.copy()
         self.status = TrackerStatus.OK  #: how the last call ended
 
     def step(self, phi: ArrayLike) -> Array:
@@ -276,171 +288,3 @@ def _guard(domain: Domain, limit: Array) -> ca.Function:
     if domain.condition is not None:
         outside = ca.fmax(outside, ca.if_else(ca.mmin(domain.condition.pivots(q)) > 0, -1, 1))
     return dense_function("guard", [before, q], [ca.vertcat(ca.norm_inf((q - before) / ca.DM(limit)), outside)])
-
-
-class ReachingTracker(Tracker):
-    """A `Tracker` that goes as near as it can where phi is out of reach.
-
-    It minimises, from where it is,
-
-        |D^-1 e_x|^2 + w^2 |e_xi|^2 + sum over boundaries of max(0, 1 - room / zone)^2
-
-    by damped Gauss-Newton steps, with the sizes D of x, w = 0.001 and a zone of 2 % next to the boundaries. The cost is
-    smooth, so q is smooth in phi where the minimum is. A phi that is reached is met to rounding, as by `Tracker`,
-    unless xi alone leads deeper into a zone; otherwise `status` is NEAREST: x has priority, xi gives way. q never
-    leaves the domain, and no joint moves more than `largest_step` in a call.
-    """
-
-    def __init__(
-        self,
-        functions: PointFunctions,
-        domain: Domain,
-        q0: ArrayLike,
-        largest_step: ArrayLike | None,
-        parts: tuple[ca.Function, ca.Function],
-        m: int,
-    ) -> None:
-        self._parts, self._m = parts, m
-        super().__init__(functions, domain, q0, largest_step)
-        n, rooms = len(domain.centre), parts[1].size1_out(0)
-        self._at, self._to, self._e, self._rooms = np.empty(n), np.empty(n), np.empty(n), np.empty(rooms)
-        self._J, self._slopes = np.empty((n, n)), np.empty((n, rooms))
-        self._near = Bound(parts[0], [self._at, self._to], [self._e, self._J, self._rooms])
-        self._inwards = Bound(parts[1], [self._at], [self._slopes])
-        widths = reach(domain)
-        self._bounded = np.flatnonzero(np.isfinite(widths))
-        self._widths = widths[self._bounded]
-
-    def __getstate__(self) -> dict[str, object]:
-        """Without scratch memory."""
-        return {**super().__getstate__(), "parts": self._parts, "m": self._m}
-
-    def __setstate__(self, state: dict[str, object]) -> None:
-        names = ("functions", "domain", "q", "limit", "parts", "m")
-        self.__init__(*(state[name] for name in names))  # type: ignore[misc]
-
-    def step(self, phi: ArrayLike) -> Array:
-        """As `Tracker.step`; where that stays, the nearest q (n,) that a search from the last one finds."""
-        start = self.q
-        q = super().step(phi)
-        reached = self.status is TrackerStatus.OK
-        if self.status is TrackerStatus.BAD_INPUT or (reached and not self._goes_deeper(start, q)):
-            return q
-        found = self._descended(start if reached else q)
-        if reached:
-            self._cost(found)
-            if np.abs(self._e[: self._m]).max() > KEPT:  # x leads there, too
-                return q
-        self._solver.q[:] = found
-        if not self._solver.refresh():
-            self._solver.q[:] = q
-            self._solver.refresh()
-            return q
-        self.status = TrackerStatus.NEAREST
-        return found
-
-    def _descended(self, q: Array) -> Array:
-        """Where Gauss-Newton steps lead from q (n,), within the domain and the largest step."""
-        start, now = q, q
-        self._to[:] = self._solver.target
-        pull = (INERTIA / self._domain.half_width) ** 2
-        cost = self._cost(now)
-        for _ in range(DESCENTS):
-            r, J = self._model()
-            gradient, H = J.T @ r + pull * (now - start), J.T @ J + np.diag(pull)
-            move = -np.linalg.solve(H, gradient)
-            promised = float(-gradient @ move)
-            if promised <= _CONVERGED * cost:
-                break
-            for halvings in range(_HALVINGS + 1):
-                change = now + move * 0.5**halvings - start
-                change /= max(1.0, float(np.abs(change / self._limit).max()))  # joints cut alone would move x
-                after = self._cost(start + change) + float(pull @ change**2) / 2
-                if after < cost - _DECREASE * 0.5**halvings * promised and self._domain.contains(self._at[None])[0]:
-                    break
-            else:
-                break
-            now, cost = start + change, after
-        return np.asarray(now)
-
-    def _goes_deeper(self, start: Array, end: Array) -> bool:
-        """Whether a way ends deeper in a zone than it begins."""
-        self._to[:] = self._solver.target
-        self._cost(end)
-        short = self._short()
-        if not short.any():
-            return False
-        self._cost(start)
-        return bool((short > self._short()).any())
-
-    def _cost(self, q: Array) -> float:
-        """Half the sum of squares at q (n,), without the way from the last q."""
-        self._at[:] = q
-        self._near.run()
-        squares = float(self._e @ self._e + (self._short() ** 2).sum())
-        return squares / 2 if np.isfinite(squares) else np.inf
-
-    def _short(self) -> Array:
-        """How deep the last q lies in the zones of joints, below and above, and of conditions, (k,); 0 outside them."""
-        away = (self._at - self._domain.centre)[self._bounded] / self._widths
-        rooms = np.concatenate([1 - away, 1 + away, self._rooms])
-        return np.maximum(0.0, 1 - rooms / ZONE)
-
-    def _model(self) -> tuple[Array, Array]:
-        """The residuals other than 0 at the last q, and their Jacobian."""
-        short = self._short()
-        active, k = short > 0, len(self._bounded)
-        rows = np.zeros((len(short), len(self._at)))
-        joints = np.arange(k)
-        rows[joints, self._bounded], rows[k + joints, self._bounded] = 1 / self._widths, -1 / self._widths
-        if active[2 * k :].any():
-            self._inwards.run()
-            rows[2 * k :] = -self._slopes.T
-        r = np.concatenate([self._e, short[active]])
-        return r, np.vstack([self._J.T, rows[active] / ZONE])
-
-
-def parts_of(
-    phi: ca.Function, rates: ca.Function, m: int, known: PhiMap, domain: Domain
-) -> tuple[ca.Function, ca.Function]:
-    """The errors of phi and the rooms of the domain's conditions, for `ReachingTracker`.
-
-    Returns:
-        q, phi_d (n, 1) -> weighted errors (n, 1), their Jacobian (n, n), rooms (k, 1); and q -> slopes of rooms (k, n).
-
-    Raises:
-        DomainError: if the domain is neither a box nor clear of singular positions.
-    """
-    n = len(known.sizes)
-    q, target = ca.MX.sym("q", n), ca.MX.sym("target", n)
-    weights = ca.DM(np.where(np.arange(n) < m, 1 / known.sizes, _WEIGHT))
-    e = -known.difference(target, phi(q)) * weights
-    rooms = ca.MX(0, 1)
-    clear = domain.singular_bound
-    if clear is not None:
-        rooms = _clearance(clear.gram(q), clear.least_singular_value)
-        if domain.room_to_fold is not None:
-            rooms = ca.vertcat(rooms, domain.room_to_fold(q))
-    elif not domain.is_box:
-        raise DomainError(f"a domain of kind '{domain.name}' has no nearest x, expected a box or a clear box")
-    near = dense_function("near", [q, target], [e, rates(q) * ca.repmat(weights, 1, n), rooms], ["q", "phi"])
-    return near, dense_function("inwards", [q], [ca.jacobian(rooms, q)])
-
-
-def _clearance(gram: ca.MX, bound: float) -> ca.MX:
-    """The product of 1 - bound^2 / sigma_i^2 over the singular values, which is 0 where the least one is the bound."""
-    m = gram.shape[0]
-    symbol = ca.SX.sym("G", m, m)
-    share = ca.SX(1)
-    for pivot, whole in zip(_pivots(symbol - bound**2 * ca.SX.eye(m)), _pivots(symbol), strict=True):
-        share *= pivot / whole
-    return ca.Function("clearance", [symbol], [ca.cse(share)])(gram)
-
-
-def _pivots(A: ca.SX) -> list[ca.SX]:
-    found = []
-    while True:
-        found.append(A[0, 0])
-        if A.shape[0] == 1:
-            return found
-        A = A[1:, 1:] - A[1:, 0] @ A[0, 1:] / A[0, 0]

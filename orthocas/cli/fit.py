@@ -55,9 +55,10 @@ from orthocas.solvers import get as get_solver
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.problem import Problem
 from orthocas.tools.archive import require_free
-from orthocas.tools.display import number_list
+from orthocas.tools.display import listed, number_list, percent
 from orthocas.tools.json import attributes
 
+_WIDE_ROWS = ("regular", "left out", "meaning")  # facts of wide fits
 _IN_CORRIDOR = "polynomial:3:cyclic"  # more terms gain little there
 
 
@@ -172,6 +173,8 @@ def fit(
                 )
     except Interrupted as stop:
         result = stop.result
+    if isinstance(result, WideFit) and result.left_out:
+        note(f"the chart of branch '{result.chart.notes['branch']}' leaves out {result.left_out}")
     result.chart.save(target, force)
     report = evaluate(result.chart, seed=seed + 1)
     if json:
@@ -238,15 +241,15 @@ def _bounds(
 
 
 def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
-    coordinates = result.chart.coordinates
+    coordinates, robot = result.chart.coordinates, result.chart.problem.robot
     rows = report.facts() if isinstance(result, WideFit) else report_rows(report)  # wide fits have no --weights
+    rows["robot"] = f"{robot.n} joints, {'tip' if len(robot.tips) == 1 else 'tips'} {listed(robot.tips)}"
     rows["fit"] = f"{coordinates.label}, {result.seconds:.2f} s, {result.status.value}"
     if isinstance(result, WideFit) and result.branch is not None:
-        rows["branch"] = f"{result.branch.name}, {result.branch.share:.1%} of the clear positions of the joint range"
-        rows["regular"] = f"{result.regular_share:.3%} of the clear positions of the branch, which are the domain"
-        if (error := result.chart.notes.get("error of its meaning")) is not None:
-            meaning = result.chart.notes["meaning"]
-            rows["meaning"] = f"xi1 is like {meaning}, {float(error):.2g} off (rms) along the home's self-motion"
+        rows["branch"] = (
+            f"{result.branch.name}, {percent(result.branch.share)} of the clear positions of the joint range"
+        )
+        rows |= {name: text for name, text in result.facts().items() if name in _WIDE_ROWS}
     if result.like:
         rows["like"] = ", ".join(f"{name} {angle:.3g} deg off" for name, angle in result.like.items())
     if result.idle_joints:
@@ -256,14 +259,20 @@ def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
     check, offer = result.problem_check, result.clear_part
     if check.singular_samples:
         at = ", ".join(f"{value:.2f}" for value in check.most_singular_point)
-        rows["singular"] = f"{check.singular_share:.2%} of the domain is near-singular, worst at q = ({at})"
+        rows["singular"] = (
+            f"{percent(check.singular_share, 2, fault=True)} of the domain is near-singular, worst at q = ({at})"
+        )
         if offer is None:
             rows["singular"] += "; --domain auto, or another --centre or --home, stays clear"
     if check.half_turn_samples:
-        rows["half a turn"] = f"at {check.half_turn_share:.2%} of the domain the task's own orientation ends"
+        rows["half a turn"] = (
+            f"at {percent(check.half_turn_share, 2, fault=True)} of the domain the task's own orientation ends"
+        )
     if offer is not None:
         bound, share = offer.least_singular_value, offer.share
-        rows["clear part"] = f"--least-singular-value {bound:g} leaves out singular positions and keeps {share:.1%}"
+        rows["clear part"] = (
+            f"--least-singular-value {bound:g} leaves out singular positions and keeps {percent(share)}"
+        )
     return {**rows, **reach_rows(result.chart), "chart": str(target)}
 
 
@@ -278,7 +287,12 @@ def _domain_rows(suggestion: DomainSuggestion) -> dict[str, str]:
 def _wide(result: Fit) -> dict[str, Any]:
     if not isinstance(result, WideFit) or result.branch is None:
         return {}
-    return {"branch": result.branch.name, "regular_share": result.regular_share}
+    meaning = None if result.meaning is None else {"like": result.chart.notes["meaning"], **asdict(result.meaning)}
+    return {
+        "branch": result.branch.name,
+        **attributes(result, "regular_share", "left_out"),
+        "meaning": meaning,
+    }
 
 
 def _as_dict(result: Fit, report: Report, target: Path, suggestion: DomainSuggestion | None) -> dict[str, Any]:
@@ -286,6 +300,7 @@ def _as_dict(result: Fit, report: Report, target: Path, suggestion: DomainSugges
     return {
         **({} if suggestion is None else {"suggested_domain": suggestion.as_dict()}),
         "chart": str(target),
+        "tips": list(result.chart.problem.robot.tips),
         **reach_data(result.chart),
         "parametrisation": result.chart.coordinates.label,
         "status": result.status.value,

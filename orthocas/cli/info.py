@@ -21,13 +21,19 @@ from orthocas.cli.problem_argument import (
 from orthocas.errors import OptionError, RobotError, SingularTaskError
 from orthocas.exact.involutivity import involutivity
 from orthocas.robots.robot import Robot
+from orthocas.tasks.branches import CLEAR
 from orthocas.tasks.branches import branches as find_branches
 from orthocas.tasks.problem import Problem, check
+from orthocas.tasks.samples import NEGLIGIBLE
 from orthocas.tasks.task import Task
+from orthocas.tools.display import percent
 from orthocas.tools.json import plain
 
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
+
+_FAULTS = ("near_singular_share", "half_turn_share")
+_SHARES = ("share", "clear_share", "share of the branch", "branches", *_FAULTS)  #: names of numbers to show in percent
 
 
 @with_options(*ROBOT)
@@ -62,7 +68,7 @@ def info(
     if json:
         print_json(data)
     else:
-        print_rows({name: _text(value) for name, value in data.items()})
+        print_rows({name: _text(value, name) for name, value in data.items()})
 
 
 def _load(path: Path) -> "Chart":
@@ -91,6 +97,7 @@ def _robot(robot: Robot) -> dict[str, Any]:
         "tip": robot.tree.tip_name,
         **({"tips": list(robot.tips)} if robot.tree.tips else {}),
         "mass_kg": float(robot.tree.masses.sum()),
+        "gravity": plain(robot.tree.gravity),
     }
 
 
@@ -104,17 +111,23 @@ def _redundancy(robot: Robot) -> dict[str, Any]:
         J = task.batched_frame_jacobian(q[None])[0].reshape(task.m, robot.n)
         if np.linalg.matrix_rank(J) == task.m < robot.n - len(floating):
             columns = zip(robot.joint_names, J.T, strict=True)
-            idle = [] if floating else [name for name, column in columns if not column.any()]
+            still = NEGLIGIBLE * np.abs(J).max()
+            idle = [] if floating else [name for name, column in columns if np.abs(column).max() <= still]
             found[kind] = f"r = {robot.n - len(floating) - task.m}" + (f", idle: {', '.join(idle)}" if idle else "")
     return {"extra_coordinates": found}
 
 
 def _branches(robot: Robot, task: Task | None) -> dict[str, Any]:
-    """The branches of the joint range: what cuts it, and for each its share of the clear positions and a posture."""
+    """The branches of the joint range: what cuts it, and for each its share of the clear positions and a posture.
+
+    Branches that are too near to singular positions for the default clearance of wide charts have the one they allow.
+    """
     found = find_branches(robot, task)
+    lower = {item.name: item.clearance for item in found if item.clearance < CLEAR}
     return {
         "cuts": [cut.explained for cut in found.cuts],
         "branches": {item.name: item.share for item in found},
+        **({"clearance_at_most": lower} if lower else {}),
         "postures": {item.name: plain(item.posture) for item in found},
     }
 
@@ -161,11 +174,13 @@ def _involutivity(problem: Problem) -> dict[str, Any]:
     }
 
 
-def _text(value: Any) -> str:
+def _text(value: Any, name: str = "") -> str:
     if isinstance(value, list):
         return ", ".join(_text(item) for item in value) or "none"
     if isinstance(value, dict):
-        return ", ".join(f"{name} {_text(item)}" for name, item in value.items())
+        return ", ".join(f"{key} {_text(item, name if name in _SHARES else key)}" for key, item in value.items())
     if value is None:
         return "unlimited"
+    if isinstance(value, float) and name in _SHARES:
+        return percent(value, 3, fault=name in _FAULTS)
     return f"{value:.4g}" if isinstance(value, float) else str(value)

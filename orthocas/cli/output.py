@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from orthocas.errors import one_line, printable
+from orthocas.tools.display import percent
 from orthocas.tools.json import to_json
 from orthocas.tools.progress import Monitor, Progress
 
@@ -130,7 +131,7 @@ def lines_of_progress(pause: float) -> Iterator[Monitor]:
     begin, reports, ended = time.monotonic(), [""], threading.Event()
 
     def show(progress: Progress) -> None:
-        reports[0] = f", {progress.stage}, {progress.fraction:.0%}: {progress.detail}"
+        reports[0] = f", {progress.stage}, {percent(progress.fraction, 0)}: {progress.detail}"
 
     def speak() -> None:
         while not ended.wait(pause):

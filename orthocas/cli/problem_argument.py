@@ -1,5 +1,6 @@
 """Arguments that describe a problem: a name or a robot file, task, metric, domain, weights."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import typer
 from orthocas import problems
 from orthocas.bases.family import Parametrisation
 from orthocas.cli.output import number, spread, whole_number
-from orthocas.errors import InvalidValueError, OptionError, UnknownNameError
+from orthocas.errors import BranchWarning, InvalidValueError, OptionError, UnknownNameError
 from orthocas.fitting.probe import Bounds
 from orthocas.fitting.suggest_domain import DomainSuggestion, suggest_domain
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Angles, Weights
@@ -21,7 +22,7 @@ from orthocas.tasks.domains import default_box
 from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.regular_box import regular_box
-from orthocas.tasks.task import Task
+from orthocas.tasks.task import Task, task_kinds
 from orthocas.tools.checks import Array
 from orthocas.tools.progress import Monitor
 
@@ -44,11 +45,17 @@ _OPTIONS: dict[str, Any] = {
         str | None,
         typer.Option("--tool", help='Pose of a tool on the tip, "x,y,z" or "x,y,z,roll,pitch,yaw" [m, rad].'),
     ],
-    "task": Annotated[
+    "gravity": Annotated[
         str | None,
         typer.Option(
-            "--task", help="Task: position, position:xy, polar, orientation, pose, pose:z, axis or position+axis."
+            "--gravity",
+            help='Gravity in the axes of the base of a robot file, "x,y,z" [m/s^2]; default: that of an MJCF file, '
+            "or 0,0,-9.81.",
         ),
+    ],
+    "task": Annotated[
+        str | None,
+        typer.Option("--task", help=f"Task: {', '.join(task_kinds())}; AXES such as xy, AXIS x, y or z."),
     ],
     "metric": Annotated[str | None, typer.Option("--metric", help="Metric: euclidean or inertia.")],
     "centre": Annotated[str | None, typer.Option("--centre", help='Centre of the domain, "0,0.5,..." [rad or m].')],
@@ -70,7 +77,7 @@ _OPTIONS: dict[str, Any] = {
         ),
     ],
 }  #: command-line options of the fields of `ProblemOptions`
-ROBOT = ("tip", "lock", "tool", "base")
+ROBOT = ("tip", "lock", "tool", "base", "gravity")
 CHAIN = (*ROBOT, "task", "metric")
 DOMAIN = ("centre", "home", "half_width")
 _NUMBERS = ("task", "mutual", "regularity", "length", "folds")
@@ -90,7 +97,7 @@ BranchName = Annotated[
 ]
 LikeName = Annotated[
     str | None,
-    typer.Option("--like", help="What the first coordinates mean: a joint or swivel; several: NAME,NAME."),
+    typer.Option("--like", help="What the first coordinates are like: a joint or swivel; several: NAME,NAME."),
 ]
 BRANCH = "branch"  #: the word of --domain for wide charts
 
@@ -103,6 +110,7 @@ class ProblemOptions:
     lock: tuple[str, ...] = ()
     tool: str | None = None
     base: str | None = None
+    gravity: str | None = None
     task: str | None = None
     metric: str | None = None
     centre: str | None = None
@@ -116,9 +124,8 @@ class ProblemOptions:
 
     def require_no_robot(self, owner: str) -> None:
         """Raise OptionError if an option describes a robot, because `owner` has its own."""
-        locked = ", ".join(self.lock) or None
-        for option, value in (("tip", self.tip), ("lock", locked), ("tool", self.tool), ("base", self.base)):
-            if value is not None:
+        for option in ROBOT:
+            if getattr(self, option):
                 raise OptionError(f"{owner} has its own robot: leave out --{option}")
 
 
@@ -140,8 +147,10 @@ def build_robot(path: str, options: ProblemOptions) -> Robot:
         OrthocasError: if anything does not fit together.
     """
     tool = None if options.tool is None else parse_numbers("--tool", options.tool)
+    gravity = None if options.gravity is None else parse_numbers("--gravity", options.gravity)
     tips = [name.strip() for name in (options.tip or "").split(",") if name.strip()]
-    return Robot.from_file(path, None, locked_joints(options.lock), tool, tips=tips, base=options.base)
+    locked = locked_joints(options.lock)
+    return Robot.from_file(path, None, locked, tool, tips=tips, base=options.base, gravity=gravity)
 
 
 def build_problem(name: str, options: ProblemOptions) -> Problem:
@@ -315,16 +324,18 @@ def wide_fit(
     robot = build_robot(name, options) if base is None else base.robot
     known = options.least_singular_value
     quantities = None if like is None else [word.strip() for word in like.split(",")]
-    return fit_wide(
-        robot,
-        Task.named(robot, options.task or "position") if base is None else base.task,
-        branch,
-        (options.metric or "euclidean") if base is None else base.metric,
-        clearance=CLEARANCE if known is None else known,
-        parametrisation=parametrisation,
-        home=options.home if base is None else base.domain.centre if branch is None else None,
-        like=quantities[0] if quantities and len(quantities) == 1 else quantities,
-        samples=samples,
-        seed=seed,
-        monitor=monitor,
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", BranchWarning)  # commands print a note
+        return fit_wide(
+            robot,
+            Task.named(robot, options.task or "position") if base is None else base.task,
+            branch,
+            (options.metric or "euclidean") if base is None else base.metric,
+            clearance=CLEARANCE if known is None else known,
+            parametrisation=parametrisation,
+            home=options.home if base is None else base.domain.centre if branch is None else None,
+            like=quantities[0] if quantities and len(quantities) == 1 else quantities,
+            samples=samples,
+            seed=seed,
+            monitor=monitor,
+        )

@@ -44,6 +44,7 @@ from orthocas.simulation.trajectory import Outcome, Trajectory, coupling_index
 from orthocas.tasks.domains import contains
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import require_known
+from orthocas.tools.display import percent
 from orthocas.tools.files import is_listed, output_folder, published, require_replaceable_files, require_writable
 from orthocas.tools.interrupts import deferred
 from orthocas.tools.json import plain, to_json
@@ -82,6 +83,7 @@ def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajector
         "second": controller.settings.get("second"),
         "gains": controller.gains,
         "outcome": seen.outcome.value,
+        "reason": seen.reason or None,
         "duration": float(seen.times[-1]),
         "tracking_error": dict(zip(seen.labels, seen.tracking_error, strict=True)),
         "coupling_index": _coupling(chart, plan.reference, seen) if judged else None,
@@ -127,7 +129,7 @@ def run_rows(report: dict[str, Any], problem: Problem) -> dict[str, str]:
         )
     rows["command"] = f"at most {command:.4g} {unit}, {joint}"
     if report["saturated_share"]:
-        rows["limit"] = f"reached for {report['saturated_share']:.1%} of the run"
+        rows["limit"] = f"reached for {percent(report['saturated_share'], fault=True)} of the run"
     if report["catches"]:
         rows["statuses"] = ", ".join(f"{name} {time:.3g} s" for name, time in report["seconds_in_status"].items())
     if energy := report["energy"]:
@@ -148,12 +150,12 @@ def fallback_text(report: dict[str, Any]) -> str | None:
         times = "once" if len(report["catches"]) == 1 else f"{len(report['catches'])} times"
         return (
             f"at t = {fallback['since']:.4g} s {fallback['reason']}: the catcher took over, {times} in all, "
-            f"and commanded for {fallback['share']:.1%} of the run"
+            f"and commanded for {percent(fallback['share'], fault=True)} of the run"
         )
     what = "the gravity torque" if report["command"] == "torque" else "zero velocity"
     return (
         f"at t = {fallback['since']:.4g} s {fallback['reason']}: the controller commanded only {what} "
-        f"for {fallback['share']:.1%} of the run"
+        f"for {percent(fallback['share'], fault=True)} of the run"
     )
 
 
@@ -216,7 +218,7 @@ def _text(value: float | None) -> str:
 
 _FILES = ("trajectory.npz", "coordinates.png", "report.json")
 CVODES = "cvodes"  #: the default plant
-_DIVERGED = 1  # exit code when the integrator gave up: the input was valid but the run failed
+_FAILED = (Outcome.DIVERGED, Outcome.LOST)  # the input was valid, but the run failed: exit code 1
 
 
 @with_settings(for_codegen=False)
@@ -299,7 +301,7 @@ def simulate(
     else:
         print_rows(run_rows(report, loaded.problem) | {"files": str(out)})
     _notes(law, report, interrupted)
-    if code := 130 if interrupted else _DIVERGED * (run.outcome is Outcome.DIVERGED):
+    if code := 130 if interrupted else int(run.outcome in _FAILED):
         raise typer.Exit(code)
 
 
@@ -382,6 +384,8 @@ def _notes(law: Controller, report: dict[str, Any], interrupted: bool) -> None:
     fallback = fallback_text(report)
     if fallback is not None:
         note(fallback)
+    if report["outcome"] == Outcome.LOST.value:
+        note(f"the law lost the arm: {report['reason']}")
     if report["outcome"] == Outcome.DIVERGED.value:
         note(f"the run diverged: the integrator gave up at t = {report['duration']:.4g} s, the run so far is saved")
     if interrupted:

@@ -1,14 +1,13 @@
 """The domain of a chart in C: its bounds, its condition, and how far a position is inside."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.solutions import DESCENTS, INERTIA, KEPT, ZONE
 from orthocas.codegen.description import chart_values, filled, flags, numbers, words
 from orthocas.codegen.precision import Precision, bounds_inside
 from orthocas.control.controller import Controller
@@ -42,12 +41,6 @@ def condition_of(chart: Chart) -> Domain | None:
     return None if domain.is_box else domain
 
 
-def has_nearest(chart: Chart) -> bool:
-    """Whether the library has the function that goes to the nearest x."""
-    domain = chart.problem.domain
-    return domain.is_box or domain.singular_bound is not None
-
-
 def position_within(domain: Domain) -> Array:
     """A joint position of a domain between its centre and a corner, (n,); of a corridor one on the path."""
     near = domain.path_bound
@@ -76,16 +69,12 @@ def domain_values(chart: Chart, known: Mapping[str, str], precision: Precision) 
         "domain_reach": numbers(reach(domain)),
         "is_clear": "1" if condition is None else "is_clear(q)",
         "clear_c": "" if condition is None else _condition_code(condition, known),
-        "nearest_h": "",
-        "nearest_c": "",
     }
-    if has_nearest(chart):
-        _, inwards = chart.reaching
-        size = {"rooms": str(max(1, inwards.size1_out(0))), "m": str(chart.m), "descents": str(DESCENTS)}
-        bounds = {"zone": repr(ZONE), "inertia": repr(INERTIA), "kept": repr(KEPT)}
-        filled_in = {**known, **values, **size, **bounds, "difference_step": precision.difference}
-        values |= {f"nearest_{kind}": filled(f"nearest.{kind}", filled_in) for kind in ("h", "c")}
-    return values
+    rules = {name: repr(number) for name, number in asdict(precision.reaching).items()}
+    rooms = max(1, chart.reaching.size1_out(2))
+    size = {"rooms": str(rooms), "m": str(chart.m), "domain_width": numbers(domain.half_width)}
+    filled_in = {**known, **values, **size, **rules}
+    return values | {f"nearest_{kind}": filled(f"nearest.{kind}", filled_in) for kind in ("h", "c")}
 
 
 def _condition_code(domain: Domain, values: Mapping[str, str]) -> str:

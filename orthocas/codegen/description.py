@@ -151,7 +151,7 @@ def clear_line(domain: Domain) -> str:
 def control_values(controller: Controller) -> dict[str, str]:
     """Values of the placeholders that describe the law."""
     gains = controller.gains
-    torque = controller.command == "torque"
+    torque, remarks = controller.command == "torque", words(controller.remarks())
     return {
         "k": str(len(controller.labels)),
         "reference_labels": ", ".join(words(controller.labels)),
@@ -162,6 +162,8 @@ def control_values(controller: Controller) -> dict[str, str]:
         "after_gains": str(5 + len(gains)),
         "commands_torque": str(int(torque)),
         "law": controller.formula,
+        "law_remarks": "".join(f"\n * Note: {remark}." for remark in remarks),
+        "law_remarks_md": "".join(f"\n- Note: {remark}." for remark in remarks),
         "fallback": _fallback(controller),
         "where": _EVERYWHERE if controller.chart is None else _IN_DOMAIN,
         "command": controller.command,

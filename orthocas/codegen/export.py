@@ -4,7 +4,7 @@ import re
 import textwrap
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 
@@ -39,11 +39,14 @@ class Library:
     constants: str
     note: str
     tables: str = ""  #: what is made of the numbers when the module is imported
+    names: Mapping[str, str] = field(default_factory=dict)  #: of functions that have another one than in NumPy
     fuses: bool = False  #: whether it computes shared values again for everything that needs them, if we let it
 
     def code(self, text: str) -> str:
         """Code for NumPy as code for this library."""
         text = text if self.fuses else _SHARED.sub(r"\1", text)
+        for name, own in self.names.items():
+            text = text.replace(f"np.{name}(", f"{self.prefix}.{own}(")
         return re.sub(r"\bnp\.", f"{self.prefix}.", text).replace("_erf(", f"{self.erf[0]}(")
 
     def imports_for(self, code: str) -> str:
@@ -71,6 +74,7 @@ LIBRARIES = {
         erf=("torch.erf", "import torch"),
         constants="ROWS = 8192  # joint positions at once, so that memory stays bounded; raise it on a GPU\n" + _ROUNDS,
         note="q is a floating-point tensor. Results have its precision and device, and are differentiable.",
+        names={"moveaxis": "movedim"},  # torch.func.vmap does not know the former
         tables="""
 with torch.inference_mode(False):  # what is made in that mode has no derivatives later
     _TABLES = {name: _numbers(*parts) for name, parts in _NUMBERS.items()}

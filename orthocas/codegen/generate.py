@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.charts.chart import Chart
-from orthocas.codegen.boundary import boundary_condition, condition_of, has_nearest
+from orthocas.codegen.boundary import boundary_condition, condition_of
 from orthocas.codegen.description import filled
 from orthocas.codegen.interface import supervision_kernels, template_values
 from orthocas.codegen.kernels import Kernels, generate_kernels, with_shared_calls, with_turns_once
@@ -124,14 +124,12 @@ def _functions(chart: Chart, controller: Controller | None, precision: Precision
         x, wanted = ca.MX.sym("x", chart.m), ca.MX.sym("wanted", chart.m)
         difference = ca.densify(chart.relative.difference(wanted, x))
         found.append(ca.Function("turned", [q, x, wanted], [difference, chart.relative.rates(q).T]))
-    if has_nearest(chart):
-        near = chart.reaching[0]
-        found.append(ca.Function("near", near.mx_in(), near.call(near.mx_in())))
+    near = chart.reaching
+    found.append(ca.Function("near", near.mx_in(), near.call(near.mx_in())))
     domain = condition_of(chart)
     if domain is not None and domain.condition is not None:
-        pivots = ca.Function(
-            "pivots", [q], [domain.condition.pivots(q)]
-        )  # a graph where tables of coordinates are in it
+        # a graph where the condition asks for coordinates of a network
+        pivots = ca.Function("pivots", [q], [domain.condition.pivots(q)])
         found.append(pivots if domain.condition.pivots.is_a("MXFunction") else scalar_code(pivots))
     if controller is not None:
         graph = precision.graph(controller)
@@ -163,9 +161,15 @@ def _stack_bytes(kernels: Kernels, chart: Chart, controller: Controller | None, 
     inner = [name for name in ("pivots", "gram", "room") if name in kernels.work]  # inside others
     clear = sum(kernels.array_bytes(name, size) for name in inner)
     work = max(kernels.array_bytes(name, size) for name in kernels.work)
-    rooms = 2  # at most
-    nearest = kernels.array_bytes("near", size) + size * n * (3 * n + 16 + rooms) if has_nearest(chart) else 0
+    nearest = kernels.array_bytes("near", size) + _reaching_bytes(chart, size)
     return max(inverse, nearest, compose, work) + supervised + clear + locals_
+
+
+def _reaching_bytes(chart: Chart, size: int) -> int:
+    """Of the two positions that the descent to the nearest x looks at, and of the equations of its steps."""
+    n, rooms = chart.n, max(1, chart.reaching.size1_out(2))
+    system = 2 * n + rooms
+    return size * (2 * n * (n + rooms + 3) + 2 * n * n + n * rooms + system**2 + 4 * system)
 
 
 def _require_identifier(name: str) -> None:

@@ -100,7 +100,7 @@ class CompiledLibrary:
         return q, int(self.function("inverse")(*places[:2], int(max_iterations), places[2]))
 
     def nearest(self, phi: Array, q_start: Array, largest_step: float) -> tuple[Array, int]:
-        """q (n,), status; for boxes, clear or not."""
+        """q (n,), status."""
         run, q = self.function("nearest"), self._zeros(self.n)
         run.argtypes, run.restype = [_POINTER, _POINTER, self.precision.c_type, _POINTER], ctypes.c_int
         arrays = [self.numbers(array) for array in (phi, q_start)]

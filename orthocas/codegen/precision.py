@@ -2,13 +2,14 @@
 
 import ctypes
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from orthocas.charts.chart import Chart
+from orthocas.charts.reaching import RULES, ReachingRules
 from orthocas.codegen.description import numbers
 from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, Controller, with_smallest_volume
 from orthocas.tasks.domains import Domain, bounds_of, reach
@@ -51,7 +52,7 @@ class Precision:
     checked: float  #: largest difference that `NAME_check` returns
     tolerance: float  #: of the proof, relative to the largest entry of a result
     sensitive: float  #: relative change of a command by one rounding of q, from which the proof accepts more
-    difference: str  #: of joints, for slopes by differences
+    reaching: ReachingRules  #: of the descent to the nearest x
 
     @property
     def size(self) -> int:
@@ -99,7 +100,7 @@ DOUBLE = Precision(
     checked=1e-9,
     tolerance=1e-10,
     sensitive=1e-12,
-    difference="1e-6",
+    reaching=RULES,
 )
 SINGLE = Precision(
     c_name="float",
@@ -117,7 +118,7 @@ SINGLE = Precision(
     checked=1e-4,
     tolerance=1e-3,
     sensitive=1e-5,
-    difference="1e-2",
+    reaching=replace(RULES, least_damping=1e-5, converged=1e-7, room=1e-4, still=1e-6),
 )
 
 

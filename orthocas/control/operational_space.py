@@ -36,6 +36,7 @@ from orthocas.control.gains import (
     non_negative_gains,
     positive_gains,
 )
+from orthocas.control.holding import holding_doubts
 from orthocas.control.linear_algebra import DAMPING_DESIGNS, DampingDesign, block_inertia, damped, median_volume
 from orthocas.control.memory import MEMORIES, Memory, Remembers
 from orthocas.control.posture import joint_path
@@ -48,7 +49,7 @@ from orthocas.tasks.problem import Problem
 from orthocas.tools.batch import Batched
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_point_set, require_kind, require_known
-from orthocas.tools.display import Shown, number_list
+from orthocas.tools.display import Shown, number_list, percent
 
 _MODE_SAMPLES = 256
 _MUCH_DEG = 15.0  # leak from which on decoupled laws are warned of
@@ -220,7 +221,7 @@ class _OperationalSpace(Shown):
             object.__setattr__(self, name, value)
         if remembers is not None:
             _ = self.memory  # raises for bounds of another size
-        doubts = _like_a_percentage(self.damping_ratio)
+        doubts = [*_like_a_percentage(self.damping_ratio), *self._holding_doubts()]
         if coupling == "decoupled" and (metric := chart.problem.metric.name) != "inertia":
             doubts.append(f"a decoupled law relies on A = M (inertia), but the metric of this chart is {metric}")
         for doubt in doubts:
@@ -303,10 +304,10 @@ class _OperationalSpace(Shown):
     def remarks(self) -> list[str]:
         """Warnings.
 
-        The metric does not decouple task and extra coordinates, a damping ratio looks like a percentage, a decoupled
-        law has a chart that leaks much, or D is not positive semi-definite.
+        The motors cannot hold the arm, the metric does not decouple task and extra coordinates, a damping ratio looks
+        like a percentage, a decoupled law has a chart that leaks much, or D is not positive semi-definite.
         """
-        found, metric = [], self.problem.metric.name
+        found, metric = [*self._holding_doubts()], self.problem.metric.name
         if metric != "inertia":
             found.append(
                 f"the metric of this chart is {metric}, but task and extra coordinates are decoupled only for A = M "
@@ -319,11 +320,15 @@ class _OperationalSpace(Shown):
                 "both, which coupled ones do not; see docs/how-to/wide.md"
             )
         if share := self.check_damping().indefinite_share:
-            found.append(
-                f"the damping matrix (29) is indefinite in {share:.1%} of the domain with these gains; "
-                "the damping design double_diagonal never is"
-            )
+            where = f"in {percent(share, fault=True)} of the domain with these gains"
+            found.append(f"the damping matrix (29) is indefinite {where}; the damping design double_diagonal never is")
         return found + self.model.remarks()
+
+    def _holding_doubts(self) -> list[str]:
+        """Of an arm that the motors cannot hold; none if the robot compensates gravity itself."""
+        if self.model.gravity == "robot":
+            return []
+        return holding_doubts(self.model.robot(self.problem), self.problem.domain, self.limit)
 
     def _leak_deg(self) -> float:
         """Root mean square of the chart's leaks at samples [deg]."""

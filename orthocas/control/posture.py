@@ -11,6 +11,8 @@ from orthocas.errors import InvalidValueError, InverseError, OrthocasError, Unre
 from orthocas.tasks.domains import bounds_of, contains
 from orthocas.tools.checks import Array, as_point, require_kind
 
+_VALUES = "; targets of a Reference are values of phi, not changes of it ('move' in a steps file is a change)"
+
 
 def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
     """Joint positions with phi(q) equal to the reference, followed from q_start, (N, n) on `reference.grid()`.
@@ -37,11 +39,13 @@ def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
         try:
             new = follower.step(value, q)
         except InverseError as error:
-            text = f"the reference cannot be reached {where}: {error}{too_far(chart, q, targets[k, chart.m :])}"
+            text = (
+                f"the reference cannot be reached {where}: {error}{too_far(chart, q, targets[k, chart.m :])}{_VALUES}"
+            )
             raise UnreachableReferenceError(text) from None
         if not contains(chart.problem.domain, new):
             reason = f"{_outside(chart, new)}{too_far(chart, q, targets[k, chart.m :])}"
-            raise UnreachableReferenceError(f"the reference leaves the domain {where}: {reason}")
+            raise UnreachableReferenceError(f"the reference leaves the domain {where}: {reason}{_VALUES}")
         path[k] = q = new
     return path
 

@@ -87,7 +87,8 @@ class Reference(Shown):
         Args:
             labels: names of the quantities, as in the controller.
             start: value at t = 0, where the reference is at rest, (k,).
-            changes: pairs (time, {label: new target}) in order of time, 0 <= time < duration.
+            changes: pairs (time, {label: new target}) in order of time, 0 <= time < duration. Targets are values, not
+                changes of values; a steps file has both, 'to' and 'move'.
             duration: [s].
             natural_frequency: omega0 > 0 [rad/s].
             damping_ratio: zeta >= 0.

@@ -127,12 +127,14 @@ class XiTask(Shown):
 
     def _looked_up(self, model: Any) -> list[tuple[Any, int]]:
         """For each joint its place in q, a slice for joints that Pinocchio stores as cosine and sine, and in dq."""
-        if not hasattr(model, "getJointId"):
-            joints = [model.joint(name) for name in self.joints]  # MuJoCo's error lists the names that it knows
-            return [(int(joint.qposadr[0]), int(joint.dofadr[0])) for joint in joints]
-        missing = [name for name in self.joints if not model.existJointName(name)]
+        of_mujoco = not hasattr(model, "getJointId")
+        names = [model.joint(k).name for k in range(model.njnt)] if of_mujoco else [*model.names]
+        missing = [name for name in self.joints if name not in names]
         if missing:
-            raise InvalidValueError("model", f"without a joint '{missing[0]}'", f"one of {', '.join(model.names)}")
+            raise InvalidValueError("model", f"without a joint '{missing[0]}'", f"one of {', '.join(names)}")
+        if of_mujoco:
+            joints = [model.joint(name) for name in self.joints]
+            return [(int(joint.qposadr[0]), int(joint.dofadr[0])) for joint in joints]
         found = []
         for name in self.joints:
             joint = model.joints[model.getJointId(name)]

@@ -21,7 +21,7 @@ from orthocas.tasks.domains import sample_evenly, sample_uniform
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.blas_graph import NumpyGraph
 from orthocas.tools.checks import Array, require_count, require_kind, require_memory
-from orthocas.tools.display import Shown, number_list
+from orthocas.tools.display import Shown, number_list, percent
 from orthocas.tools.expressions import shortest
 from orthocas.tools.progress import Monitor, Progress, Watch, silent
 
@@ -51,7 +51,7 @@ class Distilled(Shown):
             "error of xi": f"{number_list(self.value_rms)} (root mean square)",
             "error of gradients": f"{number_list(self.gradient_rms)} (relative)",
             "task angle": f"std {after.std:.3g} deg, before {before.std:.3g} deg",
-            "left out": f"{self.left_out:.3%} of the samples",
+            "left out": f"{percent(self.left_out, 3, fault=True)} of the samples",
         }
 
 

@@ -39,7 +39,7 @@ from orthocas.tasks.problem import Problem, ProblemCheck, check
 from orthocas.tasks.samples import Samples, idle_joints, sample_problem
 from orthocas.tools.batch import using_threads
 from orthocas.tools.checks import Array, as_path, require_count, require_kind
-from orthocas.tools.display import Shown, listed
+from orthocas.tools.display import Shown, listed, percent
 from orthocas.tools.interrupts import remembered
 from orthocas.tools.progress import Monitor, silent
 
@@ -66,7 +66,7 @@ class ClearPart:
     @property
     def explained(self) -> str:
         """The offer in words."""
-        return f"least singular value {self.least_singular_value:g} stays clear, on {self.share:.1%} of the box"
+        return f"least singular value {self.least_singular_value:g} stays clear, on {percent(self.share)} of the box"
 
 
 def clear_part(problem: Problem, check: ProblemCheck, worst: WorstPoints | None) -> ClearPart | None:
@@ -324,7 +324,7 @@ class Fit(Shown):
             "least conditioning": "not searched" if self.worst is None else self.worst.explained,
             **({"like": listed(meant)} if meant else {}),
             **({"cyclic joints": listed(self.cyclic_joints)} if self.cyclic_joints else {}),
-            "near singular": f"{self.problem_check.singular_share:.3%} of the domain",
+            "near singular": f"{percent(self.problem_check.singular_share, 3, fault=True)} of the domain",
             **({"offer": f"a {self.clear_part.explained}"} if self.clear_part else {}),
         }
 
@@ -542,5 +542,5 @@ def _notes(stages: Sequence[Stage], settings: FitSettings, worst: WorstPoints | 
         "lambda5": weights.folds,
         **extra,
         "angles": weights.angles or "paper",
-        **({} if settings.like is None else {"meaning": "; ".join(settings.like.names)}),
+        **({} if settings.like is None else {"meaning": settings.like.label}),
     }

@@ -47,6 +47,12 @@ def quantity_of(robot: Robot, like: Quantity | str) -> tuple[str, ca.Function]:
     return name if name.isidentifier() else "a function of q", dense_function("like", [q], [found])
 
 
+def like_label(name: str, where: str = "") -> str:
+    """What a coordinate means that is not its quantity, but like it: 'like swivel at home [rad]'."""
+    words, bracket, unit = name.rpartition(" [") if name.endswith("]") else (name, "", "")
+    return " ".join(filter(None, ("like", words, where))) + bracket + unit
+
+
 def _finite(slopes: Array) -> Array:
     """The gradients of quantities, if all numbers are finite."""
     if not np.isfinite(slopes).all():
@@ -95,6 +101,11 @@ class Like:
             raise InvalidValueError("like", "an empty list", "at least one quantity")
         values = ca.vertcat(*(function(q) for _, function in found))
         return cls(tuple(name for name, _ in found), _of_arms(robot, q, values))
+
+    @property
+    def label(self) -> str:
+        """What the coordinates mean, for the notes of a chart: 'like q3 [rad]; like height'."""
+        return "; ".join(like_label(name) for name in self.names)
 
     @cached_property
     def digest(self) -> str:

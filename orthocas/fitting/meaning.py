@@ -11,17 +11,20 @@ import numpy as np
 from orthocas.bases.family import LinearFamily
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError, RobotError
-from orthocas.fitting.like import SWIVEL, Like, Likeness, quantity_of
+from orthocas.fitting.like import SWIVEL, Like, Likeness, like_label, quantity_of
 from orthocas.tasks.metric import metric_matrices
 from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import sample_problem
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array
+from orthocas.tools.display import percent
 
 _MEANT = 100.0  # weight of the mean squared error of a meaning, relative to the slope
 _STEP, _MOST_STEPS, _FEWEST = 0.02, 400, 5  # of unit self-motions, along which a meaning is taken
 _STILL = 1e-3  # change of a quantity for a unit self-motion
 _TINY = 1e-12  # least sum of squares to divide by
+_HELD_OUT = 10_000  # samples of the domain for errors
 
 
 class Wish(NamedTuple):
@@ -30,6 +33,29 @@ class Wish(NamedTuple):
     E: Array
     g: Array
     a: float
+
+
+@dataclass(frozen=True)
+class MeaningError:
+    """How far a coordinate is from a quantity at samples of the domain, not only at home."""
+
+    rms: float  #: root mean square difference, in the unit of the quantity; of angles, the shortest
+    correlation: float  #: of the two; angles are taken within half a turn of their value at home
+    against: float  #: share of the positions at which self-motions change the two in opposite senses
+
+    @property
+    def explained(self) -> str:
+        """In words."""
+        against = percent(self.against, fault=True)
+        return f"{self.rms:.2g} off (rms), correlation {self.correlation:.2f}, against it on {against} of the domain"
+
+    def notes(self) -> dict[str, float]:
+        """For the notes of a chart."""
+        return {
+            "error of its meaning": self.rms,
+            "correlation with its meaning": self.correlation,
+            "share against its meaning": self.against,
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +68,13 @@ class Meaning:
     slope: float  #: mean change of the value for a unit self-motion, in the sense of `unit_self_motion`
     name: str  #: with its unit
     wanted: bool  #: whether coordinates are fitted to the values; otherwise they only get their scale and offset
+    quantity: ca.Function  #: q (n, 1) -> the quantity (1, 1)
+    turns: bool  #: whether it is an angle that jumps by whole turns
+
+    @property
+    def label(self) -> str:
+        """What the coordinate means, for the notes of a chart."""
+        return like_label(self.name, "at home")
 
     @classmethod
     def by_default(cls, problem: Problem, posture: Array) -> "Meaning | None":
@@ -69,7 +102,8 @@ class Meaning:
         points = np.concatenate([sides[0][:0:-1], sides[1]])
         middle = len(sides[0]) - 1
         values = np.unwrap(Batched(quantity)(points)[0][:, 0])  # angles do not jump
-        if like == SWIVEL:
+        turns = like == SWIVEL
+        if turns:
             values -= 2 * np.pi * np.round(values[middle] / (2 * np.pi))
         steps = np.diff(values)
         if len(points) < _FEWEST or not np.isfinite(steps).all():
@@ -83,7 +117,8 @@ class Meaning:
         slope = (values[high] - values[low]) / (_STEP * max(1, high - low))
         if high - low < _FEWEST or abs(slope) < _STILL:
             raise InvalidValueError("like", "a quantity that stands still at the home", "one that self-motions change")
-        return cls(points[low : high + 1], values[low : high + 1], middle - low, float(slope), name, True)
+        along = points[low : high + 1], values[low : high + 1]
+        return cls(*along, middle - low, float(slope), name, True, quantity, turns)
 
     def wish(self, family: LinearFamily) -> Wish:
         """The mean squared difference from the values, over the squared slope, for coefficients of a family."""
@@ -106,9 +141,29 @@ class Meaning:
             raw, offset=np.array([xi[self.middle] - self.values[self.middle] / scale]), scale=np.array([scale])
         )
 
-    def error(self, coordinates: Coordinates) -> float:
-        """Root mean square of what coordinates miss along the self-motion."""
-        return float(np.sqrt(np.mean((coordinates.once("xi", self.points)[:, 0] - self.values) ** 2)))
+    def error(self, problem: Problem, coordinates: Coordinates, seed: int) -> MeaningError:
+        """What coordinates miss of the quantity at held-out samples of the domain, where it has a value."""
+        samples = sample_problem(problem, _HELD_OUT, (seed, _HELD_OUT))
+        q = ca.SX.sym("q", problem.n)
+        both = dense_function("quantity", [q], [self.quantity(q), ca.jacobian(self.quantity(q), q)])
+        value, slopes = (part.reshape(len(samples), -1) for part in Batched(both)(samples.points))
+        xi, J = coordinates.once("xi", samples.points), coordinates.jacobian(samples.points)[:, 0]
+        z = samples.null_basis[:, :, 0]
+        known = np.isfinite(value[:, 0]) & np.isfinite(slopes).all(axis=1)
+        xi, value = xi[known, 0], value[known, 0]
+        missed, value = xi - value, value - self.values[self.middle]
+        if self.turns:
+            missed, value = _within_half_a_turn(missed), _within_half_a_turn(value)
+        senses = np.einsum("sn,sn->s", J, z) * np.einsum("sn,sn->s", slopes, z)
+        return MeaningError(
+            rms=float(np.sqrt(np.mean(missed**2))),
+            correlation=float(np.corrcoef(xi, value)[0, 1]),
+            against=float(np.mean(senses[known] < 0)),
+        )
+
+
+def _within_half_a_turn(angles: Array) -> Array:
+    return np.asarray(angles - 2 * np.pi * np.round(angles / (2 * np.pi)))
 
 
 def _followed(problem: Problem, posture: Array, step: float) -> Array:

@@ -80,14 +80,19 @@ class Verdict:
 
     def explained(self, miss: Miss, bounds: Bounds) -> str:
         """The value that misses a bound, and the bound, in words."""
-        trial, most, least = "a trial chart has a", bounds.leak_deg, bounds.conditioning
+        trial, most, least = "a trial chart", bounds.leak_deg, f"a conditioning of at least {bounds.conditioning:.3g}"
         words: dict[Miss, str] = {
-            "leak": f"{trial} leak of {self.leak_deg:.3g} deg, expected at most {most:.3g}",
-            "conditioning": f"{trial} conditioning of {self.conditioning:.3g}, expected at least {least:.3g}",
+            "leak": f"{trial} has a leak of {self.leak_deg:.3g} deg, expected at most {most:.3g}",
+            "conditioning": f"{trial} {conditioning_in_words(self.conditioning)}, expected {least}",
             "singularity": f"the task's relative singular value is {self.task_value:.3g}, expected {NEAR_SINGULAR:g}",
             "half a turn": "the tool turns by half a turn from the reference, expected less",
         }
         return words[miss]
+
+
+def conditioning_in_words(signed: float) -> str:
+    """The least conditioning of a chart, which is negative where det J has the other sign, in words."""
+    return f"has a conditioning of {signed:.3g}" if signed >= 0 else "folds over (det J changes its sign)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,19 +164,19 @@ class Prober:
         Raises:
             KeyboardInterrupt: after Ctrl-C.
         """
-        if self.outputs == 0:
-            return Verdict(0.0, 1.0, box.centre, 1.0, 1.0)
         problem = Problem(self.problem.robot, self.problem.task, self.problem.metric, box)
+        if self.outputs == 0:
+            return self._judged(problem, lambda points: np.zeros((len(points), 0, len(self.active))))
         space = JointSpace.of(problem).restricted_to(self.active)
         family = Polynomial(_DEGREE, self.cyclic).family(space, self.outputs)
         with one_blas_thread():
             if self._start is not None and (enough is not None or leap):
-                found = self._judged(problem, family, self._start.on(family))
+                found = self._judged(problem, self._gradients(family, self._start.on(family)))
                 if leap or found.keeps(enough):
                     self._kept = self._start if found.keeps(enough) else self._kept
                     return found
             theta = self._fitted(problem, family)
-            found = self._judged(problem, family, theta)
+            found = self._judged(problem, self._gradients(family, theta))
         if found.conditioning > 0:
             self._start = _Start(space.half_width, theta)
             self._kept = self._start if found.keeps(enough) else self._kept
@@ -200,7 +205,11 @@ class Prober:
         found = Coordinates(parametrisation, JointSpace.of(problem), idle, theta, zeros, ones)
         return worst_points(problem, found, seed, thorough=True).least
 
-    def _judged(self, problem: Problem, family: ProductFamily, theta: Array) -> Verdict:
+    def _judged(self, problem: Problem, jacobian: Callable[[Array], Array]) -> Verdict:
+        return judged(problem, sample_heavily(problem.domain, _JUDGES, _SEED), jacobian, self.active)
+
+    def _gradients(self, family: ProductFamily, theta: Array) -> Callable[[Array], Array]:
+        """Points (N, n) -> gradients in the active joints, (N, r, active)."""
         C = theta.reshape(self.outputs, family.width)
 
         def jacobian(points: Array) -> Array:
@@ -209,7 +218,7 @@ class Prober:
             J: Array = (G @ C.T).transpose(0, 2, 1)
             return J
 
-        return judged(problem, sample_heavily(problem.domain, _JUDGES, _SEED), jacobian, self.active)
+        return jacobian
 
     def _fitted(self, problem: Problem, family: ProductFamily) -> Array:
         """Parameters, (size,)."""
@@ -266,6 +275,9 @@ def judged_chart(chart: Chart, samples: int, seed: int) -> Verdict:
 def judged(problem: Problem, points: Array, jacobian: Callable[[Array], Array], active: list[int]) -> Verdict:
     """Quality at the result of `sample_heavily`.
 
+    Without fitted coordinates, such as where all are idle joints, nothing leaks, and det J has another sign where a
+    singular posture of the task lies between.
+
     Args:
         problem: robot, task and metric.
         points: all samples (N, n).
@@ -277,9 +289,11 @@ def judged(problem: Problem, points: Array, jacobian: Callable[[Array], Array], 
     uniform = len(samples) - 2 * (len(samples) // 3)
     leaks, conditioning = leak_and_conditioning(own, J)
     worst = int(np.argmin(conditioning))
-    leak = float(np.degrees(np.sqrt(np.mean(leaks[:uniform] ** 2))))
     task_value = float(relative_singular_values(problem, points).min())
     turn_value = float(distance_from_half_a_turn(problem, points).min())
+    if J.shape[1] == 0:
+        return Verdict(0.0, 1.0, samples.points[worst], task_value if conditioning[worst] > 0 else 0.0, turn_value)
+    leak = float(np.degrees(np.sqrt(np.mean(leaks[:uniform] ** 2))))
     return Verdict(leak, float(conditioning[worst]), samples.points[worst], task_value, turn_value)
 
 

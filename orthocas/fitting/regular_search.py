@@ -20,6 +20,7 @@ from orthocas.solvers.lbfgs import LBFGS
 from orthocas.solvers.protocol import SolveResult
 from orthocas.tasks.domains import Box, sample_heavily, sample_uniform
 from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import NEGLIGIBLE
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 from orthocas.tools.progress import Monitor, Watch
@@ -42,14 +43,13 @@ _WELL = 0.28  # over r, volume of all but 1 % of positions that is enough; a con
 _EVERY, _EVERY_OF_NETWORKS = 4, 50  # steps through samples, to those that give the mean lengths of gradients
 _ALIKE = 0.01  # weight of the mean squared distance to gradients of quantities, with r > 1
 _STILL = 1e-3  # change of a quantity for a unit self-motion
-_TINY = 1e-12  # over the largest entry, of columns of joints that do not move the task
 
 
 def beside_the_middle(problem: Problem, points: Array) -> NDArray[np.bool_]:
     """Whether points (N, n) are on the middle's side of singular positions, (N,), if r joints do not move the task."""
     q, task = np.vstack([problem.domain.centre, points]), problem.task
     J = task.batched_frame_jacobian(q)[0].reshape(len(q), task.m, problem.n)
-    moving = np.abs(J).max(axis=(0, 1)) > _TINY * np.abs(J).max()
+    moving = np.abs(J).max(axis=(0, 1)) > NEGLIGIBLE * np.abs(J).max()
     if moving.sum() != task.m:
         return np.ones(len(points), bool)
     sides = np.linalg.det(J[:, :, moving]) > 0
@@ -130,6 +130,37 @@ class Search(ABC):
             self.best, self.rank = theta, rank
         self._done = bad <= _ENOUGH and low >= _WELL / self.problem.r
         result.finished()
+
+
+class IdleSearch(Search):
+    """No search: r joints that do not move the task are the coordinates, exact everywhere.
+
+    Args:
+        problem, parametrisation, seed, monitor: as in `Search`.
+        idle: the joints.
+    """
+
+    solver = "none"
+
+    def __init__(
+        self, problem: Problem, parametrisation: Parametrisation, idle: tuple[int, ...], seed: int, monitor: Monitor
+    ) -> None:
+        super().__init__(problem, parametrisation, 0, seed, monitor)
+        self._idle = idle
+        self.best, self.rank = np.zeros(0), (False, 0.0, -1.0)
+
+    def begin(self, name: str) -> None:
+        """Nothing."""
+
+    def go_on(self) -> None:
+        """Nothing."""
+
+    def coordinates(self, theta: Array) -> Coordinates:
+        """The joints."""
+        return Coordinates(self.parametrisation, JointSpace.of(self.problem), self._idle, theta, theta, theta)
+
+    def _at(self, points: Array) -> Field:
+        raise NotImplementedError
 
 
 class BasisSearch(Search):

@@ -13,7 +13,7 @@ from orthocas.bases.family import Parametrisation
 from orthocas.charts.point_quality import worst_points
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.fit import Fit, fit_from
-from orthocas.fitting.probe import Bounds, Miss, Prober, Verdict, judged_chart
+from orthocas.fitting.probe import Bounds, Miss, Prober, Verdict, conditioning_in_words, judged_chart
 from orthocas.fitting.settings import default_parametrisation, require_parametrisation
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.robots.robot import Robot
@@ -434,7 +434,7 @@ def _confirmed(
     problem, robot = prober.problem, prober.problem.robot
     unbounded = [k for k in joints.idle if np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
     factors = np.where(np.isin(np.arange(robot.n), joints.free), _SHRINK, 1.0)
-    last, enough = "too small a conditioning", _DESCENT * bounds.conditioning
+    last, enough = "has too small a conditioning", _DESCENT * bounds.conditioning
     for shrinkings in range(_TRIES):
         box = Box(problem.domain.centre, widths * factors**shrinkings, unbounded)
         trial = Problem(robot, problem.task, problem.metric, box, problem.name)
@@ -445,8 +445,9 @@ def _confirmed(
         least = worst_points(found.chart.problem, found.chart.coordinates, seed + 1, thorough=True).least
         if least >= enough and verdict.keeps(bounds):
             return found, verdict
-        last = f"a leak of {verdict.leak_deg:.3g} deg and a conditioning of {min(least, verdict.conditioning):.3g}"
+        worst = conditioning_in_words(min(least, verdict.conditioning))
+        last = f"has a leak of {verdict.leak_deg:.3g} deg and {worst}"
     raise DomainError(
-        f"{parametrisation.label} misses the bounds on {_TRIES} ever smaller boxes around the home: the last one has "
+        f"{parametrisation.label} misses the bounds on {_TRIES} ever smaller boxes around the home: the last one "
         f"{last}; {REMEDIES}"
     )

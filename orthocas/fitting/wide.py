@@ -1,6 +1,8 @@
 """Wide charts: coordinates that are regular on a whole branch of the joint range."""
 
+import math
 import time
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,14 +17,14 @@ from orthocas.bases.products import Polynomial
 from orthocas.charts.chart import Chart
 from orthocas.charts.point_quality import worst_points
 from orthocas.charts.regular_part import RegularPart
-from orthocas.errors import DomainError, Interrupted, InvalidValueError
+from orthocas.errors import BranchWarning, DomainError, Interrupted, InvalidValueError
 from orthocas.fitting.fit import Fit, in_gauge, normalised
 from orthocas.fitting.like import Like, Likeness
-from orthocas.fitting.meaning import Meaning
+from orthocas.fitting.meaning import Meaning, MeaningError
 from orthocas.fitting.regular_search import (
     JUDGED,
-    JUDGED_TAG,
     BasisSearch,
+    IdleSearch,
     NetworkSearch,
     Search,
     beside_the_middle,
@@ -32,14 +34,15 @@ from orthocas.fitting.volume_loss import LEAST_VOLUME
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import require_driven
 from orthocas.solvers.protocol import Status
-from orthocas.tasks.branches import Branch, Branches, branches
-from orthocas.tasks.domains import Box, sample_evenly, sample_uniform
+from orthocas.tasks.branches import CLEARER, Branch, Branches, branches, clear_positions, middles
+from orthocas.tasks.domains import Box
 from orthocas.tasks.metric import Metric, MetricSpec
-from orthocas.tasks.problem import Problem, check, relative_singular_values
+from orthocas.tasks.problem import Problem, check
 from orthocas.tasks.regular_box import home_posture
-from orthocas.tasks.samples import sample_problem
+from orthocas.tasks.samples import idle_joints, sample_problem
 from orthocas.tasks.task import Task
-from orthocas.tools.checks import as_number, require_count, require_kind
+from orthocas.tools.checks import Array, as_number, require_count, require_kind
+from orthocas.tools.display import number_list, percent
 from orthocas.tools.interrupts import remembered
 from orthocas.tools.progress import Monitor, silent
 
@@ -53,7 +56,7 @@ _POOR, _POOR_SEVERAL = 1e-3, 4e-3  # polynomials in all joints; the same with r 
 _VERY_POOR = 2e-2  # a network in place of these
 _STILL_POOR = 6e-3  # a network after these
 _STAGE = "whole branch"  # begins the names of stages
-_MIDDLES, _CLEARER = 20_000, 1.5  # positions that may be the middle of a domain, and their clearance over the bound
+_COUNTED_TAG = 3003  # seed tag of the positions of the branch that count for its share
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -61,17 +64,20 @@ class WideFit(Fit):
     """A chart of a branch, and how it was found."""
 
     branch: Branch | None = None  #: the branch of the chart
-    regular_share: float = float(
-        "nan"
-    )  #: of the clear positions of the branch, or the box in its place, the share in the domain, from 20,000 samples
+    regular_share: float = float("nan")  #: of the clear positions of the branch, the share in the domain, from samples
+    left_out: str = ""  #: what the fit left out of the branch from the start, and why
+    meaning: MeaningError | None = None  #: how far xi is from what it is like, for r = 1
 
     def facts(self) -> dict[str, str]:
         """The facts of a fit, with branch and regular share."""
         known = super().facts()
         branch = "" if self.branch is None else self.branch.name
+        share = percent(self.regular_share, 2)
         own = {
             "branch": branch,
-            "regular": f"{self.regular_share:.3%} of the branch's clear positions; the domain is this part",
+            "regular": f"{share} of the branch's clear positions (samples); the domain is this part",
+            **({"left out": self.left_out} if self.left_out else {}),
+            **({"meaning": f"{self.meaning.explained}: xi1, {self.chart.notes['meaning']}"} if self.meaning else {}),
         }
         return {"fit": known.pop("fit"), "problem": known.pop("problem"), **own, **known}
 
@@ -121,8 +127,12 @@ def fit_wide(
     means with t = 0.3. If coordinates are not regular enough then, the worst 30,000 of 200,000 fresh samples join for
     4,000 more steps.
 
-    If r joints do not move the task at all, such as the last one under a tool with an axis, singular positions divide
-    the branch once more, by the sign of det of the other joints' columns. Samples and share are of the middle's side.
+    If r joints do not move the task at all, such as the last one under a tool with an axis, they are the coordinates,
+    exact everywhere, unless `parametrisation` or `like` is given. Singular positions then divide the branch once more,
+    by the sign of det of the other joints' columns. The chart is on the middle's side.
+
+    `regular_share` is of the branch: of all its positions that `branches` counts as clear, the share in the domain. If
+    the chart leaves out the other side, or can only serve a smaller box, `left_out` and a BranchWarning say so.
 
     Wide charts hold on most of what the arm reaches without passing a singular position (`regular_share`), but their
     leaks are large, 20 to 70 degrees on the arms that were measured. They serve inverse kinematics, closed loops,
@@ -134,14 +144,14 @@ def fit_wide(
         task: a task of that robot. A missing reference orientation is taken at the centre of the branch.
         branch: a branch of `orthocas.branches`, its name, or a box of your own. Default: the branch of the home; with
             none there, the largest. If its middle is not clear, the largest box around a clear position takes its
-            place.
+            place, see `left_out`.
         metric: as in `Problem`.
         clearance: least relative singular value of the task, > 0; see `orthocas.ClearBox`.
         parametrisation: a family that is linear in its parameters, or an MLP. Default: Polynomial(6), with one linear
             term for each joint on whose position self-motions do not depend, such as the first and the last one; or
             another one, see above.
         home: posture whose branch is meant, (n,) or its name. Default: as for `suggest_domain`.
-        like: what coordinates are to mean: a function of an SX column q, the name of a joint, or "swivel", the angle
+        like: what coordinates are to be like: a function of an SX column q, the name of a joint, or "swivel", the angle
             of the elbow about the line from shoulder to wrist [rad]. With r = 1, xi then has nearly the values of that
             quantity along the self-motion of the home, or else of the branch's posture, as far as these are monotone
             there. With r > 1, several are allowed, or a task of lower priority: the gradients of the first coordinates
@@ -193,7 +203,12 @@ def fit_wide(
     elif like is not None:
         quantities = Like.of(problem, like)
         quantities.require_at_most(problem.r)
-    searches = [_search(*case, count, seed, monitor, meaning, quantities) for case in cases]
+    idle = idle_joints(problem, sample_problem(problem, _FIRST, (seed, _FIRST_TAG)))[-problem.r :]
+    if len(idle) == problem.r and parametrisation is None and not meant:
+        meaning = None
+        searches: list[Search] = [IdleSearch(problem, cases[0][1], tuple(idle), seed, monitor)]
+    else:
+        searches = [_search(*case, count, seed, monitor, meaning, quantities) for case in cases]
     with remembered() as pressed:
         finish = partial(_finished, searches, meaning, quantities, chosen, start)
         try:
@@ -205,6 +220,8 @@ def fit_wide(
             result = finish(interrupted=True)
         if result.status is Status.INTERRUPTED or pressed():
             raise Interrupted(result)
+    if result.left_out:
+        warnings.warn(f"the chart of branch '{chosen.name}' leaves out {result.left_out}", BranchWarning, stacklevel=2)
     return result
 
 
@@ -285,11 +302,12 @@ def _finished(
     elif quantities is not None:
         coordinates = quantities.named(normalised(raw, centre, first), clear)
     else:
-        coordinates = in_gauge(normalised(raw, centre, first), centre)
+        coordinates = in_gauge(normalised(raw, centre, first), centre) if len(raw.offset) else raw
     domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
-    judged = sample_uniform(clear.domain, JUDGED, (seed, JUDGED_TAG))
-    share = float(domain.is_clear(judged[beside_the_middle(clear, judged)]).mean())
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
+    counted = clear_positions(clear.robot, clear.task, branch.box, JUDGED, (seed, _COUNTED_TAG))
+    share = float(domain.contains(counted).mean()) if len(counted) else float("nan")
+    error = None if meaning is None else meaning.error(problem, coordinates, seed)
     worst = worst_points(problem, coordinates, seed, thorough=True)
     notes: dict[str, str | float] = {
         "solver": search.solver,
@@ -297,20 +315,22 @@ def _finished(
         "samples": search.samples,
         "status": status.value,
         "branch": branch.name,
-        "regular share": share,
+        "share of the branch": share,
         "least conditioning": worst.least,
-        **({} if meaning is None else {"meaning": meaning.name, "error of its meaning": meaning.error(coordinates)}),
-        **({} if quantities is None else {"meaning": "; ".join(quantities.names)}),
+        **({} if meaning is None or error is None else {"meaning": meaning.label, **error.notes()}),
+        **({} if quantities is None else {"meaning": quantities.label}),
     }
     return WideFit(
         chart=Chart(problem, coordinates, notes),
         stages=tuple(stage.interrupted() if interrupted else stage for stage in search.stages),
         problem_check=check(problem, seed=seed),
-        idle_joints=(),
+        idle_joints=tuple(problem.robot.joint_names[k] for k in coordinates.idle),
         worst=worst,
         seconds=time.perf_counter() - start,
         branch=branch,
         regular_share=share,
+        left_out=_left_out(clear, branch, counted),
+        meaning=error,
         like={} if quantities is None else quantities.distances(problem, coordinates, seed),
     )
 
@@ -352,13 +372,27 @@ def _problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Bran
     try:
         return Problem(robot, task, metric, box, branch.name, clearance)
     except DomainError:
-        points = sample_evenly(Box(box.centre, box.half_width), _MIDDLES, 0)
-    values = relative_singular_values(Problem(robot, task, metric, box), points)
-    middles = points[values > _CLEARER * clearance]
-    room = box.half_width - np.abs(middles - box.centre)
-    if not len(middles):
-        missing = f"no position clear by {_CLEARER * clearance:g}"
-        raise DomainError(f"branch '{branch.name}' has {missing}, expected one for clearance = {clearance:g}")
+        points, values = middles(robot, task, box)
+    clear = points[values > CLEARER * clearance]
+    room = box.half_width - np.abs(clear - box.centre)
+    if not len(clear):
+        missing = f"no position clear by {CLEARER * clearance:g}"
+        most = f"at most {math.floor(1e3 * float(values.max()) / CLEARER) / 1e3:g} can serve it"
+        raise DomainError(f"branch '{branch.name}' has {missing}, expected one for clearance = {clearance:g}: {most}")
     best = int(np.argmax(np.log(room).sum(axis=1)))
-    domain = Box(middles[best], room[best], box.unbounded)
+    domain = Box(clear[best], room[best], box.unbounded)
     return Problem(robot, task, metric, domain, branch.name, clearance)
+
+
+def _left_out(problem: Problem, branch: Branch, counted: Array) -> str:
+    """What a problem leaves out of a branch, of which some positions (N, n) are clear; empty for nothing."""
+    domain, reasons = problem.domain, []
+    inside = np.asarray(Box(domain.centre, domain.half_width, domain.unbounded).contains(counted))
+    if not inside.all():
+        box = f"around q = ({number_list(domain.centre)}) with half-widths ({number_list(domain.half_width)})"
+        reasons.append(f"its middle is not clear, so the chart has a smaller box, {box}")
+    beside = beside_the_middle(problem, counted)
+    if not beside.all():
+        reasons.append("singular positions divide it, so the chart has one side of them")
+    kept = percent(float((inside & beside).mean()))
+    return f"all but {kept} of the clear positions: {'; '.join(reasons)}" if reasons else ""

@@ -27,6 +27,7 @@ except ImportError:
 
 
 _MOST_POSITIONS = 2**31  # of an environment
+_MOST_STEPS = 20  # of the tracker, for an action
 
 
 def _positions(env: Any) -> Array:
@@ -37,10 +38,11 @@ def _positions(env: Any) -> Array:
 class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
     """An environment whose actions are joint positions (n,), with actions in (x, xi) instead.
 
-    An action a in [-1, 1]^n moves the wanted phi by a * step, orientations in the tip's axes; a tracker turns it into
-    joint positions, which never leave the domain, and so the joint limits. A target out of reach is dropped: the arm
-    stays, and the next action counts from there. Observations get xi (r,) and the distance to the nearest face of the
-    domain at their end, [rad] or [m].
+    An action a in [-1, 1]^n moves phi from where it is by a * step, orientations in the tip's axes. A tracker with
+    `nearest=True` turns that into joint positions, in as many steps as it takes, up to 20. They never leave the domain,
+    and so the joint limits. Where an action leads out, x goes as near as the domain lets it, and xi gives way; the next
+    action counts from there. Observations get xi (r,) and the distance to the nearest face of the domain at their end,
+    [rad] or [m].
 
     Args:
         env: the environment; its actions and observations are boxes (gymnasium.spaces.Box).
@@ -85,19 +87,26 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (chart.n,), np.float64)
         self.observation_space = gymnasium.spaces.Box(np.append(low, -more), np.append(high, more), dtype=np.float64)
 
-    def reset(self, **options: Any) -> tuple[Array, dict[str, Any]]:
-        """Start again; the wanted phi is where the arm starts."""
-        observation, info = self.env.reset(**options)
-        self._tracker = self.chart.tracker(self._here())
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+        """Start again, where the environment puts the arm; seed and options are for that."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._tracker = self.chart.tracker(self._here(), nearest=True)
         return self._observed(observation), info
 
     def step(self, action: Array) -> tuple[Array, Any, bool, bool, dict[str, Any]]:
-        """Move the wanted phi; `info["tracker"]` has the tracker's status."""
+        """Move phi. `info["tracker"]` has the status of the tracker: OK, NEAREST, or NEARER after 20 steps.
+
+        BAD_INPUT: a number of the action is NaN; the arm stays.
+        """
         if self._tracker is None:
             raise gymnasium.error.ResetNeeded("step before reset, expected reset first")
         change = as_float_array("action", action)
         require_shape("action", change.shape, (self.chart.n,))
-        self._tracker.step(self._wanted(self._tracker.q, self._step * np.clip(change, -1.0, 1.0)))
+        target = self._wanted(self._tracker.q, self._step * np.clip(change, -1.0, 1.0))
+        for _ in range(_MOST_STEPS):
+            self._tracker.step(target)
+            if self._tracker.status != TrackerStatus.NEARER:
+                break
         status = self._tracker.status
         observation, reward, terminated, truncated, info = self.env.step(self._tracker.q)
         return self._observed(observation), reward, terminated, truncated, info | {"tracker": status}

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.errors import InvalidValueError
+from orthocas.errors import InvalidValueError, units_hint
 from orthocas.robots.spatial import (
     constant,
     half_angle_vector,
@@ -294,7 +294,7 @@ def with_tool(tree: KinematicTree, tool: ArrayLike) -> KinematicTree:
         tool: (3,) position [m], (6,) position and roll, pitch, yaw [rad] as in URDF, or a homogeneous transform (4, 4).
 
     Raises:
-        InvalidValueError: if the tool has another form.
+        InvalidValueError: if the tool has another form, or numbers that look like millimetres or degrees.
     """
     R, p = _transform(tool)
     return replace(
@@ -309,6 +309,9 @@ def _transform(tool: ArrayLike) -> tuple[Array, Array]:
     """Rotation (3, 3) and position (3,) of a tool."""
     values = as_float_array("tool", tool)
     require_finite("tool", values)
+    numbers = values[:3, 3] if values.shape == (4, 4) else values.ravel()
+    if hint := units_hint(("m", "m", "m", "rad", "rad", "rad"), numbers.tolist()):
+        raise InvalidValueError("tool", values.tolist(), f"the pose of a tip{hint}")
     if values.shape == (4, 4):
         if not np.allclose(values[3], [0, 0, 0, 1], atol=1e-12):
             raise InvalidValueError("last row of tool", values[3].tolist(), "[0, 0, 0, 1]")

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Protocol, runtime_checkable
 
 import casadi as ca
@@ -9,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError
-from orthocas.robots.kinematics import joint_points
+from orthocas.robots.kinematics import body_poses, frame_pose
 from orthocas.robots.robot import Robot
+from orthocas.robots.tree import BASE_JOINTS
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, as_number, as_point_set, frozen_array, require_kind
@@ -167,10 +169,10 @@ def _point(point: Array) -> str:
 
 @dataclass(frozen=True, eq=False)
 class LinkDistances:
-    """Distances of the links on the way to the tip from obstacles, as functions of q.
+    """Distances of the links on the ways to the tips from obstacles, as functions of q.
 
-    A link is a capsule from the origin of its joint to that of the next joint, or to the tip; the true shape of links
-    is not known. Links that no joint moves are left out.
+    A link is a capsule from the origin of its joint to that of the next joint, or to a tip; the true shape of links
+    is not known. Links that no joint moves are left out, and a link on the ways to several tips counts once.
 
     Args:
         robot: the robot.
@@ -239,19 +241,22 @@ class LinkDistances:
 
     @cached_property
     def _links(self) -> list[tuple[int, ca.SX, ca.SX]]:
-        """Joint, and both ends of its link, for links that move."""
+        """Joint, and both ends of its link, for links that move: those on the ways to all tips, each once."""
         tree = self.robot.tree
-        points = joint_points(tree, self._q)
-        seen = self.robot.joint_points(np.random.default_rng(0).uniform(-1, 1, (_POSTURES, tree.n)))
+        ends: dict[tuple[int, int | str], tuple[int, ca.SX, ca.SX]] = {}
+        origins = {-1: ca.SX.zeros(3), **{body: pose[1] for body, pose in enumerate(body_poses(tree, self._q))}}
+        for frame in (tree.tip, *map(tree.frame, tree.tips)):
+            way = tree.carriers(frame.parent)
+            for start, end in pairwise([-1, *way]):
+                # nothing solid joins the world and a base that moves
+                if tree.joint_names[end] not in BASE_JOINTS:
+                    ends[start, end] = max(start, way[0]), origins[start], origins[end]
+            ends[frame.parent, frame.name] = frame.parent, origins[frame.parent], frame_pose(tree, self._q, frame)[1]
+        links = list(ends.values())
+        points = Batched(dense_function("ends", [self._q], [ca.vertcat(*(ca.vertcat(*link[1:]) for link in links))]))
+        seen = points(np.random.default_rng(0).uniform(-1, 1, (_POSTURES, tree.n)))[0].reshape(_POSTURES, -1, 6)
         moves = np.ptp(seen, axis=0).max(axis=1) > _MOVES
-        chain: list[int] = []
-        i = tree.tip_parent
-        while i >= 0:
-            chain.insert(0, i)
-            i = tree.parents[i]
-        joints = [chain[0] if chain else 0, *chain]
-        moving = np.flatnonzero(moves[:-1] | moves[1:])
-        return [(joints[k], points[:, int(k)], points[:, int(k) + 1]) for k in moving]
+        return [link for link, moving in zip(links, moves, strict=True) if moving]
 
     @cached_property
     def _expression(self) -> ca.SX:

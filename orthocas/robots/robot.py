@@ -34,6 +34,7 @@ from orthocas.tools.expressions import WRITTEN_OUT
 
 Locked = Mapping[str, float] | None  #: joint -> position at which it is locked [rad] or [m]
 Tool = ArrayLike | None
+Gravity = ArrayLike | None
 _Key = tuple[str | None, ...]  # name of a function, then frames
 FrameQuantity = Literal["position", "rotation", "jacobian"]
 
@@ -74,6 +75,7 @@ class Robot(Shown):
         *,
         tips: Sequence[str] = (),
         base: str | None = None,
+        gravity: Gravity = None,
     ) -> Self:
         """Build from a Pinocchio model, with all its joints.
 
@@ -83,6 +85,7 @@ class Robot(Shown):
             tips: names of several frames, such as two hands, in place of `tip`.
             locked: joints to lock, with their positions [rad] or [m].
             base: as in `from_file`.
+            gravity: as in `from_file`; default: that of the model.
 
         Raises:
             UnknownNameError: if the frame or a locked joint does not exist.
@@ -93,7 +96,8 @@ class Robot(Shown):
         for name in names:
             frame_index(model, name)
         tree = tree_from_model(urdf.lock_joints(model, locked or {}), *names, base=base)
-        return cls(tree, postures(model_states(model), tree.joint_names))
+        robot = cls(tree, postures(model_states(model), tree.joint_names))
+        return robot if gravity is None else robot.with_gravity(gravity)
 
     @classmethod
     def from_file(
@@ -105,6 +109,7 @@ class Robot(Shown):
         *,
         tips: Sequence[str] = (),
         base: str | None = None,
+        gravity: Gravity = None,
     ) -> Self:
         """Build the joints that move the tips from a robot file: MJCF if its name ends in .xml, otherwise URDF.
 
@@ -123,6 +128,8 @@ class Robot(Shown):
                 drives, without gravity, by the joints float_x, float_y, float_z, float_yaw, float_pitch, float_roll
                 ("floating:xy" in the plane, by float_x, float_y, float_heading); see `zero_momentum`. They come first,
                 and have no limits. Default: a fixed base.
+            gravity: gravity acceleration in the axes of the base, (3,) [m/s^2], such as (0, 0, 9.81) for an arm that
+                hangs from a ceiling. Default: (0, 0, -9.81), or that of the MJCF file.
 
         Raises:
             RobotError: if the file cannot be read, the robot branches and no tip is given, or a joint on the chain to
@@ -130,7 +137,7 @@ class Robot(Shown):
             UnknownNameError: if the frame or a locked joint does not exist.
         """
         build = cls.from_mjcf if as_path("path", path).suffix.lower() == ".xml" else cls.from_urdf
-        return build(path, tip, locked, tool, tips=tips, base=base)
+        return build(path, tip, locked, tool, tips=tips, base=base, gravity=gravity)
 
     @classmethod
     def from_urdf(
@@ -142,11 +149,12 @@ class Robot(Shown):
         *,
         tips: Sequence[str] = (),
         base: str | None = None,
+        gravity: Gravity = None,
     ) -> Self:
         """Build the joints that move the tips from a URDF file; see `from_file`."""
         file = as_path("path", path)
         names = _names(tip, tips)
-        robot = cls._chain(urdf.read_urdf(file, names, locked), names, locked, tool, base)
+        robot = cls._chain(urdf.read_urdf(file, names, locked), names, locked, tool, base, gravity)
         return cls(robot.tree, postures(srdf_states(file), robot.joint_names))
 
     @classmethod
@@ -159,12 +167,13 @@ class Robot(Shown):
         *,
         tips: Sequence[str] = (),
         base: str | None = None,
+        gravity: Gravity = None,
     ) -> Self:
         """Build the joints that move the tips from a MuJoCo MJCF file, or from a `mujoco.MjModel`; see `from_file`.
 
         Needs the extra `orthocas[mujoco]`, because MuJoCo's compiler reads the file.
         """
-        return cls._chain(model_from_mjcf(path), _names(tip, tips), locked, tool, base)
+        return cls._chain(model_from_mjcf(path), _names(tip, tips), locked, tool, base, gravity)
 
     @classmethod
     def planar(cls, lengths: Sequence[float], masses: Sequence[float]) -> Self:
@@ -208,6 +217,27 @@ class Robot(Shown):
         """
         return type(self)(with_payload(self.tree, payload), self.homes)
 
+    def with_gravity(self, gravity: ArrayLike) -> Self:
+        """The same robot under another gravity, such as on a wall, a ceiling or the moon.
+
+        Args:
+            gravity: gravity acceleration in the axes of the base, (3,) [m/s^2].
+
+        Raises:
+            ShapeError, InvalidValueError: if it is not three finite numbers.
+            RobotError: if the base floats, and gravity is not zero.
+
+        Example:
+            >>> import orthocas as oc
+            >>> robot = oc.Robot.planar(lengths=[2.0], masses=[3.0])
+            >>> robot.with_gravity([0.0, -1.62, 0.0]).gravity([0.0]).round(9).tolist()
+            [4.86]
+        """
+        given = frozen_array("gravity", gravity, (3,))
+        if self.tree.floating and given.any():
+            raise RobotError(f"gravity is {given.tolist()}, expected none: a base that nothing holds has no gravity")
+        return type(self)(replace(self.tree, gravity=given), self.homes)
+
     def home(self, name: str) -> Array:
         """A named posture (n,) of the robot's files.
 
@@ -218,10 +248,19 @@ class Robot(Shown):
         return self.homes[name]
 
     @classmethod
-    def _chain(cls, model: pin.Model, tips: tuple[str, ...], locked: Locked, tool: Tool, base: str | None) -> Self:
+    def _chain(
+        cls,
+        model: pin.Model,
+        tips: tuple[str, ...],
+        locked: Locked,
+        tool: Tool,
+        base: str | None,
+        gravity: Gravity,
+    ) -> Self:
         """The robot of the joints that move the tips, without those that the user locks."""
         tips = tips or (urdf.default_tip(model),)
-        robot = cls.from_model(urdf.lock_off_chain(urdf.lock_joints(model, locked or {}), *tips), tips=tips, base=base)
+        chain = urdf.lock_off_chain(urdf.lock_joints(model, locked or {}), *tips)
+        robot = cls.from_model(chain, tips=tips, base=base, gravity=gravity)
         return robot if tool is None else robot.with_tool(tool)
 
     @property

@@ -8,6 +8,7 @@ import numpy as np
 
 from orthocas.errors import InvalidValueError, RobotError
 from orthocas.tools.checks import Array, as_float_array, frozen_array, require_known, require_shape, require_text
+from orthocas.tools.display import listed
 
 MOST_JOINTS = 150  #: the work for a mass matrix grows with their square
 MOST_FRAMES = 1000  #: of a robot that anybody has
@@ -15,6 +16,7 @@ _LARGEST = 1e30  # larger numbers overflow in products
 _NOT_TURNED = 1e-6  # |R R^T - 1| of a rotation in single precision
 _SYMMETRIC = 1e-6  # of the largest entry
 _INDEFINITE = 0.1  # of the largest entry: identified inertias in published robot files have -0.07
+_OF_JOINTS = ("rotations", "translations", "masses", "centres", "inertias", "armatures")
 _NO_INERTIA = 1e-9  # [kg m^2]
 REVOLUTE_ROOM = np.pi / 4  #: [rad] on either side of a default posture, as the hypercube of [AS2023] Sec. 9
 PRISMATIC_ROOM = 0.25  #: [m]
@@ -29,11 +31,13 @@ def require_joint_names(names: Sequence[str]) -> None:
         raise RobotError(f"two joints are called '{twice}', expected different names")
 
 
-def require_bounded(name: str, array: Array) -> None:
-    """Raise InvalidValueError if an entry is so large that products overflow."""
+def require_bounded(name: str, array: Array, joints: Sequence[str] = ()) -> None:
+    """Raise InvalidValueError if an entry is so large that products overflow; names the joint of its row."""
     largest = float(np.abs(array).max())
     if largest > _LARGEST:
-        raise InvalidValueError(f"largest entry of {name}", f"{largest:g}", f"at most {_LARGEST:g}")
+        row = int(np.unravel_index(np.abs(array).argmax(), array.shape)[0])
+        place = f" at joint '{joints[row]}'" if joints else ""
+        raise InvalidValueError(f"largest entry of {name}{place}", f"{largest:g}", f"at most {_LARGEST:g}")
 
 
 def require_index(name: str, value: int, largest: int) -> None:
@@ -52,13 +56,13 @@ def require_limits(joint: str, lower: float, upper: float, effort: float, veloci
             raise RobotError(f"joint '{joint}' has the {what} limit {limit:g}, expected a number > 0")
 
 
-def require_body(joint: str, mass: float, inertia: Array, armature: float) -> None:
+def require_body(joint: str, mass: float, inertia: Array, armature: float, links: Sequence[str] = ()) -> None:
     """Raise RobotError unless mass, armature and inertia (3, 3) about the centre of mass are not negative.
 
     Identified inertias in published robot files are often slightly indefinite and violate the triangle inequality.
     Whether the mass matrix is positive definite is for the metric to check.
     """
-    body = f"the body moved by joint '{joint}'"
+    body = f"the body moved by joint '{joint}'{f' ({listed(links)})' if links else ''}"
     if mass < 0:
         raise RobotError(f"{body} has mass {mass:g} kg, expected >= 0")
     if armature < 0:
@@ -150,7 +154,7 @@ class KinematicTree:
         for name, shape in shapes.items():
             object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
             if getattr(self, name).size:
-                require_bounded(name, getattr(self, name))
+                require_bounded(name, getattr(self, name), self.joint_names if name in _OF_JOINTS else ())
         for name in ("lower", "upper", "effort_limits", "velocity_limits"):  # these may be infinite
             limits = as_float_array(name, getattr(self, name)).copy()
             require_shape(name, limits.shape, (n,))
@@ -168,7 +172,6 @@ class KinematicTree:
             require_known("joint kind", self.joint_kinds[i], JOINT_KINDS)
             require_index(f"parents[{i}]", self.parents[i], i - 1)
             require_limits(name, self.lower[i], self.upper[i], self.effort_limits[i], self.velocity_limits[i])
-            require_body(name, self.masses[i], self.inertias[i], self.armatures[i])
             require_rotation(f"rotations[{i}]", self.rotations[i])
         require_index("tip_parent", self.tip_parent, self.n - 1)
         require_rotation("tip_rotation", self.tip_rotation)
@@ -181,6 +184,13 @@ class KinematicTree:
             require_rotation(f"frame_rotations[{k}]", self.frame_rotations[k])
         for tip in self.tips:
             require_known("tip", tip, self.frame_names)
+        for i, name in enumerate(self.joint_names):
+            require_body(name, self.masses[i], self.inertias[i], self.armatures[i], self._links(i))
+
+    def _links(self, body: int) -> list[str]:
+        """Names of the frames that a body carries."""
+        named = zip((self.tip_name, *self.frame_names), (self.tip_parent, *self.frame_parents), strict=True)
+        return [name for name, parent in named if parent == body]
 
     @property
     def tip(self) -> Frame:

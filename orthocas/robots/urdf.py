@@ -1,5 +1,6 @@
 """URDF files: checks for errors that Pinocchio's parser accepts, reading, and locked joints."""
 
+import logging
 import math
 import os
 import re
@@ -13,32 +14,43 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 
-from orthocas.errors import InvalidValueError, RobotError
+from orthocas.errors import InvalidValueError, RobotError, degrees_hint, one_line
 from orthocas.robots.pinocchio_model import LINKS, frame_index, joint_axis, leader_of, remedy
 from orthocas.robots.xml import MOST_LINKS, read_xml
 from orthocas.tools.checks import Array, require_known
+from orthocas.tools.display import listed
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _LARGEST, _SHORTEST = 1e20, 1e-12  # of the vector along an axis
-_LATE_LEADER = "parent joint of the mimic joint is not in the kinematic tree"  # what Pinocchio says
 _GRIPPER = re.compile("gripper|finger|jaw", re.IGNORECASE)
 _FINGER = re.compile("finger|jaw", re.IGNORECASE)
+_SHAPE = re.compile("_sc$|collision", re.IGNORECASE)  # frames of shapes that stand for links in collision checks
 _TOOL = re.compile("tool|tcp|end_?effector|eef|(^|_)ee(_|$)", re.IGNORECASE)
 _WITH_AXIS = ("revolute", "continuous", "prismatic")
 WORLD = "universe"  #: Pinocchio's name for what does not move
+_log = logging.getLogger(__name__)
+_USED = {  # what kinematics and dynamics use of a file
+    "link": ("inertial",),
+    "joint": ("origin", "parent", "child", "axis", "limit", "mimic"),
+}
+_CONTEXT = "joint xml is not initialized correctly"  # urdfdom's last words on every joint, which say nothing
 
 
 def check_urdf(path: str | Path, root: ElementTree.Element) -> None:
-    """Refuse zero axes, negative limits of effort and velocity, loops of joints, and more links than any robot has.
+    """Refuse zero axes, negative limits and masses, what is not a tree, and more links than any robot has.
 
     Pinocchio's parser checks lengths of vectors, numbers and limits.
 
     Raises:
-        RobotError: if a check fails. The message names the file and the joint.
+        RobotError: if a check fails. The message names the file and the joint or link.
     """
-    links = len(root.findall("link"))
-    if links > MOST_LINKS:
-        raise RobotError(f"{path} has {links} links, expected at most {MOST_LINKS}")
+    links = root.findall("link")
+    if len(links) > MOST_LINKS:
+        raise RobotError(f"{path} has {len(links)} links, expected at most {MOST_LINKS}")
+    for link in links:
+        mass = link.find("inertial/mass")
+        if mass is not None and _is_negative(text := mass.get("value", "")):
+            raise RobotError(f"{path}: link '{link.get('name')}' has mass {text.strip()[:80]} kg, expected >= 0")
     for joint in root.findall("joint"):
         axis = joint.find("axis")
         if axis is not None and joint.get("type") in _WITH_AXIS:
@@ -104,28 +116,49 @@ def _is_negative(text: str) -> bool:
 
 
 def _require_tree(path: str | Path, root: ElementTree.Element) -> None:
-    """Every joint hangs on a link that no joint carries; Pinocchio's parser leaves out loops without a word."""
-    joints = [(joint, _link(joint, "parent"), _link(joint, "child")) for joint in root.findall("joint")]
+    """Every joint connects two links of the file, every link but one hangs on one joint, and none on itself."""
+    names = [link.get("name", "") for link in root.findall("link")]
+    for i, name in enumerate(names):
+        if not name or name in names[:i]:
+            raise RobotError(f"{path}: two links are called '{name}'" if name else f"{path}: a link has no name")
+    joints = [(joint.get("name", ""), _link(joint, "parent"), _link(joint, "child")) for joint in root.findall("joint")]
     children: dict[str, list[str]] = {}
-    for _, parent, child in joints:
+    carriers: dict[str, str] = {}  # of a link: the joint that it hangs on
+    for name, parent, child in joints:
+        for end, link in (("parent", parent), ("child", child)):
+            if link not in names:
+                what = f"the {end} link '{link}', which the file does not have" if link else f"no {end} link"
+                raise RobotError(f"{path}: joint '{name}' has {what}")
+        if child in carriers:
+            both = f"the joints '{carriers[child]}' and '{name}'"
+            raise RobotError(f"{path}: link '{child}' hangs on {both}, expected a tree of links")
+        carriers[child] = name
         children.setdefault(parent, []).append(child)
-    carried = {child for _, _, child in joints if child}
-    waiting = [link.get("name", "") for link in root.findall("link") if link.get("name", "") not in carried]
-    reached = set(waiting)
+    roots = [link for link in names if link not in carriers]
+    if len(roots) > 1:
+        raise RobotError(f"{path}: the links '{roots[0]}' and '{roots[1]}' hang on no joint, expected one such link")
+    _require_no_loop(path, joints, children, roots)
+
+
+def _require_no_loop(
+    path: str | Path, joints: Sequence[tuple[str, str, str]], children: Mapping[str, list[str]], roots: list[str]
+) -> None:
+    """Every joint (name, parent, child) can be reached from a root."""
+    reached, waiting = set(roots), list(roots)
     while waiting:
         found = [child for child in children.get(waiting.pop(), ()) if child not in reached]
         reached.update(found)
         waiting += found
-    for joint, parent, child in joints:
-        if parent in carried and parent not in reached:
+    for name, parent, child in joints:
+        if parent not in reached:
             raise RobotError(
-                f"{path}: joint '{joint.get('name')}' hangs from link '{parent}' to link '{child}' "
+                f"{path}: joint '{name}' hangs from link '{parent}' to link '{child}' "
                 "in a loop of joints, expected a tree of links"
             )
 
 
 def _link(joint: ElementTree.Element, end: str) -> str:
-    """The link at one end of a joint; whether it is there is left to Pinocchio's parser."""
+    """The link at one end of a joint; "" if it is not given."""
     element = joint.find(end)
     return "" if element is None else element.get("link", "")
 
@@ -133,8 +166,12 @@ def _link(joint: ElementTree.Element, end: str) -> str:
 def read_urdf(path: str | Path, tips: Sequence[str] = (), locked: Mapping[str, float] | None = None) -> pin.Model:
     """Read a URDF file. Mimic joints are kept, so that they can be refused or locked later.
 
-    Pinocchio cannot keep joints that mimic a joint which comes later in its order. In files with such joints, all
-    mimic joints are locked where their leaders are, at 0, at the limit closest to 0, or as `locked` says.
+    Only what kinematics and dynamics use is read: links, their inertias, and joints. Faults elsewhere, such as in
+    shapes and colours, are logged. So are missing limits of effort and velocity, which count as unlimited.
+
+    Pinocchio cannot keep joints that mimic a fixed joint, another mimic joint, or a joint which comes later in its
+    order. In files with such joints, all mimic joints are locked where their leaders are, at 0, at the limit closest to
+    0, or as `locked` says.
 
     Args:
         path: the file.
@@ -147,67 +184,97 @@ def read_urdf(path: str | Path, tips: Sequence[str] = (), locked: Mapping[str, f
     """
     root = read_xml(path, "URDF", "robot")
     _require_no_xacro(path, root)
-    check_urdf(path, root)
-    try:
-        return _parsed(path, mimic=True)
-    except RobotError as error:
-        if _LATE_LEADER not in str(error):
-            raise
-    return _with_locked_mimics(_parsed(path, mimic=False), root, tips, locked or {})
+    unlimited = _with_all_limits(root)
+    used = _used_part(root)
+    check_urdf(path, used)
+    text = ElementTree.tostring(used, "unicode")
+    model, fault = _parsed(text, mimic=True)
+    if fault and used.find("joint/mimic") is not None:
+        model, fault = _parsed(text, mimic=False)
+        model = model if fault else _with_locked_mimics(model, used, tips, locked or {})
+    if fault:
+        raise RobotError(f"{path} is not a usable URDF model: {fault}")
+    if unlimited:
+        _log.warning("%s: limits of effort or velocity are missing, so there are none: %s", path, listed(unlimited))
+    _, beside = _parsed(ElementTree.tostring(root, "unicode"), mimic=False)
+    if beside:
+        _log.warning("%s: what kinematics does not use is left out: %s", path, beside)
+    return model
 
 
-def _parsed(path: str | Path, mimic: bool) -> pin.Model:
-    """The file as Pinocchio reads it."""
+def _with_all_limits(root: ElementTree.Element) -> list[str]:
+    """Write 0, which means unlimited, for each missing limit of effort or velocity; the names of these joints."""
+    changed = []
+    for joint in root.findall("joint"):
+        for limit in joint.findall("limit"):
+            missing = [what for what in ("effort", "velocity") if what not in limit.attrib]
+            limit.attrib.update(dict.fromkeys(missing, "0"))
+            changed += [joint.get("name", "")] if missing else []
+    return changed
+
+
+def _used_part(root: ElementTree.Element) -> ElementTree.Element:
+    """The links, inertias and joints of a file."""
+    used = ElementTree.Element("robot", name=root.get("name") or "robot")
+    for element in root:
+        if element.tag in _USED:
+            part = ElementTree.SubElement(used, element.tag, element.attrib)
+            part.extend(child for child in element if child.tag in _USED[element.tag])
+    return used
+
+
+def _parsed(text: str, mimic: bool) -> tuple[pin.Model, str]:
+    """The model that Pinocchio reads from a text, and what is wrong with it: "" if nothing.
+
+    The parser goes on after many errors and skips what it cannot read, for example a mass.
+    """
+    model, words = pin.Model(), ""
     with _captured_stderr() as notes:
         try:
-            model = pin.buildModelFromUrdf(str(path), mimic=mimic)
+            model = pin.buildModelFromXML(text, mimic=mimic)
         except (ValueError, RuntimeError) as error:
-            raise RobotError(f"{path} is not a usable URDF model: {_text(notes) or error}") from None
-        complaints = _text(notes)
-    if "Error:" in complaints:  # the parser skips what it cannot read, for example a mass
-        raise RobotError(f"{path} is not a usable URDF model: {complaints}")
-    try:
-        _ = list(model.names), [frame.name for frame in model.frames]
-    except UnicodeDecodeError:
-        raise RobotError(f"{path} has names of joints or links that are not UTF-8, expected a file in UTF-8") from None
-    return model
+            words = one_line(str(error).rpartition("message:")[2])  # without its place in the C++ source
+        said = _said(notes)
+    return model, said or words
 
 
 def _with_locked_mimics(
     model: pin.Model, root: ElementTree.Element, tips: Sequence[str], locked: Mapping[str, float]
 ) -> pin.Model:
     """The model with every mimic joint locked at multiplier x position of its leader + offset."""
-    leaders = {joint.get("name", ""): mimic for joint in root.findall("joint") for mimic in joint.findall("mimic")}
+    mimics = {joint.get("name", ""): mimic for joint in root.findall("joint") for mimic in joint.findall("mimic")}
+    joints = {joint.get("name", "") for joint in root.findall("joint")}
     carriers = [model.frames[frame_index(model, tip)].parentJoint for tip in tips or (default_tip(model),)]
     chain = {i for carrier in carriers for i in model.supports[carrier]}
     position, ids = pin.neutral(model), []
-    for name, mimic in leaders.items():
-        leader, i = mimic.get("joint", ""), model.getJointId(name)
+    for name in mimics:
+        leader, factor, offset = _followed(name, mimics)
+        i = model.getJointId(name)
         if i >= model.njoints:
             continue  # of a fixed joint
+        if i in chain and leader not in joints:
+            raise RobotError(f"joint '{name}' mimics joint '{leader}', which the file does not have")
         if i in chain and leader not in locked:
             raise RobotError(f"joint '{name}' is a mimic joint, expected independent joints: {remedy(leader)}")
         if name in locked:
             raise RobotError(f"joint '{name}' mimics joint '{leader}', expected an independent joint: {remedy(leader)}")
-        _set_position(model, i, _followed(model, name, leaders, locked), position)
+        _set_position(model, i, offset + factor * _leading(model, leader, locked), position)
         ids.append(i)
     return _without_joints(model, ids, position)
 
 
-def _followed(
-    model: pin.Model, name: str, leaders: Mapping[str, ElementTree.Element], locked: Mapping[str, float]
-) -> float:
-    """Where a joint is locked: multiplier x position of the joint that it follows + offset, along all leaders."""
-    factor, place, followed = 1.0, 0.0, set()
-    while name in leaders:
+def _followed(name: str, mimics: Mapping[str, ElementTree.Element]) -> tuple[str, float, float]:
+    """The independent joint that a joint follows, along all leaders; the multiplier and the offset."""
+    factor, offset, followed = 1.0, 0.0, set()
+    while name in mimics:
         if name in followed:
             raise RobotError(f"joint '{name}' mimics itself")
         followed.add(name)
-        mimic = leaders[name]
-        place += factor * float(mimic.get("offset", 0))
+        mimic = mimics[name]
+        offset += factor * float(mimic.get("offset", 0))
         factor *= float(mimic.get("multiplier", 1))
         name = mimic.get("joint", "")
-    return place + factor * _leading(model, name, locked)
+    return name, factor, offset
 
 
 def _leading(model: pin.Model, leader: str, locked: Mapping[str, float]) -> float:
@@ -226,7 +293,7 @@ def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
 
     Raises:
         UnknownNameError: if there is no such joint.
-        InvalidValueError: if a position is not finite.
+        InvalidValueError: if a position is not finite, or an angle looks like degrees.
         RobotError: if the joint mimics another one, or has several degrees of freedom and a position other than 0.
     """
     if not isinstance(locked, Mapping):
@@ -269,17 +336,20 @@ def default_tip(model: pin.Model) -> str:
     """The end of the arm of a robot with a single chain, apart from joints of a gripper, which is not moved.
 
     Of the frames there it is the last one that is called a tool or an end effector; otherwise the last one that is no
-    part of a finger.
+    part of a finger and no shape for collision checks.
 
     Raises:
-        RobotError: if the robot branches. The message lists the frames to choose from.
+        RobotError: if the robot branches. The message lists the frames to choose from, chain by chain.
     """
     ids = [i for i in range(1, model.njoints) if not _is_of_gripper(model, i)] or list(range(1, model.njoints))
     carriers = {model.parents[i] for i in ids}
-    tips = [_end_of(model, i) for i in ids if i not in carriers]
-    if len(tips) != 1:
-        raise RobotError(f"the robot has {len(tips)} chains, name the tip frame: {', '.join(tips)}")
-    return tips[0]
+    ends = [_ends_of(model, i) for i in ids if i not in carriers]
+    if not ends:
+        raise RobotError("the robot has no movable joint, expected at least one")
+    if len(ends) > 1:
+        listing = "; ".join(", ".join(names) for names in ends)
+        raise RobotError(f"the robot has {len(ends)} chains, name the tip frame: {listing}")
+    return ends[0][0]
 
 
 def _is_of_gripper(model: pin.Model, i: int) -> bool:
@@ -289,12 +359,14 @@ def _is_of_gripper(model: pin.Model, i: int) -> bool:
     return bool(own) and all(_is_of_gripper(model, k) for k in range(i + 1, model.njoints) if model.parents[k] == i)
 
 
-def _end_of(model: pin.Model, i: int) -> str:
-    """The frame of a body that stands for its end."""
-    frames = [frame for frame in model.frames if frame.parentJoint == i]
-    names: list[str] = [frame.name for frame in frames if frame.type in LINKS] or [frame.name for frame in frames]
-    plain = [name for name in names if not _FINGER.search(name)]
-    return [*names, *plain, *(name for name in plain if _TOOL.search(name))][-1]
+def _ends_of(model: pin.Model, i: int) -> list[str]:
+    """The frames of a body that stand for its end: the best one, then the others that carry no further frame."""
+    frames = {k: frame for k, frame in enumerate(model.frames) if frame.parentJoint == i}
+    links = [k for k in frames if frames[k].type in LINKS] or list(frames)
+    plain = [k for k in links if not (_FINGER.search(frames[k].name) or _SHAPE.search(frames[k].name))]
+    best = [*links, *plain, *(k for k in plain if _TOOL.search(frames[k].name))][-1]
+    inner = {model.frames[frames[k].parentFrame].parentFrame for k in plain}  # of a link: a fixed joint, then a link
+    return [frames[best].name, *(frames[k].name for k in plain if k != best and k not in inner)]
 
 
 @contextmanager
@@ -310,10 +382,12 @@ def _captured_stderr() -> Iterator[IO[bytes]]:
             os.close(saved)
 
 
-def _text(notes: IO[bytes]) -> str:
-    """The captured text, on one line of at most 300 characters."""
+def _said(notes: IO[bytes]) -> str:
+    """The captured errors, from the outermost element to the fault in it; "" if there are none."""
     notes.seek(0)
-    return " ".join(notes.read().decode(errors="replace").split())[:300]
+    lines = notes.read().decode(errors="replace").splitlines()
+    said = [line.removeprefix("Error:").strip() for line in lines if line.startswith("Error:")]
+    return one_line(": ".join(line.rstrip(".") for line in reversed(said) if line != _CONTEXT))[:300]
 
 
 def _without_joints(model: pin.Model, ids: list[int], position: Array) -> pin.Model:
@@ -353,4 +427,7 @@ def _set_position(model: pin.Model, i: int, value: float, position: Array) -> No
                 f"a joint with {joint.nv} degrees of freedom can only be locked at its neutral position"
             )
         return
+    turns = joint.shortname().startswith("JointModelR")
+    if turns and (hint := degrees_hint(value)):
+        raise InvalidValueError(f"locked position of joint '{name}'", f"{value:g}", f"an angle in radians{hint}")
     position[joint.idx_q : joint.idx_q + joint.nq] = (np.cos(value), np.sin(value)) if joint.nq == 2 else value

@@ -137,7 +137,7 @@ def _style(axes: Axes, trajectory: "Trajectory") -> None:
 def _title(trajectory: "Trajectory") -> str:
     text = f"{trajectory.controller}, {trajectory.times[-1]:.4g} s"
     if trajectory.outcome.value != "complete":
-        text += f": {trajectory.outcome.value}, run ended early"
+        text += f": {trajectory.outcome.value}, {trajectory.reason or 'run ended early'}"
     lasting = trajectory.seconds_in_status
     cut, red = ([status for status in lasting if (status in FROM_THE_LAW) == kind] for kind in (True, False))
     if red:
@@ -253,8 +253,8 @@ class _Arm:
 
 
 def _tip_targets(trajectory: Trajectory, problem: Problem) -> Array:
-    """Target of the tip, (N, 3). Axes that the task leaves free follow the tip; NaN if the task is not a position."""
-    if not problem.task.name.startswith("position:"):
+    """Target of the tip, (N, 3). Axes that the task leaves free follow the tip; NaN if the task is not its position."""
+    if not problem.task.of_tip or not problem.task.name.startswith("position:"):
         return np.full((len(trajectory.times), 3), np.nan)
     target = problem.robot.joint_points(trajectory.q)[:, -1].copy()
     for i, label in enumerate(problem.task.labels):

@@ -1,5 +1,6 @@
 """MuJoCo as the plant of a simulation: scenes, and steps."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from math import ceil, sqrt
 from types import ModuleType
@@ -169,9 +170,9 @@ def body_name(i: int) -> str:
     return f"body{i}"
 
 
-def rotor_name(i: int) -> str:
-    """Name of the joint of rotor i, with elasticity."""
-    return f"rotor{i}"
+def rotor_name(joint: str) -> str:
+    """Name of the joint of a rotor, from that of the robot's joint, with elasticity."""
+    return f"{joint}/rotor"
 
 
 def handle_name(i: int) -> str:
@@ -182,9 +183,9 @@ def handle_name(i: int) -> str:
 def mujoco_model(tree: KinematicTree, scene: MuJoCo, viscous: Array, coulomb: Array) -> Any:
     """An `mjModel` with the dynamics of a tree: M ddq + C dq + g = u - friction + loads.
 
-    Joint i is "joint<i>", moved by the motor "motor<i>" (gear 1), and carries "body<i>" and the massless "handle<i>",
-    where pushes act. The tip frame is the body "tip". With elasticity, the motor turns "rotor<i>", which the spring
-    "gear<i>" couples to the joint; friction then acts at the rotor.
+    Joints have the robot's names. The motor "motor<i>" (gear 1) moves joint i, which carries "body<i>" and the massless
+    "handle<i>", where pushes act. The tip frame is the body "tip". With elasticity, the motor turns the joint
+    "<name>/rotor", which the spring "gear<i>" couples to the joint; friction then acts at the rotor.
 
     Args:
         tree: the robot.
@@ -238,7 +239,7 @@ def _place_inertia(body: Any, scale: float) -> None:
 
 def _add_joint(mj: ModuleType, body: Any, tree: KinematicTree, i: int, stops: bool) -> Any:
     kind = mj.mjtJoint.mjJNT_SLIDE if tree.joint_kinds[i] == "prismatic" else mj.mjtJoint.mjJNT_HINGE
-    joint = body.add_joint(name=f"joint{i}", type=kind, axis=(0, 0, 1), armature=tree.armatures[i])
+    joint = body.add_joint(name=tree.joint_names[i], type=kind, axis=(0, 0, 1), armature=tree.armatures[i])
     ends = np.array([tree.lower[i], tree.upper[i]])
     limited = stops and bool(np.isfinite(ends).any())
     joint.limited = mj.mjtLimited.mjLIMITED_TRUE if limited else mj.mjtLimited.mjLIMITED_FALSE
@@ -254,7 +255,7 @@ def _add_rotor(mj: ModuleType, spec: Any, joint: Any, i: int, numbers: tuple[Arr
     body = spec.worldbody.add_body(name=f"rotor_body{i}", gravcomp=1.0)
     body.explicitinertial = True
     body.mass, body.inertia = inertia, (inertia, inertia, inertia)
-    rotor = body.add_joint(name=rotor_name(i), type=joint.type, axis=(0, 0, 1))
+    rotor = body.add_joint(name=rotor_name(joint.name), type=joint.type, axis=(0, 0, 1))
     rotor.limited = mj.mjtLimited.mjLIMITED_FALSE
     joint.armature = 0.0
     gear = spec.add_tendon(name=f"gear{i}", springlength=(0.0, 0.0))
@@ -368,9 +369,9 @@ class MuJoCoPlant(Shown):
         self.data: Any = mujoco().MjData(self.model)
         self._step = mujoco().mj_step
         self._timestep = float(timestep)
-        self._dofs = self._numbers([f"joint{i}" for i in range(robot.n)])
+        self._dofs = self._numbers(robot.joint_names)
         #: joints that the motors move: those of the robot, or their rotors
-        self._motors = self._dofs if elasticity is None else self._numbers([rotor_name(i) for i in range(robot.n)])
+        self._motors = self._dofs if elasticity is None else self._numbers(map(rotor_name, robot.joint_names))
         self._handles = [int(self.model.body(handle_name(i)).id) for i in range(robot.n)]
         self.reset(np.zeros(robot.n))
 
@@ -461,7 +462,7 @@ class MuJoCoPlant(Shown):
         self.model.opt.integrator = kinds.mjINT_RK4 if damped <= _MOST_PARTS else kinds.mjINT_IMPLICITFAST
         self._longest = self._timestep / parts
 
-    def _numbers(self, names: list[str]) -> NDArray[np.intp]:
+    def _numbers(self, names: Iterable[str]) -> NDArray[np.intp]:
         """Where joints stand among all."""
         return np.array([self.model.joint(name).dofadr[0] for name in names])
 

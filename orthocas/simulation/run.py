@@ -3,7 +3,7 @@
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -17,6 +17,7 @@ from orthocas.control.safety import Safety
 from orthocas.errors import Interrupted, InvalidValueError, SimulationError
 from orthocas.robots.robot import Robot
 from orthocas.simulation.disturbances import Friction, Loads, Noise, Push, Stops
+from orthocas.simulation.ends import why_lost
 from orthocas.simulation.loops import ClosedLoop, CompiledLoop, Piece, integrate, run_ticks
 from orthocas.simulation.mujoco_plant import MUJOCO, MuJoCo
 from orthocas.simulation.physics import LawWithMemory, SupervisedLaw, law_in_ticks, run_physics, run_supervised
@@ -166,7 +167,7 @@ def prepare(controller: Controller, reference: Reference, q_start: ArrayLike, se
             law = SupervisedLaw(controller, settings.safety, settings.resume_after, 1 / rate)
         ticks = _ticks(scene, settings.tolerance, law, compiled)
         pieces = partial(ticks, rate=rate, noise=noise or Noise())
-    return Prepared(loop, reference, start, pieces, compiled)
+    return Prepared(loop, reference, start, pieces, compiled, settings.safety is not None)
 
 
 _FOR_MEMORY = {"control_rate": "a rate, such as 1000.0,", "compiled": "False"}
@@ -189,6 +190,7 @@ class Prepared:
     start: Array  #: state at t = 0
     pieces: Callable[[ClosedLoop, Reference, Array], Iterator[Piece]]
     compiled: CompiledLoop | None
+    supervised: bool
 
     def run(self, monitor: Monitor) -> Trajectory:
         """Simulate.
@@ -226,7 +228,7 @@ class Prepared:
         energy = controller.energy if self.compiled is None else controller.energy_graph
         unknown = [np.full((len(times), 1), np.nan)] * 2
         storage, power = unknown if energy is None else self._rows("energy", q, dq, *wanted)
-        return Trajectory(
+        run = Trajectory(
             controller=controller.name,
             kind=controller.command,
             outcome=outcome,
@@ -245,6 +247,8 @@ class Prepared:
             dissipated_power=power[:, 0],
             cause=cause.astype(int),
         )
+        reason = why_lost(run, controller, loop.loads.pushes, self.supervised) if outcome is Outcome.COMPLETE else ""
+        return replace(run, outcome=Outcome.LOST, reason=reason) if reason else run
 
     def _commands(self, pieces: Sequence[Piece], *arguments: Array) -> tuple[Array, Array, Array]:
         """Commands, status and causes: those that were held, the last one also for the end, or those of the law."""
@@ -355,7 +359,8 @@ def simulate(
         monitor: called with progress.
 
     Returns:
-        The trajectory. Its outcome says whether it ended early because the integrator gave up.
+        The trajectory. Its outcome says whether it ended early because the integrator gave up, or whether the law lost
+        the arm: LOST with a `reason`, see `orthocas.simulation.ends.why_lost`.
 
     Raises:
         UnreachableReferenceError: if the reference leaves the domain.

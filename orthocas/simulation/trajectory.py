@@ -90,6 +90,7 @@ class Outcome(Enum):
     COMPLETE = "complete"
     INTERRUPTED = "interrupted"  #: by Ctrl-C; the arrays end at that point
     DIVERGED = "diverged"  #: the integrator gave up; the arrays end at that point
+    LOST = "lost"  #: the law lost the arm, see `Trajectory.reason`; the arrays last to the end
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -116,6 +117,7 @@ class Trajectory(Shown):
     storage: Array  #: (N,) V [J]; NaN for velocity controllers
     dissipated_power: Array  #: (N,) dissipated by the controller's damping [W]; NaN for velocity controllers
     cause: Array  #: (N,) why the catcher of a supervised law took over last, `ControlStatus`; OK if it never did
+    reason: str = ""  #: of the outcome LOST, in words
 
     @property
     def energy_balance(self) -> Array:
@@ -164,8 +166,9 @@ class Trajectory(Shown):
         """Outcome, errors, commands, and whether the controller used its fallback."""
         errors = zip(self.labels, self.tracking_error, strict=True)
         bad, cut = np.count_nonzero(self.fell_back), np.count_nonzero(self.saturated)
+        end = self.outcome.value + (f", {self.reason}" if self.reason else "")
         facts = {
-            "run": f"{self.controller}, {self.times[-1]:.4g} s: {self.outcome.value}",
+            "run": f"{self.controller}, {self.times[-1]:.4g} s: {end}",
             "instants": f"{len(self.times)} of {self.q.shape[1]} joints",
             "largest error": listed(f"{label} {error:.3g}" for label, error in errors),
             f"largest {self.kind}": number_list(np.abs(self.command).max(axis=0)),
@@ -203,6 +206,7 @@ class Trajectory(Shown):
             "controller": self.controller,
             "kind": self.kind,
             "outcome": self.outcome.value,
+            **({"reason": self.reason} if self.reason else {}),
             "labels": self.labels,
             "joint_names": self.joint_names,
             "units": _ARRAYS,
@@ -231,6 +235,7 @@ class Trajectory(Shown):
                 "controller": controller,
                 "kind": header["kind"],
                 "outcome": Outcome(header["outcome"]),
+                "reason": require_text("reason", header["reason"]) if "reason" in header else "",
             }
             return cls(**own, **names, **checked)
         except OrthocasError as error:

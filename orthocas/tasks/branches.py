@@ -1,13 +1,14 @@
 """Branches of the joint range: what is left of it if it is cut where self-motions cannot pass."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, SingularTaskError, UnknownNameError
 from orthocas.robots.robot import Robot
@@ -17,12 +18,13 @@ from orthocas.tasks.problem import Problem, relative_singular_values
 from orthocas.tasks.regular_box import joint_range
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, as_point, require_kind
-from orthocas.tools.display import Shown, listed
+from orthocas.tools.display import Shown, listed, percent
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CLEAR = 0.1  #: relative singular value above which positions are clear: those of shares, and of self-motions at cuts
+CLEARER = 1.5  #: times the clearance of a wide chart: that of its middle, if the middle of the branch is not clear
 _SLICES, _ON_SLICE, _FINER, _SEED = 61, 200, 400, 0  # slices q_k = v, and positions on each
 _FEW = 8  # positions on a slice; fewer say nothing about it
 _QUANTILE = 0.9  # of the positions of a slice that must be singular, or that self-motions must not leave
@@ -36,7 +38,8 @@ _WELL_CLEAR, _WELL = (
     0.6,
 )  # that quantile on the clearest slice of a part that counts, or over that of the joint
 _NEIGHBOURS, _SAME = 5, 1e-8  # of a minimum; difference of poses that are equal [m and rad]
-_SAMPLES = 20_000
+_SAMPLES, _DRAWN = 20_000, 25  # positions; times those that are wanted, the most that are drawn for clear ones
+_MIDDLES, _SURELY = 20_000, 3.0  # positions that may be a middle; times CLEAR, a value on any box that has one for sure
 _PANELS, _COLOUR = 4, "#1f5fa8"  # of pictures: side by side, of the arm
 _ARM = 7  #: joints of an arm, counted from its tip, whose self-motions are looked at
 _PARTS = {6: {1: "shoulder", 2: "elbow", 4: "wrist"}, 7: {1: "shoulder", 3: "elbow", 5: "wrist"}}
@@ -69,6 +72,7 @@ class Branch:
     posture: Array  #: its clear position farthest from limits and cuts, (n,)
     clear_share: float  #: share of its positions with a relative singular value above 0.1
     share: float  #: its share of all such positions of the joint range
+    clearance: float = CLEAR  #: the largest up to 0.1 for which some position is clear enough to be a chart's middle
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -125,17 +129,19 @@ class Branches(Shown, Sequence[Branch]):
         for k, (item, points) in enumerate(zip(self, postures, strict=True)):
             panel = figure.add_subplot(rows, columns, k + 1, projection="3d")
             panel.plot(*points.T, "-o", color=_COLOUR, markersize=4, linewidth=2.2)
-            panel.set_title(f"{item.name}\n{item.share:.1%} of the clear positions", fontsize=9)
+            panel.set_title(f"{item.name}\n{percent(item.share)} of the clear positions", fontsize=9)
             equal_axes(panel, postures.reshape(-1, 3))
         return figure
 
     def facts(self) -> dict[str, str]:
-        """Cuts and branches."""
-        shares = [f"{item.name} ({item.share:.1%})" for item in self.items]
+        """Cuts and branches, and those that a wide chart of the usual clearance cannot serve."""
+        shares = [f"{item.name} ({percent(item.share)})" for item in self.items]
+        lower = [f"{item.name} ({item.clearance:.2g} or less)" for item in self.items if item.clearance < CLEAR]
         return {
             "branches": f"{len(self)} of {self.robot.heading}",
             "cuts": "; ".join(cut.explained for cut in self.cuts) or "none",
             "clear positions": listed(shares),
+            **({"too singular": f"for wide charts of clearance {CLEAR:g}: {listed(lower)}"} if lower else {}),
         }
 
 
@@ -151,6 +157,7 @@ def branches(robot: Robot, task: Task | None = None) -> Branches:
     from samples, not proved.
 
     Self-motions are those of the tip's pose, by the last seven joints: charts of its position keep to the same cuts.
+    With several tips, they are those of each tip by the last seven joints that carry it, if these move the task.
     With fewer than six joints they are those of the task. Branches are the parts with positions where the task is
     clear. Joints that can turn farther than a full turn are taken from -pi to pi.
 
@@ -177,13 +184,19 @@ def branches(robot: Robot, task: Task | None = None) -> Branches:
     if task is not None:
         require_kind("task", task, Task)
     whole = joint_range(robot, 0)
-    arm = _Arm.of(robot, task, whole)
-    cuts = tuple(cut for k in arm.inner for cut in arm.cuts(k))
+    arms = _Arm.all_of(robot, task, whole)
+    cuts = tuple(cut for arm in arms for k in arm.inner for cut in arm.cuts(k))
     points = sample_evenly(Box(whole.centre, whole.half_width), _SAMPLES, _SEED)
-    clear = points[_clear(robot, task, whole, points) if task is not None else arm.judged(points)[0] > CLEAR]
-    if not len(clear):
+    if task is not None:
+        values = _values_in_range(robot, task)(points)
+    else:
+        values = np.min([arm.judged(points)[0] for arm in arms], axis=0)
+    if not (values > CLEAR).any():
         raise SingularTaskError("no position of the joint range is clear of singular ones")
-    items = [item for sides in product(*_sides(cuts)) if (item := _branch(whole, cuts, sides, points, clear))]
+    found = [_branch(whole, cuts, sides, points, values) for sides in product(*_sides(cuts))]
+    items = [item for item in found if item]
+    if task is not None or len(arms) == 1:
+        items = [_with_clearance(item, robot, task or arms[0].task, points, values) for item in items]
     items.sort(key=lambda item: -item.share)
     mirrors = tuple(i for i, cut in enumerate(cuts) if _is_mirror(robot, cut, points[:50]))
     return Branches(robot, cuts, tuple(items), mirrors)
@@ -200,12 +213,26 @@ class _Arm:
     scale: Array
 
     @classmethod
-    def of(cls, robot: Robot, task: Task | None, whole: Box) -> "_Arm":
-        if robot.n >= 6 or task is None:
-            task = Task.pose(robot)
+    def all_of(cls, robot: Robot, task: Task | None, whole: Box) -> list["_Arm"]:
+        """The arm of a robot with one tip; of others, those of all tips whose joints move the task."""
+        points = sample_evenly(Box(whole.centre, whole.half_width), 2000, _SEED)
+        if len(robot.tips) == 1:
+            joints = list(range(max(0, robot.n - _ARM), robot.n))
+            return [cls._of(robot, Task.pose(robot) if robot.n >= 6 or task is None else task, whole, joints, points)]
+        moved = np.ones(robot.n, dtype=bool)
+        if task is not None:
+            moved = np.asarray(_jacobians(task.with_reference_at(whole.centre), points[:20]).any(axis=(0, 1)))
+        found = []
+        for tip in robot.tips:
+            joints = robot.tree.carriers(robot.tree.frame(tip).parent)[-_ARM:]
+            if joints and moved[joints].any():
+                found.append(cls._of(robot, Task.pose(robot, frame=tip), whole, joints, points))
+        return found
+
+    @classmethod
+    def _of(cls, robot: Robot, task: Task, whole: Box, joints: list[int], points: Array) -> "_Arm":
         judged = task.with_reference_at(whole.centre)
-        J = _jacobians(judged, sample_evenly(Box(whole.centre, whole.half_width), 2000, _SEED))
-        joints = list(range(max(0, robot.n - _ARM), robot.n))
+        J = _jacobians(judged, points)
         return cls(robot, judged, whole, joints, row_scale(J[:, :, joints], judged.units))
 
     @property
@@ -263,7 +290,8 @@ class _Arm:
         )
         value = 0.0 if size(0.0) <= found.fun + _EXACT and values[i - 1] < 0 < values[i + 1] else float(found.x)
         name = self.robot.joint_names[k]
-        part = _PARTS.get(len(self.joints), {}).get(k - self.joints[0], name)
+        parts = _PARTS.get(len(self.joints), {}) if len(self.robot.tips) == 1 else {}
+        part = parts.get(k - self.joints[0], name)
         least = size(value)
         return Cut(k, name, part, value, singular, least < _EXACT), least
 
@@ -280,10 +308,53 @@ def _beside_a_sliver(
     return max(found, key=lambda pair: pair[1], default=None)
 
 
-def _clear(robot: Robot, task: Task, whole: Box, points: Array) -> NDArray[np.bool_]:
-    """Whether the task is clear at points, (N,)."""
-    judged = Problem(robot, task, domain=Box(whole.centre, whole.half_width))
-    return relative_singular_values(judged, points) > CLEAR
+def clear_positions(robot: Robot, task: Task, box: Box, samples: int, seed: int | tuple[int, ...]) -> Array:
+    """Uniform positions of a box at which a task is clear, as `branches` counts them, (N, n).
+
+    Args:
+        robot: the robot.
+        task: a task of that robot.
+        box: its positions.
+        samples: N, or less if fewer than one in 25 is clear.
+        seed: of the positions.
+    """
+    values, rng = _values_in_range(robot, task), np.random.default_rng(seed)
+    found, count = [np.empty((0, robot.n))], 0
+    for _ in range(_DRAWN):
+        points = rng.uniform(box.centre - box.half_width, box.centre + box.half_width, (samples, robot.n))
+        found.append(points[values(points) > CLEAR])
+        count += len(found[-1])
+        if count >= samples:
+            break
+    return np.concatenate(found)[:samples]
+
+
+def middles(robot: Robot, task: Task, box: Box) -> tuple[Array, Array]:
+    """Positions of a box (N, n), and their relative singular values with rows scaled over the box, (N,)."""
+    points = sample_evenly(Box(box.centre, box.half_width), _MIDDLES, _SEED)
+    return points, relative_singular_values(Problem(robot, task, domain=box), points)
+
+
+def _values_in_range(robot: Robot, task: Task) -> Callable[[Array], Array]:
+    """Relative singular values of a task at points (N, n), (N,); rows are scaled over the joint range."""
+    whole = joint_range(robot, 0)
+    judged = task.with_reference_at(whole.centre)
+    scale = row_scale(
+        _jacobians(judged, sample_evenly(Box(whole.centre, whole.half_width), _SAMPLES, _SEED)), judged.units
+    )
+
+    def values(points: Array) -> Array:
+        return np.asarray(np.linalg.svd(_jacobians(judged, points) / scale[:, None], compute_uv=False)[:, -1])
+
+    return values
+
+
+def _with_clearance(branch: Branch, robot: Robot, task: Task, points: Array, values: Array) -> Branch:
+    """The branch with the clearance that it allows; the values at points are those in the joint range."""
+    if task.m >= robot.n or values[branch.box.contains(points)].max() > _SURELY * CLEAR:
+        return branch
+    largest = float(middles(robot, task, branch.box)[1].max()) / CLEARER
+    return replace(branch, clearance=min(CLEAR, math.floor(1e3 * largest) / 1e3))
 
 
 def _jacobians(task: Task, points: Array) -> Array:
@@ -308,10 +379,10 @@ def _sides(cuts: tuple[Cut, ...]) -> list[range]:
     return [range(1 + sum(cut.joint == k for cut in cuts)) for k in joints]
 
 
-def _branch(whole: Box, cuts: tuple[Cut, ...], sides: tuple[int, ...], points: Array, clear: Array) -> Branch | None:
+def _branch(whole: Box, cuts: tuple[Cut, ...], sides: tuple[int, ...], points: Array, values: Array) -> Branch | None:
     """The branch on some sides of the cuts; None if it has no clear sample."""
     low, high = whole.centre - whole.half_width, whole.centre + whole.half_width
-    words = []
+    clear, words = points[values > CLEAR], []
     for k, side in zip(sorted({cut.joint for cut in cuts}), sides, strict=True):
         own = [cut for cut in cuts if cut.joint == k]
         if side:
@@ -348,5 +419,9 @@ def _is_mirror(robot: Robot, cut: Cut, points: Array) -> bool:
     if not cut.exact or any(prismatic[j] for j in near):
         return False
     moved = _reflected(robot, cut, points)
-    same = [np.abs(of(points) - of(moved)).max() < _SAME for of in (robot.tip_position, robot.tip_rotation)]
+    same = [
+        np.abs(of(points, tip) - of(moved, tip)).max() < _SAME
+        for of in (robot.frame_position, robot.frame_rotation)
+        for tip in robot.tips
+    ]
     return bool(all(same))

@@ -15,7 +15,7 @@ from orthocas.robots.robot import Robot
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, frozen_array, require_kind, require_known, require_text
-from orthocas.tools.expressions import HoldsFunctions, expression_of
+from orthocas.tools.expressions import HoldsFunctions, called, expression_of
 
 METRIC_KINDS = ("euclidean", "inertia")
 MetricSpec = str | ArrayLike | Callable[[ca.SX], ca.SX]  #: what `Metric.from_spec` accepts
@@ -45,7 +45,8 @@ class Metric(HoldsFunctions):
         require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
         if isinstance(spec, str) and spec in _REGISTERED:
-            return cls.custom(robot, spec, _REGISTERED[spec](robot))
+            built = called(f"metric '{spec}'", "a builder that takes this robot", _REGISTERED[spec], robot)
+            return cls.custom(robot, spec, built)
         if isinstance(spec, str):
             require_known("metric", spec, (*METRIC_KINDS, *_REGISTERED))
             if spec == "inertia":

@@ -9,6 +9,7 @@ from orthocas.robots.spatial import conjugate, quaternion_product, skew
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array
 from orthocas.tools.columns import BlockedFunction
 
 
@@ -50,6 +51,19 @@ class Relative:
     def batched_rates(self) -> BlockedFunction:
         """Evaluates J at many points."""
         return BlockedFunction(self.rates) if self.turned else self.task.batched_jacobian
+
+    def embedded(self, x: Array) -> Array:
+        """Orientations of x (N, m) as numbers (N, 16) whose distance is that of the error for near ones, and no seam.
+
+        They are the products of the entries of the unit quaternion, which stands for a rotation with either sign, times
+        the root of 2. For tasks of a whole orientation only.
+        """
+        p = self._batched_quaternion(x)[0]
+        return np.asarray(np.sqrt(2) * (p[:, :, None] * p[:, None]).reshape(len(p), -1))
+
+    @cached_property
+    def _batched_quaternion(self) -> Batched:
+        return Batched(self.task.quaternion_function)
 
     def error(self, q: ca.MX, x_d: ca.MX) -> tuple[ca.MX, ca.MX]:
         """The error e (m, 1), and de/dq (m, n) for x_d at rest."""

@@ -13,7 +13,9 @@ from orthocas.tasks.problem import Problem, task_jacobians
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 
-_NEGLIGIBLE = 1e-10  # robot files give angles with ten decimals
+#: of the largest entry of J_x: columns below are of joints that do not move the task. Robot files round angles to nine
+#: decimals and more, and such a joint then tilts the axis that it turns about by so little
+NEGLIGIBLE = 1e-8
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -147,18 +149,18 @@ def samples_at(problem: Problem, points: Array) -> Samples:
 def idle_joints(problem: Problem, samples: Samples) -> list[int]:
     """Joints k on which the task does not depend, and which the metric does not couple to the others.
 
-    At every sample column k of J_x vanishes, row k of A^-1 is zero off the diagonal, and A does not depend on q_k. Then
-    J_x A^-1 e_k = 0, so xi = q_k is exact and orthogonal to every coordinate of the other joints. The rest of the
-    problem does not depend on joint k. So are the joints of a floating base in `Samples.at_zero_momentum`: the
-    generalised inertia does not depend on where it is.
+    At every sample column k of J_x vanishes, up to `NEGLIGIBLE`, row k of A^-1 is zero off the diagonal, and A does not
+    depend on q_k. Then J_x A^-1 e_k = 0, so xi = q_k is exact and orthogonal to every coordinate of the other joints.
+    The rest of the problem does not depend on joint k. So are the joints of a floating base in
+    `Samples.at_zero_momentum`: the generalised inertia does not depend on where it is.
     """
     J = samples.task_jacobian
     size = np.abs(J).max(axis=(0, 1))
-    idle = size <= _NEGLIGIBLE * size.max()
+    idle = size <= NEGLIGIBLE * size.max()
     if samples.metric_inverse is not None:
         B = np.abs(samples.metric_inverse).max(axis=0)
         off_diagonal = (B - np.diag(B.diagonal())).max(axis=1)
-        idle &= off_diagonal <= _NEGLIGIBLE * B.diagonal()
+        idle &= off_diagonal <= NEGLIGIBLE * B.diagonal()
         felt_by_metric = {*problem.metric.function.jac_sparsity(0, 0).get_col()} - {*problem.robot.tree.floating}
         idle[list(felt_by_metric)] = False
     return [int(k) for k in np.flatnonzero(idle)]

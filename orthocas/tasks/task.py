@@ -27,7 +27,7 @@ from orthocas.tools.checks import (
 )
 from orthocas.tools.columns import BlockedFunction
 from orthocas.tools.display import Shown, listed
-from orthocas.tools.expressions import HoldsFunctions, expression_of
+from orthocas.tools.expressions import HoldsFunctions, called, expression_of
 
 TASK_KINDS = (
     "position",
@@ -405,8 +405,11 @@ class Task(Shown, HoldsFunctions):
             return cls.position(robot, asked.partition(":")[2] or "xyz", frames.frame, frames.relative_to)
         name, _, words = kind.partition(":")
         if name not in _REGISTERED or (name == "polar" and words):
-            raise UnknownNameError("task", kind, tuple(dict.fromkeys((*TASK_KINDS, *_REGISTERED))))
-        return _REGISTERED[name](robot, words)
+            raise UnknownNameError("task", kind, task_kinds())
+        wanted = f"'{name}' or '{name}:WORDS' with words that its builder takes"
+        task: Task = called(f"task '{kind}'", wanted, _REGISTERED[name], robot, words)
+        require_kind(f"what the builder of task '{name}' returns", task, Task)
+        return task
 
     @classmethod
     def from_recipe(cls, robot: Robot, recipe: Mapping[str, Any]) -> "Task":
@@ -503,15 +506,27 @@ class Task(Shown, HoldsFunctions):
         its own axes, per unit joint velocity: rows of the geometric Jacobian, of which an axis task takes the two
         across its axis. J_x loses rank half a turn from the reference, where x ends; these rows do not. For other tasks
         they are J_x itself.
+
+        A stack has the rows of its parts. If it has the pose of a frame, and that of a second frame in the first, then
+        what the first one moves of the second is a combination of its own rows, and is left out: the rows are those of
+        both poses in the world, to which such a stack is equivalent.
         """
-        if self.parts:
-            return _stacked(self.parts, "frame_jacobian_function")
-        turn = self.turn
-        if turn is None:
+        if self.turn is None and not self.parts:
             return self.jacobian_function
         q = ca.SX.sym("q", self.robot.n)
-        J, R = self._frame("jacobian")(q), self._frame("rotation")(q)
-        return dense_function("frame_jacobian", [q], [ca.cse(turn.rates(R.T @ J[3:, :], R.T @ J[:3, :]))])
+        rows = [part._frame_rows(q, frames) for part, frames in _independent_frames(self.parts or (self,))]
+        return dense_function("frame_jacobian", [q], [ca.cse(ca.vertcat(*rows))])
+
+    def _frame_rows(self, q: ca.SX, frames: Frames) -> ca.SX:
+        """The rows at q of a task with one part, if it looked at these frames; positions stay in their own axes."""
+        turn = self.turn
+        if turn is None and frames == self._frames:
+            return self.jacobian_function(q)
+        J, R = (frames.function(self.robot, quantity)(q) for quantity in ("jacobian", "rotation"))
+        if turn is not None:
+            return turn.rates(R.T @ J[3:, :], R.T @ J[:3, :])
+        axes = Frames(self._frames.relative_to).function(self.robot, "rotation")(q)
+        return (axes.T @ J[:3, :])[_rows_of(self.recipe["kind"].partition(":")[2]), :]
 
     @cached_property
     def second_derivative_function(self) -> ca.Function:
@@ -700,6 +715,26 @@ def _stacked(tasks: Sequence[Task], name: str) -> ca.Function:
     return dense_function("h", [q], [ca.vertcat(*(getattr(task, name)(q) for task in tasks))])
 
 
+def _independent_frames(tasks: Sequence[Task]) -> list[tuple[Task, Frames]]:
+    """Each task with the frames whose rows stand for its own beside those of the others.
+
+    A whole pose that leads from a frame with a known pose to another one is as good as the pose of the latter in the
+    world. What is seen from a frame with a known pose is as good as what the world sees of it.
+    """
+    stands: dict[int, Frames] = {}
+    known: set[str | None] = {None}  # None: the world
+    poses = [task for task in tasks if task.turn is not None and task.turn.whole and task.turn.with_position]
+    for _ in poses:
+        for task in poses:
+            ends = task._frames.relative_to, task._frames.frame or task.robot.tree.tip_name
+            new = [end for end in ends if end not in known]
+            if len(new) == 1:
+                stands[id(task)] = Frames(new[0])
+                known.add(new[0])
+    seen = {id(task): Frames(task._frames.frame) for task in tasks if task._frames.relative_to in known}
+    return [(task, stands.get(id(task), seen.get(id(task), task._frames))) for task in tasks]
+
+
 def _rotations(name: str, value: ArrayLike) -> tuple[Array, bool]:
     """Rotation matrices (N, 3, 3) from such, or from unit quaternions, and whether it was one."""
     given = as_float_array(name, value)
@@ -720,6 +755,11 @@ _REGISTERED: dict[str, Callable[[Robot, str], Task]] = {
     "polar": lambda robot, _: Task.polar(robot),
     "centre_of_mass": lambda robot, axes: Task.centre_of_mass(robot, axes or "xyz"),
 }
+
+
+def task_kinds() -> tuple[str, ...]:
+    """The short names of tasks, those of `register_task` too."""
+    return tuple(dict.fromkeys((*TASK_KINDS, *_REGISTERED)))
 
 
 def register_task(name: str, build: Callable[[Robot, str], Task]) -> None:

@@ -193,7 +193,14 @@ def require_kind(name: str, value: object, kind: type) -> None:
     """Raise InvalidValueError unless `value` is an instance of `kind`."""
     if not isinstance(value, kind):
         plain = isinstance(value, str | int | float | None)
-        raise InvalidValueError(name, repr(value)[:80] if plain else f"a {type(value).__name__}", f"a {kind.__name__}")
+        given = repr(value)[:80] if plain else f"a {type(value).__name__}"
+        raise InvalidValueError(name, given, f"a {kind.__name__}{part_hint(value, kind)}")
+
+
+def part_hint(value: object, kind: type) -> str:
+    """The end of a message about a value that has an instance of `kind`, as a fit has a chart; "" for others."""
+    name = kind.__name__.lower()
+    return f": use its attribute '{name}'" if isinstance(getattr(value, name, None), kind) else ""
 
 
 def require_at_least(name: str, value: float, least: float) -> None:

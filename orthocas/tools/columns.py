@@ -15,7 +15,7 @@ from orthocas.tools.checks import Array
 from orthocas.tools.expressions import Tape, replay, to_tape
 
 COLUMNS = 256  #: samples in a block
-MANY = 64  #: joint positions from which blocks pay off
+MANY = 16  #: joint positions from which blocks pay off
 _PIECE = 8 * COLUMNS  # joint positions that a thread takes at once
 
 #: Evaluates contiguous inputs (entries, c), and writes contiguous outputs (entries, c).
@@ -191,7 +191,7 @@ def _columns(points: Array) -> Array:
 
 
 class BlockedFunction:
-    """A dense SX function of q (n, 1), for sets of joint positions of any size; it is called like `Batched`.
+    """A dense SX function of columns, q (n, 1) first, for sets of any size; it is called like `Batched`.
 
     Args:
         function: the function, with one output: a column, or a matrix.
@@ -200,30 +200,30 @@ class BlockedFunction:
     def __init__(self, function: ca.Function) -> None:
         self._function, self._few = function, Batched(function)
 
-    def __call__(self, points: Array) -> list[Array]:
-        """Values (N, rows) or (N, rows, columns) at points (N, n)."""
+    def __call__(self, points: Array, *others: Array) -> list[Array]:
+        """Values (N, rows) or (N, rows, columns) at points (N, n), and at rows of the other inputs (N, k)."""
         rows, columns = self._function.size_out(0)
         shape = (len(points), rows) if columns == 1 else (len(points), rows, columns)
-        return [self.into(np.empty(shape), points)]
+        return [self.into(np.empty(shape), points, *others)]
 
-    def into(self, results: Array, points: Array) -> Array:
+    def into(self, results: Array, points: Array, *others: Array) -> Array:
         """Write the values to `results`, which may be part of a larger array, and return it."""
         if len(points) < MANY or self._by_rows is None:
-            results[...] = self._few(points)[0].reshape(results.shape)
+            results[...] = self._few(points, *others)[0].reshape(results.shape)
         else:
-            fill(results, points, self._on_one_block)
+            fill(results, points, self._on_one_block, *others)
         return results
 
     def _on_one_block(self) -> BlockFunction:
         """The function for `fill`."""
         assert self._by_rows is not None
         run = self._by_rows.on_one_block()
-        return lambda columns: run(columns)[0]
+        return lambda *columns: run(*columns)[0]
 
     @cached_property
     def _by_rows(self) -> ColumnFunction | None:
         """The function with its entries row by row; None if it has an operation that columns do not support."""
-        q = ca.SX.sym("q", self._function.size_in(0)[0])
-        entries = ca.vec(ca.densify(self._function(q)).T)
-        columns = ColumnFunction(ca.Function(self._function.name(), [q], [entries]))
+        inputs = [ca.SX.sym(f"i{i}", self._function.numel_in(i)) for i in range(self._function.n_in())]
+        entries = ca.vec(ca.densify(self._function(*inputs)).T)
+        columns = ColumnFunction(ca.Function(self._function.name(), inputs, [entries]))
         return columns if columns.supported else None

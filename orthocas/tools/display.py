@@ -1,7 +1,9 @@
 """Facts about an object by name, as lines of text and as an HTML table."""
 
 import html
+import math
 from collections.abc import Iterable, Mapping
+from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
 
 _WIDTH = 100  # characters per line
 _LINES = 9  # at most, including the heading
@@ -45,6 +47,22 @@ def as_html(title: str, facts: Mapping[str, str]) -> str:
         for name, value in facts.items()
     )
     return f"<table><caption>{html.escape(title)}</caption>{rows}</table>"
+
+
+def percent(share: float, digits: int = 1, *, fault: bool = False) -> str:
+    """A share in percent, rounded down: 0.99999 is '99.9%', and only 1 is '100.0%'.
+
+    Shares of faults, such as folded samples, are rounded up, so that neither reads better than it is. NaN is 'unknown'.
+
+    Args:
+        share: a number, 1 for all.
+        digits: after the decimal point.
+        fault: whether a smaller share would be better.
+    """
+    if math.isnan(share):
+        return "unknown"
+    step = Decimal(1).scaleb(-digits)
+    return f"{(100 * Decimal(repr(float(share)))).quantize(step, ROUND_CEILING if fault else ROUND_FLOOR)}%"
 
 
 def listed(words: Iterable[str], most: int = 10) -> str:

@@ -296,16 +296,25 @@ def expression_of(what: str, function: Callable[[ca.SX], ca.SX] | ca.Function, q
     """
     if not callable(function):
         raise InvalidValueError(what, repr(function), "a function of an SX column q")
-    try:
-        value = ca.SX(function(q))
-    except (RuntimeError, TypeError, ValueError, LookupError, ArithmeticError, AttributeError) as error:
-        reason = " ".join(str(error).split())[:120]
-        raise InvalidValueError(what, f"failing ({reason})", f"a function of an SX column q {q.shape}") from None
+    value: ca.SX = called(what, f"a function of an SX column q {q.shape}", lambda: ca.SX(function(q)))
     known = {str(symbol) for symbol in ca.vertsplit(q)}
     free = [str(symbol) for symbol in ca.symvar(value) if str(symbol) not in known]
     if free:
         raise InvalidValueError(what, f"using the free symbols {', '.join(free[:5])}", "an expression in q alone")
     return value
+
+
+def called(what: str, wanted: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """What a user's function returns.
+
+    Raises:
+        InvalidValueError: if it fails.
+    """
+    try:
+        return function(*arguments)
+    except (RuntimeError, TypeError, ValueError, LookupError, ArithmeticError, AttributeError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise InvalidValueError(what, f"failing ({reason})", wanted) from None
 
 
 def determinant(matrix: ca.SX) -> ca.SX:

@@ -130,7 +130,7 @@ class TerminalLines:
         new = progress.stage != self._stage
         if not self._seen or (not new and progress.fraction < 1 and time.monotonic() < self._drawn + _PAUSE):
             return
-        full = round(_BAR * min(max(progress.fraction, 0.0), 1.0))
+        full = int(_BAR * min(max(progress.fraction, 0.0), 1.0))
         start = "\n" if new and self._stage else "\r"
         end = "\n" if progress.fraction >= 1 else ""
         bar = "=" * full + " " * (_BAR - full)

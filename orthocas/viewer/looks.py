@@ -164,12 +164,12 @@ def stick_arm(tree: KinematicTree, thickness: float = 1.0, facets: int = FINE) -
 
 
 def chain_length(tree: KinematicTree) -> float:
-    """Length of the chain from the base to the tip, through all joint frames [m]."""
-    length, i = float(np.linalg.norm(tree.tip_translation)), tree.tip_parent
-    while i >= 0:
-        length += float(np.linalg.norm(tree.translations[i]))
-        i = tree.parents[i]
-    return max(length, 1e-3)
+    """Length of the longest chain from the base to a tip, through all joint frames [m]."""
+    lengths = [1e-3]
+    for frame in (tree.tip, *map(tree.frame, tree.tips)):
+        steps = [frame.translation, *tree.translations[tree.carriers(frame.parent)]]
+        lengths.append(float(sum(np.linalg.norm(step) for step in steps)))
+    return max(lengths)
 
 
 def _radii(tree: KinematicTree) -> Array:

@@ -55,8 +55,8 @@ class Stage:
         for k, (motion, shift) in enumerate(zip(motions, self.shifts, strict=True)):
             self._arms.append(Arm(scene, f"/arm{k}", robot, look, shift))
             rows = np.unique(np.linspace(0, len(motion.q) - 1, _MOST_POINTS).astype(int))
-            way = robot.tip_position(motion.q[rows]) + shift
-            ends = np.stack([way[:-1], way[1:]], axis=1)
+            ways = [robot.frame_position(motion.q[rows], tip) + shift for tip in robot.tips]
+            ends = np.concatenate([np.stack([way[:-1], way[1:]], axis=1) for way in ways])
             scene.add_line_segments(f"/path{k}", ends, PATHS[k % len(PATHS)], thickness=0.005 * size)
             if len(motions) > 1:
                 place = shift + 1.25 * size * up_of(robot) * 0.55

@@ -11,7 +11,7 @@ from orthocas.errors import ArchiveError, InvalidValueError, NoExpressionError
 from orthocas.paths.joint_motion import JointMotion
 from orthocas.robots.robot import Robot
 from orthocas.simulation.trajectory import Trajectory
-from orthocas.tools.checks import as_path
+from orthocas.tools.checks import as_path, part_hint
 from orthocas.tools.files import published, require_replaceable, require_writable
 from orthocas.viewer.chart_page import ChartPage
 from orthocas.viewer.looks import Look, decimated, stick_arm, urdf_look
@@ -191,7 +191,8 @@ def _motions(shown: Any) -> tuple[Motion, ...]:
         return (Motion.of_path(shown),)
     several = shown if isinstance(shown, list | tuple) else [shown]
     if not several or not all(isinstance(part, Motion) for part in several):
-        raise InvalidValueError("shown", f"a {type(shown).__name__}", "a chart, a robot, a run or a joint motion")
+        wanted = f"a chart, a robot, a run or a joint motion{part_hint(shown, Chart)}"
+        raise InvalidValueError("shown", f"a {type(shown).__name__}", wanted)
     return tuple(several)
 
 

@@ -68,7 +68,7 @@ static int references_stay_finite(const arm_state *state, arm_reference *referen
   status = (int)arm_reference_spline(reference, target, 2.0, uniform(), &spline);
   if (!spoiled && status != ARM_OK) return 0;
   status = (int)arm_reference_stream(state, reference, target, 5.0, (NUMBER)1e-3);
-  if (status != (spoiled ? ARM_NOT_FINITE : ARM_OK)) return 0;
+  if (spoiled ? status != ARM_NOT_FINITE : status != ARM_OK && status != ARM_NEAR_BOUNDARY) return 0;
   for (i = 0; i < K; ++i)
     if (!isfinite(reference->value[i]) || !isfinite(reference->velocity[i]) || !isfinite(reference->acceleration[i]) ||
         !isfinite(spline.value[i]) || !isfinite(spline.velocity[i]) || !isfinite(spline.acceleration[i]))

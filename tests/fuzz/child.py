@@ -6,6 +6,7 @@ and allocations beyond twice that fail, which is a finding too, whatever the cod
 """
 
 import multiprocessing
+import re
 import resource
 import signal
 import time
@@ -21,6 +22,7 @@ from orthocas.errors import OrthocasError
 SECONDS = 10.0  #: of processor time for one mutant; other work on the machine does not count
 MEMORY = 2**30  #: bytes of resident memory that a mutant may take at its peak
 _LONGEST = 2000  # characters of an error
+_FOREIGN = re.compile(r"\w::\w|Tpl<|\.[ch](pp|xx)\b")  # types and places of C++ libraries
 
 Judge = Callable[[int], str | None]  #: makes the mutant of a seed and says what is wrong with its treatment
 
@@ -46,6 +48,8 @@ def verdict(call: Callable[[], object]) -> str | None:
         text = str(error)
         if "\n" in text or len(text) > _LONGEST or not text.isprintable():
             return f"message of {len(text)} characters: {text[:200]!r}"
+        if _FOREIGN.search(text):
+            return f"C++ in a message: {text[:200]!r}"
         if any(map(_failed_allocation, _chain(error))):
             return f"takes more than {2 * MEMORY / 2**30:g} GiB: {text[:200]}"
     except Exception as error:

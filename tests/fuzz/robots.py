@@ -289,6 +289,18 @@ def _mimic(rng: Rng, root: Element) -> None:
             SubElement(joint, "mimic", values)
 
 
+def _looks(rng: Rng, root: Element) -> None:
+    """Shapes and colours that are not URDF, which kinematics does not use."""
+    colour, shape = ("material", "texture", "color"), ("geometry", "mesh", "capsule", "box", "origin")
+    for link in root.findall("link"):
+        look = SubElement(link, pick(rng, ("visual", "collision", "sensor")))
+        for tag in pick(rng, (colour, shape, (*shape, *colour))):
+            inner = SubElement(pick(rng, list(look.iter())), tag)
+            inner.set(pick(rng, ("name", "filename", "size", "rgba")), pick(rng, pick(rng, (NUMBERS, VECTORS, NAMES))))
+    for _ in range(int(rng.integers(3))):
+        SubElement(root, "material", name=pick(rng, NAMES[:3]))
+
+
 def _inertia(rng: Rng, root: Element) -> None:
     """Masses and inertias that no body has."""
     for element in root.iter():
@@ -335,5 +347,5 @@ _ANY: tuple[_Change, ...] = (
     *(_change_attribute, _drop_attribute, _add_attribute, _change_name, _share_name, _change_number),
     *(_drop_element, _double_element, _rename_element, _inertia, _nest),
 )
-_URDF_CHANGES: tuple[_Change, ...] = (*_ANY, _self_child, _self_child, _mimic, _many)
+_URDF_CHANGES: tuple[_Change, ...] = (*_ANY, _self_child, _self_child, _mimic, _looks, _many)
 _MJCF_CHANGES: tuple[_Change, ...] = (*_ANY, _include, _many)

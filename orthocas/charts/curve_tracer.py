@@ -1,0 +1,257 @@
+"""The self-motion curves of many task values at once, r = 1, whatever the limits: ways to x, and the curves there."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.charts.in_domain import KEPT, BoxedPhi
+from orthocas.charts.newton import inverses
+from orthocas.tasks.domains import bounds_of
+from orthocas.tasks.relative import Relative
+from orthocas.tools.batch import dense_function
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, Indices
+from orthocas.tools.columns import BlockedFunction
+
+
+@dataclass(frozen=True, slots=True)
+class CurveRules:
+    """Numbers of the search along curves. Chosen on panda-wide and xarm7-wide (benchmarks/round_trips.py)."""
+
+    near_phi: int = 4  #: stored positions near each phi, from which curves are sought
+    near_x: int = 8  #: the same near each x
+    more: int = 24  #: the same, for rows without a solution
+    reach: int = 25  #: steps from a start to its x
+    largest: float = 0.7  #: norm of one of those steps [rad] or [m]
+    missed: float = 0.08  #: largest correction of a step along a curve [rad] or [m]
+    step: float = 0.4  #: longest step along a curve [rad] or [m]
+    shortest: float = 0.03  #: a curve that needs shorter ones ends, near a singular position
+    most: int = 80  #: steps of a curve in one direction
+    turned: float = 0.9  #: least cosine between the tangents at both ends of a step
+    straight: float = 0.96  #: cosine from which the next step may be longer
+    known: float = 0.05  #: distance [rad] or [m] from a curve up to which a start lies on it
+    parts: int = 3  #: points with xi on each step
+    sagitta: float = 6e-3  #: largest distance of those parts from their chords [rad] or [m]
+    halvings: int = 5  #: of chords that pass the box between points outside
+    narrow: float = 1e-10  #: [rad] or [m]: brackets of an end of the domain
+    prismatic: float = 1.0  #: half-widths that a sliding joint may leave its range by
+
+
+RULES = CurveRules()
+
+
+@dataclass(frozen=True, eq=False)
+class Traces:
+    """Curves of K targets: points in order, at most `RULES.step` apart."""
+
+    row: Indices  #: number of the target, (K,)
+    q: Array  #: (K, P, n), unwrapped; the last point is repeated after the end
+    tangent: Array  #: unit tangents there, (K, P, n)
+    count: Indices  #: points of each curve, (K,)
+
+    def part(self, curves: Indices) -> "Traces":
+        """Some of the curves."""
+        return Traces(*(array[curves] for array in vars(self).values()))
+
+
+@dataclass(frozen=True, eq=False)
+class CurveTracer:
+    """Traces the curves of joint positions with the same task value, r = 1."""
+
+    boxed: BoxedPhi
+
+    def reach(self, x: Array, starts: Array) -> tuple[Array, Array]:
+        """Where damped least squares lead from starts (M, n) to x (M, m), whatever the limits; and errors (M,)."""
+        q, error, left = starts.copy(), np.full(len(starts), np.inf), np.arange(len(starts))
+        for _ in range(RULES.reach):
+            found = self._damped_step(q[left], x[left])[0]
+            error[left] = found[:, -1]
+            going = (error[left] > KEPT / 10) & np.isfinite(error[left])
+            left = left[going]
+            if not left.size:
+                break
+            q[left] += found[going, :-1]
+        return q, error
+
+    def trace(self, targets: Array, q: Array, rows: Indices) -> Traces:
+        """The curves through points q (K, n), from end to end."""
+        x = targets[:, : self.boxed.m]
+        J = self.boxed.phi_map.jacobian(q)[:, : self.boxed.m] / self.boxed.phi_map.sizes[: self.boxed.m, None]
+        t = np.linalg.qr(J.transpose(0, 2, 1), mode="complete")[0][:, :, -1]
+        ahead, tangents, count, closed = self._follow(x, q, t)
+        back = np.flatnonzero(~closed)
+        if not back.size:
+            return Traces(rows, ahead, tangents, count)
+        behind, behind_tangents, behind_count, _ = self._follow(x[back], q[back], -t[back])
+        before = np.zeros(len(q), dtype=np.int64)
+        before[back] = behind_count - 1
+        total = count + before
+        place = np.arange(total.max())
+        after = np.clip(place - before[:, None], 0, (count - 1)[:, None])
+        points, directions = (np.take_along_axis(part, after[:, :, None], axis=1) for part in (ahead, tangents))
+        turned_round = np.maximum(before[back, None] - place, 0)
+        early = (place < before[back, None])[:, :, None]
+        turned_round = np.minimum(turned_round, behind.shape[1] - 1)[:, :, None]
+        points[back] = np.where(early, np.take_along_axis(behind, turned_round, axis=1), points[back])
+        opposite = -np.take_along_axis(behind_tangents, turned_round, axis=1)
+        directions[back] = np.where(early, opposite, directions[back])
+        return Traces(rows, points, directions, total)
+
+    def on_curves(self, q: Array, traces: Traces) -> NDArray[np.bool_]:
+        """Which of the positions q (K, S, n) lie on the curves, up to full turns, (K, S)."""
+        mine, points = self._on_circles(q), self._on_circles(traces.q)
+        squares = (points**2).sum(axis=2)[:, None] - 2 * mine @ points.transpose(0, 2, 1)
+        nearest = np.argmin(squares, axis=2)
+        found = np.zeros(nearest.shape, dtype=bool)
+        for place in (np.maximum(nearest - 1, 0), nearest):
+            start = np.take_along_axis(traces.q, place[:, :, None], axis=1)
+            after = np.minimum(place + 1, traces.q.shape[1] - 1)
+            step = np.take_along_axis(traces.q, after[:, :, None], axis=1) - start
+            away = without_turns(q - start, self.turning)
+            share = (away * step).sum(axis=2) / np.maximum((step**2).sum(axis=2), 1e-300)
+            gap = away - np.clip(share, 0.0, 1.0)[:, :, None] * step
+            found |= (gap**2).sum(axis=2) < RULES.known**2
+        return found
+
+    def correct(self, x: Array, q: Array, t: Array) -> tuple[Array, Array]:
+        """Newton's steps to x across directions t (K, n), and tangents with t . tangent = 1, (K, n) each."""
+        found = self._bordered_step(q, x, t)[0]
+        return found[:, : q.shape[1]], found[:, q.shape[1] :]
+
+    def _follow(self, x: Array, q0: Array, t0: Array) -> tuple[Array, Array, Indices, NDArray[np.bool_]]:
+        """Follow curves from q0 (K, n) along t0 until they close, leave the ranges of sliding joints, or fail.
+
+        Returns:
+            Points and unit tangents (K, P, n), their number (K,), and which curves are closed, (K,).
+        """
+        K, n = q0.shape
+        points, tangents = [q0], [t0]
+        count, closed = np.ones(K, dtype=np.int64), np.zeros(K, dtype=bool)
+        q, t, bend = q0.copy(), t0.copy(), np.zeros_like(q0)
+        h, before, left = np.full(K, RULES.step / 2), np.zeros(K), np.arange(K)
+        for _ in range(RULES.most):
+            lengths = h[left, None]
+            state = np.concatenate([q[left], t[left], bend[left], lengths, q0[left], t0[left]], axis=1)
+            found = self._step(state, x[left])[0]
+            new, onward, (missed, turned, gap, ahead) = found[:, :n], found[:, n : 2 * n], found[:, 2 * n :].T
+            good = (missed < RULES.missed) & (turned > RULES.turned)
+            moved = left[good]
+            closed[moved] = ((gap < 1.6 * RULES.step) & (before[left] < 0) & (ahead >= 0))[good] & (count[moved] > 3)
+            bend[moved] = (onward[good] - t[moved]) / lengths[good]
+            q[moved], t[moved], before[moved] = new[good], onward[good], ahead[good]
+            longer = turned[good] > RULES.straight
+            h[moved] = np.where(longer, np.minimum(1.6 * h[moved], RULES.step), h[moved])
+            h[left[~good]] /= 2
+            count[moved] += 1
+            points.append(q.copy())
+            tangents.append(t.copy())
+            left = left[~closed[left] & (h[left] > RULES.shortest) & self._slides_near(q[left])]
+            if not left.size:
+                break
+        return *_compact(np.array(points), np.array(tangents), count), count, closed
+
+    def _slides_near(self, q: Array) -> NDArray[np.bool_]:
+        """Whether sliding joints are in their ranges, or not far outside."""
+        if self.turning.all():
+            return np.ones(len(q), dtype=bool)
+        low, high = bounds_of(self.boxed.domain)
+        room = RULES.prismatic * self.boxed.domain.half_width
+        return np.asarray((((q >= low - room) & (q <= high + room)) | self.turning).all(axis=1))
+
+    def _on_circles(self, q: Array) -> Array:
+        """Cosines and sines of revolute joints, and positions of the others: near one another where q (..., n) is."""
+        turning, sliding = q[..., self.turning], q[..., ~self.turning]
+        return np.concatenate([np.cos(turning), np.sin(turning), sliding], axis=-1)
+
+    @cached_property
+    def _bordered_step(self) -> BlockedFunction:
+        """As `_bordered`, at many points."""
+        return BlockedFunction(self._bordered)
+
+    @cached_property
+    def _bordered(self) -> ca.Function:
+        """q, x, t -> the solution dq of J dq = x - h(q), t . dq = 0, and that of J dq = 0, t . dq = 1, (2n, 1)."""
+        q, x, e, J = self._symbols
+        t = ca.SX.sym("t", q.shape[0])
+        right = ca.vertcat(ca.horzcat(e, ca.SX.zeros(e.shape[0])), ca.SX([[0.0, 1.0]]))
+        found = ca.solve(ca.vertcat(J, t.T), right)
+        return dense_function("bordered_step", [q, x, t], [ca.cse(ca.vec(found))])
+
+    @cached_property
+    def _step(self) -> BlockedFunction:
+        """A step along a curve: q, t, bend, h, q0, t0 in one column, and x -> new q and t, and four numbers.
+
+        They are the length of the correction, the cosine between the tangents, and the distance of q from q0 up to full
+        turns, also along t0.
+        """
+        q, x = self._symbols[:2]
+        n = q.shape[0]
+        state = ca.SX.sym("state", 5 * n + 1)
+        at, t, bend, h, q0, t0 = ca.vertsplit(state, [0, n, 2 * n, 3 * n, 3 * n + 1, 4 * n + 1, 5 * n + 1])
+        ahead = at + h * t + h**2 / 2 * bend
+        change, onward = ca.horzsplit(ca.reshape(self._bordered(ahead, x, t), n, 2))
+        new, onward = ahead + change, onward / ca.norm_2(onward)
+        gap = new - q0
+        gap -= 2 * np.pi * ca.DM(self.turning.astype(float)) * ca.floor(gap / (2 * np.pi) + 0.5)
+        numbers = ca.vertcat(ca.norm_2(change), ca.dot(t, onward), ca.norm_2(gap), ca.dot(gap, t0))
+        return BlockedFunction(dense_function("step", [state, x], [ca.cse(ca.vertcat(new, onward, numbers))]))
+
+    @cached_property
+    def _damped_step(self) -> BlockedFunction:
+        """q, x -> a step of damped least squares to x, and the largest error, (n + 1, 1)."""
+        q, x, e, J = self._symbols
+        error, gram = ca.norm_inf(e), J @ J.T
+        damping = ca.if_else(error > 0.1, 1e-2, ca.if_else(error > 1e-3, 1e-5, 1e-14)) * ca.trace(gram)
+        step = J.T @ ca.solve(gram + damping * ca.SX.eye(e.shape[0]), e)
+        step *= ca.fmin(1, RULES.largest / (ca.norm_2(step) + 1e-300))
+        return BlockedFunction(dense_function("damped_step", [q, x], [ca.cse(ca.vertcat(step, error))]))
+
+    @cached_property
+    def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+        """q (n, 1), x (m, 1), errors (x - h(q)) / scale (m, 1), and rates J / scale (m, n)."""
+        task, scale = self.boxed.task, ca.DM(self.boxed.phi_map.sizes[: self.boxed.m])
+        relative = Relative(task)
+        q, x = ca.SX.sym("q", task.robot.n), ca.SX.sym("x", task.m)
+        return (
+            q,
+            x,
+            relative.difference(x, task.function(q)) / scale,
+            relative.rates(q) / ca.repmat(scale, 1, task.robot.n),
+        )
+
+    @cached_property
+    def turning(self) -> NDArray[np.bool_]:
+        """Revolute joints, (n,)."""
+        return ~np.array(self.boxed.task.robot.tree.prismatic)
+
+
+def _compact(points: Array, tangents: Array, count: Indices) -> tuple[Array, Array]:
+    """Points and tangents (P, K, n) of curves as (K, P, n), without those that repeat the one before."""
+    moved = np.ones(points.shape[:2], dtype=bool)
+    moved[1:] = (points[1:] != points[:-1]).any(axis=2)
+    place = np.where(moved, np.cumsum(moved, axis=0) - 1, count.max())
+    columns = np.broadcast_to(np.arange(points.shape[1]), moved.shape)
+    packed = []
+    for part in (points, tangents):
+        out = np.repeat(part[-1][:, None], count.max() + 1, axis=1)
+        out[columns, place] = part
+        out[:, count.max()] = part[-1]
+        packed.append(out[:, : count.max()])
+    return packed[0], packed[1]
+
+
+def without_turns(difference: Array, turning: NDArray[np.bool_]) -> Array:
+    """Differences of joint positions (..., n) without full turns of revolute joints."""
+    turns = 2 * np.pi * np.round(difference / (2 * np.pi))
+    return np.asarray(np.where(turning, difference - turns, difference), dtype=float)
+
+
+def solutions_of(A: Array, right: Array) -> Array:
+    """A^-1 right, (N, n, k); the least-squares solution where A is singular."""
+    try:
+        found: Array = np.asarray(np.linalg.solve(A, right), dtype=float)
+    except np.linalg.LinAlgError:
+        found = inverses(A)[0] @ right
+    return found

@@ -1,0 +1,345 @@
+"""The self-motion curves of many task values at once, r = 1, and the points on them whose xi is nearest."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.charts.curve_tracer import RULES, CurveTracer, Traces, solutions_of, without_turns
+from orthocas.charts.in_domain import KEPT, BoxedPhi
+from orthocas.charts.newton import Starts
+from orthocas.charts.phi import largest, shortest
+from orthocas.tasks.domains import bounds_of
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, Indices
+
+_AT_ONCE = 2048  # rows whose curves are held in memory
+
+
+@dataclass(frozen=True, eq=False)
+class Nearest:
+    """The best point of each of N rows."""
+
+    q: Array  #: (N, n)
+    distance: Array  #: |xi - xi(q)|, (N,); 0 for solutions, infinite for rows without a point in the domain
+    between: NDArray[np.bool_]  #: rows whose q is neither a solution nor an end of an arc, (N,)
+
+    @classmethod
+    def empty(cls, starts: Array) -> "Nearest":
+        """No points yet; q holds the starts (N, n)."""
+        return cls(starts.copy(), np.full(len(starts), np.inf), np.zeros(len(starts), dtype=bool))
+
+    def take(self, rows: Indices, q: Array, distance: Array, between: bool = False) -> None:
+        """Take over points (M, n) that are nearer than those of their rows (M,), which may occur several times."""
+        farthest_first = np.argsort(-distance, kind="stable")  # what is written last stays
+        better = farthest_first[distance[farthest_first] < self.distance[rows[farthest_first]]]
+        self.q[rows[better]], self.distance[rows[better]] = q[better], distance[better]
+        self.between[rows[better]] = between
+
+
+@dataclass(frozen=True, eq=False)
+class SelfMotionCurves:
+    """Finds q in the domain with h(q) = x and the nearest xi, along all self-motion curves of x that it finds.
+
+    For charts with r = 1. All positions of a regular x form closed curves in the torus of the joints. The search
+
+    1. leads stored positions near x to x by damped least squares, whatever the limits,
+    2. traces the curve through each that does not lie on a known one, whatever the limits,
+    3. cuts the curves by the domain, and looks for xi on the parts inside.
+
+    On a part, the nearest xi is a root of xi(q) = xi_d, an end of the part, or a place where xi turns back. So the
+    result is the nearest one on all curves that were found, up to parts shorter than `RULES.step / RULES.parts`.
+    """
+
+    boxed: BoxedPhi
+    starts: Starts
+    xi: Callable[[Array], Array]  #: coordinates (N, 1) of points (N, n)
+
+    @cached_property
+    def tracer(self) -> CurveTracer:
+        """Traces the curves."""
+        return CurveTracer(self.boxed)
+
+    def search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
+        """The nearest points for targets (N, n) of phi, from stored starts and one of the caller's (N, n)."""
+        pieces = [slice(first, first + _AT_ONCE) for first in range(0, len(own), _AT_ONCE)]
+        found = [self._search(targets[rows], own[rows], tolerance) for rows in pieces]
+        parts = zip(*(vars(part).values() for part in (Nearest.empty(own[:0]), *found)), strict=True)
+        return Nearest(*(np.concatenate(arrays) for arrays in parts))
+
+    def _search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
+        best, ends, traced = Nearest.empty(own), Ends.empty(own.shape[1]), list[Traces]()
+        with np.errstate(all="ignore"):
+            for stage in range(2):
+                rows = np.flatnonzero(best.distance > 0)
+                if rows.size:
+                    starts = self._first_starts(targets[rows], own[rows]) if stage == 0 else self._more(targets[rows])
+                    ends = ends.joined(self._search_from(targets, rows, starts, traced, tolerance, best))
+            self._take_ends(targets, ends, best)
+        return best
+
+    def _search_from(
+        self, targets: Array, rows: Indices, starts: Array, traced: list[Traces], tolerance: float, best: Nearest
+    ) -> "Ends":
+        """Search some rows from starts (S, rows, n), and add to the curves that are traced; returns ends of arcs."""
+        q, known = self._reached(targets[rows], starts)
+        place, ends = np.full(len(targets), -1), Ends.empty(q.shape[2])
+        place[rows] = np.arange(len(rows))
+        for traces in traced:
+            here = np.flatnonzero(place[traces.row] >= 0)
+            of = place[traces.row[here]]
+            known[of] |= self.tracer.on_curves(q[of], traces.part(here))
+        away = self._away(q)
+        for _ in range(q.shape[1]):
+            left = np.flatnonzero(~known.all(axis=1) & (best.distance[rows] > 0))
+            if not left.size:
+                break
+            first = np.argmin(np.where(known[left], np.inf, away[left]), axis=1)
+            traces = self.tracer.trace(targets[rows[left]], q[left, first], rows[left])
+            arcs = self._arcs(targets, traces)
+            self._take_roots(targets, arcs, tolerance, best)
+            ends = ends.joined(self._take_points(targets, arcs, best))
+            known[left] |= self.tracer.on_curves(q[left], traces)
+            known[left, first] = True
+            traced.append(traces)
+        return ends
+
+    def _first_starts(self, targets: Array, own: Array) -> Array:
+        """The caller's starts, and stored positions near phi and near x, (S, N, n)."""
+        near_phi = self.starts.nearest(targets, RULES.near_phi, targets.shape[1])
+        return np.concatenate([own[None], near_phi, self.starts.nearest(targets, RULES.near_x, self.boxed.m)])
+
+    def _more(self, targets: Array) -> Array:
+        """Further stored positions near x, (S, N, n)."""
+        return self.starts.nearest(targets, RULES.near_x + RULES.more, self.boxed.m)[RULES.near_x :]
+
+    def _reached(self, targets: Array, starts: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Positions (N, S, n) with the task values of targets, and which starts (S, N, n) led to none, (N, S)."""
+        S, N, n = starts.shape
+        x = np.repeat(targets[:, : self.boxed.m], S, axis=0)
+        q, error = self.tracer.reach(x, starts.transpose(1, 0, 2).reshape(-1, n))
+        return q.reshape(N, S, n), ~(error <= KEPT).reshape(N, S)
+
+    def _away(self, q: Array) -> Array:
+        """Largest distances of joints (N, S, n) from their ranges, up to full turns, (N, S)."""
+        low, high = bounds_of(self.boxed.domain)
+        bounded = np.isfinite(low)
+        centre, half = np.where(bounded, (low + high) / 2, 0.0), np.where(bounded, (high - low) / 2, np.inf)
+        return np.asarray((np.abs(without_turns(q - centre, self.tracer.turning)) - half).max(axis=2).clip(0.0))
+
+    def _arcs(self, targets: Array, traces: Traces) -> "Arcs":
+        """Points on the steps of curves in and around the box of the domain."""
+        curve, shift = self._sheets(traces)
+        low, high = bounds_of(self.boxed.domain)
+        moved = traces.q[curve] + shift[:, None]
+        near = np.asarray(((moved >= low - RULES.step) & (moved <= high + RULES.step)).all(axis=2))
+        at, place = np.nonzero((near[:, :-1] | near[:, 1:]) & (np.arange(1, near.shape[1]) < traces.count[curve, None]))
+        q, along = _subdivided(traces, curve[at], place)
+        q += shift[at][:, None]
+        row = traces.row[curve[at]]
+        slack = RULES.step / RULES.parts
+        close = np.asarray(((q >= low - slack) & (q <= high + slack)).all(axis=2))
+        x = targets[np.repeat(row, close.sum(axis=1)), : self.boxed.m]
+        points, t = q[close], along[close]
+        points += self.tracer.correct(x, points, t)[0]
+        within = ((points >= low - RULES.sagitta) & (points <= high + RULES.sagitta)).all(axis=1)
+        points[within] += self.tracer.correct(x[within], points[within], t[within])[0]
+        q[close] = points
+        inside, xi_left = np.zeros(close.shape, dtype=bool), np.full(close.shape, np.nan)
+        inside[close] = self._contains(points)
+        xi_left[close] = self._xi_left(targets[np.repeat(row, close.sum(axis=1))], points)
+        passing = close[:, :-1] & close[:, 1:] & ~inside[:, :-1] & ~inside[:, 1:]
+        arc, place = np.nonzero(passing)
+        first, last = self._shares_inside(q[arc, place], q[arc, place + 1], RULES.sagitta)
+        passing[arc, place] = first < last
+        return Arcs(row, q, inside, passing, xi_left)
+
+    def _sheets(self, traces: Traces) -> tuple[Indices, Array]:
+        """Which curves (of K) pass the box of the domain after which full turns: curve (L,), and shifts (L, n)."""
+        low, high = bounds_of(self.boxed.domain)
+        turn, room, bounded = 2 * np.pi, RULES.step, np.isfinite(low)
+        low = np.where(bounded, low - room, self.boxed.domain.centre - np.pi)
+        high = np.where(bounded, high + room, np.inf)
+        first = np.where(self.tracer.turning, np.ceil((low - traces.q) / turn), 0.0)
+        at = traces.q + turn * first
+        passed = np.ones(at.shape[:2], dtype=bool)
+        passed[:, 1:] = (first[:, 1:] != first[:, :-1]).any(axis=2)
+        choices = [range(1 + int(k)) for k in np.where(self.tracer.turning & bounded, (high - low) // turn, 0)]
+        near = [
+            [(at[:, :, j] >= low[j]) & (at[:, :, j] <= high[j] - turn * k) for k in choices[j]] for j in range(len(low))
+        ]
+        found = []
+        for extra in product(*choices):
+            close = np.logical_and.reduce([near[j][k] for j, k in enumerate(extra)])
+            changes = close & passed
+            changes[:, 1:] |= close[:, 1:] & ~close[:, :-1]
+            curve, place = np.nonzero(changes)
+            found.append(np.column_stack([curve, first[curve, place] + np.array(extra)]))
+        sheets = np.unique(np.concatenate(found), axis=0)
+        return sheets[:, 0].astype(np.int64), turn * sheets[:, 1:]
+
+    def _take_roots(self, targets: Array, arcs: "Arcs", tolerance: float, best: Nearest) -> None:
+        """Solutions of phi(q) = phi on arcs."""
+        left = arcs.xi_left
+        jump = np.abs(left[:, 1:] - left[:, :-1])
+        crossed = (left[:, :-1] * left[:, 1:] <= 0) & (arcs.inside[:, :-1] | arcs.inside[:, 1:] | arcs.passing)
+        crossed &= ~(jump > self._period / 2)
+        arc, place = np.nonzero(crossed)
+        if not arc.size:
+            return
+        a, b = left[arc, place], left[arc, place + 1]
+        share = np.where(a == b, 0.0, a / np.where(a == b, 1.0, a - b))[:, None]
+        q = (1 - share) * arcs.q[arc, place] + share * arcs.q[arc, place + 1]
+        rows, phi_map = arcs.row[arc], self.boxed.phi_map
+        for _ in range(4):
+            J = phi_map.jacobian(q) / phi_map.sizes[:, None]
+            left_over = phi_map.difference(targets[rows], phi_map.phi(q)) / phi_map.sizes
+            q = q + solutions_of(J, left_over[:, :, None])[:, :, 0]
+        q = self._snapped(q)
+        q = np.where(np.isfinite(q), q, best.q[rows])
+        solved = (largest(phi_map.residual(targets[rows], q)) <= tolerance) & self.boxed.domain.contains(q)
+        best.take(rows[solved], q[solved], np.zeros(int(solved.sum())))
+
+    def _take_points(self, targets: Array, arcs: "Arcs", best: Nearest) -> "Ends":
+        """Points of arcs that lie in the domain; returns the ends that may be nearer."""
+        inside = arcs.inside & (best.distance > 0)[arcs.row][:, None]
+        arc, place = np.nonzero(inside)
+        rows, here = arcs.row[arc], arcs.xi_left[arc, place]
+        best.take(rows, arcs.q[arc, place], np.abs(here), between=True)
+        found = []
+        for side in (-1, 1):
+            beyond = np.clip(place + side, 0, inside.shape[1] - 1)
+            there = arcs.xi_left[arc, beyond]
+            least = np.where(here * there > 0, np.minimum(np.abs(here), np.abs(there)), 0.0)
+            ends = ~inside[arc, beyond] & np.isfinite(there) & (least < best.distance[rows])
+            points = arcs.q[arc[ends], place[ends]], arcs.q[arc[ends], beyond[ends]]
+            found.append(Ends(rows[ends], *points, least[ends]))
+        return found[0].joined(found[1]).joined(self._take_short(targets, arcs, best))
+
+    def _take_short(self, targets: Array, arcs: "Arcs", best: Nearest) -> "Ends":
+        """The same of arcs that lie between neighbouring points outside: chords that pass the box are halved."""
+        arc, place = np.nonzero(arcs.passing & (best.distance > 0)[arcs.row][:, None])
+        a, b, rows, found = arcs.q[arc, place], arcs.q[arc, place + 1], arcs.row[arc], Ends.empty(arcs.q.shape[2])
+        for level in range(RULES.halvings):
+            first, last = self._shares_inside(a, b, RULES.sagitta / 4**level)
+            passing = first < last
+            a, b, rows = a[passing], b[passing], rows[passing]
+            if not rows.size:
+                break
+            q = a + ((first + last) / 2)[passing, None] * (b - a)
+            for _ in range(2):
+                q = q + self.tracer.correct(targets[rows, : self.boxed.m], q, b - a)[0]
+            good = self._contains(q)
+            left = np.abs(self._xi_left(targets[rows[good]], q[good]))
+            best.take(rows[good], q[good], left, between=True)
+            for other in (a[good], b[good]):
+                found = found.joined(Ends(rows[good], q[good], other, np.zeros(len(left))))
+            again = ~good & ~self._in_box(q)  # conditions are not looked at so closely
+            a, b, rows = (
+                np.concatenate([a[again], q[again]]),
+                np.concatenate([q[again], b[again]]),
+                np.tile(rows[again], 2),
+            )
+        return found
+
+    def _shares_inside(self, a: Array, b: Array, slack: float) -> tuple[Array, Array]:
+        """Where the chords from a to b (K, n) are in the box, or so near: between shares low and high (K,) if <."""
+        low, high = bounds_of(self.boxed.domain)
+        step = np.where(np.abs(b - a) > 1e-300, b - a, 1e-300)
+        one, other = (low - slack - a) / step, (high + slack - a) / step
+        first, last = np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
+        return np.maximum(first, 0.0), np.minimum(last, 1.0)
+
+    def _contains(self, q: Array) -> NDArray[np.bool_]:
+        """Which points (N, n) lie in the domain; they need not be finite."""
+        inside = self._in_box(q)
+        inside[inside] = self.boxed.domain.contains(q[inside])
+        return inside
+
+    def _in_box(self, q: Array) -> NDArray[np.bool_]:
+        """Which points (N, n) lie in the box of the domain."""
+        low, high = bounds_of(self.boxed.domain)
+        return np.asarray(((q >= low) & (q <= high)).all(axis=1))
+
+    def _take_ends(self, targets: Array, ends: "Ends", best: Nearest) -> None:
+        """The ends of arcs, of rows in which they may be nearest."""
+        useful = np.flatnonzero(ends.least < best.distance[ends.row])
+        rows = ends.row[useful]
+        if rows.size:
+            q = self._end(targets[rows], ends.inside[useful], ends.outside[useful])
+            best.take(rows, q, np.abs(self._xi_left(targets[rows], q)))
+
+    def _end(self, targets: Array, inside: Array, outside: Array) -> Array:
+        """The last points of the domain between points of curves (M, n) inside and outside."""
+        x = targets[:, : self.boxed.m]
+        a, b = inside.copy(), outside.copy()
+        while np.abs(b - a).max(initial=0.0) > RULES.narrow:
+            along = b - a
+            middle = (a + b) / 2
+            t = along / np.linalg.norm(along, axis=1, keepdims=True)
+            middle = middle + self.tracer.correct(x, middle, t)[0]
+            middle = np.where(np.isfinite(middle), middle, b)
+            within = self._contains(middle)
+            a, b = np.where(within[:, None], middle, a), np.where(within[:, None], b, middle)
+        return a
+
+    def _snapped(self, q: Array) -> Array:
+        """Points that miss the boundary by rounding, on it."""
+        moved = np.clip(q, *bounds_of(self.boxed.domain))
+        near = np.abs(moved - q) <= 1e-9 * self.boxed.domain.half_width
+        return np.where(near.all(axis=1, keepdims=True), moved, q)
+
+    def _xi_left(self, targets: Array, q: Array) -> Array:
+        """xi - xi(q), (N,)."""
+        left = targets[:, self.boxed.m :] - self.xi(q)
+        return np.asarray(shortest(left, self.boxed.phi_map.difference.turns[self.boxed.m :])[:, 0])
+
+    @cached_property
+    def _period(self) -> float:
+        """Of xi; infinite where it has none."""
+        turn = float(self.boxed.phi_map.difference.turns[self.boxed.m])
+        return turn if turn > 0 else np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Arcs:
+    """S steps of curves around the domain, by G points each, close to one another."""
+
+    row: Indices  #: number of the target, (S,)
+    q: Array  #: (S, G, n)
+    inside: NDArray[np.bool_]  #: which points lie in the domain, (S, G)
+    passing: NDArray[np.bool_]  #: whether a chord between neighbours outside passes the box, (S, G - 1)
+    xi_left: Array  #: xi - xi(q), (S, G); NaN far from the domain
+
+
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """Where arcs leave the domain: between neighbouring points of K curves."""
+
+    row: Indices  #: number of the target, (K,)
+    inside: Array  #: the last point inside, (K, n)
+    outside: Array  #: the point after that, (K, n)
+    least: Array  #: about the least |xi - xi(q)| between them, (K,)
+
+    @classmethod
+    def empty(cls, n: int) -> "Ends":
+        """None."""
+        return cls(np.zeros(0, dtype=np.int64), np.zeros((0, n)), np.zeros((0, n)), np.zeros(0))
+
+    def joined(self, other: "Ends") -> "Ends":
+        """Both."""
+        parts = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Ends(*(np.concatenate(pair) for pair in parts))
+
+
+def _subdivided(traces: Traces, curve: Indices, place: Indices) -> tuple[Array, Array]:
+    """Points on cubic curves from points of traces (S,) to the next ones, and directions, (S, parts + 1, n) each."""
+    q, t = traces.q[curve, place][:, None], traces.tangent[curve, place][:, None]
+    after, onward = traces.q[curve, place + 1][:, None], traces.tangent[curve, place + 1][:, None]
+    s = (np.arange(RULES.parts + 1) / RULES.parts)[:, None]
+    step = after - q
+    bend = (s - 2 * s**2 + s**3) * t + (s**3 - s**2) * onward
+    points = q + (3 * s**2 - 2 * s**3) * step + np.linalg.norm(step, axis=2, keepdims=True) * bend
+    return points, (1 - s) * t + s * onward
