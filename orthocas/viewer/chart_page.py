@@ -216,7 +216,7 @@ class ChartPage:
         """Draw the arm and the readings, and move the sliders that the user does not hold."""
         readings = self.session.readings
         place = self.session.place
-        if self._panel.chart is not self._chart or self._panel.place != place:
+        if self._panel.place != place:
             self._rest()
             self._panel = ChartPanel(self._chart, place, mirrored=bool(self.session.flips))
         with self._server.atomic():

@@ -83,7 +83,7 @@ class ChartPanel:
     """Writes the readings of one chart."""
 
     def __init__(self, chart: Chart, place: str = "", mirrored: bool = False) -> None:
-        self.chart, self.place = chart, place
+        self.place = place
         problem = chart.problem
         robot, domain = problem.robot, problem.domain
         low, high = (-np.inf, np.inf) if mirrored else bounds_of(domain)

@@ -15,7 +15,7 @@ from orthocas.tasks.domains import StopKind
 from orthocas.tools.checks import Array, as_number, as_point, require_kind, require_known
 from orthocas.viewer.panel import Readers, Readings
 
-MOST_STEPS = 200  # of the tracker towards one wish
+_MOST_STEPS = 200  # of the tracker towards one wish
 _SHORTEST = 1e-4  # share of the way to a wish below which there is no way on
 _REACHED = 1e-10  # of the sizes of the components
 _MOST_UNDONE = 100
@@ -48,18 +48,21 @@ class Session:
 
     flips: tuple[int, ...] = ()  #: cuts of `branches` at which the arm is mirrored
     branches: Branches | None = None  #: of the robot, once they were asked for
-    _wished: Array  #: phi, (n,)
 
     def __init__(self, chart: Chart, q: Array | None = None) -> None:
         require_kind("chart", chart, Chart)
         self.home: Array = chart.problem.domain.centre if q is None else as_point("q", q, chart.n)
         self._past: list[tuple[Array, tuple[int, ...]]] = []
         self._limited = False  # whether a joint limit of the mirrored arm stopped it
-        self._use(chart, self.home)
+        self.chart = chart
+        self._tracker = chart.tracker(self.home)
+        self._readers, self._walls = Readers(chart), Walls(chart.problem)
+        self._wished: Array = chart.phi(self.home)  # (n,)
+        self.stop = ""  #: what stopped the last motion, or ""
 
     @property
     def place(self) -> str:
-        """Where the chart belongs, if there are several; the branch of a mirrored arm."""
+        """The branch of a mirrored arm."""
         if not (self.branches and self.flips):
             return ""
         found = self.branches.of(self.shown(self.q[None])[0])
@@ -127,7 +130,7 @@ class Session:
             wished[self.chart.labels.index(label)] = number
         self._wished = wished
 
-    def follow(self, most_steps: int = MOST_STEPS) -> bool:
+    def follow(self, most_steps: int = _MOST_STEPS) -> bool:
         """Move towards the wish. Returns whether q has moved; afterwards the wish is met, given up, or still ahead."""
         moved = False
         for _ in range(most_steps):
@@ -192,14 +195,6 @@ class Session:
         if self._tracker.status is not TrackerStatus.OUTSIDE_DOMAIN:
             return "a fold of the chart or a singular position"
         return told(self._walls.worst(self.q), self.chart.problem.robot)
-
-    def _use(self, chart: Chart, q: Array) -> None:
-        """Go on in a chart, at rest at a joint position."""
-        self.chart = chart
-        self._tracker = chart.tracker(q)
-        self._readers, self._walls = Readers(chart), Walls(chart.problem)
-        self._wished = chart.phi(q)
-        self.stop = ""  #: what stopped the last motion, or ""
 
     def _place(self, q: Array) -> None:
         self._tracker.reset(q)
