@@ -401,12 +401,12 @@ class _Configuration:
     """What MuJoCo and mink show of a robot, for `XiTask`."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
-        self.names, self.nv, self.model = names, len(names), self
+        self.names, self.nv, self.njnt, self.model = names, len(names), len(names), self
         self.q = np.linspace(0.6, 0.8, self.nv)
 
-    def joint(self, name: str) -> Any:
-        place = np.array([self.names.index(name)])
-        return SimpleNamespace(qposadr=place, dofadr=place)
+    def joint(self, which: str | int) -> Any:
+        k = which if isinstance(which, int) else self.names.index(which)
+        return SimpleNamespace(name=self.names[k], qposadr=np.array([k]), dofadr=np.array([k]))
 
 
 @_numbers.register

@@ -173,7 +173,7 @@ def test_angles_grow_with_the_box_as_the_defect_expects_at_any_degree(tmp_path: 
 def test_a_clear_box_takes_for_clear_what_pinocchio_does() -> None:
     of_x, frame = clear_positions.main(quick=True)
     assert float(of_x.split("|")[3].strip(" %")) > 20
-    assert frame.endswith("| 0.0 % | 0.0 % |")
+    assert frame.endswith("| 0.0% | 0.0% |")
 
 
 @pytest.mark.nightly

@@ -18,7 +18,8 @@ def why_lost(run: Trajectory, controller: Controller, pushes: Sequence[Push], su
     """Why a law lost its arm in a run, in words; empty if it kept it.
 
     It lost the arm where the arm left the domain of the law's chart, in which alone the law commands; with a law
-    without a chart, where it left the joint limits. A supervised law may leave them and come back.
+    without a chart, where it left the joint limits. A supervised law may leave them and come back, and its catcher may
+    hold the arm outside.
 
     It also lost the arm where motors were at their limit for more than 0.1 s, and the storage V, the energy of springs
     and motion, was larger after that time than before. This counts at the end of the run, and where the catcher of a
@@ -31,7 +32,8 @@ def why_lost(run: Trajectory, controller: Controller, pushes: Sequence[Push], su
         supervised: whether its supervised form ran.
     """
     away, what = _away(run, controller)
-    if away[-1] or (away.any() and not supervised):
+    held = supervised and run.status[-1] in (ControlStatus.CAUGHT, ControlStatus.RETURNING)
+    if (away[-1] and not held) or (away.any() and not supervised):
         first, _ = next(_stretches(away))
         left = "was outside" if first == 0 else "left"
         return f"the arm {left} {what} at t = {run.times[first]:.4g} s"
