@@ -60,7 +60,7 @@ def test_laws_warn_with_the_torque_of_pinocchio_and_the_share_of_the_domain(char
     (remark,) = [text for text in law.remarks() if "cannot hold" in text]
     torques = np.abs(gravity_of_pinocchio(chart, sample_uniform(domain, 4000, 3)))
     share = 100 * (torques > robot.effort_limits).any(axis=1).mean()
-    said = float(remark.split(" % of")[0].rpartition(" ")[2])
+    said = float(remark.split("% of")[0].rpartition(" ")[2])
     assert said == pytest.approx(share, abs=3.0)  # three standard deviations of 512 samples are below 2.9 %
     for other in (Impedance, lambda chart, k: Projector(chart.problem, k, k)):
         with pytest.warns(LawWarning, match="cannot hold the arm at the centre of the domain"):
