@@ -224,6 +224,25 @@ def test_nearest_xi_is_no_farther_than_a_known_position(kind: str, axes: str) ->
     assert (chart.nearest_xi(np.tile(CENTRE, (24, 1)), chart.task(own)).status <= NEAREST).all()
 
 
+@CHARTS
+@pytest.mark.parametrize("kind", ["clear box", "regular part"])
+def test_poses_that_only_singular_positions_have_are_said_to_lie_outside(kind: str, axes: str) -> None:
+    """A nearly stretched arm: the status was NOT_FOUND, though q had the pose within the limits."""
+    chart = chart_of(kind, axes)
+    domain = chart.problem.domain
+    stretched = np.random.default_rng(2).uniform(-0.04, 0.04, (8, 3))
+    assert not domain.contains(stretched).any()
+    for wish in (stretched, np.tile(CENTRE, (8, 1))):
+        near = chart.nearest_xi(wish, chart.task(stretched))
+        assert (near.status == oc.InverseStatus.OUTSIDE_DOMAIN).all()
+        assert not domain.contains(near.q).any()
+        assert (np.abs(near.q - domain.centre) <= domain.half_width + 1e-9).all()
+        np.testing.assert_allclose(chart.task(near.q), chart.task(stretched), atol=1e-8)
+        assert near.error.max() < 1e-9
+        apart = np.linalg.norm(chart.xi(near.q) - chart.xi(wish), axis=1)
+        np.testing.assert_allclose(near.distance, apart, atol=1e-9)
+
+
 def refuses_trackers(chart: oc.Chart) -> bool:
     """Whether a domain that only answers `contains` is refused, by name."""
     if chart.problem.domain.name != "round":
