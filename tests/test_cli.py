@@ -292,7 +292,7 @@ def test_output_folder_is_checked_before_the_long_work(run: Run, monkeypatch: py
     def never(*args: object) -> None:
         raise AssertionError("the fit was started")
 
-    monkeypatch.setattr(sys.modules["orthocas.cli.fit"], "fit_chart", never)
+    monkeypatch.setattr("orthocas.cli.fit.fit_chart", never)  # commands are imported when they run
     code, _, err = run("fit", "iiwa", "--out", "no/x.orthocas")
     assert code == 2
     assert "folder no does not exist" in err

@@ -231,7 +231,7 @@ class Nearest:
 
     @cached_property
     def _search(self) -> ca.Function:
-        """start (n, 1), target (n, 1) -> q (n, 1)."""
+        """start (n, 1), target (n, 1) -> q (n, 1); outside the domain if only its `contains` knows where it ends."""
         m, domain, n = self.m, self.domain, len(self.domain.centre)
         q, target = ca.MX.sym("q", n), ca.MX.sym("phi", n)
         difference = -self.phi_map.difference(target, self.phi(q))
@@ -245,9 +245,9 @@ class Nearest:
             if domain.room_to_fold is not None:
                 constraints += [_CLEAR - domain.room_to_fold(q)]
                 upper = np.zeros(m + m + 1)
-        elif domain.condition is not None:
-            constraints += [-domain.condition.pivots(q)]
-            upper = np.zeros(m + domain.condition.pivots.size1_out(0))
+        elif (condition := domain.known_condition) is not None:
+            constraints += [-condition.pivots(q)]
+            upper = np.zeros(m + condition.pivots.size1_out(0))
         lower = np.where(np.arange(len(upper)) < m, 0.0, -np.inf)
         equations: dict[str, Any] = {
             "x": q,

@@ -23,6 +23,7 @@ _ROUNDING = 1e-9  # of L: task values next to the limit may be rounded
 _ROWS = 16_384  # solved at once
 _FIRST = 2  # restarts from points of the table, and the centre, before all of the domain is searched
 _RESTARTS = 8  # from points of the table, where nothing leads to any solution
+_KEPT = (InverseStatus.NEAREST, InverseStatus.OUTSIDE_DOMAIN)  # x, if q is to lie inside
 _UNSOLVED = (InverseStatus.NOT_FOUND, InverseStatus.OUT_OF_REACH)
 _MOVED = (InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT, *_UNSOLVED)
 _SNAP = 1e-9  # of the half-widths: solutions so close to the boundary are moved onto it
@@ -100,7 +101,7 @@ class Inverse:
                 found = self._searched(targets[rows], None if starts is None else starts[rows], tolerance, inside)
                 q[rows], status[rows], iterations[rows] = found.q, found.status, found.iterations
                 error[rows], distance[rows] = found.error, self._distance(targets[rows], found.residual)
-                kept = found.status == InverseStatus.NEAREST
+                kept = np.isin(found.status, _KEPT) if inside else np.zeros(len(rows), dtype=bool)
                 error[rows[kept]] = largest(found.residual[kept, : self.problem.m])
         return Solutions(q, status, iterations, error, distance, tolerance)
 
@@ -206,12 +207,13 @@ class Inverse:
         moved = np.isin(best.status[rows], _MOVED)
         rows, q = rows[moved], q[moved]
         residual = self.phi_map.residual(targets[rows], q)
-        kept = (largest(residual[:, : self.problem.m]) <= tolerance) & self.problem.domain.contains(q)
+        kept, inside = largest(residual[:, : self.problem.m]) <= tolerance, self.problem.domain.contains(q)
         whole = kept & (largest(residual) <= tolerance)
         best.q[rows], best.residual[rows] = q, residual
         beyond = best.status[rows] == InverseStatus.OUT_OF_REACH
         missed = np.where(beyond, InverseStatus.OUT_OF_REACH, InverseStatus.NOT_FOUND)
-        best.status[rows] = np.where(whole, InverseStatus.FOUND, np.where(kept, InverseStatus.NEAREST, missed))
+        within = np.where(whole, InverseStatus.FOUND, InverseStatus.NEAREST)
+        best.status[rows] = np.where(kept, np.where(inside, within, InverseStatus.OUTSIDE_DOMAIN), missed)
 
     def _other_starts(self, targets: Array, count: int) -> Iterator[Array]:
         """Points of the table near the targets, nearest first, and the centre of the domain, (N, n) each."""

@@ -115,8 +115,10 @@ class InverseMethods(PhiFunctions):
             tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components, `phi_sizes`.
             inside: keep q in the domain, and so within the joint limits. Rows without a solution there, from q_start or
                 other starts, get the q inside with the same x and the nearest xi that is found, with the status
-                NEAREST, or NOT_FOUND if none with that x is found. With r = 1, it is the nearest one on all self-motion
-                curves of x that are found; with more coordinates, a local minimum. Not for grown coordinates.
+                NEAREST. If none with that x is found inside, the status is OUTSIDE_DOMAIN with a q within the box of
+                the domain that has it, such as one too near to a singular position, or else NOT_FOUND. With r = 1, the
+                nearest is that on all self-motion curves of x that are found; with more coordinates, a local minimum.
+                Not for grown coordinates.
             local: another solver of phi(q) = phi near given starts; `orthocas.compile_inverse` has one.
 
         Returns:
@@ -159,7 +161,7 @@ class InverseMethods(PhiFunctions):
 
         Returns:
             As `solve`: FOUND where a position with that xi was found, NEAREST where only others with that x were
-            found, NOT_FOUND where none was.
+            found, OUTSIDE_DOMAIN where only such outside the domain were, NOT_FOUND where none was.
 
         Raises:
             ShapeError: if a row has another number of entries, or x another number of rows.

@@ -29,7 +29,8 @@ class InverseStatus(IntEnum):
 
     FOUND = 0  #: a solution inside the domain
     NEAREST = 1  #: none was found inside; this q lies inside, has the same x, and the nearest xi that was found
-    OUTSIDE_DOMAIN = 2  #: none was found inside; this solution lies within the joint limits, but outside the domain
+    OUTSIDE_DOMAIN = 2  #: none was found inside; this solution lies within the joint limits, but outside the domain; of
+    #: `inside=True` and `nearest_xi`, no q with that x was found inside, and this one, with another xi, lies there
     LIMIT = 3  #: none was found within the joint limits; this solution lies beyond them
     SINGULAR = 4  #: a solution at which J is singular, so that it need not be unique
     NOT_FOUND = 5  #: no solution was found, which does not prove that there is none; q has the smallest error found
@@ -60,7 +61,7 @@ class Solutions(Shown):
     q: Array = field(repr=False)  #: the best points found, (N, n) [rad] or [m]
     status: Indices  #: an `InverseStatus` for each row, (N,)
     iterations: Indices  #: steps of Newton's method that led to q, (N,)
-    error: Array  #: largest |phi(q) - phi| relative to the sizes of the components, (N,); of x alone for NEAREST
+    error: Array  #: largest |phi(q) - phi| relative to the sizes, (N,); of x alone where only x is kept
     distance: Array  #: |xi(q) - xi|, (N,)
     tolerance: float  #: the largest error of a solution
 
@@ -115,7 +116,7 @@ class Solutions(Shown):
             )
         beyond = np.flatnonzero(~np.isin(self.status, accepted))
         if beyond.size:
-            raise InverseError(f"q with phi(q) = phi was found only outside the domain for {self.named(beyond)}")
+            raise InverseError(f"q was found only outside the domain for {self.named(beyond)}")
         return self
 
     def named(self, rows: Indices) -> str:

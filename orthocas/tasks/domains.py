@@ -91,6 +91,14 @@ class Domain(ABC):
         raise DomainError(f"a domain of kind '{self.name}' has no condition as an expression, which this needs")
 
     @property
+    def known_condition(self) -> "Condition | None":
+        """`condition`, or None where there is no expression of it and only `contains` answers."""
+        try:
+            return self.condition
+        except DomainError:
+            return None
+
+    @property
     def singular_bound(self) -> "SingularBound | None":
         """The condition, if it is a bound on the singular values of a task."""
         return None
@@ -122,11 +130,7 @@ class Domain(ABC):
         """
         if self.is_box:
             return ()
-        try:
-            condition = self.condition
-        except DomainError:
-            condition = None
-        if condition is None:
+        if (condition := self.known_condition) is None:
             return (Wall(StopKind.CONDITION, lambda q: 1.0 if self.contains(q) else -1.0, heading=f"the {self.name}"),)
         pivots = condition.pivots
         return (Wall(StopKind.CONDITION, lambda q: float(pivots(q).full().min()), heading=condition.heading),)
