@@ -126,31 +126,34 @@ class CurveTracer:
         Returns:
             Points and unit tangents (K, P, n), their number (K,), and which curves are closed, (K,).
         """
-        K, n = q0.shape
-        points, tangents = [q0], [t0]
+        (K, n), size = q0.shape, RULES.most + 1
+        points, tangents = np.empty((K, size, n)), np.empty((K, size, n))
+        points[:, 0], tangents[:, 0] = q0, t0
         count, closed = np.ones(K, dtype=np.int64), np.zeros(K, dtype=bool)
-        q, t, bend = q0.copy(), t0.copy(), np.zeros_like(q0)
-        h, before, left = np.full(K, RULES.step / 2), np.zeros(K), np.arange(K)
+        state = np.concatenate([q0, t0, np.zeros((K, n)), np.full((K, 1), RULES.step / 2), q0, t0], axis=1)
+        left, before = np.arange(K), np.zeros(K)
         for _ in range(RULES.most):
-            lengths = h[left, None]
-            state = np.concatenate([q[left], t[left], bend[left], lengths, q0[left], t0[left]], axis=1)
-            found = self._step(state, x[left])[0]
+            found = self._step(state, x)[0]
             new, onward, (missed, turned, gap, ahead) = found[:, :n], found[:, n : 2 * n], found[:, 2 * n :].T
             good = (missed < RULES.missed) & (turned > RULES.turned)
-            moved = left[good]
-            closed[moved] = ((gap < 1.6 * RULES.step) & (before[left] < 0) & (ahead >= 0))[good] & (count[moved] > 3)
-            bend[moved] = (onward[good] - t[moved]) / lengths[good]
-            q[moved], t[moved], before[moved] = new[good], onward[good], ahead[good]
-            longer = turned[good] > RULES.straight
-            h[moved] = np.where(longer, np.minimum(1.6 * h[moved], RULES.step), h[moved])
-            h[left[~good]] /= 2
+            moved, h = left[good], state[:, 3 * n]
+            around = good & (gap < 1.6 * RULES.step) & (before < 0) & (ahead >= 0) & (count[left] > 3)
+            closed[left] = around
+            points[moved, count[moved]], tangents[moved, count[moved]] = new[good], onward[good]
             count[moved] += 1
-            points.append(q.copy())
-            tangents.append(t.copy())
-            left = left[~closed[left] & (h[left] > RULES.shortest) & self._slides_near(q[left])]
+            bend = (onward - state[:, n : 2 * n]) / h[:, None]
+            state[:, : 3 * n] = np.where(good[:, None], np.hstack([new, onward, bend]), state[:, : 3 * n])
+            before = np.where(good, ahead, before)
+            longer = np.where(turned > RULES.straight, np.minimum(1.6 * h, RULES.step), h)
+            h[:] = np.where(good, longer, h / 2)
+            goes_on = ~around & (h > RULES.shortest) & self._slides_near(state[:, :n])
+            if not goes_on.all():
+                state, x, left, before = state[goes_on], x[goes_on], left[goes_on], before[goes_on]
             if not left.size:
                 break
-        return *_compact(np.array(points), np.array(tangents), count), count, closed
+        last = np.minimum(np.arange(count.max()), count[:, None] - 1)[:, :, None]
+        parts = (np.take_along_axis(part, last, axis=1) for part in (points, tangents))
+        return *parts, count, closed
 
     def _slides_near(self, q: Array) -> NDArray[np.bool_]:
         """Whether sliding joints are in their ranges, or not far outside."""
@@ -225,21 +228,6 @@ class CurveTracer:
     def turning(self) -> NDArray[np.bool_]:
         """Revolute joints, (n,)."""
         return ~np.array(self.boxed.task.robot.tree.prismatic)
-
-
-def _compact(points: Array, tangents: Array, count: Indices) -> tuple[Array, Array]:
-    """Points and tangents (P, K, n) of curves as (K, P, n), without those that repeat the one before."""
-    moved = np.ones(points.shape[:2], dtype=bool)
-    moved[1:] = (points[1:] != points[:-1]).any(axis=2)
-    place = np.where(moved, np.cumsum(moved, axis=0) - 1, count.max())
-    columns = np.broadcast_to(np.arange(points.shape[1]), moved.shape)
-    packed = []
-    for part in (points, tangents):
-        out = np.repeat(part[-1][:, None], count.max() + 1, axis=1)
-        out[columns, place] = part
-        out[:, count.max()] = part[-1]
-        packed.append(out[:, : count.max()])
-    return packed[0], packed[1]
 
 
 def without_turns(difference: Array, turning: NDArray[np.bool_]) -> Array:

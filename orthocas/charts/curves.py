@@ -98,7 +98,9 @@ class SelfMotionCurves:
                 break
             first = np.argmin(np.where(known[left], np.inf, away[left]), axis=1)
             traces = self.tracer.trace(targets[rows[left]], q[left, first], rows[left])
-            arcs = self._arcs(targets, traces)
+            steps = self._steps(traces)
+            self._take_crossed(targets, steps, tolerance, best)
+            arcs = self._arcs(targets, steps.part(best.distance[steps.row] > 0))
             self._take_roots(targets, arcs, tolerance, best)
             ends = ends.joined(self._take_points(targets, arcs, best))
             known[left] |= self.tracer.on_curves(q[left], traces)
@@ -129,19 +131,53 @@ class SelfMotionCurves:
         centre, half = np.where(bounded, (low + high) / 2, 0.0), np.where(bounded, (high - low) / 2, np.inf)
         return np.asarray((np.abs(without_turns(q - centre, self.tracer.turning)) - half).max(axis=2).clip(0.0))
 
-    def _arcs(self, targets: Array, traces: Traces) -> "Arcs":
-        """Points on the steps of curves in and around the box of the domain."""
+    def _steps(self, traces: Traces) -> "Steps":
+        """The steps of curves in and around the box of the domain, after all full turns that bring them there."""
         curve, shift = self._sheets(traces)
         low, high = bounds_of(self.boxed.domain)
         moved = traces.q[curve] + shift[:, None]
         near = np.asarray(((moved >= low - RULES.step) & (moved <= high + RULES.step)).all(axis=2))
         at, place = np.nonzero((near[:, :-1] | near[:, 1:]) & (np.arange(1, near.shape[1]) < traces.count[curve, None]))
-        q, along = _subdivided(traces, curve[at], place)
-        q += shift[at][:, None]
-        row = traces.row[curve[at]]
+        of, turn = curve[at], shift[at]
+        q = np.stack([traces.q[of, place] + turn, traces.q[of, place + 1] + turn], axis=1)
+        t = np.stack([traces.tangent[of, place], traces.tangent[of, place + 1]], axis=1)
+        follows = np.diff(at * near.shape[1] + place, prepend=-2) == 1
+        return Steps(traces.row[of], q, t, follows)
+
+    def _take_crossed(self, targets: Array, steps: "Steps", tolerance: float, best: Nearest) -> None:
+        """Solutions of phi(q) = phi on steps along which xi passes its target, in or near the box."""
+        left = self._xi_left_of(targets, steps)
+        step, share = self._crossed(left)
+        self._take_solutions(targets, steps.row[step], steps.point(step, share), tolerance, best)
+
+    def _xi_left_of(self, targets: Array, steps: "Steps") -> Array:
+        """xi - xi(q) at both ends of steps, (S, 2); NaN far from the box."""
+        left, low, high = np.full(steps.q.shape[:2], np.nan), *bounds_of(self.boxed.domain)
+        slack = RULES.step / RULES.parts
+        near = np.asarray(((steps.q >= low - slack) & (steps.q <= high + slack)).all(axis=2))
+        begins = near.copy()
+        begins[1:, 0] &= ~(steps.follows[1:] & near[:-1, 1])
+        rows = np.broadcast_to(steps.row[:, None], near.shape)
+        left[begins] = self._xi_left(targets[rows[begins]], steps.q[begins])
+        joined = near[:, 0] & ~begins[:, 0]
+        left[joined, 0] = left[np.flatnonzero(joined) - 1, 1]
+        return left
+
+    def _crossed(self, left: Array) -> tuple[Indices, Array]:
+        """Steps with xi - xi(q) (S, 2) at their ends along which it passes 0, and where, between 0 and 1."""
+        a, b = left.T
+        crossed = np.flatnonzero((a * b <= 0) & ~(np.abs(b - a) > self._period / 2))
+        a, b = a[crossed], b[crossed]
+        return crossed, np.where(a == b, 0.0, a / np.where(a == b, 1.0, a - b))
+
+    def _arcs(self, targets: Array, steps: "Steps") -> "Arcs":
+        """Points on the steps that may hold a root, an end of an arc, or a place where xi turns back."""
+        steps = steps.part(self._matters(targets, steps))
+        low, high = bounds_of(self.boxed.domain)
+        q, along = steps.divided()
         slack = RULES.step / RULES.parts
         close = np.asarray(((q >= low - slack) & (q <= high + slack)).all(axis=2))
-        x = targets[np.repeat(row, close.sum(axis=1)), : self.boxed.m]
+        x = targets[np.repeat(steps.row, close.sum(axis=1)), : self.boxed.m]
         points, t = q[close], along[close]
         points += self.tracer.correct(x, points, t)[0]
         within = ((points >= low - RULES.sagitta) & (points <= high + RULES.sagitta)).all(axis=1)
@@ -149,12 +185,38 @@ class SelfMotionCurves:
         q[close] = points
         inside, xi_left = np.zeros(close.shape, dtype=bool), np.full(close.shape, np.nan)
         inside[close] = self._contains(points)
-        xi_left[close] = self._xi_left(targets[np.repeat(row, close.sum(axis=1))], points)
+        xi_left[close] = self._xi_left(targets[np.repeat(steps.row, close.sum(axis=1))], points)
         passing = close[:, :-1] & close[:, 1:] & ~inside[:, :-1] & ~inside[:, 1:]
         arc, place = np.nonzero(passing)
         first, last = self._shares_inside(q[arc, place], q[arc, place + 1], RULES.sagitta)
         passing[arc, place] = first < last
-        return Arcs(row, q, inside, passing, xi_left)
+        return Arcs(steps.row, q, inside, passing, xi_left)
+
+    def _matters(self, targets: Array, steps: "Steps") -> NDArray[np.bool_]:
+        """Steps (S,) that pass the target or a boundary, their neighbours, and those where xi turns back.
+
+        Along the others, xi only moves from one end to the other, and both ends lie in the domain; or they lie outside
+        the box.
+        """
+        left, inside = self._xi_left_of(targets, steps), np.zeros(steps.q.shape[:2], dtype=bool)
+        inside[:, 1] = self._contains(steps.q[:, 1])
+        begins = np.flatnonzero(~steps.follows)
+        inside[begins, 0] = self._contains(steps.q[begins, 0])
+        joined = np.flatnonzero(steps.follows)
+        inside[joined, 0] = inside[joined - 1, 1]
+        both, none = inside.all(axis=1), ~inside.any(axis=1)
+        first, last = self._shares_inside(steps.q[:, 0], steps.q[:, 1], RULES.missed)
+        changes = np.where(none, first < last, ~both)
+        changes[self._crossed(left)[0]] = True
+        ahead = shortest((left[:, 1] - left[:, 0])[:, None], self.boxed.phi_map.difference.turns[self.boxed.m :])[:, 0]
+        bends = steps.follows.copy()
+        bends[1:] &= ~(ahead[1:] * ahead[:-1] > 0) & both[1:] & both[:-1]
+        changes |= bends
+        after = np.append(steps.follows[1:], False)
+        around = changes.copy()
+        around[1:] |= changes[:-1] & steps.follows[1:]
+        around[:-1] |= changes[1:] & after[:-1]
+        return np.asarray(around & ~(none & ~changes))
 
     def _sheets(self, traces: Traces) -> tuple[Indices, Array]:
         """Which curves (of K) pass the box of the domain after which full turns: curve (L,), and shifts (L, n)."""
@@ -182,17 +244,19 @@ class SelfMotionCurves:
 
     def _take_roots(self, targets: Array, arcs: "Arcs", tolerance: float, best: Nearest) -> None:
         """Solutions of phi(q) = phi on arcs."""
-        left = arcs.xi_left
-        jump = np.abs(left[:, 1:] - left[:, :-1])
-        crossed = (left[:, :-1] * left[:, 1:] <= 0) & (arcs.inside[:, :-1] | arcs.inside[:, 1:] | arcs.passing)
-        crossed &= ~(jump > self._period / 2)
-        arc, place = np.nonzero(crossed)
-        if not arc.size:
-            return
-        a, b = left[arc, place], left[arc, place + 1]
-        share = np.where(a == b, 0.0, a / np.where(a == b, 1.0, a - b))[:, None]
+        near = arcs.inside[:, :-1] | arcs.inside[:, 1:] | arcs.passing
+        near &= best.distance[arcs.row, None] > 0
+        arc, place = np.nonzero(near)
+        crossed, share = self._crossed(np.stack([arcs.xi_left[arc, place], arcs.xi_left[arc, place + 1]], axis=1))
+        arc, place, share = arc[crossed], place[crossed], share[:, None]
         q = (1 - share) * arcs.q[arc, place] + share * arcs.q[arc, place + 1]
-        rows, phi_map = arcs.row[arc], self.boxed.phi_map
+        self._take_solutions(targets, arcs.row[arc], q, tolerance, best)
+
+    def _take_solutions(self, targets: Array, rows: Indices, q: Array, tolerance: float, best: Nearest) -> None:
+        """Solutions of phi(q) = phi inside to which Newton's steps lead from points q (K, n) of some rows."""
+        if not rows.size:
+            return
+        phi_map = self.boxed.phi_map
         for _ in range(4):
             J = phi_map.jacobian(q) / phi_map.sizes[:, None]
             left_over = phi_map.difference(targets[rows], phi_map.phi(q)) / phi_map.sizes
@@ -304,6 +368,33 @@ class SelfMotionCurves:
 
 
 @dataclass(frozen=True, eq=False)
+class Steps:
+    """S steps of curves around the domain."""
+
+    row: Indices  #: number of the target, (S,)
+    q: Array  #: both ends, (S, 2, n)
+    tangent: Array  #: unit tangents there, (S, 2, n)
+    follows: NDArray[np.bool_]  #: whether a step begins where the one before it ends, (S,)
+
+    def part(self, which: NDArray[np.bool_]) -> "Steps":
+        """Some of the steps (S,)."""
+        row, q, tangent, follows = (array[which] for array in vars(self).values())
+        follows[1:] &= np.diff(np.flatnonzero(which)) == 1
+        follows[:1] = False
+        return Steps(row, q, tangent, follows)
+
+    def point(self, steps: Indices, share: Array) -> Array:
+        """Points of some steps (K,) at shares of the way (K,), on cubic curves, (K, n)."""
+        return _on_cubics(self.q[steps], self.tangent[steps], share[:, None])[:, 0]
+
+    def divided(self) -> tuple[Array, Array]:
+        """`RULES.parts` + 1 points on each step, on cubic curves, and directions there, (S, parts + 1, n) each."""
+        s = np.broadcast_to(np.arange(RULES.parts + 1) / RULES.parts, (len(self.q), RULES.parts + 1))
+        along = (1 - s[:, :, None]) * self.tangent[:, :1] + s[:, :, None] * self.tangent[:, 1:]
+        return _on_cubics(self.q, self.tangent, s), along
+
+
+@dataclass(frozen=True, eq=False)
 class Arcs:
     """S steps of curves around the domain, by G points each, close to one another."""
 
@@ -334,12 +425,8 @@ class Ends:
         return Ends(*(np.concatenate(pair) for pair in parts))
 
 
-def _subdivided(traces: Traces, curve: Indices, place: Indices) -> tuple[Array, Array]:
-    """Points on cubic curves from points of traces (S,) to the next ones, and directions, (S, parts + 1, n) each."""
-    q, t = traces.q[curve, place][:, None], traces.tangent[curve, place][:, None]
-    after, onward = traces.q[curve, place + 1][:, None], traces.tangent[curve, place + 1][:, None]
-    s = (np.arange(RULES.parts + 1) / RULES.parts)[:, None]
-    step = after - q
-    bend = (s - 2 * s**2 + s**3) * t + (s**3 - s**2) * onward
-    points = q + (3 * s**2 - 2 * s**3) * step + np.linalg.norm(step, axis=2, keepdims=True) * bend
-    return points, (1 - s) * t + s * onward
+def _on_cubics(q: Array, t: Array, share: Array) -> Array:
+    """Points on cubic curves with ends q and unit tangents t (K, 2, n), at shares (K, G) of the way, (K, G, n)."""
+    s, step = share[:, :, None], q[:, 1:] - q[:, :1]
+    bend = (s - 2 * s**2 + s**3) * t[:, :1] + (s**3 - s**2) * t[:, 1:]
+    return np.asarray(q[:, :1] + (3 * s**2 - 2 * s**3) * step + np.linalg.norm(step, axis=2, keepdims=True) * bend)

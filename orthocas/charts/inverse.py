@@ -86,6 +86,7 @@ class Inverse:
     in_domain: InDomain | None = None  #: searches all of the domain; for fitted coordinates with r > 1
     inside: Inside | None = None  #: finds points inside that keep the task; for fitted coordinates
     curves: SelfMotionCurves | None = None  #: finds the nearest xi at a task value; for fitted coordinates with r = 1
+    brief: LocalSolver | None = None  #: in place of `local` where curves are searched anyway; it may give up early
 
     def solve(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Solutions:
         """Solutions for targets (N, n), from starts (N, n) or our own. Rows that are not finite fail."""
@@ -106,7 +107,9 @@ class Inverse:
 
     def _searched(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Found:
         """What the search finds from given starts, or from the rough inverse and, where that fails, in the domain."""
-        best = self._attempt(targets, self.starts.guess(targets) if starts is None else starts, tolerance)
+        follows = self.curves is not None and (inside or starts is None)
+        first = self.local if self.brief is None or not follows else self.brief
+        best = self._attempt(targets, self.starts.guess(targets) if starts is None else starts, tolerance, first)
         self._tell_beyond(targets, best)
         if inside and self.inside is not None:
             own = best.q.copy() if starts is None else starts
@@ -115,7 +118,8 @@ class Inverse:
             else:
                 self._search_inside(self.inside, targets, best, tolerance)
         elif starts is None:
-            self._restart(targets, best, self._open(best), _FIRST, InverseStatus.FOUND, tolerance)
+            if self.curves is None:
+                self._restart(targets, best, self._open(best), _FIRST, InverseStatus.FOUND, tolerance)
             self._search_domain(targets, best, self._open(best), tolerance)
             rows = np.flatnonzero(best.status == InverseStatus.NOT_FOUND)
             self._restart(targets, best, rows, _RESTARTS, InverseStatus.SINGULAR, tolerance)
@@ -219,9 +223,10 @@ class Inverse:
             yield from self.starts.nearest(targets, count, self.problem.n)
             yield np.broadcast_to(self.problem.domain.centre, targets.shape)
 
-    def _attempt(self, targets: Array, starts: Array, tolerance: float) -> Found:
+    def _attempt(self, targets: Array, starts: Array, tolerance: float, local: LocalSolver | None = None) -> Found:
         """One search from starts (N, n), judged."""
-        return self._judged(self._snapped(targets, self.local(targets, starts), tolerance), tolerance)
+        attempt = (local or self.local)(targets, starts)
+        return self._judged(self._snapped(targets, attempt, tolerance), tolerance)
 
     def _judged(self, attempt: Attempt, tolerance: float) -> Found:
         """Where a search ended, with a status."""

@@ -12,7 +12,17 @@ from orthocas.charts.curves import SelfMotionCurves
 from orthocas.charts.in_domain import BoxedPhi, Cells, InDomain
 from orthocas.charts.inside import Inside, Nearest
 from orthocas.charts.inverse import Inverse
-from orthocas.charts.newton import FewRows, LocalSolver, Newton, OwnInverse, PointFunctions, Starts, inverse_function
+from orthocas.charts.newton import (
+    BRIEF,
+    HALVINGS,
+    FewRows,
+    LocalSolver,
+    Newton,
+    OwnInverse,
+    PointFunctions,
+    Starts,
+    inverse_function,
+)
 from orthocas.charts.phi import Differences, PhiFunctions, PhiMap
 from orthocas.charts.reaching import ReachingTracker, near_function
 from orthocas.charts.solutions import Solutions, Tracker
@@ -298,11 +308,11 @@ class InverseMethods(PhiFunctions):
         if isinstance(self.coordinates, InvertibleMap):
             return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map), starts)
         boxed = BoxedPhi(self.problem.task, domain, phi_map)
-        local = FewRows(phi_map, self._point_functions, Newton(phi_map))
+        local, brief = (FewRows(phi_map, self._point_functions, Newton(phi_map, k)) for k in (HALVINGS, BRIEF))
         by_ipopt = Nearest(domain, self.m, self.function("phi"), phi_map)
         in_domain, inside = InDomain(boxed, Cells(boxed)), Inside(boxed, starts, by_ipopt)
         curves = SelfMotionCurves(boxed, starts, self.xi) if self.r == 1 else None
-        return Inverse(self.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves)
+        return Inverse(self.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves, brief)
 
     @cached_property
     def _inverse_function(self) -> ca.Function:

@@ -24,7 +24,8 @@ _PATIENCE = 8  # iterations after which the error must have halved
 GOAL = 1e-12  #: error at which the iteration stops
 _KEEP = 0.1  # J is evaluated again if a step leaves more of the error
 _DECREASE = 1e-4  # of the error, relative to the part of the step taken
-_HALVINGS, _SOLVED = 10, 1e-10  # of a step; below this error only rounding stops the decrease
+HALVINGS, BRIEF = 10, 3  #: of a step, and where another search follows
+_SOLVED = 1e-10  # below this error only rounding stops the decrease
 _PIECE = 2048  # matrices that a thread inverts at once
 SUSPICIOUS = 1e6  #: |J| |J^-1| above which singular values are computed
 _FEW = 4  # rows that are solved one by one
@@ -73,10 +74,15 @@ class LocalSolver(Protocol):
 
 
 class Newton:
-    """Newton's method with line search, which starts at finite points."""
+    """Newton's method with line search, which starts at finite points.
 
-    def __init__(self, phi_map: PhiMap) -> None:
-        self._map = phi_map
+    Args:
+        phi_map: phi and J.
+        halvings: of a step whose error does not decrease, before a row is given up.
+    """
+
+    def __init__(self, phi_map: PhiMap, halvings: int = HALVINGS) -> None:
+        self._map, self._halvings = phi_map, halvings
 
     def __call__(self, targets: Array, starts: Array) -> Attempt:
         """Search from starts (N, n)."""
@@ -93,7 +99,7 @@ class Newton:
                 if not rows.size:
                     break
                 run.refresh(rows[run.stale[rows]])
-                rows = rows[run.advance(rows)]
+                rows = rows[run.advance(rows, self._halvings)]
             return Attempt(run.q, run.residual, run.iterations, run.suspicious)
 
 
@@ -121,8 +127,8 @@ class _Run:
             self._condition[rows] = np.where(singular, np.inf, _norm(J) * _norm(inverse))
             self.stale[rows], self._fresh[rows] = False, True
 
-    def advance(self, rows: Indices) -> NDArray[np.bool_]:
-        """Take a step in some rows, halved until the error decreases. Returns which can go on, (rows,).
+    def advance(self, rows: Indices, most: int) -> NDArray[np.bool_]:
+        """Take a step in some rows, halved up to so many times until the error decreases. Returns which can go on.
 
         A row whose J is from an earlier point waits for a new one instead.
         """
@@ -130,7 +136,7 @@ class _Run:
         steps = np.matmul(inverse, self.residual[rows, :, None])[:, :, 0]
         goes_on = np.zeros(len(rows), dtype=bool)
         left = np.flatnonzero(np.isfinite(steps).all(axis=1))
-        for halvings in range(_HALVINGS + 1):
+        for halvings in range(most + 1):
             moved = self._try(rows[left], steps[left], 0.5**halvings)
             goes_on[left[moved]] = True
             left = left[~moved]
