@@ -168,6 +168,12 @@ class CurveTracer:
         turning, sliding = q[..., self.turning], q[..., ~self.turning]
         return np.concatenate([np.cos(turning), np.sin(turning), sliding], axis=-1)
 
+    @property
+    def equations(self) -> ca.Function:
+        """q, x -> e = (x - h(q)) / scale (m, 1), and J / scale (m, n)."""
+        q, x, e, J = self._symbols
+        return dense_function("equations", [q, x], [e, J])
+
     @cached_property
     def _bordered_step(self) -> BlockedFunction:
         """As `_bordered`, at many points."""

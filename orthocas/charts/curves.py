@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,14 @@ class Nearest:
         better = farthest_first[distance[farthest_first] < self.distance[rows[farthest_first]]]
         self.q[rows[better]], self.distance[rows[better]] = q[better], distance[better]
         self.between[rows[better]] = between
+
+
+class CurveSearch(Protocol):
+    """A search along self-motion curves."""
+
+    def search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
+        """The nearest points for targets (N, n) of phi, from stored starts and one of the caller's (N, n)."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +84,9 @@ class SelfMotionCurves:
             for stage in range(2):
                 rows = np.flatnonzero(best.distance > 0)
                 if rows.size:
-                    starts = self._first_starts(targets[rows], own[rows]) if stage == 0 else self._more(targets[rows])
+                    starts = (
+                        self.first_starts(targets[rows], own[rows]) if stage == 0 else self.more_starts(targets[rows])
+                    )
                     ends = ends.joined(self._search_from(targets, rows, starts, traced, tolerance, best))
             self._take_ends(targets, ends, best)
         return best
@@ -108,12 +119,12 @@ class SelfMotionCurves:
             traced.append(traces)
         return ends
 
-    def _first_starts(self, targets: Array, own: Array) -> Array:
+    def first_starts(self, targets: Array, own: Array) -> Array:
         """The caller's starts, and stored positions near phi and near x, (S, N, n)."""
         near_phi = self.starts.nearest(targets, RULES.near_phi, targets.shape[1])
         return np.concatenate([own[None], near_phi, self.starts.nearest(targets, RULES.near_x, self.boxed.m)])
 
-    def _more(self, targets: Array) -> Array:
+    def more_starts(self, targets: Array) -> Array:
         """Further stored positions near x, (S, N, n)."""
         return self.starts.nearest(targets, RULES.near_x + RULES.more, self.boxed.m)[RULES.near_x :]
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.charts.continuation import Continuation
-from orthocas.charts.curves import SelfMotionCurves
+from orthocas.charts.curves import CurveSearch
 from orthocas.charts.in_domain import InDomain
 from orthocas.charts.inside import Inside
 from orthocas.charts.newton import Attempt, LocalSolver, Starts
@@ -85,7 +85,7 @@ class Inverse:
     along: Continuation | None = None  #: follows lines of values from given starts; for fitted coordinates
     in_domain: InDomain | None = None  #: searches all of the domain; for fitted coordinates with r > 1
     inside: Inside | None = None  #: finds points inside that keep the task; for fitted coordinates
-    curves: SelfMotionCurves | None = None  #: finds the nearest xi at a task value; for fitted coordinates with r = 1
+    curves: CurveSearch | None = None  #: finds the nearest xi at a task value; for fitted coordinates with r = 1
     brief: LocalSolver | None = None  #: in place of `local` where curves are searched anyway; it may give up early
 
     def solve(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Solutions:
@@ -163,7 +163,7 @@ class Inverse:
             best.improve(rows[left], self._attempt(targets[rows[left]], start[left], tolerance))
 
     def _search_curves(
-        self, curves: SelfMotionCurves, inside: Inside, targets: Array, best: Found, own: Array, tolerance: float
+        self, curves: CurveSearch, inside: Inside, targets: Array, best: Found, own: Array, tolerance: float
     ) -> None:
         """Replace what is not found by other solutions, or the nearest xi, on self-motion curves inside the domain."""
         rows = np.flatnonzero(best.status != InverseStatus.FOUND)
@@ -176,7 +176,7 @@ class Inverse:
 
     def _take_nearest(
         self,
-        curves: SelfMotionCurves,
+        curves: CurveSearch,
         inside: Inside,
         targets: Array,
         best: Found,
