@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.charts.in_domain import KEPT, BoxedPhi
+from orthocas.charts.in_domain import BoxedPhi
 from orthocas.charts.newton import inverses
 from orthocas.tasks.domains import bounds_of
 from orthocas.tasks.relative import Relative
@@ -24,6 +24,7 @@ class CurveRules:
     near_x: int = 8  #: the same near each x
     more: int = 24  #: the same, for rows without a solution
     reach: int = 25  #: steps from a start to its x
+    reached: float = 1e-3  #: error, relative to the sizes of the components, that one more step reduces to its square
     largest: float = 0.7  #: norm of one of those steps [rad] or [m]
     missed: float = 0.08  #: largest correction of a step along a curve [rad] or [m]
     step: float = 0.4  #: longest step along a curve [rad] or [m]
@@ -62,18 +63,17 @@ class CurveTracer:
 
     boxed: BoxedPhi
 
-    def reach(self, x: Array, starts: Array) -> tuple[Array, Array]:
-        """Where damped least squares lead from starts (M, n) to x (M, m), whatever the limits; and errors (M,)."""
-        q, error, left = starts.copy(), np.full(len(starts), np.inf), np.arange(len(starts))
+    def reach(self, x: Array, starts: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Where damped least squares lead from starts (M, n), whatever the limits, and whether near x (M, m), (M,)."""
+        q, arrived, left = starts.copy(), np.zeros(len(starts), dtype=bool), np.arange(len(starts))
         for _ in range(RULES.reach):
             found = self._damped_step(q[left], x[left])[0]
-            error[left] = found[:, -1]
-            going = (error[left] > KEPT / 10) & np.isfinite(error[left])
-            left = left[going]
+            q[left] += found[:, :-1]
+            arrived[left] = found[:, -1] <= RULES.reached
+            left = left[(found[:, -1] > RULES.reached) & np.isfinite(found[:, -1])]
             if not left.size:
                 break
-            q[left] += found[going, :-1]
-        return q, error
+        return q, arrived
 
     def trace(self, targets: Array, q: Array, rows: Indices) -> Traces:
         """The curves through points q (K, n), from end to end."""

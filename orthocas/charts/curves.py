@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.charts.curve_tracer import RULES, CurveTracer, Traces, solutions_of, without_turns
-from orthocas.charts.in_domain import KEPT, BoxedPhi
+from orthocas.charts.in_domain import BoxedPhi
 from orthocas.charts.newton import Starts
 from orthocas.charts.phi import largest, shortest
 from orthocas.tasks.domains import bounds_of
@@ -81,15 +81,18 @@ class SelfMotionCurves:
     def _search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
         best, ends, traced = Nearest.empty(own), Ends.empty(own.shape[1]), list[Traces]()
         with np.errstate(all="ignore"):
-            for stage in range(2):
+            for starts in self.stages(targets, own):
                 rows = np.flatnonzero(best.distance > 0)
                 if rows.size:
-                    starts = (
-                        self.first_starts(targets[rows], own[rows]) if stage == 0 else self.more_starts(targets[rows])
-                    )
-                    ends = ends.joined(self._search_from(targets, rows, starts, traced, tolerance, best))
+                    ends = ends.joined(self._search_from(targets, rows, starts[:, rows], traced, tolerance, best))
             self._take_ends(targets, ends, best)
         return best
+
+    def stages(self, targets: Array, own: Array) -> tuple[Array, Array]:
+        """The caller's starts and stored positions near phi and near x, and more of these, (S, N, n) each."""
+        near_phi = self.starts.nearest(targets, RULES.near_phi, targets.shape[1])
+        near_x = self.starts.nearest(targets, RULES.near_x + RULES.more, self.boxed.m)
+        return np.concatenate([own[None], near_phi, near_x[: RULES.near_x]]), near_x[RULES.near_x :]
 
     def _search_from(
         self, targets: Array, rows: Indices, starts: Array, traced: list[Traces], tolerance: float, best: Nearest
@@ -119,21 +122,12 @@ class SelfMotionCurves:
             traced.append(traces)
         return ends
 
-    def first_starts(self, targets: Array, own: Array) -> Array:
-        """The caller's starts, and stored positions near phi and near x, (S, N, n)."""
-        near_phi = self.starts.nearest(targets, RULES.near_phi, targets.shape[1])
-        return np.concatenate([own[None], near_phi, self.starts.nearest(targets, RULES.near_x, self.boxed.m)])
-
-    def more_starts(self, targets: Array) -> Array:
-        """Further stored positions near x, (S, N, n)."""
-        return self.starts.nearest(targets, RULES.near_x + RULES.more, self.boxed.m)[RULES.near_x :]
-
     def _reached(self, targets: Array, starts: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Positions (N, S, n) with the task values of targets, and which starts (S, N, n) led to none, (N, S)."""
+        """Positions (N, S, n) near the task values of targets, and which starts (S, N, n) led to none, (N, S)."""
         S, N, n = starts.shape
         x = np.repeat(targets[:, : self.boxed.m], S, axis=0)
-        q, error = self.tracer.reach(x, starts.transpose(1, 0, 2).reshape(-1, n))
-        return q.reshape(N, S, n), ~(error <= KEPT).reshape(N, S)
+        q, arrived = self.tracer.reach(x, starts.transpose(1, 0, 2).reshape(-1, n))
+        return q.reshape(N, S, n), ~arrived.reshape(N, S)
 
     def _away(self, q: Array) -> Array:
         """Largest distances of joints (N, S, n) from their ranges, up to full turns, (N, S)."""

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from orthocas.charts.coordinates import InvertibleMap
@@ -42,7 +43,6 @@ _OPTIONS: dict[str, Any] = {
 _POINTS, _SEED = 4096, 0  # of the table
 _DEGREES, _MOST_TERMS = (3, 2, 1), 500  # of the rough inverse: the first degree with so few terms
 _OVERSHOOT = 1.2  # beyond the values of the table, polynomials are not trusted
-_AT_ONCE = 1024  # targets that are compared with the table at once
 
 
 @dataclass(frozen=True)
@@ -385,17 +385,17 @@ class Starts:
             count: points for each target.
             components: how many components of phi count, the first ones.
         """
-        points, wanted = self._table[0], self._places(targets, components)
-        known = self._known[components]
-        parts = [wanted[start : start + _AT_ONCE] for start in range(0, len(wanted), _AT_ONCE)]
-        order = np.concatenate([_nearest(known, part, min(count, len(points))) for part in parts])
+        points = self._table[0]
+        order = self._trees[components].query(self._places(targets, components), range(1, min(count, len(points)) + 1))[
+            1
+        ]
         nearest: Array = points[order.T]
         return nearest
 
     @cached_property
-    def _known(self) -> BuiltOnUse[int, Array]:
-        """Places of the table by the number of components that count."""
-        return BuiltOnUse(lambda components: self._places(self._table[1], components))
+    def _trees(self) -> BuiltOnUse[int, Any]:
+        """Search trees of places of the table, by the number of components that count."""
+        return BuiltOnUse(lambda components: scipy.spatial.cKDTree(self._places(self._table[1], components)))
 
     def _places(self, phi: Array, components: int) -> Array:
         """Numbers (N, k) that are near one another where the first components of phi (N, n) are."""
@@ -457,12 +457,3 @@ def _terms(u: Array, degree: int) -> Array:
         level = [(j, product * columns[j]) for i, product in level for j in range(i, len(columns))]
         terms += [product for _, product in level]
     return np.array(terms).T
-
-
-def _nearest(phi: Array, targets: Array, count: int) -> Indices:
-    """Indices of the rows of phi (K, n) nearest to targets (N, n), nearest first, (N, count)."""
-    squares = (phi**2).sum(axis=1) - 2 * targets @ phi.T  # without |target|^2, which is the same for all rows
-    first = np.argpartition(squares, count - 1, axis=1)[:, :count]
-    order = np.argsort(np.take_along_axis(squares, first, axis=1), axis=1)
-    nearest: Indices = np.take_along_axis(first, order, axis=1)
-    return nearest

@@ -11,7 +11,6 @@ import numpy as np
 from orthocas.charts.chart import Chart
 from orthocas.charts.curve_tracer import RULES
 from orthocas.charts.curves import Nearest, SelfMotionCurves
-from orthocas.charts.in_domain import KEPT
 from orthocas.codegen.compiled import template
 from orthocas.codegen.description import flags, numbers
 from orthocas.codegen.kernels import generate_kernels
@@ -39,12 +38,12 @@ class CompiledCurves:
 
         def search_piece(first: int) -> None:
             rows = slice(first, first + _PIECE)
-            early = self.curves.first_starts(targets[rows], own[rows])
-            starts = np.concatenate([early, self.curves.more_starts(targets[rows])]).transpose(1, 0, 2)
+            stages = self.curves.stages(targets[rows], own[rows])
+            starts = np.concatenate(stages).transpose(1, 0, 2)
             given = (np.ascontiguousarray(array) for array in (targets[rows], starts))
             arrays = (*given, np.empty(room, dtype=np.uint8), best.q[rows], best.distance[rows], between[rows])
             phi, q_start, *others = (ctypes.c_void_p(array.ctypes.data) for array in arrays)
-            counts = ctypes.c_long(len(early)), ctypes.c_long(starts.shape[1])
+            counts = ctypes.c_long(len(stages[0])), ctypes.c_long(starts.shape[1])
             library.curve_rows(ctypes.c_long(len(starts)), phi, q_start, *counts, ctypes.c_double(tolerance), *others)
 
         in_threads(search_piece, range(0, len(own), _PIECE))
@@ -73,7 +72,7 @@ def curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
         sizes["CONDITION"] = functions[-1].numel_out(0)
     kernels, turn = generate_kernels(functions, "kernel"), float(chart.turns[chart.m])
     sizes |= {**kernels.sizes(), **{name.upper(): repr(value) for name, value in asdict(RULES).items()}}
-    sizes |= {"KEPT": repr(KEPT), "XI_SIZE": repr(float(chart.phi_sizes[chart.m]))}
+    sizes["XI_SIZE"] = repr(float(chart.phi_sizes[chart.m]))
     sizes["PERIOD"] = repr(turn) if turn > 0 else "INFINITY"
     low, high = bounds_of(domain)
     arrays = {"low": low, "high": high, "centre": domain.centre, "half_width": domain.half_width}

@@ -137,13 +137,12 @@ static double turned_back(double difference, int joint) {
   return turning[joint] ? difference - TURN * rint(difference / TURN) : difference;
 }
 
-/* Damped least squares to x, whatever the limits; whether it arrives. */
+/* Damped least squares to x, whatever the limits; whether it arrives near x. */
 static int reach_x(double *q, const double *x) {
   int round, i, j, k;
   for (round = 0; round < REACH; ++round) {
     double e[M], J[M * N], A[N][N + 2], step[N], trace = 0.0, size, damping;
     const double error = task_at(q, x, e, J);
-    if (error <= KEPT / 10) return 1;
     if (!isfinite(error)) return 0;
     for (i = 0; i < M; ++i) {
       for (j = 0; j < M; ++j) {
@@ -162,11 +161,9 @@ static int reach_x(double *q, const double *x) {
     }
     size = sqrt(dot(step, step));
     for (k = 0; k < N; ++k) q[k] += fmin(1.0, LARGEST / (size + 1e-300)) * step[k];
+    if (error <= REACHED) return 1;
   }
-  {
-    double e[M], J[M * N];
-    return task_at(q, x, e, J) <= KEPT;
-  }
+  return 0;
 }
 
 /* Follow a curve from its point `at` in one direction; whether it closes. */
