@@ -37,6 +37,9 @@ class CurveRules:
     sagitta: float = 6e-3  #: largest distance of those parts from their chords [rad] or [m]
     halvings: int = 5  #: of chords that pass the box between points outside
     narrow: float = 1e-10  #: [rad] or [m]: brackets of an end of the domain
+    few: int = (
+        64  #: rows up to which all starts are followed at once, though some lie on one curve
+    )
     prismatic: float = 1.0  #: half-widths that a sliding joint may leave its range by
 
 
@@ -54,7 +57,9 @@ class Traces:
 
     def part(self, curves: Indices) -> "Traces":
         """Some of the curves."""
-        return Traces(*(array[curves] for array in vars(self).values()))
+        row, q, tangent, count = (array[curves] for array in vars(self).values())
+        longest = count.max(initial=1)
+        return Traces(row, q[:, :longest], tangent[:, :longest], count)
 
 
 @dataclass(frozen=True, eq=False)

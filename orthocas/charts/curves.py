@@ -110,15 +110,21 @@ class SelfMotionCurves:
             left = np.flatnonzero(~known.all(axis=1) & (best.distance[rows] > 0))
             if not left.size:
                 break
-            first = np.argmin(np.where(known[left], np.inf, away[left]), axis=1)
-            traces = self.tracer.trace(targets[rows[left]], q[left, first], rows[left])
+            if left.size > RULES.few:
+                of, start = left, np.argmin(np.where(known[left], np.inf, away[left]), axis=1)
+            else:
+                at, start = np.nonzero(~known[left])
+                of = left[at]
+            traces = self.tracer.trace(targets[rows[of]], q[of, start], rows[of])
+            known[of, start] = True
             steps = self._steps(traces)
-            self._take_crossed(targets, steps, tolerance, best)
-            arcs = self._arcs(targets, steps.part(best.distance[steps.row] > 0))
+            xi_left = self._take_crossed(targets, steps, tolerance, best)
+            more = best.distance[steps.row] > 0
+            arcs = self._arcs(targets, steps.part(more), xi_left[more])
             self._take_roots(targets, arcs, tolerance, best)
             ends = ends.joined(self._take_points(targets, arcs, best))
-            known[left] |= self.tracer.on_curves(q[left], traces)
-            known[left, first] = True
+            on = np.flatnonzero((best.distance[traces.row] > 0) & ~known[of].all(axis=1))
+            np.logical_or.at(known, of[on], self.tracer.on_curves(q[of[on]], traces.part(on)))
             traced.append(traces)
         return ends
 
@@ -149,11 +155,16 @@ class SelfMotionCurves:
         follows = np.diff(at * near.shape[1] + place, prepend=-2) == 1
         return Steps(traces.row[of], q, t, follows)
 
-    def _take_crossed(self, targets: Array, steps: "Steps", tolerance: float, best: Nearest) -> None:
-        """Solutions of phi(q) = phi on steps along which xi passes its target, in or near the box."""
+    def _take_crossed(self, targets: Array, steps: "Steps", tolerance: float, best: Nearest) -> Array:
+        """Solutions of phi(q) = phi on steps along which xi passes its target, in or near the box.
+
+        Returns:
+            xi - xi(q) at both ends of the steps, (S, 2); NaN far from the box.
+        """
         left = self._xi_left_of(targets, steps)
         step, share = self._crossed(left)
         self._take_solutions(targets, steps.row[step], steps.point(step, share), tolerance, best)
+        return left
 
     def _xi_left_of(self, targets: Array, steps: "Steps") -> Array:
         """xi - xi(q) at both ends of steps, (S, 2); NaN far from the box."""
@@ -175,9 +186,9 @@ class SelfMotionCurves:
         a, b = a[crossed], b[crossed]
         return crossed, np.where(a == b, 0.0, a / np.where(a == b, 1.0, a - b))
 
-    def _arcs(self, targets: Array, steps: "Steps") -> "Arcs":
+    def _arcs(self, targets: Array, steps: "Steps", left: Array) -> "Arcs":
         """Points on the steps that may hold a root, an end of an arc, or a place where xi turns back."""
-        steps = steps.part(self._matters(targets, steps))
+        steps = steps.part(self._matters(steps, left))
         low, high = bounds_of(self.boxed.domain)
         q, along = steps.divided()
         slack = RULES.step / RULES.parts
@@ -197,13 +208,13 @@ class SelfMotionCurves:
         passing[arc, place] = first < last
         return Arcs(steps.row, q, inside, passing, xi_left)
 
-    def _matters(self, targets: Array, steps: "Steps") -> NDArray[np.bool_]:
+    def _matters(self, steps: "Steps", left: Array) -> NDArray[np.bool_]:
         """Steps (S,) that pass the target or a boundary, their neighbours, and those where xi turns back.
 
         Along the others, xi only moves from one end to the other, and both ends lie in the domain; or they lie outside
-        the box.
+        the box. `left` is xi - xi(q) at the ends of the steps, (S, 2).
         """
-        left, inside = self._xi_left_of(targets, steps), np.zeros(steps.q.shape[:2], dtype=bool)
+        inside = np.zeros(steps.q.shape[:2], dtype=bool)
         inside[:, 1] = self._contains(steps.q[:, 1])
         begins = np.flatnonzero(~steps.follows)
         inside[begins, 0] = self._contains(steps.q[begins, 0])
