@@ -12,11 +12,12 @@ from orthocas.charts.curve_tracer import RULES, CurveTracer, Traces, solutions_o
 from orthocas.charts.in_domain import BoxedPhi
 from orthocas.charts.newton import Starts
 from orthocas.charts.phi import largest, shortest
-from orthocas.tasks.domains import bounds_of
+from orthocas.tasks.domains import bounds_of, sample_uniform
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
 
 _AT_ONCE = 2048  # rows whose curves are held in memory
+_PROBES, _SAME = 32, 1e-9  # positions at which turns are tried, and change of xi that is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +85,19 @@ class SelfMotionCurves:
             for starts in self.stages(targets, own):
                 rows = np.flatnonzero(best.distance > 0)
                 if rows.size:
-                    ends = ends.joined(self._search_from(targets, rows, starts[:, rows], traced, tolerance, best))
+                    ends = ends.joined(self._search_from(targets, rows, starts[:, rows], own, traced, tolerance, best))
             self._take_ends(targets, ends, best)
         return best
+
+    @cached_property
+    def winding(self) -> NDArray[np.bool_]:
+        """Joints without boundaries whose full turns change xi, (n,)."""
+        q = sample_uniform(self.boxed.domain, _PROBES, 0)
+        turned = q + 2 * np.pi * np.eye(q.shape[1])[:, None]
+        here, there = self.xi(q), self.xi(turned.reshape(-1, q.shape[1])).reshape(-1, len(q), 1)
+        moved = np.abs(shortest(there - here, self.boxed.phi_map.difference.turns[self.boxed.m :])).max(axis=(1, 2))
+        free = self.tracer.turning & ~np.isfinite(bounds_of(self.boxed.domain)[0])
+        return np.asarray(free & (moved > _SAME))
 
     def stages(self, targets: Array, own: Array) -> tuple[Array, Array]:
         """The caller's starts and stored positions near phi and near x, and more of these, (S, N, n) each."""
@@ -95,7 +106,14 @@ class SelfMotionCurves:
         return np.concatenate([own[None], near_phi, near_x[: RULES.near_x]]), near_x[RULES.near_x :]
 
     def _search_from(
-        self, targets: Array, rows: Indices, starts: Array, traced: list[Traces], tolerance: float, best: Nearest
+        self,
+        targets: Array,
+        rows: Indices,
+        starts: Array,
+        own: Array,
+        traced: list[Traces],
+        tolerance: float,
+        best: Nearest,
     ) -> "Ends":
         """Search some rows from starts (S, rows, n), and add to the curves that are traced; returns ends of arcs."""
         q, known = self._reached(targets[rows], starts)
@@ -117,7 +135,7 @@ class SelfMotionCurves:
                 of = left[at]
             traces = self.tracer.trace(targets[rows[of]], q[of, start], rows[of])
             known[of, start] = True
-            steps = self._steps(traces)
+            steps = self._steps(traces, own[traces.row])
             xi_left = self._take_crossed(targets, steps, tolerance, best)
             more = best.distance[steps.row] > 0
             arcs = self._arcs(targets, steps.part(more), xi_left[more])
@@ -142,9 +160,9 @@ class SelfMotionCurves:
         centre, half = np.where(bounded, (low + high) / 2, 0.0), np.where(bounded, (high - low) / 2, np.inf)
         return np.asarray((np.abs(without_turns(q - centre, self.tracer.turning)) - half).max(axis=2).clip(0.0))
 
-    def _steps(self, traces: Traces) -> "Steps":
+    def _steps(self, traces: Traces, own: Array) -> "Steps":
         """The steps of curves in and around the box of the domain, after all full turns that bring them there."""
-        curve, shift = self._sheets(traces)
+        curve, shift = self._sheets(traces, own)
         low, high = bounds_of(self.boxed.domain)
         moved = traces.q[curve] + shift[:, None]
         near = np.asarray(((moved >= low - RULES.step) & (moved <= high + RULES.step)).all(axis=2))
@@ -234,19 +252,25 @@ class SelfMotionCurves:
         around[:-1] |= changes[1:] & after[:-1]
         return np.asarray(around & ~(none & ~changes))
 
-    def _sheets(self, traces: Traces) -> tuple[Indices, Array]:
-        """Which curves (of K) pass the box of the domain after which full turns: curve (L,), and shifts (L, n)."""
+    def _sheets(self, traces: Traces, own: Array) -> tuple[Indices, Array]:
+        """Which curves (of K) pass the box of the domain after which full turns: curve (L,), and shifts (L, n).
+
+        Joints without boundaries turn to within half a turn of the caller's starts (K, n), or one and a half where
+        turns change xi.
+        """
         low, high = bounds_of(self.boxed.domain)
         turn, room, bounded = 2 * np.pi, RULES.step, np.isfinite(low)
-        low = np.where(bounded, low - room, self.boxed.domain.centre - np.pi)
+        low = np.where(bounded, low - room, own - np.where(self.winding, 3 * np.pi, np.pi))[:, None]
         high = np.where(bounded, high + room, np.inf)
         first = np.where(self.tracer.turning, np.ceil((low - traces.q) / turn), 0.0)
         at = traces.q + turn * first
         passed = np.ones(at.shape[:2], dtype=bool)
         passed[:, 1:] = (first[:, 1:] != first[:, :-1]).any(axis=2)
-        choices = [range(1 + int(k)) for k in np.where(self.tracer.turning & bounded, (high - low) // turn, 0)]
+        width = np.where(bounded, (high - low[0, 0]) // turn, np.where(self.winding, 2, 0))
+        choices = [range(1 + int(k)) for k in np.where(self.tracer.turning, width, 0)]
         near = [
-            [(at[:, :, j] >= low[j]) & (at[:, :, j] <= high[j] - turn * k) for k in choices[j]] for j in range(len(low))
+            [(at[:, :, j] >= low[:, :, j]) & (at[:, :, j] <= high[j] - turn * k) for k in choices[j]]
+            for j in range(len(high))
         ]
         found = []
         for extra in product(*choices):

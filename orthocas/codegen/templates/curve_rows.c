@@ -16,7 +16,7 @@ typedef struct {
 } arc_end;
 
 typedef struct {
-  const double *target;
+  const double *target, *own; /* own: the start of the caller */
   double tolerance, q[N], distance;
   int between, ends;
   arc_end end[ENDS];
@@ -465,7 +465,8 @@ static void search_curve(row_search *row, const curve_points *curve) {
         lowest[i] = ceil((low[i] - STEP - q) / TURN);
         highest[i] = floor((high[i] + STEP - q) / TURN);
       } else if (turning[i]) {
-        lowest[i] = highest[i] = ceil((centre[i] - TURN / 2 - q) / TURN);
+        lowest[i] = ceil((row->own[i] - (winding[i] ? 1.5 : 0.5) * TURN - q) / TURN);
+        highest[i] = lowest[i] + (winding[i] ? 2.0 : 0.0);
       } else {
         near = q >= low[i] - STEP && q <= high[i] + STEP;
       }
@@ -542,6 +543,7 @@ void curve_rows(long rows, const double *targets, const double *starts, long fir
     row_search row;
     int curves, end;
     row.target = targets + k * N;
+    row.own = from;
     row.tolerance = tolerance;
     row.distance = INFINITY;
     row.between = row.ends = 0;
