@@ -155,8 +155,8 @@ class CurveTracer:
             if not left.size:
                 break
         last = np.minimum(np.arange(count.max()), count[:, None] - 1)[:, :, None]
-        parts = (np.take_along_axis(part, last, axis=1) for part in (points, tangents))
-        return *parts, count, closed
+        points, tangents = (np.take_along_axis(part, last, axis=1) for part in (points, tangents))
+        return points, tangents, count, closed
 
     def _slides_near(self, q: Array) -> NDArray[np.bool_]:
         """Whether sliding joints are in their ranges, or not far outside."""

@@ -238,7 +238,7 @@ class SelfMotionCurves:
         inside[begins, 0] = self._contains(steps.q[begins, 0])
         joined = np.flatnonzero(steps.follows)
         inside[joined, 0] = inside[joined - 1, 1]
-        both, none = inside.all(axis=1), ~inside.any(axis=1)
+        both, none = np.asarray(inside.all(axis=1)), np.asarray(~inside.any(axis=1))
         first, last = self._shares_inside(steps.q[:, 0], steps.q[:, 1], RULES.missed)
         changes = np.where(none, first < last, ~both)
         changes[self._crossed(left)[0]] = True
@@ -274,8 +274,8 @@ class SelfMotionCurves:
         ]
         found = []
         for extra in product(*choices):
-            close = np.logical_and.reduce([near[j][k] for j, k in enumerate(extra)])
-            changes = close & passed
+            close = np.all([near[j][k] for j, k in enumerate(extra)], axis=0)
+            changes = np.asarray(close & passed)
             changes[:, 1:] |= close[:, 1:] & ~close[:, :-1]
             curve, place = np.nonzero(changes)
             found.append(np.column_stack([curve, first[curve, place] + np.array(extra)]))

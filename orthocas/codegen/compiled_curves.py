@@ -60,7 +60,7 @@ def curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
     q, domain = ca.MX.sym("q", chart.n), chart.problem.domain
     x, own = ca.MX.sym("x", chart.m), chart.coordinates.functions
     functions = [
-        dense_function("curve_task", [q, x], curves.tracer.equations(q, x)),
+        dense_function("curve_task", [q, x], curves.tracer.equations.call([q, x])),
         *(
             dense_function(f"curve_{name}", [q], [chart.runnable(own[which])(q)])
             for name, which in (("xi", "xi"), ("gradient", "jacobian"))
