@@ -134,10 +134,13 @@ def test_a_relative_cache_does_not_count(monkeypatch: pytest.MonkeyPatch, tmp_pa
 
 @pytest.mark.slow
 @needs_c
-@pytest.mark.parametrize("name", ["panda-wide", "a joint without boundaries"])
+@pytest.mark.parametrize("name", ["panda-wide", "panda-pose", "a joint without boundaries"])
 def test_compiled_curves_are_as_near(name: str, tmp_path: Path) -> None:
-    """Of wishes whose x is that of another posture: the same status and distance, each inside and with its x."""
-    chart = oc.charts.load(name) if name == "panda-wide" else wide().chart
+    """Of wishes whose x is that of another posture: the same status and distance, each inside and with its x.
+
+    gcc, with warnings as errors, refused the chart of a box.
+    """
+    chart = oc.charts.load(name) if name.startswith("panda") else wide().chart
     domain = chart.problem.domain
     wishes, x = sample_uniform(domain, 200, 5), chart.task(sample_uniform(domain, 200, 6))
     mine, theirs = chart.nearest_xi(wishes, x), oc.compile_inverse(chart, tmp_path).nearest_xi(wishes, x)

@@ -26,6 +26,8 @@ static double task_at(const double *q, const double *x, double *e, double *J) {
   const double *arg[curve_task_arg] = {0};
   double *res[curve_task_res] = {0}, w[curve_task_w], size = 0.0;
   int iw[curve_task_iw], i;
+  memset(e, 0, M * sizeof *e); /* compilers do not see that the kernel sets them */
+  memset(J, 0, M * N * sizeof *J);
   arg[0] = q;
   arg[1] = x;
   res[0] = e;
@@ -68,7 +70,7 @@ static int in_box(const double *q, double slack) {
 static int contains(const double *q) {
 #ifdef CONDITION
   const double *arg[curve_pivots_arg] = {0};
-  double *res[curve_pivots_res] = {0}, w[curve_pivots_w], pivots[CONDITION];
+  double *res[curve_pivots_res] = {0}, w[curve_pivots_w], pivots[CONDITION] = {0};
   int iw[curve_pivots_iw], i;
   if (!in_box(q, 0.0)) return 0;
   arg[0] = q;
