@@ -31,8 +31,8 @@ RECALL = "| chart | targets | solutions: mean | most | missed by 20,000 starts |
     " --- |" * 7
 )
 NEAREST = (
-    "| chart | wishes | 4,000 starts lead nearer | ms a wish | near ends of ranges | of these missed |\n|"
-    + " --- |" * 6
+    "| chart | wishes | 4,000 starts lead nearer | ms a wish | in C | near ends of ranges | of these missed |\n|"
+    + " --- |" * 7
 )
 
 
@@ -113,10 +113,12 @@ def nearest(name: str, count: int) -> str:
     chart = oc.charts.load(name)
     domain = chart.problem.domain
     wishes, x = sample_uniform(domain, count, 0), chart.task(sample_uniform(domain, count, 1000))
-    chart.nearest_xi(wishes[:20], x[:20])
-    begin = time.process_time()
-    found = chart.nearest_xi(wishes, x)
-    seconds = time.process_time() - begin
+    seconds = []
+    for solver in (oc.compile_inverse(chart), chart):
+        solver.nearest_xi(wishes[:20], x[:20])
+        begin = time.process_time()
+        found = solver.nearest_xi(wishes, x)
+        seconds.append(1e3 * (time.process_time() - begin) / count)
     pool, xi, worse = sample_uniform(domain, _DENSE, 77), chart.xi(wishes), 0
     for k in range(count):
         others = at_task_value(chart, x[k], pool)
@@ -126,7 +128,8 @@ def nearest(name: str, count: int) -> str:
         worse += bool(mine > away.min() + 1e-6)
     starts, targets = ends(chart, count // 4)
     missed = int((~chart.solve(targets, starts).found).sum())
-    return f"| {name} | {count} | {worse} | {1e3 * seconds / count:.2f} | {len(targets)} | {missed} |"
+    in_c, in_numpy = seconds
+    return f"| {name} | {count} | {worse} | {in_numpy:.2f} | {in_c:.2f} | {len(targets)} | {missed} |"
 
 
 def at_task_value(chart: oc.Chart, x: Array, pool: Array) -> Array:

@@ -32,7 +32,7 @@ def points_of(n: int, count: int) -> Array:
     return np.random.default_rng(5).uniform(-1, 1, (count, n))
 
 
-@pytest.mark.parametrize("count", [0, 1, columns.MANY, 256, 257, 5000])
+@pytest.mark.parametrize("count", [0, 1, columns.MANY, 64, 65, 129, 256, 257, 5000])
 def test_values_are_those_of_numpy(count: int) -> None:
     """Rows of a matrix in their order, into part of a larger array, and nothing beside it."""
     A, q = np.arange(6.0).reshape(2, 3), ca.SX.sym("q", 3)

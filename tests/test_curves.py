@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from public_objects import wide
 
 import orthocas as oc
 from orthocas.tasks.domains import bounds_of, sample_uniform
@@ -78,6 +79,19 @@ def test_curves_are_cut_by_the_limits_after_full_turns() -> None:
         found = chart.nearest_xi(own, chart.task(q))
         assert found.distance[0] < 1e-9 < apart
         np.testing.assert_allclose(chart.xi(found.q[0]), chart.xi(own), atol=1e-9)
+
+
+def test_endless_joints_count_at_every_turn_near_the_wish() -> None:
+    """A turn of the first joint changes xi. Eleven of 424 wishes near x got a posture of another turn."""
+    chart = wide().chart
+    domain, rng = chart.problem.domain, np.random.default_rng(4)
+    wishes = sample_uniform(domain, 500, 3)
+    others = wishes + 0.3 * domain.half_width * rng.uniform(-1, 1, wishes.shape)
+    others = np.where(domain.contains(others)[:, None], others, wishes)
+    x, xi = chart.task(others), chart.xi(wishes)
+    found = chart.nearest_xi(wishes, x)
+    assert (found.status <= NEAREST).all()
+    assert (found.distance <= np.abs(chart.xi(others) - xi)[:, 0] + 1e-9).all()
 
 
 def test_orientations_are_embedded_without_a_seam() -> None:

@@ -48,10 +48,27 @@ def missed(chart: oc.Chart, wishes: Array, x: Array, q: Array) -> tuple[Array, A
     return error, np.linalg.norm(away[:, chart.m :], axis=1)
 
 
+def something_nearer_around(chart: oc.Chart, wish: Array, x: Array, q: Array) -> bool:
+    """Whether one of 2,000 points up to 0.01 half-widths away, moved to x and inside, has a nearer xi than q (n,)."""
+    rng, domain, m = np.random.default_rng(2), chart.problem.domain, chart.m
+    points = q + 0.01 * domain.half_width * rng.uniform(-1, 1, (2000, chart.n)) * rng.uniform(size=(2000, 1))
+    for _ in range(4):
+        J = chart.relative.batched_rates(points)[0].reshape(-1, m, chart.n)
+        step = (
+            np.linalg.pinv(J) @ chart.relative.difference(np.tile(x, (len(points), 1)), chart.task(points))[:, :, None]
+        )
+        points = points + step[:, :, 0]
+    points = points[domain.contains(points)]
+    target = np.concatenate([np.tile(x, (len(points) + 1, 1)), np.tile(chart.xi(wish), (len(points) + 1, 1))], axis=1)
+    away = chart.phi_map.difference(target, chart.phi(np.vstack([q, points])))[:, m:]
+    distance = np.linalg.norm(away, axis=1)
+    return bool(distance[1:].min(initial=np.inf) < distance[0] - 1e-6)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CHARTS)
 def test_nearest_xi_is_that_of_the_chart(tmp_path: Path, name: str) -> None:
-    """Inside, with x; and as near as what the chart finds, unless that lies on another piece of the self-motion."""
+    """Inside, with x, and as near as what the chart finds, or a local minimum; the chart finds nothing farther."""
     chart = CHARTS[name]()
     module = module_of(chart, "numpy", tmp_path)
     wishes, x = wishes_of(chart, 500, 0.1 if name == "pose, wide" else 0.3)
@@ -62,10 +79,11 @@ def test_nearest_xi_is_that_of_the_chart(tmp_path: Path, name: str) -> None:
     assert (error[ended] < 2e-9).all()
     assert chart.problem.domain.contains(q[ended]).all()
     assert (distance[status == FOUND] < 1e-8).all()
-    elsewhere = np.abs(known.q - q).max(axis=1) > 0.3  # the chart takes the best of several local minima
-    other = ~ended | ((distance > known.distance + 1e-7) & ~elsewhere)
-    assert other.mean() <= 0.005
-    assert (elsewhere & (status == NEAREST)).mean() < 0.06
+    assert (distance[ended] >= known.distance[ended] - 1e-7).all()
+    worse = np.flatnonzero(ended & (distance > known.distance + 1e-7))
+    descends = sum(something_nearer_around(chart, wishes[k], x[k], q[k]) for k in worse)
+    assert (np.count_nonzero(~ended) + descends) / len(x) <= 0.005
+    assert len(worse) / len(x) < 0.06
     assert (status == NEAREST).sum() > 2
 
 

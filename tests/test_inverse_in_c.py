@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from charts import beyond_domain
 from programs import needs_c
-from public_objects import circle, clear
+from public_objects import circle, clear, wide
+from test_curves import STARTS, positions_at
 
 import orthocas as oc
 from orthocas.codegen import compiled
 from orthocas.errors import CompileError, InvalidValueError, NoExpressionError
 from orthocas.fitting.fit import Fit
+from orthocas.tasks.domains import sample_uniform
 
 FOUND = oc.InverseStatus.FOUND
 
@@ -128,3 +130,38 @@ def test_a_relative_cache_does_not_count(monkeypatch: pytest.MonkeyPatch, tmp_pa
     for given, wanted in (("cache", tmp_path / ".cache"), ("", tmp_path / ".cache"), ("/var/tmp", Path("/var/tmp"))):
         monkeypatch.setenv("XDG_CACHE_HOME", given)
         assert compiled._cache() == wanted / "orthocas" / "libraries"
+
+
+@pytest.mark.slow
+@needs_c
+@pytest.mark.parametrize("name", ["panda-wide", "panda-pose", "a joint without boundaries"])
+def test_compiled_curves_are_as_near(name: str, tmp_path: Path) -> None:
+    """Of wishes whose x is that of another posture: the same status and distance, each inside and with its x.
+
+    gcc, with warnings as errors, refused the chart of a box.
+    """
+    chart = oc.charts.load(name) if name.startswith("panda") else wide().chart
+    domain = chart.problem.domain
+    wishes, x = sample_uniform(domain, 200, 5), chart.task(sample_uniform(domain, 200, 6))
+    mine, theirs = chart.nearest_xi(wishes, x), oc.compile_inverse(chart, tmp_path).nearest_xi(wishes, x)
+    assert {FOUND, oc.InverseStatus.NEAREST} <= set(theirs.statuses)
+    np.testing.assert_array_equal(theirs.status, mine.status)
+    np.testing.assert_allclose(theirs.distance, mine.distance, atol=1e-8)
+    ended = theirs.status <= oc.InverseStatus.NEAREST
+    assert domain.contains(theirs.q[ended]).all()
+    np.testing.assert_allclose(chart.relative.difference(x, chart.task(theirs.q))[ended], 0, atol=1e-8)
+    away = np.abs(chart.xi(theirs.q) - chart.xi(wishes))[:, 0]
+    np.testing.assert_allclose(away[ended], theirs.distance[ended], atol=1e-9)
+
+
+@pytest.mark.slow
+@needs_c
+def test_compiled_c_finds_what_random_starts_find(tmp_path: Path) -> None:
+    """The nearest xi of xarm7-wide, whose joints turn twice, against 4,000 starts of damped least squares a row."""
+    chart = oc.charts.load("xarm7-wide")
+    domain, count = chart.problem.domain, 16
+    wishes, x = sample_uniform(domain, count, 1), chart.task(sample_uniform(domain, count, 2))
+    near, pool = oc.compile_inverse(chart, tmp_path).nearest_xi(wishes, x), sample_uniform(domain, STARTS, 3)
+    for k in range(count):
+        others = positions_at(chart, x[k], pool)
+        assert near.distance[k] <= np.abs(chart.xi(others)[:, 0] - chart.xi(wishes[k])[0]).min() + 1e-6

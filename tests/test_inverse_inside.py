@@ -65,7 +65,7 @@ def test_the_search_for_all_rows_agrees_with_ipopt(iiwa_fit: Fit) -> None:
     """From the same starts, both end at the same distance; Ipopt stays a little off the boundary."""
     chart = iiwa_fit.chart
     phi = chart.phi(beyond_domain(chart, 60, 1.3))
-    inside = chart._inverse.inside
+    inside = chart.inverse_parts.inside
     assert inside is not None
     q, in_reach = inside.with_task(phi, np.tile(chart.problem.domain.centre, (60, 1)))
     assert 20 < in_reach.sum() < 60

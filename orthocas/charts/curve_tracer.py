@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.charts.in_domain import KEPT, BoxedPhi
+from orthocas.charts.in_domain import BoxedPhi
 from orthocas.charts.newton import inverses
 from orthocas.tasks.domains import bounds_of
 from orthocas.tasks.relative import Relative
@@ -24,6 +24,7 @@ class CurveRules:
     near_x: int = 8  #: the same near each x
     more: int = 24  #: the same, for rows without a solution
     reach: int = 25  #: steps from a start to its x
+    reached: float = 1e-3  #: error, relative to the sizes of the components, that one more step reduces to its square
     largest: float = 0.7  #: norm of one of those steps [rad] or [m]
     missed: float = 0.08  #: largest correction of a step along a curve [rad] or [m]
     step: float = 0.4  #: longest step along a curve [rad] or [m]
@@ -36,6 +37,7 @@ class CurveRules:
     sagitta: float = 6e-3  #: largest distance of those parts from their chords [rad] or [m]
     halvings: int = 5  #: of chords that pass the box between points outside
     narrow: float = 1e-10  #: [rad] or [m]: brackets of an end of the domain
+    few: int = 64  #: rows up to which all starts are followed at once, though some lie on one curve
     prismatic: float = 1.0  #: half-widths that a sliding joint may leave its range by
 
 
@@ -53,7 +55,9 @@ class Traces:
 
     def part(self, curves: Indices) -> "Traces":
         """Some of the curves."""
-        return Traces(*(array[curves] for array in vars(self).values()))
+        row, q, tangent, count = (array[curves] for array in vars(self).values())
+        longest = count.max(initial=1)
+        return Traces(row, q[:, :longest], tangent[:, :longest], count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,18 +66,17 @@ class CurveTracer:
 
     boxed: BoxedPhi
 
-    def reach(self, x: Array, starts: Array) -> tuple[Array, Array]:
-        """Where damped least squares lead from starts (M, n) to x (M, m), whatever the limits; and errors (M,)."""
-        q, error, left = starts.copy(), np.full(len(starts), np.inf), np.arange(len(starts))
+    def reach(self, x: Array, starts: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Where damped least squares lead from starts (M, n), whatever the limits, and whether near x (M, m), (M,)."""
+        q, arrived, left = starts.copy(), np.zeros(len(starts), dtype=bool), np.arange(len(starts))
         for _ in range(RULES.reach):
             found = self._damped_step(q[left], x[left])[0]
-            error[left] = found[:, -1]
-            going = (error[left] > KEPT / 10) & np.isfinite(error[left])
-            left = left[going]
+            q[left] += found[:, :-1]
+            arrived[left] = found[:, -1] <= RULES.reached
+            left = left[(found[:, -1] > RULES.reached) & np.isfinite(found[:, -1])]
             if not left.size:
                 break
-            q[left] += found[going, :-1]
-        return q, error
+        return q, arrived
 
     def trace(self, targets: Array, q: Array, rows: Indices) -> Traces:
         """The curves through points q (K, n), from end to end."""
@@ -126,31 +129,34 @@ class CurveTracer:
         Returns:
             Points and unit tangents (K, P, n), their number (K,), and which curves are closed, (K,).
         """
-        K, n = q0.shape
-        points, tangents = [q0], [t0]
+        (K, n), size = q0.shape, RULES.most + 1
+        points, tangents = np.empty((K, size, n)), np.empty((K, size, n))
+        points[:, 0], tangents[:, 0] = q0, t0
         count, closed = np.ones(K, dtype=np.int64), np.zeros(K, dtype=bool)
-        q, t, bend = q0.copy(), t0.copy(), np.zeros_like(q0)
-        h, before, left = np.full(K, RULES.step / 2), np.zeros(K), np.arange(K)
+        state = np.concatenate([q0, t0, np.zeros((K, n)), np.full((K, 1), RULES.step / 2), q0, t0], axis=1)
+        left, before = np.arange(K), np.zeros(K)
         for _ in range(RULES.most):
-            lengths = h[left, None]
-            state = np.concatenate([q[left], t[left], bend[left], lengths, q0[left], t0[left]], axis=1)
-            found = self._step(state, x[left])[0]
+            found = self._step(state, x)[0]
             new, onward, (missed, turned, gap, ahead) = found[:, :n], found[:, n : 2 * n], found[:, 2 * n :].T
             good = (missed < RULES.missed) & (turned > RULES.turned)
-            moved = left[good]
-            closed[moved] = ((gap < 1.6 * RULES.step) & (before[left] < 0) & (ahead >= 0))[good] & (count[moved] > 3)
-            bend[moved] = (onward[good] - t[moved]) / lengths[good]
-            q[moved], t[moved], before[moved] = new[good], onward[good], ahead[good]
-            longer = turned[good] > RULES.straight
-            h[moved] = np.where(longer, np.minimum(1.6 * h[moved], RULES.step), h[moved])
-            h[left[~good]] /= 2
+            moved, h = left[good], state[:, 3 * n]
+            around = good & (gap < 1.6 * RULES.step) & (before < 0) & (ahead >= 0) & (count[left] > 3)
+            closed[left] = around
+            points[moved, count[moved]], tangents[moved, count[moved]] = new[good], onward[good]
             count[moved] += 1
-            points.append(q.copy())
-            tangents.append(t.copy())
-            left = left[~closed[left] & (h[left] > RULES.shortest) & self._slides_near(q[left])]
+            bend = (onward - state[:, n : 2 * n]) / h[:, None]
+            state[:, : 3 * n] = np.where(good[:, None], np.hstack([new, onward, bend]), state[:, : 3 * n])
+            before = np.where(good, ahead, before)
+            longer = np.where(turned > RULES.straight, np.minimum(1.6 * h, RULES.step), h)
+            h[:] = np.where(good, longer, h / 2)
+            goes_on = ~around & (h > RULES.shortest) & self._slides_near(state[:, :n])
+            if not goes_on.all():
+                state, x, left, before = state[goes_on], x[goes_on], left[goes_on], before[goes_on]
             if not left.size:
                 break
-        return *_compact(np.array(points), np.array(tangents), count), count, closed
+        last = np.minimum(np.arange(count.max()), count[:, None] - 1)[:, :, None]
+        points, tangents = (np.take_along_axis(part, last, axis=1) for part in (points, tangents))
+        return points, tangents, count, closed
 
     def _slides_near(self, q: Array) -> NDArray[np.bool_]:
         """Whether sliding joints are in their ranges, or not far outside."""
@@ -164,6 +170,12 @@ class CurveTracer:
         """Cosines and sines of revolute joints, and positions of the others: near one another where q (..., n) is."""
         turning, sliding = q[..., self.turning], q[..., ~self.turning]
         return np.concatenate([np.cos(turning), np.sin(turning), sliding], axis=-1)
+
+    @property
+    def equations(self) -> ca.Function:
+        """q, x -> e = (x - h(q)) / scale (m, 1), and J / scale (m, n)."""
+        q, x, e, J = self._symbols
+        return dense_function("equations", [q, x], [e, J])
 
     @cached_property
     def _bordered_step(self) -> BlockedFunction:
@@ -225,21 +237,6 @@ class CurveTracer:
     def turning(self) -> NDArray[np.bool_]:
         """Revolute joints, (n,)."""
         return ~np.array(self.boxed.task.robot.tree.prismatic)
-
-
-def _compact(points: Array, tangents: Array, count: Indices) -> tuple[Array, Array]:
-    """Points and tangents (P, K, n) of curves as (K, P, n), without those that repeat the one before."""
-    moved = np.ones(points.shape[:2], dtype=bool)
-    moved[1:] = (points[1:] != points[:-1]).any(axis=2)
-    place = np.where(moved, np.cumsum(moved, axis=0) - 1, count.max())
-    columns = np.broadcast_to(np.arange(points.shape[1]), moved.shape)
-    packed = []
-    for part in (points, tangents):
-        out = np.repeat(part[-1][:, None], count.max() + 1, axis=1)
-        out[columns, place] = part
-        out[:, count.max()] = part[-1]
-        packed.append(out[:, : count.max()])
-    return packed[0], packed[1]
 
 
 def without_turns(difference: Array, turning: NDArray[np.bool_]) -> Array:

@@ -3,20 +3,22 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.charts.curve_tracer import RULES, CurveTracer, Traces, solutions_of, without_turns
-from orthocas.charts.in_domain import KEPT, BoxedPhi
+from orthocas.charts.in_domain import BoxedPhi
 from orthocas.charts.newton import Starts
 from orthocas.charts.phi import largest
-from orthocas.tasks.domains import bounds_of
+from orthocas.tasks.domains import bounds_of, sample_uniform
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.expressions import shortest
 
 _AT_ONCE = 2048  # rows whose curves are held in memory
+_PROBES, _SAME = 32, 1e-9  # positions at which turns are tried, and change of xi that is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +40,14 @@ class Nearest:
         better = farthest_first[distance[farthest_first] < self.distance[rows[farthest_first]]]
         self.q[rows[better]], self.distance[rows[better]] = q[better], distance[better]
         self.between[rows[better]] = between
+
+
+class CurveSearch(Protocol):
+    """A search along self-motion curves."""
+
+    def search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
+        """The nearest points for targets (N, n) of phi, from stored starts and one of the caller's (N, n)."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,16 +83,38 @@ class SelfMotionCurves:
     def _search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
         best, ends, traced = Nearest.empty(own), Ends.empty(own.shape[1]), list[Traces]()
         with np.errstate(all="ignore"):
-            for stage in range(2):
+            for starts in self.stages(targets, own):
                 rows = np.flatnonzero(best.distance > 0)
                 if rows.size:
-                    starts = self._first_starts(targets[rows], own[rows]) if stage == 0 else self._more(targets[rows])
-                    ends = ends.joined(self._search_from(targets, rows, starts, traced, tolerance, best))
+                    ends = ends.joined(self._search_from(targets, rows, starts[:, rows], own, traced, tolerance, best))
             self._take_ends(targets, ends, best)
         return best
 
+    @cached_property
+    def winding(self) -> NDArray[np.bool_]:
+        """Joints without boundaries whose full turns change xi, (n,)."""
+        q = sample_uniform(self.boxed.domain, _PROBES, 0)
+        turned = q + 2 * np.pi * np.eye(q.shape[1])[:, None]
+        here, there = self.xi(q), self.xi(turned.reshape(-1, q.shape[1])).reshape(-1, len(q), 1)
+        moved = np.abs(shortest(there - here, self.boxed.phi_map.difference.turns[self.boxed.m :])).max(axis=(1, 2))
+        free = self.tracer.turning & ~np.isfinite(bounds_of(self.boxed.domain)[0])
+        return np.asarray(free & (moved > _SAME))
+
+    def stages(self, targets: Array, own: Array) -> tuple[Array, Array]:
+        """The caller's starts and stored positions near phi and near x, and more of these, (S, N, n) each."""
+        near_phi = self.starts.nearest(targets, RULES.near_phi, targets.shape[1])
+        near_x = self.starts.nearest(targets, RULES.near_x + RULES.more, self.boxed.m)
+        return np.concatenate([own[None], near_phi, near_x[: RULES.near_x]]), near_x[RULES.near_x :]
+
     def _search_from(
-        self, targets: Array, rows: Indices, starts: Array, traced: list[Traces], tolerance: float, best: Nearest
+        self,
+        targets: Array,
+        rows: Indices,
+        starts: Array,
+        own: Array,
+        traced: list[Traces],
+        tolerance: float,
+        best: Nearest,
     ) -> "Ends":
         """Search some rows from starts (S, rows, n), and add to the curves that are traced; returns ends of arcs."""
         q, known = self._reached(targets[rows], starts)
@@ -97,31 +129,30 @@ class SelfMotionCurves:
             left = np.flatnonzero(~known.all(axis=1) & (best.distance[rows] > 0))
             if not left.size:
                 break
-            first = np.argmin(np.where(known[left], np.inf, away[left]), axis=1)
-            traces = self.tracer.trace(targets[rows[left]], q[left, first], rows[left])
-            arcs = self._arcs(targets, traces)
+            if left.size > RULES.few:
+                of, start = left, np.argmin(np.where(known[left], np.inf, away[left]), axis=1)
+            else:
+                at, start = np.nonzero(~known[left])
+                of = left[at]
+            traces = self.tracer.trace(targets[rows[of]], q[of, start], rows[of])
+            known[of, start] = True
+            steps = self._steps(traces, own[traces.row])
+            xi_left = self._take_crossed(targets, steps, tolerance, best)
+            more = best.distance[steps.row] > 0
+            arcs = self._arcs(targets, steps.part(more), xi_left[more])
             self._take_roots(targets, arcs, tolerance, best)
             ends = ends.joined(self._take_points(targets, arcs, best))
-            known[left] |= self.tracer.on_curves(q[left], traces)
-            known[left, first] = True
+            on = np.flatnonzero((best.distance[traces.row] > 0) & ~known[of].all(axis=1))
+            np.logical_or.at(known, of[on], self.tracer.on_curves(q[of[on]], traces.part(on)))
             traced.append(traces)
         return ends
 
-    def _first_starts(self, targets: Array, own: Array) -> Array:
-        """The caller's starts, and stored positions near phi and near x, (S, N, n)."""
-        near_phi = self.starts.nearest(targets, RULES.near_phi, targets.shape[1])
-        return np.concatenate([own[None], near_phi, self.starts.nearest(targets, RULES.near_x, self.boxed.m)])
-
-    def _more(self, targets: Array) -> Array:
-        """Further stored positions near x, (S, N, n)."""
-        return self.starts.nearest(targets, RULES.near_x + RULES.more, self.boxed.m)[RULES.near_x :]
-
     def _reached(self, targets: Array, starts: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Positions (N, S, n) with the task values of targets, and which starts (S, N, n) led to none, (N, S)."""
+        """Positions (N, S, n) near the task values of targets, and which starts (S, N, n) led to none, (N, S)."""
         S, N, n = starts.shape
         x = np.repeat(targets[:, : self.boxed.m], S, axis=0)
-        q, error = self.tracer.reach(x, starts.transpose(1, 0, 2).reshape(-1, n))
-        return q.reshape(N, S, n), ~(error <= KEPT).reshape(N, S)
+        q, arrived = self.tracer.reach(x, starts.transpose(1, 0, 2).reshape(-1, n))
+        return q.reshape(N, S, n), ~arrived.reshape(N, S)
 
     def _away(self, q: Array) -> Array:
         """Largest distances of joints (N, S, n) from their ranges, up to full turns, (N, S)."""
@@ -130,19 +161,58 @@ class SelfMotionCurves:
         centre, half = np.where(bounded, (low + high) / 2, 0.0), np.where(bounded, (high - low) / 2, np.inf)
         return np.asarray((np.abs(without_turns(q - centre, self.tracer.turning)) - half).max(axis=2).clip(0.0))
 
-    def _arcs(self, targets: Array, traces: Traces) -> "Arcs":
-        """Points on the steps of curves in and around the box of the domain."""
-        curve, shift = self._sheets(traces)
+    def _steps(self, traces: Traces, own: Array) -> "Steps":
+        """The steps of curves in and around the box of the domain, after all full turns that bring them there."""
+        curve, shift = self._sheets(traces, own)
         low, high = bounds_of(self.boxed.domain)
         moved = traces.q[curve] + shift[:, None]
         near = np.asarray(((moved >= low - RULES.step) & (moved <= high + RULES.step)).all(axis=2))
         at, place = np.nonzero((near[:, :-1] | near[:, 1:]) & (np.arange(1, near.shape[1]) < traces.count[curve, None]))
-        q, along = _subdivided(traces, curve[at], place)
-        q += shift[at][:, None]
-        row = traces.row[curve[at]]
+        of, turn = curve[at], shift[at]
+        q = np.stack([traces.q[of, place] + turn, traces.q[of, place + 1] + turn], axis=1)
+        t = np.stack([traces.tangent[of, place], traces.tangent[of, place + 1]], axis=1)
+        follows = np.diff(at * near.shape[1] + place, prepend=-2) == 1
+        return Steps(traces.row[of], q, t, follows)
+
+    def _take_crossed(self, targets: Array, steps: "Steps", tolerance: float, best: Nearest) -> Array:
+        """Solutions of phi(q) = phi on steps along which xi passes its target, in or near the box.
+
+        Returns:
+            xi - xi(q) at both ends of the steps, (S, 2); NaN far from the box.
+        """
+        left = self._xi_left_of(targets, steps)
+        step, share = self._crossed(left)
+        self._take_solutions(targets, steps.row[step], steps.point(step, share), tolerance, best)
+        return left
+
+    def _xi_left_of(self, targets: Array, steps: "Steps") -> Array:
+        """xi - xi(q) at both ends of steps, (S, 2); NaN far from the box."""
+        left, low, high = np.full(steps.q.shape[:2], np.nan), *bounds_of(self.boxed.domain)
+        slack = RULES.step / RULES.parts
+        near = np.asarray(((steps.q >= low - slack) & (steps.q <= high + slack)).all(axis=2))
+        begins = near.copy()
+        begins[1:, 0] &= ~(steps.follows[1:] & near[:-1, 1])
+        rows = np.broadcast_to(steps.row[:, None], near.shape)
+        left[begins] = self._xi_left(targets[rows[begins]], steps.q[begins])
+        joined = near[:, 0] & ~begins[:, 0]
+        left[joined, 0] = left[np.flatnonzero(joined) - 1, 1]
+        return left
+
+    def _crossed(self, left: Array) -> tuple[Indices, Array]:
+        """Steps with xi - xi(q) (S, 2) at their ends along which it passes 0, and where, between 0 and 1."""
+        a, b = left.T
+        crossed = np.flatnonzero((a * b <= 0) & ~(np.abs(b - a) > self._period / 2))
+        a, b = a[crossed], b[crossed]
+        return crossed, np.where(a == b, 0.0, a / np.where(a == b, 1.0, a - b))
+
+    def _arcs(self, targets: Array, steps: "Steps", left: Array) -> "Arcs":
+        """Points on the steps that may hold a root, an end of an arc, or a place where xi turns back."""
+        steps = steps.part(self._matters(steps, left))
+        low, high = bounds_of(self.boxed.domain)
+        q, along = steps.divided()
         slack = RULES.step / RULES.parts
         close = np.asarray(((q >= low - slack) & (q <= high + slack)).all(axis=2))
-        x = targets[np.repeat(row, close.sum(axis=1)), : self.boxed.m]
+        x = targets[np.repeat(steps.row, close.sum(axis=1)), : self.boxed.m]
         points, t = q[close], along[close]
         points += self.tracer.correct(x, points, t)[0]
         within = ((points >= low - RULES.sagitta) & (points <= high + RULES.sagitta)).all(axis=1)
@@ -150,31 +220,63 @@ class SelfMotionCurves:
         q[close] = points
         inside, xi_left = np.zeros(close.shape, dtype=bool), np.full(close.shape, np.nan)
         inside[close] = self._contains(points)
-        xi_left[close] = self._xi_left(targets[np.repeat(row, close.sum(axis=1))], points)
+        xi_left[close] = self._xi_left(targets[np.repeat(steps.row, close.sum(axis=1))], points)
         passing = close[:, :-1] & close[:, 1:] & ~inside[:, :-1] & ~inside[:, 1:]
         arc, place = np.nonzero(passing)
         first, last = self._shares_inside(q[arc, place], q[arc, place + 1], RULES.sagitta)
         passing[arc, place] = first < last
-        return Arcs(row, q, inside, passing, xi_left)
+        return Arcs(steps.row, q, inside, passing, xi_left)
 
-    def _sheets(self, traces: Traces) -> tuple[Indices, Array]:
-        """Which curves (of K) pass the box of the domain after which full turns: curve (L,), and shifts (L, n)."""
+    def _matters(self, steps: "Steps", left: Array) -> NDArray[np.bool_]:
+        """Steps (S,) that pass the target or a boundary, their neighbours, and those where xi turns back.
+
+        Along the others, xi only moves from one end to the other, and both ends lie in the domain; or they lie outside
+        the box. `left` is xi - xi(q) at the ends of the steps, (S, 2).
+        """
+        inside = np.zeros(steps.q.shape[:2], dtype=bool)
+        inside[:, 1] = self._contains(steps.q[:, 1])
+        begins = np.flatnonzero(~steps.follows)
+        inside[begins, 0] = self._contains(steps.q[begins, 0])
+        joined = np.flatnonzero(steps.follows)
+        inside[joined, 0] = inside[joined - 1, 1]
+        both, none = np.asarray(inside.all(axis=1)), np.asarray(~inside.any(axis=1))
+        first, last = self._shares_inside(steps.q[:, 0], steps.q[:, 1], RULES.missed)
+        changes = np.where(none, first < last, ~both)
+        changes[self._crossed(left)[0]] = True
+        ahead = shortest((left[:, 1] - left[:, 0])[:, None], self.boxed.phi_map.difference.turns[self.boxed.m :])[:, 0]
+        bends = steps.follows.copy()
+        bends[1:] &= ~(ahead[1:] * ahead[:-1] > 0) & both[1:] & both[:-1]
+        changes |= bends
+        after = np.append(steps.follows[1:], False)
+        around = changes.copy()
+        around[1:] |= changes[:-1] & steps.follows[1:]
+        around[:-1] |= changes[1:] & after[:-1]
+        return np.asarray(around & ~(none & ~changes))
+
+    def _sheets(self, traces: Traces, own: Array) -> tuple[Indices, Array]:
+        """Which curves (of K) pass the box of the domain after which full turns: curve (L,), and shifts (L, n).
+
+        Joints without boundaries turn to within half a turn of the caller's starts (K, n), or one and a half where
+        turns change xi.
+        """
         low, high = bounds_of(self.boxed.domain)
         turn, room, bounded = 2 * np.pi, RULES.step, np.isfinite(low)
-        low = np.where(bounded, low - room, self.boxed.domain.centre - np.pi)
+        low = np.where(bounded, low - room, own - np.where(self.winding, 3 * np.pi, np.pi))[:, None]
         high = np.where(bounded, high + room, np.inf)
         first = np.where(self.tracer.turning, np.ceil((low - traces.q) / turn), 0.0)
         at = traces.q + turn * first
         passed = np.ones(at.shape[:2], dtype=bool)
         passed[:, 1:] = (first[:, 1:] != first[:, :-1]).any(axis=2)
-        choices = [range(1 + int(k)) for k in np.where(self.tracer.turning & bounded, (high - low) // turn, 0)]
+        width = np.where(bounded, (high - low[0, 0]) // turn, np.where(self.winding, 2, 0))
+        choices = [range(1 + int(k)) for k in np.where(self.tracer.turning, width, 0)]
         near = [
-            [(at[:, :, j] >= low[j]) & (at[:, :, j] <= high[j] - turn * k) for k in choices[j]] for j in range(len(low))
+            [(at[:, :, j] >= low[:, :, j]) & (at[:, :, j] <= high[j] - turn * k) for k in choices[j]]
+            for j in range(len(high))
         ]
         found = []
         for extra in product(*choices):
-            close = np.logical_and.reduce([near[j][k] for j, k in enumerate(extra)])
-            changes = close & passed
+            close = np.all([near[j][k] for j, k in enumerate(extra)], axis=0)
+            changes = np.asarray(close & passed)
             changes[:, 1:] |= close[:, 1:] & ~close[:, :-1]
             curve, place = np.nonzero(changes)
             found.append(np.column_stack([curve, first[curve, place] + np.array(extra)]))
@@ -183,17 +285,19 @@ class SelfMotionCurves:
 
     def _take_roots(self, targets: Array, arcs: "Arcs", tolerance: float, best: Nearest) -> None:
         """Solutions of phi(q) = phi on arcs."""
-        left = arcs.xi_left
-        jump = np.abs(left[:, 1:] - left[:, :-1])
-        crossed = (left[:, :-1] * left[:, 1:] <= 0) & (arcs.inside[:, :-1] | arcs.inside[:, 1:] | arcs.passing)
-        crossed &= ~(jump > self._period / 2)
-        arc, place = np.nonzero(crossed)
-        if not arc.size:
-            return
-        a, b = left[arc, place], left[arc, place + 1]
-        share = np.where(a == b, 0.0, a / np.where(a == b, 1.0, a - b))[:, None]
+        near = arcs.inside[:, :-1] | arcs.inside[:, 1:] | arcs.passing
+        near &= best.distance[arcs.row, None] > 0
+        arc, place = np.nonzero(near)
+        crossed, share = self._crossed(np.stack([arcs.xi_left[arc, place], arcs.xi_left[arc, place + 1]], axis=1))
+        arc, place, share = arc[crossed], place[crossed], share[:, None]
         q = (1 - share) * arcs.q[arc, place] + share * arcs.q[arc, place + 1]
-        rows, phi_map = arcs.row[arc], self.boxed.phi_map
+        self._take_solutions(targets, arcs.row[arc], q, tolerance, best)
+
+    def _take_solutions(self, targets: Array, rows: Indices, q: Array, tolerance: float, best: Nearest) -> None:
+        """Solutions of phi(q) = phi inside to which Newton's steps lead from points q (K, n) of some rows."""
+        if not rows.size:
+            return
+        phi_map = self.boxed.phi_map
         for _ in range(4):
             J = phi_map.jacobian(q) / phi_map.sizes[:, None]
             left_over = phi_map.difference(targets[rows], phi_map.phi(q)) / phi_map.sizes
@@ -305,6 +409,33 @@ class SelfMotionCurves:
 
 
 @dataclass(frozen=True, eq=False)
+class Steps:
+    """S steps of curves around the domain."""
+
+    row: Indices  #: number of the target, (S,)
+    q: Array  #: both ends, (S, 2, n)
+    tangent: Array  #: unit tangents there, (S, 2, n)
+    follows: NDArray[np.bool_]  #: whether a step begins where the one before it ends, (S,)
+
+    def part(self, which: NDArray[np.bool_]) -> "Steps":
+        """Some of the steps (S,)."""
+        row, q, tangent, follows = (array[which] for array in vars(self).values())
+        follows[1:] &= np.diff(np.flatnonzero(which)) == 1
+        follows[:1] = False
+        return Steps(row, q, tangent, follows)
+
+    def point(self, steps: Indices, share: Array) -> Array:
+        """Points of some steps (K,) at shares of the way (K,), on cubic curves, (K, n)."""
+        return _on_cubics(self.q[steps], self.tangent[steps], share[:, None])[:, 0]
+
+    def divided(self) -> tuple[Array, Array]:
+        """`RULES.parts` + 1 points on each step, on cubic curves, and directions there, (S, parts + 1, n) each."""
+        s = np.broadcast_to(np.arange(RULES.parts + 1) / RULES.parts, (len(self.q), RULES.parts + 1))
+        along = (1 - s[:, :, None]) * self.tangent[:, :1] + s[:, :, None] * self.tangent[:, 1:]
+        return _on_cubics(self.q, self.tangent, s), along
+
+
+@dataclass(frozen=True, eq=False)
 class Arcs:
     """S steps of curves around the domain, by G points each, close to one another."""
 
@@ -335,12 +466,8 @@ class Ends:
         return Ends(*(np.concatenate(pair) for pair in parts))
 
 
-def _subdivided(traces: Traces, curve: Indices, place: Indices) -> tuple[Array, Array]:
-    """Points on cubic curves from points of traces (S,) to the next ones, and directions, (S, parts + 1, n) each."""
-    q, t = traces.q[curve, place][:, None], traces.tangent[curve, place][:, None]
-    after, onward = traces.q[curve, place + 1][:, None], traces.tangent[curve, place + 1][:, None]
-    s = (np.arange(RULES.parts + 1) / RULES.parts)[:, None]
-    step = after - q
-    bend = (s - 2 * s**2 + s**3) * t + (s**3 - s**2) * onward
-    points = q + (3 * s**2 - 2 * s**3) * step + np.linalg.norm(step, axis=2, keepdims=True) * bend
-    return points, (1 - s) * t + s * onward
+def _on_cubics(q: Array, t: Array, share: Array) -> Array:
+    """Points on cubic curves with ends q and unit tangents t (K, 2, n), at shares (K, G) of the way, (K, G, n)."""
+    s, step = share[:, :, None], q[:, 1:] - q[:, :1]
+    bend = (s - 2 * s**2 + s**3) * t[:, :1] + (s**3 - s**2) * t[:, 1:]
+    return np.asarray(q[:, :1] + (3 * s**2 - 2 * s**3) * step + np.linalg.norm(step, axis=2, keepdims=True) * bend)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.charts.continuation import Continuation
-from orthocas.charts.curves import SelfMotionCurves
+from orthocas.charts.curves import CurveSearch
 from orthocas.charts.in_domain import InDomain
 from orthocas.charts.inside import Inside
 from orthocas.charts.newton import Attempt, LocalSolver, Starts
@@ -86,7 +86,8 @@ class Inverse:
     along: Continuation | None = None  #: follows lines of values from given starts; for fitted coordinates
     in_domain: InDomain | None = None  #: searches all of the domain; for fitted coordinates with r > 1
     inside: Inside | None = None  #: finds points inside that keep the task; for fitted coordinates
-    curves: SelfMotionCurves | None = None  #: finds the nearest xi at a task value; for fitted coordinates with r = 1
+    curves: CurveSearch | None = None  #: finds the nearest xi at a task value; for fitted coordinates with r = 1
+    brief: LocalSolver | None = None  #: in place of `local` where curves are searched anyway; it may give up early
 
     def solve(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Solutions:
         """Solutions for targets (N, n), from starts (N, n) or our own. Rows that are not finite fail."""
@@ -107,7 +108,9 @@ class Inverse:
 
     def _searched(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Found:
         """What the search finds from given starts, or from the rough inverse and, where that fails, in the domain."""
-        best = self._attempt(targets, self.starts.guess(targets) if starts is None else starts, tolerance)
+        follows = self.curves is not None and (inside or starts is None)
+        first = self.local if self.brief is None or not follows else self.brief
+        best = self._attempt(targets, self.starts.guess(targets) if starts is None else starts, tolerance, first)
         self._tell_beyond(targets, best)
         if inside and self.inside is not None:
             own = best.q.copy() if starts is None else starts
@@ -116,7 +119,8 @@ class Inverse:
             else:
                 self._search_inside(self.inside, targets, best, tolerance)
         elif starts is None:
-            self._restart(targets, best, self._open(best), _FIRST, InverseStatus.FOUND, tolerance)
+            if self.curves is None:
+                self._restart(targets, best, self._open(best), _FIRST, InverseStatus.FOUND, tolerance)
             self._search_domain(targets, best, self._open(best), tolerance)
             rows = np.flatnonzero(best.status == InverseStatus.NOT_FOUND)
             self._restart(targets, best, rows, _RESTARTS, InverseStatus.SINGULAR, tolerance)
@@ -160,7 +164,7 @@ class Inverse:
             best.improve(rows[left], self._attempt(targets[rows[left]], start[left], tolerance))
 
     def _search_curves(
-        self, curves: SelfMotionCurves, inside: Inside, targets: Array, best: Found, own: Array, tolerance: float
+        self, curves: CurveSearch, inside: Inside, targets: Array, best: Found, own: Array, tolerance: float
     ) -> None:
         """Replace what is not found by other solutions, or the nearest xi, on self-motion curves inside the domain."""
         rows = np.flatnonzero(best.status != InverseStatus.FOUND)
@@ -173,7 +177,7 @@ class Inverse:
 
     def _take_nearest(
         self,
-        curves: SelfMotionCurves,
+        curves: CurveSearch,
         inside: Inside,
         targets: Array,
         best: Found,
@@ -221,9 +225,10 @@ class Inverse:
             yield from self.starts.nearest(targets, count, self.problem.n)
             yield np.broadcast_to(self.problem.domain.centre, targets.shape)
 
-    def _attempt(self, targets: Array, starts: Array, tolerance: float) -> Found:
+    def _attempt(self, targets: Array, starts: Array, tolerance: float, local: LocalSolver | None = None) -> Found:
         """One search from starts (N, n), judged."""
-        return self._judged(self._snapped(targets, self.local(targets, starts), tolerance), tolerance)
+        attempt = (local or self.local)(targets, starts)
+        return self._judged(self._snapped(targets, attempt, tolerance), tolerance)
 
     def _judged(self, attempt: Attempt, tolerance: float) -> Found:
         """Where a search ended, with a status."""

@@ -12,7 +12,17 @@ from orthocas.charts.curves import SelfMotionCurves
 from orthocas.charts.in_domain import BoxedPhi, Cells, InDomain
 from orthocas.charts.inside import Inside, Nearest
 from orthocas.charts.inverse import Inverse
-from orthocas.charts.newton import FewRows, LocalSolver, Newton, OwnInverse, PointFunctions, Starts, inverse_function
+from orthocas.charts.newton import (
+    BRIEF,
+    HALVINGS,
+    FewRows,
+    LocalSolver,
+    Newton,
+    OwnInverse,
+    PointFunctions,
+    Starts,
+    inverse_function,
+)
 from orthocas.charts.phi import Differences, PhiFunctions, PhiMap
 from orthocas.charts.reaching import ReachingTracker, near_function
 from orthocas.charts.solutions import Solutions, Tracker
@@ -131,6 +141,15 @@ class InverseMethods(PhiFunctions):
         Source:
             ours: docs/how-to/inverse.md.
         """
+        if local is not None and not callable(local):
+            raise InvalidValueError("local", repr(local)[:80], "a function of targets and starts")
+        parts = self.inverse_parts if local is None else replace(self.inverse_parts, local=local, brief=local)
+        return self.solve_by(parts, phi, q_start, tolerance, inside)
+
+    def solve_by(
+        self, parts: Inverse, phi: ArrayLike, q_start: ArrayLike | None, tolerance: float, inside: bool
+    ) -> Solutions:
+        """`solve` with other parts than `inverse_parts`."""
         require_at_least("tolerance", tolerance, 0)
         targets = self._rows("phi", phi)
         starts = None if q_start is None else self._rows("q_start", q_start)
@@ -141,12 +160,9 @@ class InverseMethods(PhiFunctions):
                 raise ShapeError("q_start", starts.shape, targets.shape)
             starts = np.broadcast_to(starts, targets.shape)
         require_kind("inside", inside, bool)
-        if local is not None and not callable(local):
-            raise InvalidValueError("local", repr(local)[:80], "a function of targets and starts")
         if inside:
             self._require_expression("inside=True")
-        inverse = self._inverse if local is None else replace(self._inverse, local=local)
-        return inverse.solve(targets, starts, float(tolerance), inside)
+        return parts.solve(targets, starts, float(tolerance), inside)
 
     def nearest_xi(self, q_wish: ArrayLike, x: ArrayLike | None = None, *, tolerance: float = 1e-9) -> Solutions:
         """Joint positions in the domain with task values x, and of these the xi nearest to that of a wished posture.
@@ -167,6 +183,11 @@ class InverseMethods(PhiFunctions):
             ShapeError: if a row has another number of entries, or x another number of rows.
             NoExpressionError: for grown coordinates.
         """
+        phi, wishes = self.wished(q_wish, x)
+        return self.solve(phi, wishes, tolerance=tolerance, inside=True)
+
+    def wished(self, q_wish: ArrayLike, x: ArrayLike | None) -> tuple[Array, Array]:
+        """Targets of phi for `nearest_xi`, and the wishes moved into the box of the domain, (N, n) each."""
         wishes = np.clip(self._rows("q_wish", q_wish), *bounds_of(self.problem.domain))
         phi = np.array(self.phi(wishes))
         if x is not None:
@@ -174,7 +195,7 @@ class InverseMethods(PhiFunctions):
             if values.shape not in ((self.m,), (len(phi), self.m)):
                 raise ShapeError("x", values.shape, (len(phi), self.m))
             phi[:, : self.m] = values
-        return self.solve(phi, wishes, tolerance=tolerance, inside=True)
+        return phi, wishes
 
     def solutions(self, phi: ArrayLike, tolerance: float = 1e-9) -> Array:
         """All q inside the domain with phi(q) = phi that a search of the whole domain finds.
@@ -204,7 +225,7 @@ class InverseMethods(PhiFunctions):
         """
         require_at_least("tolerance", tolerance, 0)
         self._require_expression("a search for all solutions")
-        in_domain = self._inverse.in_domain
+        in_domain = self.inverse_parts.in_domain
         assert in_domain is not None
         return in_domain.all_solutions(as_point("phi", phi, self.n), float(tolerance))
 
@@ -294,17 +315,18 @@ class InverseMethods(PhiFunctions):
         return PhiMap(self.phi, self.batched_rates, self.phi_sizes, Differences(self.turns, self.relative))
 
     @cached_property
-    def _inverse(self) -> Inverse:
+    def inverse_parts(self) -> Inverse:
+        """What `solve` consists of."""
         phi_map, domain = self.phi_map, self.problem.domain
         starts = Starts(phi_map, domain)
         if isinstance(self.coordinates, InvertibleMap):
             return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map), starts)
         boxed = BoxedPhi(self.problem.task, domain, phi_map)
-        local = FewRows(phi_map, self._point_functions, Newton(phi_map))
+        local, brief = (FewRows(phi_map, self._point_functions, Newton(phi_map, k)) for k in (HALVINGS, BRIEF))
         by_ipopt = Nearest(domain, self.m, self.function("phi"), phi_map)
         in_domain, inside = InDomain(boxed, Cells(boxed)), Inside(boxed, starts, by_ipopt)
         curves = SelfMotionCurves(boxed, starts, self.xi) if self.r == 1 else None
-        return Inverse(self.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves)
+        return Inverse(self.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves, brief)
 
     @cached_property
     def _inverse_function(self) -> ca.Function:

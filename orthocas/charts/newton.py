@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from orthocas.charts.coordinates import InvertibleMap
@@ -24,7 +25,8 @@ _PATIENCE = 8  # iterations after which the error must have halved
 GOAL = 1e-12  #: error at which the iteration stops
 _KEEP = 0.1  # J is evaluated again if a step leaves more of the error
 _DECREASE = 1e-4  # of the error, relative to the part of the step taken
-_HALVINGS, _SOLVED = 10, 1e-10  # of a step; below this error only rounding stops the decrease
+HALVINGS, BRIEF = 10, 3  #: of a step, and where another search follows
+_SOLVED = 1e-10  # below this error only rounding stops the decrease
 _PIECE = 2048  # matrices that a thread inverts at once
 SUSPICIOUS = 1e6  #: |J| |J^-1| above which singular values are computed
 _FEW = 4  # rows that are solved one by one
@@ -41,7 +43,6 @@ _OPTIONS: dict[str, Any] = {
 _POINTS, _SEED = 4096, 0  # of the table
 _DEGREES, _MOST_TERMS = (3, 2, 1), 500  # of the rough inverse: the first degree with so few terms
 _OVERSHOOT = 1.2  # beyond the values of the table, polynomials are not trusted
-_AT_ONCE = 1024  # targets that are compared with the table at once
 
 
 @dataclass(frozen=True)
@@ -73,10 +74,15 @@ class LocalSolver(Protocol):
 
 
 class Newton:
-    """Newton's method with line search, which starts at finite points."""
+    """Newton's method with line search, which starts at finite points.
 
-    def __init__(self, phi_map: PhiMap) -> None:
-        self._map = phi_map
+    Args:
+        phi_map: phi and J.
+        halvings: of a step whose error does not decrease, before a row is given up.
+    """
+
+    def __init__(self, phi_map: PhiMap, halvings: int = HALVINGS) -> None:
+        self._map, self._halvings = phi_map, halvings
 
     def __call__(self, targets: Array, starts: Array) -> Attempt:
         """Search from starts (N, n)."""
@@ -93,7 +99,7 @@ class Newton:
                 if not rows.size:
                     break
                 run.refresh(rows[run.stale[rows]])
-                rows = rows[run.advance(rows)]
+                rows = rows[run.advance(rows, self._halvings)]
             return Attempt(run.q, run.residual, run.iterations, run.suspicious)
 
 
@@ -121,8 +127,8 @@ class _Run:
             self._condition[rows] = np.where(singular, np.inf, _norm(J) * _norm(inverse))
             self.stale[rows], self._fresh[rows] = False, True
 
-    def advance(self, rows: Indices) -> NDArray[np.bool_]:
-        """Take a step in some rows, halved until the error decreases. Returns which can go on, (rows,).
+    def advance(self, rows: Indices, most: int) -> NDArray[np.bool_]:
+        """Take a step in some rows, halved up to so many times until the error decreases. Returns which can go on.
 
         A row whose J is from an earlier point waits for a new one instead.
         """
@@ -130,7 +136,7 @@ class _Run:
         steps = np.matmul(inverse, self.residual[rows, :, None])[:, :, 0]
         goes_on = np.zeros(len(rows), dtype=bool)
         left = np.flatnonzero(np.isfinite(steps).all(axis=1))
-        for halvings in range(_HALVINGS + 1):
+        for halvings in range(most + 1):
             moved = self._try(rows[left], steps[left], 0.5**halvings)
             goes_on[left[moved]] = True
             left = left[~moved]
@@ -379,17 +385,17 @@ class Starts:
             count: points for each target.
             components: how many components of phi count, the first ones.
         """
-        points, wanted = self._table[0], self._places(targets, components)
-        known = self._known[components]
-        parts = [wanted[start : start + _AT_ONCE] for start in range(0, len(wanted), _AT_ONCE)]
-        order = np.concatenate([_nearest(known, part, min(count, len(points))) for part in parts])
+        points = self._table[0]
+        order = self._trees[components].query(self._places(targets, components), range(1, min(count, len(points)) + 1))[
+            1
+        ]
         nearest: Array = points[order.T]
         return nearest
 
     @cached_property
-    def _known(self) -> BuiltOnUse[int, Array]:
-        """Places of the table by the number of components that count."""
-        return BuiltOnUse(lambda components: self._places(self._table[1], components))
+    def _trees(self) -> BuiltOnUse[int, Any]:
+        """Search trees of places of the table, by the number of components that count."""
+        return BuiltOnUse(lambda components: scipy.spatial.cKDTree(self._places(self._table[1], components)))
 
     def _places(self, phi: Array, components: int) -> Array:
         """Numbers (N, k) that are near one another where the first components of phi (N, n) are."""
@@ -451,12 +457,3 @@ def _terms(u: Array, degree: int) -> Array:
         level = [(j, product * columns[j]) for i, product in level for j in range(i, len(columns))]
         terms += [product for _, product in level]
     return np.array(terms).T
-
-
-def _nearest(phi: Array, targets: Array, count: int) -> Indices:
-    """Indices of the rows of phi (K, n) nearest to targets (N, n), nearest first, (N, count)."""
-    squares = (phi**2).sum(axis=1) - 2 * targets @ phi.T  # without |target|^2, which is the same for all rows
-    first = np.argpartition(squares, count - 1, axis=1)[:, :count]
-    order = np.argsort(np.take_along_axis(squares, first, axis=1), axis=1)
-    nearest: Indices = np.take_along_axis(first, order, axis=1)
-    return nearest

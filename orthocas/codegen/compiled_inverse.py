@@ -1,7 +1,7 @@
 """The inverse map of a chart in compiled C, for large batches on machines with a compiler."""
 
 import ctypes
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,25 +9,28 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
+from orthocas.charts.curves import SelfMotionCurves
+from orthocas.charts.inverse import Inverse
 from orthocas.charts.newton import SUSPICIOUS, Attempt, Newton
 from orthocas.charts.solutions import Solutions
 from orthocas.codegen.compiled import kept_library, loaded, template
+from orthocas.codegen.compiled_curves import CompiledCurves, curve_source
 from orthocas.codegen.generate import generate_c
-from orthocas.codegen.library import STRICT
 from orthocas.tools.batch import in_threads
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, require_kind
+from orthocas.tools.checks import Array, Indices, require_kind
 from orthocas.tools.display import Shown
 from orthocas.tools.files import draft_folder
 
-_FLAGS = (*STRICT, "-O3")
+_FLAGS = ("-O3",)  # no warnings as errors: compilers doubt pointers of CasADi that pass the end of an array
 _ROWS = "inverse_rows.c"
+_ITERATIONS, _FEW_ITERATIONS = 100, 12  # evaluations of phi, also where another search follows
 _PIECE = 512  # rows that a thread takes at once
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CompiledInverse(Shown):
-    """`Chart.solve` in compiled C; `orthocas.compile_inverse` makes it."""
+    """`Chart.solve` and `Chart.nearest_xi` in compiled C; `orthocas.compile_inverse` makes it."""
 
     chart: Chart
     library: Path  #: the shared library
@@ -40,37 +43,65 @@ class CompiledInverse(Shown):
         self, phi: ArrayLike, q_start: ArrayLike | None = None, *, tolerance: float = 1e-9, inside: bool = False
     ) -> Solutions:
         """As `Chart.solve`: the same status for each row and the same q to 1e-9, unless starts are far away."""
-        return self.chart.solve(phi, q_start, tolerance=tolerance, inside=inside, local=self._local)
+        return self.chart.solve_by(self._parts, phi, q_start, tolerance, inside)
+
+    def nearest_xi(self, q_wish: ArrayLike, x: ArrayLike | None = None, *, tolerance: float = 1e-9) -> Solutions:
+        """As `Chart.nearest_xi`."""
+        phi, wishes = self.chart.wished(q_wish, x)
+        return self.solve(phi, wishes, tolerance=tolerance, inside=True)
+
+    @cached_property
+    def _parts(self) -> Inverse:
+        """Those of the chart, with compiled searches in their places."""
+        parts = self.chart.inverse_parts
+        curves = parts.curves
+        if isinstance(curves, SelfMotionCurves):
+            curves = CompiledCurves(curves, lambda: self._c)
+        return replace(parts, local=self._local, brief=self._brief, curves=curves)
 
     def _local(self, targets: Array, starts: Array) -> Attempt:
         """Search from starts (N, n); where C finds nothing, NumPy finds how near one can get."""
+        attempt, failed = self._attempt(targets, starts, _ITERATIONS)
+        if failed.size:
+            attempt.replace(failed, Newton(self.chart.phi_map)(targets[failed], starts[failed]))
+        return attempt
+
+    def _brief(self, targets: Array, starts: Array) -> Attempt:
+        """Search from starts (N, n); rows where C finds nothing soon stay there."""
+        attempt, failed = self._attempt(targets, starts, _FEW_ITERATIONS)
+        attempt.q[failed] = starts[failed]
+        attempt.residual[failed] = self.chart.phi_map.residual(targets[failed], starts[failed])
+        return attempt
+
+    def _attempt(self, targets: Array, starts: Array, iterations: int) -> tuple[Attempt, Indices]:
+        """What C finds from starts (N, n), and the rows where that is nothing."""
         attempt, condition = Attempt.empty(*targets.shape), np.empty(len(targets))
-        given = np.ascontiguousarray(targets), np.ascontiguousarray(starts)
+        given, rows_in_c = (np.ascontiguousarray(targets), np.ascontiguousarray(starts)), self._c.arm_inverse_rows
+        rows_in_c.restype = None
 
         def solve_piece(first: int) -> None:
             rows = slice(first, first + _PIECE)
             phi, q_start, q, found = (array[rows] for array in (*given, attempt.q, attempt.residual))
             arrays = (phi, q_start, self.chart.phi_sizes, q, found, condition[rows])
-            self._c(ctypes.c_long(len(phi)), *(ctypes.c_void_p(array.ctypes.data) for array in arrays))
+            rows_in_c(
+                ctypes.c_long(len(phi)),
+                ctypes.c_int(iterations),
+                *(ctypes.c_void_p(array.ctypes.data) for array in arrays),
+            )
 
         in_threads(solve_piece, range(0, len(targets), _PIECE))
         phi_map = self.chart.phi_map
         attempt.residual[:] = phi_map.difference(targets, attempt.residual) / phi_map.scale(targets)
         attempt.iterations[:], attempt.suspicious[:] = 1, ~(condition < SUSPICIOUS)
-        failed = np.flatnonzero(condition < 0)
-        if failed.size:
-            attempt.replace(failed, Newton(phi_map)(targets[failed], starts[failed]))
-        return attempt
+        return attempt, np.flatnonzero(condition < 0)
 
     @cached_property
     def _c(self) -> Any:
-        function = loaded(self.library).arm_inverse_rows
-        function.restype = None
-        return function
+        return loaded(self.library)
 
 
 def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledInverse:
-    """Compile the inverse map of a chart, or find it compiled earlier; for batches of 100,000 rows and more.
+    """Compile the inverse map of a chart, or find it compiled earlier; for large batches.
 
     The first call for a chart generates and compiles C, which takes some seconds. Later calls, also in other processes,
     find the library in the folder: its name is a digest of the C code, the compiler and its options.
@@ -101,4 +132,7 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
         generate_c(chart, drafts, name="arm")
         sources = {name: (drafts / name).read_text(encoding="utf-8") for name in ("arm.h", "arm.c")}
     sources[_ROWS] = template(_ROWS)
+    curves = chart.inverse_parts.curves
+    if isinstance(curves, SelfMotionCurves):
+        sources["curves.c"] = curve_source(chart, curves)
     return CompiledInverse(chart, kept_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder))

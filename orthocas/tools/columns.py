@@ -15,7 +15,8 @@ from orthocas.tools.checks import Array
 from orthocas.tools.expressions import Tape, replay, to_tape
 
 COLUMNS = 256  #: samples in a block
-MANY = 16  #: joint positions from which blocks pay off
+NARROW = 64  #: samples in a block of small sets
+MANY = 9  #: joint positions from which blocks pay off: `Batched` takes 1, 8 or 64 at once
 _PIECE = 8 * COLUMNS  # joint positions that a thread takes at once
 
 #: Evaluates contiguous inputs (entries, c), and writes contiguous outputs (entries, c).
@@ -53,10 +54,11 @@ class ColumnFunction:
 
     Args:
         function: a function with any number of matrix inputs and outputs.
+        columns: samples in a block, c.
     """
 
-    def __init__(self, function: ca.Function) -> None:
-        self._function = function
+    def __init__(self, function: ca.Function, columns: int = COLUMNS) -> None:
+        self._function, self._columns = function, columns
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Outputs (B, entries, c) for contiguous inputs (B, entries, c). Threads share the blocks."""
@@ -120,13 +122,13 @@ class ColumnFunction:
     @property
     def _shapes(self) -> list[tuple[int, int]]:
         """Shapes of the outputs on one block."""
-        return [(self._function.numel_out(i), COLUMNS) for i in range(self._function.n_out())]
+        return [(self._function.numel_out(i), self._columns) for i in range(self._function.n_out())]
 
     @cached_property
     def _on_block(self) -> ca.Function:
         """The function of matrices whose rows are samples."""
         sizes = [self._function.numel_in(i) for i in range(self._function.n_in())]
-        inputs = [ca.MX.sym(f"i{i}", COLUMNS, size) for i, size in enumerate(sizes)]
+        inputs = [ca.MX.sym(f"i{i}", self._columns, size) for i, size in enumerate(sizes)]
         entries = iter(replay(self.tape, [column for x in inputs for column in ca.horzsplit(x)]))
         outputs = [
             ca.horzcat(*(next(entries) for _ in range(self._function.numel_out(i))))
@@ -173,21 +175,27 @@ def fill(results: NDArray[Any], points: Array, make: Callable[[], BlockFunction]
     functions = [make() for _ in range(min(thread_count(), len(starts)))]  # not in the threads, see ColumnFunction
 
     def one_piece(function: BlockFunction, start: int) -> None:
-        for first in range(start, min(start + _PIECE, len(points)), COLUMNS):
-            count = min(COLUMNS, len(points) - first)
-            values = function(*(_columns(array[first : first + COLUMNS]) for array in (points, *others)))
-            by_entry = values.reshape(*results.shape[1:], COLUMNS)[..., :count]
-            results[first : first + COLUMNS] = np.moveaxis(by_entry, -1, 0)
+        piece = slice(start, start + _PIECE)
+        fill_blocks(results[piece], function, COLUMNS, points[piece], *(array[piece] for array in others))
 
     in_threads_with(functions, one_piece, starts)
 
 
-def _columns(points: Array) -> Array:
+def fill_blocks(results: NDArray[Any], function: BlockFunction, columns: int, *arguments: Array) -> None:
+    """The same by one function, of blocks of so many columns, in this thread."""
+    for first in range(0, len(results), columns):
+        count = min(columns, len(results) - first)
+        values = function(*(_columns(array[first : first + columns], columns) for array in arguments))
+        by_entry = values.reshape(*results.shape[1:], columns)[..., :count]
+        results[first : first + columns] = np.moveaxis(by_entry, -1, 0)
+
+
+def _columns(points: Array, columns: int) -> Array:
     """Joint positions (k, n) as columns (n, c). The last block is padded with its first position."""
-    columns = np.empty((points.shape[1], COLUMNS))
-    columns[:, : len(points)] = points.T
-    columns[:, len(points) :] = points[:1].T
-    return columns
+    found = np.empty((points.shape[1], columns))
+    found[:, : len(points)] = points.T
+    found[:, len(points) :] = points[:1].T
+    return found
 
 
 class BlockedFunction:
@@ -210,6 +218,13 @@ class BlockedFunction:
         """Write the values to `results`, which may be part of a larger array, and return it."""
         if len(points) < MANY or self._by_rows is None:
             results[...] = self._few(points, *others)[0].reshape(results.shape)
+        elif len(points) <= 2 * NARROW:
+            try:
+                function = self._spare.pop()
+            except IndexError:
+                function = self._on_narrow_block()
+            fill_blocks(results, function, NARROW, points, *others)
+            self._spare.append(function)
         else:
             fill(results, points, self._on_one_block, *others)
         return results
@@ -220,10 +235,29 @@ class BlockedFunction:
         run = self._by_rows.on_one_block()
         return lambda *columns: run(*columns)[0]
 
+    def _on_narrow_block(self) -> BlockFunction:
+        """The function of a narrow block."""
+        run = self._by_narrow_rows.on_one_block()
+        return lambda *columns: run(*columns)[0]
+
+    @cached_property
+    def _spare(self) -> list[BlockFunction]:
+        """Functions of narrow blocks that nobody uses now."""
+        return []
+
     @cached_property
     def _by_rows(self) -> ColumnFunction | None:
         """The function with its entries row by row; None if it has an operation that columns do not support."""
-        inputs = [ca.SX.sym(f"i{i}", self._function.numel_in(i)) for i in range(self._function.n_in())]
-        entries = ca.vec(ca.densify(self._function(*inputs)).T)
-        columns = ColumnFunction(ca.Function(self._function.name(), inputs, [entries]))
+        columns = ColumnFunction(self._entries)
         return columns if columns.supported else None
+
+    @cached_property
+    def _by_narrow_rows(self) -> ColumnFunction:
+        """The same for narrow blocks."""
+        return ColumnFunction(self._entries, NARROW)
+
+    @cached_property
+    def _entries(self) -> ca.Function:
+        """The function with its entries row by row, as a column."""
+        inputs = [ca.SX.sym(f"i{i}", self._function.numel_in(i)) for i in range(self._function.n_in())]
+        return ca.Function(self._function.name(), inputs, [ca.vec(ca.densify(self._function(*inputs)).T)])

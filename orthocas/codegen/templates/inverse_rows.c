@@ -1,15 +1,13 @@
 /* Rows of the inverse map in one call. Compile with -DN=joints, next to a generated library named arm.
  *
- * For each row: q and, unless `condition` is NULL, phi there, and |J| |J^-1| of J with rows divided by the sizes, or -1
+ * For each row, after at most so many evaluations of phi: q and, unless `condition` is NULL, phi there, and |J| |J^-1| of J with rows divided by the sizes, or -1
  * where nothing was found. */
 #include "arm.h"
 
 #include <math.h>
 #include <string.h>
 
-#define ITERATIONS 100
-
-void arm_inverse_rows(long rows, const double *phi, const double *q_start, const double *sizes, double *q, double *found,
+void arm_inverse_rows(long rows, int iterations, const double *phi, const double *q_start, const double *sizes, double *q, double *found,
                       double *condition);
 
 /* Product of the Frobenius norms of A and its inverse, by Gauss-Jordan elimination with pivoting; overwrites A. */
@@ -50,13 +48,13 @@ static double condition_of(double *A) {
   return sqrt(before) * sqrt(after);
 }
 
-void arm_inverse_rows(long rows, const double *phi, const double *q_start, const double *sizes, double *q, double *found,
+void arm_inverse_rows(long rows, int iterations, const double *phi, const double *q_start, const double *sizes, double *q, double *found,
                       double *condition) {
   double jacobian[N * N];
   long k;
   int i, j;
   for (k = 0; k < rows; ++k) {
-    arm_status status = arm_inverse(phi + k * N, q_start + k * N, ITERATIONS, q + k * N);
+    arm_status status = arm_inverse(phi + k * N, q_start + k * N, iterations, q + k * N);
     if (condition == NULL) continue;
     condition[k] = -1.0;
     if (status != ARM_OK && status != ARM_OUTSIDE_DOMAIN) continue;
