@@ -1,18 +1,17 @@
 """L-BFGS with a line search (strong Wolfe conditions), also from the Gauss-Newton matrix."""
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import count
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 
-from orthocas.errors import CheckpointError, InvalidValueError, SolveError
+from orthocas.errors import InvalidValueError, SolveError
 from orthocas.solvers.protocol import BestPoint, EstimatedObjective, Objective, SolveResult, Status
 from orthocas.tools.checks import Array, require_at_least, require_count
-from orthocas.tools.progress import UNWATCHED, State, Watch
+from orthocas.tools.progress import UNWATCHED, Watch
 
 _DECREASE, _CURVATURE = 1e-3, 0.9  # constants of the two conditions, as in L-BFGS-B
 _GROWTH = 4.0  # of the step while the function still falls steeply
@@ -79,8 +78,6 @@ def _between(low: Trial, high: Trial) -> float:
 class LBFGS:
     """L-BFGS ([NW2006] Alg. 7.5) with strong Wolfe steps.
 
-    A restored run has the memory of the killed one. SciPy's L-BFGS-B cannot hand its memory over.
-
     Args:
         max_iterations: largest number of iterations.
         tolerance: stop when an iteration reduces the loss by less than this fraction of it, or of 1 if that is more.
@@ -113,30 +110,28 @@ class LBFGSRun:
     def __init__(self, settings: LBFGS, objective: Objective, theta0: Array, watch: Watch) -> None:
         self.settings = settings
         self.best = BestPoint(objective, theta0, watch)
-        kept: State = self.best.restored or {}
-        self.theta = np.array(kept.get("theta", self.best.theta))
-        self.value = float(kept.get("value", np.nan))
-        self.gradient = np.array(kept.get("gradient", np.full_like(self.theta, np.nan)))
-        self.converged = bool(kept.get("converged", False))
+        self.theta = self.best.theta
+        self.value, self.gradient = np.nan, np.full_like(self.theta, np.nan)
         #: changes of theta and of the gradient, (2, size) each, the newest last
-        self.pairs = deque(_restored_pairs(kept, self.theta.size), maxlen=settings.memory)
+        self.pairs: deque[Array] = deque(maxlen=settings.memory)
 
     def iterate(self) -> Status:
         """Iterate to the end."""
         best, limit = self.best, self.settings.max_iterations
-        if best.iterations == 0 or not np.isfinite(self.gradient).all():  # a damaged checkpoint may lack it
-            self.value, self.gradient = best.value_and_gradient(self.theta)
-            if not (np.isfinite(self.value) and np.isfinite(self.gradient).all()):
-                return Status.FAILED
-        while best.iterations < limit and not self.converged:
+        self.value, self.gradient = best.value_and_gradient(self.theta)
+        if not (np.isfinite(self.value) and np.isfinite(self.gradient).all()):
+            return Status.FAILED
+        while best.iterations < limit:
             if not np.any(self.gradient):
                 return Status.CONVERGED
             before = self.value
             if not self._step():
                 return Status.STALLED
-            self.converged = self.has_converged(before)
-            best.next_iteration(limit, **self.state())
-        return Status.CONVERGED if self.converged else Status.ITERATION_LIMIT
+            converged = self.has_converged(before)
+            best.next_iteration(limit)
+            if converged:
+                return Status.CONVERGED
+        return Status.ITERATION_LIMIT
 
     def has_converged(self, before: float) -> bool:
         """Whether the step from this value gained as little as one at the end."""
@@ -154,12 +149,6 @@ class LBFGSRun:
     def first_direction(self) -> Array:
         """A direction of descent without a memory."""
         return np.asarray(-self.gradient / np.linalg.norm(self.gradient))
-
-    def state(self) -> dict[str, Array | float]:
-        """All that a run needs to go on, besides the best point."""
-        pairs = {f"pair_{k}": pair for k, pair in enumerate(self.pairs)}
-        numbers = {"value": self.value, "converged": self.converged}
-        return {"theta": self.theta, "gradient": self.gradient, **numbers, **pairs}
 
     def _step(self) -> bool:
         """Go on along the quasi-Newton direction or, where that fails, with an empty memory; whether a step did."""
@@ -199,21 +188,6 @@ class LBFGSRun:
         for (step, change), curvature, factor in zip(self.pairs, curvatures, reversed(factors), strict=True):
             direction += (factor - (direction @ change) / curvature) * step
         return direction
-
-
-def _restored_pairs(kept: State, size: int) -> Iterator[Array]:
-    """The correction pairs of an earlier run.
-
-    Raises:
-        CheckpointError: if they belong to another objective.
-    """
-    for name in map("pair_{}".format, count()):
-        if name not in kept:
-            return
-        pair = kept[name]
-        if pair.shape != (2, size) or not 0 < pair[0] @ pair[1] < np.inf:
-            raise CheckpointError(f"{name} has shape {pair.shape}, expected {(2, size)} with a positive product")
-        yield pair
 
 
 @dataclass(frozen=True)
@@ -265,16 +239,10 @@ class _Run(LBFGSRun):
     def __init__(self, settings: QuasiNewton, objective: EstimatedObjective, theta0: Array, watch: Watch) -> None:
         super().__init__(settings, objective, theta0, watch)
         self._objective = objective
-        kept: State = self.best.restored or {}
-        self._place = np.array(kept.get("place", self.theta))  # of the matrix
-        self._height = float(kept.get("height", np.inf))  # the loss there
-        self._gained_little = bool(kept.get("gained_little", False))  # in the last step
+        self._place = self.theta  # of the matrix
+        self._height = np.inf  # the loss there
+        self._gained_little = False  # in the last step
         self._factor: tuple[Array, bool] | None = None
-
-    def state(self) -> dict[str, Array | float]:
-        """All that a run needs to go on, besides the best point. The matrix is computed again."""
-        numbers = {"height": self._height, "gained_little": float(self._gained_little)}
-        return {**super().state(), "place": self._place, **numbers}
 
     def has_converged(self, before: float) -> bool:
         """Whether two steps in a row gained little: a single one may have been short."""
@@ -300,7 +268,7 @@ class _Run(LBFGSRun):
     def _solved(self, vector: Array) -> Array:
         """The inverse of the matrix times a vector."""
         if self._factor is None:
-            if not np.isfinite(self._height):  # a resumed run knows it already
+            if not np.isfinite(self._height):
                 self._height = self.value
             self._factor = _factored(self._objective.curvature_estimate(self._place))
         return np.asarray(scipy.linalg.cho_solve(self._factor, vector), dtype=float)
@@ -315,9 +283,7 @@ def _factored(H: Array) -> tuple[Array, bool]:
         damped = H.copy()
         damped[np.diag_indices_from(H)] += damping * scale
         if not np.isfinite(damped).all():
-            raise SolveError(
-                "the curvature of the loss is not finite: parameters are huge, or the checkpoint is damaged"
-            )
+            raise SolveError("the curvature of the loss is not finite: parameters are huge")
         try:
             factor, lower = scipy.linalg.cho_factor(damped, overwrite_a=True)
         except np.linalg.LinAlgError:

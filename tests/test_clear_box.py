@@ -429,11 +429,3 @@ def test_threads_and_pickles_share_a_clear_box(problem: oc.Problem) -> None:
     with ThreadPoolExecutor(4) as pool:
         for found in pool.map(fresh.contains, [points] * 8):
             np.testing.assert_array_equal(found, wanted)
-
-
-def test_a_checkpoint_of_the_whole_box_is_not_resumed(problem: oc.Problem, tmp_path: Path) -> None:
-    arm = oc.Problem(problem.robot, problem.task, domain=oc.Box([0.6, 0.8, 0.8], 0.2))
-    barely = oc.Problem(problem.robot, problem.task, domain=arm.domain, least_singular_value=1e-6)  # same samples
-    oc.fit(arm, oc.Polynomial(2), samples=200, checkpoint=tmp_path / "state")
-    with pytest.raises(oc.errors.CheckpointError):
-        oc.fit(barely, oc.Polynomial(2), samples=200, checkpoint=tmp_path / "state")

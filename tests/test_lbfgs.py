@@ -3,22 +3,10 @@
 import numpy as np
 import pytest
 import scipy.optimize
-from objectives import START, LastState, Valley
 
 from orthocas import solvers
-from orthocas.errors import CheckpointError
 from orthocas.solvers.lbfgs import Trial, wolfe_step
 from orthocas.solvers.protocol import Status
-from orthocas.tools.progress import Watch
-
-
-@pytest.mark.parametrize("pair", [np.ones((2, 3)), np.array([[1.0, 0.0], [-1.0, 0.0]]), np.full((2, 2), np.nan)])
-def test_lbfgs_refuses_pairs_of_another_objective(pair: np.ndarray) -> None:
-    keeper = LastState()
-    solvers.LBFGS(max_iterations=3).minimise(Valley(), START, Watch(keeper=keeper))
-    assert keeper.state is not None
-    with pytest.raises(CheckpointError, match="pair_1 has shape"):
-        solvers.LBFGS().minimise(Valley(), START, Watch(keeper=LastState({**keeper.state, "pair_1": pair})))
 
 
 @pytest.mark.slow

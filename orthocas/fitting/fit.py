@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 import scipy
@@ -27,10 +26,9 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import WorstPoints
 from orthocas.errors import DomainError, Interrupted, InvalidValueError, OrthocasError
-from orthocas.fitting.checkpoint import Checkpoint, Stage
 from orthocas.fitting.like import Likeness
 from orthocas.fitting.settings import FitSettings, Precision, default_parametrisation
-from orthocas.fitting.stages import FoldSearch, Plan, StageRunner
+from orthocas.fitting.stages import FoldSearch, Plan, Stage, StageRunner
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, LEAST_CONDITIONING, WeightNumbers, Weights
 from orthocas.solvers.protocol import Solver, Status
 from orthocas.tasks.clear_box import ClearBox
@@ -38,7 +36,7 @@ from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem, ProblemCheck, check
 from orthocas.tasks.samples import Samples, idle_joints, sample_problem
 from orthocas.tools.batch import using_threads
-from orthocas.tools.checks import Array, as_path, require_count, require_kind
+from orthocas.tools.checks import Array, require_count, require_kind
 from orthocas.tools.display import Shown, listed, percent
 from orthocas.tools.interrupts import remembered
 from orthocas.tools.progress import Monitor, silent
@@ -295,7 +293,7 @@ class Fit(Shown):
     problem_check: ProblemCheck
     idle_joints: tuple[str, ...]  #: names of joints that are exact coordinates themselves
     worst: WorstPoints | None  #: result of the last search for folds; None if there was none
-    seconds: float  #: of this run; the seconds of stages include earlier runs of a checkpoint
+    seconds: float
     like: Mapping[str, float] = field(default_factory=dict)  #: root mean square angle to each quantity's gradient [deg]
     clear_part: ClearPart | None = None  #: a smaller domain to fit on, if this one touches near-singular positions
 
@@ -339,7 +337,6 @@ def fit(
     seed: int = 0,
     monitor: Monitor = silent,
     max_mutual_deg: float | None = None,
-    checkpoint: str | Path | None = None,
     align_to: Chart | None = None,
     threads: int | None = None,
     split_idle: bool = True,
@@ -369,7 +366,6 @@ def fit(
         monitor: called with progress.
         max_mutual_deg: bound on the root mean square deviation of mutual angles from 90 degrees over the samples [deg],
             at least 1e-6. With a bound, Ipopt minimises the task term, and lambda2 is not used.
-        checkpoint: a file that keeps the state of a long fit. If it exists, the fit resumes from it.
         align_to: a chart of the same robot that defines order and signs of the coordinates, for a refit. By default,
             coordinates that move the first joints come first, and each moves its main joint in the positive direction.
         threads: threads that share the work; bases and networks (`MLP`) do not depend on their number. Default:
@@ -392,7 +388,6 @@ def fit(
         MemoryNeedError: if the degree is too large for this machine.
         InvalidValueError, SolveError: if settings are invalid or contradict each other, or the loss is not finite.
         InfeasibleError: if max_mutual_deg cannot be met.
-        CheckpointError: if the checkpoint is damaged, or belongs to another fit.
         Interrupted: after Ctrl-C, once there are coordinates; before that, KeyboardInterrupt.
 
     Example:
@@ -415,7 +410,7 @@ def fit(
     if like is not None and align_to is not None:
         raise InvalidValueError("like", "given with align_to", "one of them: both define order and signs")
     with using_threads(None if threads is None else require_count("threads", threads)):
-        return _finished(problem, settings, monitor, checkpoint, align_to, start)
+        return _finished(problem, settings, monitor, align_to, start)
 
 
 def fit_from(
@@ -429,14 +424,13 @@ def fit_from(
     """The fit of `fit`, from known coordinates if there are some."""
     start = time.perf_counter()
     settings = FitSettings.checked(problem, parametrisation, None, weights, None, seed, None)
-    return _finished(problem, settings, monitor, None, None, start, begin)
+    return _finished(problem, settings, monitor, None, start, begin)
 
 
 def _finished(
     problem: Problem,
     settings: FitSettings,
     monitor: Monitor,
-    checkpoint: str | Path | None,
     align_to: Chart | None,
     start: float,
     begin: Begin | None = None,
@@ -451,7 +445,7 @@ def _finished(
     if isinstance(settings.parametrisation, Mobile):
         problem = anywhere(problem, settings.parametrisation.base)
     with remembered() as pressed:
-        result = _fitted(problem, settings, monitor, checkpoint, align_to, start, begin)
+        result = _fitted(problem, settings, monitor, align_to, start, begin)
         if result.status is Status.INTERRUPTED or pressed():
             raise Interrupted(result)
     return result
@@ -461,7 +455,6 @@ def _fitted(
     problem: Problem,
     settings: FitSettings,
     monitor: Monitor,
-    checkpoint: str | Path | None,
     align_to: Chart | None,
     start: float,
     begin: Begin | None,
@@ -476,8 +469,7 @@ def _fitted(
         coordinates = in_closed_form(problem, settings.parametrisation, first)
     else:
         idle = tuple(idle_joints(problem, first)[-problem.r :]) if settings.split_idle else ()
-        file = Checkpoint(None if checkpoint is None else as_path("checkpoint", checkpoint), settings.identity(problem))
-        stages, coordinates, worst = _minimised(problem, settings, idle, monitor, file, first, begin)
+        stages, coordinates, worst = _minimised(problem, settings, idle, monitor, first, begin)
         if stages:
             coordinates = _arranged(coordinates, problem, settings, align_to, first)
     return Fit(
@@ -497,7 +489,6 @@ def _minimised(
     settings: FitSettings,
     idle: tuple[int, ...],
     monitor: Monitor,
-    checkpoint: Checkpoint,
     samples: Samples,
     begin: Begin | None,
 ) -> tuple[tuple[Stage, ...], Coordinates, WorstPoints | None]:
@@ -509,7 +500,7 @@ def _minimised(
     like = None if settings.like is None else settings.like.term(problem, active)
     settings = settings if like is None else settings.with_term(like)
     folds = FoldSearch(problem, active, settings.fold_weight(problem))
-    runner = StageRunner(problem, settings, active, monitor, checkpoint, folds, like)
+    runner = StageRunner(problem, settings, active, monitor, folds, like)
     solved = Continuation(runner, r, begin).run()
     raw = Coordinates(solved.parametrisation, space, idle, solved.theta, np.zeros(r), np.ones(r))
     return solved.stages, normalised(raw, problem.domain.centre, samples), solved.worst

@@ -13,10 +13,9 @@ from orthocas.bases.products import Fourier, Polynomial
 from orthocas.charts.angles import pairs
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import WorstPoints, worst_points
-from orthocas.errors import CheckpointError, InfeasibleError, InvalidValueError, SolveError
+from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
 from orthocas.fitting.basis_objective import STRIDE, BasisObjective, BoundedMutual, expanded
-from orthocas.fitting.checkpoint import Checkpoint, Stage
 from orthocas.fitting.dense_objectives import ArrayObjective, GraphObjective
 from orthocas.fitting.like import LikeTerm
 from orthocas.fitting.settings import FitSettings
@@ -48,6 +47,20 @@ _TRIAL_DEGREE = 3  # of the trial that chooses among symmetric coordinates
 _FRESH = 2000  # seed tag of samples drawn while a solver runs; stages use other tags
 
 _COLLECTED = 1.5 * LEAST_CONDITIONING  # points below it are collected, before they become worse
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One minimisation of a fit."""
+
+    label: str  #: parametrisation, for example 'polynomial:3'
+    parameters: int
+    samples: int
+    result: SolveResult
+
+    def interrupted(self) -> "Stage":
+        """The same stage, marked as interrupted by Ctrl-C."""
+        return replace(self, result=replace(self.result, status=Status.INTERRUPTED))
 
 
 class FoldSearch:
@@ -161,7 +174,6 @@ class StageRunner:
     settings: FitSettings
     active: list[int]  #: joints that are not coordinates themselves
     monitor: Monitor
-    checkpoint: Checkpoint
     folds: FoldSearch
     like: LikeTerm | None = None  #: what the first coordinates follow
 
@@ -207,37 +219,24 @@ class StageRunner:
         return {}
 
     def run(self, plan: Plan) -> Stage:
-        """Draw samples, find a start if none is given, and minimise. A finished stage comes from the checkpoint.
+        """Draw samples, find a start if none is given, and minimise.
 
         Raises:
             SolveError: if there is no usable point. Only the final stage has to satisfy a bound on mutual angles.
         """
         family = plan.family
         kept = self.mirror.kept(family) if isinstance(family, LinearFamily) and self.mirror is not None else None
-        self.checkpoint.require_fitting(plan.label, family.size, family.size if kept is None else int(kept.sum()))
-        done = self.checkpoint.finished(plan.label)
-        if done is not None:
-            return done
         # other networks are few large products: they need the threads of BLAS more than the last digits
         with one_blas_thread() if isinstance(family, LinearFamily | ArrayFamily) else nullcontext():
-            stage = self._minimised(plan, kept)
-        self.checkpoint.add(stage)
-        return stage
+            return self._minimise(plan, kept)
 
-    def _minimised(self, plan: Plan, kept: NDArray[np.bool_] | None) -> Stage:
-        """A stage that is not in the checkpoint."""
+    def _minimise(self, plan: Plan, kept: NDArray[np.bool_] | None) -> Stage:
         count = self._sample_count(plan.family, kept)
         self.monitor(Progress(plan.label, 0.0, f"sampling {count} points"))
         samples = self._samples(count, 1 + plan.tag)
         with deferred():  # CasADi may swallow Ctrl-C while graphs are built
             objective, theta = self._objective(plan, samples, kept)
-        keeper = self.checkpoint.keeper(plan.label)
-        try:
-            result = plan.solver.minimise(objective, theta, Watch(self.monitor, plan.label, keeper))
-        except CheckpointError as error:  # the solver's own part of the state
-            raise self.checkpoint.inconsistent(str(error)) from None
-        if result.status is Status.INTERRUPTED:
-            keeper.flush()
+        result = plan.solver.minimise(objective, theta, Watch(self.monitor, plan.label))
         if isinstance(objective, BoundedMutual) and not np.isfinite(result.value):
             if plan.final:
                 assert self.settings.max_mutual is not None
