@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from orthocas.charts.curve_tracer import RULES, CurveTracer, Traces, solutions_of, without_turns
 from orthocas.charts.in_domain import KEPT, BoxedPhi
 from orthocas.charts.newton import Starts
-from orthocas.charts.phi import largest, shortest
+from orthocas.charts.phi import largest
 from orthocas.tasks.domains import bounds_of
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
+from orthocas.tools.expressions import shortest
 
 _AT_ONCE = 2048  # rows whose curves are held in memory
 
