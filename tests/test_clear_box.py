@@ -21,7 +21,7 @@ from orthocas.charts.point_quality import worst_points
 from orthocas.codegen import CompiledLibrary, check_c, compile_shared
 from orthocas.control import ControlStatus
 from orthocas.errors import ChartFileError, DomainError, InvalidValueError, UnreachableReferenceError
-from orthocas.fitting.fit import clear_part
+from orthocas.fitting.fit import offer_clear_part
 from orthocas.tasks.domains import sample_evenly, sample_heavily, sample_uniform
 
 Numbers = NDArray[np.float64]
@@ -266,7 +266,7 @@ def test_nothing_is_offered_where_the_centre_is_singular() -> None:
     straight = oc.Problem(robot, oc.Task.position(robot, "xy"), domain=oc.Box([0.5, 0.0, 0.0], 0.5))
     found = oc.check(straight)
     assert found.singular_samples > 0
-    assert clear_part(straight, found, None) is None
+    assert offer_clear_part(straight, found, None) is None
 
 
 @pytest.mark.slow

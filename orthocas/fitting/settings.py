@@ -43,7 +43,7 @@ class FitSettings:
     def checked(
         cls,
         problem: Problem,
-        parametrisation: Parametrisation,
+        parametrisation: Parametrisation | None,
         solver: Solver | None,
         weights: Weights | WeightNumbers,
         samples: int | None,
@@ -53,12 +53,14 @@ class FitSettings:
         precision: Precision = "double",
         like: Likeness | None = None,
     ) -> "FitSettings":
-        """Check the settings, and fill in the default solver and the default angles.
+        """Check the settings, and fill in the default parametrisation, solver and angles.
 
         Raises:
             InvalidValueError, ShapeError: if a setting is invalid, or contradicts another one.
         """
         require_kind("problem", problem, Problem)
+        if parametrisation is None:
+            parametrisation = default_parametrisation(problem, bounded=max_mutual_deg is not None)
         require_parametrisation(parametrisation)
         bound = parametrisation.for_problem(problem)
         if max_mutual_deg is not None:
