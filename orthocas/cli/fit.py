@@ -56,6 +56,7 @@ from orthocas.solvers.protocol import Status
 from orthocas.tasks.problem import Problem
 from orthocas.tools.archive import require_free
 from orthocas.tools.display import listed, number_list, percent
+from orthocas.tools.interrupts import INTERRUPTED
 from orthocas.tools.json import attributes
 
 _WIDE_ROWS = ("regular", "left out", "meaning")  # facts of wide fits
@@ -166,7 +167,7 @@ def fit(
         print_rows({**_rows(result, report, target), **({} if suggestion is None else _domain_rows(suggestion))})
     if result.status is Status.INTERRUPTED:
         note("interrupted: the chart holds the best coordinates found so far")
-        raise typer.Exit(130)
+        raise typer.Exit(INTERRUPTED)
 
 
 def _require_none(given: dict[str, Any]) -> None:
