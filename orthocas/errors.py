@@ -216,10 +216,6 @@ class ArchiveError(OrthocasError, ValueError):
     """A file written by orthocas cannot be written or read."""
 
 
-class CheckpointError(ArchiveError):
-    """A checkpoint is damaged, is not a checkpoint, or belongs to another fit."""
-
-
 class TrajectoryFileError(ArchiveError):
     """A trajectory file is missing, damaged, not a trajectory file, or from a newer version."""
 

@@ -56,14 +56,12 @@ class _Run:
     def __init__(self, settings: Adam, objective: Objective, theta0: Array, watch: Watch) -> None:
         self.settings, self.objective = settings, objective
         self.best = BestPoint(objective, theta0, watch)
-        kept = self.best.restored or {}
-        self.theta = np.array(kept.get("theta", theta0), dtype=float)
-        self.mean = np.array(kept.get("mean", np.zeros_like(self.theta)))
-        self.square = np.array(kept.get("square", np.zeros_like(self.theta)))
+        self.theta = np.array(theta0, dtype=float)
+        self.mean, self.square = np.zeros_like(self.theta), np.zeros_like(self.theta)
 
     def iterate(self) -> Status:
         best, epochs = self.best, self.settings.epochs
-        if not best.found and not self._judge():
+        if not self._evaluate():
             return Status.FAILED
         while best.iterations < epochs:
             for k, part in enumerate(self._parts(best.iterations)):
@@ -72,9 +70,8 @@ class _Run:
                 if not np.isfinite(gradient).all():
                     return Status.STALLED
                 self._step(gradient, best.iterations * self.settings.steps + k)
-            self._judge()
-            state = {"theta": self.theta, "mean": self.mean, "square": self.square}
-            best.next_iteration(epochs, **{name: array.copy() for name, array in state.items()})
+            self._evaluate()
+            best.next_iteration(epochs)
         return Status.ITERATION_LIMIT
 
     def _parts(self, epoch: int) -> Iterable[Objective]:
@@ -96,7 +93,7 @@ class _Run:
             unbiased = np.sqrt(square / (1 - _SQUARE ** (k + 1))) + _SMALL
             theta -= rate / (1 - _MOMENT ** (k + 1)) * mean / unbiased
 
-    def _judge(self) -> bool:
+    def _evaluate(self) -> bool:
         """Evaluate the loss on the fixed samples, and return whether it is finite."""
         value = self.objective.value(self.theta)
         self.best.evaluations += 1

@@ -57,14 +57,12 @@ class _Run:
     def __init__(self, settings: GaussNewton, objective: LeastSquaresObjective, theta0: Array, watch: Watch) -> None:
         self.settings, self.objective = settings, objective
         self.best = BestPoint(objective, theta0, watch)
-        kept = self.best.restored or {}
-        self.damping = float(kept.get("damping", 1e-3))
-        self.converged = bool(kept.get("converged", False))
-        self._gained_little = bool(kept.get("gained_little", False))  # in the last step
+        self.damping = 1e-3
+        self._gained_little = False  # in the last step
 
     def iterate(self) -> Status:
         best = self.best
-        while best.iterations < self.settings.max_iterations and not self.converged:
+        while best.iterations < self.settings.max_iterations:
             before, gradient, H = self.objective.normal_equations(best.theta)
             best.evaluations += 1
             best.offer(best.theta, before)
@@ -75,10 +73,11 @@ class _Run:
                 return Status.STALLED if np.any(gradient) else Status.CONVERGED
             cautious = self.damping > damping  # a step after rejections is short: a small gain is no convergence
             little = not cautious and before - best.value <= self.settings.tolerance * before
-            self.converged, self._gained_little = little and self._gained_little, little
-            state = {"damping": self.damping, "converged": self.converged, "gained_little": little}
-            best.next_iteration(self.settings.max_iterations, **state)
-        return Status.CONVERGED if self.converged else Status.ITERATION_LIMIT
+            converged, self._gained_little = little and self._gained_little, little
+            best.next_iteration(self.settings.max_iterations)
+            if converged:
+                return Status.CONVERGED
+        return Status.ITERATION_LIMIT
 
     def _step(self, gradient: Array, H: Array) -> bool:
         """Try steps with growing damping until the loss falls, and return whether it fell."""

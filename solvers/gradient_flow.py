@@ -23,10 +23,9 @@ _MAX_USES = 10  # of a Jacobian, so that Newton's method gets a new one where it
 class GradientFlow:
     """Follows the path of steepest descent: slow, but with the same limit as gradient descent with tiny steps.
 
-    Time is divided into intervals, each twice as long as the previous one. The integrator starts anew in each of them,
-    so that a restored run takes the same steps. The flow is stiff, so CVODES takes implicit BDF steps. Their Jacobian
-    is the Hessian if the objective has one, or else the Gauss-Newton matrix. If it has neither, as for networks, a
-    Krylov method uses finite differences of the gradient.
+    Time is divided into intervals, each twice as long as the previous one. The flow is stiff, so CVODES takes implicit
+    BDF steps. Their Jacobian is the Hessian if the objective has one, or else the Gauss-Newton matrix. If it has
+    neither, as for networks, a Krylov method uses finite differences of the gradient.
 
     A run ends as STALLED where an interval needs more than `max_steps` steps. In networks that happens long before a
     minimum: where the loss curves downwards, no step can be longer than the time in which neighbours move apart.
@@ -68,26 +67,22 @@ class _Run:
     def __init__(self, settings: GradientFlow, objective: Objective, theta0: Array, watch: Watch) -> None:
         self.settings, self.objective = settings, objective
         self.best = BestPoint(objective, theta0, watch)
-        kept = self.best.restored or {}
-        self.theta = np.array(kept.get("theta", theta0), dtype=float)
-        self.value = float(kept.get("value", np.nan))
-        self.stretch = float(kept.get("stretch", 0.0))
-        self.scale = float(kept.get("scale", np.abs(self.theta).max() or 1.0))  # of the theta that the flow starts from
-        self.converged = bool(kept.get("converged", False))
+        self.theta = np.array(theta0, dtype=float)
+        self.value, self.stretch = np.nan, 0.0
+        self.scale = float(np.abs(self.theta).max() or 1.0)  # of the theta that the flow starts from
         self.direct = isinstance(objective, SmoothObjective | LeastSquaresObjective)
         self._last = np.full_like(self.theta, np.nan), self.theta
         self._kept, self._uses = (self._last[0], np.empty((0, 0))), 0
 
     def iterate(self) -> Status:
         best, limit = self.best, self.settings.max_iterations
-        if not self.stretch:
-            status = self._start()
-            if status is not None:
-                return status
+        status = self._start()
+        if status is not None:
+            return status
         with deferred(), building:
             node = self._flow_node()
             integrator = self._integrator(node)
-        while best.iterations < limit and not self.converged:
+        while best.iterations < limit:
             if not self._advance(integrator, node):
                 return Status.STALLED
             before, self.value = self.value, self.objective.value(self.theta)
@@ -96,14 +91,11 @@ class _Run:
                 return Status.STALLED
             best.offer(self.theta, self.value)
             self.stretch *= 2
-            self.converged = before - self.value <= self.settings.tolerance * before and best.iterations >= 5
-            best.next_iteration(limit, **self._state())
-        return Status.CONVERGED if self.converged else Status.ITERATION_LIMIT
-
-    def _state(self) -> dict[str, Array | float]:
-        """All that a run needs to go on, besides the best point."""
-        numbers = {"value": self.value, "stretch": self.stretch, "scale": self.scale, "converged": self.converged}
-        return {"theta": self.theta, **numbers}
+            converged = before - self.value <= self.settings.tolerance * before and best.iterations >= 5
+            best.next_iteration(limit)
+            if converged:
+                return Status.CONVERGED
+        return Status.ITERATION_LIMIT
 
     def _start(self) -> Status | None:
         """Choose the first stretch; a status if there is nowhere to flow."""
@@ -117,7 +109,7 @@ class _Run:
 
     def _advance(self, integrator: ca.Function, node: ArrayNode) -> bool:
         """Follow the flow for one interval, and return whether the integrator reached the end."""
-        self._uses = _MAX_USES  # a new Jacobian, as in a restored run
+        self._uses = _MAX_USES  # a new Jacobian
         try:
             with deferred():
                 end = integrator(x0=self.theta, p=self.stretch)["xf"]

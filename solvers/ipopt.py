@@ -31,7 +31,7 @@ class Ipopt:
     """Primal-dual interior-point method [WB2006]: Newton steps on the Lagrangian with a filter line search.
 
     The Hessian is exact if the objective provides one and has up to 1,500 parameters; otherwise it is a limited-memory
-    approximation. A restored run starts from the best point.
+    approximation.
 
     Args:
         max_iterations: largest number of iterations.
@@ -68,8 +68,6 @@ class _Run:
         self._constraints_at: tuple[bytes, Array, Array] | None = None
         self._count = 0
         self._current = self.best.theta
-        if self.best.restored and not self.best.found:  # killed before any point met the constraints
-            self._current = np.array(self.best.restored["theta"], dtype=float)
         self._least = np.inf, self._current  # violation of the constraints
 
     def result(self) -> SolveResult:
@@ -77,9 +75,6 @@ class _Run:
         start = {"x0": ca.DM(self._current)}
         if self.constrained:
             start |= {name: ca.DM(bound) for name, bound in zip(("lbg", "ubg"), self.constrained.bounds, strict=True)}
-        if self.best.iterations >= self.settings.max_iterations:
-            self._evaluate(self._current)
-            return self._outcome(Status.ITERATION_LIMIT)
         try:
             with deferred():
                 with building:
@@ -126,7 +121,7 @@ class _Run:
             "sb": "yes",
             "tol": self.settings.tolerance,
             "mu_init": _BARRIER,
-            "max_iter": self.settings.max_iterations - self.best.iterations,
+            "max_iter": self.settings.max_iterations,
         }
         options |= {f"ipopt.{name}": value for name, value in settings.items()}
         return ca.nlpsol("ipopt", "ipopt", problem, options)
@@ -196,6 +191,6 @@ class _Run:
 
     def _iterated(self, *_: Array) -> list[float]:
         if self._count:
-            self.best.next_iteration(self.settings.max_iterations, theta=self._current)
+            self.best.next_iteration(self.settings.max_iterations)
         self._count += 1
         return [1.0 if any(node.error for node in self._nodes) else 0.0]

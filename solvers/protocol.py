@@ -11,7 +11,7 @@ import numpy as np
 from orthocas.errors import SolveError
 from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import check_remembered
-from orthocas.tools.progress import UNWATCHED, State, Watch
+from orthocas.tools.progress import UNWATCHED, Watch
 
 
 class Objective(Protocol):
@@ -136,7 +136,7 @@ class Solver(Protocol):
         ...
 
     def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
-        """Minimise from theta0, or resume from the state that the watch's keeper restores.
+        """Minimise from theta0.
 
         After Ctrl-C it returns the best point so far, with status INTERRUPTED.
         """
@@ -148,23 +148,20 @@ class BestPoint:
 
     Args:
         objective: the function to minimise.
-        theta0: start of a new run.
-        watch: monitor and keeper. If the keeper holds the state of an earlier run, the run resumes from it.
+        theta0: start.
+        watch: called with progress.
     """
 
     def __init__(self, objective: Objective, theta0: Array, watch: Watch) -> None:
         self.objective, self.watch = objective, watch
-        self.restored = watch.keeper.restored()
-        kept: State = self.restored or {}
-        self.theta = np.array(kept.get("best_theta", theta0), dtype=float)
-        self.value = float(kept.get("best_value", np.inf))
-        self.iterations = int(kept.get("iterations", 0))
-        self.evaluations = int(kept.get("evaluations", 0))
-        self._start = time.perf_counter() - float(kept.get("seconds", 0.0))
+        self.theta = np.array(theta0, dtype=float)
+        self.value = float("inf")
+        self.iterations = self.evaluations = 0
+        self._start = time.perf_counter()
 
     @property
     def seconds(self) -> float:
-        """Time spent, including earlier runs."""
+        """Time spent."""
         return time.perf_counter() - self._start
 
     @property
@@ -186,20 +183,11 @@ class BestPoint:
         self.offer(theta, value)
         return value, gradient
 
-    def next_iteration(self, limit: int, **state: Array | float) -> None:
-        """Count an iteration, report it to the monitor, and offer the state to the keeper.
-
-        The state holds everything that decides how the run goes on. The solver does not change its arrays in place
-        later.
-        """
+    def next_iteration(self, limit: int) -> None:
+        """Count an iteration, of at most `limit`, and report it to the monitor."""
         check_remembered()
         self.iterations += 1
-        self.keep(**state)
         self.watch.report(self.iterations / limit, self.value)
-
-    def keep(self, **state: Array | float) -> None:
-        """Offer the state to the keeper: the best point, the counts, and the solver's own state."""
-        self.watch.keeper.keep(lambda: self._state(**state))
 
     def run(self, iterate: Callable[[], Status]) -> SolveResult:
         """Iterate to the end. After Ctrl-C the result is the best point so far, if there is one."""
@@ -216,14 +204,3 @@ class BestPoint:
         if not self.found and status is not Status.INFEASIBLE:
             status = Status.FAILED
         return SolveResult(self.theta, self.value, status, self.iterations, self.evaluations, self.seconds)
-
-    def _state(self, **state: Array | float) -> dict[str, Array]:
-        numbers: dict[str, Array | float] = {
-            "best_theta": self.theta,
-            "best_value": self.value,
-            "iterations": self.iterations,
-            "evaluations": self.evaluations,
-            "seconds": self.seconds,
-            **state,
-        }
-        return {name: np.asarray(value, dtype=float) for name, value in numbers.items()}

@@ -1,12 +1,8 @@
 """Problems with known answers for solvers, and objectives that misbehave."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from orthocas import solvers
-from orthocas.solvers.protocol import Objective
-from orthocas.tools.progress import State
 
 ALL = [
     solvers.GaussNewton(max_iterations=60, tolerance=1e-12),
@@ -59,13 +55,6 @@ class SmoothValley(Valley):
         return np.array([[1 - 200 * (b - a * a) + 400 * a * a, -200 * a], [-200 * a, 100.0]])
 
 
-class Plain:
-    """An objective of which only values and gradients are known."""
-
-    def __init__(self, objective: Objective) -> None:
-        self.value, self.value_and_gradient = objective.value, objective.value_and_gradient
-
-
 class Interrupted(Valley):
     """Ctrl-C arrives after some evaluations."""
 
@@ -100,19 +89,6 @@ class Broken(Valley):
 
     def residuals(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         raise ZeroDivisionError("broken on purpose")
-
-
-class LastState:
-    """A keeper that holds the newest state, or goes on from one."""
-
-    def __init__(self, state: State | None = None) -> None:
-        self.state = state
-
-    def restored(self) -> State | None:
-        return self.state
-
-    def keep(self, state: Callable[[], State]) -> None:
-        self.state = state()
 
 
 class Bowl:

@@ -4,7 +4,7 @@ import ast
 import importlib
 import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 
@@ -25,39 +25,97 @@ ORDER = (  # packages import what stands before them, and nothing else
 )
 
 
+#: calls that import what a string names; of ours, only strings that are written out count as imports
+LOADERS = {
+    "import_module",
+    "__import__",
+    "of_extra",
+    "resolve_name",
+    "run_module",
+    "run_path",
+    "find_spec",
+    "exec",
+    "eval",
+}
+COMPUTED = {  # files that may compute the name of a module, and why
+    "orthocas.__init__",  # the public names of __init__.pyi, which is above all packages
+    "orthocas.cli.commands",  # commands of its own package, on demand
+    "orthocas.tools.checks",  # `of_extra`, whose callers write the name out
+}
+
+
 @cache
 def tree(path: Path) -> ast.Module:
     return ast.parse(path.read_text())
 
 
-def imports_of(path: Path, inside: bool = False, types: bool = False) -> set[str]:
-    """Modules of this package that a file takes names from; names that a package hands on count where they are made.
+@cache
+def imports_of(path: Path, inside: bool = False, types: bool = False, named: bool = True) -> frozenset[str]:
+    """Modules of this package that a file takes names from, itself excluded; see `imports_in`."""
+    return frozenset(name for name in imports_in(tree(path), inside, types, named) if MODULES[name] != path)
+
+
+def imports_in(source: ast.Module, inside: bool = False, types: bool = False, named: bool = True) -> set[str]:
+    """Modules of this package that a text takes names from; names that a package hands on count where they are made.
 
     Args:
-        path: the file.
-        inside: also imports in functions, and modules that are named by strings.
+        source: the text.
+        inside: also imports in functions.
         types: also imports that only types need.
+        named: with `inside`, also modules that are named by strings.
     """
     found = set()
-    for node in nodes(path, inside, types):
+    for node in nodes(source, inside, types):
         if isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: relative import"
+            assert node.level == 0, "relative import"
             found |= {home(node.module or "", alias.name) for alias in node.names}
         elif isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
-        elif inside and isinstance(node, ast.Constant) and isinstance(node.value, str):
+        elif inside and named and isinstance(node, ast.Constant) and isinstance(node.value, str) and "." in node.value:
             found.add(node.value.partition(":")[0])
-    return {name for name in found if name in MODULES and MODULES[name] != path}
+    return {name for name in found if name in MODULES}
 
 
-def nodes(path: Path, inside: bool, types: bool) -> Iterator[ast.AST]:
-    for node in tree(path).body:
+def nodes(source: ast.Module, inside: bool, types: bool) -> Iterator[ast.AST]:
+    for node in source.body:
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
             yield from node.body if types else ()
         elif inside:
             yield from ast.walk(node)
         else:
             yield node
+
+
+def takes_from_the_face(source: ast.Module) -> bool:
+    """Whether a text imports `orthocas` itself, through which it could reach every package, or a public name of it."""
+    for node in ast.walk(source):
+        if isinstance(node, ast.ImportFrom) and node.module == "orthocas":
+            if any(home("orthocas", alias.name) == "orthocas" for alias in node.names):
+                return True
+        elif isinstance(node, ast.Import):
+            whole = [alias.name for alias in node.names if alias.asname is None or alias.name == "orthocas"]
+            if any(name.partition(".")[0] == "orthocas" for name in whole):
+                return True
+    return False
+
+
+def computes_names(source: ast.Module) -> bool:
+    """Whether a text imports modules whose names are not written out, or hands a function on that does."""
+    aliases = [alias for node in ast.walk(source) if isinstance(node, ast.ImportFrom) for alias in node.names]
+    loaders = LOADERS | {alias.asname for alias in aliases if alias.name in LOADERS and alias.asname}
+    written_out = {
+        node.func
+        for node in ast.walk(source)
+        if isinstance(node, ast.Call)
+        and node.args
+        and isinstance(node.args[0], ast.Constant)
+        and isinstance(node.args[0].value, str)
+    }
+    for node in ast.walk(source):
+        name = node.id if isinstance(node, ast.Name) else node.attr if isinstance(node, ast.Attribute) else ""
+        if name in loaders and node not in written_out:
+            return True
+    return False
 
 
 @cache
@@ -76,7 +134,7 @@ def package(module: str) -> str:
     return module.removeprefix("orthocas.").partition(".")[0]
 
 
-def circle() -> list[str]:
+def circle(imports: Mapping[str, Collection[str]]) -> list[str]:
     """Modules that import each other, first = last; empty if there are none."""
     done: set[str] = set()
 
@@ -84,13 +142,13 @@ def circle() -> list[str]:
         if name in way:
             return [*way[way.index(name) :], name]
         if name not in done:
-            for below in sorted(imports_of(MODULES[name])):
+            for below in sorted(imports[name]):
                 if found := visit(below, (*way, name)):
                     return found
             done.add(name)
         return []
 
-    return next((found for name in MODULES if (found := visit(name, ()))), [])
+    return next((found for name in imports if (found := visit(name, ()))), [])
 
 
 def test_there_are_sources_to_check() -> None:
@@ -101,12 +159,23 @@ def test_there_are_sources_to_check() -> None:
     assert {package(name) for name in MODULES if name not in (*FACES, "orthocas")} == set(ORDER)
 
 
-@pytest.mark.slow
 def test_files_import_in_no_circle() -> None:
-    assert circle() == []
+    """Imports in functions count, too; those that only types need do not."""
+    assert circle({name: imports_of(path, inside=True, named=False) for name, path in MODULES.items()}) == []
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c", "b"]
 
 
-@pytest.mark.slow
+def test_no_file_takes_names_from_the_face() -> None:
+    """`import orthocas as oc` would lead to every package, up and down."""
+    assert [name for name, path in SOURCES.items() if takes_from_the_face(tree(path))] == []
+
+
+@pytest.mark.parametrize("text", ["import orthocas as oc", "import orthocas.charts.chart", "from orthocas import fit"])
+def test_names_from_the_face_are_found(text: str) -> None:
+    assert takes_from_the_face(ast.parse(f"def late():\n    {text}"))
+    assert not takes_from_the_face(ast.parse("from orthocas import problems\nimport orthocas.charts.chart as chart"))
+
+
 @pytest.mark.parametrize("types", [False, True])
 def test_packages_import_in_one_order(types: bool) -> None:
     """Imports in functions and modules named by strings count, too, and with `types` those that only types need."""
@@ -117,7 +186,6 @@ def test_packages_import_in_one_order(types: bool) -> None:
             assert not up, f"{name} imports {up}, which stand above it"
 
 
-@pytest.mark.slow
 def test_picture_of_the_packages_is_the_code() -> None:
     """Drawn by tools/packages.py: its arrows lead just where imports do, and its files are all there are."""
     page = (ROOT / "CONTRIBUTING.md").read_text()
@@ -136,14 +204,12 @@ def closure(arrows: set[tuple[str, str]]) -> set[tuple[str, str]]:
     return arrows if longer == arrows else closure(longer)
 
 
-@pytest.mark.slow
 def test_nothing_imports_the_faces() -> None:
     for name, path in MODULES.items():
         if name not in FACES:
             assert not imports_of(path, inside=True, types=True) & set(FACES), name
 
 
-@pytest.mark.slow
 def test_domains_answer_for_themselves() -> None:
     """Few files outside their package know a kind of domain by its name; boxes are the language of all."""
     kinds = {"ClearBox", "Corridor", "Torus"}
@@ -159,16 +225,43 @@ def test_domains_answer_for_themselves() -> None:
     }
 
 
-def test_modules_are_not_named_by_strings() -> None:
-    """But for commands, which are imported when they are called."""
-    named = {
-        name for name, path in SOURCES.items() if re.search(r"""import_module\(f?["']orthocas""", path.read_text())
-    }
-    computed = {name for name, path in SOURCES.items() if "import_module(f" in path.read_text()}
-    assert (named, computed) == (set(), {"orthocas.__init__", "orthocas.cli.commands"})
+def test_names_of_modules_are_written_out() -> None:
+    """Then the order holds for them: a string that names a module of ours counts as an import."""
+    assert {name for name, path in SOURCES.items() if computes_names(tree(path))} == COMPUTED
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import_module(name)",
+        "importlib.import_module(f'orthocas.{name}')",
+        "from importlib import import_module as load\nload('orthocas.' + name)",
+        "list(map(import_module, names))",
+        "__import__(name)",
+        "of_extra(package, 'view', 'view')",
+        "exec(text)",
+    ],
+)
+def test_computed_names_of_modules_are_found(text: str) -> None:
+    assert computes_names(ast.parse(text))
+    written_out = ast.parse("def late():\n    return import_module('orthocas.cli.fit')")
+    assert not computes_names(written_out)
+    assert imports_in(written_out, inside=True) == {"orthocas.cli.fit"}
+
+
+def test_entry_points_lead_to_the_top() -> None:
+    """Commands start in `cli`. Plug-ins, which lower packages load, lie in a package that nothing imports."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert {package(target.partition(":")[0]) for target in project["scripts"].values()} == {"cli"}
+    groups = project.get("entry-points", {}).values()
+    plugged = {package(target.partition(":")[0]) for group in groups for target in group.values()}
+    for name, path in MODULES.items():
+        others = {package(other) for other in imports_of(path, inside=True, types=True)} - {package(name)}
+        assert not others & plugged, f"{name} imports a plug-in"
+    readers = {name for name, path in SOURCES.items() if "entry_points" in path.read_text()}
+    assert readers <= {"orthocas.tools.plugins"}
+
+
 def test_imports_in_functions_say_why() -> None:
     """They are for heavy libraries that few calls need: at the top of the function, the first with its reason."""
     for path in SOURCES.values():

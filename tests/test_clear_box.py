@@ -21,7 +21,7 @@ from orthocas.charts.point_quality import worst_points
 from orthocas.codegen import CompiledLibrary, check_c, compile_shared
 from orthocas.control import ControlStatus
 from orthocas.errors import ChartFileError, DomainError, InvalidValueError, UnreachableReferenceError
-from orthocas.fitting.fit import clear_part
+from orthocas.fitting.fit import offer_clear_part
 from orthocas.tasks.domains import sample_evenly, sample_heavily, sample_uniform
 
 Numbers = NDArray[np.float64]
@@ -266,7 +266,7 @@ def test_nothing_is_offered_where_the_centre_is_singular() -> None:
     straight = oc.Problem(robot, oc.Task.position(robot, "xy"), domain=oc.Box([0.5, 0.0, 0.0], 0.5))
     found = oc.check(straight)
     assert found.singular_samples > 0
-    assert clear_part(straight, found, None) is None
+    assert offer_clear_part(straight, found, None) is None
 
 
 @pytest.mark.slow
@@ -429,11 +429,3 @@ def test_threads_and_pickles_share_a_clear_box(problem: oc.Problem) -> None:
     with ThreadPoolExecutor(4) as pool:
         for found in pool.map(fresh.contains, [points] * 8):
             np.testing.assert_array_equal(found, wanted)
-
-
-def test_a_checkpoint_of_the_whole_box_is_not_resumed(problem: oc.Problem, tmp_path: Path) -> None:
-    arm = oc.Problem(problem.robot, problem.task, domain=oc.Box([0.6, 0.8, 0.8], 0.2))
-    barely = oc.Problem(problem.robot, problem.task, domain=arm.domain, least_singular_value=1e-6)  # same samples
-    oc.fit(arm, oc.Polynomial(2), samples=200, checkpoint=tmp_path / "state")
-    with pytest.raises(oc.errors.CheckpointError):
-        oc.fit(barely, oc.Polynomial(2), samples=200, checkpoint=tmp_path / "state")

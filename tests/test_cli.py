@@ -344,18 +344,6 @@ def test_fit_under_a_bound_on_mutual_angles(run: Run) -> None:
 
 
 @pytest.mark.slow
-def test_fit_goes_on_from_its_checkpoint(run: Run, tmp_path: Path) -> None:
-    words = ("fit", "planar_3r_x", "--param", "polynomial:2", "--samples", "100", "--checkpoint", "run.checkpoint")
-    assert run(*words)[0] == 0
-    first = (tmp_path / "planar_3r_x.orthocas").read_bytes()
-    assert run(*words)[0] == 0
-    assert (tmp_path / "planar_3r_x.orthocas").read_bytes() == first
-    code, _, err = run(*words, "--seed", "4")
-    assert code == 2
-    assert "another fit: its seed is 0, expected 4" in err
-
-
-@pytest.mark.slow
 def test_compare_writes_tables_pictures_and_charts(run: Run, tmp_path: Path) -> None:
     words = ("compare", "planar_3r_x", "--samples", "100", "--held-out", "300", "--param", "linear")
     code, out, err = run(

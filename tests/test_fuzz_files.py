@@ -3,7 +3,6 @@
 import pytest
 from fuzz.certificates import certificates
 from fuzz.charts import charts
-from fuzz.checkpoints import checkpoints
 from fuzz.libraries import libraries
 from fuzz.motions import motions
 from fuzz.paths import logs, paths, postures
@@ -20,11 +19,6 @@ def test_no_number_of_a_certified_chart_can_be_changed() -> None:
 @pytest.mark.slow
 def test_mutated_charts_are_usable_or_refused_in_one_line() -> None:
     assert charts(40) == []
-
-
-@pytest.mark.slow
-def test_mutated_checkpoints_are_resumed_or_refused_in_one_line() -> None:
-    assert checkpoints(20) == []
 
 
 @needs_c

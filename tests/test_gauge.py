@@ -9,7 +9,7 @@ from programs import nightly
 import orthocas as oc
 from orthocas.bases import JointSpace
 from orthocas.errors import InvalidValueError
-from orthocas.fitting.fit import aligned, in_gauge
+from orthocas.fitting.fit import align, fix_gauge
 from orthocas.tasks.samples import sample_problem
 from orthocas.tools.checks import Array
 
@@ -58,9 +58,9 @@ def test_gauge_does_not_depend_on_how_coordinates_came(planar_x: oc.Problem, par
     )
     points = sample_problem(planar_x, 20, 1).points
     np.testing.assert_allclose(turned.xi(points), found.xi(points)[:, ::-1] * [-1, 1], atol=1e-12)
-    again = in_gauge(turned, planar_x.domain.centre)
+    again = fix_gauge(turned, planar_x.domain.centre)
     np.testing.assert_allclose(again.xi(points), found.xi(points), atol=1e-12)
-    back = aligned(turned, fit.chart, sample_problem(planar_x, 20, 1))
+    back = align(turned, fit.chart, sample_problem(planar_x, 20, 1))
     np.testing.assert_allclose(back.xi(points), found.xi(points), atol=1e-12)
 
 
@@ -93,5 +93,5 @@ def test_a_coordinate_that_folds_at_the_centre_keeps_its_values(planar_x: oc.Pro
     folded = [c for c in units if not c.jacobian(centre[None]).any() and np.ptp(c.xi(points), axis=0).any()]
     assert folded  # squares of a joint
     for coordinates in folded:
-        again = in_gauge(coordinates, centre).xi(points)
+        again = fix_gauge(coordinates, centre).xi(points)
         np.testing.assert_allclose(np.sort(np.abs(again)), np.sort(np.abs(coordinates.xi(points))), atol=1e-12)

@@ -12,7 +12,7 @@ from programs import Run
 import orthocas as oc
 from orthocas import problems, solvers
 from orthocas.bases import JointSpace, Parametrisation
-from orthocas.errors import CheckpointError, UnknownNameError
+from orthocas.errors import UnknownNameError
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.dense_objectives import GraphObjective
 from orthocas.fitting.terms import Weights
@@ -117,12 +117,6 @@ def test_bound_on_mutual_angles_is_one_in_the_metric(planar_x: oc.Problem) -> No
     fit = oc.fit(planar_x, oc.Polynomial(2), samples=400, max_mutual_deg=1.0, weights=Weights(angles="metric"))
     angle = oc.evaluate(fit.chart, 5000).metric_mutual_angle
     assert np.hypot(angle.std, angle.mean - 90) == pytest.approx(1.0, rel=0.1)
-
-
-def test_checkpoint_of_the_other_angles_is_refused(planar_x: oc.Problem, tmp_path: Path) -> None:
-    oc.fit(planar_x, oc.Polynomial(2), samples=100, checkpoint=tmp_path / "run")
-    with pytest.raises(CheckpointError, match="its weights"):
-        oc.fit(planar_x, oc.Polynomial(2), samples=100, checkpoint=tmp_path / "run", weights=Weights(angles="paper"))
 
 
 def test_unknown_angles_are_refused_in_python_and_on_the_command_line(run: Run) -> None:

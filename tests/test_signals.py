@@ -62,8 +62,8 @@ def test_what_needs_a_finished_minimisation_ends_with_ctrl_c(planar_x: oc.Proble
     grown = oc.grow(planar_x, leaf="linear")
     step = BestPoint.next_iteration
 
-    def interrupted(self: BestPoint, limit: int, **state: float) -> None:
-        step(self, limit, **state)
+    def interrupted(self: BestPoint, limit: int) -> None:
+        step(self, limit)
         signal.raise_signal(signal.SIGINT)
 
     with patch.object(BestPoint, "next_iteration", interrupted), pytest.raises(KeyboardInterrupt):

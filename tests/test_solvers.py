@@ -1,11 +1,10 @@
 """One contract for every solver, on problems with known answers."""
 
-from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from objectives import ALL, SHORT, START, Bowl, Broken, Interrupted, LastState, NotFinite, Plain, SmoothValley, Valley
+from objectives import ALL, SHORT, START, Bowl, Broken, Interrupted, NotFinite, SmoothValley, Valley
 
 from orthocas import solvers
 from orthocas.errors import InvalidValueError, SolveError, UnknownNameError
@@ -13,13 +12,12 @@ from orthocas.solvers.protocol import (
     ConstrainedObjective,
     EstimatedObjective,
     LeastSquaresObjective,
-    Objective,
     SmoothObjective,
     Solver,
     SolveResult,
     Status,
 )
-from orthocas.tools.progress import Progress, State, Watch
+from orthocas.tools.progress import Progress, Watch
 
 
 @pytest.mark.parametrize("solver", ALL, ids=lambda s: s.name)
@@ -78,58 +76,6 @@ class TestShortRuns:
         assert result.status is Status.ITERATION_LIMIT
         assert result.iterations == 3
         assert result.value < Valley().value(START)
-
-    def test_restored_run_goes_on_where_it_was(self, solver: Solver) -> None:
-        keeper = LastState()
-        first = solver.minimise(Valley(), START, Watch(keeper=keeper))
-        longer = next(s for s in ALL if s.name == solver.name)
-        result = longer.minimise(Valley(), START, Watch(keeper=LastState(keeper.state)))
-        assert result.iterations > first.iterations
-        assert result.evaluations > first.evaluations
-        assert result.seconds > first.seconds
-        np.testing.assert_allclose(result.theta, 1.0, atol=1e-3)
-
-    def test_restored_run_that_was_done_ends_at_once(self, solver: Solver) -> None:
-        keeper = LastState()
-        first = solver.minimise(Valley(), START, Watch(keeper=keeper))
-        again = solver.minimise(Valley(), np.zeros(2), Watch(keeper=LastState(keeper.state)))
-        assert again.iterations == first.iterations
-        np.testing.assert_array_equal(again.theta, first.theta)
-
-
-KILLED = [
-    solvers.GaussNewton(tolerance=0.0),
-    solvers.GaussNewton(),
-    solvers.QuasiNewton(),
-    solvers.Adam(epochs=6, steps=10),
-    solvers.GradientFlow(),
-    solvers.GradientFlow(max_iterations=7),
-    solvers.LBFGS(),
-    solvers.LBFGS(tolerance=1e-15, memory=3),
-]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("solver", "objective"),
-    [(solver, Valley()) for solver in KILLED] + [(solver, Plain(Valley())) for solver in KILLED[3:]],
-    ids=lambda value: getattr(value, "name", type(value).__name__),
-)
-def test_killed_run_loses_nothing(solver: Solver, objective: Objective) -> None:
-    """A run restored from its state after any iteration, the last one included, ends at the same point, bit by bit."""
-    states: list[State] = []
-
-    class Recorder(LastState):
-        def keep(self, state: Callable[[], State]) -> None:
-            states.append(state())  # not copied: solvers must not change what they handed over
-
-    whole = solver.minimise(objective, START, Watch(keeper=Recorder()))
-    assert len(states) == whole.iterations > 3
-    for state in states:
-        resumed = solver.minimise(objective, START, Watch(keeper=LastState(state)))
-        np.testing.assert_array_equal(resumed.theta, whole.theta)
-        assert (resumed.iterations, resumed.evaluations) == (whole.iterations, whole.evaluations)
-        assert (resumed.value, resumed.status) == (whole.value, whole.status)
 
 
 def test_protocols_are_recognised() -> None:

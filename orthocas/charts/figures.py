@@ -8,7 +8,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from orthocas.charts.quality import AngleStatistics, LeakStatistics
 from orthocas.charts.self_motion import fan_along
 from orthocas.errors import InvalidValueError
 from orthocas.tools.checks import Array, require_at_least, require_count
@@ -16,7 +15,7 @@ from orthocas.tools.picture import Picture, equal_axes
 
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
-    from orthocas.charts.quality import Report
+    from orthocas.charts.quality import AngleStatistics, LeakStatistics, Report
 
 _MOST_POSTURES = 1000
 _PANELS = 2  #: side by side
@@ -69,7 +68,7 @@ def self_motion_figure(chart: "Chart", postures: int = 9, reach: float | None = 
     return figure
 
 
-def _draw_angles(axes: Axes, angles: AngleStatistics, colour: str, label: str) -> None:
+def _draw_angles(axes: Axes, angles: "AngleStatistics", colour: str, label: str) -> None:
     first = 3  # groups of five bins, so that 90 degrees lies in the middle of its group
     counts = angles.histogram[first:-3].reshape(-1, 5).sum(axis=1)
     edges = (first - 0.5) / 10 + 0.5 * np.arange(len(counts) + 1)
@@ -81,7 +80,7 @@ def _draw_angles(axes: Axes, angles: AngleStatistics, colour: str, label: str) -
     axes.grid(alpha=0.3)
 
 
-def _draw_leaks(axes: Axes, leak: LeakStatistics) -> None:
+def _draw_leaks(axes: Axes, leak: "LeakStatistics") -> None:
     counts = leak.histogram[:900].reshape(-1, 5).sum(axis=1)
     axes.stairs(counts / max(counts.sum(), 1) / 0.5, 0.5 * np.arange(len(counts) + 1) - 0.05, fill=True, color=_LEAK)
     axes.set_xlim(0, max(6.0, 3 * leak.rms))

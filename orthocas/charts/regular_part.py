@@ -79,10 +79,6 @@ class RegularPart(ClearBox):
         """Those of the clear box, and the bound."""
         return {**super().numbers_of_condition(), "least_volume": self.least_volume}
 
-    def identity(self) -> list[Array]:
-        """Those of the clear box, bound and coordinates."""
-        return [*super().identity(), np.array([self.least_volume]), self.coordinates.theta]
-
     def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
         """Those of the clear box, bound and coordinates."""
         data, arrays = super().to_data()

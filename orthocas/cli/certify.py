@@ -30,6 +30,7 @@ from orthocas.cli.output import (
 from orthocas.errors import Interrupted
 from orthocas.tools.archive import require_free
 from orthocas.tools.checks import require_count
+from orthocas.tools.interrupts import INTERRUPTED
 from orthocas.tools.processes import Processes, begin_worker, scheduler_executor
 
 _NOT_PROVED = 1  # exit code
@@ -87,7 +88,7 @@ def certify(
     _report(found, target, json)
     if interrupted:
         note("interrupted: the file holds what is proved so far; the same command goes on from it")
-        raise typer.Exit(130)
+        raise typer.Exit(INTERRUPTED)
     raise typer.Exit(0 if found.proved else _NOT_PROVED)
 
 

@@ -6,9 +6,8 @@ from typing import Annotated
 
 import typer
 
-from orthocas.cli.entry import INTERRUPTED
 from orthocas.errors import OrthocasError, one_line
-from orthocas.tools.interrupts import ended_in_order, remembered
+from orthocas.tools.interrupts import INTERRUPTED, ended_in_order, remembered
 from orthocas.version import VERSION
 
 COMMANDS = {

@@ -28,6 +28,7 @@ from orthocas.fitting.comparison_figures import convergence_figure, front_figure
 from orthocas.fitting.settings import PRECISIONS, Precision
 from orthocas.solvers import get as get_solver
 from orthocas.tools.files import output_folder, published, require_replaceable_files
+from orthocas.tools.interrupts import INTERRUPTED
 
 _FILES = ("comparison.csv", "comparison.json", "front.png", "convergence.png")
 _PARAMETRISATIONS = ["linear", "polynomial:2", "polynomial:3", "polynomial:4", "mlp:32x32"]
@@ -104,7 +105,7 @@ def _tell(found: Comparison, out: Path, json: bool) -> None:
         note(f"{failed} of {len(found.results)} fits failed, see comparison.csv")
     if found.interrupted:
         note(f"interrupted after {len(found.results)} fits")
-        raise typer.Exit(130)
+        raise typer.Exit(INTERRUPTED)
 
 
 def save(found: Comparison, out: Path, force: bool = False) -> None:

@@ -5,7 +5,7 @@ import signal
 import sys
 from types import FrameType
 
-INTERRUPTED = 130  #: exit code after Ctrl-C, as shells have it
+from orthocas.tools.interrupts import INTERRUPTED
 
 
 def open_closed_streams() -> None:

@@ -57,6 +57,7 @@ from orthocas.solvers.protocol import Status
 from orthocas.tasks.problem import Problem
 from orthocas.tools.archive import require_free
 from orthocas.tools.display import listed, number_list, percent
+from orthocas.tools.interrupts import INTERRUPTED
 from orthocas.tools.json import attributes
 
 _WIDE_ROWS = ("regular", "left out", "meaning")  # facts of wide fits
@@ -121,12 +122,6 @@ def fit(
             help="Bound on the rms deviation of the mutual angles from 90 deg; Ipopt minimises the task angle.",
         ),
     ] = None,
-    checkpoint: Annotated[
-        Path | None,
-        typer.Option(
-            "--checkpoint", help="File for the state of a long fit. If the file exists, the fit resumes from it."
-        ),
-    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="Chart file; default: PROBLEM.orthocas in the current folder.")
     ] = None,
@@ -140,7 +135,7 @@ def fit(
         raise OptionError("--branch requires --domain branch")
     if wide:
         usual_loss = weights == WEIGHTS_TEXT and angles is None and precision == PRECISIONS[0]
-        _require_none({"solver": solver, "max-mutual-deg": max_mutual_deg, "checkpoint": checkpoint})
+        _require_none({"solver": solver, "max-mutual-deg": max_mutual_deg})
         _require_none({"weights, --angles and --precision": None if usual_loss else weights})
     built = _corridor_or_box(problem, words, corridor, radius) if bounds is None and not wide else None
     target = out or Path(f"{Path(problem).stem if built is None else built.name}.orthocas")
@@ -157,8 +152,8 @@ def fit(
             if built is None:
                 result: Fit = wide_fit(problem, words, branch, like, parametrisation, samples, seed, monitor)
             else:
-                others = (minimiser, samples, max_mutual_deg, checkpoint, like)
-                usual = others == (None,) * 5 and precision == PRECISIONS[0]
+                others = (minimiser, samples, max_mutual_deg, like)
+                usual = others == (None,) * 4 and precision == PRECISIONS[0]
                 result = (_confirming(suggestion, built, parametrisation) if usual else None) or fit_chart(
                     built,
                     parametrisation,
@@ -168,7 +163,6 @@ def fit(
                     seed=seed,
                     monitor=monitor,
                     max_mutual_deg=max_mutual_deg,
-                    checkpoint=checkpoint,
                     precision=cast(Precision, precision),
                     like=None if like is None else [word.strip() for word in like.split(",")],
                 )
@@ -187,7 +181,7 @@ def fit(
         print_rows({**_rows(result, report, target), **({} if suggestion is None else _domain_rows(suggestion))})
     if result.status is Status.INTERRUPTED:
         note("interrupted: the chart holds the best coordinates found so far")
-        raise typer.Exit(130)
+        raise typer.Exit(INTERRUPTED)
 
 
 def _require_none(given: dict[str, Any]) -> None:

@@ -46,7 +46,7 @@ from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import require_known
 from orthocas.tools.display import percent
 from orthocas.tools.files import is_listed, output_folder, published, require_replaceable_files, require_writable
-from orthocas.tools.interrupts import deferred
+from orthocas.tools.interrupts import INTERRUPTED, deferred
 from orthocas.tools.json import plain, to_json
 from orthocas.tools.progress import Monitor
 
@@ -301,7 +301,7 @@ def simulate(
     else:
         print_rows(run_rows(report, loaded.problem) | {"files": str(out)})
     _notes(law, report, interrupted)
-    if code := 130 if interrupted else int(run.outcome in _FAILED):
+    if code := INTERRUPTED if interrupted else int(run.outcome in _FAILED):
         raise typer.Exit(code)
 
 

@@ -4,7 +4,6 @@
 - `terms` has the terms and weights of the loss, `residuals` the loss of one sample.
 - `basis_objective` (with `basis_gradients`) evaluates the loss for families linear in theta, `dense_objectives` for
   networks and all others. `symbolic_loss` gives the loss as one CasADi expression.
-- `fold_search` finds folds, `checkpoint` keeps the state of a long fit in a file.
 - `suggest_domain` (with `probe`) chooses domains. `distil` fits grown coordinates.
 - `compare` fits a `grid`, and has the result.
 """

@@ -107,11 +107,6 @@ class Like:
         """What the coordinates mean, for the notes of a chart: 'like q3 [rad]; like height'."""
         return "; ".join(like_label(name) for name in self.names)
 
-    @cached_property
-    def digest(self) -> str:
-        """A name for the quantities, the same in every process."""
-        return _digest(self.function)
-
     def require_at_most(self, count: int) -> None:
         """Raise InvalidValueError if there are more quantities than coordinates."""
         if len(self.names) > count:

@@ -11,9 +11,9 @@ from orthocas.bases.family import ArrayFamily, JointSpace, LinearFamily, Paramet
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
-from orthocas.fitting.checkpoint import Stage
 from orthocas.fitting.like import Like
 from orthocas.fitting.meaning import Meaning, Wish, unit_self_motion
+from orthocas.fitting.stages import Stage
 from orthocas.fitting.volume_loss import LEAST_VOLUME, BasisField, BasisShortfall, Field, NetworkField, NetworkShortfall
 from orthocas.solvers.adam import Adam
 from orthocas.solvers.lbfgs import LBFGS

@@ -1,6 +1,5 @@
 """The settings of one fit, checked once."""
 
-import hashlib
 from dataclasses import dataclass, replace
 from typing import Literal, Self
 
@@ -16,7 +15,6 @@ from orthocas.solvers.ipopt import Ipopt
 from orthocas.solvers.lbfgs import LBFGS, QuasiNewton
 from orthocas.solvers.protocol import Solver
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.samples import sample_problem
 from orthocas.tools.checks import as_number, require_count, require_kind, require_known
 
 Precision = Literal["double", "single"]
@@ -24,7 +22,6 @@ PRECISIONS: tuple[Precision, ...] = ("double", "single")  #: of the large produc
 _MANY_JOINTS = 8  # with more, coordinates are many as well, and the matrix grows with their square
 _DEGREES = ((8, 4), (9, 3), (12, 2))  # joints from which the default degree is lower
 _MANY_TERMS = 300  # where a Gauss-Newton matrix takes longer than ten gradients: degree 4 for seven joints
-_TELLTALE = (20, (0, 1000))  # number and seed of the samples that identify a problem
 _LEAST_BOUND = 1e-6  # deg; rounding hides smaller angles
 
 
@@ -46,7 +43,7 @@ class FitSettings:
     def checked(
         cls,
         problem: Problem,
-        parametrisation: Parametrisation,
+        parametrisation: Parametrisation | None,
         solver: Solver | None,
         weights: Weights | WeightNumbers,
         samples: int | None,
@@ -56,12 +53,14 @@ class FitSettings:
         precision: Precision = "double",
         like: Likeness | None = None,
     ) -> "FitSettings":
-        """Check the settings, and fill in the default solver and the default angles.
+        """Check the settings, and fill in the default parametrisation, solver and angles.
 
         Raises:
             InvalidValueError, ShapeError: if a setting is invalid, or contradicts another one.
         """
         require_kind("problem", problem, Problem)
+        if parametrisation is None:
+            parametrisation = default_parametrisation(problem, bounded=max_mutual_deg is not None)
         require_parametrisation(parametrisation)
         bound = parametrisation.for_problem(problem)
         if max_mutual_deg is not None:
@@ -104,21 +103,6 @@ class FitSettings:
         free = not problem.domain.full_turns and self.max_mutual_deg is None
         return self.weights.folds if free else 0.0
 
-    def identity(self, problem: Problem) -> dict[str, str]:
-        """Settings that identify this fit, for its checkpoint."""
-        return {
-            "problem": _digest(problem),
-            "parametrisation": self.parametrisation.label,
-            "solver": repr(self.solver),
-            "weights": repr(self.weights),
-            "samples": repr(self.samples),
-            "seed": repr(self.seed),
-            "max_mutual_deg": repr(self.max_mutual_deg),
-            **({} if self.split_idle else {"split_idle": "False"}),
-            **({"precision": self.precision} if self.single else {}),
-            **({} if self.like is None else {"like": self.like.digest}),
-        }
-
 
 def default_parametrisation(problem: Problem, bounded: bool) -> Polynomial:
     """Polynomials of degree 5; of 4 with a bound or 8 joints, of 3 with more, of 2 from 12: terms grow too many."""
@@ -152,12 +136,3 @@ def _require_bound(parametrisation: Parametrisation, max_mutual_deg: float) -> N
         raise InvalidValueError("max_mutual_deg", f"given with {parametrisation.label}", "a parametrisation to fit")
     if not _LEAST_BOUND <= as_number("max_mutual_deg", max_mutual_deg) < 90:
         raise InvalidValueError("max_mutual_deg", max_mutual_deg, f"an angle from {_LEAST_BOUND:g} to below 90 degrees")
-
-
-def _digest(problem: Problem) -> str:
-    """A fingerprint of a problem: its domain, and its task and metric at some samples."""
-    samples = sample_problem(problem, *_TELLTALE)
-    parts = [samples.points, samples.task_jacobian]
-    parts += [] if samples.metric_inverse is None else [samples.metric_inverse]
-    parts += problem.domain.identity()
-    return hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()[:16]

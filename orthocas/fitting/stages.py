@@ -1,6 +1,6 @@
-"""One stage of a fit is a minimisation: samples, a start, an objective, a solver."""
+"""The stages of a fit, from low degrees to high ones. Each minimises an objective on samples, from a start."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from math import ceil
@@ -8,15 +8,22 @@ from math import ceil
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.bases.family import ArrayFamily, Family, GradedParametrisation, JointSpace, LinearFamily, Parametrisation
-from orthocas.bases.products import Fourier, Polynomial
+from orthocas.bases.family import (
+    ArrayFamily,
+    Family,
+    GradedFamily,
+    GradedParametrisation,
+    JointSpace,
+    LinearFamily,
+    Parametrisation,
+)
+from orthocas.bases.products import Fourier, Polynomial, ProductFamily
 from orthocas.charts.angles import pairs
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import WorstPoints, worst_points
-from orthocas.errors import CheckpointError, InfeasibleError, InvalidValueError, SolveError
+from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
 from orthocas.fitting.basis_objective import STRIDE, BasisObjective, BoundedMutual, expanded
-from orthocas.fitting.checkpoint import Checkpoint, Stage
 from orthocas.fitting.dense_objectives import ArrayObjective, GraphObjective
 from orthocas.fitting.like import LikeTerm
 from orthocas.fitting.settings import FitSettings
@@ -46,8 +53,119 @@ MLP_SAMPLES = 2000  #: default sample count of families that are not linear in t
 _START_SEED = 0  # seed of the samples of spectral starts, the same for all fits
 _TRIAL_DEGREE = 3  # of the trial that chooses among symmetric coordinates
 _FRESH = 2000  # seed tag of samples drawn while a solver runs; stages use other tags
-
+_SEARCHED = 3  # degree from which worst points are searched: those of lower degrees differ from the last ones
+_ROUNDS = 4  # of the last degree
+_LEAST_GAIN = 0.01  # of the conditioning in a round
 _COLLECTED = 1.5 * LEAST_CONDITIONING  # points below it are collected, before they become worse
+Begin = Callable[[ProductFamily], Array | None]  #: parameters to start from, (size,), if some are known
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One minimisation of a fit."""
+
+    label: str  #: parametrisation, for example 'polynomial:3'
+    parameters: int
+    samples: int
+    result: SolveResult
+
+    def interrupted(self) -> "Stage":
+        """The same stage, marked as interrupted by Ctrl-C."""
+        return replace(self, result=replace(self.result, status=Status.INTERRUPTED))
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Finished minimisations, the parametrisation that they reached, and its worst points if a search was made."""
+
+    stages: tuple[Stage, ...]
+    parametrisation: Parametrisation
+    worst: WorstPoints | None
+
+    @property
+    def theta(self) -> Array:
+        """Parameters found by the last minimisation."""
+        return self.stages[-1].result.theta
+
+
+class Continuation:
+    """Solves a low degree from a spectral start, embeds the result, and solves the next degree.
+
+    The worst points of each degree join the loss of the next one. The last degree is solved again until its least
+    conditioning is large enough or, without a fold, no longer grows. If folds remain after some rounds, the domain
+    forces them: then the last stage leaves the fold term out.
+
+    Args:
+        runner: runs single stages.
+        r: number of coordinates of the active joints.
+        begin: gives parameters of polynomials to start from, instead of a spectral start. Without a mirror only, since
+            coordinates of another fit need not be even and odd.
+    """
+
+    def __init__(self, runner: "StageRunner", r: int, begin: Begin | None = None) -> None:
+        self._runner, self._r, self._begin = runner, r, begin
+        self._stages: list[Stage] = []
+        self._reached: tuple[Parametrisation, Family] | None = None
+
+    def run(self) -> Solution:
+        """Run all stages. After Ctrl-C, the last one is marked as interrupted."""
+        steps = self._steps(self._runner.settings.parametrisation)
+        try:
+            for step in steps:
+                self._solve(step, step.label, final=step is steps[-1])
+            self._unfold(steps[-1])
+        except KeyboardInterrupt:  # also between minimisations
+            if self._reached is None:
+                raise
+            self._stages[-1] = self._stages[-1].interrupted()
+        assert self._reached is not None
+        return Solution(tuple(self._stages), self._reached[0], self._runner.folds.found)
+
+    def _steps(self, target: Parametrisation) -> Sequence[Parametrisation]:
+        if not isinstance(target, GradedParametrisation):
+            return [target]
+        self._runner.require_memory(target, self._r)
+        return [target.of_degree(degree) for degree in range(min(target.degree, 2), target.degree + 1)]
+
+    def _solve(self, step: Parametrisation, label: str, final: bool) -> None:
+        """Run a stage, and search the worst points of its result."""
+        runner, degree = self._runner, step.degree if isinstance(step, GradedParametrisation) else 0
+        family = runner.family(step, self._r)
+        solver = runner.settings.solver if final else runner.settings.solver.coarser()
+        stage = runner.run(Plan(label, family, self._start(family), solver, degree, final))
+        self._stages.append(stage)
+        self._reached = step, family
+        if stage.result.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        if final or degree >= _SEARCHED:
+            runner.folds.search(stage, step, len(self._stages), runner.monitor)
+
+    def _start(self, family: Family) -> Array | None:
+        """The last result, embedded; at first that of `begin`."""
+        if self._reached is None:
+            polynomials = isinstance(self._runner.settings.parametrisation, Polynomial)
+            if self._begin is None or not polynomials or self._runner.mirror is not None:
+                return None
+            assert isinstance(family, ProductFamily)
+            return self._begin(family)
+        theta, before = self._stages[-1].result.theta, self._reached[1]
+        if theta.size == family.size:
+            return theta
+        assert isinstance(family, GradedFamily)
+        assert isinstance(before, GradedFamily)
+        return family.embed(theta, before)
+
+    def _unfold(self, step: Parametrisation) -> None:
+        """Solve the last step again until there is no point of small conditioning."""
+        folds, before = self._runner.folds, 0.0
+        for k in range(2, 2 + _ROUNDS):
+            if folds.least >= LEAST_CONDITIONING or 0 <= folds.least < before + _LEAST_GAIN:
+                break
+            before = folds.least
+            self._solve(step, f"{step.label}, round {k}", final=True)
+        if folds.least < 0:
+            folds.give_up()
+            self._solve(step, f"{step.label}, with folds", final=True)
 
 
 class FoldSearch:
@@ -161,7 +279,6 @@ class StageRunner:
     settings: FitSettings
     active: list[int]  #: joints that are not coordinates themselves
     monitor: Monitor
-    checkpoint: Checkpoint
     folds: FoldSearch
     like: LikeTerm | None = None  #: what the first coordinates follow
 
@@ -207,37 +324,24 @@ class StageRunner:
         return {}
 
     def run(self, plan: Plan) -> Stage:
-        """Draw samples, find a start if none is given, and minimise. A finished stage comes from the checkpoint.
+        """Draw samples, find a start if none is given, and minimise.
 
         Raises:
             SolveError: if there is no usable point. Only the final stage has to satisfy a bound on mutual angles.
         """
         family = plan.family
         kept = self.mirror.kept(family) if isinstance(family, LinearFamily) and self.mirror is not None else None
-        self.checkpoint.require_fitting(plan.label, family.size, family.size if kept is None else int(kept.sum()))
-        done = self.checkpoint.finished(plan.label)
-        if done is not None:
-            return done
         # other networks are few large products: they need the threads of BLAS more than the last digits
         with one_blas_thread() if isinstance(family, LinearFamily | ArrayFamily) else nullcontext():
-            stage = self._minimised(plan, kept)
-        self.checkpoint.add(stage)
-        return stage
+            return self._minimise(plan, kept)
 
-    def _minimised(self, plan: Plan, kept: NDArray[np.bool_] | None) -> Stage:
-        """A stage that is not in the checkpoint."""
+    def _minimise(self, plan: Plan, kept: NDArray[np.bool_] | None) -> Stage:
         count = self._sample_count(plan.family, kept)
         self.monitor(Progress(plan.label, 0.0, f"sampling {count} points"))
         samples = self._samples(count, 1 + plan.tag)
         with deferred():  # CasADi may swallow Ctrl-C while graphs are built
             objective, theta = self._objective(plan, samples, kept)
-        keeper = self.checkpoint.keeper(plan.label)
-        try:
-            result = plan.solver.minimise(objective, theta, Watch(self.monitor, plan.label, keeper))
-        except CheckpointError as error:  # the solver's own part of the state
-            raise self.checkpoint.inconsistent(str(error)) from None
-        if result.status is Status.INTERRUPTED:
-            keeper.flush()
+        result = plan.solver.minimise(objective, theta, Watch(self.monitor, plan.label))
         if isinstance(objective, BoundedMutual) and not np.isfinite(result.value):
             if plan.final:
                 assert self.settings.max_mutual is not None

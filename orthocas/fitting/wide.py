@@ -18,7 +18,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.point_quality import worst_points
 from orthocas.charts.regular_part import RegularPart
 from orthocas.errors import BranchWarning, DomainError, Interrupted, InvalidValueError
-from orthocas.fitting.fit import Fit, in_gauge, normalised
+from orthocas.fitting.fit import Fit, fix_gauge, normalise
 from orthocas.fitting.like import Like, Likeness
 from orthocas.fitting.meaning import Meaning, MeaningError
 from orthocas.fitting.regular_search import (
@@ -300,9 +300,9 @@ def _finished(
     if meaning is not None:
         coordinates = meaning.named(raw)
     elif quantities is not None:
-        coordinates = quantities.named(normalised(raw, centre, first), clear)
+        coordinates = quantities.named(normalise(raw, centre, first), clear)
     else:
-        coordinates = in_gauge(normalised(raw, centre, first), centre) if len(raw.offset) else raw
+        coordinates = fix_gauge(normalise(raw, centre, first), centre) if len(raw.offset) else raw
     domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
     counted = clear_positions(clear.robot, clear.task, branch.box, JUDGED, (seed, _COUNTED_TAG))

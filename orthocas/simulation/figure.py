@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -18,12 +18,14 @@ from PIL import Image
 
 from orthocas.control.controller import FROM_THE_LAW, ControlStatus
 from orthocas.errors import ArchiveError, InvalidValueError
-from orthocas.simulation.trajectory import Trajectory
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, require_known
 from orthocas.tools.files import published, require_replaceable_files, require_writable
 from orthocas.tools.picture import Picture
 from orthocas.tools.progress import Monitor, Progress, silent
+
+if TYPE_CHECKING:
+    from orthocas.simulation.trajectory import Trajectory
 
 ACTUAL, FALLBACK = "#3d85c6", "#d62728"
 _WANTED, _STORAGE = "#222222", "#1b9e77"
@@ -166,7 +168,7 @@ class MovingPicture:
         speed: playback speed relative to real time, for the title.
     """
 
-    def __init__(self, trajectory: Trajectory, problem: Problem, speed: float = 1.0) -> None:
+    def __init__(self, trajectory: "Trajectory", problem: Problem, speed: float = 1.0) -> None:
         k = len(trajectory.labels)
         height = max(4.2, _PANEL * k + 0.8)
         figure = Figure(figsize=(_WIDTH, round(height * _DPI / 2) * 2 / _DPI), dpi=_DPI)  # even height: MP4 needs it
@@ -215,7 +217,7 @@ class MovingPicture:
 class _Arm:
     """The arm, the path of its tip and the target of the tip, in 2-D axes for planar arms, otherwise in 3-D."""
 
-    def __init__(self, figure: Figure, trajectory: Trajectory, problem: Problem) -> None:
+    def __init__(self, figure: Figure, trajectory: "Trajectory", problem: Problem) -> None:
         points = problem.robot.joint_points(trajectory.q)  # (N, points, 3)
         low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
         flat = np.flatnonzero(high - low < _FLAT)
@@ -252,7 +254,7 @@ class _Arm:
         return [*self._shadow, *self._lines]
 
 
-def _tip_targets(trajectory: Trajectory, problem: Problem) -> Array:
+def _tip_targets(trajectory: "Trajectory", problem: Problem) -> Array:
     """Target of the tip, (N, 3). Axes that the task leaves free follow the tip; NaN if the task is not its position."""
     if not problem.task.of_tip or not problem.task.name.startswith("position:"):
         return np.full((len(trajectory.times), 3), np.nan)
@@ -297,7 +299,7 @@ def require_format(name: str) -> None:
 
 
 def save_animation(
-    path: str | Path, trajectory: Trajectory, problem: Problem, monitor: Monitor = silent, force: bool = False
+    path: str | Path, trajectory: "Trajectory", problem: Problem, monitor: Monitor = silent, force: bool = False
 ) -> None:
     """Write an animation of the arm and its controlled quantities. The file appears whole or not at all.
 

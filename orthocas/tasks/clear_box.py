@@ -153,11 +153,6 @@ class ClearBox(Box):
             "clear_share": self.share,
         }
 
-    def identity(self) -> list[Array]:
-        """Scale and bound, and a mark if other rows than J_x count."""
-        own = self.jacobian_function is self.task.jacobian_function
-        return [np.append(self.scale, self.least_singular_value), *([] if own else [np.array([1.0])])]
-
     def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
         """The bound, and the rows that count if they are not J_x: older files, which do not name them, mean J_x."""
         of_x = self.jacobian_function is self.task.jacobian_function

@@ -95,10 +95,6 @@ class Corridor(Box):
         """The condition in one line."""
         return {"corridor": self.heading}
 
-    def identity(self) -> list[Array]:
-        """What identifies a corridor: the postures of its path, and its radius."""
-        return [self.postures, self.radius]
-
     def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
         """Path and radius, beside those of the box."""
         return super().to_data()[0], {"postures": self.postures, "radius": self.radius}

@@ -167,10 +167,6 @@ class Domain(ABC):
         """What `orthocas info --json` has of the condition."""
         return {}
 
-    def identity(self) -> list[Array]:
-        """Numbers that identify the domain in a checkpoint, beside samples of it."""
-        return []
-
     def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
         """Plain data and arrays for files, beside name, centre and half-width."""
         raise DomainError(

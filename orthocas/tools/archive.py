@@ -1,4 +1,4 @@
-"""The container of chart files and checkpoints: a zip of a JSON header, `.npy` arrays and checksums."""
+"""The container of chart files: a zip of a JSON header, `.npy` arrays and checksums."""
 
 import errno
 import hashlib
@@ -161,7 +161,7 @@ def unpacking(source: Path, what: str, error: type[ArchiveError]) -> Iterator[Un
 class Kind:
     """A kind of file, and the error that its readers and writers raise."""
 
-    name: str  #: 'chart' or 'checkpoint'
+    name: str  #: such as 'chart'
     version: int  #: newest format version
     error: type[ArchiveError]
 

@@ -3,12 +3,10 @@
 import html
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, Protocol, TextIO
-
-from orthocas.tools.checks import Array
+from typing import Any, TextIO
 
 _PAUSE = 0.1  # [s] between pictures
 _BAR = 24  # characters
@@ -26,46 +24,18 @@ class Progress:
 
 
 Monitor = Callable[[Progress], None]
-State = Mapping[str, Array]  #: all that a minimiser needs to resume
 
 
 def silent(progress: Progress) -> None:
     """The default monitor. It shows nothing."""
 
 
-class Keeper(Protocol):
-    """Keeps the state of a minimisation, so that a killed run can resume."""
-
-    def restored(self) -> State | None:
-        """The state that an earlier run kept, or None for a new run."""
-        ...
-
-    def keep(self, state: Callable[[], State]) -> None:
-        """Offer the current state. The keeper decides whether to write it."""
-        ...
-
-
-class Forgetful:
-    """The default keeper. It keeps nothing."""
-
-    def restored(self) -> State | None:
-        """Nothing."""
-        return None
-
-    def keep(self, state: Callable[[], State]) -> None:
-        """Do nothing."""
-
-
-FORGETFUL = Forgetful()
-
-
 @dataclass(frozen=True)
 class Watch:
-    """Observes a running minimiser: a monitor and a keeper."""
+    """Observes a running minimiser."""
 
     monitor: Monitor = silent
     stage: str = ""  #: name of the stage, for the monitor
-    keeper: Keeper = FORGETFUL
 
     def report(self, fraction: float, value: float) -> None:
         """Report progress to the monitor."""

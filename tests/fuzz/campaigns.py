@@ -7,7 +7,6 @@ from fuzz import signals
 from fuzz.calls import calls
 from fuzz.certificates import certificates
 from fuzz.charts import charts
-from fuzz.checkpoints import checkpoints
 from fuzz.child import Finding
 from fuzz.commands import commands
 from fuzz.libraries import libraries
@@ -26,7 +25,6 @@ CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
     "calls": calls,
     "certificates": certificates,
     "charts": charts,
-    "checkpoints": checkpoints,
     "commands": commands,
     "libraries": libraries,
     "lists": lists,
@@ -60,7 +58,7 @@ READERS = {  #: functions that read files, by module and name, with the campaign
     "simulation.disturbances.read_steps": "steps",
     "simulation.trajectory.load": "runs",
     "simulation.trajectory.read_run_file": "runs",
-    "tools.archive.read_archive": "checkpoints",
+    "tools.archive.read_archive": "charts",
     "tools.files.read_table": "paths",
     "tools.files.read_list": "lists",
     "viewer.looks.urdf_look": "robots",

@@ -73,7 +73,7 @@ _VALUES: dict[str, tuple[str, ...]] = {
     "--like": ("swivel", "q1", "nothing", ""),
     **dict.fromkeys(("--share", "--margin-deg"), (*NUMBERS, "0.001")),
     **dict.fromkeys(("--splits", "--degree"), _COUNTS),
-    **dict.fromkeys(("--out", "--checkpoint"), ("out", "out/x/y", ".", "", "chart.orthocas", "/dev/null/x", "x" * 300)),
+    "--out": ("out", "out/x/y", ".", "", "chart.orthocas", "/dev/null/x", "x" * 300),
     **dict.fromkeys(("--coupling", "--damping", "--animation"), ("coupled", "square_root", "none", "mp5", "")),
     "--task": ("position:x", "position", "polar", "axis:z", "axis:w", "pose:z", "position:xx", "position+axis", ""),
     "--metric": ("euclidean", "inertia", "identity"),
@@ -115,7 +115,7 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
         {"--param": "polynomial:1", "--samples": "30", "--out": "new.orthocas"},
         (
             *(*_PROBLEM_OPTIONS, *_DOMAIN_OPTIONS, *_AUTO_OPTIONS),
-            *("--solver", "--seed", "--weights", "--max-mutual-deg", "--checkpoint"),
+            *("--solver", "--seed", "--weights", "--max-mutual-deg"),
         ),
     ),
     "fit --domain auto": (

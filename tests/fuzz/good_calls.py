@@ -249,7 +249,6 @@ def _functions() -> dict[str, Call]:
                 "weights": (10, 1, 1),
                 "samples": 50,
                 "seed": 0,
-                "checkpoint": None,
                 "precision": "single",
             },
         ),
