@@ -45,7 +45,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
 
     Args:
         out: folder for the picture.
-        quick: coordinates of degree 1, and fewer samples.
+        quick: coordinates of degree 2, and fewer samples.
 
     Returns:
         Seconds of the fit, leak and least conditioning, and of the motion: how far the hand is off at most and at its
@@ -56,7 +56,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     home = np.concatenate([np.zeros(6), ARM])
     problem = oc.Problem(robot, oc.Task.position(robot), "inertia", oc.Box(home, HALF_WIDTH, unbounded=range(6)))
     began = time.process_time()
-    chart = oc.fit(problem, oc.Polynomial(1 if quick else 3)).chart
+    chart = oc.fit(problem, oc.Polynomial(2 if quick else 3)).chart
     seconds = time.process_time() - began
     report = oc.evaluate(chart, samples=2_000 if quick else 20_000)
     assert report.without_idle is not None

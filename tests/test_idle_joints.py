@@ -10,6 +10,7 @@ import pytest
 from conftest import Run, robot_data
 
 import orthocas as oc
+from orthocas.errors import BranchWarning
 from orthocas.fitting.probe import Bounds, Verdict
 from orthocas.tasks.samples import NEGLIGIBLE
 
@@ -59,8 +60,10 @@ def test_coarser_angles_are_no_rounding(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_wide_fit_is_the_joint_itself_on_all_of_its_side_of_the_branch(robot: oc.Robot) -> None:
     """Polynomials in all joints leaked by 60 deg. Along xi, position and axis stay, by the kinematics alone."""
-    fit = oc.fit_wide(robot, oc.Task.named(robot, TASK))
-    assert (fit.idle_joints, fit.regular_share) == (("wrist_3_joint",), 1.0)
+    with pytest.warns(BranchWarning, match="singular positions divide it, so the chart has one side"):
+        fit = oc.fit_wide(robot, oc.Task.named(robot, TASK))
+    assert fit.idle_joints == ("wrist_3_joint",)
+    assert 0.4 < fit.regular_share < 0.6
     assert oc.evaluate(fit.chart, 500).leak.rms < np.degrees(10 * NEGLIGIBLE)
     q = fit.chart.problem.domain.centre
     moved = fit.chart.inverse(fit.chart.phi(q) + 0.5 * np.eye(6)[5], q)

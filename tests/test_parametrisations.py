@@ -11,7 +11,7 @@ import orthocas as oc
 from orthocas.bases import JointSpace, ProductFamily, component_gradients, parse_parametrisation
 from orthocas.charts.coordinates import point_functions
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError, UnknownNameError
-from orthocas.fitting.basis_gradients import BasisGradients, BoxGradients, ProductGradients, SparseGradients
+from orthocas.fitting.basis_gradients import BasisGradients, ProductGradients, SparseGradients
 from orthocas.tools.columns import COLUMNS, by_sample
 
 SPACE = JointSpace(np.array([0.1, -0.3, 0.2]), np.array([0.5, 0.7, 0.4]), (False, False, False), ("a", "b", "c"))
@@ -185,24 +185,6 @@ def test_products_with_basis_gradients_are_those_with_all_entries(
     assert some.dtype == np.float32
     np.testing.assert_allclose(some, G[::4][:, :, kept], rtol=1e-6, atol=1e-6)
     assert gradients.dense(X[:1, :, :, :0], 0).shape == (0, 3, family.width)  # no hinge of a fold acts
-
-
-def test_box_gradients_are_those_of_the_cube_in_other_units() -> None:
-    names, half_width = ("a", "b", "c"), np.array([0.5, 0.2, 0.8])
-    cube = JointSpace(np.zeros(3), np.ones(3), (False,) * 3, names)
-    box = JointSpace(np.zeros(3), half_width, (False,) * 3, names)
-    u, rng = np.random.default_rng(5).uniform(-1, 1, (40, 3)), np.random.default_rng(6)
-    on_cube = ProductGradients(oc.Polynomial(3).family(cube, 2), 3)
-    known = on_cube.at(u)
-    ours = BoxGradients(on_cube, half_width, u, known)
-    assert ours.at(u) is known
-    theirs = ProductGradients(oc.Polynomial(3).family(box, 2), 3)
-    X, C = theirs.at(u * half_width), rng.normal(size=(2, on_cube.family.width))
-    np.testing.assert_allclose(ours.dense(known, 40), theirs.dense(X, 40), atol=1e-12)
-    np.testing.assert_allclose(ours.table(C) @ known, theirs.table(C) @ X, atol=1e-12)
-    slopes = rng.normal(size=(6, COLUMNS))
-    pulled = [form.collected(slopes @ Y[0].transpose(0, 2, 1)) for form, Y in ((ours, known), (theirs, X))]
-    np.testing.assert_allclose(*pulled, atol=1e-11)
 
 
 def test_linear_normals_of_the_paper() -> None:
