@@ -21,6 +21,7 @@ from orthocas.tools.display import percent
 
 REPEATS = 3
 TICKS = 100  # of the stream in C, timed together
+ITERATIONS = 100  # at most, of a call in C
 
 
 def main(quick: bool = False) -> dict[str, float]:
@@ -115,7 +116,7 @@ def in_c(compiled: CompiledInverse, path: Any, q: Any) -> float:
     for first in [*range(0, len(targets) - TICKS + 1, TICKS)] * REPEATS:
         arrays = [ctypes.c_void_p(array[first:].ctypes.data) for array in (targets, starts, results)]
         begin = time.perf_counter()
-        run(ctypes.c_long(TICKS), *arrays[:2], None, arrays[2], None, None)
+        run(ctypes.c_long(TICKS), ctypes.c_int(ITERATIONS), *arrays[:2], None, arrays[2], None, None)
         seconds.append((time.perf_counter() - begin) / TICKS)
     known = slice(len(targets) // TICKS * TICKS)
     np.testing.assert_allclose(results[known], q[1:][known], atol=1e-9)
