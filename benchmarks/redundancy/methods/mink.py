@@ -25,7 +25,7 @@ class Mink:
         self.frame = mink.FrameTask("tip", "body", position_cost=1.0, orientation_cost=1.0, lm_damping=lm_damping)
         self.posture = mink.PostureTask(self.model, cost=self.cost)
         self.tasks = [self.frame, self.posture] if self.cost else [self.frame]
-        fastest = {f"joint{i}": limit for i, limit in enumerate(arm.fastest) if np.isfinite(limit)}
+        fastest = {name: limit for name, limit in zip(arm.joints, arm.fastest, strict=True) if np.isfinite(limit)}
         self.limits = [mink.ConfigurationLimit(self.model), mink.VelocityLimit(self.model, fastest)]
 
     def start(self, q: Array, path: Sequence[Target] | None) -> None:
