@@ -101,6 +101,14 @@ def test_the_checker_of_gymnasium_accepts_it() -> None:
     np.testing.assert_array_equal(first, env.reset(seed=3)[0])
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_the_checker_of_stable_baselines_accepts_it() -> None:
+    """Where it is installed: it brings several gigabytes of torch, so the extras do not ask for it."""
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    chart = oc.fit(oc.problems.get("planar_3r_xy"), oc.Polynomial(2), samples=300).chart
+    checker.check_env(learn.PhiActions(Arm(chart), chart, PAGE))
+
+
 @pytest.mark.slow
 def test_an_action_moves_one_coordinate_with_the_tool_at_rest() -> None:
     """Against MuJoCo's kinematics; observations are those of the environment with xi and the room to the boundary."""
