@@ -14,6 +14,7 @@ from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.columns import BlockedFunction
+from orthocas.tools.expressions import shortest
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,8 +242,7 @@ class CurveTracer:
 
 def without_turns(difference: Array, turning: NDArray[np.bool_]) -> Array:
     """Differences of joint positions (..., n) without full turns of revolute joints."""
-    turns = 2 * np.pi * np.round(difference / (2 * np.pi))
-    return np.asarray(np.where(turning, difference - turns, difference), dtype=float)
+    return np.asarray(shortest(difference, 2 * np.pi * turning), dtype=float)
 
 
 def solutions_of(A: Array, right: Array) -> Array:

@@ -16,6 +16,7 @@ from orthocas.tasks.domains import StopKind, bounds_of, contains
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, Indices, as_number, as_point, frozen_array, require_count
 from orthocas.tools.display import Shown, listed, number_list
+from orthocas.tools.expressions import shortest
 
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
@@ -97,9 +98,7 @@ class Walls:
 
     def gap(self, q: Array, start: Array) -> Array:
         """q - start (n,), up to full turns of unbounded revolute joints."""
-        difference = q - start
-        turns = 2 * np.pi * np.round(difference / (2 * np.pi))
-        return np.where(self.turning, difference - turns, difference)
+        return np.asarray(shortest(q - start, 2 * np.pi * self.turning))
 
 
 Signs = Callable[[Array, Array], float]  #: q and tangent -> a number that turns negative at a fold

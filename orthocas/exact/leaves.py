@@ -18,7 +18,7 @@ from orthocas.tasks.problem import Problem, task_jacobians
 from orthocas.tasks.samples import samples_at
 from orthocas.tools.cached import building, cached_property
 from orthocas.tools.checks import Array, Indices, frozen_array, frozen_indices, require_known, require_memory
-from orthocas.tools.expressions import determinant
+from orthocas.tools.expressions import determinant, shortest
 from orthocas.tools.interrupts import deferred
 
 _ON_LEAF = 1e-6  # [rad] or [m]
@@ -98,7 +98,7 @@ def turning_joints(problem: Problem) -> NDArray[np.bool_]:
 
 def without_turns(problem: Problem, differences: Array) -> Array:
     """Differences of joint positions, (..., n), with angles within half a turn of 0."""
-    return np.asarray(differences - 2 * np.pi * np.round(differences / (2 * np.pi)) * turning_joints(problem))
+    return np.asarray(shortest(differences, 2 * np.pi * turning_joints(problem)))
 
 
 def covers(region: Box, points: Array) -> NDArray[np.bool_]:
