@@ -1,5 +1,6 @@
 """Joints that turn without end: sensors that wrap, targets inside the range of xi, and arms that turn for long."""
 
+import pickle
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -219,6 +220,7 @@ def test_a_path_around_a_turn_says_what_it_leaves_over(chart: oc.Chart, axis: st
     assert motion.kind.startswith("path around a turn: x and xi end where they began, joint 'j")
     assert chart.left_over(HOME, tracker.q) == pytest.approx(apart, abs=1e-6)
     assert tracker.left_over == pytest.approx(apart, abs=1e-6)
+    assert pickle.loads(pickle.dumps(tracker)).left_over == pytest.approx(apart, abs=1e-6)
     tracker.step(np.r_[path[-2], chart.xi(HOME)])
     assert tracker.left_over is None
 

@@ -242,7 +242,7 @@ class CurveTracer:
 
 def without_turns(difference: Array, turning: NDArray[np.bool_]) -> Array:
     """Differences of joint positions (..., n) without full turns of revolute joints."""
-    return np.asarray(shortest(difference, 2 * np.pi * turning), dtype=float)
+    return np.asarray(shortest(difference, np.where(turning, 2 * np.pi, 0.0)))
 
 
 def solutions_of(A: Array, right: Array) -> Array:

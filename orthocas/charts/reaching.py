@@ -1,7 +1,7 @@
 """Trackers that go as near as they can where phi is out of reach."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -76,13 +76,14 @@ class ReachingTracker(Tracker):
         self._width, ends = domain.half_width, reach(domain) - RULES.joint_room * domain.half_width
         self._low, self._high = domain.centre - ends, domain.centre + ends
 
-    def __getstate__(self) -> dict[str, object]:
+    def __getstate__(self) -> dict[str, Any]:
         """Without scratch memory."""
         return {**super().__getstate__(), "near": self._parts, "m": self._m}
 
-    def __setstate__(self, state: dict[str, object]) -> None:
+    def __setstate__(self, state: dict[str, Any]) -> None:
         names = ("functions", "domain", "q", "limit", "near", "m")
         self.__init__(*(state[name] for name in names))  # type: ignore[misc]
+        self._start = state["start"]
 
     def step(self, phi: ArrayLike) -> Array:
         """As `Tracker.step`; where that stays, the nearest q (n,) that a descent from the last one finds."""

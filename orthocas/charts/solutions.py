@@ -176,10 +176,12 @@ class Tracker(Shown):
 
     def __getstate__(self) -> dict[str, Any]:
         """Without scratch memory."""
-        return {"functions": self._functions, "domain": self._domain, "q": self.q, "limit": self._limit}
+        parts = {"functions": self._functions, "domain": self._domain, "q": self.q, "limit": self._limit}
+        return {**parts, "start": self._start}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(state["functions"], state["domain"], state["q"], state["limit"])  # type: ignore[misc]
+        self._start = state["start"]
 
     @property
     def q(self) -> Array:

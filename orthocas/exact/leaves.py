@@ -98,7 +98,7 @@ def turning_joints(problem: Problem) -> NDArray[np.bool_]:
 
 def without_turns(problem: Problem, differences: Array) -> Array:
     """Differences of joint positions, (..., n), with angles within half a turn of 0."""
-    return np.asarray(shortest(differences, 2 * np.pi * turning_joints(problem)))
+    return np.asarray(shortest(differences, np.where(turning_joints(problem), 2 * np.pi, 0.0)))
 
 
 def covers(region: Box, points: Array) -> NDArray[np.bool_]:
