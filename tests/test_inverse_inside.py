@@ -2,14 +2,15 @@
 
 from itertools import product
 
+import casadi as ca
 import numpy as np
 from charts import beyond_domain
 from public_objects import clear
 
 import orthocas as oc
-from orthocas.charts.inside import Programs, minimum
+from orthocas.charts.descent import Programs, solve_programs
 from orthocas.fitting.fit import Fit
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.domains import bounds_of, sample_uniform
 
 FOUND, NEAREST = oc.InverseStatus.FOUND, oc.InverseStatus.NEAREST
 
@@ -28,7 +29,7 @@ def test_inside_gives_the_nearest_coordinates_that_keep_the_task(planar_arm: oc.
         inner = self_motion(planar_arm, phi[k, :2])
         if solutions.status[k] == NEAREST:
             least = np.abs(planar_arm.xi(inner) - phi[k, 2]).min() if len(inner) else np.inf
-            assert solutions.distance[k] <= least + 1e-7  # Ipopt stays a little off the boundary
+            assert solutions.distance[k] <= least + 1e-9
         else:
             assert len(inner) == 0
 
@@ -61,7 +62,7 @@ def test_inside_keeps_clear_of_singular_positions() -> None:
     assert chart.problem.domain.contains(solutions.q[kept]).all()
 
 
-def test_the_search_for_all_rows_agrees_with_ipopt(iiwa_fit: Fit) -> None:
+def test_descents_end_as_near_as_ipopt(iiwa_fit: Fit) -> None:
     """From the same starts, both end at the same distance; Ipopt stays a little off the boundary."""
     chart = iiwa_fit.chart
     phi = chart.phi(beyond_domain(chart, 60, 1.3))
@@ -70,27 +71,41 @@ def test_the_search_for_all_rows_agrees_with_ipopt(iiwa_fit: Fit) -> None:
     q, in_reach = inside.with_task(phi, np.tile(chart.problem.domain.centre, (60, 1)))
     assert 20 < in_reach.sum() < 60
     phi, q = phi[in_reach], q[in_reach]
-    mine, theirs = inside.nearest(phi, q), inside.by_ipopt.search(phi, q)
-    for found in (mine, theirs):
-        assert inside.by_ipopt.keeps_task(phi, found, 1e-9).all()
+    mine, theirs = inside.nearer(phi, q), by_ipopt(chart, phi, q)
+    assert chart.problem.domain.contains(mine).all()
+    np.testing.assert_allclose(chart.task(mine), phi[:, : chart.m], atol=1e-9)
     away, theirs_away = (np.linalg.norm(chart.xi(found) - phi[:, chart.m :], axis=1) for found in (mine, theirs))
     np.testing.assert_allclose(away, theirs_away, atol=1e-6)
 
 
-def test_boxed_programs_have_the_least_of_all_active_sets() -> None:
+def by_ipopt(chart: oc.Chart, phi: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Where Ipopt ends from starts (N, n) with the task values kept."""
+    low, high = bounds_of(chart.problem.domain)
+    q, target = ca.MX.sym("q", chart.n), ca.MX.sym("phi", chart.n)
+    error = chart.function("phi")(q) - target
+    program = {"x": q, "p": target, "f": ca.sumsqr(error[chart.m :]) / 2, "g": error[: chart.m]}
+    options = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-9}
+    solver = ca.nlpsol("nearest", "ipopt", program, options)
+    found = [
+        solver(x0=start, p=value, lbx=low, ubx=high, lbg=0, ubg=0)["x"]
+        for start, value in zip(starts, phi, strict=True)
+    ]
+    return np.clip(np.array(ca.horzcat(*found)).T, low, high)
+
+
+def test_bounded_programs_have_the_least_of_all_active_sets() -> None:
     """With 4 variables there are 81 guesses which bounds hold; the least allowed value is the minimum."""
     rng, n = np.random.default_rng(3), 4
     root = rng.standard_normal((50, n, n))
     A = rng.standard_normal((50, 1, n))
     H, g, high = root @ root.transpose(0, 2, 1), 3 * rng.standard_normal((50, n)), rng.uniform(0, 1, (50, n))
-    programs = Programs(H, g, A, -rng.uniform(0, 1, (50, n)), high)
-    found = minimum(programs, *np.zeros((2, 50, n), dtype=bool))
-    assert found.solved.mean() >= 0.98
-    for k in np.flatnonzero(found.solved):
+    programs = Programs(H, g, A, -rng.uniform(0, 1, (50, n)), high, np.zeros((50, 0, n)))
+    d, _, solved = solve_programs(programs, np.zeros((50, n), dtype=np.int8))
+    assert solved.mean() >= 0.98
+    for k in np.flatnonzero(solved):
         values = [value(programs, k, np.array(held)) for held in product((-1, 0, 1), repeat=n)]
-        d = found.d[k]
-        assert abs(A[k] @ d) < 1e-9
-        assert np.isclose(d @ programs.H[k] @ d / 2 + programs.g[k] @ d, min(values), atol=1e-9)
+        assert abs(A[k] @ d[k]) < 1e-9
+        assert np.isclose(d[k] @ programs.H[k] @ d[k] / 2 + programs.g[k] @ d[k], min(values), atol=1e-9)
 
 
 def value(programs: Programs, k: int, held: np.ndarray) -> float:

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.charts.in_domain import BoxedPhi
+from orthocas.charts.descent import BoxedPhi
 from orthocas.charts.newton import inverses
 from orthocas.tasks.domains import bounds_of
 from orthocas.tasks.relative import Relative

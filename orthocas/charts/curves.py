@@ -9,16 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.charts.curve_tracer import RULES, CurveTracer, Traces, solutions_of, without_turns
-from orthocas.charts.in_domain import BoxedPhi
+from orthocas.charts.descent import BoxedPhi
 from orthocas.charts.newton import Starts
 from orthocas.charts.phi import largest
-from orthocas.tasks.domains import bounds_of, sample_uniform
+from orthocas.tasks.domains import bounds_of
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.expressions import shortest
 
 _AT_ONCE = 2048  # rows whose curves are held in memory
-_PROBES, _SAME = 32, 1e-9  # positions at which turns are tried, and change of xi that is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,16 +88,6 @@ class SelfMotionCurves:
                     ends = ends.joined(self._search_from(targets, rows, starts[:, rows], own, traced, tolerance, best))
             self._take_ends(targets, ends, best)
         return best
-
-    @cached_property
-    def winding(self) -> NDArray[np.bool_]:
-        """Joints without boundaries whose full turns change xi, (n,)."""
-        q = sample_uniform(self.boxed.domain, _PROBES, 0)
-        turned = q + 2 * np.pi * np.eye(q.shape[1])[:, None]
-        here, there = self.xi(q), self.xi(turned.reshape(-1, q.shape[1])).reshape(-1, len(q), 1)
-        moved = np.abs(shortest(there - here, self.boxed.phi_map.difference.turns[self.boxed.m :])).max(axis=(1, 2))
-        free = self.tracer.turning & ~np.isfinite(bounds_of(self.boxed.domain)[0])
-        return np.asarray(free & (moved > _SAME))
 
     def stages(self, targets: Array, own: Array) -> tuple[Array, Array]:
         """The caller's starts and stored positions near phi and near x, and more of these, (S, N, n) each."""
@@ -261,13 +250,13 @@ class SelfMotionCurves:
         """
         low, high = bounds_of(self.boxed.domain)
         turn, room, bounded = 2 * np.pi, RULES.step, np.isfinite(low)
-        low = np.where(bounded, low - room, own - np.where(self.winding, 3 * np.pi, np.pi))[:, None]
+        low = np.where(bounded, low - room, own - np.where(self.boxed.winding, 3 * np.pi, np.pi))[:, None]
         high = np.where(bounded, high + room, np.inf)
         first = np.where(self.tracer.turning, np.ceil((low - traces.q) / turn), 0.0)
         at = traces.q + turn * first
         passed = np.ones(at.shape[:2], dtype=bool)
         passed[:, 1:] = (first[:, 1:] != first[:, :-1]).any(axis=2)
-        width = np.where(bounded, (high - low[0, 0]) // turn, np.where(self.winding, 2, 0))
+        width = np.where(bounded, (high - low[0, 0]) // turn, np.where(self.boxed.winding, 2, 0))
         choices = [range(1 + int(k)) for k in np.where(self.tracer.turning, width, 0)]
         near = [
             [(at[:, :, j] >= low[:, :, j]) & (at[:, :, j] <= high[j] - turn * k) for k in choices[j]]

@@ -117,7 +117,7 @@ class Inverse:
             if self.curves is not None:
                 self._search_curves(self.curves, self.inside, targets, best, own, tolerance)
             else:
-                self._search_inside(self.inside, targets, best, tolerance)
+                self._search_inside(self.inside, targets, best, own, tolerance)
         elif starts is None:
             if self.curves is None:
                 self._restart(targets, best, self._open(best), _FIRST, InverseStatus.FOUND, tolerance)
@@ -196,15 +196,14 @@ class Inverse:
         self._replace(targets, best, rows[has], near.q[has], tolerance)
         return np.asarray(rows[~has], dtype=np.int64)
 
-    def _search_inside(self, inside: Inside, targets: Array, best: Found, tolerance: float) -> None:
+    def _search_inside(self, inside: Inside, targets: Array, best: Found, own: Array, tolerance: float) -> None:
         """Replace what is not found by other solutions, or the nearest coordinates, inside the domain."""
-        self._search_domain(targets, best, self._open(best), tolerance)
         rows = np.flatnonzero(best.status != InverseStatus.FOUND)
-        q, in_reach = inside.with_task(targets[rows], best.q[rows])
-        self._replace(targets, best, rows[~in_reach], q[~in_reach], tolerance)
-        rows, q = rows[in_reach], q[in_reach]
-        moved = np.isin(best.status[rows], _MOVED)
-        self._replace(targets, best, rows[moved], inside.nearest(targets[rows[moved]], q[moved]), tolerance)
+        q, distance = inside.nearest(targets[rows], own[rows])
+        has = np.isfinite(distance)
+        self._replace(targets, best, rows[has], q[has], tolerance)
+        missing = rows[~has]
+        self._replace(targets, best, missing, inside.with_task(targets[missing], best.q[missing])[0], tolerance)
 
     def _replace(self, targets: Array, best: Found, rows: Indices, q: Array, tolerance: float) -> None:
         """Put points of the box into some rows, with their status; singular solutions stay."""

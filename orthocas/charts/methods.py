@@ -9,8 +9,9 @@ from numpy.typing import ArrayLike
 from orthocas.charts.continuation import Continuation
 from orthocas.charts.coordinates import Coordinates, InvertibleMap
 from orthocas.charts.curves import SelfMotionCurves
-from orthocas.charts.in_domain import BoxedPhi, Cells, InDomain
-from orthocas.charts.inside import Inside, Nearest
+from orthocas.charts.descent import BoxedPhi
+from orthocas.charts.in_domain import Cells, InDomain
+from orthocas.charts.inside import Inside
 from orthocas.charts.inverse import Inverse
 from orthocas.charts.newton import (
     BRIEF,
@@ -323,8 +324,7 @@ class InverseMethods(PhiFunctions):
             return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map), starts)
         boxed = BoxedPhi(self.problem.task, domain, phi_map)
         local, brief = (FewRows(phi_map, self._point_functions, Newton(phi_map, k)) for k in (HALVINGS, BRIEF))
-        by_ipopt = Nearest(domain, self.m, self.function("phi"), phi_map)
-        in_domain, inside = InDomain(boxed, Cells(boxed)), Inside(boxed, starts, by_ipopt)
+        in_domain, inside = InDomain(boxed, Cells(boxed)), Inside(boxed, starts)
         curves = SelfMotionCurves(boxed, starts, self.xi) if self.r == 1 else None
         return Inverse(self.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves, brief)
 

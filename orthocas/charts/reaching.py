@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from orthocas.charts.descent import least, rooms_of
 from orthocas.charts.newton import Bound, PointFunctions
 from orthocas.charts.phi import PhiMap
 from orthocas.charts.solutions import Tracker, TrackerStatus
@@ -175,49 +176,6 @@ class _Look(NamedTuple):
     slopes: Array  #: d rooms/dq, (k, n); 0 where undefined
 
 
-def least(H: Array, g: Array, rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """The d (n,) with the least g d + d H d / 2 of those with low <= rows d <= high, by a primal active set from d = 0.
-
-    Args:
-        H: (n, n), positive definite.
-        g: (n,).
-        rows: (k, n).
-        low: (k,) <= 0, or minus infinity.
-        high: (k,) >= 0, or infinity.
-
-    Returns:
-        d, and which rows are held, (k,): -1 at low, 1 at high, 0 for none. If rounds run out, d is feasible, and lower
-        than 0, but not the least.
-    """
-    n, k = len(g), len(rows)
-    d, held = np.zeros(n), np.zeros(k)
-    K = np.zeros((n + k, n + k))
-    K[:n, :n] = H
-    for _ in range(2 * k):
-        on = held != 0
-        K[:n, n:], K[n:, :n], K[n:, n:] = -rows.T * on, rows * on[:, None], np.diag(~on)
-        try:
-            solution = np.linalg.solve(K, np.concatenate([-(g + H @ d), np.zeros(k)]))
-        except np.linalg.LinAlgError:
-            break
-        way, multipliers = solution[:n], solution[n:]
-        along = rows @ way
-        moving = ~on & (np.abs(along) > RULES.still)
-        shares = np.full(k, np.inf)
-        shares[moving] = (np.where(along < 0, low, high) - rows @ d)[moving] / along[moving]
-        first = int(np.argmin(shares))
-        d = d + min(1.0, max(0.0, float(shares[first]))) * way
-        if shares[first] < 1:
-            held[first] = np.sign(along[first])
-            continue
-        wrong = multipliers * held
-        worst = int(np.argmax(wrong))
-        if wrong[worst] <= 0:
-            break
-        held[worst] = 0.0
-    return d, held
-
-
 def near_function(phi: ca.Function, rates: ca.Function, m: int, known: PhiMap, domain: Domain) -> ca.Function:
     """What `ReachingTracker` has to know of a position.
 
@@ -234,34 +192,6 @@ def near_function(phi: ca.Function, rates: ca.Function, m: int, known: PhiMap, d
     e, J = -known.difference(target, phi(q)), rates(q)
     if relative is not None:  # rates are those of an orientation that is reached
         J = ca.vertcat(relative.error(q, target[:m])[1], J[m:, :])
-    rooms = _rooms(domain, q)
+    rooms = rooms_of(domain, q)
     outputs = [e * weights, J * ca.repmat(weights, 1, n), rooms, ca.jacobian(rooms, q)]
     return dense_function("near", [q, target], outputs, ["q", "phi"])
-
-
-def _rooms(domain: Domain, q: ca.MX) -> ca.MX:
-    """Smooth numbers (k, 1) that are positive just inside the conditions of a domain, and grow from 0 at their ends."""
-    clear = domain.singular_bound
-    if clear is None:
-        return ca.MX(0, 1) if domain.condition is None else domain.condition.pivots(q)
-    rooms = _clearance(clear.gram(q), clear.least_singular_value)
-    return rooms if domain.room_to_fold is None else ca.vertcat(rooms, domain.room_to_fold(q))
-
-
-def _clearance(gram: ca.MX, bound: float) -> ca.MX:
-    """The product of 1 - bound^2 / sigma_i^2 over the singular values, which is 0 where the least one is the bound."""
-    m = gram.shape[0]
-    symbol = ca.SX.sym("G", m, m)
-    share = ca.SX(1)
-    for pivot, whole in zip(_pivots(symbol - bound**2 * ca.SX.eye(m)), _pivots(symbol), strict=True):
-        share *= pivot / whole
-    return ca.Function("clearance", [symbol], [ca.cse(share)])(gram)
-
-
-def _pivots(A: ca.SX) -> list[ca.SX]:
-    found = []
-    while True:
-        found.append(A[0, 0])
-        if A.shape[0] == 1:
-            return found
-        A = A[1:, 1:] - A[1:, 0] @ A[0, 1:] / A[0, 0]

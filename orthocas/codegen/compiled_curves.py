@@ -78,7 +78,7 @@ def curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
     arrays = {"low": low, "high": high, "centre": domain.centre, "half_width": domain.half_width}
     lines = [f"#define {name} {value}" for name, value in sizes.items()]
     lines += [f"static const double {name}[N] = {{{numbers(values)}}};" for name, values in arrays.items()]
-    kinds = {"turning": curves.tracer.turning, "bounded": np.isfinite(low), "winding": curves.winding}
+    kinds = {"turning": curves.tracer.turning, "bounded": np.isfinite(low), "winding": curves.boxed.winding}
     lines += [f"static const int {name}[N] = {{{flags(values)}}};" for name, values in kinds.items()]
     head = "#include <math.h>\n#include <stddef.h>\n#include <string.h>"
     return "\n".join([head, kernels.code, *lines, template("curve_rows.c")])
