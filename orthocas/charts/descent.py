@@ -49,7 +49,6 @@ class DescentRules:
     room: float = 1e-9  #: to the conditions of the domain, relative
     probes: int = 32  #: positions at which full turns are tried
     same: float = 1e-9  #: change of xi that is rounding
-    still: float = 1e-13  #: smaller changes of a constraint along a step are rounding
 
 
 RULES = DescentRules()
@@ -277,49 +276,6 @@ def _solve_held(programs: Programs, held: NDArray[np.int8]) -> tuple[Array, NDAr
         short = (programs.slopes @ d[:, :, None])[:, :, 0] < programs.low[:, n:] - RULES.slack
         now[:, n:] = np.where(row, -1 * (solution[:, n + m :] < 0), -1 * short)
     return d, now
-
-
-def least(H: Array, g: Array, rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """The d (n,) with the least g d + d H d / 2 of those with low <= rows d <= high, by a primal active set from d = 0.
-
-    Args:
-        H: (n, n), positive definite.
-        g: (n,).
-        rows: (k, n).
-        low: (k,) <= 0, or minus infinity.
-        high: (k,) >= 0, or infinity.
-
-    Returns:
-        d, and which rows are held, (k,): -1 at low, 1 at high, 0 for none. If rounds run out, d is feasible, and lower
-        than 0, but not the least.
-    """
-    n, k = len(g), len(rows)
-    d, held = np.zeros(n), np.zeros(k)
-    K = np.zeros((n + k, n + k))
-    K[:n, :n] = H
-    for _ in range(2 * k):
-        on = held != 0
-        K[:n, n:], K[n:, :n], K[n:, n:] = -rows.T * on, rows * on[:, None], np.diag(~on)
-        try:
-            solution = np.linalg.solve(K, np.concatenate([-(g + H @ d), np.zeros(k)]))
-        except np.linalg.LinAlgError:
-            break
-        way, multipliers = solution[:n], solution[n:]
-        along = rows @ way
-        moving = ~on & (np.abs(along) > RULES.still)
-        shares = np.full(k, np.inf)
-        shares[moving] = (np.where(along < 0, low, high) - rows @ d)[moving] / along[moving]
-        first = int(np.argmin(shares))
-        d = d + min(1.0, max(0.0, float(shares[first]))) * way
-        if shares[first] < 1:
-            held[first] = np.sign(along[first])
-            continue
-        wrong = multipliers * held
-        worst = int(np.argmax(wrong))
-        if wrong[worst] <= 0:
-            break
-        held[worst] = 0.0
-    return d, held
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.charts.descent import least, rooms_of
+from orthocas.charts.descent import rooms_of
 from orthocas.charts.newton import Bound, PointFunctions
 from orthocas.charts.phi import PhiMap
 from orthocas.charts.solutions import Tracker, TrackerStatus
@@ -174,6 +174,49 @@ class _Look(NamedTuple):
     J: Array  #: de/dq, (n, n)
     rooms: Array  #: of the domain's conditions, (k,), positive inside
     slopes: Array  #: d rooms/dq, (k, n); 0 where undefined
+
+
+def least(H: Array, g: Array, rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """The d (n,) with the least g d + d H d / 2 of those with low <= rows d <= high, by a primal active set from d = 0.
+
+    Args:
+        H: (n, n), positive definite.
+        g: (n,).
+        rows: (k, n).
+        low: (k,) <= 0, or minus infinity.
+        high: (k,) >= 0, or infinity.
+
+    Returns:
+        d, and which rows are held, (k,): -1 at low, 1 at high, 0 for none. If rounds run out, d is feasible, and lower
+        than 0, but not the least.
+    """
+    n, k = len(g), len(rows)
+    d, held = np.zeros(n), np.zeros(k)
+    K = np.zeros((n + k, n + k))
+    K[:n, :n] = H
+    for _ in range(2 * k):
+        on = held != 0
+        K[:n, n:], K[n:, :n], K[n:, n:] = -rows.T * on, rows * on[:, None], np.diag(~on)
+        try:
+            solution = np.linalg.solve(K, np.concatenate([-(g + H @ d), np.zeros(k)]))
+        except np.linalg.LinAlgError:
+            break
+        way, multipliers = solution[:n], solution[n:]
+        along = rows @ way
+        moving = ~on & (np.abs(along) > RULES.still)
+        shares = np.full(k, np.inf)
+        shares[moving] = (np.where(along < 0, low, high) - rows @ d)[moving] / along[moving]
+        first = int(np.argmin(shares))
+        d = d + min(1.0, max(0.0, float(shares[first]))) * way
+        if shares[first] < 1:
+            held[first] = np.sign(along[first])
+            continue
+        wrong = multipliers * held
+        worst = int(np.argmax(wrong))
+        if wrong[worst] <= 0:
+            break
+        held[worst] = 0.0
+    return d, held
 
 
 def near_function(phi: ca.Function, rates: ca.Function, m: int, known: PhiMap, domain: Domain) -> ca.Function:
