@@ -10,8 +10,10 @@ import casadi as ca
 import numpy as np
 from mujoco_arm import Arm
 from public_objects import (
+    HAS_COMPILER,
     circle,
     clear,
+    compiled,
     fitted,
     impedance,
     joint_motion,
@@ -70,6 +72,17 @@ def _searches() -> dict[str, Call]:
         "chart.nearest_xi": (chart.nearest_xi, {"q_wish": q, "x": chart.task(q), "tolerance": 1e-9}),
         "chart_along": (oc.chart_along, {"problem": problem, "postures": [q, q + 0.1], "radius": 0.2}),
         "compile_inverse": (oc.compile_inverse, {"chart": chart, "folder": "kept"}),
+        **(
+            {
+                "CompiledInverse.solve": (compiled().solve, {"phi": compiled().chart.phi(q), "tolerance": 1e-9}),
+                "CompiledInverse.nearest_xi": (
+                    compiled().nearest_xi,
+                    {"q_wish": q, "x": compiled().chart.task(q), "tolerance": 1e-9},
+                ),
+            }
+            if HAS_COMPILER
+            else {}
+        ),
         "progress": (lambda monitor: oc.fit(problem, oc.Linear(), samples=50, monitor=monitor), {"monitor": None}),
         "register_domain": (oc.register_domain, {"kind": oc.Box}),
         "register_metric": (oc.register_metric, {"name": "euclidean", "build": None}),
@@ -426,6 +439,10 @@ def _control() -> dict[str, Call]:
         ),
         "Remembering.tick": (
             control.Remembering(control.PDPlus(chart, 50.0, limit=9.0, remembers=control.Adaptation())).tick,
+            {"q": centre, "dq": 0 * centre, "reference": np.zeros((3, 3)), "period": 1e-3},
+        ),
+        "Remembering.tick without a memory": (
+            control.Remembering(control.PDPlus(chart, 50.0, limit=9.0)).tick,
             {"q": centre, "dq": 0 * centre, "reference": np.zeros((3, 3)), "period": 1e-3},
         ),
         "XiTask": (control.XiTask, {"chart": chart, "cost": 1.0, "gain": 0.5, "lm_damping": 0.1}),

@@ -1,6 +1,7 @@
 """One of every public object, small and quick to build, and the numbers that tell whether two of them are equal."""
 
 import copy
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass, replace
 from enum import Enum
@@ -15,6 +16,7 @@ import numpy as np
 
 import orthocas as oc
 from orthocas import control, problems, solvers
+from orthocas.codegen.compiled_inverse import CompiledInverse
 from orthocas.control import Controller, Reference
 from orthocas.fitting.compare import Comparison
 from orthocas.fitting.fit import ClearPart, Fit
@@ -83,6 +85,16 @@ def clear() -> oc.Chart:
     known = problems.get("planar_3r_xy")
     problem = oc.Problem(known.robot, known.task, domain=known.domain, least_singular_value=0.1)
     return oc.fit(problem, oc.Polynomial(2), samples=300).chart
+
+
+HAS_COMPILER = any(shutil.which(name) for name in ("gcc", "clang", "cc"))
+_LIBRARIES = TemporaryDirectory()  # until this process ends: copies in others load from it
+
+
+@cache
+def compiled() -> Any:
+    """The inverse of a chart with r = 1 and a condition in compiled C."""
+    return oc.compile_inverse(clear(), _LIBRARIES.name)
 
 
 BENT = oc.Box([0.0, 1.3, 1.3], [3.0, 1.2, 1.2])
@@ -224,6 +236,8 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "run-time model": run_time_model,
     "momentum observer": control.MomentumObserver,
     "law in ticks": lambda: control.Remembering(CONTROLLERS["PD+ with a memory"]()),
+    "law without a memory in ticks": lambda: control.Remembering(CONTROLLERS["PD+"]()),
+    **({"compiled inverse": compiled} if HAS_COMPILER else {}),
     "safety": lambda: control.Safety.of(impedance(), fade_in=0.1),
     "modes": lambda: impedance().modes(),
     "custom task": lambda: with_idle_joint().problem.task,
@@ -347,6 +361,14 @@ def _of_chart(chart: oc.Chart) -> Iterator[Any]:
     yield chart.inverse(phi[known], q[known] + 1e-3)
     if not isinstance(chart, oc.GrownChart):
         yield from (np.asarray(chart.function(name)(q[0])) for name in ("xi", "phi", "jacobian"))
+
+
+@_numbers.register
+def _of_compiled(inverse: CompiledInverse) -> Iterator[Any]:
+    q = points_of(inverse.chart)
+    x, wishes = inverse.chart.task(q), q[::-1] + 2.0
+    for solutions in (inverse.solve(inverse.chart.phi(q)), inverse.nearest_xi(wishes, x)):
+        yield from (solutions.q, solutions.status)
 
 
 @_numbers.register

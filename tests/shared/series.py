@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from public_objects import circle, disk, fitted, impedance, network, points_of, states_of
+from public_objects import HAS_COMPILER, circle, compiled, disk, fitted, impedance, network, points_of, states_of
 
 import orthocas as oc
 from orthocas.control import Controller
@@ -45,10 +45,19 @@ def calls_of_law(law: Controller) -> list[Call]:
     return [command]
 
 
+def calls_of_compiled() -> list[Call]:
+    """Both searches of a compiled inverse: near starts, and along self-motion curves."""
+    inverse = copy.deepcopy(compiled())
+    q = points_of(inverse.chart)
+    phi, x = inverse.chart.phi(q), inverse.chart.task(q)
+    return [lambda k: inverse.solve(phi[k % 6 :]).q, lambda k: inverse.nearest_xi(q[::-1] + 2.0, x[k % 6]).q]
+
+
 SERIES: dict[str, tuple[Callable[[], list[Call]], int]] = {  #: of 5,000 calls
     "polynomial": (lambda: calls_of_chart(copy.deepcopy(fitted().chart)), 2400),
     "network": (lambda: calls_of_chart(copy.deepcopy(network())), 1200),
     "circle": (lambda: calls_of_chart(copy.deepcopy(circle())), 60),
     "disk": (lambda: calls_of_chart(copy.deepcopy(disk())), 40),
+    **({"compiled inverse": (calls_of_compiled, 200)} if HAS_COMPILER else {}),
     "law": (lambda: calls_of_law(copy.deepcopy(impedance())), 1300),
 }
