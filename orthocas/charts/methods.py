@@ -24,7 +24,7 @@ from orthocas.charts.newton import (
     Starts,
     inverse_function,
 )
-from orthocas.charts.phi import Differences, PhiFunctions, PhiMap
+from orthocas.charts.phi import Differences, PhiFunctions, PhiMap, leave_over
 from orthocas.charts.reaching import ReachingTracker, near_function
 from orthocas.charts.solutions import Solutions, Tracker
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, units_hint
@@ -267,7 +267,7 @@ class InverseMethods(PhiFunctions):
         """
         start, end = as_point("q_start", q_start, self.n), as_point("q", q, self.n)
         apart = self.phi_map.difference(self.phi(end), self.phi(start)) / self.phi_sizes
-        return None if np.abs(apart).max() > tolerance else np.asarray(self.problem.unwrap(end, start) - start)
+        return leave_over(float(np.abs(apart).max()), tolerance, end - start, self.problem.turning)
 
     @cached_property
     def turn_shifts(self) -> dict[str, Array]:

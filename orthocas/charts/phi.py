@@ -20,6 +20,16 @@ ROUNDING = 1e-5  #: of phi: 1e-9 of it are 45 units in the last place
 _SINGULAR = 1e-8  # ratio of singular values of J below which the inverse map fails
 
 
+def leave_over(apart: float, tolerance: float, change: Array, turning: tuple[int, ...]) -> Array | None:
+    """What a loop leaves over in the joints: their change (n,), less full turns of those that turn without end.
+
+    None if phi at its ends differs by more than the tolerance, relative to the sizes of the components.
+    """
+    turns = np.zeros(len(change))
+    turns[list(turning)] = 2 * np.pi
+    return None if apart > tolerance else np.asarray(shortest(change, turns))
+
+
 def counted_on(rows: Array, turns: Array) -> Array:
     """Rows (N, k) of values along a curve; periodic ones go on by the shorter way from row to row."""
     if not turns.any():

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocas.charts.newton import GOAL, REFRESHES, Bound, PointFunctions, PointSolver
+from orthocas.charts.phi import leave_over
 from orthocas.errors import InvalidValueError, InverseError, degrees_hint
 from orthocas.tasks.domains import Domain, bounds_of, contains, reach
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, Indices, as_float_array, as_point, require_shape
 from orthocas.tools.display import Shown, listed, number_list
-from orthocas.tools.expressions import shortest
 from orthocas.tools.interrupts import deferred
 
 _FEW = 5  # rows that a message names
@@ -196,11 +196,8 @@ class Tracker(Shown):
         something over, see `Chart.left_over`.
         """
         q, phi = self._start
-        if self._functions.distance(phi, self._solver.phi) > _RETURNED:
-            return None
-        turns = np.zeros(len(q))
-        turns[list(self._functions.turning)] = 2 * np.pi
-        return np.asarray(shortest(self._solver.q - q, turns))
+        apart = self._functions.distance(phi, self._solver.phi)
+        return leave_over(apart, _RETURNED, self._solver.q - q, self._functions.turning)
 
     @property
     def largest_step(self) -> Array:
