@@ -61,7 +61,7 @@ def slopes(f: Callable[[Array], Any], q: Array) -> Array:
 
 def errors(chart: oc.Chart, phi: Array, q: Array) -> Array:
     """Weighted as the tracker's."""
-    e = np.asarray(chart.phi_map.difference(phi, chart.phi(q))) / chart.phi_sizes
+    e = np.asarray(chart.parts.phi_map.difference(phi, chart.phi(q))) / chart.phi_sizes
     return e * np.where(np.arange(chart.n) < chart.m, 1.0, RULES.xi_weight)
 
 

@@ -37,7 +37,7 @@ def compared(chart: oc.Chart, wishes: Array, x: Array, q: Array, status: Array) 
     """Shares of rows [%]: the chart's answer or a nearer one, the chart's lies elsewhere, reported, none of these."""
     known = chart.nearest_xi(wishes, x)
     target = np.concatenate([x, chart.xi(wishes)], axis=1)
-    away = np.linalg.norm(chart.phi_map.difference(target, chart.phi(q))[:, chart.m :], axis=1)
+    away = np.linalg.norm(chart.parts.phi_map.difference(target, chart.phi(q))[:, chart.m :], axis=1)
     apart, ended = np.abs(q - known.q).max(axis=1), status <= InverseStatus.NEAREST
     same = ended & ((apart < AGREED) | (away <= known.distance + AGREED))
     elsewhere = ended & ~same & (apart > ELSEWHERE)

@@ -1,6 +1,6 @@
 """Methods of charts around the inverse map q(phi), and the CasADi functions of a chart, the inverse among them."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -24,12 +24,13 @@ from orthocas.charts.newton import (
     Starts,
     inverse_function,
 )
-from orthocas.charts.phi import Differences, PhiFunctions, PhiMap, leave_over
+from orthocas.charts.phi import Differences, PhiFunctions, PhiMap, fill_coordinates, leave_over
 from orthocas.charts.reaching import ReachingTracker, near_function
 from orthocas.charts.solutions import Solutions, Tracker
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, units_hint
 from orthocas.tasks.domains import bounds_of, sample_uniform
 from orthocas.tasks.problem import task_sizes
+from orthocas.tasks.relative import Relative
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
     Array,
@@ -144,26 +145,8 @@ class InverseMethods(PhiFunctions):
         """
         if local is not None and not callable(local):
             raise InvalidValueError("local", repr(local)[:80], "a function of targets and starts")
-        parts = self.inverse_parts if local is None else replace(self.inverse_parts, local=local, brief=local)
-        return self.solve_by(parts, phi, q_start, tolerance, inside)
-
-    def solve_by(
-        self, parts: Inverse, phi: ArrayLike, q_start: ArrayLike | None, tolerance: float, inside: bool
-    ) -> Solutions:
-        """`solve` with other parts than `inverse_parts`."""
-        require_at_least("tolerance", tolerance, 0)
-        targets = self._rows("phi", phi)
-        starts = None if q_start is None else self._rows("q_start", q_start)
-        if starts is None and isinstance(self.coordinates, InvertibleMap):
-            starts = self.problem.domain.centre[None]
-        if starts is not None:
-            if len(starts) not in (1, len(targets)):
-                raise ShapeError("q_start", starts.shape, targets.shape)
-            starts = np.broadcast_to(starts, targets.shape)
-        require_kind("inside", inside, bool)
-        if inside:
-            self._require_expression("inside=True")
-        return parts.solve(targets, starts, float(tolerance), inside)
+        search = self.parts.inverse if local is None else replace(self.parts.inverse, local=local, brief=local)
+        return solve_with(search, self, phi, q_start, tolerance, inside)
 
     def nearest_xi(self, q_wish: ArrayLike, x: ArrayLike | None = None, *, tolerance: float = 1e-9) -> Solutions:
         """Joint positions in the domain with task values x, and of these the xi nearest to that of a wished posture.
@@ -184,19 +167,8 @@ class InverseMethods(PhiFunctions):
             ShapeError: if a row has another number of entries, or x another number of rows.
             NoExpressionError: for grown coordinates.
         """
-        phi, wishes = self.wished(q_wish, x)
+        phi, wishes = targets_of_wish(self, q_wish, x)
         return self.solve(phi, wishes, tolerance=tolerance, inside=True)
-
-    def wished(self, q_wish: ArrayLike, x: ArrayLike | None) -> tuple[Array, Array]:
-        """Targets of phi for `nearest_xi`, and the wishes moved into the box of the domain, (N, n) each."""
-        wishes = np.clip(self._rows("q_wish", q_wish), *bounds_of(self.problem.domain))
-        phi = np.array(self.phi(wishes))
-        if x is not None:
-            values = as_float_array("x", x)
-            if values.shape not in ((self.m,), (len(phi), self.m)):
-                raise ShapeError("x", values.shape, (len(phi), self.m))
-            phi[:, : self.m] = values
-        return phi, wishes
 
     def solutions(self, phi: ArrayLike, tolerance: float = 1e-9) -> Array:
         """All q inside the domain with phi(q) = phi that a search of the whole domain finds.
@@ -225,8 +197,8 @@ class InverseMethods(PhiFunctions):
             2
         """
         require_at_least("tolerance", tolerance, 0)
-        self._require_expression("a search for all solutions")
-        in_domain = self.inverse_parts.in_domain
+        require_expression(self, "a search for all solutions")
+        in_domain = self.parts.inverse.in_domain
         assert in_domain is not None
         return in_domain.all_solutions(as_point("phi", phi, self.n), float(tolerance))
 
@@ -245,10 +217,10 @@ class InverseMethods(PhiFunctions):
             InvalidValueError: if q0 lies outside the domain, or J is singular there.
             DomainError: if the domain has a condition, but no expression of it.
         """
-        self._require_expression("a tracker")
+        require_expression(self, "a tracker")
         require_kind("nearest", nearest, bool)
-        parts = self._point_functions, self.problem.domain, q0, largest_step
-        return ReachingTracker(*parts, self.reaching, self.m) if nearest else Tracker(*parts)
+        parts = self.parts.point_functions, self.problem.domain, q0, largest_step
+        return ReachingTracker(*parts, self.parts.reaching, self.m) if nearest else Tracker(*parts)
 
     def left_over(self, q_start: ArrayLike, q: ArrayLike, tolerance: float = 1e-9) -> Array | None:
         """What a loop in (x, xi) leaves over in the joints: q - q_start (n,), less full turns of endless joints.
@@ -266,7 +238,7 @@ class InverseMethods(PhiFunctions):
             (n,) [rad] or [m]; None if x or xi differ, so that the path is open.
         """
         start, end = as_point("q_start", q_start, self.n), as_point("q", q, self.n)
-        apart = self.phi_map.difference(self.phi(end), self.phi(start)) / self.phi_sizes
+        apart = self.parts.phi_map.difference(self.phi(end), self.phi(start)) / self.phi_sizes
         return leave_over(float(np.abs(apart).max()), tolerance, end - start, self.problem.turning)
 
     @cached_property
@@ -278,7 +250,7 @@ class InverseMethods(PhiFunctions):
         """
         q, found = sample_uniform(self.problem.domain, _TURNED, 0), {}
         for k in self.problem.turning:
-            shift = self.phi_map.difference(self.phi(q + 2 * np.pi * np.eye(self.n)[k]), self.phi(q))[:, self.m :]
+            shift = self.parts.phi_map.difference(self.phi(q + 2 * np.pi * np.eye(self.n)[k]), self.phi(q))[:, self.m :]
             if np.abs(shift[0]).max() > _SAME_SHIFT and np.ptp(shift, axis=0).max() < _SAME_SHIFT:
                 found[self.problem.robot.joint_names[k]] = np.asarray(shift[0])
         return found
@@ -299,6 +271,11 @@ class InverseMethods(PhiFunctions):
         return self._inverse_function if name == "inverse" else self._graph(name)
 
     @cached_property
+    def parts(self) -> "ChartParts":
+        """What other packages of orthocas use of a chart; it may change without notice."""
+        return ChartParts(self)
+
+    @cached_property
     def phi_sizes(self) -> Array:
         """Sizes of the components of phi, (n,): how far task components move over the domain, and 1 for xi."""
         return np.concatenate([task_sizes(self.problem), np.ones(self.r)])
@@ -311,36 +288,8 @@ class InverseMethods(PhiFunctions):
         return np.concatenate([np.zeros(self.m), periods])
 
     @cached_property
-    def phi_map(self) -> PhiMap:
-        """phi and J for solvers of phi(q) = phi."""
-        return PhiMap(self.phi, self.batched_rates, self.phi_sizes, Differences(self.turns, self.relative))
-
-    @cached_property
-    def inverse_parts(self) -> Inverse:
-        """What `solve` consists of."""
-        phi_map, domain = self.phi_map, self.problem.domain
-        starts = Starts(phi_map, domain)
-        if isinstance(self.coordinates, InvertibleMap):
-            return Inverse(self.problem, phi_map, OwnInverse(self.coordinates, phi_map), starts)
-        boxed = BoxedPhi(self.problem.task, domain, phi_map)
-        local, brief = (FewRows(phi_map, self._point_functions, Newton(phi_map, k)) for k in (HALVINGS, BRIEF))
-        in_domain, inside = InDomain(boxed, Cells(boxed)), Inside(boxed, starts)
-        curves = SelfMotionCurves(boxed, starts, self.xi) if self.r == 1 else None
-        return Inverse(self.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves, brief)
-
-    @cached_property
     def _inverse_function(self) -> ca.Function:
-        return inverse_function(self.function("phi"), self.phi_sizes, self.phi_map.difference)
-
-    @cached_property
-    def _point_functions(self) -> PointFunctions:
-        parts = self.function("phi"), self.rates, self.phi_sizes, self.phi_map.difference
-        return PointFunctions.of(*parts, self.problem.turning)
-
-    @cached_property
-    def reaching(self) -> ca.Function:
-        """The function of `ReachingTracker`: see `near_function`."""
-        return near_function(self.function("phi"), self.rates, self.m, self.phi_map, self.problem.domain)
+        return inverse_function(self.function("phi"), self.phi_sizes, self.parts.phi_map.difference)
 
     def _outside_error(
         self, targets: Array, q_start: ArrayLike | None, found: Solutions, beyond: Indices, single: bool
@@ -349,9 +298,8 @@ class InverseMethods(PhiFunctions):
         nearest = None
         if not isinstance(self.coordinates, InvertibleMap):
             nearest = found.q.copy()
-            starts = None if q_start is None else np.broadcast_to(self._rows("q_start", q_start), targets.shape)[beyond]
-            inside = self.solve(targets[beyond], starts, tolerance=found.tolerance, inside=True)
-            nearest[beyond] = inside.q
+            own = None if q_start is None else np.broadcast_to(rows_of(self, "q_start", q_start), targets.shape)[beyond]
+            nearest[beyond] = self.solve(targets[beyond], own, tolerance=found.tolerance, inside=True).q
         q, domain = found.q[beyond[0]], self.problem.domain
         low, high = bounds_of(domain)
         j = int(np.argmax(np.maximum(low - q, q - high) / domain.half_width))
@@ -366,13 +314,108 @@ class InverseMethods(PhiFunctions):
             None if nearest is None else nearest[0] if single else nearest,
         )
 
-    def _require_expression(self, what: str) -> None:
-        """Raise NoExpressionError if the coordinates are grown."""
-        if isinstance(self.coordinates, InvertibleMap):
-            raise NoExpressionError(f"{what} needs coordinates with a CasADi expression; received grown coordinates")
 
-    def _rows(self, name: str, value: ArrayLike) -> Array:
-        """One point or a set, as `as_point_set` takes them, but finite or not, (N, n)."""
-        array = as_float_array(name, value)
-        as_point_set(name, np.zeros_like(array), self.n)
-        return array.reshape(-1, self.n)
+def solve_with(
+    search: Inverse, chart: InverseMethods, phi: ArrayLike, q_start: ArrayLike | None, tolerance: float, inside: bool
+) -> Solutions:
+    """`InverseMethods.solve` by a search of one's own."""
+    require_at_least("tolerance", tolerance, 0)
+    targets = rows_of(chart, "phi", phi)
+    starts = None if q_start is None else rows_of(chart, "q_start", q_start)
+    if starts is None and isinstance(chart.coordinates, InvertibleMap):
+        starts = chart.problem.domain.centre[None]
+    if starts is not None:
+        if len(starts) not in (1, len(targets)):
+            raise ShapeError("q_start", starts.shape, targets.shape)
+        starts = np.broadcast_to(starts, targets.shape)
+    require_kind("inside", inside, bool)
+    if inside:
+        require_expression(chart, "inside=True")
+    return search.solve(targets, starts, float(tolerance), inside)
+
+
+def targets_of_wish(chart: InverseMethods, q_wish: ArrayLike, x: ArrayLike | None) -> tuple[Array, Array]:
+    """Targets of phi for `nearest_xi`, and the wishes moved into the box of the domain, (N, n) each."""
+    wishes = np.clip(rows_of(chart, "q_wish", q_wish), *bounds_of(chart.problem.domain))
+    phi = np.array(chart.phi(wishes))
+    if x is not None:
+        values = as_float_array("x", x)
+        if values.shape not in ((chart.m,), (len(phi), chart.m)):
+            raise ShapeError("x", values.shape, (len(phi), chart.m))
+        phi[:, : chart.m] = values
+    return phi, wishes
+
+
+def require_expression(chart: InverseMethods, what: str) -> None:
+    """Raise NoExpressionError if the coordinates are grown."""
+    if isinstance(chart.coordinates, InvertibleMap):
+        raise NoExpressionError(f"{what} needs coordinates with a CasADi expression; received grown coordinates")
+
+
+def rows_of(chart: InverseMethods, name: str, value: ArrayLike) -> Array:
+    """One point or a set, as `as_point_set` takes them, but finite or not, (N, n)."""
+    array = as_float_array(name, value)
+    as_point_set(name, np.zeros_like(array), chart.n)
+    return array.reshape(-1, chart.n)
+
+
+@dataclass(frozen=True, eq=False)
+class ChartParts:
+    """What solvers, laws and generated code use of a chart; no interface for users."""
+
+    chart: InverseMethods
+
+    @cached_property
+    def relative(self) -> Relative:
+        """Task values relative to wanted ones."""
+        return Relative(self.chart.problem.task)
+
+    @cached_property
+    def rates(self) -> ca.Function:
+        """q (n, 1) -> J (n, n) with the rows of `Relative.rates` for the task: for solvers and laws."""
+        chart = self.chart
+        if not self.relative.turned:
+            return chart.function("jacobian")
+        q = ca.MX.sym("q", chart.n)
+        rows = ca.vertcat(self.relative.rates(q), chart.coordinates.functions["jacobian"](q))
+        return ca.Function("rates", [q], [ca.densify(rows)], ["q"], ["rates"])
+
+    def batched_rates(self, points: Array) -> Array:
+        """Those rows at points (N, n), (N, n, n); NaN where the task has no finite Jacobian."""
+        chart = self.chart
+        J = np.empty((len(points), chart.n, chart.n))
+        J[:, : chart.m] = self.relative.batched_rates(points)[0].reshape(-1, chart.m, chart.n)
+        fill_coordinates(chart.coordinates, "jacobian", J[:, chart.m :], points)
+        return J
+
+    @cached_property
+    def phi_map(self) -> PhiMap:
+        """phi and J for solvers of phi(q) = phi."""
+        chart = self.chart
+        return PhiMap(chart.phi, self.batched_rates, chart.phi_sizes, Differences(chart.turns, self.relative))
+
+    @cached_property
+    def inverse(self) -> Inverse:
+        """The search of `InverseMethods.solve`."""
+        chart, phi_map, domain = self.chart, self.phi_map, self.chart.problem.domain
+        starts = Starts(phi_map, domain)
+        if isinstance(chart.coordinates, InvertibleMap):
+            return Inverse(chart.problem, phi_map, OwnInverse(chart.coordinates, phi_map), starts)
+        boxed = BoxedPhi(chart.problem.task, domain, phi_map)
+        local, brief = (FewRows(phi_map, self.point_functions, Newton(phi_map, k)) for k in (HALVINGS, BRIEF))
+        in_domain, inside = InDomain(boxed, Cells(boxed)), Inside(boxed, starts)
+        curves = SelfMotionCurves(boxed, starts, chart.xi) if chart.r == 1 else None
+        return Inverse(chart.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves, brief)
+
+    @cached_property
+    def point_functions(self) -> PointFunctions:
+        """Those of trackers."""
+        phi_map = self.phi_map
+        phi = self.chart.function("phi")
+        return PointFunctions.of(phi, self.rates, phi_map.sizes, phi_map.difference, self.chart.problem.turning)
+
+    @cached_property
+    def reaching(self) -> ca.Function:
+        """The function of `ReachingTracker`: see `near_function`."""
+        chart = self.chart
+        return near_function(chart.function("phi"), self.rates, chart.m, self.phi_map, chart.problem.domain)

@@ -173,7 +173,7 @@ class PhiFunctions:
         points, single = as_point_set("q", q, self.n)
         phi = np.empty((len(points), self.n))
         self.problem.task.batched.into(phi[:, : self.m], points)
-        self._coordinates_into("xi", phi[:, self.m :], points)
+        fill_coordinates(self.coordinates, "xi", phi[:, self.m :], points)
         return phi[0] if single else phi
 
     @overload
@@ -187,29 +187,8 @@ class PhiFunctions:
         points, single = as_point_set("q", q, self.n)
         J = np.empty((len(points), self.n, self.n))
         task_jacobians(self.problem, points, J[:, : self.m])
-        self._coordinates_into("jacobian", J[:, self.m :], points)
+        fill_coordinates(self.coordinates, "jacobian", J[:, self.m :], points)
         return J[0] if single else J
-
-    @cached_property
-    def relative(self) -> Relative:
-        """Task values relative to wanted ones."""
-        return Relative(self.problem.task)
-
-    @cached_property
-    def rates(self) -> ca.Function:
-        """q (n, 1) -> J (n, n) with the rows of `Relative.rates` for the task: for solvers and laws."""
-        if not self.relative.turned:
-            return self._graph("jacobian")
-        q = ca.MX.sym("q", self.n)
-        rows = ca.vertcat(self.relative.rates(q), self.coordinates.functions["jacobian"](q))
-        return ca.Function("rates", [q], [ca.densify(rows)], ["q"], ["rates"])
-
-    def batched_rates(self, points: Array) -> Array:
-        """Those rows at points (N, n), (N, n, n); NaN where the task has no finite Jacobian."""
-        J = np.empty((len(points), self.n, self.n))
-        J[:, : self.m] = self.relative.batched_rates(points)[0].reshape(-1, self.m, self.n)
-        self._coordinates_into("jacobian", J[:, self.m :], points)
-        return J
 
     def _graph(self, name: str) -> ca.Function:
         """The CasADi function of that name, but the inverse."""
@@ -221,13 +200,6 @@ class PhiFunctions:
         """Evaluate a function at a CasADi column (n, 1)."""
         require_shape("q", q.shape, (self.n, 1))
         return self._graph(name)(q)
-
-    def _coordinates_into(self, name: str, results: Array, points: Array) -> None:
-        """Write xi or its Jacobian at points (N, n) to part of an array."""
-        if isinstance(self.coordinates, Coordinates):
-            self.coordinates.into(name, results, points)
-        else:
-            results[...] = getattr(self.coordinates, name)(points)
 
     @cached_property
     def _functions(self) -> dict[str, ca.Function]:
@@ -247,3 +219,11 @@ class PhiFunctions:
             "second_derivative", [q, v, w], [ca.densify(second)], ["q", "v", "w"], ["second_derivative"]
         )
         return functions
+
+
+def fill_coordinates(coordinates: CoordinateMap, name: str, results: Array, points: Array) -> None:
+    """Write xi or its Jacobian, by name, at points (N, n) to part of an array."""
+    if isinstance(coordinates, Coordinates):
+        coordinates.into(name, results, points)
+    else:
+        results[...] = getattr(coordinates, name)(points)

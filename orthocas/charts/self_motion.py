@@ -244,12 +244,12 @@ Functions = tuple[Callable[[Array], Array], Callable[[Array], Array], Callable[[
 
 def _of_phi(chart: "Chart") -> Functions:
     """phi and its rates at one joint position, and differences of two values."""
-    return chart.phi, lambda q: chart.batched_rates(q[None])[0], chart.phi_map.difference
+    return chart.phi, lambda q: chart.parts.batched_rates(q[None])[0], chart.parts.phi_map.difference
 
 
 def _of_task(chart: "Chart") -> Functions:
     """The same of the task alone."""
-    relative = chart.relative
+    relative = chart.parts.relative
     return chart.task, lambda q: relative.batched_rates(q[None])[0].reshape(chart.m, chart.n), relative.difference
 
 
@@ -362,7 +362,7 @@ def start_inside(chart: "Chart", q: ArrayLike) -> Array:
         stop = Walls(chart.problem).worst(point)
         hint = degrees_hint(*point[~np.array(chart.problem.robot.tree.prismatic)])
         raise InvalidValueError("q", given, f"a point of the domain, which ends at {stop}{hint}")
-    if not (np.isfinite(chart.phi(point)).all() and np.isfinite(chart.batched_rates(point[None])).all()):
+    if not (np.isfinite(chart.phi(point)).all() and np.isfinite(chart.parts.batched_rates(point[None])).all()):
         raise InvalidValueError("q", given, "a point at which the chart is finite")
     return point
 
@@ -376,7 +376,7 @@ def branch_along(chart: "Chart", q: Array, k: int, sign: float) -> Branch:
         gradient = chart.coordinates.jacobian(point[None])[0, k]
         return float(sign * gradient @ t / (np.linalg.norm(gradient) or 1.0))
 
-    return curve.follow(q, sign * chart.batched_rates(q[None])[0, row], rising)
+    return curve.follow(q, sign * chart.parts.batched_rates(q[None])[0, row], rising)
 
 
 def xi_along(chart: "Chart", points: Array) -> Array:
@@ -440,7 +440,7 @@ def filled(chart: "Chart", q: Array, alone: XiRange, samples: int) -> Array:
     spacing = _spans(alone) / cells
     known: dict[tuple[int, ...], Array] = {(0,) * chart.r: q}
     front, tried = list(known), set(known)
-    start, sign = chart.phi(q), np.sign(np.linalg.det(chart.batched_rates(q[None])[0]))
+    start, sign = chart.phi(q), np.sign(np.linalg.det(chart.parts.batched_rates(q[None])[0]))
     while front and len(known) < _MOST * samples:
         pairs = _neighbours(front, tried, cells)
         if not pairs:
@@ -475,7 +475,7 @@ def _neighbours(
 
 def _solved(chart: "Chart", starts: Array, targets: Array, sign: float) -> tuple[Array, Indices]:
     """Newton's method from all starts (N, n), and the rows where it found a point of the domain on the same sheet."""
-    phi_map = chart.phi_map
+    phi_map = chart.parts.phi_map
     found = Newton(phi_map)(targets, starts)
     step = np.linalg.solve(phi_map.jacobian(starts), phi_map.difference(targets, phi_map.phi(starts))[..., None])[
         ..., 0
@@ -541,7 +541,7 @@ def self_motion(chart: "Chart", q: ArrayLike, step: float = 0.05, samples: int =
 def _curve(chart: "Chart", q: Array, step: float) -> SelfMotionCurve:
     """Both directions of the curve; the coordinate rises at q."""
     curve = LevelCurve(chart, np.arange(chart.m), step)
-    gradient = chart.batched_rates(q[None])[0, chart.m]
+    gradient = chart.parts.batched_rates(q[None])[0, chart.m]
     up = curve.follow(q, gradient)
     down = Branch(q[None], np.zeros(1), up.stop) if up.endless else curve.follow(q, -gradient)
     points = np.concatenate([down.q[:0:-1], up.q])

@@ -71,7 +71,7 @@ def domain_values(chart: Chart, known: Mapping[str, str], precision: Precision) 
         "clear_c": "" if condition is None else _condition_code(condition, known),
     }
     rules = {name: repr(number) for name, number in asdict(precision.reaching).items()}
-    rooms = max(1, chart.reaching.size1_out(2))
+    rooms = max(1, chart.parts.reaching.size1_out(2))
     size = {"rooms": str(rooms), "m": str(chart.m), "domain_width": numbers(domain.half_width)}
     filled_in = {**known, **values, **size, **rules}
     return values | {f"nearest_{kind}": filled(f"nearest.{kind}", filled_in) for kind in ("h", "c")}

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from orthocas.charts.chart import Chart
 from orthocas.charts.curves import SelfMotionCurves
 from orthocas.charts.inverse import Inverse
+from orthocas.charts.methods import solve_with, targets_of_wish
 from orthocas.charts.newton import SUSPICIOUS, Attempt, Newton
 from orthocas.charts.solutions import Solutions
 from orthocas.codegen.compiled import kept_library, loaded, template
@@ -43,17 +44,17 @@ class CompiledInverse(Shown):
         self, phi: ArrayLike, q_start: ArrayLike | None = None, *, tolerance: float = 1e-9, inside: bool = False
     ) -> Solutions:
         """As `Chart.solve`: the same status for each row and the same q to 1e-9, unless starts are far away."""
-        return self.chart.solve_by(self._parts, phi, q_start, tolerance, inside)
+        return solve_with(self._parts, self.chart, phi, q_start, tolerance, inside)
 
     def nearest_xi(self, q_wish: ArrayLike, x: ArrayLike | None = None, *, tolerance: float = 1e-9) -> Solutions:
         """As `Chart.nearest_xi`."""
-        phi, wishes = self.chart.wished(q_wish, x)
+        phi, wishes = targets_of_wish(self.chart, q_wish, x)
         return self.solve(phi, wishes, tolerance=tolerance, inside=True)
 
     @cached_property
     def _parts(self) -> Inverse:
         """Those of the chart, with compiled searches in their places."""
-        parts = self.chart.inverse_parts
+        parts = self.chart.parts.inverse
         curves = parts.curves
         if isinstance(curves, SelfMotionCurves):
             curves = CompiledCurves(curves, lambda: self._c)
@@ -63,14 +64,14 @@ class CompiledInverse(Shown):
         """Search from starts (N, n); where C finds nothing, NumPy finds how near one can get."""
         attempt, failed = self._attempt(targets, starts, _ITERATIONS)
         if failed.size:
-            attempt.replace(failed, Newton(self.chart.phi_map)(targets[failed], starts[failed]))
+            attempt.replace(failed, Newton(self.chart.parts.phi_map)(targets[failed], starts[failed]))
         return attempt
 
     def _brief(self, targets: Array, starts: Array) -> Attempt:
         """Search from starts (N, n); rows where C finds nothing soon stay there."""
         attempt, failed = self._attempt(targets, starts, _FEW_ITERATIONS)
         attempt.q[failed] = starts[failed]
-        attempt.residual[failed] = self.chart.phi_map.residual(targets[failed], starts[failed])
+        attempt.residual[failed] = self.chart.parts.phi_map.residual(targets[failed], starts[failed])
         return attempt
 
     def _attempt(self, targets: Array, starts: Array, iterations: int) -> tuple[Attempt, Indices]:
@@ -90,7 +91,7 @@ class CompiledInverse(Shown):
             )
 
         in_threads(solve_piece, range(0, len(targets), _PIECE))
-        phi_map = self.chart.phi_map
+        phi_map = self.chart.parts.phi_map
         attempt.residual[:] = phi_map.difference(targets, attempt.residual) / phi_map.scale(targets)
         attempt.iterations[:], attempt.suspicious[:] = 1, ~(condition < SUSPICIOUS)
         return attempt, np.flatnonzero(condition < 0)
@@ -132,7 +133,7 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
         generate_c(chart, drafts, name="arm")
         sources = {name: (drafts / name).read_text(encoding="utf-8") for name in ("arm.h", "arm.c")}
     sources[_ROWS] = template(_ROWS)
-    curves = chart.inverse_parts.curves
+    curves = chart.parts.inverse.curves
     if isinstance(curves, SelfMotionCurves):
         sources["curves.c"] = curve_source(chart, curves)
     return CompiledInverse(chart, kept_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder))

@@ -43,7 +43,7 @@ def _newton(chart: Chart) -> Form:
     low, high = bounds_of(domain)
     bounds = np.array([low - slack, high + slack, robot.lower - slack, robot.upper + slack])
     target, value = ca.SX.sym("target", n), ca.SX.sym("value", n)
-    difference = chart.phi_map.difference(target, value)
+    difference = chart.parts.phi_map.difference(target, value)
     functions = [
         function_code(
             "_difference",
@@ -52,10 +52,10 @@ def _newton(chart: Chart) -> Form:
         )
     ]
     rates = "_task_and_slopes"
-    if chart.relative.turned:
+    if chart.parts.relative.turned:
         summary = "Task values, then how fast they move, angular velocities in the tip's axes, (m + m n, N)."
         rates = "_task_and_rates"
-        functions.append(function_code(rates, summary, problem.task.function, chart.relative.rates))
+        functions.append(function_code(rates, summary, problem.task.function, chart.parts.relative.rates))
     tables = {"centre": domain.centre[:, None], "sizes": chart.phi_sizes[:, None], "bounds": bounds[:, :, None]}
     return Form("inverse", {"rates": rates}, "\n\n".join(functions), tables, {})
 

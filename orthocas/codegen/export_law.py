@@ -81,7 +81,7 @@ def _functions(law: Impedance | PDPlus) -> list[str]:
     q, dq, w = (ca.MX.sym(name, n) for name in ("q", "dq", "w"))
     x_d, dx_d, ddx_d = (ca.MX.sym(name, m) for name in ("x_d", "dx_d", "ddx_d"))
     inputs, robot = {"q": q, "dq": dq}, law.problem.robot
-    error, slope = chart.relative.error(q, x_d)
+    error, slope = chart.parts.relative.error(q, x_d)
     e = ca.SX.sym("e", n)
     found = [
         _code("_task_errors", "e, then de/dq row by row, of q, x_d.", [q, x_d], [error, ca.vec(slope.T)]),
@@ -96,8 +96,8 @@ def _functions(law: Impedance | PDPlus) -> list[str]:
         _code("_gravity", "Gravity torque, (n, N).", [q], [law.model.gravity_torque(robot, inputs)]),
     ]
     if law.feed_forward:
-        drift = chart.relative.drift(q, x_d, dx_d)
-        bend = chart.relative.bend(q, dq, w, (x_d, dx_d, ddx_d))
+        drift = chart.parts.relative.drift(q, x_d, dx_d)
+        bend = chart.parts.relative.bend(q, dq, w, (x_d, dx_d, ddx_d))
         coriolis = law.model.coriolis_torque(robot, inputs, w)
         states = [q, dq, w, x_d, dx_d, ddx_d]
         found += [

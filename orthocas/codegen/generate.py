@@ -120,11 +120,11 @@ def _functions(chart: Chart, controller: Controller | None, precision: Precision
         ca.Function("curvature", [q, dq, v], [chart.function("second_derivative")(q, dq, v)]),
         fast_form(ca.Function("dynamics", [q, dq], [robot.mass_matrix(q), robot.bias(q, dq), robot.gravity(q)]), n),
     ]
-    if chart.relative.turned:
+    if chart.parts.relative.turned:
         x, wanted = ca.MX.sym("x", chart.m), ca.MX.sym("wanted", chart.m)
-        difference = ca.densify(chart.relative.difference(wanted, x))
-        found.append(ca.Function("turned", [q, x, wanted], [difference, chart.relative.rates(q).T]))
-    near = chart.reaching
+        difference = ca.densify(chart.parts.relative.difference(wanted, x))
+        found.append(ca.Function("turned", [q, x, wanted], [difference, chart.parts.relative.rates(q).T]))
+    near = chart.parts.reaching
     found.append(ca.Function("near", near.mx_in(), near.call(near.mx_in())))
     domain = condition_of(chart)
     if domain is not None and domain.condition is not None:
@@ -167,7 +167,7 @@ def _stack_bytes(kernels: Kernels, chart: Chart, controller: Controller | None, 
 
 def _reaching_bytes(chart: Chart, size: int) -> int:
     """Of the two positions that the descent to the nearest x looks at, and of the equations of its steps."""
-    n, rooms = chart.n, max(1, chart.reaching.size1_out(2))
+    n, rooms = chart.n, max(1, chart.parts.reaching.size1_out(2))
     system = 2 * n + rooms
     return size * (2 * n * (n + rooms + 3) + 2 * n * n + n * rooms + system**2 + 4 * system)
 

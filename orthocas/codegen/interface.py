@@ -310,7 +310,7 @@ def template_values(
         **kernels.sizes(),
     }
     values |= domain_values(chart, values, precision)
-    values["difference"] = filled("turned.c", values) if chart.relative.turned else ""
+    values["difference"] = filled("turned.c", values) if chart.parts.relative.turned else ""
     if controller is not None and safety is not None:
         condition = boundary_condition(controller)
         values |= control_values(controller) | _counted_turns(controller, values)
@@ -342,7 +342,7 @@ def _shortest_way(chart: Chart) -> dict[str, str]:
         rounds = np.where(chart.turns > 0, 1 / np.where(chart.turns > 0, chart.turns, 1.0), 0.0)
         table = f"\n  static const double turn[N] = {{{numbers(chart.turns)}}}, rounds[N] = {{{numbers(rounds)}}};"
         plain = "(wanted[i] - phi[i] - turn[i] * floor((wanted[i] - phi[i]) * rounds[i] + 0.5))"
-    if chart.relative.turned:
+    if chart.parts.relative.turned:
         return {
             "turn_table": f"{table}\n  double turn_left[{chart.m}];",
             "shortest": f"(i < {chart.m} ? turn_left[i] : {plain})",

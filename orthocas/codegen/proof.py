@@ -245,7 +245,7 @@ def _remaining(library: CompiledLibrary, chart: Chart, target: Array, q: Array) 
     """The largest error in phi as the library has it, with its own phi and scale: far outside, rounding is large."""
     phi = library.chart(q)[0].astype(float)
     scale = chart.phi_sizes + library.precision.coarse * np.abs(target)
-    return float(np.abs(chart.phi_map.difference(target[None], phi[None])[0] / scale).max())
+    return float(np.abs(chart.parts.phi_map.difference(target[None], phi[None])[0] / scale).max())
 
 
 def _control(library: CompiledLibrary, controller: Controller, q: Array, dq: Array, rng: np.random.Generator) -> float:

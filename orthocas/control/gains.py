@@ -183,7 +183,7 @@ def fastest_posture(chart: Chart, stiffness: Array, robot: Robot) -> Array:
 
 def mobility(chart: Chart, points: ArrayLike, robot: Robot) -> Array:
     """M_phi^-1 = J M^-1 J^T of a robot at points (N, n), (N, n, n)."""
-    J, M = chart.batched_rates(as_point_set("points", points, chart.n)[0]), robot.mass_matrix(points)
+    J, M = chart.parts.batched_rates(as_point_set("points", points, chart.n)[0]), robot.mass_matrix(points)
     return np.asarray(J @ np.linalg.solve(M, J.transpose(0, 2, 1)))
 
 

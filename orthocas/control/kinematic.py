@@ -114,7 +114,7 @@ class Kinematic(Shown):
         e, J = errors(self.chart, q, inputs["reference"])
         B, Lambda, volume = block_inertia(n, (n,))(J, problem.metric.function(q))
         rate = drift(self.chart, q, inputs["reference"], inputs["reference_velocity"]) - inputs["feedback"] * e
-        scale = median_volume(problem, self.chart.rates, problem.metric, (n,))
+        scale = median_volume(problem, self.chart.parts.rates, problem.metric, (n,))
         velocity = B @ (Lambda @ rate)  # J^-1 = A^-1 J^T (J A^-1 J^T)^-1
         return guarded_graph(self.name, inputs, velocity, ca.MX(n, 1), volume / scale, problem.domain, True)
 

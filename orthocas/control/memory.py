@@ -321,7 +321,7 @@ class Adaptation(_Correcting):
 
     def _springs(self, law: "_OperationalSpace") -> Array:
         """Stiffness of the law at the joints, the diagonal of J^T K J in the middle of the domain, (n,)."""
-        J = law.chart.batched_rates(law.problem.domain.centre[None])[0]
+        J = law.chart.parts.batched_rates(law.problem.domain.centre[None])[0]
         return np.asarray((J**2 * law.stiffness[:, None]).sum(axis=0))
 
 

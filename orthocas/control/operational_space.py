@@ -419,7 +419,7 @@ class _OperationalSpace(Shown):
         """q, stiffness, damping_ratio, then damping_stiffness and payload if they are inputs -> D(q), (n, n)."""
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
         chosen = {name: inputs[name] for name in ("q", *self._of_the_damping)}
-        J, M = self.chart.rates(inputs["q"]), self.model.own_mass_matrix(self.problem.robot, inputs)
+        J, M = self.chart.parts.rates(inputs["q"]), self.model.own_mass_matrix(self.problem.robot, inputs)
         D = self._damped(self._inertia(J, M)[1], inputs, ca.MX.eye(self.chart.n))
         return self.chart.runnable(named_function("damping_matrix", chosen, {"D": D}))
 
@@ -505,7 +505,7 @@ class _OperationalSpace(Shown):
     @cached_property
     def median_volume(self) -> float:
         """Of the gradients over the domain, squared; in blocks if the law is decoupled."""
-        return median_volume(self.problem, self.chart.rates, "inertia", self._blocks)
+        return median_volume(self.problem, self.chart.parts.rates, "inertia", self._blocks)
 
 
 def _like_a_percentage(damping_ratio: Array) -> list[str]:

@@ -115,9 +115,9 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
         """phi at a change from q."""
         phi, m = self.chart.phi(q), self.chart.m
         wanted = np.array(phi + change)
-        if self.chart.relative.turned:
+        if self.chart.parts.relative.turned:
             none = np.zeros(m)
-            wanted[:m] = np.array(self.chart.relative.moved(phi[:m], change[:m], phi[:m], none, none)[0]).ravel()
+            wanted[:m] = np.array(self.chart.parts.relative.moved(phi[:m], change[:m], phi[:m], none, none)[0]).ravel()
         return wanted
 
     def _here(self) -> Array:

@@ -215,12 +215,12 @@ def walk(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
 
 
 def _step(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
-    J = chart.relative.batched_rates(q[None])[0].reshape(chart.m, chart.n)
+    J = chart.parts.relative.batched_rates(q[None])[0].reshape(chart.m, chart.n)
     inner = np.linalg.svd(J)[2][chart.m :].T  # (n, r)
     residuals, gradients = (part[0] for part in costs(q[None]))
     G = gradients @ inner
     along = -inner @ np.linalg.solve(G.T @ G + _WALK_DAMPING * np.eye(chart.r), G.T @ residuals)
-    task = np.linalg.pinv(J, rcond=1e-3) @ chart.relative.difference(x, chart.task(q))
+    task = np.linalg.pinv(J, rcond=1e-3) @ chart.parts.relative.difference(x, chart.task(q))
     return _cut(task) + _cut(along)
 
 

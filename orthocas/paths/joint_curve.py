@@ -38,7 +38,7 @@ class Solver:
 
     def __init__(self, chart: "Chart") -> None:
         self.chart = chart
-        self._newton = Newton(chart.phi_map)
+        self._newton = Newton(chart.parts.phi_map)
         with deferred(), building:  # threads share the chart
             q, v, w = (ca.MX.sym(name, chart.n) for name in ("q", "v", "w"))
             bends = (
@@ -50,7 +50,7 @@ class Solver:
 
     def jacobian(self, q: Array) -> Array:
         """J (N, n, n) at joint positions (N, n), with the rates of orientations."""
-        return self.chart.phi_map.jacobian(q)
+        return self.chart.parts.phi_map.jacobian(q)
 
     def turning(self, q: Array, v: Array, w: Array) -> Array:
         """The derivative of J w along v, (N, n)."""

@@ -16,16 +16,16 @@ ROUNDING = 1e-12
 def walk(chart: oc.Chart, q: np.ndarray, k: int, step: float) -> float:
     """The value of the k-th coordinate where it leaves the domain or turns back, in even steps and plain Newton."""
     phi, row = chart.phi(q), chart.m + k
-    side = np.sign(np.linalg.det(chart.batched_rates(q[None])[0]))
+    side = np.sign(np.linalg.det(chart.parts.batched_rates(q[None])[0]))
     for count in range(1, 100_000):
         target, new = phi.copy(), q.copy()
         target[row] += count * step
         for _ in range(6):
             new = new + np.linalg.solve(
-                chart.batched_rates(new[None])[0], chart.phi_map.difference(target, chart.phi(new))
+                chart.parts.batched_rates(new[None])[0], chart.parts.phi_map.difference(target, chart.phi(new))
             )
-        kept = np.abs(chart.phi_map.difference(target, chart.phi(new))).max() < 1e-10
-        turned = np.sign(np.linalg.det(chart.batched_rates(new[None])[0])) != side
+        kept = np.abs(chart.parts.phi_map.difference(target, chart.phi(new))).max() < 1e-10
+        turned = np.sign(np.linalg.det(chart.parts.batched_rates(new[None])[0])) != side
         if not kept or turned or np.abs(new - q).max() > 0.2 or not chart.problem.domain.contains(new):
             return float(phi[row] + (count - 1) * step)
         q = new
@@ -64,7 +64,7 @@ def test_ends_of_a_range_are_found_from_there(kind: str) -> None:
                     targets.append(target)
     solutions = chart.solve(np.array(targets), np.array(starts))
     assert solutions.found.all()
-    np.testing.assert_allclose(chart.phi_map.residual(np.array(targets), solutions.q), 0, atol=1e-9)
+    np.testing.assert_allclose(chart.parts.phi_map.residual(np.array(targets), solutions.q), 0, atol=1e-9)
 
 
 def test_orientations_go_the_shorter_way_from_a_start() -> None:

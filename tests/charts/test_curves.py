@@ -21,7 +21,7 @@ def test_no_random_start_leads_to_a_nearer_xi(name: str) -> None:
     near, pool = chart.nearest_xi(wishes, x), sample_uniform(domain, STARTS, 3)
     assert {FOUND, NEAREST} == set(near.statuses)
     assert domain.contains(near.q).all()
-    np.testing.assert_allclose(chart.relative.difference(x, chart.task(near.q)), 0, atol=1e-8)
+    np.testing.assert_allclose(chart.parts.relative.difference(x, chart.task(near.q)), 0, atol=1e-8)
     xi = chart.xi(wishes)[:, 0]
     np.testing.assert_allclose(near.distance, np.abs(chart.xi(near.q)[:, 0] - xi), atol=1e-9)
     known = 0
@@ -44,7 +44,7 @@ def test_positions_near_boundaries_are_found_again(inside: bool) -> None:
     solutions = chart.solve(chart.phi(q), inside=inside)
     assert len(q) == 1000
     assert solutions.found.all()
-    np.testing.assert_allclose(chart.phi_map.residual(chart.phi(q), solutions.q), 0, atol=1e-9)
+    np.testing.assert_allclose(chart.parts.phi_map.residual(chart.phi(q), solutions.q), 0, atol=1e-9)
 
 
 def test_curves_are_cut_by_the_limits_after_full_turns() -> None:
@@ -83,6 +83,6 @@ def test_orientations_are_embedded_without_a_seam() -> None:
     rng = np.random.default_rng(0)
     q = sample_uniform(chart.problem.domain, 300, 4)
     x, y = chart.task(q), chart.task(q + 1e-3 * rng.normal(size=q.shape))
-    error = np.linalg.norm(chart.relative.difference(x, y)[:, 3:], axis=1)
-    apart = np.linalg.norm(chart.relative.embedded(x) - chart.relative.embedded(y), axis=1)
+    error = np.linalg.norm(chart.parts.relative.difference(x, y)[:, 3:], axis=1)
+    apart = np.linalg.norm(chart.parts.relative.embedded(x) - chart.parts.relative.embedded(y), axis=1)
     np.testing.assert_allclose(apart, error, rtol=1e-4, atol=1e-12)

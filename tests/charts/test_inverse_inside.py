@@ -66,7 +66,7 @@ def test_descents_end_as_near_as_ipopt(iiwa_fit: Fit) -> None:
     """From the same starts, both end at the same distance; Ipopt stays a little off the boundary."""
     chart = iiwa_fit.chart
     phi = chart.phi(beyond_domain(chart, 60, 1.3))
-    inside = chart.inverse_parts.inside
+    inside = chart.parts.inverse.inside
     assert inside is not None
     q, in_reach = inside.with_task(phi, np.tile(chart.problem.domain.centre, (60, 1)))
     assert 20 < in_reach.sum() < 60

@@ -107,7 +107,7 @@ def wide_chart() -> oc.Chart:
 
 def cost(chart: oc.Chart, phi: np.ndarray, q: np.ndarray) -> float:
     """What a tracker of the nearest x makes small."""
-    e = chart.phi_map.difference(phi, chart.phi(q)) / chart.phi_sizes
+    e = chart.parts.phi_map.difference(phi, chart.phi(q)) / chart.phi_sizes
     return float((e[: chart.m] ** 2).sum() + 9e-8 * (e[chart.m :] ** 2).sum())
 
 

@@ -43,8 +43,8 @@ def wishes_of(chart: oc.Chart, count: int = 300, away: float = 0.3) -> tuple[Arr
 def missed(chart: oc.Chart, wishes: Array, x: Array, q: Array) -> tuple[Array, Array]:
     """The largest error of x, and the distance of xi, (N,) each."""
     target = np.concatenate([x, chart.xi(wishes)], axis=1)
-    away = chart.phi_map.difference(target, chart.phi(q))
-    error = np.abs(away / chart.phi_map.scale(target))[:, : chart.m].max(axis=1)
+    away = chart.parts.phi_map.difference(target, chart.phi(q))
+    error = np.abs(away / chart.parts.phi_map.scale(target))[:, : chart.m].max(axis=1)
     return error, np.linalg.norm(away[:, chart.m :], axis=1)
 
 
@@ -53,14 +53,15 @@ def something_nearer_around(chart: oc.Chart, wish: Array, x: Array, q: Array) ->
     rng, domain, m = np.random.default_rng(2), chart.problem.domain, chart.m
     points = q + 0.01 * domain.half_width * rng.uniform(-1, 1, (2000, chart.n)) * rng.uniform(size=(2000, 1))
     for _ in range(4):
-        J = chart.relative.batched_rates(points)[0].reshape(-1, m, chart.n)
+        J = chart.parts.relative.batched_rates(points)[0].reshape(-1, m, chart.n)
         step = (
-            np.linalg.pinv(J) @ chart.relative.difference(np.tile(x, (len(points), 1)), chart.task(points))[:, :, None]
+            np.linalg.pinv(J)
+            @ chart.parts.relative.difference(np.tile(x, (len(points), 1)), chart.task(points))[:, :, None]
         )
         points = points + step[:, :, 0]
     points = points[domain.contains(points)]
     target = np.concatenate([np.tile(x, (len(points) + 1, 1)), np.tile(chart.xi(wish), (len(points) + 1, 1))], axis=1)
-    away = chart.phi_map.difference(target, chart.phi(np.vstack([q, points])))[:, m:]
+    away = chart.parts.phi_map.difference(target, chart.phi(np.vstack([q, points])))[:, m:]
     distance = np.linalg.norm(away, axis=1)
     return bool(distance[1:].min(initial=np.inf) < distance[0] - 1e-6)
 

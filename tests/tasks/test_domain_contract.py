@@ -98,10 +98,12 @@ def newton(chart: oc.Chart, phi: Array, q: Array) -> Array | None:
     """The solution near q, by plain Newton steps; None if they do not converge, or go far."""
     new = q
     for _ in range(12):
-        new = new + np.linalg.solve(chart.batched_rates(new[None])[0], chart.phi_map.difference(phi, chart.phi(new)))
+        new = new + np.linalg.solve(
+            chart.parts.batched_rates(new[None])[0], chart.parts.phi_map.difference(phi, chart.phi(new))
+        )
         if np.abs(new - q).max() > 0.2:
             return None
-    return new if np.abs(chart.phi_map.difference(phi, chart.phi(new))).max() < 1e-10 else None
+    return new if np.abs(chart.parts.phi_map.difference(phi, chart.phi(new))).max() < 1e-10 else None
 
 
 def walk(chart: oc.Chart, q: Array, k: int, end: float) -> tuple[Array, Array | None]:
@@ -141,7 +143,7 @@ def test_ranges_end_where_the_domain_ends(kind: str, axes: str) -> None:
             seen.add(stop.kind)
             before, beyond = walk(chart, q, k, end)
             assert domain.contains(before).all()
-            det = np.abs(np.linalg.det(chart.batched_rates(before)))
+            det = np.abs(np.linalg.det(chart.parts.batched_rates(before)))
             if stop.kind in FOLDS and kind != "regular part":
                 assert det[-1] < 0.02 * det.max()
                 continue
@@ -185,7 +187,7 @@ def test_values_within_a_range_are_found_from_there(kind: str, axes: str, inside
     assert len(targets) >= 12
     assert found.found.all()
     assert chart.problem.domain.contains(found.q).all()
-    np.testing.assert_allclose(chart.phi_map.residual(np.array(targets), found.q), 0, atol=1e-8)
+    np.testing.assert_allclose(chart.parts.phi_map.residual(np.array(targets), found.q), 0, atol=1e-8)
 
 
 @CHARTS
@@ -204,7 +206,7 @@ def test_statuses_of_the_inverse_say_where_q_lies(kind: str, axes: str) -> None:
         near = chart.solve(phi, inside, inside=True)
         kept = near.status <= NEAREST
         assert domain.contains(near.q[kept]).all()
-        apart = chart.phi_map.difference(phi, chart.phi(near.q))
+        apart = chart.parts.phi_map.difference(phi, chart.phi(near.q))
         np.testing.assert_allclose(apart[kept, : chart.m], 0, atol=1e-8)
         np.testing.assert_allclose(near.distance[kept], np.linalg.norm(apart[kept, chart.m :], axis=1), atol=1e-9)
     assert (near.status == NEAREST).sum() > 8 or kind == "torus"  # where xi has no end
@@ -219,7 +221,7 @@ def test_nearest_xi_is_no_farther_than_a_known_position(kind: str, axes: str) ->
     assert (near.status <= NEAREST).all()
     assert chart.problem.domain.contains(near.q).all()
     np.testing.assert_allclose(chart.task(near.q), chart.task(own), atol=1e-8)
-    apart = chart.phi_map.difference(chart.phi(wish), chart.phi(own))[:, chart.m :]
+    apart = chart.parts.phi_map.difference(chart.phi(wish), chart.phi(own))[:, chart.m :]
     assert (near.distance <= np.linalg.norm(apart, axis=1) + 1e-9).all()
     assert (chart.nearest_xi(np.tile(CENTRE, (24, 1)), chart.task(own)).status <= NEAREST).all()
 
@@ -282,7 +284,7 @@ def test_trackers_go_to_the_end_of_a_range_and_stay(kind: str, axes: str) -> Non
 def cost(chart: oc.Chart, phi: Array, q: Array) -> Array:
     """What a tracker with `nearest=True` lowers, at points (N, n)."""
     weights = np.where(np.arange(3) < chart.m, 1 / chart.phi_sizes, RULES.xi_weight)
-    return np.asarray(((chart.phi_map.difference(phi, chart.phi(q)) * weights) ** 2).sum(axis=1))
+    return np.asarray(((chart.parts.phi_map.difference(phi, chart.phi(q)) * weights) ** 2).sum(axis=1))
 
 
 @CHARTS
