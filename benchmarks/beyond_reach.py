@@ -16,9 +16,8 @@ from redundancy.arms import TICK, Arm
 from scipy.optimize import minimize
 
 import orthocas as oc
-from orthocas.charts.reaching import RULES
 from orthocas.charts.regular_part import RegularPart
-from orthocas.charts.solutions import TrackerStatus
+from orthocas.charts.trackers import RULES, TrackerStatus
 from orthocas.tasks.domains import bounds_of, sample_uniform
 from orthocas.tools.checks import Array
 

@@ -19,7 +19,7 @@ from benchmark import run
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.charts.solutions import InverseStatus
+from orthocas.charts.inverse import InverseStatus
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tools.checks import Array
 

@@ -16,7 +16,7 @@ from batches import exported
 from benchmark import run
 
 import orthocas as oc
-from orthocas.charts.solutions import InverseStatus
+from orthocas.charts.inverse import InverseStatus
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tools.checks import Array
 

@@ -18,7 +18,7 @@ from batches import exported
 from benchmark import run
 
 import orthocas as oc
-from orthocas.charts.solutions import TrackerStatus
+from orthocas.charts.trackers import TrackerStatus
 from orthocas.learn import PhiActions
 from orthocas.tools.checks import Array
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from orthocas.charts.curve_tracer import RULES, CurveTracer, Traces, solutions_of, without_turns
 from orthocas.charts.descent import BoxedPhi
-from orthocas.charts.newton import Starts
 from orthocas.charts.phi import largest
+from orthocas.charts.search import Starts
 from orthocas.tasks.domains import bounds_of
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices

@@ -1,33 +1,143 @@
-"""The inverse map q(x, xi): restarts where needed, and how each row ended."""
+"""The inverse map q(x, xi): its searches in order, how each row ended, and their results."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.charts.continuation import Continuation
 from orthocas.charts.curves import CurveSearch
-from orthocas.charts.in_domain import InDomain
-from orthocas.charts.inside import Inside
-from orthocas.charts.newton import Attempt, LocalSolver, Starts
+from orthocas.charts.newton import Attempt, Continuation, LocalSolver
 from orthocas.charts.phi import PhiMap, largest
-from orthocas.charts.solutions import InverseStatus, Solutions
+from orthocas.charts.search import InDomain, Inside, Starts
+from orthocas.errors import InverseError
 from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.domains import bounds_of
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, Indices
+from orthocas.tools.display import Shown, listed
 
-_ROUNDING = 1e-9  # of L: task values next to the limit may be rounded
-_ROWS = 16_384  # solved at once
-_FIRST = 2  # restarts from points of the table, and the centre, before all of the domain is searched
-_RESTARTS = 8  # from points of the table, where nothing leads to any solution
+
+@dataclass(frozen=True, slots=True)
+class InverseRules:
+    """Numbers of the order of searches."""
+
+    rounding: float = 1e-9  #: of the length of the arm: task values next to the limit may be rounded
+    rows: int = 16_384  #: solved at once
+    first: int = 2  #: restarts from points of the table, and the centre, before all of the domain is searched
+    restarts: int = 8  #: from points of the table, where nothing leads to any solution
+    snap: float = 1e-9  #: half-widths: solutions so close to the boundary are moved onto it
+    slack: float = 1e-9  #: half-widths: joint limits are decimal numbers, see `require_within_limits`
+    named: int = 5  #: rows that a message names
+
+
+RULES = InverseRules()
+
+
+class InverseStatus(IntEnum):
+    """How the search for a q with phi(q) = phi ended, from best to worst."""
+
+    FOUND = 0  #: a solution inside the domain
+    NEAREST = 1  #: none was found inside; this q lies inside, has the same x, and the nearest xi that was found
+    OUTSIDE_DOMAIN = 2  #: none was found inside; this solution lies within the joint limits, but outside the domain; of
+    #: `inside=True` and `nearest_xi`, no q with that x was found inside, and this one, with another xi, lies there
+    LIMIT = 3  #: none was found within the joint limits; this solution lies beyond them
+    SINGULAR = 4  #: a solution at which J is singular, so that it need not be unique
+    NOT_FOUND = 5  #: no solution was found, which does not prove that there is none; q has the smallest error found
+    BAD_INPUT = 6  #: a number of phi or of the start is not finite; q is NaN
+    OUT_OF_REACH = 7  #: no solution: x is farther from the first joint than the arm is long; q as for NOT_FOUND
+
+
 _KEPT = (InverseStatus.NEAREST, InverseStatus.OUTSIDE_DOMAIN)  # x, if q is to lie inside
 _UNSOLVED = (InverseStatus.NOT_FOUND, InverseStatus.OUT_OF_REACH)
 _MOVED = (InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT, *_UNSOLVED)
-_SNAP = 1e-9  # of the half-widths: solutions so close to the boundary are moved onto it
-_SLACK = 1e-9  # of the half-widths: joint limits are decimal numbers, see `require_within_limits`
+_ACCEPTED = (InverseStatus.FOUND, InverseStatus.NEAREST)
+_FAILED = (InverseStatus.NOT_FOUND, InverseStatus.BAD_INPUT, InverseStatus.OUT_OF_REACH)
+_BEYOND = (InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Solutions(Shown):
+    """Joint positions with given task values and coordinates; see `Chart.solve`.
+
+    Example:
+        >>> import numpy as np
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> phi = chart.phi([[0.7, 0.9, 0.6], [0.6, 0.8, 0.8]])
+        >>> solutions = chart.solve(np.vstack([phi, [9.0, 0.0, 0.0]]))
+        >>> [status.name for status in solutions.statuses], solutions.found.tolist()
+        (['FOUND', 'FOUND', 'OUT_OF_REACH'], [True, True, False])
+    """
+
+    q: Array = field(repr=False)  #: the best points found, (N, n) [rad] or [m]
+    status: Indices  #: an `InverseStatus` for each row, (N,)
+    iterations: Indices  #: steps of Newton's method that led to q, (N,)
+    error: Array  #: largest |phi(q) - phi| relative to the sizes, (N,); of x alone where only x is kept
+    distance: Array  #: |xi(q) - xi|, (N,)
+    tolerance: float  #: the largest error of a solution
+
+    def __post_init__(self) -> None:
+        for array in (self.q, self.status, self.iterations, self.error, self.distance):
+            array.setflags(write=False)
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """Rows with a solution inside the domain, (N,)."""
+        return np.asarray(self.status == InverseStatus.FOUND)
+
+    @property
+    def statuses(self) -> tuple[InverseStatus, ...]:
+        """The status of each row by name."""
+        return tuple(InverseStatus(value) for value in self.status)
+
+    def facts(self) -> dict[str, str]:
+        """How many rows ended how."""
+        counts = {status.name: int((self.status == status).sum()) for status in InverseStatus}
+        solved = self.error[np.isin(self.status, (*_ACCEPTED, *_BEYOND))]
+        return {
+            "solutions": listed(f"{count} {name}" for name, count in counts.items() if count) or "no rows",
+            **({"largest error": f"{solved.max():.3g}"} if solved.size else {}),
+            **({"iterations": f"{self.iterations.mean():.3g} on average"} if len(self) else {}),
+        }
+
+    def require(self, inside: bool = True) -> Self:
+        """These solutions, if all rows have one.
+
+        Args:
+            inside: do not accept solutions outside the domain.
+
+        Raises:
+            InverseError: if a row is not solved; the message names the rows.
+        """
+        accepted = _ACCEPTED if inside else (*_ACCEPTED, *_BEYOND)
+        missing = np.flatnonzero(np.isin(self.status, _FAILED))
+        if missing.size:
+            raise InverseError(
+                f"no q with phi(q) = phi found for {self.named(missing)}: relative error is "
+                f"{self.error[missing].max():.3g}, expected <= {self.tolerance:.1g}. "
+                "The target may be out of reach, or the path to it singular"
+            )
+        singular = np.flatnonzero(self.status == InverseStatus.SINGULAR)
+        if singular.size:
+            raise InverseError(
+                f"the Jacobian is singular at the solution of row {singular[0]}: q need not be unique there"
+            )
+        beyond = np.flatnonzero(~np.isin(self.status, accepted))
+        if beyond.size:
+            raise InverseError(f"q was found only outside the domain for {self.named(beyond)}")
+        return self
+
+    def named(self, rows: Indices) -> str:
+        """Some rows in words, for messages."""
+        return f"rows {rows[: RULES.named].tolist()}" if len(self) > 1 else "phi"
 
 
 def beyond_reach(task: Task, x: Array) -> NDArray[np.bool_]:
@@ -40,7 +150,7 @@ def beyond_reach(task: Task, x: Array) -> NDArray[np.bool_]:
         return np.zeros(len(x), dtype=bool)
     origin, length = _origin_and_length(task.robot.tree)
     away = x[:, columns] - origin[["xyz".index(task.labels[k]) for k in columns]]
-    return np.asarray(np.linalg.norm(away, axis=1) > (1 + _ROUNDING) * length)
+    return np.asarray(np.linalg.norm(away, axis=1) > (1 + RULES.rounding) * length)
 
 
 def _origin_and_length(tree: KinematicTree) -> tuple[Array, float]:
@@ -97,7 +207,7 @@ class Inverse:
         q = np.full(targets.shape, np.nan)
         error, distance = np.full((2, len(q)), np.nan)
         status, iterations = np.full(len(q), int(InverseStatus.BAD_INPUT)), np.zeros(len(q), dtype=np.int64)
-        for rows in np.array_split(np.flatnonzero(good), -(-int(good.sum()) // _ROWS) or 1):
+        for rows in np.array_split(np.flatnonzero(good), -(-int(good.sum()) // RULES.rows) or 1):
             if rows.size:
                 found = self._searched(targets[rows], None if starts is None else starts[rows], tolerance, inside)
                 q[rows], status[rows], iterations[rows] = found.q, found.status, found.iterations
@@ -120,10 +230,10 @@ class Inverse:
                 self._search_inside(self.inside, targets, best, own, tolerance)
         elif starts is None:
             if self.curves is None:
-                self._restart(targets, best, self._open(best), _FIRST, InverseStatus.FOUND, tolerance)
+                self._restart(targets, best, self._open(best), RULES.first, InverseStatus.FOUND, tolerance)
             self._search_domain(targets, best, self._open(best), tolerance)
             rows = np.flatnonzero(best.status == InverseStatus.NOT_FOUND)
-            self._restart(targets, best, rows, _RESTARTS, InverseStatus.SINGULAR, tolerance)
+            self._restart(targets, best, rows, RULES.restarts, InverseStatus.SINGULAR, tolerance)
         elif self.along is not None:
             rows = self._open(best)
             best.improve(rows, self._judged(self.along(targets[rows], starts[rows]), tolerance))
@@ -151,7 +261,7 @@ class Inverse:
             attempt = Attempt(q, self.phi_map.residual(targets[rows], q), best.iterations[rows], np.ones(len(q), bool))
             best.improve(rows, self._judged(attempt, tolerance))
         if not self.problem.domain.is_box:  # it may be a small part of its box
-            self._restart(targets, best, rows, _RESTARTS, InverseStatus.FOUND, tolerance)
+            self._restart(targets, best, rows, RULES.restarts, InverseStatus.FOUND, tolerance)
 
     def _restart(
         self, targets: Array, best: Found, rows: Indices, count: int, worst: InverseStatus, tolerance: float
@@ -247,7 +357,7 @@ class Inverse:
     def _status(self, q: Array) -> Indices:
         """Where solutions (N, n) lie."""
         robot, domain = self.problem.robot, self.problem.domain
-        slack = _SLACK * domain.half_width
+        slack = RULES.slack * domain.half_width
         allowed = ((q >= robot.lower - slack) & (q <= robot.upper + slack)).all(axis=1)
         beyond = np.where(allowed, InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT)
         return np.where(domain.contains(q), InverseStatus.FOUND, beyond).astype(np.int64)
@@ -257,7 +367,7 @@ class Inverse:
         low, high = bounds_of(self.problem.domain)
         moved = np.clip(attempt.q, low, high)
         off = np.abs(moved - attempt.q)
-        rows = np.flatnonzero((off > 0).any(axis=1) & (off <= _SNAP * self.problem.domain.half_width).all(axis=1))
+        rows = np.flatnonzero((off > 0).any(axis=1) & (off <= RULES.snap * self.problem.domain.half_width).all(axis=1))
         if not rows.size:
             return attempt
         residual = self.phi_map.residual(targets[rows], moved[rows])

@@ -6,27 +6,24 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.charts.continuation import Continuation
 from orthocas.charts.coordinates import Coordinates, InvertibleMap
 from orthocas.charts.curves import SelfMotionCurves
+from orthocas.charts.descent import RULES as DESCENT
 from orthocas.charts.descent import BoxedPhi
-from orthocas.charts.in_domain import Cells, InDomain
-from orthocas.charts.inside import Inside
-from orthocas.charts.inverse import Inverse
+from orthocas.charts.inverse import Inverse, Solutions
 from orthocas.charts.newton import (
-    BRIEF,
-    HALVINGS,
+    NEWTON,
+    Continuation,
     FewRows,
     LocalSolver,
     Newton,
     OwnInverse,
     PointFunctions,
-    Starts,
     inverse_function,
 )
 from orthocas.charts.phi import Differences, PhiFunctions, PhiMap, fill_coordinates, leave_over
-from orthocas.charts.reaching import ReachingTracker, near_function
-from orthocas.charts.solutions import Solutions, Tracker
+from orthocas.charts.search import Cells, InDomain, Inside, Starts
+from orthocas.charts.trackers import ReachingTracker, Tracker, near_function
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, units_hint
 from orthocas.tasks.domains import bounds_of, sample_uniform
 from orthocas.tasks.problem import task_sizes
@@ -43,8 +40,6 @@ from orthocas.tools.checks import (
     require_known,
 )
 
-_TURNED = 8  # samples that show whether a turn changes xi by the same everywhere
-_SAME_SHIFT = 1e-9  # of xi
 FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian", "inverse")
 
 
@@ -248,10 +243,10 @@ class InverseMethods(PhiFunctions):
         One posture then has many values of xi, these apart. Joints whose turns do not change xi are missing, and so are
         those whose turns change it by different amounts in different postures.
         """
-        q, found = sample_uniform(self.problem.domain, _TURNED, 0), {}
+        q, found = sample_uniform(self.problem.domain, 8, 0), {}
         for k in self.problem.turning:
             shift = self.parts.phi_map.difference(self.phi(q + 2 * np.pi * np.eye(self.n)[k]), self.phi(q))[:, self.m :]
-            if np.abs(shift[0]).max() > _SAME_SHIFT and np.ptp(shift, axis=0).max() < _SAME_SHIFT:
+            if np.abs(shift[0]).max() > DESCENT.same and np.ptp(shift, axis=0).max() < DESCENT.same:
                 found[self.problem.robot.joint_names[k]] = np.asarray(shift[0])
         return found
 
@@ -402,7 +397,9 @@ class ChartParts:
         if isinstance(chart.coordinates, InvertibleMap):
             return Inverse(chart.problem, phi_map, OwnInverse(chart.coordinates, phi_map), starts)
         boxed = BoxedPhi(chart.problem.task, domain, phi_map)
-        local, brief = (FewRows(phi_map, self.point_functions, Newton(phi_map, k)) for k in (HALVINGS, BRIEF))
+        local, brief = (
+            FewRows(phi_map, self.point_functions, Newton(phi_map, k)) for k in (NEWTON.halvings, NEWTON.brief)
+        )
         in_domain, inside = InDomain(boxed, Cells(boxed)), Inside(boxed, starts)
         curves = SelfMotionCurves(boxed, starts, chart.xi) if chart.r == 1 else None
         return Inverse(chart.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves, brief)

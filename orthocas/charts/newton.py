@@ -1,38 +1,42 @@
-"""Newton's method for phi(q) = phi: many rows at once, few rows one by one, its starts, and its derivatives."""
+"""Solvers of phi(q) = phi near a start: Newton's method for many rows, few rows and CasADi, and continuation."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from math import comb
 from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from orthocas.charts.coordinates import InvertibleMap
 from orthocas.charts.phi import ROUNDING, Differences, PhiMap, largest
-from orthocas.errors import SingularTaskError
-from orthocas.tasks.domains import Domain, sample_heavily
 from orthocas.tools.batch import dense_function, in_threads
-from orthocas.tools.cached import BuiltOnUse, cached_property
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.interrupts import deferred
 
-MAX_ITERATIONS = 50
-_PATIENCE = 8  # iterations after which the error must have halved
-GOAL = 1e-12  #: error at which the iteration stops
-_KEEP = 0.1  # J is evaluated again if a step leaves more of the error
-_DECREASE = 1e-4  # of the error, relative to the part of the step taken
-HALVINGS, BRIEF = 10, 3  #: of a step, and where another search follows
-_SOLVED = 1e-10  # below this error only rounding stops the decrease
-_PIECE = 2048  # matrices that a thread inverts at once
-SUSPICIOUS = 1e6  #: |J| |J^-1| above which singular values are computed
-_FEW = 4  # rows that are solved one by one
-STEPS = 3  #: with the same Jacobian
-REFRESHES = 4
-_TOLERANCE = 1e-9  # the largest relative error of a solution
+
+@dataclass(frozen=True, slots=True)
+class NewtonRules:
+    """Numbers of Newton's method. Errors are relative to the sizes of the components."""
+
+    iterations: int = 50  #: at most
+    patience: int = 8  #: iterations after which the error must have halved
+    goal: float = 1e-12  #: error at which the iteration stops
+    keep: float = 0.1  #: J is evaluated again if a step leaves more of the error
+    decrease: float = 1e-4  #: of the error, relative to the part of the step taken
+    halvings: int = 10  #: of a step
+    brief: int = 3  #: the same where another search follows
+    solved: float = 1e-10  #: error below which only rounding stops the decrease
+    piece: int = 2048  #: matrices that a thread inverts at once
+    suspicious: float = 1e6  #: |J| |J^-1| above which singular values are computed
+    few: int = 4  #: rows that are solved one by one
+    steps: int = 3  #: with the same Jacobian, of one row
+    refreshes: int = 4  #: of that Jacobian
+    tolerance: float = 1e-9  #: error of a solution in CasADi
+
+
+NEWTON = NewtonRules()
 _OPTIONS: dict[str, Any] = {
     "error_on_fail": False,  # an exception would end an optimisation
     "abstol": 1e-12,
@@ -40,9 +44,6 @@ _OPTIONS: dict[str, Any] = {
     "line_search": True,
     "linear_solver": "symbolicqr",
 }
-_POINTS, _SEED = 4096, 0  # of the table
-_DEGREES, _MOST_TERMS = (3, 2, 1), 500  # of the rough inverse: the first degree with so few terms
-_OVERSHOOT = 1.2  # beyond the values of the table, polynomials are not trusted
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ class Newton:
         halvings: of a step whose error does not decrease, before a row is given up.
     """
 
-    def __init__(self, phi_map: PhiMap, halvings: int = HALVINGS) -> None:
+    def __init__(self, phi_map: PhiMap, halvings: int = NEWTON.halvings) -> None:
         self._map, self._halvings = phi_map, halvings
 
     def __call__(self, targets: Array, starts: Array) -> Attempt:
@@ -91,11 +92,11 @@ class Newton:
             rows = np.flatnonzero(np.isfinite(run.error))
             run.refresh(rows)
             before = run.error.copy()
-            for k in range(1, MAX_ITERATIONS + 1):
-                if k % _PATIENCE == 0:
+            for k in range(1, NEWTON.iterations + 1):
+                if k % NEWTON.patience == 0:
                     rows = rows[run.error[rows] < before[rows] / 2]
                     before[rows] = run.error[rows]
-                rows = rows[run.error[rows] > GOAL]
+                rows = rows[run.error[rows] > NEWTON.goal]
                 if not rows.size:
                     break
                 run.refresh(rows[run.stale[rows]])
@@ -143,7 +144,7 @@ class _Run:
             if halvings == 0:
                 waiting = ~self._fresh[rows[left]]
                 self.stale[rows[left[waiting]]] = goes_on[left[waiting]] = True
-                left = left[~waiting & (self.error[rows[left]] > _SOLVED)]
+                left = left[~waiting & (self.error[rows[left]] > NEWTON.solved)]
             if not left.size:
                 break
         self._fresh[rows] = False
@@ -154,17 +155,17 @@ class _Run:
         q = self.q[rows] + share * steps
         residual = self._map.residual(self._targets[rows], q)
         before, error = self.error[rows], largest(residual)
-        better = error < (1 - _DECREASE * share) * before
+        better = error < (1 - NEWTON.decrease * share) * before
         moved = rows[better]
         self.q[moved], self.residual[moved], self.error[moved] = q[better], residual[better], error[better]
         self.iterations[moved] += 1
-        self.stale[moved] = error[better] > _KEEP * before[better]
+        self.stale[moved] = error[better] > NEWTON.keep * before[better]
         return better
 
     @property
     def suspicious(self) -> NDArray[np.bool_]:
         """Rows whose last J may be singular: |J| |J^-1| is not less than its condition number."""
-        return np.asarray(~(self._condition < SUSPICIOUS))
+        return np.asarray(~(self._condition < NEWTON.suspicious))
 
 
 def inverses(matrices: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -175,7 +176,7 @@ def inverses(matrices: Array) -> tuple[Array, NDArray[np.bool_]]:
     singular: NDArray[np.bool_] = np.zeros(len(matrices), dtype=bool)
     try:
         found = np.empty_like(matrices)
-        pieces = [slice(first, first + _PIECE) for first in range(0, len(matrices), _PIECE)]
+        pieces = [slice(first, first + NEWTON.piece) for first in range(0, len(matrices), NEWTON.piece)]
         for piece, inverse in zip(
             pieces, in_threads(lambda piece: np.linalg.inv(matrices[piece]), pieces), strict=True
         ):
@@ -193,6 +194,73 @@ def _norm(matrices: Array) -> Array:
     """Frobenius norms, (N,)."""
     norms: Array = np.sqrt(np.einsum("nij,nij->n", matrices, matrices))
     return norms
+
+
+@dataclass(frozen=True, slots=True)
+class ContinuationRules:
+    """Numbers of the continuation. Chosen on panda-wide, held on five arms (tests/charts/test_continuation.py)."""
+
+    first: float = 0.1  #: largest change of a joint in the first step [rad] or [m]
+    longest: float = 0.3  #: in any step
+    shortest: float = 1e-5  #: a line that needs shorter steps ends at a fold
+    bent: float = 0.3  #: largest miss of the linear prediction, relative to the part of the way taken
+    straight: float = 0.1  #: the miss up to which the next step may be longer
+    rounding: float = 1e-9  #: error below which only rounding may stop the decrease
+    most: int = 400  #: steps
+
+
+CONTINUATION = ContinuationRules()
+
+
+class Continuation:
+    """Follows phi(q(s)) = phi - (1 - s) e from a start with the error e = phi - phi(q), to s = 1.
+
+    Errors of orientations and of periodic coordinates are the shorter way around. Each step goes along J^-1 e; it is
+    halved until phi follows the line and det J keeps its sign, so q stays on the sheet of its start. It finds nothing
+    where the line meets a fold first, or where e is not the way that the arm can take.
+    """
+
+    def __init__(self, phi_map: PhiMap) -> None:
+        self._map = phi_map
+
+    def __call__(self, targets: Array, starts: Array) -> Attempt:
+        """Follow the lines to targets (N, n) from starts (N, n)."""
+        with np.errstate(all="ignore"):
+            return self._followed(targets, starts)
+
+    def _followed(self, targets: Array, starts: Array) -> Attempt:
+        q, residual = starts.copy(), self._map.residual(targets, starts)
+        error = largest(residual)
+        step, sign = self._steps(targets, q, residual)
+        h, iterations = np.full(len(q), CONTINUATION.first), np.zeros(len(q), dtype=np.int64)
+        left = np.flatnonzero(np.isfinite(error) & np.isfinite(step).all(axis=1))
+        for _ in range(CONTINUATION.most):
+            left = left[(error[left] > NEWTON.goal) & (h[left] > CONTINUATION.shortest)]
+            if not left.size:
+                break
+            share = np.minimum(1.0, h[left] / np.abs(step[left]).max(axis=1))
+            new = q[left] + share[:, None] * step[left]
+            after = self._map.residual(targets[left], new)
+            miss = largest(after - (1 - share[:, None]) * residual[left]) / (share * error[left])
+            onward, side = self._steps(targets[left], new, after)
+            rounded = (share == 1) & (error[left] < CONTINUATION.rounding)
+            good = (miss <= CONTINUATION.bent) & (side == sign[left]) & np.isfinite(onward).all(axis=1)
+            good &= ~rounded | (largest(after) < error[left])
+            moved = left[good]
+            q[moved], residual[moved], step[moved] = new[good], after[good], onward[good]
+            error[moved] = largest(after[good])
+            iterations[moved] += 1
+            longer = miss[good] <= CONTINUATION.straight
+            h[moved] = np.where(longer, np.minimum(1.5 * h[moved], CONTINUATION.longest), h[moved])
+            h[left[~good]] /= 2
+            left = left[good | ~rounded]
+        return Attempt(q, residual, iterations, np.ones(len(q), dtype=bool))
+
+    def _steps(self, targets: Array, q: Array, residual: Array) -> tuple[Array, Indices]:
+        """J^-1 e at points (N, n), and the signs of det J, (N,)."""
+        J = self._map.jacobian(q) / self._map.scale(targets)[:, :, None]
+        steps = (inverses(J)[0] @ residual[:, :, None])[:, :, 0]
+        return steps, np.sign(np.linalg.slogdet(J)[0]).astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -232,7 +300,7 @@ class PointFunctions:
         scale = ca.DM(sizes) + ROUNDING * ca.fabs(target)
         now, value, left = q, known, difference(target, known)
         errors = [ca.norm_2(left / scale)]  # norm_inf drops NaN
-        for _ in range(STEPS):
+        for _ in range(NEWTON.steps):
             now = now + H @ left
             value = phi(now)
             left = difference(target, value)
@@ -256,7 +324,7 @@ class PointSolver:
     def __init__(self, functions: PointFunctions) -> None:
         n = functions.chord.numel_out(0)
         self.q, self.phi, self.target, self.reached, self._phi_reached = np.empty((5, n))
-        self.errors, self.condition = np.empty(STEPS + 1), np.empty(1)
+        self.errors, self.condition = np.empty(NEWTON.steps + 1), np.empty(1)
         self.iterations = 0  #: of the last solution
         H = np.empty(n * n)
         self._refresh = Bound(functions.inverted, [self.q], [self.phi, H, self.condition])
@@ -266,7 +334,7 @@ class PointSolver:
     def refresh(self) -> bool:
         """Evaluate phi and J at q. Returns whether J is regular."""
         self._refresh.run()
-        return bool(self.condition[0] < SUSPICIOUS)
+        return bool(self.condition[0] < NEWTON.suspicious)
 
     def step(self) -> bool:
         """Take steps from q with the last J. Returns whether all of them reduced the error; q stays."""
@@ -280,12 +348,12 @@ class PointSolver:
     def solve(self) -> bool:
         """Solve for the target from q. Returns whether the error fell to rounding; then q is the solution."""
         self.iterations = 0
-        for _ in range(REFRESHES):
+        for _ in range(NEWTON.refreshes):
             if not self.refresh() or not self.step():
                 return False
             self.accept()
-            self.iterations += STEPS
-            if self.errors[-1] <= GOAL:
+            self.iterations += NEWTON.steps
+            if self.errors[-1] <= NEWTON.goal:
                 return True
         return False
 
@@ -298,7 +366,7 @@ class FewRows:
 
     def __call__(self, targets: Array, starts: Array) -> Attempt:
         """Search from starts (N, n)."""
-        if len(targets) > _FEW:
+        if len(targets) > NEWTON.few:
             return self._other(targets, starts)
         attempt = Attempt.empty(*targets.shape)
         with deferred():  # otherwise CasADi turns Ctrl-C into a RuntimeError, or swallows it
@@ -313,7 +381,7 @@ class FewRows:
 
 def decreasing(errors: list[float]) -> bool:
     """Whether errors fall until they are rounding."""
-    return all(after < before or after <= GOAL for before, after in pairwise(errors))
+    return all(after < before or after <= NEWTON.goal for before, after in pairwise(errors))
 
 
 class Bound:
@@ -356,104 +424,7 @@ def inverse_function(phi: ca.Function, sizes: Array, difference: Differences) ->
 
     solve = ca.rootfinder("solve", "newton", {"x": q, "p": target, "g": residual(q)}, _OPTIONS)
     found = solve(start, target)
-    failed = ca.if_else(ca.norm_2(residual(found)) <= _TOLERANCE, 0.0, np.nan)  # a constant, so without derivatives
+    failed = ca.if_else(
+        ca.norm_2(residual(found)) <= NEWTON.tolerance, 0.0, np.nan
+    )  # a constant, so without derivatives
     return ca.Function("inverse", [target, start], [found + failed], ["phi", "q_start"], ["q"])
-
-
-class Starts:
-    """Joint positions from which Newton's method may reach phi(q) = phi.
-
-    The rough inverse is a polynomial q(phi), fitted to 4,096 points of the domain by least squares. Both coordinates
-    and task are smooth, so it is much closer than the centre of the domain. It takes 0.1 s once for each chart.
-    """
-
-    def __init__(self, phi_map: PhiMap, domain: Domain) -> None:
-        self._map, self._domain = phi_map, domain
-
-    def guess(self, targets: Array) -> Array:
-        """The rough inverse at targets (N, n), moved into the box of the domain, (N, n)."""
-        centre, half_width = self._domain.centre, self._domain.half_width
-        q = _terms(self._normalised(targets), self._degree) @ self._coefficients
-        guess: Array = np.clip(q, centre - half_width, centre + half_width)
-        return guess
-
-    def nearest(self, targets: Array, count: int, components: int) -> Array:
-        """The points of the table whose phi is nearest to targets (N, n), nearest first, (count or fewer, N, n).
-
-        Args:
-            targets: values of phi.
-            count: points for each target.
-            components: how many components of phi count, the first ones.
-        """
-        points = self._table[0]
-        order = self._trees[components].query(self._places(targets, components), range(1, min(count, len(points)) + 1))[
-            1
-        ]
-        nearest: Array = points[order.T]
-        return nearest
-
-    @cached_property
-    def _trees(self) -> BuiltOnUse[int, Any]:
-        """Search trees of places of the table, by the number of components that count."""
-        return BuiltOnUse(lambda components: scipy.spatial.cKDTree(self._places(self._table[1], components)))
-
-    def _places(self, phi: Array, components: int) -> Array:
-        """Numbers (N, k) that are near one another where the first components of phi (N, n) are."""
-        normalised, relative = self._normalised(phi)[:, :components], self._map.difference.task
-        if relative is None or not relative.turned:
-            return normalised
-        first, last = relative.first, relative.task.m
-        orientations = relative.embedded(phi[:, :last]) / self._range[1][first:last].mean()
-        return np.concatenate([normalised[:, :first], orientations, normalised[:, last:]], axis=1)
-
-    @cached_property
-    def _table(self) -> tuple[Array, Array]:
-        """Points of the domain where phi is defined, and phi, (K, n) each."""
-        return where_known(self._map, sample_heavily(self._domain, _POINTS, _SEED))
-
-    @cached_property
-    def _range(self) -> tuple[Array, Array]:
-        """Middle and half of the range of phi over the domain, (n,) each."""
-        low, high = self._table[1].min(axis=0), self._table[1].max(axis=0)
-        return (low + high) / 2, np.where(high > low, (high - low) / 2, 1.0)
-
-    @cached_property
-    def _coefficients(self) -> Array:
-        """Of the rough inverse, (terms, n)."""
-        points, phi = self._table
-        found = np.linalg.lstsq(_terms(self._normalised(phi), self._degree), points, rcond=None)[0]
-        return np.asarray(found, dtype=float)
-
-    @property
-    def _degree(self) -> int:
-        n = len(self._domain.centre)
-        return next((degree for degree in _DEGREES if comb(n + degree, degree) <= _MOST_TERMS), 1)
-
-    def _normalised(self, phi: Array) -> Array:
-        """Values of phi (N, n) in the range [-1, 1], or a little beyond."""
-        middle, half = self._range
-        return np.clip((phi - middle) / half, -_OVERSHOOT, _OVERSHOOT)
-
-
-def where_known(phi_map: PhiMap, points: Array) -> tuple[Array, Array]:
-    """The points (N, n) at which phi is finite, and phi there, (K, n) each.
-
-    Raises:
-        SingularTaskError: if there are none.
-    """
-    phi = phi_map.phi(points)
-    known = np.isfinite(phi).all(axis=1)
-    if not known.any():
-        raise SingularTaskError(f"phi is not finite at any of {len(points)} samples of the domain")
-    return points[known], phi[known]
-
-
-def _terms(u: Array, degree: int) -> Array:
-    """All monomials of the columns of u (N, n) up to a degree, (N, terms)."""
-    columns = np.ascontiguousarray(u.T)
-    level = [(0, np.ones(len(u)))]  # index of the last factor, product
-    terms = [level[0][1]]
-    for _ in range(degree):
-        level = [(j, product * columns[j]) for i, product in level for j in range(i, len(columns))]
-        terms += [product for _, product in level]
-    return np.array(terms).T

@@ -19,14 +19,26 @@ from orthocas.tools.columns import MANY
 from orthocas.tools.display import Shown, number_list
 from orthocas.tools.json import attributes
 
-_CHUNK = 40_000  # joint positions evaluated at once
-_NEAR_THE_END = 0.1  # cos(angle / 2) of turns beyond which rounding of J_x shows
-_LONGEST = 1e100  # squares of longer gradients overflow: they have no value
-CANDIDATES = 6000
-_DESCENTS, _STEPS = 300, 15  # of the worst candidates
-_KEPT, _MORE_STEPS = 60, 150  # the worst of them go on, if the result is to be printed
-_FIRST_STEP, _LAST_STEP = 0.3, 1e-4  # of the half-widths
-_MOVED = 0.4  # share of the joints that move in a step
+
+@dataclass(frozen=True, slots=True)
+class WorstRules:
+    """Numbers of the quality at points, and of descents to the worst ones."""
+
+    chunk: int = 40_000  #: joint positions evaluated at once
+    near_the_end: float = 0.1  #: cos(angle / 2) of turns beyond which rounding of J_x shows
+    longest: float = 1e100  #: squares of longer gradients overflow: they have no value
+    candidates: int = 6000  #: points from which descents may start
+    descents: int = 300  #: from the worst of them
+    steps: int = 15  #: of each
+    kept: int = 60  #: the worst of these go on, if the result is to be printed
+    more_steps: int = 150  #: of those
+    first_step: float = 0.3  #: half-widths
+    last_step: float = 1e-4  #: half-widths
+    moved: float = 0.4  #: fraction of the joints that move in a step
+
+
+WORST = WorstRules()
+
 Value = Callable[[Array], Array]  #: u (N, n) -> (N,), NaN where there is no value
 
 
@@ -47,8 +59,8 @@ class Judged:
     @classmethod
     def at(cls, problem: Problem, coordinates: CoordinateMap, points: Array) -> Self:
         """Judge coordinates at joint positions (N, n)."""
-        starts = range(0, max(len(points), 1), _CHUNK)
-        parts = [_judged(problem, coordinates, points[start : start + _CHUNK]) for start in starts]
+        starts = range(0, max(len(points), 1), WORST.chunk)
+        parts = [_judged(problem, coordinates, points[start : start + WORST.chunk]) for start in starts]
         found: dict[str, Any] = parts[0]
         if len(parts) > 1:
             together = in_threads(lambda name: np.concatenate([part[name] for part in parts]), list(found))
@@ -65,12 +77,12 @@ def _judged(problem: Problem, coordinates: CoordinateMap, points: Array) -> dict
     J = coordinates.jacobian(samples.points)
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         squares = np.einsum("sij,sij->si", J, J)
-    alive = ((squares > 0) & (squares < _LONGEST**2)).all(axis=1)  # false for NaN, as grown coordinates have it
+    alive = ((squares > 0) & (squares < WORST.longest**2)).all(axis=1)  # false for NaN, as grown coordinates have it
     kept[kept] = alive
     if not alive.all():
         samples, J = samples[alive], J[alive]
     found = judge(samples, J)
-    ends = distance_from_half_a_turn(problem, samples.points) < _NEAR_THE_END
+    ends = distance_from_half_a_turn(problem, samples.points) < WORST.near_the_end
     if ends.any():
         for name, values in zip(
             ("leak_sines", "conditioning", "signs"), _by_frame(problem, samples[ends], J[ends]), strict=True
@@ -160,7 +172,7 @@ class WorstPoints:
     def explained(self) -> str:
         """The least conditioning and how it was searched."""
         found = f"{self.least:.3f}" if self.least >= 0 else "0, the chart FOLDS OVER"
-        return f"{found} ({len(self.points)} descents from {CANDIDATES} points, many in corners)"
+        return f"{found} ({len(self.points)} descents from {WORST.candidates} points, many in corners)"
 
     def below(self, bound: float) -> Array:
         """Points with less conditioning than that, (l, n)."""
@@ -179,7 +191,7 @@ def worst_points(problem: Problem, coordinates: CoordinateMap, seed: int = 0, *,
         seed: seed of candidates and steps.
         thorough: follow the worst descents to their ends, for a least value that is printed; fits need bad points only.
     """
-    points = sample_heavily(problem.domain, CANDIDATES, (seed, CANDIDATES, 1))
+    points = sample_heavily(problem.domain, WORST.candidates, (seed, WORST.candidates, 1))
     u = (points - problem.domain.centre) / problem.domain.half_width
     found = _signed_conditioning(problem, coordinates, u)
     orientation = 1.0 if np.sum(found >= 0) >= np.isfinite(found).sum() / 2 else -1.0
@@ -202,7 +214,7 @@ def least_in_domain(value: Value, domain: Domain, seed: int = 0) -> Array:
     Source:
         ours.
     """
-    points = sample_heavily(domain, CANDIDATES, (seed, CANDIDATES, 1))
+    points = sample_heavily(domain, WORST.candidates, (seed, WORST.candidates, 1))
 
     def inside(u: Array) -> Array:
         q = domain.centre + domain.half_width * u
@@ -226,27 +238,27 @@ def descended(value: Value, u: Array, found: Array, seed: int, thorough: bool) -
         seed: of the steps.
         thorough: whether the least descents go on until they gain nothing.
     """
-    rng = np.random.default_rng((seed, CANDIDATES))
-    order = np.argsort(found)[: min(_DESCENTS, int(np.isfinite(found).sum()))]
-    u, found, step = u[order], found[order], np.full(len(order), _FIRST_STEP)
-    for _ in range(_STEPS):
+    rng = np.random.default_rng((seed, WORST.candidates))
+    order = np.argsort(found)[: min(WORST.descents, int(np.isfinite(found).sum()))]
+    u, found, step = u[order], found[order], np.full(len(order), WORST.first_step)
+    for _ in range(WORST.steps):
         _step(value, u, found, step, rng)
     order = np.argsort(found)
     u, found, step = u[order], found[order], step[order]
-    for _ in range(_MORE_STEPS * thorough):
-        _step(value, u[:_KEPT], found[:_KEPT], step[:_KEPT], rng)
+    for _ in range(WORST.more_steps * thorough):
+        _step(value, u[: WORST.kept], found[: WORST.kept], step[: WORST.kept], rng)
     order = np.argsort(found)
     return u[order], found[order]
 
 
 def _step(value: Value, u: Array, found: Array, step: Array, rng: np.random.Generator) -> None:
     """One step of all descents, in place."""
-    moves = rng.normal(size=u.shape) * (rng.uniform(size=u.shape) < _MOVED)
+    moves = rng.normal(size=u.shape) * (rng.uniform(size=u.shape) < WORST.moved)
     tried = np.clip(u + step[:, None] * moves, -1, 1)
     values = value(tried)
     less = values < found
     u[less], found[less] = tried[less], values[less]
-    step[:] = np.maximum(_LAST_STEP, step * np.where(less, 1.5, 0.8))
+    step[:] = np.maximum(WORST.last_step, step * np.where(less, 1.5, 0.8))
 
 
 def _signed_conditioning(problem: Problem, coordinates: CoordinateMap, u: Array) -> Array:

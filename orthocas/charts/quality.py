@@ -22,12 +22,21 @@ from orthocas.tools.json import attributes, plain
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_BIN = 0.1  # [deg]; the middle angle lies in the middle of its bin
-_PIECE = 2**13  # samples that a thread takes at once
-DEGENERATE = 0.1  #: 1 % quantile of the conditioning below which a chart is reported as degenerate
-SAMPLES, SEED = 100_000, 1  #: of an evaluation by default
-_TELLING = 200  # samples by which idle joints are found
-_ALONE = 1e-10  # share of a gradient that counts as zero
+
+@dataclass(frozen=True, slots=True)
+class ReportRules:
+    """Numbers of an evaluation."""
+
+    bin: float = 0.1  #: [deg]; the middle angle lies in the middle of its bin
+    piece: int = 2**13  #: samples that a thread takes at once
+    degenerate: float = 0.1  #: 1 % quantile of the conditioning below which a chart is reported as degenerate
+    samples: int = 100_000  #: by default
+    seed: int = 1  #: by default
+    telling: int = 200  #: samples by which idle joints are found
+    alone: float = 1e-10  #: fraction of a gradient that counts as zero
+
+
+RULES = ReportRules()
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,18 +54,18 @@ class _Sums:
     def of(cls, inverse: Callable[[Array], Array], values: Array, middle: float, most: int) -> Self:
         """Of inverse(values), for values (N, k); angles are at most `most` degrees."""
         N, k = values.shape
-        bins = round(most / _BIN) + 1
+        bins = round(most / RULES.bin) + 1
         first_bins = bins * np.arange(k)[:, None]
 
         def one_piece(start: int) -> tuple[Array, Array, Array, Indices]:
-            angles = np.degrees(inverse(np.ascontiguousarray(values[start : start + _PIECE].T)))
-            places = (angles / _BIN + 0.5).astype(np.intp) + first_bins
+            angles = np.degrees(inverse(np.ascontiguousarray(values[start : start + RULES.piece].T)))
+            places = (angles / RULES.bin + 0.5).astype(np.intp) + first_bins
             counts = np.bincount(places.ravel(), minlength=k * bins).reshape(k, bins)
             angles -= middle
             return angles.sum(axis=1), (angles * angles).sum(axis=1), np.abs(angles).max(axis=1), counts
 
         first, second, largest, counts = np.zeros(k), np.zeros(k), np.zeros(k), np.zeros((k, bins))
-        for part in in_threads(one_piece, range(0, N, _PIECE) if k else ()):
+        for part in in_threads(one_piece, range(0, N, RULES.piece) if k else ()):
             first, second, counts = first + part[0], second + part[1], counts + part[3]
             largest = np.maximum(largest, part[2])
         return cls(N, middle, first, second, largest, counts)
@@ -226,7 +235,7 @@ class Report(Shown):
     @property
     def degenerate(self) -> bool:
         """Whether coordinates are nearly parallel to each other or to the task gradients on over 1 % of the domain."""
-        return self.conditioning.p01 < DEGENERATE
+        return self.conditioning.p01 < RULES.degenerate
 
     def plot(self) -> "Figure":
         """Histograms of angles and leaks, as a matplotlib figure; see `orthocas.plotting.quality_figure`."""
@@ -338,7 +347,10 @@ def evaluate(
     """
     require_kind("chart", chart, Chart)
     if points is None:
-        count, drawn = _count(chart, SAMPLES if samples is None else samples), SEED if seed is None else seed
+        count, drawn = (
+            _count(chart, RULES.samples if samples is None else samples),
+            RULES.seed if seed is None else seed,
+        )
         drawn = require_count("seed", drawn, least=0)
         searched = isinstance(chart.coordinates, Coordinates) and not chart.problem.domain.full_turns
         problem, found = chart.problem, chart.coordinates
@@ -399,10 +411,10 @@ def _worst_point(judged: Judged, worst: WorstPoints | None) -> Array:
 
 def _idle_coordinates(chart: Chart, judged: Judged) -> dict[int, str]:
     """Coordinates that are functions of one idle joint alone, with the names of these joints."""
-    first = samples_at(chart.problem, sample_uniform(chart.problem.domain, _TELLING, 0))
+    first = samples_at(chart.problem, sample_uniform(chart.problem.domain, RULES.telling, 0))
     found: dict[int, str] = {}
     for joint in idle_joints(chart.problem, first):
-        likely = _functions_of(joint, judged.jacobian[:_TELLING])
+        likely = _functions_of(joint, judged.jacobian[: RULES.telling])
         sure = likely[_functions_of(joint, judged.jacobian[:, likely])]
         found |= {int(j): chart.problem.robot.joint_names[joint] for j in sure}
     return found
@@ -410,7 +422,7 @@ def _idle_coordinates(chart: Chart, judged: Judged) -> dict[int, str]:
 
 def _functions_of(joint: int, J: Array) -> NDArray[np.int_]:
     """Coordinates whose gradients, rows of J (N, r, n), have entries for one joint only."""
-    others = np.abs(np.delete(J, joint, axis=2)).max(axis=2, initial=0.0) <= _ALONE * _lengths(J)
+    others = np.abs(np.delete(J, joint, axis=2)).max(axis=2, initial=0.0) <= RULES.alone * _lengths(J)
     return np.flatnonzero(others.all(axis=0))
 
 

@@ -21,17 +21,25 @@ from orthocas.tools.expressions import shortest
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
 
-_AT_LIMIT = 1e-9  # of the half-width: boundaries closer to a joint limit are that limit
-_TOLERANCE = 1e-11  # largest error of the components that are held, relative to `Chart.phi_sizes`
-_CORRECTIONS = 8
-_SHARPEST = np.cos(0.35)  # of the angle between the tangents at both ends of a step
-_SHORTEST = 1e-5  # share of the largest step below which there is no way on
-_LONGEST = 1000.0  # length of a curve [rad] or [m] after which it counts as endless
-_ROUNDING = 2e-12  # of the place of a boundary on a step
-_STEP = 0.1  # [rad] or [m], of the widest step
-_PHI_TOLERANCE = 1e-10  # of phi, relative to `Chart.phi_sizes`
-_FARTHEST = 3.0  # distance of a point from its neighbour, in lengths of the predicted step
-_MOST = 4  # times as many points as wanted, at most
+
+@dataclass(frozen=True, slots=True)
+class SelfMotionRules:
+    """Numbers of ranges and self-motions."""
+
+    at_limit: float = 1e-9  #: half-widths: boundaries closer to a joint limit are that limit
+    tolerance: float = 1e-11  #: largest error of the components that are held, relative to `Chart.phi_sizes`
+    corrections: int = 8  #: of a step
+    sharpest: float = float(np.cos(0.35))  #: of the angle between the tangents at both ends of a step
+    shortest: float = 1e-5  #: fraction of the largest step below which there is no way on
+    longest: float = 1000.0  #: length of a curve [rad] or [m] after which it counts as endless
+    rounding: float = 2e-12  #: of the place of a boundary on a step
+    step: float = 0.1  #: [rad] or [m], of the widest step
+    phi_tolerance: float = 1e-10  #: of phi, relative to `Chart.phi_sizes`
+    farthest: float = 3.0  #: distance of a point from its neighbour, in lengths of the predicted step
+    most: int = 4  #: times as many points as wanted, at most
+
+
+RULES = SelfMotionRules()
 
 
 @dataclass(frozen=True)
@@ -89,7 +97,7 @@ class Walls:
             return Stop(wall.kind, value=value, condition=wall.heading)
         i = k % n
         boundary, limit = (self._low, self._robot.lower) if k < n else (self._high, self._robot.upper)
-        at_limit = bool(abs(boundary[i] - limit[i]) <= _AT_LIMIT * self._domain.half_width[i])
+        at_limit = bool(abs(boundary[i] - limit[i]) <= RULES.at_limit * self._domain.half_width[i])
         return Stop(StopKind.JOINT, self._robot.joint_names[i], float(boundary[i]), at_limit)
 
     def worst(self, q: Array) -> Stop:
@@ -153,7 +161,7 @@ class LevelCurve:
             found = self._stepped(points[-1], tangents[-1], h, target)
             if found is None:
                 h /= 2
-                stop = Stop(StopKind.SINGULAR) if h < _SHORTEST * self._step else None
+                stop = Stop(StopKind.SINGULAR) if h < RULES.shortest * self._step else None
                 continue
             if self._margin(*found, signs) < 0:
                 found, stop = self._end(points[-1], tangents[-1], h, target, signs)
@@ -161,7 +169,7 @@ class LevelCurve:
                 found = self._back_at_start(points[-1], tangents[-1], h, target, q, tangents[0])
                 stop = Stop(StopKind.ENDLESS)
             lengths.append(lengths[-1] + _arc(points[-1], tangents[-1], *found))
-            stop = Stop(StopKind.ENDLESS) if stop is None and lengths[-1] > _LONGEST else stop
+            stop = Stop(StopKind.ENDLESS) if stop is None and lengths[-1] > RULES.longest else stop
             points.append(found[0])
             tangents.append(found[1])
             h = min(1.5 * h, self._step)
@@ -183,7 +191,7 @@ class LevelCurve:
     def _stepped(self, q: Array, t: Array, h: float, target: Array) -> tuple[Array, Array] | None:
         """The point a step ahead and the tangent there; None if the corrector fails or the curve turns too far."""
         new = q + h * t
-        for _ in range(_CORRECTIONS):
+        for _ in range(RULES.corrections):
             error = -self._difference(target, self._value(new))[self._held] / self._sizes
             J = self._rows(new)
             if J is None or not np.abs(error).max() < np.inf:
@@ -192,9 +200,9 @@ class LevelCurve:
             new = new + change
             if np.linalg.norm(new - q) > 2 * h + self._step / 10:
                 return None
-            if np.abs(error).max() < _TOLERANCE:
+            if np.abs(error).max() < RULES.tolerance:
                 onward = self.tangent(new, t)
-                return None if onward is None or onward @ t < _SHARPEST else (new, onward)
+                return None if onward is None or onward @ t < RULES.sharpest else (new, onward)
         return None
 
     def _margin(self, q: Array, t: Array, signs: Signs | None) -> float:
@@ -212,10 +220,10 @@ class LevelCurve:
 
         s = 0.0
         if self._margin(q, t, signs) > 0:
-            s = scipy.optimize.brentq(margin, 0.0, h, xtol=_ROUNDING)
-        point, onward = self._stepped(q, t, max(0.0, s - 2 * _ROUNDING), target) or (q, t)
+            s = scipy.optimize.brentq(margin, 0.0, h, xtol=RULES.rounding)
+        point, onward = self._stepped(q, t, max(0.0, s - 2 * RULES.rounding), target) or (q, t)
         # What ends the curve is told just beyond its end: a domain that only answers `contains` has no slope inside.
-        beyond, further = self._stepped(q, t, min(h, s + 2 * _ROUNDING), target) or (point, onward)
+        beyond, further = self._stepped(q, t, min(h, s + 2 * RULES.rounding), target) or (point, onward)
         values = self.walls.values(beyond)
         if signs is not None and signs(beyond, further) < values.min():
             return (point, onward), Stop(StopKind.FOLD)
@@ -236,7 +244,7 @@ class LevelCurve:
             point, _ = self._stepped(q, t, s, target) or (q, t)
             return float(self.walls.gap(point, start) @ t_start)
 
-        return self._stepped(q, t, scipy.optimize.brentq(ahead, 0.0, h, xtol=_ROUNDING), target) or (q, t)
+        return self._stepped(q, t, scipy.optimize.brentq(ahead, 0.0, h, xtol=RULES.rounding), target) or (q, t)
 
 
 Functions = tuple[Callable[[Array], Array], Callable[[Array], Array], Callable[[Array, Array], Array]]
@@ -370,7 +378,7 @@ def start_inside(chart: "Chart", q: ArrayLike) -> Array:
 def branch_along(chart: "Chart", q: Array, k: int, sign: float) -> Branch:
     """The curve from q (n,) on which x and all coordinates but the k-th stay, and that one rises (sign 1) or falls."""
     row = chart.m + k
-    curve = LevelCurve(chart, np.delete(np.arange(chart.n), row), _STEP)
+    curve = LevelCurve(chart, np.delete(np.arange(chart.n), row), RULES.step)
 
     def rising(point: Array, t: Array) -> float:
         gradient = chart.coordinates.jacobian(point[None])[0, k]
@@ -441,7 +449,7 @@ def filled(chart: "Chart", q: Array, alone: XiRange, samples: int) -> Array:
     known: dict[tuple[int, ...], Array] = {(0,) * chart.r: q}
     front, tried = list(known), set(known)
     start, sign = chart.phi(q), np.sign(np.linalg.det(chart.parts.batched_rates(q[None])[0]))
-    while front and len(known) < _MOST * samples:
+    while front and len(known) < RULES.most * samples:
         pairs = _neighbours(front, tried, cells)
         if not pairs:
             break
@@ -480,8 +488,10 @@ def _solved(chart: "Chart", starts: Array, targets: Array, sign: float) -> tuple
     step = np.linalg.solve(phi_map.jacobian(starts), phi_map.difference(targets, phi_map.phi(starts))[..., None])[
         ..., 0
     ]
-    near = np.linalg.norm(found.q - starts, axis=1) <= _FARTHEST * np.linalg.norm(step, axis=1) + 1e-9
-    rows = np.flatnonzero((largest(found.residual) < _PHI_TOLERANCE) & near & chart.problem.domain.contains(found.q))
+    near = np.linalg.norm(found.q - starts, axis=1) <= RULES.farthest * np.linalg.norm(step, axis=1) + 1e-9
+    rows = np.flatnonzero(
+        (largest(found.residual) < RULES.phi_tolerance) & near & chart.problem.domain.contains(found.q)
+    )
     same = np.sign(np.linalg.det(phi_map.jacobian(found.q[rows]))) == sign
     return found.q, np.asarray(rows[same], dtype=np.int64)
 

@@ -10,10 +10,9 @@ from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.curves import SelfMotionCurves
-from orthocas.charts.inverse import Inverse
+from orthocas.charts.inverse import Inverse, Solutions
 from orthocas.charts.methods import solve_with, targets_of_wish
-from orthocas.charts.newton import SUSPICIOUS, Attempt, Newton
-from orthocas.charts.solutions import Solutions
+from orthocas.charts.newton import NEWTON, Attempt, Newton
 from orthocas.codegen.compiled import kept_library, loaded, template
 from orthocas.codegen.compiled_curves import CompiledCurves, curve_source
 from orthocas.codegen.generate import generate_c
@@ -93,7 +92,7 @@ class CompiledInverse(Shown):
         in_threads(solve_piece, range(0, len(targets), _PIECE))
         phi_map = self.chart.parts.phi_map
         attempt.residual[:] = phi_map.difference(targets, attempt.residual) / phi_map.scale(targets)
-        attempt.iterations[:], attempt.suspicious[:] = 1, ~(condition < SUSPICIOUS)
+        attempt.iterations[:], attempt.suspicious[:] = 1, ~(condition < NEWTON.suspicious)
         return attempt, np.flatnonzero(condition < 0)
 
     @cached_property

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.solutions import InverseStatus
+from orthocas.charts.inverse import InverseStatus
 from orthocas.codegen.export_forms import Form, function_code
 from orthocas.tasks.domains import Domain, FoldBound, PathBound, SingularBound, bounds_of, sample_uniform
 from orthocas.tools.batch import dense_function

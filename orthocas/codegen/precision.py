@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.reaching import RULES, ReachingRules
+from orthocas.charts.trackers import RULES, ReachingRules
 from orthocas.codegen.description import numbers
 from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, Controller, with_smallest_volume
 from orthocas.tasks.domains import Domain, bounds_of, reach

@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.self_motion import too_far
-from orthocas.charts.solutions import Tracker, TrackerStatus
+from orthocas.charts.trackers import Tracker, TrackerStatus
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError, InverseError, OrthocasError, UnreachableReferenceError, degrees_hint
 from orthocas.tasks.domains import bounds_of, contains

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.solutions import Tracker, TrackerStatus
+from orthocas.charts.trackers import Tracker, TrackerStatus
 from orthocas.errors import DomainError, InvalidValueError, InverseError, MissingExtraError
 from orthocas.tasks.domains import bounds_of
 from orthocas.tools.checks import (

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.solutions import TrackerStatus
+from orthocas.charts.trackers import TrackerStatus
 from orthocas.errors import InvalidValueError, PathError, PathFileError
 from orthocas.paths.joint_motion import JointMotion
 from orthocas.robots.robot import Robot

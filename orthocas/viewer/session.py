@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.self_motion import Stop, Walls, fan_along
-from orthocas.charts.solutions import TrackerStatus
+from orthocas.charts.trackers import TrackerStatus
 from orthocas.errors import InvalidValueError
 from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import Branches

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 import orthocas as oc
 from orthocas import control
-from orthocas.charts.solutions import InverseStatus, TrackerStatus
+from orthocas.charts.inverse import InverseStatus
+from orthocas.charts.trackers import TrackerStatus
 from orthocas.codegen.library import CompiledLibrary, compile_shared
 from orthocas.codegen.supervisor import Supervisor
 from orthocas.control.controller import ControlStatus

@@ -15,7 +15,7 @@ from test_export import array_of, module_of
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.charts.solutions import InverseStatus
+from orthocas.charts.inverse import InverseStatus
 from orthocas.codegen.export import LIBRARIES
 from orthocas.tasks.domains import Domain, sample_uniform
 from orthocas.tools.checks import Array

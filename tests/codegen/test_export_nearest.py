@@ -13,7 +13,7 @@ from test_export import array_of, module_of
 from test_export_inverse import CHARTS as CHARTS_OF_INVERSE
 
 import orthocas as oc
-from orthocas.charts.solutions import InverseStatus
+from orthocas.charts.inverse import InverseStatus
 from orthocas.codegen.export import LIBRARIES
 from orthocas.tasks.domains import bounds_of, sample_uniform
 from orthocas.tools.checks import Array

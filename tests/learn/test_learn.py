@@ -11,7 +11,7 @@ from public_objects import ring, wide
 
 import orthocas as oc
 from orthocas import learn
-from orthocas.charts.solutions import TrackerStatus
+from orthocas.charts.trackers import TrackerStatus
 from orthocas.errors import DomainError, InvalidValueError, InverseError, ShapeError
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tools.checks import Array

@@ -9,8 +9,8 @@ import pytest
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.charts.reaching import RULES
 from orthocas.charts.self_motion import Interval, Stop
+from orthocas.charts.trackers import RULES
 from orthocas.errors import DomainError
 from orthocas.tasks.domains import StopKind, sample_uniform
 from orthocas.tools.checks import Array

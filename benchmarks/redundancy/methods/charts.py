@@ -6,7 +6,7 @@ from contextlib import suppress
 import numpy as np
 
 import orthocas as oc
-from orthocas.charts.solutions import Tracker
+from orthocas.charts.trackers import Tracker
 from orthocas.errors import DomainError, OrthocasError
 from orthocas.tools.checks import Array
 from redundancy.arms import TICK, Arm

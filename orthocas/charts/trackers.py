@@ -1,6 +1,7 @@
-"""Trackers that go as near as they can where phi is out of reach."""
+"""Trackers of moving targets, which stay or go as near as they can where phi is out of reach."""
 
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -8,12 +9,195 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.descent import rooms_of
-from orthocas.charts.newton import Bound, PointFunctions
-from orthocas.charts.phi import PhiMap
-from orthocas.charts.solutions import Tracker, TrackerStatus
-from orthocas.tasks.domains import Domain, reach
+from orthocas.charts.newton import NEWTON, Bound, PointFunctions, PointSolver
+from orthocas.charts.phi import PhiMap, leave_over
+from orthocas.errors import InvalidValueError, degrees_hint
+from orthocas.tasks.domains import Domain, bounds_of, contains, reach
 from orthocas.tools.batch import dense_function
-from orthocas.tools.checks import Array
+from orthocas.tools.cached import building
+from orthocas.tools.checks import Array, as_float_array, as_point, require_shape
+from orthocas.tools.display import Shown, number_list
+from orthocas.tools.interrupts import deferred
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerRules:
+    """Numbers of the tracker."""
+
+    rounded: float = 1e-9  #: error up to which only rounding may have stopped the decrease
+    returned: float = 1e-8  #: of phi, relative to its sizes: the tracker is back
+    step: float = 0.1  #: of the half-widths: default of the largest change of q in a call
+
+
+TRACKER = TrackerRules()
+
+
+class TrackerStatus(IntEnum):
+    """How the last call of a tracker ended. With all but OK, NEAREST and NEARER, q stays where it was."""
+
+    OK = 0  #: phi(q) = phi, inside the domain
+    JUMP = 1  #: q would have moved by more than `largest_step`
+    OUTSIDE_DOMAIN = 2  #: q would have left the domain
+    SINGULAR = 3  #: J is singular, or nearly so
+    LOST = 4  #: no solution near the last q
+    BAD_INPUT = 5  #: a number of phi is not finite
+    NEAREST = 6  #: a local minimum of the distance to phi in the domain; of trackers with `nearest=True`
+    NEARER = 7  #: at least as near as before, but no minimum: `largest_step` or the work of a call ended the descent
+
+
+class Tracker(Shown):
+    """Follows a stream of phi: each call starts where the last one ended, and never leaves the domain.
+
+    A call takes chord steps with the Jacobian of an earlier call, and evaluates a new one only where they do not
+    converge. If the new q would be too far from the last one or outside the domain, or if there is none, `step` returns
+    the last q again, and `status` says why. `Chart.tracker` makes trackers; each belongs to one thread.
+
+    Example:
+        >>> import numpy as np
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> tracker = chart.tracker([0.6, 0.8, 0.8])
+        >>> phi = chart.phi([0.6, 0.8, 0.8])
+        >>> q = tracker.step(phi + [0.01, 0.0, 0.0])  # along x, with xi held
+        >>> np.allclose(chart.phi(q) - phi, [0.01, 0.0, 0.0]), tracker.status.name
+        (True, 'OK')
+    """
+
+    def __init__(
+        self, functions: PointFunctions, domain: Domain, q0: ArrayLike, largest_step: ArrayLike | None
+    ) -> None:
+        n = len(domain.centre)
+        self._functions, self._domain = functions, domain
+        limit = as_float_array(
+            "largest_step", TRACKER.step * domain.half_width if largest_step is None else largest_step
+        )
+        if limit.ndim:
+            require_shape("largest_step", limit.shape, (n,))
+        if not (limit > 0).all():
+            raise InvalidValueError("largest_step", limit.tolist(), "positive numbers")
+        self._limit = np.broadcast_to(limit, n)
+        self._solver = PointSolver(functions)
+        self._before, self._guarded = np.empty(n), np.empty(2)
+        with deferred(), building:  # CasADi's expressions are not for several threads at a time
+            function = _guard(domain, self._limit)
+        self._guard = Bound(function, [self._before, self._solver.reached], [self._guarded])
+        self.reset(q0)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without scratch memory."""
+        parts = {"functions": self._functions, "domain": self._domain, "q": self.q, "limit": self._limit}
+        return {**parts, "start": self._start}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(state["functions"], state["domain"], state["q"], state["limit"])  # type: ignore[misc]
+        self._start = state["start"]
+
+    @property
+    def q(self) -> Array:
+        """The last solution, (n,)."""
+        return self._solver.q.copy()
+
+    @property
+    def left_over(self) -> Array | None:
+        """What the way since the last reset leaves over in the joints, (n,), less full turns of endless joints.
+
+        None while x or xi differ from those of the start. A loop around a full turn of tool or base may leave
+        something over, see `Chart.left_over`.
+        """
+        q, phi = self._start
+        apart = self._functions.distance(phi, self._solver.phi)
+        return leave_over(apart, TRACKER.returned, self._solver.q - q, self._functions.turning)
+
+    @property
+    def largest_step(self) -> Array:
+        """Largest change of each joint in a call, (n,) [rad] or [m]."""
+        return self._limit
+
+    def facts(self) -> dict[str, str]:
+        """Where it is."""
+        return {
+            "tracker": f"status {self.status.name}",
+            "q": number_list(self._solver.q),
+            "largest step": number_list(self._limit),
+        }
+
+    def reset(self, q: ArrayLike) -> None:
+        """Continue from another joint position.
+
+        Args:
+            q: a point of the domain, (n,).
+
+        Raises:
+            InvalidValueError: if q lies outside the domain, or J is singular there.
+        """
+        point = as_point("q", q, len(self._limit))
+        if not contains(self._domain, point):
+            hint = degrees_hint(*point[np.isfinite(bounds_of(self._domain)[0])])
+            raise InvalidValueError("q", point.tolist(), f"a point of the domain{hint}")
+        self._solver.q[:] = point
+        if not self._solver.refresh():
+            raise InvalidValueError("q", point.tolist(), "a point where J is regular")
+        self._start = self._solver.q.copy(), self._solver.phi.copy()
+        self.status = TrackerStatus.OK  #: how the last call ended
+
+    def step(self, phi: ArrayLike) -> Array:
+        """The q near the last one with phi(q) = phi, or the last one; see `status`.
+
+        Args:
+            phi: target values, (n,).
+
+        Returns:
+            q, (n,) [rad] or [m].
+
+        Raises:
+            ShapeError: if phi has another number of entries.
+        """
+        solver = self._solver
+        if type(phi) is not np.ndarray or phi.shape != solver.target.shape:
+            phi = as_float_array("phi", phi)
+            require_shape("phi", phi.shape, solver.target.shape)
+        solver.target[:] = phi
+        self._before[:] = solver.q
+        self.status = self._advance()
+        if self.status != TrackerStatus.OK:
+            solver.q[:] = self._before
+            solver.refresh()
+        return solver.q.copy()
+
+    def _advance(self) -> TrackerStatus:
+        """Move to the solution; returns whether that is allowed."""
+        solver, fresh = self._solver, False
+        for _ in range(NEWTON.refreshes):
+            falls, error = solver.step(), solver.errors[-1]
+            if error <= NEWTON.goal or (error <= TRACKER.rounded and not falls):
+                self._guard.run()
+                solver.accept()
+                return self._allowed()
+            if falls:
+                solver.accept()
+            elif fresh:
+                break
+            fresh = True
+            if not solver.refresh():
+                return TrackerStatus.SINGULAR
+        return TrackerStatus.LOST if np.isfinite(solver.target).all() else TrackerStatus.BAD_INPUT
+
+    def _allowed(self) -> TrackerStatus:
+        """Whether the step that the guard looked at is allowed."""
+        jump, outside = self._guarded.tolist()
+        if outside > 0:
+            return TrackerStatus.OUTSIDE_DOMAIN
+        return TrackerStatus.JUMP if jump > 1 else TrackerStatus.OK
+
+
+def _guard(domain: Domain, limit: Array) -> ca.Function:
+    """q before, q -> the largest change relative to its limit, and a number > 0 outside the domain."""
+    before, q = (ca.MX.sym(name, len(limit)) for name in ("before", "q"))
+    outside = ca.mmax(ca.fabs(q - ca.DM(domain.centre)) - ca.DM(reach(domain)))
+    if domain.condition is not None:
+        outside = ca.fmax(outside, ca.if_else(ca.mmin(domain.condition.pivots(q)) > 0, -1, 1))
+    return dense_function("guard", [before, q], [ca.vertcat(ca.norm_inf((q - before) / ca.DM(limit)), outside)])
 
 
 @dataclass(frozen=True, slots=True)
