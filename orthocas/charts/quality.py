@@ -347,11 +347,8 @@ def evaluate(
     """
     require_kind("chart", chart, Chart)
     if points is None:
-        count, drawn = (
-            _count(chart, RULES.samples if samples is None else samples),
-            RULES.seed if seed is None else seed,
-        )
-        drawn = require_count("seed", drawn, least=0)
+        count = _count(chart, RULES.samples if samples is None else samples)
+        drawn = require_count("seed", RULES.seed if seed is None else seed, least=0)
         searched = isinstance(chart.coordinates, Coordinates) and not chart.problem.domain.full_turns
         problem, found = chart.problem, chart.coordinates
         worst = worst_points(problem, found, drawn, thorough=True) if searched else None
