@@ -39,10 +39,10 @@ from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError, SingularTaskError, UnreachableReferenceError
 from orthocas.robots.tree import require_driven
-from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.relative import Relative
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, frozen_array, require_kind

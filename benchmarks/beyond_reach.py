@@ -19,7 +19,8 @@ import orthocas as oc
 from orthocas.charts.reaching import RULES
 from orthocas.charts.regular_part import RegularPart
 from orthocas.charts.solutions import TrackerStatus
-from orthocas.tasks.domains import bounds_of, sample_uniform
+from orthocas.tasks.domains import bounds_of
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 READY = ("panda-wide", "iiwa7-wide", "xarm7-wide", "baxter-left-wide", "pr2-left-wide")

@@ -15,7 +15,8 @@ from benchmark import run, table
 
 import orthocas as oc
 from orthocas.charts.phi import shortest
-from orthocas.tasks.domains import Domain, bounds_of, sample_uniform
+from orthocas.tasks.domains import Domain, bounds_of
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 QUICK = ("panda-position", "ur5-position")

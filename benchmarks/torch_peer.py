@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 import orthocas as oc
 from orthocas.errors import DomainError, PathError
-from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.problem import relative_singular_values
 from orthocas.tasks.regular_box import joint_range
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.display import percent
 
 Numbers = NDArray[np.float64]

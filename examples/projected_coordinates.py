@@ -29,8 +29,8 @@ from paper.hidden_spring import POSTURE_STIFFNESS, HiddenSpring
 import orthocas as oc
 from orthocas.control import Controller, Impedance, Kinematic, PDPlus, Reference
 from orthocas.simulation import Trajectory
-from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.metric import metric_matrices
+from orthocas.tasks.samples import sample_uniform
 
 sys.path.append(str(Path(__file__).parent.parent / "benchmarks"))
 

@@ -32,9 +32,9 @@ from orthocas.simulation import (
     coupling_index,
     simulate,
 )
-from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.metric import Metric, metric_matrices
-from orthocas.tasks.samples import sample_problem
+from orthocas.tasks.problem_samples import sample_problem
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
 

@@ -11,7 +11,7 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.bases import JointSpace
 from orthocas.charts.coordinates import Coordinates
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools import columns
 from orthocas.tools.batch import Batched, dense_function, using_threads
 from orthocas.tools.checks import Array

@@ -5,7 +5,8 @@ import pytest
 from public_objects import wide
 
 import orthocas as oc
-from orthocas.tasks.domains import bounds_of, sample_uniform
+from orthocas.tasks.domains import bounds_of
+from orthocas.tasks.samples import sample_uniform
 
 FOUND, NEAREST = oc.InverseStatus.FOUND, oc.InverseStatus.NEAREST
 STARTS = 4000

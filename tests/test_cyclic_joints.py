@@ -18,8 +18,9 @@ from orthocas.control import ControlStatus, Kinematic, PDPlus
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.probe import judged_chart, leak_and_conditioning
-from orthocas.tasks.domains import bounds_of, sample_heavily, sample_uniform
-from orthocas.tasks.samples import samples_at
+from orthocas.tasks.domains import bounds_of
+from orthocas.tasks.problem_samples import samples_at
+from orthocas.tasks.samples import sample_boundary_weighted, sample_uniform
 from orthocas.tools.archive import read_archive
 from orthocas.tools.batch import Batched
 
@@ -91,7 +92,7 @@ def test_chart_holds_over_the_full_turn_of_the_first_axis(cyclic_fit: Fit) -> No
     chart = cyclic_fit.chart
     assert cyclic_fit.cyclic_joints == ("A1",)
     np.testing.assert_allclose(chart.problem.domain.half_width[0], np.radians(170), atol=1e-6)
-    here = sample_heavily(problems.get("iiwa").domain, 60, seed=8)
+    here = sample_boundary_weighted(problems.get("iiwa").domain, 60, seed=8)
     there = here.copy()
     there[:, 0] = FULL_TURN
     found = [leak_and_conditioning(samples_at(chart.problem, q), chart.coordinates.jacobian(q)) for q in (here, there)]

@@ -18,7 +18,7 @@ from orthocas.certificates.waves import Waves, cofactors, waves_of
 from orthocas.charts.certificate import COFACTORS, ELIMINATION, OPEN, PROVED, Subdivision, halfway
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import CertifyError
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import to_tape
 

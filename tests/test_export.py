@@ -24,7 +24,7 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.codegen.export import LIBRARIES, module_text
 from orthocas.codegen.export_forms import function_code
 from orthocas.errors import ArchiveError, InvalidValueError, NoExpressionError, UnknownNameError
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import TASK_KINDS
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array

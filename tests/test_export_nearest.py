@@ -15,7 +15,8 @@ from test_export_inverse import CHARTS as CHARTS_OF_INVERSE
 import orthocas as oc
 from orthocas.charts.solutions import InverseStatus
 from orthocas.codegen.export import LIBRARIES
-from orthocas.tasks.domains import bounds_of, sample_uniform
+from orthocas.tasks.domains import bounds_of
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 FOUND, NEAREST, NOT_FOUND, BAD_INPUT = 0, 1, 5, 6

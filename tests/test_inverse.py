@@ -12,7 +12,8 @@ from orthocas.charts.inverse import beyond_reach
 from orthocas.charts.newton import inverses
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError
 from orthocas.fitting.fit import Fit
-from orthocas.tasks.domains import bounds_of, sample_uniform
+from orthocas.tasks.domains import bounds_of
+from orthocas.tasks.samples import sample_uniform
 
 FOUND = oc.InverseStatus.FOUND
 BEYOND = (oc.InverseStatus.OUTSIDE_DOMAIN, oc.InverseStatus.LIMIT)

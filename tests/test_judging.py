@@ -13,8 +13,8 @@ import orthocas as oc
 from orthocas.charts.angles import judge_by_columns, judge_by_lapack
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
 from orthocas.fitting.fit import Fit
-from orthocas.tasks.domains import sample_uniform
-from orthocas.tasks.samples import samples_at
+from orthocas.tasks.problem_samples import samples_at
+from orthocas.tasks.samples import sample_uniform
 
 
 def leaks_by_hand(chart: oc.Chart, q: np.ndarray) -> np.ndarray:

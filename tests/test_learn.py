@@ -15,7 +15,7 @@ from orthocas import learn
 from orthocas.charts.solutions import TrackerStatus
 from orthocas.errors import DomainError, InvalidValueError, InverseError, ShapeError
 from orthocas.simulation import MuJoCoPlant
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 

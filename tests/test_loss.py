@@ -33,7 +33,7 @@ from orthocas.fitting.terms import (
     task_cosines,
     volume_hinges,
 )
-from orthocas.tasks.samples import Draw, Samples, sample_problem, samples_at
+from orthocas.tasks.problem_samples import Draw, Samples, sample_problem, samples_at
 from orthocas.tools import columns
 from orthocas.tools.expressions import determinant
 

@@ -7,7 +7,7 @@ import pytest
 import orthocas as oc
 from orthocas import problems
 from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError, UnknownNameError
-from orthocas.tasks.samples import sample_problem, samples_at
+from orthocas.tasks.problem_samples import sample_problem, samples_at
 
 
 def arm(joints: int = 3) -> oc.Robot:

@@ -11,8 +11,8 @@ from orthocas.bases import JointSpace, Parametrisation
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.dense_objectives import GraphObjective
-from orthocas.tasks.domains import sample_evenly
-from orthocas.tasks.samples import samples_at
+from orthocas.tasks.problem_samples import samples_at
+from orthocas.tasks.samples import sample_evenly
 
 EVERY_TERM = oc.Weights(length=3.0, angles="paper")
 CASES = [

@@ -23,7 +23,7 @@ from orthocas.certificates.taylor import (
     sine_and_cosine,
     sum_error,
 )
-from orthocas.tasks.samples import samples_at
+from orthocas.tasks.problem_samples import samples_at
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
 

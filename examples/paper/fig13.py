@@ -19,7 +19,7 @@ from matplotlib.patheffects import withStroke
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.singularities import Jump, SingularPoint, jumps, singular_points
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 from .drawing import Drawing

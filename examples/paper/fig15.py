@@ -17,8 +17,9 @@ from orthocas.charts.grow import grow
 from orthocas.exact.flow import GrownCoordinates, TaskFlow
 from orthocas.exact.harmonic import level_surface, signed_areas
 from orthocas.exact.leaves import DiskLeaf, disk_leaf
-from orthocas.tasks.domains import Box, sample_uniform
+from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array
 

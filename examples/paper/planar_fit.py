@@ -17,9 +17,9 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.terms import Weights
 from orthocas.solvers import GaussNewton
-from orthocas.tasks.domains import sample_evenly
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.samples import sample_problem, samples_at
+from orthocas.tasks.problem_samples import sample_problem, samples_at
+from orthocas.tasks.samples import sample_evenly
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array
 

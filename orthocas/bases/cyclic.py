@@ -10,10 +10,11 @@ from orthocas.bases.family import JointSpace
 from orthocas.errors import InvalidValueError
 from orthocas.robots.kinematics import TipTurn
 from orthocas.robots.tree import KinematicTree
-from orthocas.tasks.domains import Box, sample_uniform
+from orthocas.tasks.domains import Box
 from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem import Problem, is_regular
-from orthocas.tasks.samples import NEGLIGIBLE
+from orthocas.tasks.problem_samples import NEGLIGIBLE
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, require_kind
 from orthocas.tools.expressions import gradient_dependences, to_tape

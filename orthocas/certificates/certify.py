@@ -18,7 +18,8 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
 from orthocas.errors import CertifyError, Interrupted, InvalidValueError
 from orthocas.robots.tree import require_driven
-from orthocas.tasks.domains import Box, Domain, contains, reach, sample_heavily, slack
+from orthocas.tasks.domains import Box, Domain, contains, reach, slack
+from orthocas.tasks.samples import sample_boundary_weighted
 from orthocas.tools.checks import Array, as_number, require_at_least, require_executor, require_kind
 from orthocas.tools.display import percent
 from orthocas.tools.processes import in_order
@@ -233,7 +234,7 @@ def _suspects(chart: Chart) -> Array:
     points = np.vstack([domain.centre, domain.centre + domain.half_width * np.sign(unit) * np.abs(unit) ** powers])
     points = points[contains(domain, points)]
     if domain.draws_itself:
-        points = sample_heavily(domain, _SAMPLES, 0)
+        points = sample_boundary_weighted(domain, _SAMPLES, 0)
     J_x = chart.problem.task.batched_jacobian(points)[0].reshape(-1, chart.m, chart.n)
     volumes = np.linalg.det(np.nan_to_num(np.concatenate([J_x, chart.coordinates.jacobian(points)], axis=1)))
     worst = int(np.argmin(volumes * np.sign(volumes[0])))

@@ -19,8 +19,8 @@ from orthocas.charts.regular_part import RegularPart
 from orthocas.errors import CertifyError, ChartFileError, InvalidValueError, OrthocasError
 from orthocas.exact.flow import GrownCoordinates
 from orthocas.exact.leaves import leaf_from_arrays
-from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.problem import FOREIGN, Problem, problem_from_data, problem_to_data
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.archive import Kind, Stored, read_archive, to_npy, write_archive
 from orthocas.tools.checks import require_count, require_text
 from orthocas.tools.json import part

@@ -12,7 +12,8 @@ from orthocas.charts.curve_tracer import RULES, CurveTracer, Traces, solutions_o
 from orthocas.charts.in_domain import BoxedPhi
 from orthocas.charts.newton import Starts
 from orthocas.charts.phi import largest
-from orthocas.tasks.domains import bounds_of, sample_uniform
+from orthocas.tasks.domains import bounds_of
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.expressions import shortest

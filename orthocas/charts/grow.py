@@ -19,8 +19,9 @@ from orthocas.exact.leaves import (
     turning_joints,
 )
 from orthocas.robots.tree import require_driven
-from orthocas.tasks.domains import Box, sample_evenly
+from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem, check
+from orthocas.tasks.samples import sample_evenly
 from orthocas.tools.checks import (
     Array,
     as_float_array,

@@ -27,8 +27,9 @@ from orthocas.charts.phi import Differences, PhiFunctions, PhiMap
 from orthocas.charts.reaching import ReachingTracker, near_function
 from orthocas.charts.solutions import Solutions, Tracker
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, units_hint
-from orthocas.tasks.domains import bounds_of, sample_uniform
+from orthocas.tasks.domains import bounds_of
 from orthocas.tasks.problem import task_sizes
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
     Array,

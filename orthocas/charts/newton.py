@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from orthocas.charts.coordinates import InvertibleMap
 from orthocas.charts.phi import ROUNDING, Differences, PhiMap, largest
 from orthocas.errors import SingularTaskError
-from orthocas.tasks.domains import Domain, sample_heavily
+from orthocas.tasks.domains import Domain
+from orthocas.tasks.samples import sample_boundary_weighted
 from orthocas.tools.batch import dense_function, in_threads
 from orthocas.tools.cached import BuiltOnUse, cached_property
 from orthocas.tools.checks import Array, Indices
@@ -409,7 +410,7 @@ class Starts:
     @cached_property
     def _table(self) -> tuple[Array, Array]:
         """Points of the domain where phi is defined, and phi, (K, n) each."""
-        return where_known(self._map, sample_heavily(self._domain, _POINTS, _SEED))
+        return where_known(self._map, sample_boundary_weighted(self._domain, _POINTS, _SEED))
 
     @cached_property
     def _range(self) -> tuple[Array, Array]:

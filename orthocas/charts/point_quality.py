@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from orthocas.charts.angles import MOST_JOINTS, judge_by_columns, judge_by_lapack
 from orthocas.charts.coordinates import CoordinateMap
 from orthocas.errors import SingularTaskError
-from orthocas.tasks.domains import Domain, bounds_of, contains, sample_heavily
+from orthocas.tasks.domains import Domain, bounds_of, contains
 from orthocas.tasks.problem import Problem, distance_from_half_a_turn, task_jacobians
-from orthocas.tasks.samples import Samples, samples_at
+from orthocas.tasks.problem_samples import Samples, samples_at
+from orthocas.tasks.samples import sample_boundary_weighted
 from orthocas.tools.batch import in_threads
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import MANY
@@ -179,7 +180,7 @@ def worst_points(problem: Problem, coordinates: CoordinateMap, seed: int = 0, *,
         seed: seed of candidates and steps.
         thorough: follow the worst descents to their ends, for a least value that is printed; fits need bad points only.
     """
-    points = sample_heavily(problem.domain, CANDIDATES, (seed, CANDIDATES, 1))
+    points = sample_boundary_weighted(problem.domain, CANDIDATES, (seed, CANDIDATES, 1))
     u = (points - problem.domain.centre) / problem.domain.half_width
     found = _signed_conditioning(problem, coordinates, u)
     orientation = 1.0 if np.sum(found >= 0) >= np.isfinite(found).sum() / 2 else -1.0
@@ -202,7 +203,7 @@ def least_in_domain(value: Value, domain: Domain, seed: int = 0) -> Array:
     Source:
         ours.
     """
-    points = sample_heavily(domain, CANDIDATES, (seed, CANDIDATES, 1))
+    points = sample_boundary_weighted(domain, CANDIDATES, (seed, CANDIDATES, 1))
 
     def inside(u: Array) -> Array:
         q = domain.centre + domain.half_width * u

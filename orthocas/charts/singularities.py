@@ -10,9 +10,10 @@ from orthocas.charts.chart import Chart
 from orthocas.errors import GrowError
 from orthocas.exact.flow import GrownCoordinates
 from orthocas.exact.leaves import turning_joints
-from orthocas.tasks.domains import contains, sample_evenly
+from orthocas.tasks.domains import contains
 from orthocas.tasks.metric import metric_matrices
 from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.tasks.samples import sample_evenly
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array, require_at_least, require_kind
 

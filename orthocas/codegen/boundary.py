@@ -11,7 +11,8 @@ from orthocas.charts.chart import Chart
 from orthocas.codegen.description import chart_values, filled, flags, numbers, words
 from orthocas.codegen.precision import Precision, bounds_inside
 from orthocas.control.controller import Controller
-from orthocas.tasks.domains import Domain, PathBound, SingularBound, bounds_of, contains, reach, sample_uniform
+from orthocas.tasks.domains import Domain, PathBound, SingularBound, bounds_of, contains, reach
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import scalar_code

@@ -6,7 +6,8 @@ import numpy as np
 from orthocas.charts.chart import Chart
 from orthocas.charts.solutions import InverseStatus
 from orthocas.codegen.export_forms import Form, function_code
-from orthocas.tasks.domains import Domain, FoldBound, PathBound, SingularBound, bounds_of, sample_uniform
+from orthocas.tasks.domains import Domain, FoldBound, PathBound, SingularBound, bounds_of
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
 

@@ -10,8 +10,8 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.point_quality import least_in_domain
 from orthocas.errors import InvalidValueError
 from orthocas.robots.robot import Robot
-from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.metric import require_mass
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import (
     Array,
     as_float_array,

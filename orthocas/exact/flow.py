@@ -13,7 +13,7 @@ from orthocas.errors import NoExpressionError
 from orthocas.exact.leaves import LeafChart, LeafValues, without_turns
 from orthocas.tasks.metric import metric_matrices
 from orthocas.tasks.problem import Problem, task_jacobians
-from orthocas.tasks.samples import Samples
+from orthocas.tasks.problem_samples import Samples
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_point_set

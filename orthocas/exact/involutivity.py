@@ -8,8 +8,8 @@ import numpy as np
 
 from orthocas.errors import InvalidValueError, SingularTaskError
 from orthocas.robots.tree import require_driven
-from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.problem import Problem, check, is_regular
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array, require_count, require_kind, require_memory, require_shape
 from orthocas.tools.display import Shown, number_list

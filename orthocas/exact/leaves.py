@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from orthocas.errors import GrowError, InvalidValueError
 from orthocas.exact.harmonic import TriangleMesh, harmonic_disk, level_surface
 from orthocas.exact.mesh import TriangleLocator
-from orthocas.tasks.domains import Box, sample_uniform
+from orthocas.tasks.domains import Box
 from orthocas.tasks.metric import metric_matrices
 from orthocas.tasks.problem import Problem, task_jacobians
-from orthocas.tasks.samples import samples_at
+from orthocas.tasks.problem_samples import samples_at
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.cached import building, cached_property
 from orthocas.tools.checks import Array, Indices, frozen_array, frozen_indices, require_known, require_memory
 from orthocas.tools.expressions import determinant, shortest

@@ -17,7 +17,7 @@ from orthocas.errors import GrowError, InvalidValueError
 from orthocas.exact.flow import GrownCoordinates
 from orthocas.solvers.lbfgs import LBFGS
 from orthocas.solvers.protocol import Solver
-from orthocas.tasks.domains import sample_evenly, sample_uniform
+from orthocas.tasks.samples import sample_evenly, sample_uniform
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.blas_graph import NumpyGraph
 from orthocas.tools.checks import Array, require_count, require_kind, require_memory

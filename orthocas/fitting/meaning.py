@@ -14,7 +14,7 @@ from orthocas.errors import InvalidValueError, RobotError
 from orthocas.fitting.like import SWIVEL, Like, Likeness, like_label, quantity_of
 from orthocas.tasks.metric import metric_matrices
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.samples import sample_problem
+from orthocas.tasks.problem_samples import sample_problem
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array

@@ -40,9 +40,9 @@ from orthocas.solvers.protocol import (
     SolveResult,
     Status,
 )
-from orthocas.tasks.domains import sample_evenly
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.samples import Samples, sample_problem, samples_at
+from orthocas.tasks.problem_samples import Samples, sample_problem, samples_at
+from orthocas.tasks.samples import sample_evenly
 from orthocas.tools.batch import one_blas_thread
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_memory

@@ -11,9 +11,9 @@ from orthocas.fitting.residuals import Loss, sample_loss
 from orthocas.fitting.settings import require_parametrisation
 from orthocas.fitting.starts import spectral_start
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Sizes, WeightNumbers, Weights
-from orthocas.tasks.domains import sample_evenly
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.samples import Samples, samples_at
+from orthocas.tasks.problem_samples import Samples, samples_at
+from orthocas.tasks.samples import sample_evenly
 from orthocas.tools.checks import Array, as_point_set, frozen_array, require_count, require_kind
 
 

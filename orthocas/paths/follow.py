@@ -19,7 +19,8 @@ from orthocas.paths.plan import Plan
 from orthocas.robots.obstacles import LinkDistances, Obstacle
 from orthocas.robots.tree import require_driven
 from orthocas.tasks.clear_box import row_scale
-from orthocas.tasks.domains import bounds_of, contains, sample_uniform
+from orthocas.tasks.domains import bounds_of, contains
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind

@@ -9,16 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocas.errors import DomainError, InvalidValueError, SingularTaskError
-from orthocas.tasks.domains import (
-    Box,
-    Domain,
-    StopKind,
-    Wall,
-    register_domain,
-    require_within_limits,
-    sample_evenly,
-    sample_uniform,
-)
+from orthocas.tasks.domains import Box, Domain, StopKind, Wall, register_domain, require_within_limits
+from orthocas.tasks.samples import sample_evenly, sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property

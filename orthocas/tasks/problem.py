@@ -12,9 +12,10 @@ from orthocas.errors import InvalidValueError, MetricError, NotRedundantError, S
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.clear_box import clear_domain, row_scale
-from orthocas.tasks.domains import Domain, domain_from_data, require_within_limits, sample_uniform
+from orthocas.tasks.domains import Domain, domain_from_data, require_within_limits
 from orthocas.tasks.metric import Metric, MetricSpec, metric_matrices
 from orthocas.tasks.regular_box import regular_box
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.archive import Stored
 from orthocas.tools.checks import Array, require_kind, require_shape, require_text

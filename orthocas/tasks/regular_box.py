@@ -10,7 +10,8 @@ from orthocas.errors import DomainError, InvalidValueError, NotRedundantError, d
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM
 from orthocas.tasks.clear_box import row_scale
-from orthocas.tasks.domains import Box, default_box, default_half_width, sample_evenly
+from orthocas.tasks.domains import Box, default_box, default_half_width
+from orthocas.tasks.samples import sample_evenly
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array, as_number, as_point
