@@ -179,7 +179,7 @@ class KinematicProjector(TwoTaskLaw):
         J_2_inverse, _, relative = self._second.weighted(q, A)
         rest = self._second.shortest(x_d - self.measured(q))[m:]
         second = J_2_inverse @ (dx_d[m:] + gain[m:] * rest)
-        velocity = second + B @ (Lambda @ (known.drift(q, x_d[:m], dx_d[:m]) - gain[:m] * e - J @ second))
+        velocity = second + B @ (Lambda @ (known.compute_drift(q, x_d[:m], dx_d[:m]) - gain[:m] * e - J @ second))
         scale = median_volume(problem, known.rates, problem.metric, (m,))
         domain = None if self.chart is None else self.chart.problem.domain
         return guarded_graph(self.name, inputs, velocity, ca.MX(problem.n, 1), volume / scale * relative, domain, True)
@@ -612,8 +612,8 @@ def two_task_forces(problem: Problem, second: SecondTask, inputs: Inputs, feed_f
     sharp, M_2, _ = second.weighted(q, M)
     x_d, rate, acceleration = (inputs[name] for name in ("reference", "reference_velocity", "reference_acceleration"))
     relative = Relative(problem.task)
-    bend = relative.bend(q, dq, dq, (x_d[:m], rate[:m], acceleration[:m]))
-    f_x += M_x @ (B.T @ C_dq - bend) - damped_x(J @ dq - relative.drift(q, x_d[:m], rate[:m]))
+    bend = relative.compute_bias(q, dq, dq, (x_d[:m], rate[:m], acceleration[:m]))
+    f_x += M_x @ (B.T @ C_dq - bend) - damped_x(J @ dq - relative.compute_drift(q, x_d[:m], rate[:m]))
     f_2 += M_2 @ (acceleration[m:] - second.curvature(q, dq)) + sharp.T @ C_dq - damped_2(J_2 @ dq - rate[m:])
     return f_x, f_2
 

@@ -35,7 +35,7 @@ from orthocas.bases.products import ProductFamily
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.singularities import singular_points
 from orthocas.solvers import GaussNewton
-from orthocas.tasks.problem_samples import samples_at
+from orthocas.tasks.problem_samples import evaluate_samples
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import shortest
 
@@ -130,7 +130,7 @@ class Leak:
 
     def __init__(self, pairs: SymmetricPairs, points: Array) -> None:
         self.pairs, self.u, self.v = pairs, *pairs.columns(points)
-        self.along = samples_at(pairs.problem, points).unit_task_gradients[:, 0].T  # (2, N), unit
+        self.along = evaluate_samples(pairs.problem, points).unit_task_gradients[:, 0].T  # (2, N), unit
 
     def value(self, theta: Array) -> float:
         """The loss."""

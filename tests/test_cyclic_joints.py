@@ -19,7 +19,7 @@ from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.probe import judged_chart, leak_and_conditioning
 from orthocas.tasks.domains import bounds_of
-from orthocas.tasks.problem_samples import samples_at
+from orthocas.tasks.problem_samples import evaluate_samples
 from orthocas.tasks.samples import sample_boundary_weighted, sample_uniform
 from orthocas.tools.archive import read_archive
 from orthocas.tools.batch import Batched
@@ -95,7 +95,9 @@ def test_chart_holds_over_the_full_turn_of_the_first_axis(cyclic_fit: Fit) -> No
     here = sample_boundary_weighted(problems.get("iiwa").domain, 60, seed=8)
     there = here.copy()
     there[:, 0] = FULL_TURN
-    found = [leak_and_conditioning(samples_at(chart.problem, q), chart.coordinates.jacobian(q)) for q in (here, there)]
+    found = [
+        leak_and_conditioning(evaluate_samples(chart.problem, q), chart.coordinates.jacobian(q)) for q in (here, there)
+    ]
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-7)
     report = oc.evaluate(chart, 20_000, seed=5)

@@ -33,7 +33,7 @@ from orthocas.fitting.terms import (
     task_cosines,
     volume_hinges,
 )
-from orthocas.tasks.problem_samples import Draw, Samples, sample_problem, samples_at
+from orthocas.tasks.problem_samples import Draw, Samples, evaluate_samples, sample_problem
 from orthocas.tools import columns
 from orthocas.tools.expressions import determinant
 
@@ -197,14 +197,16 @@ def test_taylor_remainder_falls_with_the_square_of_the_step(planar_x: oc.Problem
 
 
 def test_gauss_newton_matrix_is_that_of_the_residuals(planar_x: oc.Problem) -> None:
-    twice = samples_at(planar_x, np.repeat(sample_problem(planar_x, 40, 9).points, 2, axis=0))  # every second is used
+    twice = evaluate_samples(
+        planar_x, np.repeat(sample_problem(planar_x, 40, 9).points, 2, axis=0)
+    )  # every second is used
     family = oc.Polynomial(2).family(JointSpace.of(planar_x), 2)
     theta = family.initial(3)
     objective = BasisObjective(family, twice, REGULAR, theta, draw_from(planar_x))
     loss = Loss.of(Sizes(n=3, m=1, r=2, identity_metric=False), REGULAR.by_name)
     J, data = loss.arguments()
     rho = ca.Function("rho", [J, *data], [loss.residuals(J, data)])
-    parts = twice.described(loss.data, twice.orientation(objective.coordinate_jacobians(theta)))
+    parts = twice.collect_data(loss.data, twice.orientation(objective.coordinate_jacobians(theta)))
 
     def residuals(theta: np.ndarray) -> np.ndarray:
         rows = zip(objective.coordinate_jacobians(theta), *parts, strict=True)

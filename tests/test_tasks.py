@@ -260,5 +260,5 @@ def test_the_distance_from_half_a_turn_is_that_of_rotation_matrices(kind: str) -
     if kind == "pose:z":  # its turn ends at half a turn as well
         wanted = np.minimum(wanted, np.cos(task.batched(points)[0][:, 5] / 2))
     assert task.turn is not None
-    found = task.turn.distance_from_half_a_turn(task.batched(points)[0].reshape(50, -1))
+    found = task.turn.measure_half_turn_distance(task.batched(points)[0].reshape(50, -1))
     np.testing.assert_allclose(found, wanted, atol=1e-7)

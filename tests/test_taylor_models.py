@@ -23,7 +23,7 @@ from orthocas.certificates.taylor import (
     sine_and_cosine,
     sum_error,
 )
-from orthocas.tasks.problem_samples import samples_at
+from orthocas.tasks.problem_samples import evaluate_samples
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
 
@@ -182,7 +182,7 @@ def test_bounds_of_the_conditioning_lie_below_it() -> None:
     assert (bound > 0.2).all()
     for _ in range(50):
         q = middle + half * rng.uniform(-1, 1, middle.shape)
-        samples = samples_at(known.problem, q)
+        samples = evaluate_samples(known.problem, q)
         unit = known.coordinates.jacobian(q)
         unit /= np.linalg.norm(unit, axis=2, keepdims=True)
         smallest = np.linalg.svd(np.concatenate([samples.task_basis, unit], axis=1), compute_uv=False)[:, -1]

@@ -42,7 +42,7 @@ from orthocas.fitting.wide import _run
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.branches import _Arm
 from orthocas.tasks.domains import StopKind
-from orthocas.tasks.regular_box import joint_range
+from orthocas.tasks.regular_box import find_joint_range
 from orthocas.tasks.samples import sample_boundary_weighted, sample_uniform
 from orthocas.tools.display import number_list, percent
 from orthocas.tools.progress import Progress, silent
@@ -809,15 +809,15 @@ def test_ctrl_c_before_a_network_has_a_middle_is_no_error_of_the_domain(monkeypa
 def test_slivers_join_one_neighbour(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cuts at -0.4 and 0.4 that self-motions do not cross, with nothing clear between them: the weaker one goes."""
     robot = oc.problems.get("iiwa").robot
-    whole = joint_range(robot, 0)
-    arm = _Arm.all_of(robot, None, whole)[0]
+    whole = find_joint_range(robot, 0)
+    arm = _Arm.build_all(robot, None, whole)[0]
 
     def sizes(self: _Arm, k: int, value: float, count: int) -> tuple[float, float]:
         clear = 0.05 if abs(value) < 0.4 else 0.3
         return clear, min(abs(value + 0.4), abs(value - 0.4) + 1e-3)
 
-    monkeypatch.setattr(_Arm, "_sizes", sizes)
-    found = arm.cuts(3)
+    monkeypatch.setattr(_Arm, "_measure_slice", sizes)
+    found = arm.find_cuts(3)
     assert [(cut.value, cut.singular) for cut in found] == [(pytest.approx(-0.4, abs=1e-3), False)]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 from orthocas.charts.chart import Chart
-from orthocas.tasks.problem_samples import samples_at
+from orthocas.tasks.problem_samples import evaluate_samples
 from orthocas.tools.checks import Array
 
 from .drawing import Drawing
@@ -78,7 +78,7 @@ def _draw_leaves(axes: Any, chart: Chart, steps: int) -> None:
 def _vectors(chart: Chart, points: Array) -> list[Array]:
     """J_x, M^-1 J_x^T, J_xi and M^-1 J_xi^T at points (N, 2), each (N, 2)."""
     J = chart.jacobian(points)
-    raised = samples_at(chart.problem, points).raised(J)
+    raised = evaluate_samples(chart.problem, points).compute_metric_gradients(J)
     return [J[:, 0], raised[:, 0], J[:, 1], raised[:, 1]]
 
 

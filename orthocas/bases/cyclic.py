@@ -75,7 +75,7 @@ def over_cyclic_joints(problem: Problem, names: tuple[str, ...]) -> Problem:
             unbounded.add(k)
         else:
             centre[k] = (low + high) / 2
-    wider = domain.within(Box(centre, half_width, sorted(unbounded)))
+    wider = domain.apply_to(Box(centre, half_width, sorted(unbounded)))
     return Problem(robot, problem.task, problem.metric, wider, problem.name)
 
 

@@ -14,8 +14,8 @@ from orthocas.bases import cyclic as cyclic_choice
 from orthocas.bases.cyclic import Cyclic
 from orthocas.bases.family import BasisFamily, ClosedForm, JointSpace
 from orthocas.errors import InvalidValueError, SingularTaskError
-from orthocas.tasks.metric import metric_matrices
-from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.tasks.metric import evaluate_metric
+from orthocas.tasks.problem import Problem, evaluate_task_jacobians
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, frozen_array, require_count, require_known
 
@@ -368,7 +368,7 @@ class Linear:
             InvalidValueError, SingularTaskError: if the task is singular at the base.
         """
         base = frozen_array("base", problem.domain.centre if self.base is None else self.base, (problem.n,))
-        J, A = task_jacobians(problem, base[None])[0], metric_matrices(problem.metric, base[None])[0]
+        J, A = evaluate_task_jacobians(problem, base[None])[0], evaluate_metric(problem.metric, base[None])[0]
         if not (J**2).sum(axis=1).all():
             raise InvalidValueError("base", base.tolist(), "a joint position where no task gradient vanishes")
         theta = self.normal_vectors(np.linalg.solve(A, J.T).T).ravel()

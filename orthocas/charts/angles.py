@@ -211,7 +211,7 @@ def _lengths(rows: ca.SX) -> ca.SX:
 
 def judge_by_lapack(samples: Samples, J: Array) -> dict[str, Array]:
     """Like `judge`."""
-    gradients, covectors, unit = samples.raised(J), J.transpose(0, 2, 1), _unit(J)
+    gradients, covectors, unit = samples.compute_metric_gradients(J), J.transpose(0, 2, 1), _unit(J)
     own = np.sqrt(np.einsum("sij,sij->si", gradients, J))
     first, second = (np.array([pair[k] for pair in pairs(J.shape[1])], dtype=int) for k in (0, 1))
     in_metric = gradients @ covectors / own[:, :, None] / own[:, None, :]

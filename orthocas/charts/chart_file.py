@@ -19,7 +19,7 @@ from orthocas.charts.regular_part import RegularPart
 from orthocas.errors import CertifyError, ChartFileError, InvalidValueError, OrthocasError
 from orthocas.exact.flow import GrownCoordinates
 from orthocas.exact.leaves import leaf_from_arrays
-from orthocas.tasks.problem import FOREIGN, Problem, problem_from_data, problem_to_data
+from orthocas.tasks.problem import FOREIGN, Problem, read_problem, write_problem
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.archive import Kind, Stored, read_archive, to_npy, write_archive
 from orthocas.tools.checks import require_count, require_text
@@ -139,7 +139,7 @@ def fingerprint(problem: Problem, coordinates: CoordinateMap) -> str:
 
 def _content(problem: Problem, coordinates: CoordinateMap) -> tuple[dict[str, Any], dict[str, Stored]]:
     """Header and arrays of a chart, without notes."""
-    header, arrays = problem_to_data(problem)
+    header, arrays = write_problem(problem)
     description, numbers = _coordinates_to_data(coordinates)
     return {**header, "coordinates": description}, {**arrays, **numbers}
 
@@ -152,7 +152,7 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes, Certifi
     """
     header, arrays = read_archive(path, CHART)
     try:
-        problem = problem_from_data(header, arrays)
+        problem = read_problem(header, arrays)
         coordinates = _coordinates(problem, part(header, "coordinates", dict), arrays)
         if coordinates.r != problem.r:
             raise ChartFileError(f"{path} has {coordinates.r} coordinates, expected r = {problem.r}")

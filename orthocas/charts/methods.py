@@ -28,7 +28,7 @@ from orthocas.charts.reaching import ReachingTracker, near_function
 from orthocas.charts.solutions import Solutions, Tracker
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, units_hint
 from orthocas.tasks.domains import bounds_of
-from orthocas.tasks.problem import task_sizes
+from orthocas.tasks.problem import measure_task_sizes
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
@@ -301,7 +301,7 @@ class InverseMethods(PhiFunctions):
     @cached_property
     def phi_sizes(self) -> Array:
         """Sizes of the components of phi, (n,): how far task components move over the domain, and 1 for xi."""
-        return np.concatenate([task_sizes(self.problem), np.ones(self.r)])
+        return np.concatenate([measure_task_sizes(self.problem), np.ones(self.r)])
 
     @property
     def turns(self) -> Array:
@@ -360,7 +360,7 @@ class InverseMethods(PhiFunctions):
             f"joint '{self.problem.robot.joint_names[j]}' at {q[j]:.4g}, expected within [{low[j]:.4g}, {high[j]:.4g}]"
         )
         if not domain.is_box and low[j] <= q[j] <= high[j]:
-            reason = domain.explained(q)
+            reason = domain.explain(q)
         return InverseError(
             f"q with phi(q) = phi lies outside the domain for {found.named(beyond)}: {reason}. "
             "`error.nearest` has joint positions inside; outside=True accepts those outside",

@@ -404,7 +404,7 @@ class Starts:
         if relative is None or not relative.turned:
             return normalised
         first, last = relative.first, relative.task.m
-        orientations = relative.embedded(phi[:, :last]) / self._range[1][first:last].mean()
+        orientations = relative.embed(phi[:, :last]) / self._range[1][first:last].mean()
         return np.concatenate([normalised[:, :first], orientations, normalised[:, last:]], axis=1)
 
     @cached_property

@@ -11,8 +11,8 @@ from orthocas.charts.angles import MOST_JOINTS, judge_by_columns, judge_by_lapac
 from orthocas.charts.coordinates import CoordinateMap
 from orthocas.errors import SingularTaskError
 from orthocas.tasks.domains import Domain, bounds_of, contains
-from orthocas.tasks.problem import Problem, distance_from_half_a_turn, task_jacobians
-from orthocas.tasks.problem_samples import Samples, samples_at
+from orthocas.tasks.problem import Problem, evaluate_task_jacobians, measure_half_turn_distance
+from orthocas.tasks.problem_samples import Samples, evaluate_samples
 from orthocas.tasks.samples import sample_boundary_weighted
 from orthocas.tools.batch import in_threads
 from orthocas.tools.checks import Array
@@ -59,10 +59,10 @@ class Judged:
 
 def _judged(problem: Problem, coordinates: CoordinateMap, points: Array) -> dict[str, Array]:
     """The fields of `Judged` by name, for so few joint positions that all intermediate values have room in memory."""
-    samples = samples_at(problem, points)
+    samples = evaluate_samples(problem, points)
     kept = np.ones(len(points), dtype=bool)
     if len(samples) < len(points):
-        kept = np.asarray((task_jacobians(problem, points) != 0).any(axis=2).all(axis=1))
+        kept = np.asarray((evaluate_task_jacobians(problem, points) != 0).any(axis=2).all(axis=1))
     J = coordinates.jacobian(samples.points)
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         squares = np.einsum("sij,sij->si", J, J)
@@ -71,7 +71,7 @@ def _judged(problem: Problem, coordinates: CoordinateMap, points: Array) -> dict
     if not alive.all():
         samples, J = samples[alive], J[alive]
     found = judge(samples, J)
-    ends = distance_from_half_a_turn(problem, samples.points) < _NEAR_THE_END
+    ends = measure_half_turn_distance(problem, samples.points) < _NEAR_THE_END
     if ends.any():
         for name, values in zip(
             ("leak_sines", "conditioning", "signs"), _by_frame(problem, samples[ends], J[ends]), strict=True

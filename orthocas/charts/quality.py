@@ -12,7 +12,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import Judged, WorstPoints, worst_points
 from orthocas.errors import InvalidValueError, SingularTaskError
-from orthocas.tasks.problem_samples import idle_joints, samples_at
+from orthocas.tasks.problem_samples import evaluate_samples, find_idle_joints
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import in_threads
 from orthocas.tools.checks import Array, Indices, as_point_set, require_count, require_kind, require_memory
@@ -399,9 +399,9 @@ def _worst_point(judged: Judged, worst: WorstPoints | None) -> Array:
 
 def _idle_coordinates(chart: Chart, judged: Judged) -> dict[int, str]:
     """Coordinates that are functions of one idle joint alone, with the names of these joints."""
-    first = samples_at(chart.problem, sample_uniform(chart.problem.domain, _TELLING, 0))
+    first = evaluate_samples(chart.problem, sample_uniform(chart.problem.domain, _TELLING, 0))
     found: dict[int, str] = {}
-    for joint in idle_joints(chart.problem, first):
+    for joint in find_idle_joints(chart.problem, first):
         likely = _functions_of(joint, judged.jacobian[:_TELLING])
         sure = likely[_functions_of(joint, judged.jacobian[:, likely])]
         found |= {int(j): chart.problem.robot.joint_names[joint] for j in sure}

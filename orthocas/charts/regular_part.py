@@ -75,9 +75,9 @@ class RegularPart(ClearBox):
         """Both conditions in one line."""
         return f"{super().heading}, and volume of the coordinates above {self.least_volume:g}"
 
-    def numbers_of_condition(self) -> dict[str, Any]:
+    def report_condition(self) -> dict[str, Any]:
         """Those of the clear box, and the bound."""
-        return {**super().numbers_of_condition(), "least_volume": self.least_volume}
+        return {**super().report_condition(), "least_volume": self.least_volume}
 
     def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
         """Those of the clear box, bound and coordinates."""
@@ -106,16 +106,16 @@ class RegularPart(ClearBox):
         own = Coordinates(parametrisation_from_data(kind), space, idle, theta, np.zeros(fitted), np.ones(fitted))
         return cls(box, own, part(data, "least_volume", float))
 
-    def explained(self, q: Array) -> str:
+    def explain(self, q: Array) -> str:
         """What is wrong with a position (n,) of the box."""
         if self.singular_values(q) <= self.least_singular_value:
-            return super().explained(q)
+            return super().explain(q)
         bound = f"expected one above least_volume = {self.least_volume:g}"
         return f"the coordinates have a volume of {self.volumes(q):.3g}, {bound}"
 
-    def within(self, box: Box) -> "RegularPart":
+    def apply_to(self, box: Box) -> "RegularPart":
         """The same conditions on another box."""
-        return RegularPart(super().within(box), self.coordinates, self.least_volume)
+        return RegularPart(super().apply_to(box), self.coordinates, self.least_volume)
 
     def volumes(self, q: ArrayLike) -> Any:
         """v(q), positive as at the centre, at points (n,) or (N, n): a number, or (N,)."""

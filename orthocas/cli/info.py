@@ -21,7 +21,7 @@ from orthocas.cli.problem_argument import (
 from orthocas.errors import OptionError, RobotError, SingularTaskError
 from orthocas.exact.involutivity import involutivity
 from orthocas.robots.robot import Robot
-from orthocas.tasks.branches import CLEAR
+from orthocas.tasks.branches import RULES as BRANCH_RULES
 from orthocas.tasks.branches import branches as find_branches
 from orthocas.tasks.problem import Problem, check
 from orthocas.tasks.problem_samples import NEGLIGIBLE
@@ -123,7 +123,7 @@ def _branches(robot: Robot, task: Task | None) -> dict[str, Any]:
     Branches that are too near to singular positions for the default clearance of wide charts have the one they allow.
     """
     found = find_branches(robot, task)
-    lower = {item.name: item.clearance for item in found if item.clearance < CLEAR}
+    lower = {item.name: item.clearance for item in found if item.clearance < BRANCH_RULES.nonsingular}
     return {
         "cuts": [cut.explained for cut in found.cuts],
         "branches": {item.name: item.share for item in found},
@@ -145,7 +145,7 @@ def _problem(problem: Problem) -> dict[str, Any]:
         "centre": problem.domain.centre.tolist(),
         "half_width": problem.domain.half_width.tolist(),
         "unbounded_joints": [problem.robot.joint_names[k] for k in problem.domain.unbounded],
-        **problem.domain.numbers_of_condition(),
+        **problem.domain.report_condition(),
         "cyclic_joints": list(cyclic_joints(problem)),
         "near_singular_share": found.singular_share,
         "half_turn_share": found.half_turn_share,

@@ -96,8 +96,8 @@ def _functions(law: Impedance | PDPlus) -> list[str]:
         _code("_gravity", "Gravity torque, (n, N).", [q], [law.model.gravity_torque(robot, inputs)]),
     ]
     if law.feed_forward:
-        drift = chart.relative.drift(q, x_d, dx_d)
-        bend = chart.relative.bend(q, dq, w, (x_d, dx_d, ddx_d))
+        drift = chart.relative.compute_drift(q, x_d, dx_d)
+        bend = chart.relative.compute_bias(q, dq, w, (x_d, dx_d, ddx_d))
         coriolis = law.model.coriolis_torque(robot, inputs, w)
         states = [q, dq, w, x_d, dx_d, ddx_d]
         found += [

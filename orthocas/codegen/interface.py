@@ -85,7 +85,7 @@ def supervision_kernels(controller: Controller, condition: BoundaryCondition | N
     measured, relative = controller.measured(q), Relative(controller.problem.task)
     start, velocity, acceleration, end = (ca.MX.sym(name, k) for name in ("start", "velocity", "acceleration", "end"))
     m, gap = controller.problem.m, _apart(controller, relative, end, start)
-    turned = relative.rates_of(start[:m], velocity[:m], acceleration[:m])
+    turned = relative.convert_rates(start[:m], velocity[:m], acceleration[:m])
     rates = [ca.vertcat(*parts) for parts in zip(turned, (velocity[m:], acceleration[m:]), strict=True)]
     found = [
         ca.Function("fallback", inputs, fallback.call(inputs)),
@@ -131,7 +131,7 @@ def _implied(controller: Controller, relative: Relative) -> ca.Function:
         J_2 = ca.jacobian(controller.measured(q)[m:], q)
         J, bend = ca.vertcat(slope, J_2), ca.jtimes(J_2 @ dq, q, dq)
     bend = ca.vertcat(controller.problem.task.rates_derivative_function(q, dq, dq), bend)
-    turned = relative.rates_of(value[:m], rates[0][:m], rates[1][:m])
+    turned = relative.convert_rates(value[:m], rates[0][:m], rates[1][:m])
     velocity, acceleration = (ca.vertcat(a, b[m:]) for a, b in zip(turned, rates, strict=True))
     B = ca.horzcat(change, velocity, acceleration - bend)
     if k != n:

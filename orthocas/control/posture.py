@@ -81,7 +81,7 @@ class _Follower:
 def _outside(chart: Chart, q: Array) -> str:
     domain = chart.problem.domain
     if domain.condition is not None and not np.all(np.asarray(domain.condition.pivots(q)) > 0):
-        return domain.explained(q)
+        return domain.explain(q)
     low, high = bounds_of(domain)
     i = int(np.argmax(np.abs(q - domain.centre) / (high - low)))
     low, high = low[i], high[i]

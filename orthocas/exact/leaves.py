@@ -13,9 +13,9 @@ from orthocas.errors import GrowError, InvalidValueError
 from orthocas.exact.harmonic import TriangleMesh, harmonic_disk, level_surface
 from orthocas.exact.mesh import TriangleLocator
 from orthocas.tasks.domains import Box
-from orthocas.tasks.metric import metric_matrices
-from orthocas.tasks.problem import Problem, task_jacobians
-from orthocas.tasks.problem_samples import samples_at
+from orthocas.tasks.metric import evaluate_metric
+from orthocas.tasks.problem import Problem, evaluate_task_jacobians
+from orthocas.tasks.problem_samples import evaluate_samples
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.cached import building, cached_property
 from orthocas.tools.checks import Array, Indices, frozen_array, frozen_indices, require_known, require_memory
@@ -109,7 +109,7 @@ def covers(region: Box, points: Array) -> NDArray[np.bool_]:
 
 def require_on_leaf(problem: Problem, level: Array, points: Array) -> None:
     """Raise InvalidValueError unless points (N, n) lie on the leaf h(q) = level (m,), relative to the size of J_x."""
-    J = task_jacobians(problem, points)
+    J = evaluate_task_jacobians(problem, points)
     off = np.abs(problem.task.batched(points)[0] - level).max(axis=1)
     size = np.sqrt((J**2).sum(axis=(1, 2)).mean())
     if not off.max() <= _ON_LEAF * size:
@@ -311,7 +311,7 @@ class LinearLeaf:
                 residual = self._residual(q, start + share * (xi - start))
                 if np.abs(residual).max(initial=0.0) < _SOLVED:
                     break
-                J = np.concatenate([task_jacobians(self.problem, q) / self._scale, N], axis=1)
+                J = np.concatenate([evaluate_task_jacobians(self.problem, q) / self._scale, N], axis=1)
                 q = q - (np.linalg.pinv(J) @ residual[:, :, None])[:, :, 0]
         solved = np.abs(self._residual(q, xi)).max(axis=1) < 1e3 * _SOLVED
         return np.where(solved[:, None], q, np.nan)
@@ -327,13 +327,13 @@ class LinearLeaf:
     @cached_property
     def _scale(self) -> float:
         """Size of J_x at q0, which makes the units of the task irrelevant."""
-        return float(np.linalg.norm(task_jacobians(self.problem, self.centre[None])))
+        return float(np.linalg.norm(evaluate_task_jacobians(self.problem, self.centre[None])))
 
 
 def linear_leaf(problem: Problem, centre: Array) -> LinearLeaf:
     """The leaf through a joint position (n,), with coordinates along its tangent space there."""
     points = centre[None]
-    normals = (metric_matrices(problem.metric, points) @ samples_at(problem, points).null_basis)[0]
+    normals = (evaluate_metric(problem.metric, points) @ evaluate_samples(problem, points).null_basis)[0]
     level = problem.task.batched(points)[0][0]
     return LinearLeaf(problem, level, centre, normals / np.linalg.norm(normals, axis=0))
 
@@ -452,7 +452,7 @@ def _closed(problem: Problem, level: Array, start: Array, length: float, samples
         last = curve[-1] - curve[-2]
         length -= float(last @ without_turns(problem, curve[-1] - start)) / float(np.linalg.norm(last))
     curve = trace(start, length)
-    sizes = np.linalg.svd(task_jacobians(problem, curve), compute_uv=False)
+    sizes = np.linalg.svd(evaluate_task_jacobians(problem, curve), compute_uv=False)
     if sizes[:, -1].min() < _SINGULAR * sizes[:, 0].max():  # the integrator may step across a singular point
         raise _singular(level)
     return CircleLeaf(problem, level, curve, np.array([length]))

@@ -13,7 +13,7 @@ from orthocas.bases.family import LinearFamily
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
 from orthocas.fitting.residuals import Loss, Pairs, curvature_columns, loss_columns, residual_columns, value_columns
 from orthocas.fitting.terms import Sizes, Weights
-from orthocas.tasks.problem_samples import Draw, Samples, even_parts
+from orthocas.tasks.problem_samples import Draw, Samples, split_samples
 from orthocas.tools.batch import in_threads, in_threads_with, thread_count
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import COLUMNS, Run, blocked, by_sample, shares
@@ -143,7 +143,7 @@ class BasisObjective:
         self._expanded: dict[str, Array] = {}
 
     def _describe(self, samples: Samples) -> None:
-        found = samples.described(self._loss.data, self._orientation)
+        found = samples.collect_data(self._loss.data, self._orientation)
         self._described = dict(zip(self._loss.data, map(blocked, found), strict=True))
 
     @property
@@ -153,7 +153,7 @@ class BasisObjective:
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
         """The same loss on `count` fresh sample sets of `size` each."""
-        for part in even_parts(self._draw(size * count, seed), count):
+        for part in split_samples(self._draw(size * count, seed), count):
             other = copy(self)
             other._put(part)
             other._describe(part)

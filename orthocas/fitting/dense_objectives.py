@@ -12,7 +12,7 @@ import numpy as np
 from orthocas.bases.family import ArrayFamily, ArrayMemory, Family, Memories
 from orthocas.fitting.residuals import Loss, loss_columns, loss_with_slopes, value_columns
 from orthocas.fitting.terms import Sizes, Weights
-from orthocas.tasks.problem_samples import Draw, Samples, even_parts
+from orthocas.tasks.problem_samples import Draw, Samples, split_samples
 from orthocas.tools.batch import in_threads, in_threads_with, thread_count
 from orthocas.tools.blas_graph import NumpyGraph
 from orthocas.tools.cached import cached_property
@@ -106,7 +106,7 @@ class ArrayObjective:
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
         """The same loss on `count` fresh sample sets of `size` each."""
-        for part in even_parts(self._draw(size * count, seed), count):
+        for part in split_samples(self._draw(size * count, seed), count):
             other = copy(self)
             other._put(part)
             yield other
@@ -131,7 +131,7 @@ class ArrayObjective:
         """Use these samples, in pieces of nearly equal size."""
         N, most = len(samples), max(_LEAST, _ENTRIES // (self.r * self._family.width))
         size = ceil(N / ceil(N / most))
-        data = samples.described(self._loss.data, self._orientation)
+        data = samples.collect_data(self._loss.data, self._orientation)
         self._pieces = []
         for k in range(0, N, size):
             points = samples.points[k : k + size]
@@ -169,7 +169,7 @@ class GraphObjective:
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
         """The same loss on `count` fresh sample sets of `size` each. They share their graphs."""
-        for part in even_parts(self._draw(size * count, seed), count):
+        for part in split_samples(self._draw(size * count, seed), count):
             other = copy(self)
             other._put(part, size)
             yield other
@@ -188,7 +188,7 @@ class GraphObjective:
 
     def _put(self, samples: Samples, room: int) -> None:
         """Use these samples. Graphs are built for `room` samples, so that smaller sets share them."""
-        entries = _entries(samples.described(self._graphs.loss.data, self._orientation), len(samples))
+        entries = _entries(samples.collect_data(self._graphs.loss.data, self._orientation), len(samples))
         graph = self._graphs.of_size(room)
         self._blocks = [
             _Block.filled(graph, samples.points[k : k + graph.columns], entries[k : k + graph.columns], len(samples))

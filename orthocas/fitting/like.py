@@ -148,7 +148,9 @@ class Like:
         samples, k = sample_problem(problem, _HELD_OUT, (seed, _HELD_OUT)), len(self.names)
         J, Z = coordinates.jacobian(samples.points)[:, :k], samples.null_basis
         left = self.slopes(samples.points) @ Z
-        lengths = np.sqrt(np.einsum("skn,skn->sk", J, samples.raised(J))) * np.linalg.norm(left, axis=2)
+        lengths = np.sqrt(np.einsum("skn,skn->sk", J, samples.compute_metric_gradients(J))) * np.linalg.norm(
+            left, axis=2
+        )
         cosines = np.einsum("skz,skz->sk", J @ Z, left) / np.maximum(lengths, _STILL)
         angles = np.degrees(np.sqrt((np.arccos(np.clip(cosines, -1, 1)) ** 2).mean(axis=0)))
         return dict(zip(self.names, angles.tolist(), strict=True))

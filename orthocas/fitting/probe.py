@@ -23,10 +23,10 @@ from orthocas.tasks.problem import (
     NEAR_HALF_A_TURN,
     NEAR_SINGULAR,
     Problem,
-    distance_from_half_a_turn,
+    measure_half_turn_distance,
     relative_singular_values,
 )
-from orthocas.tasks.problem_samples import Samples, samples_at
+from orthocas.tasks.problem_samples import Samples, evaluate_samples
 from orthocas.tasks.samples import sample_boundary_weighted, sample_evenly
 from orthocas.tools.batch import one_blas_thread
 from orthocas.tools.checks import Array
@@ -225,7 +225,7 @@ class Prober:
         """Parameters, (size,)."""
         even = sample_evenly(problem.domain, _TRAINING, _SEED)
         heavy = sample_boundary_weighted(problem.domain, _HEAVY, _SEED + 1)
-        samples = samples_at(problem, np.vstack([even, heavy])).restricted_to(self.active)
+        samples = evaluate_samples(problem, np.vstack([even, heavy])).restricted_to(self.active)
         with deferred():
             fresh = self._start is None
             start = spectral_start(family, samples[: len(even)]) if self._start is None else self._start.on(family)
@@ -285,13 +285,13 @@ def judged(problem: Problem, points: Array, jacobian: Callable[[Array], Array], 
         jacobian: gradients of the fitted coordinates in the active joints, (N, r, n), at points of all joints.
         active: the active joints.
     """
-    samples = samples_at(problem, points)
+    samples = evaluate_samples(problem, points)
     J, own = jacobian(samples.points), samples.restricted_to(active)
     uniform = len(samples) - 2 * (len(samples) // 3)
     leaks, conditioning = leak_and_conditioning(own, J)
     worst = int(np.argmin(conditioning))
     task_value = float(relative_singular_values(problem, points).min())
-    turn_value = float(distance_from_half_a_turn(problem, points).min())
+    turn_value = float(measure_half_turn_distance(problem, points).min())
     if J.shape[1] == 0:
         return Verdict(0.0, 1.0, samples.points[worst], task_value if conditioning[worst] > 0 else 0.0, turn_value)
     leak = float(np.degrees(np.sqrt(np.mean(leaks[:uniform] ** 2))))

@@ -18,7 +18,7 @@ from orthocas.paths.joint_motion import JointMotion, Margins
 from orthocas.paths.plan import Plan
 from orthocas.robots.obstacles import LinkDistances, Obstacle
 from orthocas.robots.tree import require_driven
-from orthocas.tasks.clear_box import row_scale
+from orthocas.tasks.clear_box import compute_row_scale
 from orthocas.tasks.domains import bounds_of, contains
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched, dense_function
@@ -73,7 +73,7 @@ class Limits:
         if domain.singular_bound is not None:
             return domain.singular_bound.scale
         J = self._rows_at(sample_uniform(domain, _SAMPLES, 0))
-        return row_scale(J[np.isfinite(J).all(axis=(1, 2))], self.chart.problem.task.units)
+        return compute_row_scale(J[np.isfinite(J).all(axis=(1, 2))], self.chart.problem.task.units)
 
     def scaled_rows(self, q: Array) -> Array:
         """D^-1 J at joint positions (P, n), (P, m, n)."""

@@ -255,7 +255,7 @@ class TipTurn:
             rows = ca.vertcat(tilting[_others(axis), :], *([turning[axis, :]] if self.whole else []))
         return ca.vertcat(moving, rows) if self.with_position else rows
 
-    def distance_from_half_a_turn(self, x: Array) -> Array:
+    def measure_half_turn_distance(self, x: Array) -> Array:
         """cos(angle / 2) of the larger of tilt and turn, at task values (N, m), (N,): 0 where the components end."""
         turns = x[:, 3:] if self.with_position else x
         angles = 2 * np.arcsin(np.minimum(np.linalg.norm(turns[:, : 3 if self.axis is None else 2], axis=1) / 2, 1.0))

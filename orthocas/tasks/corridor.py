@@ -91,7 +91,7 @@ class Corridor(Box):
         """Itself."""
         return self
 
-    def facts_of_condition(self) -> dict[str, str]:
+    def describe_condition(self) -> dict[str, str]:
         """The condition in one line."""
         return {"corridor": self.heading}
 
@@ -105,12 +105,12 @@ class Corridor(Box):
         box = cast("Box", Box.from_data(task, data, arrays))
         return cls(box, *(part(arrays, name, np.ndarray) for name in ("postures", "radius")))
 
-    def within(self, box: Box) -> Self:
+    def apply_to(self, box: Box) -> Self:
         """The same condition on another box. Joints that have more room there do not count."""
         wider = box.half_width > self.half_width * (1 + 1e-9)
         return type(self)(box, self.postures, np.where(wider, np.inf, self.radius))
 
-    def explained(self, q: Array) -> str:
+    def explain(self, q: Array) -> str:
         """What is wrong with a position (n,) that is too far from the path."""
         distance = float(np.sqrt(1 - float(self.pivots(q))))
         return f"the position is {distance:.3g} radii away from the path of the corridor, expected at most 1"

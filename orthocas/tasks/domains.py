@@ -148,19 +148,19 @@ class Domain(ABC):
         points: Array = self.centre + self.half_width * (u if power == 1 else np.sign(u) * np.abs(u) ** power)
         return points
 
-    def within(self, box: "Box") -> "Domain":
+    def apply_to(self, box: "Box") -> "Domain":
         """The same condition on another box."""
         raise DomainError(f"a domain of kind '{self.name}' has no other size, expected a box")
 
-    def explained(self, q: Array) -> str:
+    def explain(self, q: Array) -> str:
         """What is wrong with a position (n,) of the box that lies outside the domain."""
         return f"the position {np.round(q, 4).tolist()} lies outside the {self.name}"
 
-    def facts_of_condition(self) -> dict[str, str]:
+    def describe_condition(self) -> dict[str, str]:
         """The condition in one line, by its name."""
         return {}
 
-    def numbers_of_condition(self) -> dict[str, Any]:
+    def report_condition(self) -> dict[str, Any]:
         """What `orthocas info --json` has of the condition."""
         return {}
 
@@ -311,7 +311,7 @@ class Box(Domain):
         """Whether points (n,) or (N, n) lie in the box: a bool, or (N,)."""
         return _between_boundaries(self, q)
 
-    def within(self, box: "Box") -> "Box":
+    def apply_to(self, box: "Box") -> "Box":
         """The other box."""
         return box
 
@@ -322,7 +322,8 @@ class Box(Domain):
     @classmethod
     def from_data(cls, task: "Task", data: Mapping[str, Any], arrays: Mapping[str, Any]) -> "Domain":
         """The box of a file."""
-        unbounded = json.part(data, "unbounded", list) if "unbounded" in data else ()  # missing in older files
+        # Older files have no unbounded joints.
+        unbounded = json.part(data, "unbounded", list) if "unbounded" in data else ()
         return Box(json.part(arrays, "centre", np.ndarray), json.part(arrays, "half_width", np.ndarray), unbounded)
 
 
@@ -437,7 +438,8 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
     low, high = domain.centre - domain.half_width, domain.centre + domain.half_width
     if not domain.full_turns:
         low, high = bounds_of(domain)
-    slack = 1e-9 * domain.half_width  # limits in a URDF are decimal, so sums are not exact
+    # Limits in a URDF are decimal, so sums are not exact.
+    slack = 1e-9 * domain.half_width
     outside = np.flatnonzero((low < robot.lower - slack) | (high > robot.upper + slack))
     if outside.size:
         _raise_outside(robot, int(outside[0]), low, high)

@@ -19,7 +19,7 @@ from orthocas.tools.expressions import HoldsFunctions, called, expression_of
 
 METRIC_KINDS = ("euclidean", "inertia")
 MetricSpec = str | ArrayLike | Callable[[ca.SX], ca.SX]  #: what `Metric.from_spec` accepts
-_SINGULAR = 1e-12  # eigenvalue, relative to the largest entry, that counts as zero
+_SINGULAR = 1e-12  #: eigenvalue, relative to the largest entry, that counts as zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ def register_metric(name: str, build: Callable[[Robot], Callable[[ca.SX], ca.SX]
     _REGISTERED[name] = build
 
 
-def metric_matrices(metric: Metric, points: Array) -> Array:
+def evaluate_metric(metric: Metric, points: Array) -> Array:
     """A at points (N, n), as an array (N, n, n). Each matrix is checked to be symmetric positive definite."""
     n = points.shape[1]
     if metric.is_identity:
@@ -163,7 +163,8 @@ def require_spd(matrices: Array, points: Array) -> None:
             f"metric is not symmetric at q = {np.round(points[worst], 4).tolist()} "
             f"(difference {asymmetry[worst]:.3g}), expected symmetric positive definite"
         )
-    with suppress(np.linalg.LinAlgError):  # faster than eigenvalues
+    # A Cholesky factorisation is faster than eigenvalues, and enough where it succeeds.
+    with suppress(np.linalg.LinAlgError):
         np.linalg.cholesky(matrices - _SINGULAR * size[:, None, None] * np.eye(matrices.shape[1]))
         return
     smallest = np.linalg.eigvalsh(matrices)[:, 0]
