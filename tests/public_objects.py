@@ -18,7 +18,7 @@ from orthocas import control, problems, solvers
 from orthocas.control import Controller, Reference
 from orthocas.fitting.compare import Comparison
 from orthocas.fitting.fit import ClearPart, Fit
-from orthocas.robots.tree import on_moving_base
+from orthocas.robots.tree import place_on_base
 from orthocas.simulation import (
     Elasticity,
     Friction,
@@ -253,9 +253,9 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "task of a frame in another": lambda: oc.Task.relative_pose(planar().robot, "tip", "tip"),
     "stacked tasks": lambda: oc.Task.stack(oc.Task.position(planar().robot, "x"), oc.Task.axis(planar().robot)),
     "fit with a meaning": lambda: oc.fit(planar(), oc.Polynomial(1), like="q3", samples=200),
-    "robot on a rail": lambda: oc.Robot(on_moving_base(planar().robot.tree, "rail:x", 1.0, np.zeros(3), np.eye(3))),
+    "robot on a rail": lambda: oc.Robot(place_on_base(planar().robot.tree, "rail:x", 1.0, np.zeros(3), np.eye(3))),
     "robot that floats": lambda: oc.Robot(
-        on_moving_base(planar().robot.tree, "floating:xy", 1.0, np.zeros(3), np.eye(3))
+        place_on_base(planar().robot.tree, "floating:xy", 1.0, np.zeros(3), np.eye(3))
     ),
     "task of a quadratic program": lambda: oc.control.XiTask(fitted().chart, cost=1.0),
     "mobile": lambda: oc.Mobile(oc.Polynomial(2)),

@@ -15,7 +15,8 @@ import orthocas as oc
 from orthocas.errors import (
     RobotError,
 )
-from orthocas.robots.urdf import lock_off_chain, read_urdf
+from orthocas.robots.pinocchio_model import lock_off_chain
+from orthocas.robots.urdf import read_urdf
 from orthocas.viewer.looks import TOOL, BodyPoses, ball, block, capsule, decimated, drum, stick_arm, urdf_look
 from orthocas.viewer.view import shape_of
 

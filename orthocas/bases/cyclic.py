@@ -164,7 +164,7 @@ def _moves_the_task(task: Task, joint: int) -> bool:
     tree, kind = task.robot.tree, task.recipe["kind"]
     if not task.of_tip:
         return False
-    turn = TipTurn.of_kind(kind)
+    turn = TipTurn.from_kind(kind)
     if turn is not None and turn.whole and joint == tree.tip_parent:
         return True
     return _turns_the_rest(tree, joint) and (turn is not None or _turns_components(tree, joint, kind))

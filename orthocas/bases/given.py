@@ -9,7 +9,7 @@ import numpy as np
 
 from orthocas.bases.family import ClosedForm, Expression, JointSpace, component_gradients
 from orthocas.errors import InvalidValueError, RobotError
-from orthocas.robots.kinematics import Pose, body_poses
+from orthocas.robots.kinematics import Pose, build_body_poses
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.problem import Problem
@@ -161,7 +161,7 @@ def sew_angle(robot: Robot, kind: str) -> ca.Function:
     _require_seven_revolute(robot.tree)
     shoulder, elbow, wrist = _heights(robot.tree)
     q = ca.SX.sym("q", robot.n)
-    poses = body_poses(robot.tree, q)
+    poses = build_body_poses(robot.tree, q)
     S, E, W = _on_axis(poses[0], shoulder), _on_axis(poses[3], elbow), _on_axis(poses[4], wrist)
     e_t, e_r = (ca.SX(ca.DM(direction)) for direction in _DIRECTIONS[kind])
     return dense_function("sew_angle", [q], [_angle(E - S, W - S, e_t, e_r)])

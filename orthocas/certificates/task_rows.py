@@ -47,7 +47,7 @@ class TipRows:
             return cls((0, 1))
         if kind.startswith("position:"):
             return cls(tuple(map(_AXES.index, kind.removeprefix("position:"))))
-        if (turned := TipTurn.of_kind(kind)) is None:
+        if (turned := TipTurn.from_kind(kind)) is None:
             return None
         whole = turned.whole or turned.axis is None
         return cls((0, 1, 2) if turned.with_position else (), whole, None if whole else _AXES.index(str(turned.axis)))

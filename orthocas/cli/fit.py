@@ -51,9 +51,9 @@ from orthocas.fitting.settings import PRECISIONS, Precision, default_parametrisa
 from orthocas.fitting.suggest_domain import CONDITIONING, LEAK_DEG, DomainSuggestion
 from orthocas.fitting.wide import WideFit
 from orthocas.paths.chart_along import RADIUS, corridor_problem
-from orthocas.robots.homes import read_postures
 from orthocas.solvers import get as get_solver
 from orthocas.solvers.protocol import Status
+from orthocas.tasks.corridor import read_postures
 from orthocas.tasks.problem import Problem
 from orthocas.tools.archive import require_free
 from orthocas.tools.display import listed, number_list, percent

@@ -109,7 +109,7 @@ def _with_units(task: Task) -> list[str]:
 
 def _orientation(task: Task) -> str:
     """The convention of orientation components, and their reference rotation."""
-    turn = TipTurn.of_kind(task.recipe["kind"])
+    turn = TipTurn.from_kind(task.recipe["kind"])
     if turn is None or "reference" not in task.recipe:
         return ""
     first = turn.labels[3 if turn.with_position else 0]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError
-from orthocas.robots.dynamics import payload_numbers
+from orthocas.robots.dynamics import check_payload
 from orthocas.robots.robot import Robot
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, as_float_array, frozen_array, require_finite, require_known, require_shape
@@ -66,7 +66,7 @@ class RunTimeModel:
         if self.payload is not None:
             if self.source == "given":
                 raise InvalidValueError("payload", self.payload, "none, because the given model includes the load")
-            object.__setattr__(self, "payload", payload_numbers("payload", self.payload))
+            object.__setattr__(self, "payload", check_payload("payload", self.payload))
         if self.wrench is not None:
             object.__setattr__(self, "wrench", frozen_array("wrench", self.wrench, (6,)))
 

@@ -161,7 +161,7 @@ class Costs:
         """Residuals (P, k) and gradients (P, k, n) at joint positions (P, n)."""
         parts = [self._of_boundaries(q), self._of_task(q)]
         if self.limits.distances.obstacles:
-            values, gradients = self.limits.distances.with_gradients(q)
+            values, gradients = self.limits.distances.evaluate_gradients(q)
             residuals, slopes = _inverse(values - self.limits.clearance, _AWAY, _TOO_NEAR)
             parts.append((residuals, slopes[..., None] * gradients))
         return np.concatenate([part[0] for part in parts], axis=1), np.concatenate([part[1] for part in parts], axis=1)

@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 from orthocas.charts.chart import Chart
 from orthocas.charts.phi import counted_on
 from orthocas.errors import InvalidValueError, ShapeError
-from orthocas.robots.spatial import rotations_of
+from orthocas.robots.spatial import build_rotations
 from orthocas.tasks.relative import Relative
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array, as_float_array, frozen_array
@@ -78,7 +78,7 @@ class TaskSpline:
         if not self._relative.turned:
             return rows
         first, p = np.split(rows.reshape(-1, rows.shape[-1]), [self._relative.first], axis=1)
-        R = rotations_of(p / np.linalg.norm(p, axis=1, keepdims=True))
+        R = build_rotations(p / np.linalg.norm(p, axis=1, keepdims=True))
         x = np.hstack([first, Batched(self._relative.task.components_function)(R)[0]])
         return np.asarray(x.reshape(*rows.shape[:-1], -1))
 

@@ -93,7 +93,7 @@ class ClosedLoop:
         """Amounts of friction, if there is any, then the inertial parameters of the robot."""
         if not self.torque:
             return np.zeros(0)
-        inertials = dynamics.inertial_numbers(self.plant.tree)
+        inertials = dynamics.collect_inertials(self.plant.tree)
         return np.concatenate([self.friction.numbers(self.n), inertials]) if self.rubs else inertials
 
     @property

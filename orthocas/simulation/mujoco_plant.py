@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocas.control.gains import non_negative_gains, positive_gains
 from orthocas.errors import InvalidValueError, RobotError, SimulationError
 from orthocas.robots.robot import Robot
-from orthocas.robots.spatial import rotation_z_to
+from orthocas.robots.spatial import rotate_z_to
 from orthocas.robots.tree import KinematicTree, require_body
 from orthocas.simulation.disturbances import Friction, Link, place_of
 from orthocas.tools.checks import Array, as_number, as_point, frozen_array, of_extra, require_at_least, require_kind
@@ -283,7 +283,7 @@ def _add_wall(mj: ModuleType, spec: Any, tip: Any, wall: Wall) -> None:
     centre = wall.point - wall.normal * half[2]
     solref = (wall.time_constant, 1.0)
     box = spec.worldbody.add_geom(type=mj.mjtGeom.mjGEOM_BOX, size=half, pos=centre, name="wall", solref=solref)
-    box.quat = _quaternion(mj, rotation_z_to(wall.normal))
+    box.quat = _quaternion(mj, rotate_z_to(wall.normal))
     size = (wall.tip_radius, 0, 0)
     tip.add_geom(type=mj.mjtGeom.mjGEOM_SPHERE, size=size, mass=0, name=HAND, solref=solref)
 

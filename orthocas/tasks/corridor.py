@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Self, cast
 
 import casadi as ca
@@ -9,15 +10,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, ShapeError
+from orthocas.robots.robot import Robot
 from orthocas.tasks.domains import NARROWEST, WIDEST, Box, Domain, register_domain
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, as_point_set, frozen_array, require_kind
 from orthocas.tools.display import number_list
+from orthocas.tools.files import column_places, read_table
 from orthocas.tools.json import part
 
 CORRIDOR = "corridor"  #: name of the kind
-_MOST_POSTURES = 2000
+_MOST_POSTURES = 2000  #: of a path
+_MOST_IN_FILE = 1_000_000  #: postures of a CSV file
 
 
 @register_domain
@@ -191,3 +195,21 @@ class Corridor(Box):
         starts, steps = (z[:-1], np.diff(z, axis=0)) if len(z) > 1 else (z, np.zeros_like(z))
         squares = np.maximum((steps**2).sum(axis=1), 1e-24)
         return starts, steps / np.sqrt(squares)[:, None], squares
+
+
+def read_postures(path: Path, robot: Robot) -> Array:
+    """Postures (N, n) of a CSV file: a header with the names of joints in any order, and one posture a line.
+
+    Columns of other names, such as those of time and velocities, are left alone.
+
+    Raises:
+        PathFileError: names the file, the line, and what is wrong there.
+    """
+    return read_table(
+        path,
+        "postures file",
+        "postures",
+        _MOST_IN_FILE,
+        lambda names: column_places(names, robot.joint_names),
+        least=1,
+    )

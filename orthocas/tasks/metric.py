@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, MetricError, ShapeError
-from orthocas.robots.pinocchio_model import remedy
+from orthocas.robots.pinocchio_model import suggest_lock
 from orthocas.robots.robot import Robot
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
@@ -184,5 +184,5 @@ def require_mass(robot: Robot, use: str) -> None:
         joint = robot.joint_names[int(np.argmax(np.abs(vectors[0, :, 0])))]
         raise MetricError(
             f"joint '{joint}' moves no mass, so M(q) is singular, expected mass or armature for {use}: "
-            f"give the joint's link a mass in the robot file, or {remedy(joint)}"
+            f"give the joint's link a mass in the robot file, or {suggest_lock(joint)}"
         )

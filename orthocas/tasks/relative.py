@@ -5,7 +5,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from orthocas.robots.spatial import conjugate, quaternion_product, skew
+from orthocas.robots.spatial import conjugate, multiply_quaternions, skew
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
@@ -106,9 +106,9 @@ class Relative:
         assert turn is not None
         half, omega, alpha = (self._order.T @ part[first:] for part in (e / 2, rates, changes))
         step = ca.vertcat(ca.sqrt(ca.fmax(1 - ca.sumsqr(half), 0)), half)
-        p = quaternion_product(self._compute_quaternion(x), step)
-        dp = quaternion_product(p, ca.vertcat(0, omega)) / 2
-        ddp = (quaternion_product(dp, ca.vertcat(0, omega)) + quaternion_product(p, ca.vertcat(0, alpha))) / 2
+        p = multiply_quaternions(self._compute_quaternion(x), step)
+        dp = multiply_quaternions(p, ca.vertcat(0, omega)) / 2
+        ddp = (multiply_quaternions(dp, ca.vertcat(0, omega)) + multiply_quaternions(p, ca.vertcat(0, alpha))) / 2
         at = ca.SX.sym("p", 4)
         value = turn.of_quaternion(at)
         rate = ca.jtimes(value, at, dp)
@@ -188,7 +188,7 @@ class Relative:
 
     def _compute_turn(self, x: ca.SX, target: ca.SX) -> tuple[ca.SX, ca.SX]:
         """w >= 0 and v of the rotation from the target orientation to that of x."""
-        turn = quaternion_product(conjugate(target), self._compute_quaternion(x))
+        turn = multiply_quaternions(conjugate(target), self._compute_quaternion(x))
         turn = turn * ca.if_else(turn[0] < 0, -1, 1)
         return turn[0], turn[1:]
 
@@ -198,4 +198,4 @@ class Relative:
         dp = ca.jtimes(p, x_d, dx_d)
         ddp = ca.jtimes(dp, x_d, dx_d) + ca.jtimes(p, x_d, ddx_d)
         back = conjugate(p)
-        return p, 2 * quaternion_product(back, dp)[1:], 2 * quaternion_product(back, ddp)[1:]
+        return p, 2 * multiply_quaternions(back, dp)[1:], 2 * multiply_quaternions(back, ddp)[1:]

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
-from orthocas.robots.kinematics import TipTurn, frame_along
+from orthocas.robots.kinematics import TipTurn, align_frame
 from orthocas.robots.robot import FrameQuantity, Robot
-from orthocas.robots.spatial import quaternion_of, quaternion_product, rotation_matrix, rotations_of, skew
+from orthocas.robots.spatial import build_rotations, find_quaternion, multiply_quaternions, rotation_matrix, skew
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
@@ -213,7 +213,7 @@ class Task(Shown, HoldsFunctions):
         """
         require_kind("axis", axis, str)
         turn, frames = TipTurn(False, False, axis), Frames(frame, relative_to)
-        return cls._build_turned(robot, turn, None if reference is None else frame_along(reference, axis), frames)
+        return cls._build_turned(robot, turn, None if reference is None else align_frame(reference, axis), frames)
 
     @classmethod
     def position_and_axis(
@@ -227,7 +227,7 @@ class Task(Shown, HoldsFunctions):
         """Position [m] and direction of one axis of the tip, (5,); see `position` and `axis`."""
         require_kind("axis", axis, str)
         turn, frames = TipTurn(True, False, axis), Frames(frame, relative_to)
-        return cls._build_turned(robot, turn, None if reference is None else frame_along(reference, axis), frames)
+        return cls._build_turned(robot, turn, None if reference is None else align_frame(reference, axis), frames)
 
     @classmethod
     def relative_position(cls, robot: Robot, base: str, frame: str, axes: str = "xyz") -> Self:
@@ -399,7 +399,7 @@ class Task(Shown, HoldsFunctions):
             if len(robot.tips) != 2:
                 raise InvalidValueError("task", kind, f"a robot with two tips; this one has {listed(robot.tips)}")
             base_kind, frames = kind.removeprefix(_RELATIVE), Frames(robot.tips[1], robot.tips[0])
-        if (turn := TipTurn.of_kind(base_kind)) is not None:
+        if (turn := TipTurn.from_kind(base_kind)) is not None:
             reference = None if q_reference is None else frames.evaluate_rotation(robot, q_reference)
             return cls._build_turned(robot, turn, reference, frames)
         if base_kind.partition(":")[0] == "position":
@@ -419,7 +419,7 @@ class Task(Shown, HoldsFunctions):
         kind, frames = recipe["kind"], Frames.from_recipe(recipe)
         if kind == "pointing":
             return cls.pointing(robot, recipe["camera"], recipe["target"], recipe["axis"])
-        if (turn := TipTurn.of_kind(kind)) is not None:
+        if (turn := TipTurn.from_kind(kind)) is not None:
             return cls._build_turned(robot, turn, recipe.get("reference"), frames)
         if kind.startswith("position:"):
             return cls.position(robot, kind.removeprefix("position:"), frames.frame, frames.relative_to)
@@ -429,7 +429,7 @@ class Task(Shown, HoldsFunctions):
     def of_tip(self) -> bool:
         """Whether the task is a function of the pose of the (first) tip in the world, of a kind that is known."""
         kind = self.recipe["kind"]
-        known = TipTurn.of_kind(kind) is not None or kind == "polar" or kind.startswith("position:")
+        known = TipTurn.from_kind(kind) is not None or kind == "polar" or kind.startswith("position:")
         return known and Frames.from_recipe(self.recipe) == _OF_TIP
 
     @property
@@ -441,7 +441,7 @@ class Task(Shown, HoldsFunctions):
     @property
     def turn(self) -> TipTurn | None:
         """How the task compares the tip's orientation with a reference; None if it does not."""
-        return TipTurn.of_kind(self.recipe["kind"])
+        return TipTurn.from_kind(self.recipe["kind"])
 
     def with_reference_at(self, q: ArrayLike) -> "Task":
         """The task with the tip's orientation at q (n,) as its reference, or the task itself if it has one already."""
@@ -537,7 +537,7 @@ class Task(Shown, HoldsFunctions):
         if self._has_rotation_vector:
             J, p, change = self.rates_function(q), self._build_quaternion(q), self.rates_derivative_function(q, v, w)
             along, there = (J[self.m - 3 :, :] @ rate for rate in (v, w))
-            dp = quaternion_product(p, ca.vertcat(0, along)) / 2
+            dp = multiply_quaternions(p, ca.vertcat(0, along)) / 2
             bend = dp[0] * there + ca.cross(dp[1:], there)
             bend += p[0] * change[self.m - 3 :] + ca.cross(p[1:], change[self.m - 3 :])
             second = ca.cse(ca.vertcat(change[: self.m - 3], bend))
@@ -605,7 +605,7 @@ class Task(Shown, HoldsFunctions):
         """The tip's orientation in the world, (3, 3) or (N, 3, 3), at task values x (m,) or (N, m); see `value`."""
         self._require_whole_turn()
         values, single = as_point_set("x", x, self.m)
-        R = self.reference @ rotations_of(Batched(self.quaternion_function)(values)[0])
+        R = self.reference @ build_rotations(Batched(self.quaternion_function)(values)[0])
         return np.asarray(R[0] if single else R)
 
     @cached_property
@@ -626,7 +626,7 @@ class Task(Shown, HoldsFunctions):
 
     def _build_quaternion(self, q: ca.SX) -> ca.SX:
         """The rotation from the reference to the tip, (4, 1)."""
-        return quaternion_of(ca.SX(ca.DM(self.reference.T)) @ self._build_frame("rotation")(q))
+        return find_quaternion(ca.SX(ca.DM(self.reference.T)) @ self._build_frame("rotation")(q))
 
     @property
     def _frames(self) -> Frames:
@@ -749,7 +749,7 @@ def _read_rotations(name: str, value: ArrayLike) -> tuple[Array, bool]:
         off = np.abs(np.linalg.norm(rows, axis=1) - 1)
         if len(rows) and off.max() > 1e-6:
             raise InvalidValueError(name, rows[off.argmax()].tolist(), "a quaternion (w, x, y, z) of length 1")
-        return rotations_of(rows / np.linalg.norm(rows, axis=1, keepdims=True)), single
+        return build_rotations(rows / np.linalg.norm(rows, axis=1, keepdims=True)), single
     return np.array([rotation_matrix(name, R) for R in rows]).reshape(-1, 3, 3), single
 
 
@@ -783,7 +783,7 @@ def register_task(name: str, build: Callable[[Robot, str], Task]) -> None:
         ('height',)
     """
     require_text("name", name)
-    taken = name in TASK_KINDS or TipTurn.of_kind(name) is not None or _REGISTERED.get(name, build) is not build
+    taken = name in TASK_KINDS or TipTurn.from_kind(name) is not None or _REGISTERED.get(name, build) is not build
     if ":" in name or taken:
         raise InvalidValueError("name", repr(name), "a free name without a colon")
     if not callable(build):
