@@ -45,9 +45,9 @@ from orthocas.tasks.relative import Relative
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, frozen_array, require_kind
+from orthocas.tools.checks import Array, as_float_array, freeze_array, require_kind
 from orthocas.tools.display import Shown
-from orthocas.tools.expressions import fast_form, shortest
+from orthocas.tools.expressions import choose_form, wrap_shortest
 
 _SAMPLES, _RANK_LOST = 32, 1e-9
 
@@ -263,10 +263,10 @@ class Projector(TwoTaskLaw):
         posture = springs("posture_stiffness", posture_stiffness, k_2)
         force = None if second_force is None else as_float_array("second_force", second_force)
         if force is not None:
-            force = frozen_array("second_force", force if force.ndim else np.full(k_2, force), (k_2,))
+            force = freeze_array("second_force", force if force.ndim else np.full(k_2, force), (k_2,))
         for name, value in {
             "problem": problem,
-            "stiffness": frozen_array("stiffness", np.concatenate([task, posture]), (k,)),
+            "stiffness": freeze_array("stiffness", np.concatenate([task, posture]), (k,)),
             "damping_ratio": non_negative_gains("damping_ratio", damping_ratio, k),
             "limit": command_limit("limit", limit, problem.robot.effort_limits),
             "second": second,
@@ -405,7 +405,7 @@ class SecondTask(Protocol):
         """dJ_2/dt dq, (k_2, 1)."""
         ...
 
-    def shortest(self, difference: ca.MX) -> ca.MX:
+    def wrap_shortest(self, difference: ca.MX) -> ca.MX:
         """A difference of two [x; x_2], without whole turns of joints that turn without end."""
         ...
 
@@ -462,11 +462,11 @@ class _Joints:
     def curvature(self, q: ca.MX, dq: ca.MX) -> ca.MX:
         return ca.MX.zeros(self.problem.n)
 
-    def shortest(self, difference: ca.MX) -> ca.MX:
+    def wrap_shortest(self, difference: ca.MX) -> ca.MX:
         return difference
 
     def runnable(self, graph: ca.Function) -> ca.Function:
-        return fast_form(graph, self.problem.n)
+        return choose_form(graph, self.problem.n)
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         """Raise UnreachableReferenceError if a posture of the reference leaves the joint limits."""
@@ -526,11 +526,11 @@ class _OwnTask:
     def curvature(self, q: ca.MX, dq: ca.MX) -> ca.MX:
         return self.task.second_derivative_function(q, dq, dq)
 
-    def shortest(self, difference: ca.MX) -> ca.MX:
+    def wrap_shortest(self, difference: ca.MX) -> ca.MX:
         return difference
 
     def runnable(self, graph: ca.Function) -> ca.Function:
-        return fast_form(graph, self.problem.n)
+        return choose_form(graph, self.problem.n)
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         pass
@@ -568,8 +568,8 @@ class _ExtraCoordinates:
     def curvature(self, q: ca.MX, dq: ca.MX) -> ca.MX:
         return self.chart.coordinates.functions["second_derivative"](q, dq, dq)
 
-    def shortest(self, difference: ca.MX) -> ca.MX:
-        shorter: ca.MX = shortest(difference, self.chart.turns)
+    def wrap_shortest(self, difference: ca.MX) -> ca.MX:
+        shorter: ca.MX = wrap_shortest(difference, self.chart.turns)
         return shorter
 
     def runnable(self, graph: ca.Function) -> ca.Function:

@@ -37,7 +37,7 @@ from orthocas.charts.singularities import singular_points
 from orthocas.solvers import GaussNewton
 from orthocas.tasks.problem_samples import evaluate_samples
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 
 DEGREES = (8, 16, 24, 32)  # total degree in both angles
 LEVELS = {"euclidean": 1.0, "inertia": 0.05}  # of the leaves whose arc length labels flow lines at the start [m]
@@ -213,7 +213,7 @@ def jump_across_the_cut(chart: oc.Chart) -> float:
     leaf = grown_chart(chart.problem).coordinates.leaf
     tangent = leaf.values(leaf.cut[None]).gradients[0, 0]
     near = leaf.cut + 0.005 * np.array([[-1.0], [1.0]]) * tangent / np.linalg.norm(tangent)
-    return float(np.abs(shortest(np.diff(chart.xi(near), axis=0), np.array([2 * np.pi]))).max())
+    return float(np.abs(wrap_shortest(np.diff(chart.xi(near), axis=0), np.array([2 * np.pi]))).max())
 
 
 def draw(charts: dict[str, oc.Chart]) -> Figure:

@@ -11,7 +11,7 @@ from orthocas.certificates.chart_rows import joint_models, true_gradients
 from orthocas.certificates.graph import TaylorGraph
 from orthocas.errors import CertifyError
 from orthocas.tools.batch import dense_function
-from orthocas.tools.expressions import gradient_dependences, periodic_joints, to_tape
+from orthocas.tools.expressions import find_gradient_dependences, find_periodic_joints, write_tape
 
 C = 2.0**55  #: spacing of numbers there: 8
 
@@ -95,11 +95,11 @@ def test_gradients_of_tasks_contain_finite_differences(kind: str) -> None:
 def test_joints_that_gradients_depend_on_are_read_from_the_steps() -> None:
     q = ca.SX.sym("q", 4)
     h = dense_function("h", [q], [ca.vertcat(0.3 * q[0] + q[1] * q[2] - q[3] / 2, ca.sin(q[1]) + 2 / q[3])])
-    linear, bent = gradient_dependences(to_tape(h))
+    linear, bent = find_gradient_dependences(write_tape(h))
     assert linear == {0: set(), 1: {2}, 2: {1}, 3: set()}
     assert bent == {1: {1}, 3: {3}}
     hidden = dense_function("h", [q], [rounded(q)])  # CasADi's derivative of C (x + 1) - C x has no x
-    assert gradient_dependences(to_tape(hidden))[0] == {0: {0}}
+    assert find_gradient_dependences(write_tape(hidden))[0] == {0: {0}}
 
 
 def test_periods_are_read_from_the_steps() -> None:
@@ -107,8 +107,14 @@ def test_periods_are_read_from_the_steps() -> None:
     turning = ca.sin(q[0]) + ca.cos(3 * q[1] - 2 * q[2])
     whole = ca.vertcat(turning, q[3] + ca.atan2(ca.sin(q[3]), 2 + ca.cos(q[3])), ca.sin(q[4] / 2), q[5] ** 2)
     h = dense_function("h", [q], [whole])
-    assert periodic_joints(to_tape(h), 6) == {0, 1, 2, 3}
-    assert periodic_joints(to_tape(dense_function("h", [q], [ca.sin(1.5 * q[0]) + ca.tan(q[1])])), 6) == {1, 2, 3, 4, 5}
+    assert find_periodic_joints(write_tape(h), 6) == {0, 1, 2, 3}
+    assert find_periodic_joints(write_tape(dense_function("h", [q], [ca.sin(1.5 * q[0]) + ca.tan(q[1])])), 6) == {
+        1,
+        2,
+        3,
+        4,
+        5,
+    }
 
 
 @pytest.mark.parametrize(

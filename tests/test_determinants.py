@@ -20,7 +20,7 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import CertifyError
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import to_tape
+from orthocas.tools.expressions import write_tape
 
 ROUNDING = 1e-12  # of plain evaluations that bounds are compared with
 
@@ -95,7 +95,7 @@ def test_what_makes_no_waves_is_refused(expression: str) -> None:
     q = ca.SX.sym("q", 2)
     value = {"exp": ca.exp(ca.sin(q[0])), "slide": q[0] * ca.cos(q[1]), "double": ca.sin(3 * q[0])}[expression]
     with pytest.raises(CertifyError, match="the task uses"):
-        waves_of(to_tape(ca.Function("h", [q], [value])), 2)
+        waves_of(write_tape(ca.Function("h", [q], [value])), 2)
 
 
 def test_cofactors_are_those_of_numbers() -> None:

@@ -28,7 +28,7 @@ from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import TASK_KINDS
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import BINARY, CODES, UNARY, to_tape
+from orthocas.tools.expressions import BINARY, CODES, UNARY, write_tape
 
 FITTED = [name for name in CHARTS if name not in ("circle chart", "disk chart", "linear leaf chart")]
 AGREED = 1e-10
@@ -147,7 +147,7 @@ def test_every_operation_is_written(library: str) -> None:
     points = np.random.default_rng(1).uniform(0.4, 0.6, (5, 3))
     found = np.asarray(scope["f"](array(np.ascontiguousarray(points.T))))
     np.testing.assert_allclose(found, Batched(function)(points)[0].T, rtol=1e-14, atol=1e-14)
-    assert len({step[0] for step in to_tape(function)["steps"]}) > 40
+    assert len({step[0] for step in write_tape(function)["steps"]}) > 40
 
 
 @pytest.mark.slow

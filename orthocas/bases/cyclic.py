@@ -17,7 +17,7 @@ from orthocas.tasks.problem_samples import NEGLIGIBLE
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, require_kind
-from orthocas.tools.expressions import gradient_dependences, to_tape
+from orthocas.tools.expressions import find_gradient_dependences, write_tape
 
 _SAMPLES, _POSITIONS = 24, 6  # joint positions, and other positions of one joint at each of them
 _SEED = 0
@@ -173,7 +173,9 @@ def _moves_the_task(task: Task, joint: int) -> bool:
 def _is_no_part_of_gradients(task: Task, joint: int) -> bool:
     """Whether the steps of h show that J_x does not depend on a joint."""
     return all(
-        joint not in joints for row in gradient_dependences(to_tape(task.smooth_function)) for joints in row.values()
+        joint not in joints
+        for row in find_gradient_dependences(write_tape(task.smooth_function))
+        for joints in row.values()
     )
 
 

@@ -16,7 +16,7 @@ from orthocas.tasks.problem import Problem
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_count, require_known, require_shape, require_text
-from orthocas.tools.expressions import Tape, expression_of, replay, require_tape, to_tape
+from orthocas.tools.expressions import Tape, build_expression, replay, require_tape, write_tape
 
 _MOST_JOINTS = 1000
 SEWKind = Literal["conventional", "stereographic"]
@@ -69,9 +69,9 @@ class Given:
             ('x', 'y', 'xi1')
         """
         q = ca.SX.sym("q", require_count("n", n, most=_MOST_JOINTS))
-        xi = expression_of(f"coordinates '{name}'", function, q)
+        xi = build_expression(f"coordinates '{name}'", function, q)
         require_shape(f"coordinates '{name}'", xi.shape, (None, 1))
-        return cls(name, n, to_tape(dense_function("xi", [q], [xi])))
+        return cls(name, n, write_tape(dense_function("xi", [q], [xi])))
 
     def for_problem(self, problem: "Problem") -> "Given":
         """The object itself: it does not depend on the problem."""

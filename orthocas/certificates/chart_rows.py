@@ -38,7 +38,7 @@ from orthocas.tasks.domains import Box, Domain
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import gradient_dependences
+from orthocas.tools.expressions import find_gradient_dependences
 
 MOST_VARIABLES = 20
 _MOST_STEPS = 100_000
@@ -359,7 +359,7 @@ def true_gradients(task: Task, joints: Sequence[int]) -> tuple[GraphRows, set[in
 def _derivatives(function: ca.Function, joints: Sequence[int], what: str) -> tuple[GraphRows, set[int]]:
     """Columns of the Jacobian of a function of q, and the inputs that they depend on."""
     graph = TaylorGraph.of(function, what, joints)
-    known = gradient_dependences(graph.tape)
+    known = find_gradient_dependences(graph.tape)
     return GraphRows(graph, len(known)), {k for row in known for j in joints for k in row.get(j, ())}
 
 

@@ -37,7 +37,7 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import CertifyError
 from orthocas.tools.batch import one_blas_thread
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import to_tape
+from orthocas.tools.expressions import write_tape
 
 DEGREE = 5  #: of the polynomials: more of it costs more and leaves less out
 _ROUNDINGS = 64  # of numbers in a table, of powers, and of a few operations around a sum
@@ -229,8 +229,8 @@ def _task_waves(chart: Chart) -> list[list[Waves]]:
     task, n = chart.problem.task, chart.n
     rows, allowance = task_rows(task, chart.problem.domain)
     if rows is task.jacobian_function:  # CasADi's derivatives have rounded constants, waves have their own
-        return [[each.derivative(j) for j in range(n)] for each in waves_of(to_tape(task.function), n)]
-    entries = [replace(each, error=each.error + allowance) for each in waves_of(to_tape(rows), n)]
+        return [[each.derivative(j) for j in range(n)] for each in waves_of(write_tape(task.function), n)]
+    entries = [replace(each, error=each.error + allowance) for each in waves_of(write_tape(rows), n)]
     return [entries[i :: task.m] for i in range(task.m)]
 
 

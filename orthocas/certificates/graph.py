@@ -20,7 +20,7 @@ from orthocas.certificates.taylor import (
     square,
 )
 from orthocas.errors import CertifyError
-from orthocas.tools.expressions import Tape, read, to_tape
+from orthocas.tools.expressions import Tape, evaluate_tape, write_tape
 
 _LARGEST_POWER = 64
 _LINEAR = ("assign", "neg", "twice")
@@ -67,7 +67,7 @@ class TaylorGraph:
     @classmethod
     def of(cls, function: ca.Function, what: str, joints: Sequence[int] | None = None) -> "TaylorGraph":
         """The steps of a function, checked; `what` names it in errors."""
-        tape = to_tape(function)
+        tape = write_tape(function)
         _require_bounds(tape, what, joints is None)
         return cls(tape, None if joints is None else tuple(joints))
 
@@ -80,7 +80,7 @@ class TaylorGraph:
                 return _Jet(TaylorModel.constant(np.array([float(of)])), {})
             return _Jet(inputs[of], {of: _one()} if of in moving else {})
 
-        found = read(self.tape, leaf, _jet)
+        found = evaluate_tape(self.tape, leaf, _jet)
         if self.joints is None:
             return [_known(jet) for jet in found]
         none = TaylorModel.constant(np.zeros(1))
@@ -193,7 +193,7 @@ def _require_bounds(tape: Tape, what: str, values: bool) -> None:
         bounded = name in UNARY or name in BINARY or name in POWERS
         return _Step(bounded and all(operand.known for operand in of), any(operand.moving for operand in of))
 
-    found = read(tape, lambda name, of: _Step(True, name == "input", of if name == "const" else None), step)
+    found = evaluate_tape(tape, lambda name, of: _Step(True, name == "input", of if name == "const" else None), step)
     if values and not all(output.known for output in found):
         raise CertifyError(unknown)
 

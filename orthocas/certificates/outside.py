@@ -39,7 +39,7 @@ from orthocas.tasks.domains import PathBound, SingularBound, bounds_of
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import dense_function, one_blas_thread
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import Tape, gradient_dependences, periodic_joints, to_tape
+from orthocas.tools.expressions import Tape, find_gradient_dependences, find_periodic_joints, write_tape
 
 _ROUNDING = 1e-6  # of distances, far above that of floating-point numbers
 _LENGTHS = 1e-7  # of squares: far above what singular vectors miss that are orthogonal up to 1e-9, and roundings of D
@@ -76,7 +76,7 @@ def _same_after_turns(chart: Chart) -> set[int]:
     """The joints whose full turns change neither J_x nor J_xi."""
     coordinates = chart.coordinates
     assert isinstance(coordinates, Coordinates)  # `chart_rows` has refused others
-    task = _alike(to_tape(chart.problem.task.smooth_function), chart.n)
+    task = _alike(write_tape(chart.problem.task.smooth_function), chart.n)
     if not len(coordinates.offset):
         return task
     own = _family_alike(coordinates.family, len(coordinates.active), coordinates)
@@ -92,13 +92,13 @@ def _family_alike(family: Family, n: int, coordinates: Coordinates) -> set[int]:
         values = family.basis(q)
     else:
         values = family.expression(q, ca.SX(ca.DM(coordinates.theta)))
-    return _alike(to_tape(dense_function("values", [q], [values])), n)
+    return _alike(write_tape(dense_function("values", [q], [values])), n)
 
 
 def _alike(tape: Tape, n: int) -> set[int]:
     """The joints whose full turns do not change a gradient."""
-    needed = {k for row in gradient_dependences(tape) for joints in row.values() for k in joints}
-    return {k for k in range(n) if k not in needed} | periodic_joints(tape, n)
+    needed = {k for row in find_gradient_dependences(tape) for joints in row.values() for k in joints}
+    return {k for k in range(n) if k not in needed} | find_periodic_joints(tape, n)
 
 
 @dataclass(frozen=True, eq=False)

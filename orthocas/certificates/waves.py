@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from orthocas.certificates.taylor import TINY, UNIT, UP, above, sum_error
 from orthocas.errors import CertifyError
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import Tape, read
+from orthocas.tools.expressions import Tape, evaluate_tape
 
 _MOST_TERMS = 1_000_000  # of a product before equal frequencies are joined
 _WIDEST, _MOST_JOINTS = 100, 8  # frequency of a joint; numbers of so many joints are whole numbers of 64 bits
@@ -131,7 +131,7 @@ def waves_of(tape: Tape, n: int) -> list[Waves]:
             raise CertifyError(f"the task uses the operation {name}, which makes no waves")
         return _STEPS[name](*map(_known, of))
 
-    return [_known(value) for value in read(tape, leaf, step)]
+    return [_known(value) for value in evaluate_tape(tape, leaf, step)]
 
 
 def _known(value: Waves | int) -> Waves:

@@ -145,12 +145,12 @@ def judge_by_columns(samples: Samples, J: Array) -> dict[str, Array]:
 def _evaluated(function: ColumnFunction, size: int, data: list[Array]) -> Array:
     """Results (N, size) for data (N, ...)."""
 
-    def on_one_block() -> BlockFunction:
-        run = function.on_one_block()
+    def build_block_function() -> BlockFunction:
+        run = function.build_block_function()
         return lambda *columns: run(*columns)[0]
 
     results = np.empty((len(data[0]), size))
-    fill(results, data[0], on_one_block, *data[1:])
+    fill(results, data[0], build_block_function, *data[1:])
     return results
 
 

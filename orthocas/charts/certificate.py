@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.errors import CertifyError, InvalidValueError
-from orthocas.tools.checks import Array, frozen_array, require_kind, require_shape, require_text
+from orthocas.tools.checks import Array, freeze_array, require_kind, require_shape, require_text
 from orthocas.tools.display import Shown, number_list, percent
-from orthocas.tools.json import attributes
+from orthocas.tools.json import collect_attributes
 
 OPEN, PROVED = 255, 254  #: codes of boxes that are not halved; others are the joint that is
 MOST_BOXES = 20_000_000
@@ -34,8 +34,8 @@ class Subdivision:
     codes: Array  #: uint8, in preorder: the joint whose interval is halved (lower half first), PROVED or OPEN
 
     def __post_init__(self) -> None:
-        low = frozen_array("low", self.low, (None,))
-        high = frozen_array("high", self.high, low.shape)
+        low = freeze_array("low", self.low, (None,))
+        high = freeze_array("high", self.high, low.shape)
         codes = np.array(self.codes)
         if codes.dtype != np.uint8 or codes.ndim != 1 or not 0 < codes.size <= MOST_BOXES:
             raise InvalidValueError("codes", f"{codes.dtype} of shape {codes.shape}", "bytes of a tree of boxes")
@@ -235,13 +235,13 @@ class Certificate(Shown):
         """Plain data for JSON."""
         one = self.injective
         return {
-            **attributes(self, "proved", "share", "bound", "conditioning", "boxes"),
+            **collect_attributes(self, "proved", "share", "bound", "conditioning", "boxes"),
             "parts": self.regular.proved_count,
             "unproved": self.regular.open_count,
             "seconds": self.seconds,
             "one_to_one_half_width": None if one is None else ((one.high - one.low) / 2).tolist(),
-            **attributes(self, "fold", *(("least_volume", "clear_share") if self.least_volume else ())),
-            **attributes(self, "method", "fingerprint"),
+            **collect_attributes(self, "fold", *(("least_volume", "clear_share") if self.least_volume else ())),
+            **collect_attributes(self, "method", "fingerprint"),
         }
 
     def _verdict(self) -> str:

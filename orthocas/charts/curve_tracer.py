@@ -14,7 +14,7 @@ from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.columns import BlockedFunction
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,7 +242,7 @@ class CurveTracer:
 
 def without_turns(difference: Array, turning: NDArray[np.bool_]) -> Array:
     """Differences of joint positions (..., n) without full turns of revolute joints."""
-    return np.asarray(shortest(difference, np.where(turning, 2 * np.pi, 0.0)))
+    return np.asarray(wrap_shortest(difference, np.where(turning, 2 * np.pi, 0.0)))
 
 
 def solutions_of(A: Array, right: Array) -> Array:

@@ -16,7 +16,7 @@ from orthocas.tasks.domains import bounds_of
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 
 _AT_ONCE = 2048  # rows whose curves are held in memory
 _PROBES, _SAME = 32, 1e-9  # positions at which turns are tried, and change of xi that is rounding
@@ -97,7 +97,9 @@ class SelfMotionCurves:
         q = sample_uniform(self.boxed.domain, _PROBES, 0)
         turned = q + 2 * np.pi * np.eye(q.shape[1])[:, None]
         here, there = self.xi(q), self.xi(turned.reshape(-1, q.shape[1])).reshape(-1, len(q), 1)
-        moved = np.abs(shortest(there - here, self.boxed.phi_map.difference.turns[self.boxed.m :])).max(axis=(1, 2))
+        moved = np.abs(wrap_shortest(there - here, self.boxed.phi_map.difference.turns[self.boxed.m :])).max(
+            axis=(1, 2)
+        )
         free = self.tracer.turning & ~np.isfinite(bounds_of(self.boxed.domain)[0])
         return np.asarray(free & (moved > _SAME))
 
@@ -244,7 +246,9 @@ class SelfMotionCurves:
         first, last = self._shares_inside(steps.q[:, 0], steps.q[:, 1], RULES.missed)
         changes = np.where(none, first < last, ~both)
         changes[self._crossed(left)[0]] = True
-        ahead = shortest((left[:, 1] - left[:, 0])[:, None], self.boxed.phi_map.difference.turns[self.boxed.m :])[:, 0]
+        ahead = wrap_shortest((left[:, 1] - left[:, 0])[:, None], self.boxed.phi_map.difference.turns[self.boxed.m :])[
+            :, 0
+        ]
         bends = steps.follows.copy()
         bends[1:] &= ~(ahead[1:] * ahead[:-1] > 0) & both[1:] & both[:-1]
         changes |= bends
@@ -400,7 +404,7 @@ class SelfMotionCurves:
     def _xi_left(self, targets: Array, q: Array) -> Array:
         """xi - xi(q), (N,)."""
         left = targets[:, self.boxed.m :] - self.xi(q)
-        return np.asarray(shortest(left, self.boxed.phi_map.difference.turns[self.boxed.m :])[:, 0])
+        return np.asarray(wrap_shortest(left, self.boxed.phi_map.difference.turns[self.boxed.m :])[:, 0])
 
     @cached_property
     def _period(self) -> float:

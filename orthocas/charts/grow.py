@@ -26,7 +26,7 @@ from orthocas.tools.checks import (
     Array,
     as_float_array,
     as_point,
-    frozen_array,
+    freeze_array,
     require_count,
     require_kind,
     require_known,
@@ -159,7 +159,7 @@ def _level(problem: Problem, level: ArrayLike | None, origin: Array | None) -> A
         return np.asarray(problem.task.batched(q[None])[0][0])
     values = np.atleast_1d(as_float_array("level", level))
     require_shape("level", values.shape, (problem.m,))
-    return frozen_array("level", values, (problem.m,))
+    return freeze_array("level", values, (problem.m,))
 
 
 def _start(problem: Problem, x0: Array, origin: Array | None) -> Array:

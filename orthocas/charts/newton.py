@@ -16,7 +16,7 @@ from orthocas.charts.phi import ROUNDING, Differences, PhiMap, largest
 from orthocas.errors import SingularTaskError
 from orthocas.tasks.domains import Domain
 from orthocas.tasks.samples import sample_boundary_weighted
-from orthocas.tools.batch import dense_function, in_threads
+from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.cached import BuiltOnUse, cached_property
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.interrupts import deferred
@@ -178,7 +178,7 @@ def inverses(matrices: Array) -> tuple[Array, NDArray[np.bool_]]:
         found = np.empty_like(matrices)
         pieces = [slice(first, first + _PIECE) for first in range(0, len(matrices), _PIECE)]
         for piece, inverse in zip(
-            pieces, in_threads(lambda piece: np.linalg.inv(matrices[piece]), pieces), strict=True
+            pieces, run_in_threads(lambda piece: np.linalg.inv(matrices[piece]), pieces), strict=True
         ):
             found[piece] = inverse
     except np.linalg.LinAlgError:  # it does not say which

@@ -14,11 +14,11 @@ from orthocas.tasks.domains import Domain, bounds_of, contains
 from orthocas.tasks.problem import Problem, evaluate_task_jacobians, measure_half_turn_distance
 from orthocas.tasks.problem_samples import Samples, evaluate_samples
 from orthocas.tasks.samples import sample_boundary_weighted
-from orthocas.tools.batch import in_threads
+from orthocas.tools.batch import run_in_threads
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import MANY
 from orthocas.tools.display import Shown, number_list
-from orthocas.tools.json import attributes
+from orthocas.tools.json import collect_attributes
 
 _CHUNK = 40_000  # joint positions evaluated at once
 _NEAR_THE_END = 0.1  # cos(angle / 2) of turns beyond which rounding of J_x shows
@@ -52,7 +52,7 @@ class Judged:
         parts = [_judged(problem, coordinates, points[start : start + _CHUNK]) for start in starts]
         found: dict[str, Any] = parts[0]
         if len(parts) > 1:
-            together = in_threads(lambda name: np.concatenate([part[name] for part in parts]), list(found))
+            together = run_in_threads(lambda name: np.concatenate([part[name] for part in parts]), list(found))
             found = dict(zip(found, together, strict=True))
         return cls(**{"metric_mutual_cosines": found["mutual_cosines"], **found})
 
@@ -130,7 +130,7 @@ class PointQuality(Shown):
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
-        return attributes(self, "leak_deg", "conditioning", "boundary_distance")
+        return collect_attributes(self, "leak_deg", "conditioning", "boundary_distance")
 
 
 def point_quality(problem: Problem, coordinates: CoordinateMap, points: Array) -> PointQuality:

@@ -18,8 +18,8 @@ from orthocas.tasks.domains import Box, Domain, StopKind, Wall, register_domain
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_number, as_point_set, frozen_array, require_kind
-from orthocas.tools.json import part
+from orthocas.tools.checks import Array, as_number, as_point_set, freeze_array, require_kind
+from orthocas.tools.json import get_part
 
 REGULAR_PART = "regular part"  #: name of the kind
 _ARRAYS = ("theta", "space_centre", "space_half_width")
@@ -91,20 +91,20 @@ class RegularPart(ClearBox):
     def from_data(cls, task: Task, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
         """The domain of a file."""
         box = ClearBox.from_data(task, data, arrays)
-        kind, robot = part(data, "regular", dict), task.robot
-        theta, centre, half_width = (part(arrays, name, np.ndarray) for name in _ARRAYS)
+        kind, robot = get_part(data, "regular", dict), task.robot
+        theta, centre, half_width = (get_part(arrays, name, np.ndarray) for name in _ARRAYS)
         n = robot.n
         centre, half_width = (
-            frozen_array("space_centre", centre, (n,)),
-            frozen_array("space_half_width", half_width, (n,)),
+            freeze_array("space_centre", centre, (n,)),
+            freeze_array("space_half_width", half_width, (n,)),
         )
         space = JointSpace(centre, half_width, robot.tree.prismatic, robot.joint_names)
         if not space.half_width.min() > 0:
             raise InvalidValueError("space_half_width", space.half_width.min(), "positive numbers")
-        idle = tuple(part(kind, "idle", list))
+        idle = tuple(get_part(kind, "idle", list))
         fitted = n - task.m - len(idle)
         own = Coordinates(parametrisation_from_data(kind), space, idle, theta, np.zeros(fitted), np.ones(fitted))
-        return cls(box, own, part(data, "least_volume", float))
+        return cls(box, own, get_part(data, "least_volume", float))
 
     def explain(self, q: Array) -> str:
         """What is wrong with a position (n,) of the box."""

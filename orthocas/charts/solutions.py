@@ -15,7 +15,7 @@ from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, Indices, as_float_array, as_point, require_shape
 from orthocas.tools.display import Shown, listed, number_list
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 from orthocas.tools.interrupts import deferred
 
 _FEW = 5  # rows that a message names
@@ -200,7 +200,7 @@ class Tracker(Shown):
             return None
         turns = np.zeros(len(q))
         turns[list(self._functions.turning)] = 2 * np.pi
-        return np.asarray(shortest(self._solver.q - q, turns))
+        return np.asarray(wrap_shortest(self._solver.q - q, turns))
 
     @property
     def largest_step(self) -> Array:

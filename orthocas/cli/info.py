@@ -27,7 +27,7 @@ from orthocas.tasks.problem import Problem, check
 from orthocas.tasks.problem_samples import NEGLIGIBLE
 from orthocas.tasks.task import Task
 from orthocas.tools.display import percent
-from orthocas.tools.json import plain
+from orthocas.tools.json import clean
 
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
@@ -89,15 +89,15 @@ def _robot(robot: Robot) -> dict[str, Any]:
     return {
         "joints": list(robot.joint_names),
         "kinds": list(robot.tree.joint_kinds),
-        "lower": plain(robot.lower),
-        "upper": plain(robot.upper),
-        "effort_limits": plain(robot.effort_limits),
-        "velocity_limits": plain(robot.velocity_limits),
+        "lower": clean(robot.lower),
+        "upper": clean(robot.upper),
+        "effort_limits": clean(robot.effort_limits),
+        "velocity_limits": clean(robot.velocity_limits),
         "homes": list(robot.homes),
         "tip": robot.tree.tip_name,
         **({"tips": list(robot.tips)} if robot.tree.tips else {}),
         "mass_kg": float(robot.tree.masses.sum()),
-        "gravity": plain(robot.tree.gravity),
+        "gravity": clean(robot.tree.gravity),
     }
 
 
@@ -128,7 +128,7 @@ def _branches(robot: Robot, task: Task | None) -> dict[str, Any]:
         "cuts": [cut.explained for cut in found.cuts],
         "branches": {item.name: item.share for item in found},
         **({"clearance_at_most": lower} if lower else {}),
-        "postures": {item.name: plain(item.posture) for item in found},
+        "postures": {item.name: clean(item.posture) for item in found},
     }
 
 

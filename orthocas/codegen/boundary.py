@@ -15,7 +15,7 @@ from orthocas.tasks.domains import Domain, PathBound, SingularBound, bounds_of, 
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import scalar_code
+from orthocas.tools.expressions import expand_scalars
 
 _USUAL = 256  # positions of a domain whose median room to a fold is the usual one
 
@@ -125,7 +125,7 @@ def _clear(domain: Domain, clear: SingularBound) -> BoundaryCondition:
     )
     words = {"clear_bound": repr(clear.least_singular_value), "clear_span": repr(span)}
     q = ca.MX.sym("q", len(clear.centre))
-    kernels = (scalar_code(ca.Function("gram", [q], [clear.gram(q)])),)
+    kernels = (expand_scalars(ca.Function("gram", [q], [clear.gram(q)])),)
     room = domain.room_to_fold
     if room is None:
         words |= dict.fromkeys(("least_of", "end_of_least", "or_volume"), "")
@@ -138,7 +138,7 @@ def _clear(domain: Domain, clear: SingularBound) -> BoundaryCondition:
         "fold_span": repr(usual),
     }
     meaning += " So is\n * the bound on the volume of the coordinates, in shares of the median."
-    folds = scalar_code(ca.Function("room", [q], [room(q)]))
+    folds = expand_scalars(ca.Function("room", [q], [room(q)]))
     return BoundaryCondition(("fold_boundary.c", "clear_boundary.c"), meaning, words, (*kernels, folds))
 
 

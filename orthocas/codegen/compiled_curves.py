@@ -15,7 +15,7 @@ from orthocas.codegen.compiled import template
 from orthocas.codegen.description import flags, numbers
 from orthocas.codegen.kernels import generate_kernels
 from orthocas.tasks.domains import bounds_of
-from orthocas.tools.batch import dense_function, in_threads
+from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.checks import Array
 
 _PIECE = 64  # rows that a thread takes at once
@@ -46,7 +46,7 @@ class CompiledCurves:
             counts = ctypes.c_long(len(stages[0])), ctypes.c_long(starts.shape[1])
             library.curve_rows(ctypes.c_long(len(starts)), phi, q_start, *counts, ctypes.c_double(tolerance), *others)
 
-        in_threads(search_piece, range(0, len(own), _PIECE))
+        run_in_threads(search_piece, range(0, len(own), _PIECE))
         best.between[:] = between
         return best
 

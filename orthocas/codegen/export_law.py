@@ -10,7 +10,7 @@ from orthocas.control.operational_space import Impedance, PDPlus
 from orthocas.errors import InvalidValueError
 from orthocas.tasks.domains import reach
 from orthocas.tools.batch import dense_function
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 
 TORQUE_LAWS = (Impedance, PDPlus)  #: that can be exported
 _STATUSES = ("OK", "OUTSIDE_DOMAIN", "SINGULAR", "NOT_FINITE", "SATURATED")
@@ -88,7 +88,7 @@ def _functions(law: Impedance | PDPlus) -> list[str]:
         function_code(
             "_shortest",
             "Errors by the shorter way around for coordinates that are angles, (n, N).",
-            dense_function("f", [e], [shortest(e, chart.turns)]),
+            dense_function("f", [e], [wrap_shortest(e, chart.turns)]),
         ),
         _code(
             "_mass_matrix", "Entries of M row by row, (n n, N).", [q], [ca.vec(law.model.mass_matrix(robot, inputs))]

@@ -21,7 +21,7 @@ from orthocas.control.controller import Controller
 from orthocas.control.memory import memory_of
 from orthocas.control.safety import SIGNED, UNBOUNDED, Safety
 from orthocas.tasks.relative import Relative
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 from orthocas.version import VERSION
 
 _TORQUE = """It compensates gravity and the load that it has felt, damps
@@ -111,7 +111,7 @@ def _apart(controller: Controller, relative: Relative, end: ca.MX, start: ca.MX)
         unit = ca.sumsqr(relative.task.quaternion_function(end[:m])) < _UNIT
         difference = ca.if_else(unit, difference, ca.MX.nan(len(controller.labels)))
     if controller.chart is not None and controller.labels == controller.chart.labels:
-        difference = shortest(difference, controller.chart.turns)
+        difference = wrap_shortest(difference, controller.chart.turns)
     return ca.densify(difference)
 
 

@@ -13,7 +13,7 @@ from orthocas.control.controller import Controller
 from orthocas.control.operational_space import PDPlus
 from orthocas.tasks.domains import contains
 from orthocas.tools.checks import Array
-from orthocas.tools.files import draft_folder
+from orthocas.tools.files import open_draft_folder
 from orthocas.tools.interrupts import deferred
 from orthocas.tools.processes import run_program
 
@@ -37,7 +37,7 @@ def control_tick(chart: Chart) -> float:
     Raises:
         CompileError: if there is no C compiler.
     """
-    with draft_folder() as folder:
+    with open_draft_folder() as folder:
         with deferred():  # CasADi may lose Ctrl-C while it builds functions
             law = PDPlus(chart, 50.0, coupling="decoupled")
             generated = generate_c(chart, folder, law, "tick")
@@ -54,7 +54,7 @@ def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int =
         CompileError: if there is no C compiler, or the timing program cannot be built or run.
     """
     first = cases[0][1]
-    with draft_folder() as folder:
+    with open_draft_folder() as folder:
         data, program = folder / "states", folder / "ticks"
         numbers = np.concatenate([part.ravel() for law, _ in cases for part in (_states(law), gain_numbers(law))])
         first.numbers(numbers).tofile(data)

@@ -3,7 +3,7 @@
 import casadi as ca
 
 from orthocas.charts.chart import Chart
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 
 
 def errors(chart: Chart, q: ca.MX, reference: ca.MX) -> tuple[ca.MX, ca.MX]:
@@ -15,7 +15,7 @@ def errors(chart: Chart, q: ca.MX, reference: ca.MX) -> tuple[ca.MX, ca.MX]:
     """
     m, own = chart.m, chart.coordinates.functions
     e, slope = chart.relative.error(q, reference[:m])
-    rest = shortest(own["xi"](q) - reference[m:], chart.turns[m:])
+    rest = wrap_shortest(own["xi"](q) - reference[m:], chart.turns[m:])
     return ca.vertcat(e, rest), ca.vertcat(slope, own["jacobian"](q))
 
 

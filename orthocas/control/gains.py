@@ -17,7 +17,7 @@ from orthocas.tools.checks import (
     as_float_array,
     as_number,
     as_point_set,
-    frozen_array,
+    freeze_array,
     require_kind,
     require_shape,
 )
@@ -81,7 +81,7 @@ def command_limit(name: str, value: ArrayLike | None, default: Array) -> Array:
 
 
 def _spread(name: str, value: ArrayLike, length: int) -> Array:
-    return frozen_array(name, np.broadcast_to(_one_or(name, value, length), (length,)), (length,))
+    return freeze_array(name, np.broadcast_to(_one_or(name, value, length), (length,)), (length,))
 
 
 def _one_or(name: str, value: ArrayLike, length: int) -> Array:

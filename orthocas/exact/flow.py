@@ -17,7 +17,7 @@ from orthocas.tasks.problem_samples import Samples
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_point_set
-from orthocas.tools.columns import ColumnFunction, blocked, by_sample
+from orthocas.tools.columns import ColumnFunction, arrange_blocks, split_by_sample
 
 _STAGES = 12
 _FEW = 64  # up to this many trajectories, a block of columns does not pay off
@@ -72,8 +72,8 @@ class BatchedFlow:
         N = len(arguments[0])
         if N <= _FEW:
             return self._few(*arguments)
-        outputs = self._many(*map(blocked, arguments))
-        return [by_sample(out[:, None], N)[:, :, 0] for out in outputs]
+        outputs = self._many(*map(arrange_blocks, arguments))
+        return [split_by_sample(out[:, None], N)[:, :, 0] for out in outputs]
 
     @cached_property
     def _few(self) -> Batched:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocas.errors import FoldedMapError, InvalidValueError
 from orthocas.exact import libigl as igl
 from orthocas.exact.mesh import TriangleMesh, cotangents, flip_to_delaunay, require_disk, steps_to_neighbours
-from orthocas.tools.checks import Array, Indices, frozen_array, require_count, require_finite, require_shape
+from orthocas.tools.checks import Array, Indices, freeze_array, require_count, require_finite, require_shape
 
 _ON_LEVEL = 2e-13  # |h - level| of a vertex, relative to the larger of 1 and the largest |h|
 _ROUNDS = 4  # rounds of flips and smoothing
@@ -54,8 +54,8 @@ def level_surface(
         Marching cubes: [AS2023] Sec. 5.2. Exact vertices and the improvement of the triangles are ours:
         docs/explanation/derivations_exact.md#disk-chart.
     """
-    frozen_array("level", level, ())
-    corners = np.stack([frozen_array("low", low, (3,)), frozen_array("high", high, (3,))])
+    freeze_array("level", level, ())
+    corners = np.stack([freeze_array("low", low, (3,)), freeze_array("high", high, (3,))])
     if not np.all(corners[0] < corners[1]):
         raise InvalidValueError("low", corners[0].tolist(), f"less than high = {corners[1].tolist()}")
     axes = _grid_axes(corners, require_count("cells", cells, least=2))

@@ -13,7 +13,7 @@ from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array, require_count, require_kind, require_memory, require_shape
 from orthocas.tools.display import Shown, number_list
-from orthocas.tools.json import attributes
+from orthocas.tools.json import collect_attributes
 
 _ROUNDING = 1e-7  # a defect below this share of the terms that cancel in it counts as zero
 _STRAIGHT = 1e-12  # [rad]; task gradients that turn by less over the domain count as constant
@@ -61,7 +61,7 @@ class Involutivity(Shown):
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON, without the function."""
-        return attributes(self, *(part.name for part in fields(self) if part.name != "function"), "verdict")
+        return collect_attributes(self, *(part.name for part in fields(self) if part.name != "function"), "verdict")
 
 
 def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involutivity:

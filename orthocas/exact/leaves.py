@@ -18,8 +18,8 @@ from orthocas.tasks.problem import Problem, evaluate_task_jacobians
 from orthocas.tasks.problem_samples import evaluate_samples
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.cached import building, cached_property
-from orthocas.tools.checks import Array, Indices, frozen_array, frozen_indices, require_known, require_memory
-from orthocas.tools.expressions import determinant, shortest
+from orthocas.tools.checks import Array, Indices, freeze_array, freeze_indices, require_known, require_memory
+from orthocas.tools.expressions import compute_determinant, wrap_shortest
 from orthocas.tools.interrupts import deferred
 
 _ON_LEAF = 1e-6  # [rad] or [m]
@@ -99,7 +99,7 @@ def turning_joints(problem: Problem) -> NDArray[np.bool_]:
 
 def without_turns(problem: Problem, differences: Array) -> Array:
     """Differences of joint positions, (..., n), with angles within half a turn of 0."""
-    return np.asarray(shortest(differences, np.where(turning_joints(problem), 2 * np.pi, 0.0)))
+    return np.asarray(wrap_shortest(differences, np.where(turning_joints(problem), 2 * np.pi, 0.0)))
 
 
 def covers(region: Box, points: Array) -> NDArray[np.bool_]:
@@ -146,8 +146,8 @@ class DiskLeaf:
             "disk": (count, 2),
         }
         for name, shape in shapes.items():
-            object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
-        object.__setattr__(self, "faces", frozen_indices("faces", self.faces, (None, 3), count))
+            object.__setattr__(self, name, freeze_array(name, getattr(self, name), shape))
+        object.__setattr__(self, "faces", freeze_indices("faces", self.faces, (None, 3), count))
         if not len(self.faces):
             raise InvalidValueError("faces", "empty", "at least one triangle")
         if np.linalg.norm(self.disk, axis=1).max() > 1 + 1e-9:
@@ -244,11 +244,11 @@ def disk_leaf(problem: Problem, level: Array, region: Box, cells: int = CELLS) -
             f"the problem has n = {problem.n} and m = {problem.m}, expected n = 3 and m = 1 for a disk leaf"
         )
     low, high = region.centre - region.half_width, region.centre + region.half_width
-    shortest = cells * float(region.half_width.min() / region.half_width.max())
-    if shortest < _FEWEST_ACROSS:
+    wrap_shortest = cells * float(region.half_width.min() / region.half_width.max())
+    if wrap_shortest < _FEWEST_ACROSS:
         widths = (2 * region.half_width).round(4).tolist()
         raise GrowError(
-            f"the region has edges {widths}, so {cells} cells along the longest give {shortest:.1f} along "
+            f"the region has edges {widths}, so {cells} cells along the longest give {wrap_shortest:.1f} along "
             f"the shortest, expected at least {_FEWEST_ACROSS}"
         )
     require_memory(f"a mesh with {cells} cells", 40.0 * cells**3)
@@ -286,7 +286,7 @@ class LinearLeaf:
     def __post_init__(self) -> None:
         n, m, r = self.problem.n, self.problem.m, self.problem.r
         for name, shape in (("level", (m,)), ("centre", (n,)), ("normals", (n, r))):
-            object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
+            object.__setattr__(self, name, freeze_array(name, getattr(self, name), shape))
         require_on_leaf(self.problem, self.level, self.centre[None])
         if np.abs(np.linalg.norm(self.normals, axis=0) - 1).max() > 1e-9:
             raise InvalidValueError("normals", self.normals.tolist(), "columns of length 1")
@@ -355,7 +355,7 @@ class CircleLeaf:
 
     def __post_init__(self) -> None:
         for name, shape in (("level", (self.problem.m,)), ("curve", (None, self.problem.n)), ("length", (1,))):
-            object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
+            object.__setattr__(self, name, freeze_array(name, getattr(self, name), shape))
         if len(self.curve) < _FEWEST or not self.length[0] > 0:
             raise InvalidValueError("curve", f"{len(self.curve)} samples of length {self.length[0]}", "a closed curve")
         require_on_leaf(self.problem, self.level, self.curve)
@@ -470,7 +470,7 @@ def _tracer(problem: Problem, level: Array, steps: int) -> Callable[[Array, floa
     q, length = ca.SX.sym("q", problem.n), ca.SX.sym("length")
     J = problem.task.jacobian_function(q)
     others = [[k for k in range(problem.n) if k != i] for i in range(problem.n)]
-    across = ca.vertcat(*((-1) ** (i + 1) * determinant(J[:, columns]) for i, columns in enumerate(others)))
+    across = ca.vertcat(*((-1) ** (i + 1) * compute_determinant(J[:, columns]) for i, columns in enumerate(others)))
     home = J.T @ ca.solve(J @ J.T, problem.task.function(q) - level)
     rate = length * (across / ca.norm_2(across) - home)
     grid = np.linspace(0.0, 1.0, steps + 1)

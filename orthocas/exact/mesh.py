@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocas.errors import InvalidValueError, NotADiskError
 from orthocas.exact import libigl as igl
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, Indices, frozen_array, frozen_indices, require_finite, require_shape
+from orthocas.tools.checks import Array, Indices, freeze_array, freeze_indices, require_finite, require_shape
 
 _CHUNK = 10_000  # points per call of libigl, which Ctrl-C cannot interrupt; 0.1 s on 200,000 triangles
 _MOST_ROUNDS = 200  # rounds of flips; a few dozen suffice, but there is no proof that they end on a curved surface
@@ -34,9 +34,9 @@ class TriangleMesh:
     faces: Indices
 
     def __post_init__(self) -> None:
-        vertices = frozen_array("vertices", self.vertices, (None, 3))
+        vertices = freeze_array("vertices", self.vertices, (None, 3))
         object.__setattr__(self, "vertices", vertices)
-        object.__setattr__(self, "faces", frozen_indices("faces", self.faces, (None, 3), len(vertices)))
+        object.__setattr__(self, "faces", freeze_indices("faces", self.faces, (None, 3), len(vertices)))
 
     @cached_property
     def edges(self) -> Indices:
@@ -142,10 +142,10 @@ class TriangleLocator:
     """
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
-        self._vertices = frozen_array("vertices", vertices, (None, None))
+        self._vertices = freeze_array("vertices", vertices, (None, None))
         if self._vertices.shape[1] not in (2, 3):
             require_shape("vertices", self._vertices.shape, (None, 3))
-        self._faces = frozen_indices("faces", faces, (None, 3), len(self._vertices))
+        self._faces = freeze_indices("faces", faces, (None, 3), len(self._vertices))
         if not len(self._faces):
             raise InvalidValueError("faces", "empty", "at least one triangle")
         self._points = _in_space(self._vertices)

@@ -26,7 +26,7 @@ from orthocas.tasks.clear_box import ClearBox
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem, ProblemCheck, check
 from orthocas.tasks.problem_samples import Samples, find_idle_joints, sample_problem
-from orthocas.tools.batch import using_threads
+from orthocas.tools.batch import use_threads
 from orthocas.tools.checks import Array, require_count
 from orthocas.tools.display import Shown, listed, percent
 from orthocas.tools.interrupts import remembered
@@ -127,7 +127,7 @@ def fit(
     )
     if like is not None and align_to is not None:
         raise InvalidValueError("like", "given with align_to", "one of them: both define order and signs")
-    with using_threads(None if threads is None else require_count("threads", threads)):
+    with use_threads(None if threads is None else require_count("threads", threads)):
         return _fit(problem, settings, monitor, align_to)
 
 

@@ -26,7 +26,7 @@ from orthocas.tasks.regular_box import find_home
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, as_number, require_count, require_kind
 from orthocas.tools.display import Shown, listed, number_list
-from orthocas.tools.json import attributes
+from orthocas.tools.json import collect_attributes
 from orthocas.tools.progress import Monitor, Progress, silent
 
 JUDGES = 30_000  #: samples that judge the fit
@@ -126,7 +126,7 @@ class DomainSuggestion(Shown):
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
         quality = ("leak_deg", "conditioning", "worst_point", "asked", "seconds")
-        return attributes(self, "home", "home_source", "joints", *quality)
+        return collect_attributes(self, "home", "home_source", "joints", *quality)
 
 
 @dataclass(eq=False)

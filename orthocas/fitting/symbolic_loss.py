@@ -14,7 +14,7 @@ from orthocas.fitting.terms import DEFAULT_WEIGHTS, Sizes, WeightNumbers, Weight
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.problem_samples import Samples, evaluate_samples
 from orthocas.tasks.samples import sample_evenly
-from orthocas.tools.checks import Array, as_point_set, frozen_array, require_count, require_kind
+from orthocas.tools.checks import Array, as_point_set, freeze_array, require_count, require_kind
 
 
 def loss(
@@ -60,7 +60,7 @@ def loss(
     require_parametrisation(parametrisation)
     family = parametrisation.for_problem(problem).family(JointSpace.of(problem), problem.r)
     drawn = _drawn(problem, samples, seed)
-    theta0 = _start(family, drawn, seed) if start is None else frozen_array("start", start, (family.size,))
+    theta0 = _start(family, drawn, seed) if start is None else freeze_array("start", start, (family.size,))
     theta = ca.MX.sym("theta", family.size)
     J = _jacobians(family, drawn.points, theta)  # (r n, N), each J_xi column by column
     identity = drawn.metric_inverse is None

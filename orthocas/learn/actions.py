@@ -15,7 +15,7 @@ from orthocas.tools.checks import (
     as_float_array,
     as_point,
     as_point_set,
-    frozen_indices,
+    freeze_indices,
     require_kind,
     require_shape,
 )
@@ -77,7 +77,7 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
             raise InvalidValueError("positions", repr(positions)[:80], "a function of an environment")
         self.chart, self._positions = chart, positions
         places = range(chart.n) if joints is None else joints
-        self._joints = frozen_indices("joints", places, (chart.n,), _MOST_POSITIONS)
+        self._joints = freeze_indices("joints", places, (chart.n,), _MOST_POSITIONS)
         sizes = as_float_array("step", step)
         if sizes.shape not in ((), (chart.n,)) or not ((sizes > 0) & np.isfinite(sizes)).all():
             raise InvalidValueError("step", sizes.tolist(), f"one finite number or {chart.n}, > 0")

@@ -22,7 +22,7 @@ from orthocas.robots.spatial import (
     turn_about,
 )
 from orthocas.robots.tree import Frame, KinematicTree
-from orthocas.tools.checks import Array, as_float_array, frozen_array, require_finite, require_known
+from orthocas.tools.checks import Array, as_float_array, freeze_array, require_finite, require_known
 
 _AXES = ("x", "y", "z")
 _LEAST_SQUARE = 1e-24  #: of a cosine
@@ -284,7 +284,7 @@ def align_frame(direction: ArrayLike, axis: str) -> Array:
     Raises:
         ShapeError, InvalidValueError: if the direction is zero or not (3,).
     """
-    target = frozen_array("reference", direction, (3,))
+    target = freeze_array("reference", direction, (3,))
     if not target.any():
         raise InvalidValueError("reference", target.tolist(), "a direction other than zero")
     return np.roll(rotate_z_to(target), _AXES.index(axis) - 2, axis=1)

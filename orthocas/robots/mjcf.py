@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from orthocas.errors import RobotError, one_line
 from orthocas.robots.urdf import RULES, read_xml
-from orthocas.tools.checks import Array, as_path, of_extra
+from orthocas.tools.checks import Array, as_path, import_extra
 
 #: attributes that hold names
 _WORDS = ("name", "class", "childclass", "joint", "body", "file", "mesh", "material")
@@ -38,7 +38,7 @@ def read_mjcf(source: Any) -> pin.Model:
         RobotError: if MuJoCo refuses the file, or the model has no joint, armatures of tendons or actuators, or
             flexible bodies.
     """
-    mujoco = of_extra("mujoco", "reading MJCF files", "mujoco")
+    mujoco = import_extra("mujoco", "reading MJCF files", "mujoco")
     if isinstance(source, mujoco.MjModel):
         return _convert(mujoco, source, "the model")
     source = as_path("path", source)

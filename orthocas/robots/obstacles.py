@@ -15,7 +15,7 @@ from orthocas.robots.robot import Robot
 from orthocas.robots.tree import BASE_JOINTS
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, as_number, as_point_set, frozen_array, require_kind
+from orthocas.tools.checks import Array, as_float_array, as_number, as_point_set, freeze_array, require_kind
 
 __all__ = ["Capsule", "LinkDistances", "Obstacle", "Plane", "Sphere"]
 
@@ -65,7 +65,7 @@ class Sphere:
     radius: float
 
     def __init__(self, centre: ArrayLike, radius: float) -> None:
-        object.__setattr__(self, "centre", frozen_array("centre", centre, (3,)))
+        object.__setattr__(self, "centre", freeze_array("centre", centre, (3,)))
         object.__setattr__(self, "radius", _check_size("radius", radius))
 
     @property
@@ -93,8 +93,8 @@ class Capsule:
     radius: float
 
     def __init__(self, start: ArrayLike, end: ArrayLike, radius: float) -> None:
-        object.__setattr__(self, "start", frozen_array("start", start, (3,)))
-        object.__setattr__(self, "end", frozen_array("end", end, (3,)))
+        object.__setattr__(self, "start", freeze_array("start", start, (3,)))
+        object.__setattr__(self, "end", freeze_array("end", end, (3,)))
         object.__setattr__(self, "radius", _check_size("radius", radius))
 
     @property
@@ -121,12 +121,12 @@ class Plane:
     point: Array
 
     def __init__(self, normal: ArrayLike, point: ArrayLike) -> None:
-        given = frozen_array("normal", normal, (3,))
+        given = freeze_array("normal", normal, (3,))
         length = float(np.linalg.norm(given))
         if not 1e-9 < length < np.inf:
             raise InvalidValueError("normal", given.tolist(), "a direction, of a length above 1e-9")
-        object.__setattr__(self, "normal", frozen_array("normal", given / length, (3,)))
-        object.__setattr__(self, "point", frozen_array("point", point, (3,)))
+        object.__setattr__(self, "normal", freeze_array("normal", given / length, (3,)))
+        object.__setattr__(self, "point", freeze_array("point", point, (3,)))
 
     @property
     def heading(self) -> str:

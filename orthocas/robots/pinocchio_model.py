@@ -9,7 +9,7 @@ import pinocchio as pin
 from orthocas.errors import InvalidValueError, RobotError, degrees_hint
 from orthocas.robots.spatial import rotate_z_to, snap
 from orthocas.robots.tree import BASE_JOINTS, JointKind, KinematicTree, place_on_base
-from orthocas.tools.checks import Array, frozen_array, require_known
+from orthocas.tools.checks import Array, freeze_array, require_known
 
 LINKS = (pin.FrameType.BODY, pin.FrameType.OP_FRAME)  #: links of URDF, bodies and sites of MJCF
 _UNLIMITED = 1e10  #: numbers above it are no limits: Pinocchio uses the largest double
@@ -312,8 +312,8 @@ def build_planar(lengths: Sequence[float], masses: Sequence[float]) -> pin.Model
     Source:
         [AS2023] Fig. 5 and Sec. 8.
     """
-    lengths = frozen_array("lengths", lengths, (None,)).tolist()
-    masses = frozen_array("masses", masses, (len(lengths),)).tolist()
+    lengths = freeze_array("lengths", lengths, (None,)).tolist()
+    masses = freeze_array("masses", masses, (len(lengths),)).tolist()
     for name, values in (("lengths", lengths), ("masses", masses)):
         if not values or min(values) <= 0:
             raise InvalidValueError(name, values, "positive numbers, one per link")

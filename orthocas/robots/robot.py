@@ -34,7 +34,7 @@ from orthocas.tools.checks import (
     as_float_array,
     as_path,
     as_point_set,
-    frozen_array,
+    freeze_array,
     require_kind,
     require_known,
 )
@@ -73,7 +73,7 @@ class Robot(Shown):
         require_kind("homes", homes, Mapping)
         self.tree = tree
         #: named postures (n,) of the robot's files: SRDF group states, MJCF keyframes. Chart files do not store them.
-        self.homes = {name: frozen_array(f"home '{name}'", q, (tree.n,)) for name, q in homes.items()}
+        self.homes = {name: freeze_array(f"home '{name}'", q, (tree.n,)) for name, q in homes.items()}
 
     @classmethod
     def from_file(
@@ -212,7 +212,7 @@ class Robot(Shown):
             ShapeError, InvalidValueError: if the factors are invalid.
         """
         given = as_float_array("factor", factor)
-        factors = frozen_array("factor", np.full(self.n, given) if given.ndim == 0 else given, (self.n,))
+        factors = freeze_array("factor", np.full(self.n, given) if given.ndim == 0 else given, (self.n,))
         if factors.min() <= 0:
             raise InvalidValueError("factor", factors.min(), "numbers > 0")
         masses, inertias = self.tree.masses * factors, self.tree.inertias * factors[:, None, None]
@@ -258,7 +258,7 @@ class Robot(Shown):
             >>> robot.with_gravity([0.0, -1.62, 0.0]).gravity([0.0]).round(9).tolist()
             [4.86]
         """
-        given = frozen_array("gravity", gravity, (3,))
+        given = freeze_array("gravity", gravity, (3,))
         if self.tree.floating and given.any():
             raise RobotError(f"gravity is {given.tolist()}, expected none: a base that nothing holds has no gravity")
         return type(self)(replace(self.tree, gravity=given), self.homes)

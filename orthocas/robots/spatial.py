@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError
-from orthocas.tools.checks import Array, frozen_array
+from orthocas.tools.checks import Array, freeze_array
 
 _TINY = 1e-24  #: under square roots, so that their derivatives are finite
 _ROUNDING = 1e-14  #: entries of rotations this close to 0 or +-1 are rounding of rpy -> matrix
@@ -113,7 +113,7 @@ def rotation_matrix(name: str, value: ArrayLike) -> Array:
     Raises:
         ShapeError, InvalidValueError: if it is not a rotation matrix.
     """
-    rotation = frozen_array(name, value, (3, 3))
+    rotation = freeze_array(name, value, (3, 3))
     # Products of larger numbers may overflow.
     bounded = np.abs(rotation).max() < 2
     if not bounded or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0:

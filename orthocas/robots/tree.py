@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from orthocas.errors import InvalidValueError, RobotError
-from orthocas.tools.checks import Array, as_float_array, frozen_array, require_known, require_shape, require_text
+from orthocas.tools.checks import Array, as_float_array, freeze_array, require_known, require_shape, require_text
 from orthocas.tools.display import listed
 
 
@@ -100,7 +100,7 @@ class KinematicTree:
             "frame_translations": (len(self.frame_names), 3),
         }
         for name, shape in shapes.items():
-            array = frozen_array(name, getattr(self, name), shape)
+            array = freeze_array(name, getattr(self, name), shape)
             object.__setattr__(self, name, array)
             # Products of larger numbers would overflow.
             if array.size and np.abs(array).max() > RULES.largest:

@@ -16,7 +16,7 @@ from orthocas.errors import InvalidValueError, OrthocasError, StepsFileError
 from orthocas.robots.kinematics import point_jacobian
 from orthocas.robots.tree import KinematicTree
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, frozen_array, require_count, require_known, require_shape
+from orthocas.tools.checks import Array, as_float_array, freeze_array, require_count, require_known, require_shape
 from orthocas.tools.json import Reader
 
 _STICTION_SPEED = 0.01  # [rad/s] or [m/s]: above twice this speed, Coulomb friction is nearly at its full value
@@ -104,11 +104,11 @@ class Push:
                 raise InvalidValueError(f"{name} of a push", value, f"a finite number {want}")
         object.__setattr__(self, "start", float(start))
         object.__setattr__(self, "duration", float(duration))
-        object.__setattr__(self, "force", frozen_array("force", force, (3,)))
-        object.__setattr__(self, "torque", None if torque is None else frozen_array("torque", torque, (None,)))
+        object.__setattr__(self, "force", freeze_array("force", force, (3,)))
+        object.__setattr__(self, "torque", None if torque is None else freeze_array("torque", torque, (None,)))
         require_link(link)
         object.__setattr__(self, "link", link)
-        object.__setattr__(self, "point", frozen_array("point", point, (3,)))
+        object.__setattr__(self, "point", freeze_array("point", point, (3,)))
 
     @property
     def end(self) -> float:

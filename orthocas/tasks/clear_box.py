@@ -14,9 +14,9 @@ from orthocas.tasks.samples import sample_evenly, sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_number, as_point_set, frozen_array, require_kind, require_known
+from orthocas.tools.checks import Array, as_number, as_point_set, freeze_array, require_kind, require_known
 from orthocas.tools.columns import BlockedFunction
-from orthocas.tools.json import part
+from orthocas.tools.json import get_part
 
 CLEAR_BOX = "clear box"  #: name of the kind
 ROWS = ("frame", "x")  #: Jacobians by which a position is evaluated
@@ -93,7 +93,7 @@ class ClearBox(Box):
         task = task.with_reference_at(box.centre)
         object.__setattr__(self, "task", task)
         object.__setattr__(self, "rows", rows)
-        sizes = self._measure_rows() if scale is None else frozen_array("scale", scale, (task.m,))
+        sizes = self._measure_rows() if scale is None else freeze_array("scale", scale, (task.m,))
         bound = as_number("least_singular_value", least_singular_value)
         for name, value in (("least_singular_value", bound), ("scale", sizes.min())):
             if not 0 < value < np.inf:
@@ -153,9 +153,9 @@ class ClearBox(Box):
         box = Box.from_data(task, data, arrays)
         require_kind("box", box, Box)
         require_within_limits(task.robot, box)
-        rows = part(data, "judged_rows", str) if "judged_rows" in data else "frame" if task.turn is None else "x"
-        bound = part(data, "least_singular_value", float)
-        return cls(cast("Box", box), task, bound, part(arrays, "row_scale", np.ndarray), rows)
+        rows = get_part(data, "judged_rows", str) if "judged_rows" in data else "frame" if task.turn is None else "x"
+        bound = get_part(data, "least_singular_value", float)
+        return cls(cast("Box", box), task, bound, get_part(arrays, "row_scale", np.ndarray), rows)
 
     @property
     def jacobian_function(self) -> ca.Function:

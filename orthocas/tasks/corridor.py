@@ -14,10 +14,10 @@ from orthocas.robots.robot import Robot
 from orthocas.tasks.domains import NARROWEST, WIDEST, Box, Domain, register_domain
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, as_point_set, frozen_array, require_kind
+from orthocas.tools.checks import Array, as_float_array, as_point_set, freeze_array, require_kind
 from orthocas.tools.display import number_list
-from orthocas.tools.files import column_places, read_table
-from orthocas.tools.json import part
+from orthocas.tools.files import find_columns, read_table
+from orthocas.tools.json import get_part
 
 CORRIDOR = "corridor"  #: name of the kind
 _MOST_POSTURES = 2000  #: of a path
@@ -60,7 +60,7 @@ class Corridor(Box):
         require_kind("box", box, Box)
         super().__init__(box.centre, box.half_width, box.unbounded)
         n = len(box.centre)
-        path = frozen_array("postures", postures, (None, n))
+        path = freeze_array("postures", postures, (None, n))
         if (widest := np.abs(path).max(initial=0.0)) > WIDEST:
             raise InvalidValueError("postures", f"up to {widest:.3g}", f"numbers up to {WIDEST:g}")
         if not 1 <= len(path) <= _MOST_POSTURES:
@@ -107,7 +107,7 @@ class Corridor(Box):
     def from_data(cls, task: Any, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
         """The corridor of a file."""
         box = cast("Box", Box.from_data(task, data, arrays))
-        return cls(box, *(part(arrays, name, np.ndarray) for name in ("postures", "radius")))
+        return cls(box, *(get_part(arrays, name, np.ndarray) for name in ("postures", "radius")))
 
     def apply_to(self, box: Box) -> Self:
         """The same condition on another box. Joints that have more room there do not count."""
@@ -210,6 +210,6 @@ def read_postures(path: Path, robot: Robot) -> Array:
         "postures file",
         "postures",
         _MOST_IN_FILE,
-        lambda names: column_places(names, robot.joint_names),
+        lambda names: find_columns(names, robot.joint_names),
         least=1,
     )

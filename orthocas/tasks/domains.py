@@ -18,7 +18,7 @@ from orthocas.tools.checks import (
     Array,
     as_float_array,
     as_point_set,
-    frozen_array,
+    freeze_array,
     require_count,
     require_kind,
     require_known,
@@ -270,11 +270,11 @@ class Box(Domain):
     is_box = True
 
     def __init__(self, centre: ArrayLike, half_width: ArrayLike, unbounded: Sequence[int] = ()) -> None:
-        middle = frozen_array("centre", centre, (None,))
+        middle = freeze_array("centre", centre, (None,))
         widths = as_float_array("half_width", half_width)
         if widths.ndim > 0 and widths.shape != middle.shape:
             raise ShapeError("half_width", widths.shape, middle.shape)
-        widths = frozen_array("half_width", np.broadcast_to(widths, middle.shape), middle.shape)
+        widths = freeze_array("half_width", np.broadcast_to(widths, middle.shape), middle.shape)
         if widths.size == 0:
             raise InvalidValueError("centre", "empty", "at least one joint")
         if widths.min() <= NARROWEST or widths.max() > WIDEST:
@@ -299,8 +299,8 @@ class Box(Domain):
             ShapeError: if the two differ in length.
             InvalidValueError: if a number is not finite, or lower_i >= upper_i.
         """
-        low = frozen_array("lower", lower, (None,))
-        high = frozen_array("upper", upper, low.shape)
+        low = freeze_array("lower", lower, (None,))
+        high = freeze_array("upper", upper, low.shape)
         wrong = np.flatnonzero(low >= high)
         if wrong.size:
             i = int(wrong[0])
@@ -323,8 +323,10 @@ class Box(Domain):
     def from_data(cls, task: "Task", data: Mapping[str, Any], arrays: Mapping[str, Any]) -> "Domain":
         """The box of a file."""
         # Older files have no unbounded joints.
-        unbounded = json.part(data, "unbounded", list) if "unbounded" in data else ()
-        return Box(json.part(arrays, "centre", np.ndarray), json.part(arrays, "half_width", np.ndarray), unbounded)
+        unbounded = json.get_part(data, "unbounded", list) if "unbounded" in data else ()
+        return Box(
+            json.get_part(arrays, "centre", np.ndarray), json.get_part(arrays, "half_width", np.ndarray), unbounded
+        )
 
 
 @register_domain
@@ -348,8 +350,8 @@ class Torus(Domain):
     def __init__(self, n: int) -> None:
         require_count("n", n, most=_MOST_JOINTS)
         object.__setattr__(self, "n", n)
-        object.__setattr__(self, "centre", frozen_array("centre", np.zeros(n), (n,)))
-        object.__setattr__(self, "half_width", frozen_array("half_width", np.full(n, np.pi), (n,)))
+        object.__setattr__(self, "centre", freeze_array("centre", np.zeros(n), (n,)))
+        object.__setattr__(self, "half_width", freeze_array("half_width", np.full(n, np.pi), (n,)))
 
     def contains(self, q: ArrayLike) -> Any:
         """Whether points (n,) or (N, n) lie on the torus: a bool, or (N,). All finite angles do."""
@@ -405,7 +407,7 @@ def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: Array
             leaves the limits.
     """
     require_kind("robot", robot, Robot)
-    middle = robot.tree.middle if centre is None else frozen_array("centre", centre, (robot.n,))
+    middle = robot.tree.middle if centre is None else freeze_array("centre", centre, (robot.n,))
     if half_width is not None:
         return Box(middle, half_width)
     widths = default_half_width(robot, middle)

@@ -14,8 +14,8 @@ from orthocas.robots.pinocchio_model import suggest_lock
 from orthocas.robots.robot import Robot
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, frozen_array, require_kind, require_known, require_text
-from orthocas.tools.expressions import HoldsFunctions, called, expression_of
+from orthocas.tools.checks import Array, freeze_array, require_kind, require_known, require_text
+from orthocas.tools.expressions import HoldsFunctions, build_expression, call_user
 
 METRIC_KINDS = ("euclidean", "inertia")
 MetricSpec = str | ArrayLike | Callable[[ca.SX], ca.SX]  #: what `Metric.from_spec` accepts
@@ -45,7 +45,7 @@ class Metric(HoldsFunctions):
         require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
         if isinstance(spec, str) and spec in _REGISTERED:
-            built = called(f"metric '{spec}'", "a builder that takes this robot", _REGISTERED[spec], robot)
+            built = call_user(f"metric '{spec}'", "a builder that takes this robot", _REGISTERED[spec], robot)
             return cls.custom(robot, spec, built)
         if isinstance(spec, str):
             require_known("metric", spec, (*METRIC_KINDS, *_REGISTERED))
@@ -55,7 +55,7 @@ class Metric(HoldsFunctions):
             return cls(spec, dense_function("metric", [q], [A]), {"kind": spec})
         if callable(spec):
             return cls.custom(robot, "custom", spec)
-        matrix = frozen_array("metric", spec, (robot.n, robot.n))
+        matrix = freeze_array("metric", spec, (robot.n, robot.n))
         require_spd(matrix[None], np.zeros((1, robot.n)))
         return cls(
             "constant",
@@ -86,7 +86,7 @@ class Metric(HoldsFunctions):
         require_text("name of a metric", str(name))
         require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
-        A = expression_of("metric", function, q)
+        A = build_expression("metric", function, q)
         if A.shape != (robot.n, robot.n):
             raise ShapeError("metric", A.shape, (robot.n, robot.n))
         return cls(str(name), dense_function("metric", [q], [A]), {"kind": "custom", "name": str(name)})

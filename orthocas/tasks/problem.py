@@ -20,8 +20,8 @@ from orthocas.tasks.task import Task
 from orthocas.tools.archive import Stored
 from orthocas.tools.checks import Array, require_kind, require_shape, require_text
 from orthocas.tools.display import Shown, listed, number_list
-from orthocas.tools.expressions import from_tape, require_tape, shortest, to_tape
-from orthocas.tools.json import part
+from orthocas.tools.expressions import read_tape, require_tape, wrap_shortest, write_tape
+from orthocas.tools.json import get_part
 
 NEAR_SINGULAR = 0.01  #: smallest relative singular value of the task below which a sample counts as singular
 NEAR_HALF_A_TURN = 0.01  #: cos(angle / 2) of turns that count as half a turn: those above 178.9 deg
@@ -143,7 +143,7 @@ class Problem(Shown):
             return q
         period = np.zeros(self.n)
         period[list(self.turning)] = 2 * np.pi
-        return near + shortest(q - near, period)
+        return near + wrap_shortest(q - near, period)
 
     def facts(self) -> dict[str, str]:
         """Sizes, task, metric, domain and robot."""
@@ -315,26 +315,26 @@ def read_problem(header: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Pro
     Raises:
         OrthocasError, and the errors that Python and NumPy have for damaged data: if they make no sense.
     """
-    robot, data = Robot(_read_tree(part(header, "robot", dict), arrays)), part(header, "problem", dict)
-    kind = part(data, "domain", str)
-    task, metric = _read_task(robot, part(data, "task", dict)), _read_metric(robot, part(data, "metric", dict))
+    robot, data = Robot(_read_tree(get_part(header, "robot", dict), arrays)), get_part(header, "problem", dict)
+    kind = get_part(data, "domain", str)
+    task, metric = _read_task(robot, get_part(data, "task", dict)), _read_metric(robot, get_part(data, "metric", dict))
     own = {name.removeprefix("domain_"): array for name, array in arrays.items() if name.startswith("domain_")}
-    return Problem(robot, task, metric, domain_from_data(kind, task, data, own), part(data, "name", str))
+    return Problem(robot, task, metric, domain_from_data(kind, task, data, own), get_part(data, "name", str))
 
 
 def _write_task(task: Task) -> dict[str, Any]:
     """A task as plain data, with the expressions of custom ones."""
     data = _add_tape(task.recipe, task.function)
-    return data | {"parts": [_write_task(part) for part in task.parts]} if task.parts else data
+    return data | {"parts": [_write_task(get_part) for get_part in task.parts]} if task.parts else data
 
 
 def _add_tape(recipe: Mapping[str, Any], function: ca.Function) -> dict[str, Any]:
     """A task or metric as plain data. A custom one includes its expression."""
-    return {**recipe, "tape": to_tape(function)} if recipe["kind"] == "custom" else dict(recipe)
+    return {**recipe, "tape": write_tape(function)} if recipe["kind"] == "custom" else dict(recipe)
 
 
 def _read_tree(data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> KinematicTree:
-    names = part(data, "joint_names", list)
+    names = get_part(data, "joint_names", list)
     numbers: dict[str, Any] = {
         name.removeprefix("robot_"): array for name, array in arrays.items() if name.startswith("robot_")
     }
@@ -349,26 +349,26 @@ def _read_tree(data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Kinemat
         odd = f"with {sorted(received - expected)} and without {sorted(expected - received)}"
         raise InvalidValueError("robot", odd, "the fields of a KinematicTree")
     for name in ("joint_kinds", "parents", *sorted(_OF_FRAMES & {*data})):
-        part(data, name, list)
+        get_part(data, name, list)
     return KinematicTree(**texts | numbers)
 
 
 def _read_task(robot: Robot, recipe: Mapping[str, Any]) -> Task:
-    if part(recipe, "kind", str) == "custom":
-        labels = part(recipe, "labels", list)
+    if get_part(recipe, "kind", str) == "custom":
+        labels = get_part(recipe, "labels", list)
         # Older files have no units.
-        units = part(recipe, "units", list) if "units" in recipe else ()
-        require_tape(part(recipe, "tape", dict), robot.n)
-        return Task.custom(robot, part(recipe, "name", str), lambda q: from_tape(recipe["tape"], q), labels, units)
+        units = get_part(recipe, "units", list) if "units" in recipe else ()
+        require_tape(get_part(recipe, "tape", dict), robot.n)
+        return Task.custom(robot, get_part(recipe, "name", str), lambda q: read_tape(recipe["tape"], q), labels, units)
     if recipe["kind"] == "stack":
-        return Task.stack(*(_read_task(robot, each) for each in part(recipe, "parts", list)))
+        return Task.stack(*(_read_task(robot, each) for each in get_part(recipe, "parts", list)))
     return Task.from_recipe(robot, recipe)
 
 
 def _read_metric(robot: Robot, recipe: Mapping[str, Any]) -> Metric:
-    if part(recipe, "kind", str) == "custom":
-        require_tape(part(recipe, "tape", dict), robot.n)
+    if get_part(recipe, "kind", str) == "custom":
+        require_tape(get_part(recipe, "tape", dict), robot.n)
         # Older files have no name.
         name = recipe.get("name", "custom")
-        return Metric.custom(robot, name, lambda q: from_tape(recipe["tape"], q))
+        return Metric.custom(robot, name, lambda q: read_tape(recipe["tape"], q))
     return Metric.from_spec(robot, recipe["matrix"] if recipe["kind"] == "constant" else recipe["kind"])

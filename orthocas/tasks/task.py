@@ -18,7 +18,7 @@ from orthocas.tools.checks import (
     Array,
     as_float_array,
     as_point_set,
-    frozen_array,
+    freeze_array,
     require_finite,
     require_kind,
     require_known,
@@ -27,7 +27,7 @@ from orthocas.tools.checks import (
 )
 from orthocas.tools.columns import BlockedFunction
 from orthocas.tools.display import Shown, listed
-from orthocas.tools.expressions import HoldsFunctions, called, expression_of
+from orthocas.tools.expressions import HoldsFunctions, build_expression, call_user
 
 TASK_KINDS = (
     "position",
@@ -285,7 +285,7 @@ class Task(Shown, HoldsFunctions):
         require_kind("camera", camera, str)
         require_known("axis of the camera", axis, tuple("xyz"))
         q, k = ca.SX.sym("q", robot.n), "xyz".index(axis)
-        place = target if isinstance(target, str) else frozen_array("target", target, (3,)).tolist()
+        place = target if isinstance(target, str) else freeze_array("target", target, (3,)).tolist()
         to = robot.frame_position(q, place) if isinstance(place, str) else ca.SX(place)
         u = robot.frame_rotation(q, camera).T @ (to - robot.frame_position(q, camera))
         u /= ca.norm_2(u)
@@ -366,7 +366,7 @@ class Task(Shown, HoldsFunctions):
         require_kind("robot", robot, Robot)
         require_text("name of a task", str(name))
         q = ca.SX.sym("q", robot.n)
-        x = expression_of(f"task '{name}'", function, q)
+        x = build_expression(f"task '{name}'", function, q)
         if x.shape[1] != 1 or x.shape[0] == 0:
             raise ShapeError(f"task '{name}'", x.shape, (None, 1))
         require_kind("labels", labels, Sequence)
@@ -409,7 +409,7 @@ class Task(Shown, HoldsFunctions):
         if name not in _REGISTERED or (name == "polar" and words):
             raise UnknownNameError("task", kind, list_task_kinds())
         wanted = f"'{name}' or '{name}:WORDS' with words that its builder takes"
-        task: Task = called(f"task '{kind}'", wanted, _REGISTERED[name], robot, words)
+        task: Task = call_user(f"task '{kind}'", wanted, _REGISTERED[name], robot, words)
         require_kind(f"what the builder of task '{name}' returns", task, Task)
         return task
 

@@ -49,9 +49,9 @@ class _CachedProperty(Generic[T]):
         if store is not None and self._name in store:
             value: T = store[self._name]
             return value
-        return self._once(instance)
+        return self._build_once(instance)
 
-    def _once(self, instance: object) -> T:
+    def _build_once(self, instance: object) -> T:
         """The value. The first thread builds it while the others wait."""
         with building:
             store = instance.__dict__.setdefault(_PLACE, _Store())
@@ -62,7 +62,8 @@ class _CachedProperty(Generic[T]):
 
 
 if TYPE_CHECKING:
-    from builtins import property as cached_property  # to type checkers it is one, also in protocols
+    # To type checkers it is a property, also in protocols.
+    from builtins import property as cached_property
 else:
     cached_property = _CachedProperty
 

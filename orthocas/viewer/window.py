@@ -30,7 +30,7 @@ import numpy as np
 from orthocas.errors import InvalidValueError, OrthocasError, ViewError
 from orthocas.robots.robot import Robot
 from orthocas.robots.spatial import rotate_z_to
-from orthocas.tools.checks import Array, of_extra, require_count
+from orthocas.tools.checks import Array, import_extra, require_count
 from orthocas.viewer.looks import chain_length
 
 _INPUT, _CAMERA = "GuiUpdateMessage", "ViewerCameraMessage"
@@ -418,7 +418,7 @@ def viser() -> ModuleType:
     Raises:
         MissingExtraError: if it is not installed.
     """
-    return of_extra("viser", "a view in the browser", "view")
+    return import_extra("viser", "a view in the browser", "view")
 
 
 def open_window(host: str, port: int, title: str) -> tuple[Any, str]:
