@@ -7,8 +7,8 @@ from test_taylor_models import values_at
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.certificates.chart_rows import joint_models, true_gradients
 from orthocas.certificates.graph import TaylorGraph
+from orthocas.certificates.rows import build_joint_models, build_true_gradients
 from orthocas.errors import CertifyError
 from orthocas.tools.batch import dense_function
 from orthocas.tools.expressions import find_gradient_dependences, find_periodic_joints, write_tape
@@ -63,11 +63,11 @@ def test_gradients_contain_those_of_casadi() -> None:
     rng = np.random.default_rng(5)
     low = rng.uniform(0.5, 1.0, (100, 2))
     half = rng.uniform(0, 0.1, (100, 2))
-    joints, _ = joint_models(low, low + 2 * half, (0, 1))
+    joints, _ = build_joint_models(low, low + 2 * half, (0, 1))
     t = rng.uniform(-1, 1, (100, 2))
     points = low + half + half * t
     J = np.array([np.array(true(point)).ravel("F") for point in points])
-    entries = TaylorGraph.of(h, "it", (0, 1))(joints)
+    entries = TaylorGraph.build(h, "it", (0, 1))(joints)
     assert len(entries) == J.shape[1] == 14
     for entry, wanted in zip(entries, J.T, strict=True):
         there = np.broadcast_to(values_at(entry, t), wanted.shape)
@@ -81,8 +81,8 @@ def test_gradients_of_tasks_contain_finite_differences(kind: str) -> None:
     task = oc.Task.named(known.robot, kind, known.domain.centre)
     rng, n = np.random.default_rng(5), known.robot.n
     q = known.domain.centre + 0.3 * rng.uniform(-1, 1, (30, n))
-    rows, depends = true_gradients(task, range(n))
-    J = rows(joint_models(q - 0.01, q + 0.01, tuple(sorted(depends)))[0])
+    rows, depends = build_true_gradients(task, range(n))
+    J = rows(build_joint_models(q - 0.01, q + 0.01, tuple(sorted(depends)))[0])
     t = rng.uniform(-1, 1, (30, n))
     h, step = task.batched, 1e-5
     for k in range(n):
@@ -130,4 +130,4 @@ def test_periods_are_read_from_the_steps() -> None:
 def test_what_has_no_bounds_is_refused_by_name(made: object, complaint: str) -> None:
     q = ca.SX.sym("q", 2)
     with pytest.raises(CertifyError, match=complaint):
-        TaylorGraph.of(dense_function("h", [q], [made(q)]), "it", (0, 1))  # type: ignore[operator]
+        TaylorGraph.build(dense_function("h", [q], [made(q)]), "it", (0, 1))  # type: ignore[operator]

@@ -13,7 +13,7 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.bases import JointSpace, Parametrisation
 from orthocas.bases.cyclic import leaves_stay
-from orthocas.certificates.certify import whole_domain
+from orthocas.certificates.certify import cover_domain
 from orthocas.charts.certificate import ELIMINATION, PROVED, Certificate, Subdivision
 from orthocas.charts.chart_file import fingerprint
 from orthocas.charts.coordinates import Coordinates
@@ -33,7 +33,7 @@ def on_torus(task: Callable[[ca.SX], ca.SX], xi: Parametrisation | Callable[[ca.
 
 def forged(chart: oc.Chart, **changes: object) -> Certificate:
     """A proof in one part, as if all were proved."""
-    base = whole_domain(chart.problem.domain)
+    base = cover_domain(chart.problem.domain)
     whole = Subdivision(base.low, base.high, np.array([PROVED], dtype=np.uint8))
     made = Certificate(fingerprint(chart.problem, chart.coordinates), ELIMINATION, 0.0, whole, 0.0)
     return replace(made, **changes).sealed()  # type: ignore[arg-type]
@@ -81,7 +81,7 @@ def test_periodic_charts_are_proved_on_the_torus(xi: Callable[[ca.SX], ca.SX]) -
 @pytest.mark.parametrize("centre", [0.0, 3.0, -10.0])
 def test_the_box_of_a_full_turn_holds_every_angle(centre: float) -> None:
     """pi is rounded down, and so may be the boundaries."""
-    box = whole_domain(oc.Box([centre], np.pi, [0]))
+    box = cover_domain(oc.Box([centre], np.pi, [0]))
     assert (box.high[0] - centre) - np.pi > 1e-15
     assert (centre - box.low[0]) - np.pi > 1e-15
 
