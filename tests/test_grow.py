@@ -25,7 +25,7 @@ from orthocas.errors import (
     UnknownNameError,
 )
 from orthocas.exact.flow import Arrival, GrownCoordinates, TaskFlow
-from orthocas.exact.leaves import leaf_from_arrays
+from orthocas.exact.leaves import read_leaf
 from orthocas.tasks.metric import evaluate_metric
 from orthocas.tools.archive import read_archive, write_archive
 
@@ -363,4 +363,4 @@ def test_edited_leaves_are_refused(leaf: str, name: str, change: Callable[[np.nd
     arrays = dict(chart.coordinates.leaf.to_arrays())
     arrays[name] = change(arrays[name])
     with pytest.raises((InvalidValueError, ShapeError)):
-        leaf_from_arrays(chart.problem, leaf, arrays)
+        read_leaf(chart.problem, leaf, arrays)

@@ -31,7 +31,7 @@ def test_batched_flow_solves_a_closed_form() -> None:
     y, p = ca.SX.sym("y", 2), ca.SX.sym("p")
     field = ca.Function("field", [y, p], [ca.vertcat(-p * y[1], p * y[0])])  # turns by the angle p
     angles = np.linspace(0.1, 30, 300)[:, None]
-    ends, arrived = BatchedFlow(field, np.ones(2)).end_points(np.tile([1.0, 0.0], (300, 1)), angles, 1e-11)
+    ends, arrived = BatchedFlow(field, np.ones(2)).find_end_points(np.tile([1.0, 0.0], (300, 1)), angles, 1e-11)
     assert arrived.all()
     np.testing.assert_allclose(ends, np.hstack([np.cos(angles), np.sin(angles)]), atol=1e-9)  # 10 to 60 steps
 
@@ -39,7 +39,7 @@ def test_batched_flow_solves_a_closed_form() -> None:
 def test_batched_flow_stops_where_the_solution_ends() -> None:
     y, p = ca.SX.sym("y"), ca.SX.sym("p")
     flow = BatchedFlow(ca.Function("field", [y, p], [p * y**2]), np.ones(1))  # 1 / (1/y0 - p s): ends at s = 1 / p
-    ends, arrived = flow.end_points(np.ones((3, 1)), np.array([[0.5], [2.0], [np.nan]]), 1e-9)
+    ends, arrived = flow.find_end_points(np.ones((3, 1)), np.array([[0.5], [2.0], [np.nan]]), 1e-9)
     np.testing.assert_array_equal(arrived, [True, False, False])
     np.testing.assert_allclose(ends[0], 2.0, atol=1e-8)
 

@@ -15,7 +15,7 @@ from test_level_surface import arm_leaf, sphere
 
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.exact import mesh as triangle_locator
-from orthocas.exact.harmonic import TriangleMesh, harmonic_disk
+from orthocas.exact.harmonic import TriangleMesh, map_to_disk
 from orthocas.exact.mesh import Located, TriangleLocator
 from orthocas.tools.checks import Array
 
@@ -88,7 +88,7 @@ def test_no_other_triangle_is_closer(leaf: TriangleMesh, kind: str) -> None:
 
 
 def test_points_of_the_disk_lie_in_their_triangles(leaf: TriangleMesh) -> None:
-    disk = harmonic_disk(leaf)
+    disk = map_to_disk(leaf)
     rng = np.random.default_rng(7)
     weights, face = rng.dirichlet([1, 1, 1], 2000), rng.integers(len(leaf.faces), size=2000)
     found = checked(disk, leaf.faces, np.einsum("nc,ncd->nd", weights, disk[leaf.faces[face]]))
@@ -99,7 +99,7 @@ def test_points_of_the_disk_lie_in_their_triangles(leaf: TriangleMesh) -> None:
 
 @pytest.mark.slow
 def test_distance_to_a_disk_from_outside(leaf: TriangleMesh) -> None:
-    disk = harmonic_disk(leaf)
+    disk = map_to_disk(leaf)
     points = 3 * np.random.default_rng(7).normal(size=(200, 2))
     found = checked(disk, leaf.faces, points)
     assert_allclose(found.distance, np.maximum(np.linalg.norm(points, axis=1) - 1, 0), rtol=0, atol=2e-3)  # a polygon
@@ -205,7 +205,7 @@ def test_no_points_are_no_trouble(leaf: TriangleMesh) -> None:
 
 def test_locators_are_pickled_and_copied(leaf: TriangleMesh) -> None:
     points = queries(leaf)["near"]
-    for vertices, queried in ((leaf.vertices, points), (harmonic_disk(leaf), points[:, :2])):
+    for vertices, queried in ((leaf.vertices, points), (map_to_disk(leaf), points[:, :2])):
         locator = TriangleLocator(vertices, leaf.faces)
         for again in (pickle.loads(pickle.dumps(locator)), copy.deepcopy(locator)):
             for one, other in zip(locator.locate(queried), again.locate(queried), strict=True):

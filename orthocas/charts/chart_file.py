@@ -18,7 +18,7 @@ from orthocas.charts.coordinates import CoordinateMap, Coordinates
 from orthocas.charts.regular_part import RegularPart
 from orthocas.errors import CertifyError, ChartFileError, InvalidValueError, OrthocasError
 from orthocas.exact.flow import GrownCoordinates
-from orthocas.exact.leaves import leaf_from_arrays
+from orthocas.exact.leaves import read_leaf
 from orthocas.tasks.problem import FOREIGN, Problem, read_problem, write_problem
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.archive import Kind, Stored, read_archive, write_archive, write_npy
@@ -237,7 +237,7 @@ def _coordinates_to_data(coordinates: CoordinateMap) -> tuple[dict[str, Any], di
 def _coordinates(problem: Problem, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> CoordinateMap:
     if "leaf" in data:
         own = {name.removeprefix(_LEAF): array for name, array in arrays.items() if name.startswith(_LEAF)}
-        return GrownCoordinates(problem, leaf_from_arrays(problem, get_part(data, "leaf", str), own))
+        return GrownCoordinates(problem, read_leaf(problem, get_part(data, "leaf", str), own))
     parametrisation = parametrisation_from_data(data)
     found = Coordinates(
         parametrisation,
