@@ -14,10 +14,10 @@ import numpy as np
 from benchmark import run, table
 
 import orthocas as oc
-from orthocas.charts.phi import shortest
 from orthocas.tasks.domains import Domain, bounds_of
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
+from orthocas.tools.expressions import wrap_shortest
 
 QUICK = ("panda-position", "ur5-position")
 SEVERAL = ("iiwa7-position", "ur5-position", "ur10-position", "xarm7-position", "panda-pose")  # for all solutions
@@ -124,7 +124,11 @@ def nearest(name: str, count: int) -> str:
     for k in range(count):
         others = at_task_value(chart, x[k], pool)
         turns = chart.turns[chart.m :]
-        away = np.linalg.norm(shortest(xi[k] - chart.xi(others), turns), axis=1) if len(others) else np.array([np.inf])
+        away = (
+            np.linalg.norm(wrap_shortest(xi[k] - chart.xi(others), turns), axis=1)
+            if len(others)
+            else np.array([np.inf])
+        )
         mine = found.distance[k] if found.status[k] <= oc.InverseStatus.NEAREST else np.inf
         worse += bool(mine > away.min() + 1e-6)
     starts, targets = ends(chart, count // 4)

@@ -120,7 +120,7 @@ def test_no_second_solution_is_found_in_a_proved_box_of_a_random_arm(task: str) 
     held = 0
     for seed in range(2):
         known = arm_chart(seed, task)
-        base = certifying.whole_domain(known.problem.domain)
+        base = certifying.cover_domain(known.problem.domain)
         for scale in (1.0, 0.6, 0.3):
             if proved(known, known.problem.domain.half_width * scale, 50):
                 middle, half = known.problem.domain.centre, known.problem.domain.half_width * scale

@@ -64,7 +64,7 @@ def test_boxes_without_a_proof_of_their_own_hold_no_clear_position(chart: oc.Cha
 
 @pytest.mark.slow
 def test_a_chart_next_to_singular_positions_needs_few_boxes(chart: oc.Chart) -> None:
-    base = certifying.whole_domain(chart.problem.domain)
+    base = certifying.cover_domain(chart.problem.domain)
     search = Search(choose_check(chart, build_chart_rows(chart), 0.0), base, Limits(), rank_by_volume(base))
     search.run(lambda _: None)
     assert search.finished

@@ -4,6 +4,7 @@ import copy
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -194,7 +195,7 @@ def test_any_triangles_and_points(mesh_and_points: tuple[Array, Array], spread: 
 def test_result_does_not_depend_on_the_chunks(leaf: TriangleMesh, monkeypatch: pytest.MonkeyPatch) -> None:
     points = queries(leaf)["off"]
     whole = checked(leaf.vertices, leaf.faces, points)
-    monkeypatch.setattr(triangle_locator, "_CHUNK", 7)
+    monkeypatch.setattr(triangle_locator, "RULES", replace(triangle_locator.RULES, chunk=7))
     for one, other in zip(whole, checked(leaf.vertices, leaf.faces, points), strict=True):
         assert np.array_equal(one, other)
 
