@@ -611,7 +611,7 @@ def test_laws_stop_where_coordinates_end() -> None:
     law, zero = control.PDPlus(chart, 50.0), np.zeros(7)
     _, status = law.function(bad, zero, chart.phi(bad), zero, zero, *law.gains.values())
     assert int(status) == control.ControlStatus.OUTSIDE_DOMAIN
-    assert "volume" in domain.explained(bad)
+    assert "volume" in domain.explain(bad)
 
 
 @needs_c
