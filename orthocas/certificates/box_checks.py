@@ -184,15 +184,23 @@ def bound_conditioning(J: TaylorModel, m: int) -> Array:
 
 
 def _build_volume(J: TaylorModel, m: int) -> TaylorModel:
-    """D, (boxes,)."""
+    """The volume of the gradients of the coordinates across those of the task, (boxes,)."""
     left, right = find_singular_vectors(J[:m])
     unit = np.broadcast_to(np.eye(1), (len(right), 1, 1))
     task = multiply_between(left, J[:m], right)
-    gradients = _normalise(stack([multiply_between(unit, J[j : j + 1], right)[0] for j in range(m, len(J.remainder))]))
+    gradients = stack([multiply_between(unit, J[j : j + 1], right)[0] for j in range(m, len(J.remainder))])
+    # Gradients of length 1.
+    squares = gradients * gradients
+    squared_lengths = _sum_models([squares[:, k] for k in range(squares.remainder.shape[1])])
+    gradients = gradients * reciprocal_square_root(squared_lengths)[:, None]
+    # Their parts across the task, in the basis [X; I] of its kernel, whose growth is det(I + X X^T)^(1/2).
     kernel = _solve_kernel(task, m)
     across = gradients[:, m:] + _sum_models([gradients[:, k, None] * kernel[None, k] for k in range(m)])
     turned, _ = rotate_to_singular_basis(across)
-    return reduce(mul, [*compute_pivots(turned), *map(reciprocal_square_root, _compute_growth(kernel, m))])
+    products = kernel[:, None] * kernel[None]
+    gram = _sum_models([products[:, :, k] for k in range(products.remainder.shape[2])])
+    growth = compute_pivots(gram + TaylorModel.constant(np.eye(m)[:, :, None]))
+    return reduce(mul, [*compute_pivots(turned), *map(reciprocal_square_root, growth)])
 
 
 def _solve_kernel(task: TaylorModel, m: int) -> TaylorModel:
@@ -209,20 +217,6 @@ def _solve_kernel(task: TaylorModel, m: int) -> TaylorModel:
         total = _sum_models([row[known:], *(row[k, None] * solution[k] for k in range(known))])
         solution.insert(0, -(total * inverse[None]))
     return stack(solution)
-
-
-def _compute_growth(kernel: TaylorModel, m: int) -> list[TaylorModel]:
-    """The pivots of I + X X^T."""
-    products = kernel[:, None] * kernel[None]
-    gram = _sum_models([products[:, :, k] for k in range(products.remainder.shape[2])])
-    return compute_pivots(gram + TaylorModel.constant(np.eye(m)[:, :, None]))
-
-
-def _normalise(rows: TaylorModel) -> TaylorModel:
-    """The rows divided by their lengths."""
-    squares = rows * rows
-    squared_lengths = _sum_models([squares[:, k] for k in range(squares.remainder.shape[1])])
-    return rows * reciprocal_square_root(squared_lengths)[:, None]
 
 
 def _sum_models(parts: list[TaylorModel]) -> TaylorModel:

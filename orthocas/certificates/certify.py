@@ -326,7 +326,10 @@ def _find_one_to_one_box(
 
     def proved(share: Array, most: int) -> bool:
         nonlocal best
-        part = _scale_box(base, share)
+        # A box about the same centre, with so much of the width of each joint.
+        centre, whole = (base.low + base.high) / 2, share == 1
+        low, high = np.where(whole, base.low, centre - share * half), np.where(whole, base.high, centre + share * half)
+        part = Subdivision.whole(low, high)
         middle, own = (part.low + part.high)[None] / 2, replace(check, low=part.low, high=part.high)
         # At the centre of the box, the two points may be farthest apart.
         if not own(middle, middle).proved.all():
@@ -366,14 +369,6 @@ def _try_scales(shares: Sequence[Array], proved: Callable[[Array, int], bool], m
         low += 2
     if low < len(shares):
         proved(shares[low], most)
-
-
-def _scale_box(base: Subdivision, share: Array) -> Subdivision:
-    """A box about the same centre, with so much of the width of each joint, (n,)."""
-    middle, half = (base.low + base.high) / 2, (base.high - base.low) / 2
-    whole = share == 1
-    low, high = np.where(whole, base.low, middle - share * half), np.where(whole, base.high, middle + share * half)
-    return Subdivision.whole(low, high)
 
 
 def find_proved_scale(parts: Subdivision) -> float:

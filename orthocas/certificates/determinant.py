@@ -174,7 +174,10 @@ class Determinant:
         active, family = list(coordinates.active), coordinates.family
         if not chart.m + 1 == len(active) <= RULES.columns:
             return None
-        if not isinstance(family, ProductFamily) or not _is_polynomial(family):
+        # A family is polynomial if each derivative of a one-joint function is a sum of earlier ones.
+        if not isinstance(family, ProductFamily):
+            return None
+        if any(np.triu(family.one_joint_derivatives(i)).any() for i in range(family.space.n)):
             return None
         try:
             z = compute_cofactors([[row[j] for j in active] for row in _expand_task_rows(chart)])
@@ -216,11 +219,6 @@ def list_indices(n: int, degree: int) -> tuple[Monomial, ...]:
 def build_power_table(x: Array, degree: int) -> Array:
     """x^a / a! for all monomials a up to a degree, (monomials, boxes), for x (n, boxes)."""
     return np.concatenate([compute_powers(x, order) for order in range(degree + 1)])
-
-
-def _is_polynomial(family: ProductFamily) -> bool:
-    """Whether each derivative of a one-joint function is a sum of earlier ones."""
-    return all(not np.triu(family.one_joint_derivatives(i)).any() for i in range(family.space.n))
 
 
 def _bound_degree(family: ProductFamily) -> int:
@@ -530,17 +528,15 @@ def compute_cofactors(rows: Sequence[Sequence[Waves]]) -> list[Waves]:
     minors: dict[tuple[int, ...], Waves] = {(j,): rows[0][j].trim() for j in columns}
     for k, row in enumerate(rows[1:], 1):
         entries = [entry.trim() for entry in row]
-        minors = {chosen: _expand_minor(entries, minors, chosen) for chosen in combinations(columns, k + 1)}
+        # Each minor is expanded along its last row.
+        before, minors = minors, {}
+        for chosen in combinations(columns, k + 1):
+            parts = (
+                _apply_sign(entries[j] * before[chosen[:place] + chosen[place + 1 :]], k + place)
+                for place, j in enumerate(chosen)
+            )
+            minors[chosen] = reduce(Waves.__add__, parts).trim()
     return [_apply_sign(minors[tuple(i for i in columns if i != j)], len(rows) + j) for j in columns]
-
-
-def _expand_minor(row: list[Waves], minors: dict[tuple[int, ...], Waves], columns: tuple[int, ...]) -> Waves:
-    """Of some columns, by expansion along the last row."""
-    parts = (
-        _apply_sign(row[j] * minors[columns[:place] + columns[place + 1 :]], len(columns) - 1 + place)
-        for place, j in enumerate(columns)
-    )
-    return reduce(Waves.__add__, parts).trim()
 
 
 def _apply_sign(value: Waves, places: int) -> Waves:

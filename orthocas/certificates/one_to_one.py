@@ -135,7 +135,10 @@ class OneToOneCheck:
         projected = np.linalg.pinv(np.nan_to_num(centre))[:, list(self.still)]
         D = around.differences.copy()
         for rows in (projected, np.broadcast_to(np.eye(r), (len(centre), r, r))):
-            sizes, least = _bound_combinations(rows, centre, doubt)
+            # Upper and lower bounds of the sizes of rows @ J for |J - centre| <= doubt, (boxes, rows, columns).
+            middle = np.abs(rows @ centre)
+            error = (np.abs(rows) @ (doubt + sum_error(rows.shape[2]) * np.abs(centre))) * UP
+            sizes, least = (middle + error) * UP, (middle - error) / UP
             for row in range(sizes.shape[1]):
                 for k in self.still:
                     others = (sizes[:, row] * D.T).sum(axis=1) - sizes[:, row, k] * D[k]
@@ -244,13 +247,6 @@ def _spread(left: Array, terms: Array, right: Array) -> Array:
     sizes = np.abs(left) @ np.abs(parts, out=parts).sum(axis=3) @ np.abs(right)
     spread: Array = ((sums + sum_error(2 * (rows + columns)) * sizes) * compute_margin(count)).transpose(1, 2, 0)
     return spread
-
-
-def _bound_combinations(rows: Array, centre: Array, doubt: Array) -> tuple[Array, Array]:
-    """Upper and lower bounds of the sizes of rows @ J for |J - centre| <= doubt, (boxes, rows, columns)."""
-    middle = np.abs(rows @ centre)
-    error = (np.abs(rows) @ (doubt + sum_error(rows.shape[2]) * np.abs(centre))) * UP
-    return (middle + error) * UP, (middle - error) / UP
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -156,12 +156,10 @@ class Search:
             _log.warning("%d boxes are left unproved: worker processes died over them", len(given_up))
 
     def _take(self) -> list[tuple[float, int, Array, Array]]:
-        return [heapq.heappop(self._waiting) for _ in range(self._choose_batch_size())]
-
-    def _choose_batch_size(self) -> int:
-        """As many boxes as there are, but enough tasks for all workers of an executor."""
+        # As many boxes as there are, but enough tasks for all workers of an executor.
         waiting = len(self._waiting)
-        return min(BATCH, waiting if self.executor is None else max(waiting // _TASKS, min(_SMALL, waiting)))
+        size = min(BATCH, waiting if self.executor is None else max(waiting // _TASKS, min(_SMALL, waiting)))
+        return [heapq.heappop(self._waiting) for _ in range(size)]
 
     def _return(self, batch: list[tuple[float, int, Array, Array]]) -> None:
         for box in batch:
@@ -171,7 +169,11 @@ class Search:
         """Close the boxes that are proved, and halve the others."""
         low, high = _stack_corners(batch)
         self.evaluated += len(batch)
-        self._look_for_folds((low + high) / 2, results.sign)
+        # A point for each sign that is new is visited: signs at the centres of boxes without a proof are hints.
+        for sign in {-1, 1} - set(self.signs):
+            there = np.flatnonzero(results.sign == sign)
+            if there.size:
+                self.visit((low + high)[there[:1]] / 2)
         proved = results.proved
         if proved.any():
             self.conditioning = min(self.conditioning, float(results.conditioning[proved].min()))
@@ -206,13 +208,6 @@ class Search:
             heapq.heappush(self._waiting, (rank, len(self._codes), a, b))
             self._codes.append(OPEN)
             self._children.append(0)
-
-    def _look_for_folds(self, points: Array, signs: Array) -> None:
-        """Visit a point for each sign that is new: signs at the middle of boxes without a proof are hints."""
-        for sign in {-1, 1} - set(self.signs):
-            there = np.flatnonzero(signs == sign)
-            if there.size:
-                self.visit(points[there[:1]])
 
     def _list_preorder(self, root: int) -> list[int]:
         codes, waiting = [], [root]

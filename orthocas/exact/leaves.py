@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, NoReturn, Protocol
+from typing import Any, Literal, NoReturn
 
 import casadi as ca
 import numpy as np
@@ -59,47 +59,6 @@ class LeafValues:
     xi: Array  #: (N, r)
     gradients: Array  #: d xi0 / dq along the leaf, (N, r, n)
     inside: NDArray[np.bool_]  #: which points the chart covers, (N,); the other rows are meaningless
-
-
-class LeafChart(Protocol):
-    """A chart xi0 of the base leaf."""
-
-    @property
-    def kind(self) -> str:
-        """Short name: 'linear', 'circle' or 'disk'."""
-        ...
-
-    @property
-    def level(self) -> Array:
-        """Task value x0 of the leaf, (m,)."""
-        ...
-
-    def values(self, points: Array) -> LeafValues:
-        """Coordinates of points on the leaf, (N, n)."""
-        ...
-
-    @property
-    def turn(self) -> float:
-        """Period of the coordinates: 2 pi on a circle, otherwise 0 (none)."""
-        ...
-
-    @property
-    def periodic(self) -> bool:
-        """Whether the coordinates stay the same under whole turns of the joints."""
-        ...
-
-    def points(self, xi: Array, near: Array | None = None) -> Array:
-        """Points of the leaf (N, n) with coordinates xi (N, r); NaN where no such point exists.
-
-        Args:
-            xi: coordinates.
-            near: points of the leaf, (N, n), NaN if unknown; they select one of several solutions.
-        """
-        ...
-
-    def to_arrays(self) -> Mapping[str, Array | Indices]:
-        """All arrays, for chart files."""
-        ...
 
 
 def find_turning_joints(problem: Problem) -> NDArray[np.bool_]:
@@ -506,6 +465,7 @@ def _build_tracer(problem: Problem, level: Array, steps: int) -> Callable[[Array
     return trace
 
 
+LeafChart = LinearLeaf | CircleLeaf | DiskLeaf  #: a chart xi0 of the base leaf
 LEAVES: dict[str, type[LinearLeaf] | type[CircleLeaf] | type[DiskLeaf]] = {
     kind.kind: kind for kind in (LinearLeaf, CircleLeaf, DiskLeaf)
 }

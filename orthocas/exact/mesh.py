@@ -190,14 +190,15 @@ class TriangleLocator:
         require_finite("points", points)
         require_shape("points", points.shape, (None, self._vertices.shape[1]))
         starts = range(0, max(len(points), 1), RULES.chunk)
-        parts = [self._locate(_pad_to_space(points[start : start + RULES.chunk])) for start in starts]
+        parts = []
+        for start in starts:
+            part = _pad_to_space(points[start : start + RULES.chunk])
+            squares, face, closest = self._trees[0].squared_distance(self._points, self._faces, part)
+            # Where a distance is not finite, libigl has found no face.
+            require_finite("squared distance", squares)
+            weights = _compute_barycentric(closest, self._points[self._faces[face]])
+            parts.append(Located(face, weights, np.sqrt(squares)))
         return Located(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-
-    def _locate(self, points: Array) -> Located:
-        squares, face, closest = self._trees[0].squared_distance(self._points, self._faces, points)
-        # Where a distance is not finite, libigl has found no face.
-        require_finite("squared distance", squares)
-        return Located(face, _compute_barycentric(closest, self._points[self._faces[face]]), np.sqrt(squares))
 
 
 def _pad_to_space(points: Array) -> Array:
@@ -278,7 +279,10 @@ def _find_inner_edges(faces: Indices, count: int) -> tuple[Indices, Indices, Ind
 
 def _flip(vertices: Array, faces: Indices, keys: Indices, first: Indices, second: Indices) -> bool:
     """Flip edges that do not share a triangle, in place, and return whether any was flipped."""
-    quads = _build_quads(faces, first, second)
+    # Edges i -> j, with the opposite corners k in the first triangle and n in the second, as rows (N, 4).
+    face, corner = first % len(faces), first // len(faces)
+    i, j, k = (faces[face, (corner + shift) % 3] for shift in (1, 2, 0))
+    quads = np.stack([i, j, k, faces[second % len(faces), second // len(faces)]], axis=1)
     allowed = _is_allowed(vertices, quads, keys)
     quads, face, other = quads[allowed], first[allowed] % len(faces), second[allowed] % len(faces)
     chosen = _select_independent(quads, face, other, len(vertices))
@@ -286,13 +290,6 @@ def _flip(vertices: Array, faces: Indices, keys: Indices, first: Indices, second
     faces[face[chosen]] = np.stack([i, n, k], axis=1)
     faces[other[chosen]] = np.stack([n, j, k], axis=1)
     return bool(chosen.any())
-
-
-def _build_quads(faces: Indices, first: Indices, second: Indices) -> Indices:
-    """Edges i -> j, with the opposite corners k in the first triangle and n in the second, as rows (N, 4)."""
-    face, corner = first % len(faces), first // len(faces)
-    i, j, k = (faces[face, (corner + shift) % 3] for shift in (1, 2, 0))
-    return np.stack([i, j, k, faces[second % len(faces), second // len(faces)]], axis=1)
 
 
 def _is_allowed(vertices: Array, quads: Indices, keys: Indices) -> NDArray[np.bool_]:

@@ -52,7 +52,11 @@ def mass_matrix(tree: KinematicTree, q: ca.SX, payload: ca.SX | None = None, ine
     mass, moment, inertia = ([getattr(body, name) for body in bodies] for name in ("mass", "moment", "inertia"))
     M = ca.SX.zeros(tree.n, tree.n)
     for i in reversed(range(tree.n)):
-        force, torque = _build_unit_wrench(tree, i, mass[i], moment[i], inertia[i])
+        # Force, and torque about the origin, that give the body unit acceleration along its joint.
+        if tree.joint_kinds[i] == "prismatic":
+            force, torque = mass[i] * _Z, ca.cross(moment[i], _Z)
+        else:
+            force, torque = ca.cross(_Z, moment[i]), inertia[i][:, 2]
         M[i, i] = _project_on_joint(tree, i, force, torque) + tree.armatures[i]
         j = i
         while tree.parents[j] >= 0:
@@ -214,13 +218,6 @@ def _project_on_joint(tree: KinematicTree, i: int, force: ca.SX, torque: ca.SX) 
     return force[2] if tree.joint_kinds[i] == "prismatic" else torque[2]
 
 
-def _build_unit_wrench(tree: KinematicTree, i: int, mass: ca.SX, moment: ca.SX, inertia: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Force, and torque about the origin, that give body i unit acceleration along its joint."""
-    if tree.joint_kinds[i] == "prismatic":
-        return mass * _Z, ca.cross(moment, _Z)
-    return ca.cross(_Z, moment), inertia[:, 2]
-
-
 def collect_inertials(tree: KinematicTree) -> Array:
     """The inertial parameters on which the dynamics depend, (k,): 7 of each revolute joint's body, 10 of others."""
     numbers = []
@@ -263,18 +260,18 @@ def _build_bodies(tree: KinematicTree, payload: ca.SX | None, inertials: ca.SX |
     else:
         bodies = _unpack_inertials(tree, inertials)
     if payload is not None and tree.tip_parent >= 0:
-        body = bodies[tree.tip_parent]
-        mass, moment, inertia = _place_payload(tree, payload)
-        bodies[tree.tip_parent] = _Inertials(body.mass + mass, body.moment + moment, body.inertia + inertia)
+        # Mass, mass times centre, and inertia about the body's origin, in the frame of the tip's body.
+        body, R, p, mass = (
+            bodies[tree.tip_parent],
+            constant(tree.tip_rotation),
+            constant(tree.tip_translation),
+            payload[0],
+        )
+        centre = p + R @ payload[1:4]
+        turned = R @ ca.reshape(payload[4:][_MATRIX], 3, 3) @ R.T
+        inertia = turned + mass * (ca.dot(centre, centre) * ca.SX.eye(3) - centre @ centre.T)
+        bodies[tree.tip_parent] = _Inertials(body.mass + mass, body.moment + mass * centre, body.inertia + inertia)
     return bodies
-
-
-def _place_payload(tree: KinematicTree, payload: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Mass, mass times centre (3, 1), and inertia (3, 3) about the body's origin, in the frame of the tip's body."""
-    R, p, mass = constant(tree.tip_rotation), constant(tree.tip_translation), payload[0]
-    centre = p + R @ payload[1:4]
-    turned = R @ ca.reshape(payload[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3) @ R.T
-    return mass, mass * centre, turned + mass * (ca.dot(centre, centre) * ca.SX.eye(3) - centre @ centre.T)
 
 
 def _regroup(tree: KinematicTree) -> list[_Body]:

@@ -459,17 +459,15 @@ class Robot(Shown):
         names, expression = _FUNCTIONS[name]
         by_bias = name.startswith("coriolis_product") and self.n > WRITTEN_OUT
         kind = ca.MX if by_bias else ca.SX
-        arguments = [kind.sym(argument, PAYLOAD if argument == "payload" else self.n) for argument in names]
+        arguments: list[Any] = [kind.sym(argument, PAYLOAD if argument == "payload" else self.n) for argument in names]
         if by_bias:
-            result = self._build_coriolis_product(*arguments)
+            # Two calls of the bias, in which gravity cancels: no further code in generated C.
+            q, v, w, *payload = arguments
+            bias = self.function("bias_with_payload" if payload else "bias")
+            result = (bias(q, v + w, *payload) - bias(q, v - w, *payload)) / 4
         else:
             result = expression(self.tree, *arguments, *(frame and self.tree.frame(frame) for frame in frames))
         return dense_function(name, arguments, [result], names)
-
-    def _build_coriolis_product(self, q: Any, v: Any, w: Any, *payload: Any) -> Any:
-        """C(q, v) w by two calls of the bias, in which gravity cancels: no further code in generated C."""
-        bias = self.function("bias_with_payload" if payload else "bias")
-        return (bias(q, v + w, *payload) - bias(q, v - w, *payload)) / 4
 
     def _find_key(self, quantity: str, frame: str | None, relative_to: str | None) -> _Key:
         """Key of a frame's function; that of the tip in the world has a name of its own."""

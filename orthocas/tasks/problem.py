@@ -148,21 +148,17 @@ class Problem(Shown):
     def facts(self) -> dict[str, str]:
         """Sizes, task, metric, domain and robot."""
         domain = self.domain
+        joints = [self.robot.joint_names[k] for k in domain.unbounded]
+        unbounded = f", unbounded in {listed(joints)}" if joints else ""
         return {
             "problem": f"{self.name}, n = {self.n} joints, m = {self.m} task, r = {self.r} extra",
             "task": self.task.heading,
             "metric": self.metric.name,
-            "domain": f"{domain.name}, half-width {number_list(domain.half_width)}{self._endless}",
+            "domain": f"{domain.name}, half-width {number_list(domain.half_width)}{unbounded}",
             **domain.describe_condition(),
             "centre": number_list(domain.centre),
             "robot": self.robot.heading,
         }
-
-    @property
-    def _endless(self) -> str:
-        """The unbounded joints of the domain, in words."""
-        joints = [self.robot.joint_names[k] for k in self.domain.unbounded]
-        return f", unbounded in {listed(joints)}" if joints else ""
 
 
 @dataclass(frozen=True)

@@ -143,7 +143,11 @@ class NumpyGraph:
         if not heavy:
             return outputs
         cuts = [ca.MX.sym("cut", *node.shape) for node in heavy]
-        operands = [[_strip_transposition(node.dep(i)) for i in range(node.n_dep())] for node in heavy]
+        # The operands of each node without a transposition, and whether they had one.
+        operands = []
+        for node in heavy:
+            deps = [node.dep(i) for i in range(node.n_dep())]
+            operands.append([(x.dep(0), True) if x.op() == ca.OP_TRANSPOSE else (x, False) for x in deps])
         pieces = iter(ca.graph_substitute([x for xs in operands for x, _ in xs] + outputs, heavy, cuts))
         definitions = []
         for node, xs in zip(heavy, operands, strict=True):
@@ -166,10 +170,3 @@ class NumpyGraph:
         if node.op() == ca.OP_MTIMES and not operands[0].is_zero():
             result = (operands[0].T if flips[0] else operands[0]) + result
         return result
-
-
-def _strip_transposition(operand: ca.MX) -> tuple[ca.MX, bool]:
-    """The operand without a transposition, and whether it had one."""
-    if operand.op() == ca.OP_TRANSPOSE:
-        return operand.dep(0), True
-    return operand, False

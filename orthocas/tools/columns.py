@@ -224,22 +224,18 @@ class BlockedFunction:
             try:
                 function = self._spare.pop()
             except IndexError:
-                function = self._build_narrow()
+                function = self._build_function(narrow=True)
             fill_blocks(results, function, NARROW, points, *others)
             self._spare.append(function)
         else:
-            fill(results, points, self._build_wide, *others)
+            fill(results, points, self._build_function, *others)
         return results
 
-    def _build_wide(self) -> BlockFunction:
-        """The function for `fill`."""
-        assert self._by_rows is not None
-        run = self._by_rows.build_block_function()
-        return lambda *columns: run(*columns)[0]
-
-    def _build_narrow(self) -> BlockFunction:
-        """The function of a narrow block."""
-        run = self._by_narrow_rows.build_block_function()
+    def _build_function(self, narrow: bool = False) -> BlockFunction:
+        """The function of a block."""
+        rows = self._by_narrow_rows if narrow else self._by_rows
+        assert rows is not None
+        run = rows.build_block_function()
         return lambda *columns: run(*columns)[0]
 
     @cached_property
