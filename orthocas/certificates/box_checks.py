@@ -43,7 +43,7 @@ class BoxResults:
 
     proved: Array  #: (boxes,) bool
     regular: Array  #: (boxes,) bool: det J has the sign below on the whole box
-    sign: Array  #: (boxes,) of det J at the middle of the box: +1, -1, or 0 where it is unclear
+    sign: Array  #: (boxes,) of det J at the centre of the box: +1, -1, or 0 where it is unclear
     conditioning: Array  #: (boxes,) lower bounds; 0 where none is known
     #: (boxes,) the joint to halve; `UNKNOWN` where bounds are infinite, so none is known to help most; `NEVER` where
     #: halves will not be proved
@@ -233,7 +233,7 @@ def _bound_smallest_singular_value(volume: Array, n: int) -> Array:
 
 
 def have_positive_pivots(pivots: list[TaylorModel]) -> NDArray[np.bool_]:
-    """Whether all pivots have one sign on the box and the pivots of the middle are positive."""
+    """Whether all pivots have one sign on the box and the pivots of the centre are positive."""
     return np.asarray(np.all([lower_bound(pivot) > 0 for pivot in pivots], axis=0))
 
 

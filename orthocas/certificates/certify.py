@@ -70,8 +70,8 @@ def certify(
     joint on which J does not depend keeps its whole range if it can.
 
     In a `ClearBox`, parts need no proof that are proved, by the same arithmetic, to lie outside: the relative singular
-    value of the task is at most the bound there. They count as proved in the share of the box. So do parts of the box
-    of a `Corridor` that are farther from its path than the radius.
+    value of the task is at most the bound there. They count as proved in the share of the box. So do parts of the box of
+    a `Corridor` that are farther from its path than the radius.
 
     The domain of a wide chart, a `RegularPart`, leaves out folds itself. There, proved is that its clear box needs no
     such test: what is not proved is left to the domain, and the search ends after a million boxes.

@@ -102,7 +102,7 @@ class WaveSeries:
         return cls(waves, sizes, table, (np.array([each.error for each in sums]) + rounding) * UP)
 
     def __call__(self, centre: Array, half: Array) -> Expansion:
-        """Expansions of all sums, (sums, monomials, boxes), for boxes of given middles and half-widths (n, boxes)."""
+        """Expansions of all sums, (sums, monomials, boxes), for boxes of given centres and half-widths (n, boxes)."""
         (sine, error), (cosine, _) = evaluate_sine_cosine(self.frequencies @ centre)
         values = np.concatenate([cosine, sine])
         found = (self.table @ values).reshape(len(self.sizes), -1, centre.shape[1]) * build_power_table(half, DEGREE)

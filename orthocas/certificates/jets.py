@@ -33,7 +33,7 @@ ORDERS = (4, 6)  #: of the derivatives of J that are used, at most: more of them
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Around:
-    """Boxes of middles c + C t, and half differences d = D v, for t and v in [-1, 1]^n."""
+    """Boxes of centres c + C t, and half differences d = D v, for t and v in [-1, 1]^n."""
 
     centre: Array  #: c, (n, boxes)
     middles: Array  #: C, (n, boxes)
@@ -53,7 +53,7 @@ class Around:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Jets:
-    """Some rows of J: their derivatives at the middle, and what these leave out of the average."""
+    """Some rows of J: their derivatives at the centre, and what these leave out of the average."""
 
     derivatives: tuple[Array, ...]  #: by order, each (rows, columns, multi-indices of the order, boxes)
     doubts: tuple[Array, ...]  #: bounds of their errors, of shapes that broadcast to theirs
@@ -68,7 +68,7 @@ class Jets:
         return cls(derivatives, doubts, np.concatenate([part.rest for part in parts]))
 
     def average(self, around: Around, variables: Variables) -> tuple[TaylorModel, Array]:
-        """The average of J as a model in the middle, and terms (rows, columns, terms, boxes) with signs of their own.
+        """The average of J as a model of the centre c, and terms (rows, columns, terms, boxes) with signs of their own.
 
         The rest comes on top of both. Terms with the square of one joint's difference have one sign only: half of each
         goes to the centre.

@@ -54,18 +54,18 @@ _ROUNDS = 2  #: of bounds of the differences by the coordinates
 
 @dataclass(frozen=True, eq=False, repr=False)
 class OneToOneCheck:
-    """Proves that Jm(c, d) is nonsingular, for middles c in a box and all d that two points of the whole can have."""
+    """Proves that Jm(c, d) is nonsingular, for centres c in a box and all d that two points of the whole can have."""
 
     task: "TipJets"
     coordinates: ProductRows | None
     active: tuple[int, ...]
-    still: tuple[int, ...]  #: columns of joints that Jm does not depend on in the middle; they may have wide ranges
+    still: tuple[int, ...]  #: columns of joints on whose centre Jm does not depend; they may have wide ranges
     low: Array  #: of the whole, (n,)
     high: Array
 
     @property
     def joints(self) -> tuple[int, ...]:
-        """The joints whose middles matter."""
+        """The joints whose centres matter."""
         return tuple(joint for k, joint in enumerate(self.active) if k not in self.still)
 
     @property
@@ -115,7 +115,7 @@ class OneToOneCheck:
         return proved, find_most_influential(gains, self.active), promising
 
     def _build_around(self, low: Array, high: Array) -> Around:
-        """Middles of the boxes, and the largest differences that two points of the whole with such middles have."""
+        """Centres of the boxes, and the largest differences that two points of the whole with such centres have."""
         rounding = 8 * UNIT * (np.abs(self.low) + np.abs(self.high))
         centre, outer = (self.low + self.high) / 2, (self.high - self.low) / 2
         nearest = np.maximum(np.maximum(low - centre, centre - high), 0)
@@ -275,7 +275,7 @@ class TipJets:
         return cls(rows, tree, columns, np.array([lengths[i] for i in columns]) * longer, doubt)
 
     def __call__(self, q: Array, around: Around) -> Jets:
-        """Jets at joint positions q (all joints, boxes), the columns of which are the middles of the boxes."""
+        """Jets at joint positions q (all joints, boxes), the columns of which are the centres of the boxes."""
         axes, arms, R = self._compute_geometry(q)
         turning = np.array([not self.tree.prismatic[i] for i in self.columns])
         carried = np.array([i in self.tree.carriers(self.tree.tip_parent) for i in self.columns])
@@ -374,7 +374,7 @@ def _split(n: int, order: int) -> tuple[Array, Array]:
 def _bound_rest(around: Around, lengths: Array) -> Array:
     """What the derivatives of J that are used leave out of the average, (columns, boxes).
 
-    Of the next order at the middle, the terms that are odd in d cancel; the one after it is bounded everywhere between
+    Of the next order at the centre, the terms that are odd in d cancel; the one after it is bounded everywhere between
     the points. The length of a derivative depends on the last of its joints: sums over joints up to each, weighted by
     their steps.
     """

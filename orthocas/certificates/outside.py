@@ -1,8 +1,8 @@
 """What a proof must know beyond the box: parts of a domain, endless joints."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -39,7 +39,7 @@ from orthocas.tasks.domains import PathBound, SingularBound, bounds_of
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import dense_function, one_blas_thread
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import Tape, find_gradient_dependences, find_periodic_joints, write_tape
+from orthocas.tools.expressions import Tape, evaluate_tape, find_gradient_dependences, write_tape
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,8 @@ def require_all_positions(chart: Chart, variables: Collection[int]) -> None:
 def _find_periodic_joints(chart: Chart) -> set[int]:
     """The joints whose full turns change neither J_x nor J_xi."""
     coordinates = chart.coordinates
-    assert isinstance(coordinates, Coordinates)  # `chart_rows` has refused others
+    # `build_chart_rows` has refused others.
+    assert isinstance(coordinates, Coordinates)
     task = _find_unchanged(write_tape(chart.problem.task.smooth_function), chart.n)
     if not len(coordinates.offset):
         return task
@@ -109,6 +110,52 @@ def _find_unchanged(tape: Tape, n: int) -> set[int]:
     """The joints whose full turns do not change a gradient."""
     needed = {k for row in find_gradient_dependences(tape) for joints in row.values() for k in joints}
     return {k for k in range(n) if k not in needed} | find_periodic_joints(tape, n)
+
+
+def find_periodic_joints(tape: Tape, n: int) -> frozenset[int]:
+    """The joints k of n for which h(q + 2 pi e_k) - h(q) is the same constant at every q, for all outputs h."""
+    nothing, unit = np.zeros(n), np.eye(n)
+
+    def leaf(name: str, of: Any) -> _Shift:
+        return _Shift(nothing, float(of)) if name == "const" else _Shift(unit[of])
+
+    shifts = evaluate_tape(tape, leaf, lambda name, of: _Shift(_compute_shift(name, of)))
+    alike = np.all([~np.isnan(each.turn) for each in shifts], axis=0)
+    return frozenset(np.flatnonzero(alike).tolist())
+
+
+class _Shift(NamedTuple):
+    """What a full turn does to a value."""
+
+    turn: Any  #: change by a turn of each joint / 2 pi; NaN where it is no constant
+    constant: float | None = None  #: the value itself, if it is a number
+
+
+def _compute_shift(name: str, of: Sequence[_Shift]) -> Any:
+    """The change of a step. Only whole numbers of moderate size are added and multiplied, which is exact."""
+    shifts = [each.turn for each in of]
+    if name in _EXACT:
+        return _keep_whole(_EXACT[name](*shifts))
+    for one, other in ((of[0], of[-1]), (of[-1], of[0])):
+        if name == "mul" and one.constant is not None:
+            return _keep_whole(np.where(other.turn == 0, 0.0, other.turn * one.constant))
+    still = np.all([shift == 0 for shift in shifts], axis=0)
+    if name in ("sin", "cos", "tan"):
+        still = ~np.isnan(shifts[0])
+    return np.where(still, 0.0, np.nan)
+
+
+_EXACT: Mapping[str, Callable[..., Any]] = {
+    "assign": lambda a: a,
+    "neg": lambda a: -a,
+    "twice": lambda a: 2 * a,
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+}
+
+
+def _keep_whole(shift: Any) -> Any:
+    return np.where((shift == np.round(shift)) & (np.abs(shift) < 2.0**40), shift, np.nan)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -166,12 +213,12 @@ class OutsideCheck:
         )
 
     def _select_promising(self, values: Array, low: Array, high: Array) -> NDArray[np.bool_]:
-        """Boxes that may lie outside: others, too large for the value at their middle, are rarely proved to."""
+        """Boxes that may lie outside: others, too large for the value at their centre, are rarely proved to."""
         half = (high - low)[:, list(self.variables)] / 2
         return np.asarray(self.domain.least_singular_value - values > RULES.steep * half.sum(axis=1))
 
     def _avoid_slivers(self, values: Array, low: Array, high: Array, widest: Array) -> Array:
-        """The joint to halve: of thin boxes with a middle outside the widest one, so that they become worth a try."""
+        """The joint to halve: of thin boxes with a centre outside the widest one, so that they become worth a try."""
         joints = np.array(self.joints)
         half = (high - low)[:, joints] / 2
         known = np.maximum(widest, 0)
@@ -211,7 +258,7 @@ def _build_least_row(turned: TaylorModel) -> TaylorModel:
 class CorridorCheck:
     """Counts boxes as proved, without a sign, that are farther from the path than the radius.
 
-    A box is, if the distance of its middle is larger than the radius by more than half of its diagonal.
+    A box is, if the distance of its centre is larger than the radius by more than half of its diagonal.
 
     Another check evaluates the other boxes, and their det J must have the sign of the first posture of the path.
     """

@@ -201,7 +201,7 @@ def _build_derivatives(function: ca.Function, joints: Sequence[int], what: str) 
 def build_joint_models(low: Array, high: Array, variables: Variables) -> tuple[list[TaylorModel], Array]:
     """Models of q_1, ..., q_n on boxes between corners (boxes, n), and the half-widths (n, boxes).
 
-    Joints that are no variables stand still at the middle of the box: J does not depend on them.
+    Joints that are no variables stand still at the centre of the box: J does not depend on them.
     """
     centre = (low + high) / 2
     half = np.nextafter(np.maximum(high - centre, centre - low), np.inf) + TINY
@@ -415,7 +415,7 @@ class ProductRows:
         return {i for index, there in zip(indices, sizes.tolist(), strict=True) if there for i in index}
 
     def build_jets(self, around: Around) -> Jets:
-        """The derivatives of J_xi at the middles of boxes. The next order, on the whole box, bounds the rest."""
+        """The derivatives of J_xi at the centres of boxes. The next order, on the whole box, bounds the rest."""
         points = [TaylorModel.constant(np.ascontiguousarray(c)) for c in around.centre]
         values, errors = self._evaluate_basis(self.functions(points))
         known = [self._evaluate_derivatives(order, values, errors) for order in range(1, around.order + 2)]

@@ -32,7 +32,7 @@ class Limits:
 
     seconds: float = np.inf
     boxes: int = MOST_BOXES // 4
-    smallest: float = 2.0**-12  #: share of the width of the whole below which a joint's interval is not halved
+    smallest: float = 2.0**-12  #: fraction of the width of the whole below which a joint's interval is not halved
     first_failure: bool = False  #: whether boxes that rank behind one that is too small to halve do not matter
     folds: bool = True  #: whether a fold ends the search
     hopeless: int = MOST_BOXES  #: boxes after which the search ends if the rest would take more than `boxes`
@@ -48,7 +48,7 @@ class Search:
     priority: Priority
     executor: Executor | None = None
     evaluated: int = 0
-    proved_volume: float = 0.0  #: share of the whole
+    proved_volume: float = 0.0  #: fraction of the whole
     open_count: int = 0  #: number of boxes where nothing is proved so far
     dead: int = 0  #: number of boxes too small to halve, or of no use to halve
     failed: float = np.inf  #: least rank of these boxes

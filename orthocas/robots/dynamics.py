@@ -1,6 +1,7 @@
 """Mass matrix (composite rigid bodies), inverse dynamics (recursive Newton-Euler), and payloads."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -24,21 +25,12 @@ _INDEFINITE = 1e-6  #: of the largest entry of a payload's inertia, as rounded o
 
 
 @dataclass
-class _Inertials:
-    """Inertial parameters of a body as expressions, about the body frame's origin."""
-
-    mass: ca.SX
-    moment: ca.SX  #: m c, (3, 1)
-    inertia: ca.SX  #: (3, 3)
-
-
-@dataclass
 class _Body:
-    """Inertial parameters about the body frame's origin."""
+    """Inertial parameters about the body frame's origin, as numbers or SX expressions."""
 
-    mass: float
-    moment: Array  #: m c, (3,)
-    inertia: Array  #: about the origin, (3, 3)
+    mass: Any
+    moment: Any  #: m c, (3,) or (3, 1)
+    inertia: Any  #: (3, 3)
 
 
 def mass_matrix(tree: KinematicTree, q: ca.SX, payload: ca.SX | None = None, inertials: ca.SX | None = None) -> ca.SX:
@@ -193,7 +185,7 @@ def _build_transforms(tree: KinematicTree, q: ca.SX) -> list[_JointTransform]:
 def _sum_wrenches(
     tree: KinematicTree,
     joints: list[_JointTransform],
-    bodies: list[_Inertials],
+    bodies: list[_Body],
     states: list[tuple[ca.SX, ca.SX, ca.SX]],
     accelerations: list[ca.SX],
 ) -> ca.SX:
@@ -242,21 +234,21 @@ def find_first_moments(tree: KinematicTree) -> tuple[list[int], tuple[int, ...]]
     return places, tuple(joints)
 
 
-def _unpack_inertials(tree: KinematicTree, inertials: ca.SX) -> list[_Inertials]:
+def _unpack_inertials(tree: KinematicTree, inertials: ca.SX) -> list[_Body]:
     """Bodies with the numbers of `collect_inertials`."""
     bodies, start = [], 0
     for kind in tree.joint_kinds:
         ten = ca.SX(10, 1)
         for place in _OF_BODY[kind]:
             ten[place], start = inertials[start], start + 1
-        bodies.append(_Inertials(ten[0], ten[1:4], ca.reshape(ten[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3)))
+        bodies.append(_Body(ten[0], ten[1:4], ca.reshape(ten[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3)))
     return bodies
 
 
-def _build_bodies(tree: KinematicTree, payload: ca.SX | None, inertials: ca.SX | None) -> list[_Inertials]:
+def _build_bodies(tree: KinematicTree, payload: ca.SX | None, inertials: ca.SX | None) -> list[_Body]:
     """The regrouped bodies, with the payload on the one that carries the tip."""
     if inertials is None:
-        bodies = [_Inertials(ca.SX(b.mass), constant(b.moment), constant(b.inertia)) for b in _regroup(tree)]
+        bodies = [_Body(ca.SX(b.mass), constant(b.moment), constant(b.inertia)) for b in _regroup(tree)]
     else:
         bodies = _unpack_inertials(tree, inertials)
     if payload is not None and tree.tip_parent >= 0:
@@ -270,7 +262,7 @@ def _build_bodies(tree: KinematicTree, payload: ca.SX | None, inertials: ca.SX |
         centre = p + R @ payload[1:4]
         turned = R @ ca.reshape(payload[4:][_MATRIX], 3, 3) @ R.T
         inertia = turned + mass * (ca.dot(centre, centre) * ca.SX.eye(3) - centre @ centre.T)
-        bodies[tree.tip_parent] = _Inertials(body.mass + mass, body.moment + mass * centre, body.inertia + inertia)
+        bodies[tree.tip_parent] = _Body(body.mass + mass, body.moment + mass * centre, body.inertia + inertia)
     return bodies
 
 

@@ -187,10 +187,10 @@ class KinematicTree:
         return len(self.joint_names)
 
     @property
-    def middle(self) -> Array:
+    def centre_posture(self) -> Array:
         """A posture away from the joint limits, (n,) [rad] or [m].
 
-        It is the middle of the limits. A joint without both limits has the value closest to 0 that is pi/4 rad (0.25 m)
+        It is the centre of the limits. A joint without both limits has the value closest to 0 that is pi/4 rad (0.25 m)
         away from its limit.
         """
         room = np.where(self.prismatic, PRISMATIC_ROOM, REVOLUTE_ROOM)

@@ -85,11 +85,10 @@ class Branch:
     name: str  #: such as "shoulder+ elbow- wrist+"; "whole" without cuts
     box: Box  #: up to the joint limits
     posture: Array  #: its clear position farthest from limits and cuts, (n,)
-    clear_share: float  #: share of its positions with a relative singular value above 0.1
-    share: float  #: its share of all such positions of the joint range
-    clearance: float = (
-        RULES.nonsingular
-    )  #: the largest up to 0.1 for which some position is clear enough to be a chart's middle
+    clear_share: float  #: fraction of its positions with a relative singular value above 0.1
+    share: float  #: its fraction of all such positions of the joint range
+    #: the largest up to 0.1 for which some position is nonsingular enough to be the centre of a chart
+    clearance: float = RULES.nonsingular
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -126,14 +125,14 @@ class Branches(Shown, Sequence[Branch]):
     def mirrored(self, q: ArrayLike, cut: int) -> Array:
         """The joint position (n,) beyond a cut with the same pose of the tip, for cuts among `mirrors`.
 
-        q_k - value changes its sign, and its neighbours turn by half a turn, towards the middle of their range.
+        q_k - value changes its sign, and its neighbours turn by half a turn, towards the centre of their range.
         """
         q = as_point("q", q, self.robot.n)
         image: Array = _reflect(self.robot, self.cuts[cut], q[None])[0]
         return image
 
     def plot(self) -> "Figure":
-        """The posture of each branch, in a panel with its name and its share of the clear positions."""
+        """The posture of each branch, in a panel with its name and its fraction of the clear positions."""
         from matplotlib.layout_engine import ConstrainedLayoutEngine  # takes long, and searches need no pictures
 
         from orthocas.tools.picture import Picture, equal_axes
@@ -430,7 +429,7 @@ def _reflect(robot: Robot, cut: Cut, points: Array) -> Array:
     k = cut.joint
     moved = points.copy()
     moved[:, k] = 2 * cut.value - points[:, k]
-    middle = np.where(np.isfinite(robot.tree.middle), robot.tree.middle, 0.0)
+    middle = np.where(np.isfinite(robot.tree.centre_posture), robot.tree.centre_posture, 0.0)
     for j in (k - 1, k + 1):
         if 0 <= j < robot.n:
             moved[:, j] += np.where(points[:, j] > middle[j], -np.pi, np.pi)

@@ -196,7 +196,7 @@ class ClearBox(Box):
 
     @cached_property
     def share(self) -> float:
-        """Share of the box that is clear, from 20,000 samples."""
+        """Fraction of the box that is clear, from 20,000 samples."""
         return float(
             self.is_clear(sample_evenly(Box(self.centre, self.half_width), RULES.fraction_samples, RULES.seed)).mean()
         )

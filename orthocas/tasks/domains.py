@@ -64,7 +64,7 @@ class Domain(ABC):
     """
 
     name: str  #: of the kind, as files and messages have it
-    centre: Array  #: middle of the box around it, (n,)
+    centre: Array  #: centre of the box around it, (n,)
     half_width: Array  #: half of the edge lengths of that box, (n,), > 0
     unbounded: tuple[int, ...] = ()  #: joints whose every position lies inside
     full_turns: bool = False  #: whether all joints turn without end and positions repeat after a turn
@@ -397,7 +397,7 @@ def slack(domain: Domain) -> Array:
 def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: ArrayLike | None = None) -> Box:
     """A box inside the joint limits.
 
-    The centre is the middle of the limits. For a joint without both limits it is 0, or the allowed value nearest to 0.
+    The centre is that of the limits. For a joint without both limits it is 0, or the allowed value nearest to 0.
     Half-widths are pi/4 for revolute and 0.25 m for prismatic joints, or less where the limits are closer.
 
     Args:
@@ -407,7 +407,7 @@ def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: Array
             leaves the limits.
     """
     require_kind("robot", robot, Robot)
-    middle = robot.tree.middle if centre is None else freeze_array("centre", centre, (robot.n,))
+    middle = robot.tree.centre_posture if centre is None else freeze_array("centre", centre, (robot.n,))
     if half_width is not None:
         return Box(middle, half_width)
     widths = default_half_width(robot, middle)

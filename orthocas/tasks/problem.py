@@ -173,12 +173,12 @@ class ProblemCheck:
 
     @property
     def half_turn_share(self) -> float:
-        """Share of samples about half a turn from the reference."""
+        """Fraction of samples about half a turn from the reference."""
         return self.half_turn_samples / self.samples
 
     @property
     def singular_share(self) -> float:
-        """Share of near-singular samples."""
+        """Fraction of near-singular samples."""
         return self.singular_samples / self.samples
 
 

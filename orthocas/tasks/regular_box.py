@@ -91,7 +91,7 @@ def find_home(robot: Robot, task: Task, home: ArrayLike | str | None = None) -> 
         raise NotRedundantError(task.m, robot.n)
     if home is None:
         box = default_box(robot)
-        score, usual_room = PostureScore.build(robot, task, box), default_half_width(robot, robot.tree.middle)
+        score, usual_room = PostureScore.build(robot, task, box), default_half_width(robot, robot.tree.centre_posture)
         for name, q in robot.homes.items():
             has_room = np.all(default_half_width(robot, q) >= RULES.room * usual_room)
             if has_room and score.evaluate(q[None])[0] >= RULES.regular_home:
@@ -120,7 +120,7 @@ def find_joint_range(robot: Robot, margin_deg: float) -> Box:
         raise InvalidValueError("margin_deg", margin_deg, "an angle from 0 to below 180 degrees")
     prismatic = np.array(robot.tree.prismatic)
     missing = np.isinf(robot.lower) | np.isinf(robot.upper)
-    middle = robot.tree.middle
+    middle = robot.tree.centre_posture
     low = np.where(missing, middle - PRISMATIC_ROOM, robot.lower)
     high = np.where(missing, middle + PRISMATIC_ROOM, robot.upper)
     room = np.where(prismatic, RULES.prismatic_margin * (high - low), margin) * ~missing

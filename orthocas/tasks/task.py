@@ -92,7 +92,7 @@ class Task(Shown, HoldsFunctions):
     """The task map h of a robot. Use the class methods to build one.
 
     Orientation, pose and axis tasks compare the tip with a reference orientation. If none is given, `Problem` uses the
-    tip's orientation at the centre of its domain, and the task itself uses that in the middle of the joint limits.
+    tip's orientation at the centre of its domain, and the task itself uses that at the centre of the joint limits.
     """
 
     robot: Robot
@@ -650,8 +650,9 @@ class Task(Shown, HoldsFunctions):
         """
         if self.turn is None:
             raise InvalidValueError("task", self.name, "one with an orientation")
-        given = self.recipe.get("reference")
-        return self._frames.evaluate_rotation(self.robot, self.robot.tree.middle) if given is None else np.array(given)
+        if "reference" in self.recipe:
+            return np.array(self.recipe["reference"])
+        return self._frames.evaluate_rotation(self.robot, self.robot.tree.centre_posture)
 
     @cached_property
     def smooth_function(self) -> ca.Function:
@@ -671,7 +672,7 @@ class Task(Shown, HoldsFunctions):
         """A task of a frame's rotation from a reference (3, 3), or from the default if it is None."""
         require_kind("robot", robot, Robot)
         if reference is None:
-            base, extra = frames.evaluate_rotation(robot, robot.tree.middle), {}
+            base, extra = frames.evaluate_rotation(robot, robot.tree.centre_posture), {}
         else:
             base = rotation_matrix("reference", reference)
             extra = {"reference": base.tolist()}

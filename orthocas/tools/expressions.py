@@ -1,10 +1,10 @@
 """SX expressions as data: tapes for files, their structure, scalar code, and users' functions of q."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import inf
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -230,52 +230,6 @@ def _combine_dependences(name: str, of: Sequence[tuple[Joints, Gradient]]) -> tu
         for j, own in part.items():
             total[j] = total.get(j, _NOTHING) | partial | own
     return everything, total
-
-
-def find_periodic_joints(tape: Tape, n: int) -> Joints:
-    """The joints k of n for which h(q + 2 pi e_k) - h(q) is the same constant at every q, for all outputs h."""
-    nothing, unit = np.zeros(n), np.eye(n)
-
-    def leaf(name: str, of: Any) -> _Shift:
-        return _Shift(nothing, float(of)) if name == "const" else _Shift(unit[of])
-
-    found = evaluate_tape(tape, leaf, lambda name, of: _Shift(_compute_shift(name, of)))
-    alike = np.all([~np.isnan(each.turn) for each in found], axis=0)
-    return frozenset(np.flatnonzero(alike).tolist())
-
-
-class _Shift(NamedTuple):
-    """What a full turn does to a value."""
-
-    turn: Any  #: change by a turn of each joint / 2 pi; NaN where it is no constant
-    constant: float | None = None  #: the value itself, if it is a number
-
-
-def _compute_shift(name: str, of: Sequence[_Shift]) -> Any:
-    """The change of a step. Only whole numbers of moderate size are added and multiplied, which is exact."""
-    shifts = [each.turn for each in of]
-    if name in _EXACT:
-        return _keep_whole(_EXACT[name](*shifts))
-    for one, other in ((of[0], of[-1]), (of[-1], of[0])):
-        if name == "mul" and one.constant is not None:
-            return _keep_whole(np.where(other.turn == 0, 0.0, other.turn * one.constant))
-    still = np.all([shift == 0 for shift in shifts], axis=0)
-    if name in ("sin", "cos", "tan"):
-        still = ~np.isnan(shifts[0])
-    return np.where(still, 0.0, np.nan)
-
-
-_EXACT: Mapping[str, Callable[..., Any]] = {
-    "assign": lambda a: a,
-    "neg": lambda a: -a,
-    "twice": lambda a: 2 * a,
-    "add": lambda a, b: a + b,
-    "sub": lambda a, b: a - b,
-}
-
-
-def _keep_whole(shift: Any) -> Any:
-    return np.where((shift == np.round(shift)) & (np.abs(shift) < 2.0**40), shift, np.nan)
 
 
 def choose_form(graph: ca.Function, rows: int) -> ca.Function:

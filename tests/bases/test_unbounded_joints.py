@@ -151,7 +151,7 @@ def test_leaves_are_proved_to_stay_where_finite_motions_say_so(kind: str, wanted
     """Reference: the projector on the task gradients at other positions of each joint, by samples."""
     file, tip = ROBOTS["tiago with its prismatic torso"]
     robot = oc.Robot.from_urdf(robot_data(file), tip)
-    centre = robot.tree.middle + 0.1
+    centre = robot.tree.centre_posture + 0.1
     problem = oc.Problem(robot, oc.Task.named(robot, kind, centre), domain=oc.Box(centre, 0.01))
     rng = np.random.default_rng(5)
     q = centre + 0.1 * rng.uniform(-1, 1, (20, robot.n))

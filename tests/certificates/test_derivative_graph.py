@@ -8,10 +8,11 @@ from test_taylor_models import values_at
 import orthocas as oc
 from orthocas import problems
 from orthocas.certificates.graph import TaylorGraph
+from orthocas.certificates.outside import find_periodic_joints
 from orthocas.certificates.rows import build_joint_models, build_true_gradients
 from orthocas.errors import CertifyError
 from orthocas.tools.batch import dense_function
-from orthocas.tools.expressions import find_gradient_dependences, find_periodic_joints, write_tape
+from orthocas.tools.expressions import find_gradient_dependences, write_tape
 
 C = 2.0**55  #: spacing of numbers there: 8
 

@@ -50,7 +50,7 @@ def points_of(chart: oc.Chart, count: int = 40) -> Array:
 
 def random_chart(robot: oc.Robot, task: oc.Task, parametrisation: Any, idle: tuple[int, ...] = ()) -> oc.Chart:
     """A chart without a fit, with random parameters."""
-    problem = oc.Problem(robot, task, domain=oc.Box(robot.tree.middle, 0.1))
+    problem = oc.Problem(robot, task, domain=oc.Box(robot.tree.centre_posture, 0.1))
     space, rng, r = JointSpace.of(problem), np.random.default_rng(3), problem.r - len(idle)
     active = [k for k in range(robot.n) if k not in idle]
     size = parametrisation.family(space.restricted_to(active), r).size

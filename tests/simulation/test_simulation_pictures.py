@@ -241,7 +241,7 @@ def test_targets_are_drawn_for_positions_of_the_first_tip_only() -> None:
     q = np.zeros((3, robot.n))
     own, other = oc.Task.position(robot), oc.Task.position(robot, frame="right_gripper")
     for task, drawn in ((own, True), (other, False), (oc.Task.stack(own, other), False)):
-        problem = oc.Problem(robot, task, domain=oc.Box(robot.tree.middle, 0.1))
+        problem = oc.Problem(robot, task, domain=oc.Box(robot.tree.centre_posture, 0.1))
         run: Any = SimpleNamespace(times=np.arange(3.0), q=q, reference=np.tile(task.batched(q[:1])[0], (3, 1)))
         targets = figure._tip_targets(run, problem)
         assert np.isfinite(targets).all() == drawn

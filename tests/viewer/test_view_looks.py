@@ -83,7 +83,7 @@ def test_all_tips_are_drawn() -> None:
     path = robot_data("baxter_description/urdf/baxter.urdf")
     tips = ["left_gripper", "right_gripper"]
     robot = oc.Robot.from_urdf(path, tips=tips)
-    q = robot.tree.middle
+    q = robot.tree.centre_posture
     positions, quaternions = BodyPoses(robot.tree)(q[None])
     balls = []
     for i, solids in enumerate(stick_arm(robot.tree)):
