@@ -70,8 +70,8 @@ def certify(
     joint on which J does not depend keeps its whole range if it can.
 
     In a `ClearBox`, parts need no proof that are proved, by the same arithmetic, to lie outside: the relative singular
-    value of the task is at most the bound there. They count as proved in the share of the box. So do parts of the box of
-    a `Corridor` that are farther from its path than the radius.
+    value of the task is at most the bound there. They count as proved in the share of the box. So do parts of the box
+    of a `Corridor` that are farther from its path than the radius.
 
     The domain of a wide chart, a `RegularPart`, leaves out folds itself. There, proved is that its clear box needs no
     such test: what is not proved is left to the domain, and the search ends after a million boxes.
@@ -199,11 +199,13 @@ def check_certificate(
         >>> oc.check_certificate(chart, oc.certify(chart))
         True
     """
+    # The certificate must be one of this chart before any number of it is checked.
     check_options(chart, None, executor)
     certificate = chart.certificate if certificate is None else certificate
     if certificate is None:
         raise CertifyError("the chart has no certificate, expected one made by `certify`")
     require_same(chart, certificate)
+    # All parts are checked as they were proved, by the same method.
     bound, rows = check_bound(chart, certificate.bound), build_chart_rows(chart)
     check = choose_check(chart, rows, bound, certificate.method)
     mapped: Mapped = map if executor is None else partial(in_order, executor)
@@ -214,6 +216,7 @@ def check_certificate(
     fraction = _estimate_proved_fraction(chart.problem.domain, certificate.regular)
     if abs(fraction - certificate.clear_share) > RULES.same_fraction:
         return False
+    # The one-to-one box has its own check, and must lie around the centre.
     box = certificate.injective
     if box is None:
         return True
@@ -303,6 +306,7 @@ def _sample_suspects(chart: Chart) -> Array:
     points = points[contains(domain, points)]
     if domain.draws_itself:
         points = sample_boundary_weighted(domain, RULES.samples, 0)
+    # det J of the samples, relative to its sign at the centre.
     J_x = chart.problem.task.batched_jacobian(points)[0].reshape(-1, chart.m, chart.n)
     volumes = np.linalg.det(np.nan_to_num(np.concatenate([J_x, chart.coordinates.jacobian(points)], axis=1)))
     worst = int(np.argmin(volumes * np.sign(volumes[0])))
@@ -387,6 +391,7 @@ def _build_certificate(
     resume: Certificate | None,
 ) -> Certificate:
     fold = tuple(tuple(point.tolist()) for point in search.signs.values()) if search.folded else ()
+    # What an earlier search took and found counts as well.
     before = (0, 0.0) if resume is None else (resume.boxes, resume.seconds)
     known = (
         search.conditioning

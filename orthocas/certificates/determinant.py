@@ -129,12 +129,14 @@ class PolynomialSeries:
     @classmethod
     def build(cls, values: Array, doubts: Array, family: ProductFamily, variables: list[int]) -> "PolynomialSeries":
         """Of derivatives and their errors by `_differentiate_coordinate`, for the variables that they depend on."""
+        # Keep the derivatives by the variables that count.
         degree, n = _bound_degree(family), family.space.n
         places = {m: k for k, m in enumerate(list_indices(n, degree))}
         kept = list_indices(len(variables), degree)
         numbers = [places[tuple(sorted(variables[v] for v in m))] for m in kept]
         values, doubts = values[:, numbers], doubts[:, numbers]
         own = {m: k for k, m in enumerate(kept)}
+        # The derivative by a and b of each polynomial, which ends at its degree.
         table = np.zeros((len(values), len(kept), len(kept)))
         for i, a in enumerate(kept):
             for j, b in enumerate(kept):

@@ -188,6 +188,7 @@ def _require_bounds(tape: Tape, what: str, values: bool) -> None:
     """Refuse operations whose derivative has no bounds, or needs a value that has none; and outputs without bounds."""
     unknown = f"{what} uses the value of log, atan, asin, acos or atan2, which cannot be certified"
 
+    # Follow the tape with what is known of each place.
     def step(name: str, of: Sequence[_Step]) -> _Step:
         if name not in _KNOWN:
             raise CertifyError(f"{what} uses the operation {name}, which cannot be certified")

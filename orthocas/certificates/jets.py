@@ -73,6 +73,7 @@ class Jets:
         The rest comes on top of both. Terms with the square of one joint's difference have one sign only: half of each
         goes to the centre.
         """
+        # Even orders of d stay: the model takes degrees up to 3, squares of one joint half each.
         weights = [build_power_weights(around, order) for order in range(around.order + 1)]
         model = [d * w[:, 0] for d, w in zip(self.derivatives[: DEGREE + 1], weights, strict=False)]
         squared = self.derivatives[2] * (weights[2][:, 2] / 3)
@@ -83,6 +84,7 @@ class Jets:
         higher = [self.derivatives[k] * average_even(weights[k]) for k in range(DEGREE + 1, around.order + 1)]
         terms = np.concatenate([squared, mixed, *higher], axis=2)
         coefficients = np.concatenate([centre[:, :, None], *model[1:]], axis=2)
+        # The remainder covers errors of the derivatives and rounding of the sums.
         doubt = sum((e * average_even(w)).sum(axis=2) for e, w in zip(self.doubts, weights, strict=True))
         size = np.abs(coefficients).sum(axis=2) + np.abs(terms).sum(axis=2)
         remainder = (doubt + sum_error(8 * around.order) * size) * compute_margin(terms.shape[2]) + TINY

@@ -99,6 +99,7 @@ class OneToOneCheck:
         """Whether boxes are proved, the joint to halve, and whether they might be proved with higher derivatives."""
         own = () if self.coordinates is None else (self.coordinates.build_jets(around),)
         jets = Jets.join([self.task(q, around), *own])
+        # J averaged over the segments, in the singular basis of its centre.
         model, terms = jets.average(around, self.active)
         left, right = find_singular_vectors(model)
         turned = multiply_between(left, model, right)
@@ -106,6 +107,7 @@ class OneToOneCheck:
         rest = (np.abs(left) @ jets.rest.transpose(2, 0, 1) @ np.abs(right)).transpose(1, 2, 0) * UP
         all_ = replace(known, remainder=(known.remainder + rest) * UP)
         sound = is_orthogonal(left) & is_orthogonal(right)
+        # Halving joints that stand still is of no use.
         gains = compute_influences(all_)
         gains[:, self.still] = 0
         proved = have_positive_pivots(compute_pivots(all_)) & sound
@@ -205,6 +207,7 @@ def choose_one_to_one_check(chart: Chart, rows: ChartRows, base: Subdivision) ->
     coordinates, known = chart.coordinates, isinstance(rows.coordinates, ProductRows | None)
     if rows.base or {*rows.variables} - {*active} or _has_jumps(chart, rows):
         return None
+    # Rows without derivatives in closed form have the convex check.
     if tip is None or not known:
         true = replace(rows, task=build_true_gradients(chart.problem.task, active)[0])
         centre = chart.problem.domain.centre[None]
@@ -215,6 +218,7 @@ def choose_one_to_one_check(chart: Chart, rows: ChartRows, base: Subdivision) ->
         assert isinstance(coordinates, Coordinates)
         assert isinstance(coordinates.family, ProductFamily)
         own = ProductRows.build(coordinates.family, coordinates.theta, ORDERS[-1] + 2)
+    # Leading joints on which J does not depend keep a free range.
     leading = takewhile(lambda i: i not in rows.variables, tree.carriers(tree.tip_parent))
     still = tuple(active.index(i) for i in leading if i in active)
     task = TipJets.build(tip, tree, active, chart.problem.domain)
@@ -276,6 +280,7 @@ class TipJets:
 
     def __call__(self, q: Array, around: Around) -> Jets:
         """Jets at joint positions q (all joints, boxes), the columns of which are the centres of the boxes."""
+        # Each part has nested cross products of joint axes: of arms, of rotations, of one axis.
         axes, arms, R = self._compute_geometry(q)
         turning = np.array([not self.tree.prismatic[i] for i in self.columns])
         carried = np.array([i in self.tree.carriers(self.tree.tip_parent) for i in self.columns])
@@ -314,6 +319,7 @@ class TipJets:
     def _compute_geometry(self, q: Array) -> tuple[Array, Array, Array]:
         """Axes of the columns' joints and arms from their origins to the tip, (columns, 3, boxes); R, (boxes, 3, 3)."""
         boxes = q.shape[1]
+        # Forward kinematics of the chain, for all boxes at once.
         R, p = np.broadcast_to(np.eye(3), (boxes, 3, 3)), np.zeros((boxes, 3))
         axes, origins = {}, {}
         for i in self.tree.carriers(self.tree.tip_parent):

@@ -66,6 +66,7 @@ def require_all_positions(chart: Chart, variables: Collection[int]) -> None:
     and of xi are read. The joints of a torus are unbounded.
     """
     problem = chart.problem
+    # Joints without bounds on which the proof depends must repeat after a turn.
     endless = np.flatnonzero(np.isinf(bounds_of(problem.domain)[1])).tolist()
     asked = [joint for joint in endless if joint in variables]
     if not asked:
@@ -228,9 +229,9 @@ class OutsideCheck:
 
     def check_outside(self, low: Array, high: Array) -> tuple[Array, Array]:
         """Whether boxes lie outside, and the joint to halve to find out."""
-        J = self.rows(build_joint_models(low, high, self.variables)[0]).multiply_by(
-            1 / self.domain.scale[:, None, None]
-        )
+        joints = build_joint_models(low, high, self.variables)[0]
+        J = self.rows(joints).multiply_by(1 / self.domain.scale[:, None, None])
+        # The row v^T J with the change along the other singular vectors taken out.
         left, right = find_singular_vectors(J)
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             least = _build_least_row(multiply_between(left, J, right))
@@ -238,6 +239,7 @@ class OutsideCheck:
             squared = (sizes**2).sum(axis=0) * UP
             squared += RULES.guards * (J.bound_magnitude() ** 2).sum(axis=(0, 1))
             influences = (least.compute_gains() * sizes).sum(axis=1)
+        # Its length bounds the smallest singular value from above.
         small = squared <= self.domain.least_singular_value**2 * (1 - RULES.lengths)
         outside: Array = small & is_orthogonal(left) & is_orthogonal(right)
         return outside, find_most_influential(influences.T, least.variables)

@@ -134,6 +134,7 @@ def build_chart_rows(chart: Chart) -> ChartRows:
         raise CertifyError(f"a chart with {coordinates.label} coordinates has no expression, expected a fitted chart")
     if not np.all(coordinates.scale != 0):
         raise CertifyError("a coordinate is scaled by 0, so it is constant, expected coordinates that vary")
+    # Rows of the task and of the coordinates, for joints that are no coordinates themselves.
     active = tuple(coordinates.active)
     task, moved_by = build_task_rows(chart.problem.task, chart.problem.domain, active)
     own, depends = _build_coordinate_rows(coordinates)
@@ -164,6 +165,7 @@ def _find_base(chart: Chart) -> Variables:
     except InvalidValueError as error:
         raise CertifyError(f"the base of the chart is none: {error}") from None
     tree = problem.robot.tree
+    # The base must carry the tip, joint by joint from the world on.
     places = tuple(tree.joint_names.index(name) for name in chosen.base)
     if tree.carriers(tree.tip_parent)[: len(places)] != list(places) or not isinstance(problem.domain, Box):
         return ()
@@ -219,6 +221,7 @@ def _build_coordinate_rows(coordinates: Coordinates) -> tuple[CoordinateRows | N
     """The fitted coordinates, and the joints they depend on."""
     if not len(coordinates.offset):
         return None, set()
+    # Product bases and networks have rows of their own; others are differentiated step by step.
     family, active = coordinates.family, coordinates.active
     if isinstance(family, ProductFamily):
         rows = ProductRows.build(family, coordinates.theta)
@@ -514,6 +517,7 @@ class NetworkRows:
         turning = [q for q, slides in zip(joints, self.direct, strict=True) if not slides]
         sliding = [q for q, slides in zip(joints, self.direct, strict=True) if slides]
         sines, cosines = [sine(q) for q in turning], [cosine(q) for q in turning]
+        # Values from layer to layer, then gradients backwards.
         layer, slopes = stack([*sines, *cosines, *sliding]), []
         one = TaylorModel.constant(np.ones((1, 1)))
         for W, b in self.layers[:-1]:

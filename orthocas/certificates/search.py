@@ -132,6 +132,7 @@ class Search:
                 raise
             self._apply(batch, results)
             return
+        # Keep the executor busy, and take back what is done.
         while self._waiting and len(pending) < _IN_FLIGHT:
             batch = self._take()
             try:

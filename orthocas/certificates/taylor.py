@@ -184,6 +184,7 @@ class TaylorModel:
             return other._multiply_constant(self)
         if not other.variables:
             return self._multiply_constant(other)
+        # Constant times all, linear times linear and quadratic, quadratic times linear.
         table = plan_product(self.variables, other.variables)
         a, b = self.coefficients, other.coefficients
         out = np.zeros((table.size, *np.broadcast_shapes(a.shape[1:], b.shape[1:])))

@@ -68,6 +68,7 @@ class BatchedFlow:
         y, s, step = starts.copy(), np.zeros(len(starts)), np.full(len(starts), RULES.first)
         running = np.arange(len(starts))
         while running.size:
+            # Try a step of each running trajectory, keep good ones, and adapt all step sizes.
             tried = np.minimum(step[running], 1 - s[running])
             moved, error = self._take_steps(y[running], tried[:, None], parameters[running])
             ratio = np.nan_to_num(error[:, 0] / tolerance, nan=np.inf)
@@ -177,6 +178,7 @@ class TaskFlow:
         n, r = self.problem.n, self.problem.r
         A = evaluate_metric(self.problem.metric, points)
         inverse = np.asarray(np.linalg.inv(A), dtype=float)
+        # Tangent vectors start as an A-orthonormal basis of ker J_x.
         samples = Samples(points, evaluate_task_jacobians(self.problem, points), inverse)
         Z = samples.null_basis
         lengths = np.linalg.norm(Z, axis=1)
@@ -184,6 +186,7 @@ class TaskFlow:
         starts = np.concatenate([points, directions, np.log(lengths)], axis=1)
         dx = level - self.problem.task.batched(points)[0]
         ends, arrived = self._with_tangents.find_end_points(starts, dx, tolerance)
+        # Directions and logarithms of lengths make the vectors again.
         tangents = ends[:, n : n + r * n].reshape(-1, r, n) * np.exp(ends[:, n + r * n :])[:, :, None]
         moved = Moved(ends[:, :n], np.where(arrived, Arrival.REACHED, Arrival.SINGULAR))
         return moved, tangents.transpose(0, 2, 1) @ Z.transpose(0, 2, 1) @ A

@@ -75,6 +75,7 @@ def build_level_surface(
     if not np.all(corners[0] < corners[1]):
         raise InvalidValueError("low", corners[0].tolist(), f"less than high = {corners[1].tolist()}")
     axes = _build_grid_axes(corners, require_count("cells", cells, least=2))
+    # Marching cubes, then Newton steps onto the surface, then flips and smoothing in turns.
     gap, largest = _sample_gap(h, level, axes)
     points, faces, free, ends = _march_cubes(gap, axes)
     sheet = _Sheet(
@@ -123,6 +124,7 @@ class _Sheet:
             moving, gap = moving[np.abs(gap) > self.tolerance], gap[np.abs(gap) > self.tolerance]
             if not len(moving):
                 break
+            # A Newton step along the free part of the gradient, at most a cell long.
             slope = _evaluate_checked(self.gradient, points[moving], "gradient", (3,)) * self.free[moving]
             step = slope * (gap / np.maximum(np.sum(slope**2, axis=1), RULES.tiny))[:, None]
             length = np.linalg.norm(step, axis=1, keepdims=True)

@@ -113,6 +113,7 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
     require_kind("problem", problem, Problem)
     require_driven("involutivity", problem.robot.tree)
     require_memory(f"{samples} samples of the defect", 32.0 * samples * problem.n * problem.m**2)
+    # Brackets across the span at all samples, and the scale of what cancels in them.
     points = _sample_regular(problem, samples, seed)
     brackets = TaskBrackets.build(problem)
     across, size, basis = Batched(brackets.build_tensor_function())(points)
@@ -121,6 +122,7 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
     if not np.isfinite(d).all():
         at = np.round(points[np.flatnonzero(~np.isfinite(d))[0]], 4).tolist()
         raise SingularTaskError(f"the second derivative of task '{problem.task.name}' is not finite at q = {at}")
+    # What the defect makes of the domain, as an angle.
     turns = _compute_squared_turns(T, basis.reshape(-1, problem.n, problem.m), problem.domain.half_width)
     leak = float(np.degrees(np.sqrt(turns.mean() / problem.r)))
     worst = int(np.argmax(d))

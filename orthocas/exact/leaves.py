@@ -151,6 +151,7 @@ class DiskLeaf:
         corners = self.faces[located.face]
         feet = np.einsum("sk,skn->sn", located.barycentric, self.vertices[corners])
         normals = self._normals[located.face]
+        # Newton along the normal of the triangle, for all points at once.
         height = np.zeros((len(xi), 1))
         for _ in range(RULES.disk_steps):
             q = feet + height * normals
@@ -274,6 +275,7 @@ class LinearLeaf:
         """
         q = np.broadcast_to(self.centre, (len(xi), len(self.centre)))
         q = q if near is None else np.where(np.isfinite(near), near, q)
+        # Follow the straight line to xi in steps, so that Newton stays on the sheet.
         start = (q - self.centre) @ self.normals
         N = np.broadcast_to(self.normals.T, (len(xi), *self.normals.T.shape))
         for share in np.linspace(0.0, 1.0, RULES.stages + 1)[1:]:
@@ -339,6 +341,7 @@ class CircleLeaf:
         """Coordinates of points on the leaf, (N, n)."""
         nearest = self._tree.query(self._embed(points))[1]
         L = self.length[0]
+        # From the nearest sample to the nearest point, by Gauss-Newton steps along the curve.
         samples = self.curve[nearest]
         near = samples + remove_turns(self.problem, points - samples)
         along = nearest * L / (len(self.curve) - 1)
@@ -440,6 +443,7 @@ def _build_tracer(problem: Problem, level: Array, steps: int) -> Callable[[Array
     The curve follows the unit vector orthogonal to all task gradients; the term -J_x^# (h - x0) keeps it on the leaf.
     """
     q, length = ca.SX.sym("q", problem.n), ca.SX.sym("length")
+    # The unit vector across all gradients, by cofactors, and a pull back to the leaf.
     J = problem.task.jacobian_function(q)
     others = [[k for k in range(problem.n) if k != i] for i in range(problem.n)]
     across = ca.vertcat(*((-1) ** (i + 1) * compute_determinant(J[:, columns]) for i, columns in enumerate(others)))

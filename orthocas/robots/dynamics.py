@@ -83,6 +83,7 @@ def inverse_dynamics(
     accelerations: list[ca.SX] = []
     at_rest = (ca.SX(3, 1), ca.SX(3, 3), constant(-gravity))
     for i, parent in enumerate(tree.parents):
+        # The parent's motion in the axes of the body, then what the joint adds.
         omega_p, U_p, a_p = states[parent] if parent >= 0 else at_rest
         alpha_p = accelerations[parent] if parent >= 0 else ca.SX(3, 1)
         to_child = joints[i].to_child
@@ -194,6 +195,7 @@ def _sum_wrenches(
     torques = [ca.SX(3, 1)] * tree.n
     tau = ca.SX.zeros(tree.n)
     for i in reversed(range(tree.n)):
+        # The wrench of the body itself, and those of the bodies that it carries.
         omega, U, a = states[i]
         moment, inertia = bodies[i].moment, bodies[i].inertia
         force = forces[i] + bodies[i].mass * a + U @ moment
@@ -313,6 +315,7 @@ def check_payload(name: str, value: ArrayLike) -> Array:
     if given.shape not in ((1,), (4,), (PAYLOAD,)):
         raise InvalidValueError(f"shape of {name}", given.shape, _FORMS)
     require_finite(name, given)
+    # Missing numbers are 0: a point mass at the tip, or one elsewhere.
     numbers = np.zeros(PAYLOAD)
     numbers[: len(given)] = given
     if numbers[0] < 0:
@@ -334,6 +337,7 @@ def add_payload(tree: KinematicTree, payload: ArrayLike) -> KinematicTree:
         return tree
     R = tree.tip_rotation
     added = tree.tip_translation + R @ numbers[1:4]
+    # The joint centre of mass, and both inertias about it (Steiner).
     together = (mass * centre + numbers[0] * added) / total
     turned = R @ numbers[4:][_MATRIX].reshape(3, 3) @ R.T
     inertia = inertia + turned + _steiner(mass, centre - together) + _steiner(numbers[0], added - together)

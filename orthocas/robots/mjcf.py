@@ -88,6 +88,7 @@ def _refuse_unread(compiled: Any, name: str) -> None:
         raise RobotError(f"{name} has no joint, expected at least one")
     if compiled.nbody - 1 > RULES.links:
         raise RobotError(f"{name} has more than {RULES.links} bodies")
+    # Numbers and names must be finite and readable.
     placed = (
         "body_pos",
         "body_quat",
@@ -105,6 +106,7 @@ def _refuse_unread(compiled: Any, name: str) -> None:
         raise RobotError(f"{name} has names that are not UTF-8, expected a file in UTF-8") from None
     if not all(np.isfinite(getattr(compiled, part)).all() for part in placed):
         raise RobotError(f"{name} holds numbers that are not finite")
+    # Flexible bodies and armatures of tendons and actuators change the mass matrix.
     if compiled.nflex:
         raise RobotError(f"{name} has a flexible body, which orthocas does not support")
     for kind in ("tendon", "actuator"):

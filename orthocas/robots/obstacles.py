@@ -209,6 +209,7 @@ class LinkDistances:
         for k, obstacle in enumerate(obstacles):
             if isinstance(obstacle, type) or not isinstance(obstacle, Obstacle):
                 raise InvalidValueError(f"obstacles[{k}]", f"a {type(obstacle).__name__}", "a Sphere, Capsule or Plane")
+        # One radius for all links, or one for each.
         given = as_float_array("radius", radius)
         if given.shape not in ((), (robot.n,)):
             raise InvalidValueError("radius", f"an array of shape {given.shape}", f"one number, or {robot.n}")

@@ -100,6 +100,7 @@ def find_axis(model: pin.Model, i: int) -> tuple[JointKind, Array]:
             f"joint '{name}' is of type {joint.shortname()} with {joint.nv} degrees of freedom, "
             f"expected revolute, continuous or prismatic joints: {suggest_lock(name)}"
         )
+    # The motion subspace of a joint with one degree of freedom is a unit twist.
     data = joint.createData()
     joint.calc(data, pin.neutral(model))
     subspace = np.asarray(data.S).ravel()
@@ -154,6 +155,7 @@ def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
     """
     if not isinstance(locked, Mapping):
         raise InvalidValueError("locked", locked, "a mapping from joint names to positions")
+    # Each joint gets its position; those that mimic one of them follow.
     names = list(model.names)[1:]
     position = pin.neutral(model)
     ids = []
@@ -201,6 +203,7 @@ def fix_joints(model: pin.Model, ids: list[int], position: Array) -> pin.Model:
         raise RobotError(
             f"a joint is called '{WORLD}', which no joint can be called while joints are locked: rename it"
         )
+    # Frames other than joints get unique names meanwhile.
     renamed, names = model.copy(), {}
     for i, frame in enumerate(renamed.frames):
         if i > 0 and frame.type != pin.FrameType.JOINT:
@@ -227,6 +230,7 @@ def set_position(model: pin.Model, i: int, value: float, position: Array) -> Non
                 f"a joint with {joint.nv} degrees of freedom can only be locked at its neutral position"
             )
         return
+    # Angles that look like degrees are mistakes.
     turns = joint.shortname().startswith("JointModelR")
     if turns and (hint := degrees_hint(value)):
         raise InvalidValueError(f"locked position of joint '{name}'", f"{value:g}", f"an angle in radians{hint}")
@@ -317,6 +321,7 @@ def build_planar(lengths: Sequence[float], masses: Sequence[float]) -> pin.Model
     for name, values in (("lengths", lengths), ("masses", masses)):
         if not values or min(values) <= 0:
             raise InvalidValueError(name, values, "positive numbers, one per link")
+    # The model: one revolute joint and one uniform rod a link.
     model = pin.Model()
     model.name = f"planar_{len(lengths)}r"
     model.gravity.linear = np.array([0.0, -GRAVITY, 0.0])

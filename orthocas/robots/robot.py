@@ -481,12 +481,14 @@ class Robot(Shown):
         """Call a function with CasADi or NumPy arguments, and return the same kind."""
         key = (name,) if isinstance(name, str) else name
         function = self._functions[key]
+        # CasADi arguments give an expression, which needs columns of the right size.
         if any(isinstance(a, ca.SX | ca.MX) for a in arguments):
             for a in arguments:
                 shape = tuple(a.shape) if hasattr(a, "shape") else np.shape(as_float_array("a joint vector", a))
                 if shape != (self.n, 1):
                     raise ShapeError("a CasADi joint vector", shape, (self.n, 1))
             return function(*arguments)
+        # NumPy arguments give arrays, of one state or of a set.
         sets = [as_point_set(name, a, self.n) for name, a in zip(function.name_in(), arguments, strict=True)]
         points = [p for p, _ in sets]
         if len({len(p) for p in points}) > 1:

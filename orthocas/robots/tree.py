@@ -130,6 +130,7 @@ class KinematicTree:
         for i, name in enumerate(self.joint_names):
             require_known("joint kind", self.joint_kinds[i], JOINT_KINDS)
             _require_index(f"parents[{i}]", self.parents[i], i - 1)
+            # A joint can be somewhere, and move.
             lower, upper = self.lower[i], self.upper[i]
             if not lower <= upper or lower == np.inf or upper == -np.inf:
                 raise RobotError(f"joint '{name}' has limits [{lower:g}, {upper:g}], expected lower <= upper")
@@ -151,6 +152,7 @@ class KinematicTree:
             _require_rotation(f"frame_rotations[{k}]", self.frame_rotations[k])
         for tip in self.tips:
             require_known("tip", tip, self.frame_names)
+        # The links of each body name it in errors.
         frames = list(zip((self.tip_name, *self.frame_names), (self.tip_parent, *self.frame_parents), strict=True))
         for i, name in enumerate(self.joint_names):
             links = [frame for frame, parent in frames if parent == i]

@@ -169,6 +169,7 @@ def _check_urdf(path: str | Path, root: ElementTree.Element) -> None:
 
     Pinocchio's parser checks lengths of vectors, numbers and limits.
     """
+    # Bodies, then joints, then how they hang together.
     links = root.findall("link")
     if len(links) > RULES.links:
         raise RobotError(f"{path} has {len(links)} links, expected at most {RULES.links}")

@@ -405,6 +405,7 @@ def _build_branch(
     whole: Box, cuts: tuple[Cut, ...], sides: tuple[int, ...], points: Array, values: Array
 ) -> Branch | None:
     """The branch on some sides of the cuts; None if it has no clear sample."""
+    # Each side is the part of a joint between two of its cuts, or between a cut and a limit.
     low, high = whole.centre - whole.half_width, whole.centre + whole.half_width
     clear, words = points[values > RULES.nonsingular], []
     for k, side in zip(sorted({cut.joint for cut in cuts}), sides, strict=True):
@@ -414,6 +415,7 @@ def _build_branch(
         if side < len(own):
             high[k] = own[side].value
         words.append(own[0].part + ("-", "+")[side] if len(own) == 1 else own[0].part + ("-", "0", "+")[side])
+    # The box, its fractions, and the nonsingular position farthest from all its boundaries.
     inside = clear[((clear > low) & (clear < high)).all(axis=1)]
     if not len(inside):
         return None

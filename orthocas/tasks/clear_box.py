@@ -89,6 +89,7 @@ class ClearBox(Box):
         require_kind("box", box, Box)
         require_kind("task", task, Task)
         require_known("rows", rows, ROWS)
+        # The frame Jacobian decides unless `rows` says otherwise; sizes are those of its rows on the box.
         super().__init__(box.centre, box.half_width, box.unbounded)
         task = task.with_reference_at(box.centre)
         object.__setattr__(self, "task", task)

@@ -60,6 +60,7 @@ class Corridor(Box):
         require_kind("box", box, Box)
         super().__init__(box.centre, box.half_width, box.unbounded)
         n = len(box.centre)
+        # Check the path, then the radius of each joint; infinite ones do not count.
         path = freeze_array("postures", postures, (None, n))
         if (widest := np.abs(path).max(initial=0.0)) > WIDEST:
             raise InvalidValueError("postures", f"up to {widest:.3g}", f"numbers up to {WIDEST:g}")

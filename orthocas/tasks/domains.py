@@ -272,6 +272,7 @@ class Box(Domain):
     def __init__(self, centre: ArrayLike, half_width: ArrayLike, unbounded: Sequence[int] = ()) -> None:
         middle = freeze_array("centre", centre, (None,))
         widths = as_float_array("half_width", half_width)
+        # Check both, with one half-width for all joints spread out.
         if widths.ndim > 0 and widths.shape != middle.shape:
             raise ShapeError("half_width", widths.shape, middle.shape)
         widths = freeze_array("half_width", np.broadcast_to(widths, middle.shape), middle.shape)

@@ -44,6 +44,7 @@ class Metric(HoldsFunctions):
         """
         require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
+        # By the name of a registered builder, or of a kind of its own.
         if isinstance(spec, str) and spec in _REGISTERED:
             built = call_user(f"metric '{spec}'", "a builder that takes this robot", _REGISTERED[spec], robot)
             return cls.custom(robot, spec, built)
@@ -53,6 +54,7 @@ class Metric(HoldsFunctions):
                 require_mass(robot, "the inertia metric")
             A = robot.function("mass_matrix")(q) if spec == "inertia" else ca.SX.eye(robot.n)
             return cls(spec, dense_function("metric", [q], [A]), {"kind": spec})
+        # By a map of q, or by a constant matrix.
         if callable(spec):
             return cls.custom(robot, "custom", spec)
         matrix = freeze_array("metric", spec, (robot.n, robot.n))

@@ -75,6 +75,7 @@ class Problem(Shown):
         name: str = "custom",
         least_singular_value: float | None = None,
     ) -> None:
+        # Robot and task belong together, and the task leaves some freedom.
         if not isinstance(task, Task) or not isinstance(robot, Robot):
             raise InvalidValueError(
                 "robot and task", f"{type(robot).__name__} and {type(task).__name__}", "Robot and Task"
@@ -83,12 +84,14 @@ class Problem(Shown):
             raise InvalidValueError("task", f"a task of another robot ({task.name})", "a task built on the same robot")
         if task.m >= robot.n - len(robot.tree.floating):
             raise NotRedundantError(task.m, robot.n - len(robot.tree.floating))
+        # The domain lies within the limits; its centre gives a missing reference.
         domain = regular_box(robot, task) if domain is None else domain
         if not isinstance(domain, Domain):
             raise InvalidValueError("domain", repr(domain), "a Box, a Torus or another Domain")
         require_within_limits(robot, domain)
         task = task.with_reference_at(domain.centre)
         domain = exclude_singular(domain, task, least_singular_value)
+        # The metric is one of the same robot; what moves a floating base is its inertia.
         metric = metric if isinstance(metric, Metric) else Metric.from_spec(robot, metric)
         require_shape("metric", metric.function.size_out(0), (robot.n, robot.n))
         if robot.tree.floating and not metric.is_inertia:
@@ -199,6 +202,7 @@ def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
         0.0
     """
     require_kind("problem", problem, Problem)
+    # Each metric matrix is checked, then the rank of the task.
     points = sample_uniform(problem.domain, samples, seed)
     evaluate_metric(problem.metric, points)
     smallest = relative_singular_values(problem, points)

@@ -97,6 +97,7 @@ def find_home(robot: Robot, task: Task, home: ArrayLike | str | None = None) -> 
             if has_room and score.evaluate(q[None])[0] >= RULES.regular_home:
                 return Home(q, f"posture '{name}' of the robot's files")
         return Home(find_bent_posture(score, robot, box), "bent posture where the task is most regular")
+    # A posture that is given must lie inside the limits.
     source = f"posture '{home}' of the robot's files" if isinstance(home, str) else "as given"
     q = robot.home(home) if isinstance(home, str) else as_point("home", home, robot.n)
     outside = np.flatnonzero((q <= robot.lower) | (q >= robot.upper))
@@ -118,6 +119,7 @@ def find_joint_range(robot: Robot, margin_deg: float) -> Box:
     margin = np.radians(as_number("margin_deg", margin_deg))
     if not 0 <= margin < np.pi:
         raise InvalidValueError("margin_deg", margin_deg, "an angle from 0 to below 180 degrees")
+    # Joints without limits take the room of a default box; endless ones a full turn.
     prismatic = np.array(robot.tree.prismatic)
     missing = np.isinf(robot.lower) | np.isinf(robot.upper)
     middle = robot.tree.centre_posture

@@ -104,11 +104,13 @@ class Relative:
         x, e, rates, changes = symbols = self._make_symbols("x", "e", "rates", "changes")
         turn, first = self.task.turn, self.first
         assert turn is not None
+        # The error as a quaternion step, and how the product turns.
         half, omega, alpha = (self._order.T @ part[first:] for part in (e / 2, rates, changes))
         step = ca.vertcat(ca.sqrt(ca.fmax(1 - ca.sumsqr(half), 0)), half)
         p = multiply_quaternions(self._compute_quaternion(x), step)
         dp = multiply_quaternions(p, ca.vertcat(0, omega)) / 2
         ddp = (multiply_quaternions(dp, ca.vertcat(0, omega)) + multiply_quaternions(p, ca.vertcat(0, alpha))) / 2
+        # The components of the product, and their derivatives along it.
         at = ca.SX.sym("p", 4)
         value = turn.of_quaternion(at)
         rate = ca.jtimes(value, at, dp)

@@ -61,6 +61,7 @@ def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> 
     if domain.draws_itself:
         return sample_uniform(domain, samples, seed)
     rng, n = _make_generator(domain, samples, seed), len(domain.centre)
+    # The generalised golden ratio, by fixed-point iteration.
     g = 1.5
     for _ in range(64):
         g = (1 + g) ** (1 / (n + 1))
@@ -94,6 +95,7 @@ def _keep_inside(domain: Domain, samples: int, draw: Callable[[int], Array]) -> 
     kept = [np.empty((0, len(domain.centre)))]
     drawn, count, size = 0, 0, samples
     while count < samples:
+        # Give up where next to no point of the box lies in the domain.
         if drawn >= RULES.tried and count < RULES.least_fraction * drawn:
             raise DomainError(
                 f"{count} of {drawn} points of its box lie in the domain, expected at least "

@@ -287,6 +287,7 @@ class Task(Shown, HoldsFunctions):
         q, k = ca.SX.sym("q", robot.n), "xyz".index(axis)
         place = target if isinstance(target, str) else freeze_array("target", target, (3,)).tolist()
         to = robot.frame_position(q, place) if isinstance(place, str) else ca.SX(place)
+        # The unit vector to the target in the axes of the camera, flattened by Lambert's map.
         u = robot.frame_rotation(q, camera).T @ (to - robot.frame_position(q, camera))
         u /= ca.norm_2(u)
         others = [i for i in range(3) if i != k]
@@ -371,6 +372,7 @@ class Task(Shown, HoldsFunctions):
             raise ShapeError(f"task '{name}'", x.shape, (None, 1))
         require_kind("labels", labels, Sequence)
         require_kind("units", units, Sequence)
+        # Names and units are free, but printable and one for each component.
         labels = tuple(str(label) for label in labels) or tuple(f"{name}[{i}]" for i in range(x.shape[0]))
         units = tuple(str(unit) for unit in units) or ("",) * x.shape[0]
         for argument, texts in (("labels", labels), ("units", units)):
@@ -516,6 +518,7 @@ class Task(Shown, HoldsFunctions):
         if self.turn is None and not self.parts:
             return self.jacobian_function
         q = ca.SX.sym("q", self.robot.n)
+        # Parts that repeat what another one says take the rows of their own frames.
         rows = [part._build_frame_rows(q, frames) for part, frames in _find_independent_frames(self.parts or (self,))]
         return dense_function("frame_jacobian", [q], [ca.cse(ca.vertcat(*rows))])
 
@@ -535,6 +538,7 @@ class Task(Shown, HoldsFunctions):
         """q, v, w (n, 1) -> d^2 h(q)[v, w] = (d/ds) J_x(q + s v) w, (m, 1)."""
         q, v, w = (ca.SX.sym(name, self.robot.n) for name in ("q", "v", "w"))
         if self._has_rotation_vector:
+            # d^2 x = d(w omega + v x omega), with the change of the quaternion along v.
             J, p, change = self.rates_function(q), self._build_quaternion(q), self.rates_derivative_function(q, v, w)
             along, there = (J[self.m - 3 :, :] @ rate for rate in (v, w))
             dp = multiply_quaternions(p, ca.vertcat(0, along)) / 2

@@ -81,6 +81,7 @@ def write_archive(
     """
     target = Path(path)
     require_free(target, kind, force)
+    # The header lists the checksum of every array, and has one of its own.
     entries = {f"{name}.npy": write_npy(array) for name, array in arrays.items()}
     full = {
         "format": kind.format,
@@ -94,6 +95,7 @@ def write_archive(
         raise kind.error(f"cannot write {target}: its header would hold NaN or infinity") from None
     entries = {_HEADER: text, _DIGEST: _compute_digest(text).encode(), **entries}
     try:
+        # The file is written beside its place, and moved there whole.
         with (
             publish(target.parent) as drafts,
             zipfile.ZipFile(drafts / target.name, "w", zipfile.ZIP_DEFLATED) as draft,
@@ -123,6 +125,7 @@ def read_archive(path: str | Path, kind: Kind) -> tuple[dict[str, Any], dict[str
     """
     source = Path(path)
     with open_archive(source, kind.name, kind.error) as zipped:
+        # Nothing is believed before format, version and checksum are right.
         text = zipped.read(_HEADER)
         header = _check_header(source, kind, text)
         if (

@@ -67,6 +67,7 @@ class Batched:
             how = ("thread", THREADS) if chunk == _LARGE and THREADS > 1 else ()
             with building:
                 self._mapped[chunk] = self.function.map(chunk, *how)
+        # Large sets run in threads of CasADi; small ones in buffers that each thread keeps.
         if chunk == _LARGE:
             return evaluate_columns(self._mapped[chunk], chunk, *arguments)
         if not hasattr(self._mine, "columns"):

@@ -100,6 +100,7 @@ def write_tape(function: ca.Function) -> Tape:
         operation = function.instruction_id(k)
         if operation not in _NAMES:
             raise OrthocasError(f"custom expression uses CasADi operation {operation}, which chart files cannot store")
+        # A step is its operation, the place of its result, and a number or places of operands.
         name, into, of = _NAMES[operation], function.instruction_output(k), function.instruction_input(k)
         if name == "const":
             steps.append([name, into[0], function.instruction_constant(k)])
@@ -225,6 +226,7 @@ def _combine_dependences(name: str, of: Sequence[tuple[Joints, Gradient]]) -> tu
         partials = values[::-1]
     elif name == "div":
         partials[0] = values[1]
+    # By the chain rule: what a partial derivative and the operand's own depend on.
     total: Gradient = {}
     for partial, (_, part) in zip(partials, of, strict=True):
         for j, own in part.items():
@@ -291,6 +293,7 @@ def compute_determinant(matrix: ca.SX) -> ca.SX:
     rows = require_count("rows of a determinant", matrix.shape[0], least=1, most=MOST_ROWS)
     if rows <= _BY_CASADI:
         return ca.det(matrix)
+    # From row to row, each minor is expanded along its last row.
     minors: dict[tuple[int, ...], ca.SX] = {(): ca.SX(1)}
     for k in range(rows):
         minors = {

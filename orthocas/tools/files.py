@@ -355,6 +355,7 @@ def _read_lines(path: Path, what: str) -> list[tuple[int, list[str]]]:
 
 def _parse_row(line: int, cells: Sequence[str], header: Sequence[str], chosen: Sequence[int]) -> list[float]:
     """The numbers of the chosen columns of a line."""
+    # Columns that nobody reads may hold anything, but none may be missing.
     if len(cells) != len(header):
         raise ValueError(f"line {line}: {len(cells)} numbers, expected {len(header)} as in the header")
     values = []
