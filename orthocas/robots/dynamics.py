@@ -33,7 +33,9 @@ class _Body:
     inertia: Any  #: (3, 3)
 
 
-def mass_matrix(tree: KinematicTree, q: ca.SX, payload: ca.SX | None = None, inertials: ca.SX | None = None) -> ca.SX:
+def build_mass_matrix(
+    tree: KinematicTree, q: ca.SX, payload: ca.SX | None = None, inertials: ca.SX | None = None
+) -> ca.SX:
     """M(q), (n, n), symmetric positive definite, [kg m^2] for revolute joints. The diagonal includes rotor inertias.
 
     A payload (10, 1) is mass, centre in the tip frame, and inertia about it: Ixx, Ixy, Ixz, Iyy, Iyz, Izz. Inertials
@@ -66,7 +68,7 @@ def mass_matrix(tree: KinematicTree, q: ca.SX, payload: ca.SX | None = None, ine
     return M
 
 
-def inverse_dynamics(
+def build_inverse_dynamics(
     tree: KinematicTree,
     q: ca.SX,
     dq: ca.SX,
@@ -100,7 +102,7 @@ def inverse_dynamics(
     return _sum_wrenches(tree, joints, bodies, states, accelerations) + ca.SX(ca.DM(tree.armatures)) * ddq
 
 
-def forward_dynamics(
+def build_forward_dynamics(
     tree: KinematicTree, q: ca.SX, dq: ca.SX, tau: ca.SX, gravity: Array, inertials: ca.SX | None = None
 ) -> ca.SX:
     """ddq = M^-1 (tau - C dq - g), (n, 1), with M = L^T D L, from the tips to the base.
@@ -108,13 +110,13 @@ def forward_dynamics(
     In this order L keeps the zeros of M between joints of different branches ([F2008] Sec. 6.5).
     """
     tips_first = list(reversed(range(tree.n)))
-    M = mass_matrix(tree, q, inertials=inertials)[tips_first, tips_first]
+    M = build_mass_matrix(tree, q, inertials=inertials)[tips_first, tips_first]
     D, LT, order = ca.ldl(M, False)
-    force = (tau - bias(tree, q, dq, gravity, inertials=inertials))[tips_first]
+    force = (tau - build_bias(tree, q, dq, gravity, inertials=inertials))[tips_first]
     return ca.ldl_solve(force, D, LT, order)[tips_first]
 
 
-def bias(
+def build_bias(
     tree: KinematicTree,
     q: ca.SX,
     dq: ca.SX,
@@ -123,27 +125,27 @@ def bias(
     inertials: ca.SX | None = None,
 ) -> ca.SX:
     """C(q, dq) dq + g(q), (n, 1)."""
-    return inverse_dynamics(tree, q, dq, ca.SX(tree.n, 1), gravity, payload, inertials)
+    return build_inverse_dynamics(tree, q, dq, ca.SX(tree.n, 1), gravity, payload, inertials)
 
 
-def zero_momentum(tree: KinematicTree, q: ca.SX) -> ca.SX:
+def build_zero_momentum(tree: KinematicTree, q: ca.SX) -> ca.SX:
     """H(q) = [-M_bb^-1 M_ba; I], (n, a), for a base b that floats and a joints of the arms."""
     k = len(tree.floating)
-    M = mass_matrix(tree, q)
-    # L of L^T D L is in the order of `forward_dynamics`.
+    M = build_mass_matrix(tree, q)
+    # L of L^T D L is in the order of `build_forward_dynamics`.
     base_first = list(reversed(range(k)))
     D, LT, order = ca.ldl(M[base_first, base_first], False)
     follows = ca.ldl_solve(M[base_first, k:], D, LT, order)[base_first, :]
     return ca.vertcat(-follows, ca.SX.eye(tree.n - k))
 
 
-def coriolis_product(tree: KinematicTree, q: ca.SX, v: ca.SX, w: ca.SX, payload: ca.SX | None = None) -> ca.SX:
+def build_coriolis_product(tree: KinematicTree, q: ca.SX, v: ca.SX, w: ca.SX, payload: ca.SX | None = None) -> ca.SX:
     """C(q, v) w with the Christoffel form of C, (n, 1), by polarisation of the quadratic form C(q, v) v.
 
     C(q, v) w = (c(v + w) - c(v - w)) / 4 with c(v) = C(q, v) v. It is bilinear and symmetric in (v, w).
     """
     weightless = np.zeros(3)
-    return (bias(tree, q, v + w, weightless, payload) - bias(tree, q, v - w, weightless, payload)) / 4
+    return (build_bias(tree, q, v + w, weightless, payload) - build_bias(tree, q, v - w, weightless, payload)) / 4
 
 
 @dataclass

@@ -54,7 +54,7 @@ def _move_to_child(tree: KinematicTree, q: ca.SX, i: int, pose: Pose) -> Pose:
     return R_joint @ turn(q[i]), p_joint
 
 
-def frame_pose(tree: KinematicTree, q: ca.SX, frame: Frame, base: Frame | None = None) -> Pose:
+def build_frame_pose(tree: KinematicTree, q: ca.SX, frame: Frame, base: Frame | None = None) -> Pose:
     """Rotation and position of a frame in the world, or in another frame, for q (n, 1).
 
     Joints that carry both frames take no part.
@@ -67,7 +67,7 @@ def frame_pose(tree: KinematicTree, q: ca.SX, frame: Frame, base: Frame | None =
     return across.T @ R, across.T @ (p - origin)
 
 
-def frame_jacobian(tree: KinematicTree, q: ca.SX, frame: Frame, base: Frame | None = None) -> ca.SX:
+def build_frame_jacobian(tree: KinematicTree, q: ca.SX, frame: Frame, base: Frame | None = None) -> ca.SX:
     """Geometric Jacobian of a frame, (6, n), in axes of the world, or of another frame and as seen from it.
 
     d(position)/dt = J[:3] dq, angular velocity = J[3:] dq.
@@ -82,7 +82,7 @@ def frame_jacobian(tree: KinematicTree, q: ca.SX, frame: Frame, base: Frame | No
     return ca.vertcat(across.T @ J[:3, :], across.T @ J[3:, :])
 
 
-def centre_of_mass(tree: KinematicTree, q: ca.SX) -> ca.SX:
+def build_centre_of_mass(tree: KinematicTree, q: ca.SX) -> ca.SX:
     """Centre of mass of all bodies that joints move, in the world, (3, 1)."""
     places = [p + R @ constant(centre) for (R, p), centre in zip(build_body_poses(tree, q), tree.centres, strict=True)]
     total: ca.SX = sum(mass * place for mass, place in zip(tree.masses, places, strict=True)) / tree.masses.sum()
@@ -116,22 +116,22 @@ def _build_jacobian(tree: KinematicTree, q: ca.SX, carrier: int, point: ca.SX, s
     return J
 
 
-def tip_pose(tree: KinematicTree, q: ca.SX) -> Pose:
+def build_tip_pose(tree: KinematicTree, q: ca.SX) -> Pose:
     """Rotation and position of the tip frame in the world, for q (n, 1)."""
-    return frame_pose(tree, q, tree.tip)
+    return build_frame_pose(tree, q, tree.tip)
 
 
-def tip_jacobian(tree: KinematicTree, q: ca.SX) -> ca.SX:
+def build_tip_jacobian(tree: KinematicTree, q: ca.SX) -> ca.SX:
     """Geometric Jacobian of the tip in world axes, (6, n): d(position)/dt = J[:3] dq, angular velocity = J[3:] dq."""
-    return frame_jacobian(tree, q, tree.tip)
+    return build_frame_jacobian(tree, q, tree.tip)
 
 
-def point_jacobian(tree: KinematicTree, q: ca.SX, body: int, point: Array) -> ca.SX:
+def build_point_jacobian(tree: KinematicTree, q: ca.SX, body: int, point: Array) -> ca.SX:
     """Jacobian (3, n) of a point (3,) [m] that is fixed in a body's frame: d(position in the world)/dt = J dq."""
-    return frame_jacobian(tree, q, Frame("point", body, np.eye(3), point))[:3, :]
+    return build_frame_jacobian(tree, q, Frame("point", body, np.eye(3), point))[:3, :]
 
 
-def joint_points(tree: KinematicTree, q: ca.SX) -> ca.SX:
+def build_joint_points(tree: KinematicTree, q: ca.SX) -> ca.SX:
     """Base, origins of the joints that move the tip, and the tip, (3, points), in the world: a line to draw.
 
     With further tips, the line goes to these first, and back along their joints.
@@ -145,7 +145,7 @@ def joint_points(tree: KinematicTree, q: ca.SX) -> ca.SX:
         shared = len(here) - len(back)
         points += [poses[body][1] for body in [*reversed(back), *here[shared - 1 : shared]]]
         points += [poses[body][1] for body in chain[shared:]]
-        points.append(frame_pose(tree, q, frame)[1])
+        points.append(build_frame_pose(tree, q, frame)[1])
         here = chain
     return ca.horzcat(*points)
 

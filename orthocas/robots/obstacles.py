@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError
-from orthocas.robots.kinematics import build_body_poses, frame_pose
+from orthocas.robots.kinematics import build_body_poses, build_frame_pose
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import BASE_JOINTS
 from orthocas.tools.batch import Batched, dense_function
@@ -261,7 +261,11 @@ class LinkDistances:
                 # Nothing solid joins the world and a base that moves.
                 if tree.joint_names[end] not in BASE_JOINTS:
                     ends[start, end] = max(start, way[0]), origins[start], origins[end]
-            ends[frame.parent, frame.name] = frame.parent, origins[frame.parent], frame_pose(tree, self._q, frame)[1]
+            ends[frame.parent, frame.name] = (
+                frame.parent,
+                origins[frame.parent],
+                build_frame_pose(tree, self._q, frame)[1],
+            )
         links = list(ends.values())
         points = Batched(dense_function("ends", [self._q], [ca.vertcat(*(ca.vertcat(*link[1:]) for link in links))]))
         seen = points(np.random.default_rng(0).uniform(-1, 1, (RULES.postures, tree.n)))[0].reshape(

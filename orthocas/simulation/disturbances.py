@@ -13,7 +13,7 @@ from orthocas.charts.chart import Chart
 from orthocas.control.gains import non_negative_gains, positive_gains
 from orthocas.control.reference import DAMPING_RATIO, NATURAL_FREQUENCY, Reference
 from orthocas.errors import InvalidValueError, OrthocasError, StepsFileError
-from orthocas.robots.kinematics import point_jacobian
+from orthocas.robots.kinematics import build_point_jacobian
 from orthocas.robots.tree import KinematicTree
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, freeze_array, require_count, require_known, require_shape
@@ -244,7 +244,7 @@ class Loads:
         """J^T f at every place, plus the torque of the joints, (n, 1), for a row (3 P + n, 1)."""
         torque = row[3 * len(self.places) :]
         for k, place in enumerate(self.places):
-            torque += point_jacobian(self._tree, q, place.body, np.array(place.point)).T @ row[3 * k : 3 * k + 3]
+            torque += build_point_jacobian(self._tree, q, place.body, np.array(place.point)).T @ row[3 * k : 3 * k + 3]
         return torque
 
     @cached_property

@@ -85,7 +85,7 @@ class ClosedLoop:
             torque -= self.friction.torque(dq, numbers[: 2 * n])
         inertials = numbers[2 * n :] if self.rubs else numbers
         tree = self.plant.tree
-        ddq = dynamics.forward_dynamics(tree, q, dq, torque, tree.gravity, inertials)
+        ddq = dynamics.build_forward_dynamics(tree, q, dq, torque, tree.gravity, inertials)
         return ca.Function("plant", [ca.vertcat(q, dq), command, load, numbers], [ca.vertcat(dq, ddq)])
 
     @property

@@ -16,7 +16,7 @@ import pinocchio as pin
 import scipy
 
 from orthocas.errors import RobotError
-from orthocas.robots.kinematics import build_body_poses, tip_pose
+from orthocas.robots.kinematics import build_body_poses, build_tip_pose
 from orthocas.robots.pinocchio_model import find_axis, find_frame, lock_joints, lock_off_chain
 from orthocas.robots.robot import Robot
 from orthocas.robots.spatial import rotate_z_to
@@ -346,7 +346,7 @@ class BodyPoses:
     def __init__(self, tree: KinematicTree) -> None:
         q = ca.SX.sym("q", tree.n)
         base = (ca.SX.eye(3), ca.SX.zeros(3))
-        poses = [base, *build_body_poses(tree, q), tip_pose(tree, q)]
+        poses = [base, *build_body_poses(tree, q), build_tip_pose(tree, q)]
         self._batched = Batched(dense_function("poses", [q], [ca.horzcat(*(ca.horzcat(R, p) for R, p in poses))]))
 
     def __call__(self, q: Array) -> tuple[Array, Array]:
