@@ -213,8 +213,8 @@ def _solve_kernel(task: TaylorModel, m: int) -> TaylorModel:
             task = task[1:, 1:] - (task[1:, 0] * inverses[-1][None])[:, None] * task[0, 1:][None]
     solution: list[TaylorModel] = []
     for row, inverse in zip(rows[::-1], inverses[::-1], strict=True):
-        known = len(solution)
-        total = _sum_models([row[known:], *(row[k, None] * solution[k] for k in range(known))])
+        count = len(solution)
+        total = _sum_models([row[count:], *(row[k, None] * solution[k] for k in range(count))])
         solution.insert(0, -(total * inverse[None]))
     return stack(solution)
 
@@ -246,8 +246,8 @@ def compute_influences(turned: TaylorModel) -> Array:
 
 def find_most_influential(influences: Array, joints: Variables) -> Array:
     """The joint of the largest influence on each box, (boxes,); `UNKNOWN` where they are not finite."""
-    known = np.isfinite(influences).all(axis=1)
-    return np.where(known, np.array(joints)[np.argmax(np.nan_to_num(influences), axis=1)], UNKNOWN)
+    finite = np.isfinite(influences).all(axis=1)
+    return np.where(finite, np.array(joints)[np.argmax(np.nan_to_num(influences), axis=1)], UNKNOWN)
 
 
 def select_boxes(J: TaylorModel, boxes: slice | NDArray[np.bool_]) -> TaylorModel:

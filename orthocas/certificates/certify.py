@@ -393,7 +393,7 @@ def _build_certificate(
     fold = tuple(tuple(point.tolist()) for point in search.signs.values()) if search.folded else ()
     # What an earlier search took and found counts as well.
     before = (0, 0.0) if resume is None else (resume.boxes, resume.seconds)
-    known = (
+    conditioning = (
         search.conditioning
         if resume is None or not resume.conditioning
         else min(search.conditioning, resume.conditioning)
@@ -404,7 +404,7 @@ def _build_certificate(
         method,
         bound,
         parts,
-        known * (1 - 1e-9) if bound > 0 and np.isfinite(known) else 0.0,
+        conditioning * (1 - 1e-9) if bound > 0 and np.isfinite(conditioning) else 0.0,
         injective,
         fold,
         before[0] + search.evaluated,
@@ -458,18 +458,18 @@ def _report_search(monitor: Monitor, stage: str, *, guarded: bool = False) -> Lo
     return show
 
 
-def _check_regular(certificate: Certificate, found: list[BoxResults]) -> bool:
+def _check_regular(certificate: Certificate, parts: list[BoxResults]) -> bool:
     """Whether the parts are proved, with one sign unless the chart folds, and the conditioning is what it says."""
-    signs = {int(sign) for results in found for sign in np.unique(results.sign) if sign}
-    least = min((float(results.conditioning.min()) for results in found), default=0.0)
-    proved = all(results.proved.all() for results in found)
+    signs = {int(sign) for results in parts for sign in np.unique(results.sign) if sign}
+    least = min((float(results.conditioning.min()) for results in parts), default=0.0)
+    proved = all(results.proved.all() for results in parts)
     return proved and (len(signs) < 2 or bool(certificate.fold)) and least >= certificate.conditioning
 
 
 def _check_fold(chart: Chart, check: BoxCheck, points: Array) -> bool:
     """Whether det J is proved to have opposite signs at two points (2, n) of the domain."""
-    found = check(points, points)
-    return bool(contains(chart.problem.domain, points).all() and found.regular.all() and found.sign.prod() < 0)
+    results = check(points, points)
+    return bool(contains(chart.problem.domain, points).all() and results.regular.all() and results.sign.prod() < 0)
 
 
 def _is_around_centre(certificate: Certificate, box: Subdivision) -> bool:

@@ -105,14 +105,16 @@ class WaveSeries:
         """Expansions of all sums, (sums, monomials, boxes), for boxes of given centres and half-widths (n, boxes)."""
         (sine, error), (cosine, _) = evaluate_sine_cosine(self.frequencies @ centre)
         values = np.concatenate([cosine, sine])
-        found = (self.table @ values).reshape(len(self.sizes), -1, centre.shape[1]) * build_power_table(half, DEGREE)
+        coefficients = (self.table @ values).reshape(len(self.sizes), -1, centre.shape[1]) * build_power_table(
+            half, DEGREE
+        )
         # |k . h|.
         turns = np.abs(self.frequencies) @ half * UP
         phases = sum_error(len(centre)) * (np.abs(self.frequencies).max(axis=0, initial=0) @ np.abs(centre))
         relative = 2 * (sum_error(len(values) + RULES.roundings) + error.max(axis=0, initial=0) + phases) * UP
-        known = sum(turns**d / factorial(d) for d in range(DEGREE + 1))
-        rest = self.sizes @ (turns ** (DEGREE + 1) / factorial(DEGREE + 1) + relative * known)
-        return found, rest * compute_margin(len(self.frequencies)) + self.errors[:, None] + TINY
+        truncated = sum(turns**d / factorial(d) for d in range(DEGREE + 1))
+        rest = self.sizes @ (turns ** (DEGREE + 1) / factorial(DEGREE + 1) + relative * truncated)
+        return coefficients, rest * compute_margin(len(self.frequencies)) + self.errors[:, None] + TINY
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -153,10 +155,10 @@ class PolynomialSeries:
         """Expansions of all polynomials, (polynomials, monomials, boxes)."""
         u, h = ((centre.T - self.centre) / self.scale).T, (half.T / self.scale).T
         terms = build_power_table(u, self.degree)
-        found = (self.table @ terms).reshape(len(self.sizes), *terms.shape)
+        coefficients = (self.table @ terms).reshape(len(self.sizes), *terms.shape)
         reach = np.maximum(1.0, (np.abs(u) + h).max(axis=0, initial=0)) ** self.degree * UP
         rounding = sum_error(self.table.shape[1] + RULES.roundings) * self.sizes
-        return found * build_power_table(h, self.degree), (self.errors + rounding)[:, None] * reach * UP + TINY
+        return coefficients * build_power_table(h, self.degree), (self.errors + rounding)[:, None] * reach * UP + TINY
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -204,11 +206,11 @@ class Determinant:
         middle = ((low + high) / 2)[:, chosen].T
         half = np.nextafter(np.maximum(high[:, chosen].T - middle, middle - low[:, chosen].T), np.inf) + TINY
         (A, rest_a), (B, rest_b) = self.slopes(middle, half), self.cofactors(middle, half)
-        found, rest = _multiply_expansions(A, B[:-1], self.slopes.degree, len(chosen))
+        products, rest = _multiply_expansions(A, B[:-1], self.slopes.degree, len(chosen))
         total_a, total_b = (np.abs(part).sum(axis=1) for part in (A, B[:-1]))
         carried = rest_a * (total_b + rest_b[:-1]) + total_a * rest_b[:-1] + rest
         carried += sum_error(_SPLITS * len(A)) * total_a * total_b
-        coefficients = found + B[-1]
+        coefficients = products + B[-1]
         unknown = carried.sum(axis=0) + rest_b[-1] + UNIT * np.abs(coefficients).sum(axis=0)
         return coefficients, unknown * compute_margin(A.shape[1] + len(coefficients)) + TINY
 
@@ -269,15 +271,15 @@ def _plan_products(n: int, degree: int) -> tuple[tuple[bool, int, slice, NDArray
     every = list_indices(n, max(DEGREE, degree))
     place = {m: k for k, m in enumerate(every)}
     starts = [len(list_indices(n, d - 1)) if d else 0 for d in range(max(DEGREE, degree) + 2)]
-    found = []
+    plan = []
     for k, one in enumerate(every):
         own = len(one)
         for of_a, least, most in ((True, own, DEGREE - own), (False, own + 1, min(degree, DEGREE - own))):
             if least <= most and (not of_a or own <= degree):
                 others = slice(starts[least], starts[most + 1])
                 where = np.array([place[tuple(sorted(one + other))] for other in every[others]])
-                found.append((of_a, k, others, where))
-    return tuple(found)
+                plan.append((of_a, k, others, where))
+    return tuple(plan)
 
 
 def _multiply_expansions(A: Array, B: Array, degree: int, n: int) -> Expansion:
@@ -365,8 +367,8 @@ def compute_gains(coefficients: Array, rest: Array, n: int) -> Array:
     sizes, taken = np.abs(coefficients), _weigh_halving(n)
     highest = len(list_indices(n, DEGREE - 1))
     last = taken[:, highest:] @ sizes[highest:]
-    found: Array = taken @ sizes + last / (last.sum(axis=0) + TINY) * rest
-    return found.T
+    gains: Array = taken @ sizes + last / (last.sum(axis=0) + TINY) * rest
+    return gains.T
 
 
 @cache

@@ -80,11 +80,11 @@ class TaylorGraph:
                 return _Jet(TaylorModel.constant(np.array([float(of)])), {})
             return _Jet(inputs[of], {of: _build_one()} if of in moving else {})
 
-        found = evaluate_tape(self.tape, leaf, _apply_step)
+        jets = evaluate_tape(self.tape, leaf, _apply_step)
         if self.joints is None:
-            return [_get_value(jet) for jet in found]
+            return [_get_value(jet) for jet in jets]
         none = TaylorModel.constant(np.zeros(1))
-        return [jet.slopes.get(joint, none) for joint in self.joints for jet in found]
+        return [jet.slopes.get(joint, none) for joint in self.joints for jet in jets]
 
 
 def is_whole(value: float | None) -> bool:
@@ -199,8 +199,8 @@ def _require_bounds(tape: Tape, what: str, values: bool) -> None:
         bounded = name in UNARY or name in BINARY or name in POWERS
         return _Step(bounded and all(operand.known for operand in of), any(operand.moving for operand in of))
 
-    found = evaluate_tape(tape, lambda name, of: _Step(True, name == "input", of if name == "const" else None), step)
-    if values and not all(output.known for output in found):
+    outputs = evaluate_tape(tape, lambda name, of: _Step(True, name == "input", of if name == "const" else None), step)
+    if values and not all(output.known for output in outputs):
         raise CertifyError(unknown)
 
 

@@ -147,9 +147,9 @@ def _compute_factorials(n: int, order: int) -> Array:
 def compute_powers(widths: Array, order: int) -> Array:
     """r^a / a! for all multi-indices of an order, (multi-indices, boxes), for half-widths r (n, boxes)."""
     n = len(widths)
-    found = np.ones((1, widths.shape[1]))
+    powers = np.ones((1, widths.shape[1]))
     for k in range(1, order + 1):
         before, last = _find_prefixes(n, k)
-        found = found[before] * widths[last]
-    scaled: Array = found / _compute_factorials(n, order)[:, None]
+        powers = powers[before] * widths[last]
+    scaled: Array = powers / _compute_factorials(n, order)[:, None]
     return scaled

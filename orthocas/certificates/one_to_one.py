@@ -75,11 +75,11 @@ class OneToOneCheck:
 
     def __call__(self, low: Array, high: Array) -> BoxResults:
         """Evaluate boxes between corners (boxes, n)."""
-        found = []
+        parts = []
         with one_blas_thread(), np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             for k in range(0, len(low), _AT_ONCE):
-                found.append(self._check_few(low[k : k + _AT_ONCE], high[k : k + _AT_ONCE]))
-        return _join_results(found)
+                parts.append(self._check_few(low[k : k + _AT_ONCE], high[k : k + _AT_ONCE]))
+        return _join_results(parts)
 
     def _check_few(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array]:
         q, around = (low + high).T / 2, self._build_around(low, high)
@@ -103,9 +103,9 @@ class OneToOneCheck:
         model, terms = jets.average(around, self.active)
         left, right = find_singular_vectors(model)
         turned = multiply_between(left, model, right)
-        known = replace(turned, remainder=(turned.remainder + _spread(left, terms, right)) * UP)
+        narrow = replace(turned, remainder=(turned.remainder + _spread(left, terms, right)) * UP)
         rest = (np.abs(left) @ jets.rest.transpose(2, 0, 1) @ np.abs(right)).transpose(1, 2, 0) * UP
-        all_ = replace(known, remainder=(known.remainder + rest) * UP)
+        all_ = replace(narrow, remainder=(narrow.remainder + rest) * UP)
         sound = is_orthogonal(left) & is_orthogonal(right)
         # Halving joints that stand still is of no use.
         gains = compute_influences(all_)
@@ -113,7 +113,7 @@ class OneToOneCheck:
         proved = have_positive_pivots(compute_pivots(all_)) & sound
         promising = ~proved & sound
         if around.order < ORDERS[-1] and promising.any():
-            promising[promising] = have_positive_pivots(compute_pivots(select_boxes(known, promising)))
+            promising[promising] = have_positive_pivots(compute_pivots(select_boxes(narrow, promising)))
         return proved, find_most_influential(gains, self.active), promising
 
     def _build_around(self, low: Array, high: Array) -> Around:
@@ -170,11 +170,11 @@ class ConvexCheck:
 
     def __call__(self, low: Array, high: Array) -> BoxResults:
         """Evaluate boxes between corners (boxes, n)."""
-        found = []
+        parts = []
         with one_blas_thread(), np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             for k in range(0, len(low), _AT_ONCE):
-                found.append(self._check_few(self.rows(low[k : k + _AT_ONCE], high[k : k + _AT_ONCE])))
-        return _join_results(found)
+                parts.append(self._check_few(self.rows(low[k : k + _AT_ONCE], high[k : k + _AT_ONCE])))
+        return _join_results(parts)
 
     def _check_few(self, J: TaylorModel) -> tuple[NDArray[np.bool_], Array]:
         boxes = J.remainder.shape[-1]
@@ -204,11 +204,11 @@ def choose_one_to_one_check(chart: Chart, rows: ChartRows, base: Subdivision) ->
     or stand for those at another heading of a moving base.
     """
     tip, tree, active = TipRows.build(chart.problem.task), chart.problem.robot.tree, rows.active
-    coordinates, known = chart.coordinates, isinstance(rows.coordinates, ProductRows | None)
+    coordinates, closed_form = chart.coordinates, isinstance(rows.coordinates, ProductRows | None)
     if rows.base or {*rows.variables} - {*active} or _has_jumps(chart, rows):
         return None
     # Rows without derivatives in closed form have the convex check.
-    if tip is None or not known:
+    if tip is None or not closed_form:
         true = replace(rows, task=build_true_gradients(chart.problem.task, active)[0])
         centre = chart.problem.domain.centre[None]
         inverse = np.asarray(np.linalg.pinv(true(centre, centre).centre[:, :, 0]), dtype=float)
@@ -235,8 +235,8 @@ def _has_angle(rows: CoordinateRows | None) -> bool:
     return isinstance(rows, GraphRows) and any(step[0] == "atan2" for step in rows.graph.tape["steps"])
 
 
-def _join_results(found: list[tuple[NDArray[np.bool_], Array]]) -> BoxResults:
-    proved, widest = (np.concatenate(each) for each in zip(*found, strict=True))
+def _join_results(parts: list[tuple[NDArray[np.bool_], Array]]) -> BoxResults:
+    proved, widest = (np.concatenate(each) for each in zip(*parts, strict=True))
     nothing = np.zeros(len(proved))
     return BoxResults(proved, proved, nothing, nothing, widest)
 
@@ -346,11 +346,11 @@ def _rotate_about_z(angles: Array) -> Array:
 
 def _nest_products(axes: Array, first: Array, highest: int) -> list[Array]:
     """a_i x (a_j x ... first_l) for multi-indices i <= j <= ... <= l from order 1 on, (multi-indices, 3, boxes)."""
-    found = [first]
+    nested = [first]
     for order in range(2, highest + 2):
         outer, inner = _split(len(axes), order)
-        found.append(np.cross(axes[outer], found[-1][inner], axis=1))
-    return found
+        nested.append(np.cross(axes[outer], nested[-1][inner], axis=1))
+    return nested
 
 
 def _nest_rotations(axes: Array, highest: int) -> list[Array]:
@@ -360,14 +360,14 @@ def _nest_rotations(axes: Array, highest: int) -> list[Array]:
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         crosses[:, j, i], crosses[:, i, j] = axes[:, k], -axes[:, k]
-    found, product = [], crosses
+    nested, product = [], crosses
     for order in range(1, highest + 2):
         if order > 1:
             outer, inner = _split(n, order)
             product = np.einsum("mijb,mjkb->mikb", crosses[outer], product[inner])
         skew = [(product[:, (k + 2) % 3, (k + 1) % 3] - product[:, (k + 1) % 3, (k + 2) % 3]) / 2 for k in range(3)]
-        found.append(np.stack(skew, axis=1))
-    return found
+        nested.append(np.stack(skew, axis=1))
+    return nested
 
 
 def _split(n: int, order: int) -> tuple[Array, Array]:

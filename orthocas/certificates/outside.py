@@ -68,11 +68,11 @@ def require_all_positions(chart: Chart, variables: Collection[int]) -> None:
     problem = chart.problem
     # Joints without bounds on which the proof depends must repeat after a turn.
     endless = np.flatnonzero(np.isinf(bounds_of(problem.domain)[1])).tolist()
-    asked = [joint for joint in endless if joint in variables]
-    if not asked:
+    endless_variables = [joint for joint in endless if joint in variables]
+    if not endless_variables:
         return
     alike = _find_periodic_joints(chart)
-    for joint in asked:
+    for joint in endless_variables:
         name = problem.robot.joint_names[joint]
         if problem.robot.tree.prismatic[joint] or problem.domain.half_width[joint] < np.pi:
             raise CertifyError(f"joint '{name}' is unbounded and J depends on it, expected bounds, or a full turn")
@@ -190,18 +190,18 @@ class OutsideCheck:
 
     def __call__(self, low: Array, high: Array) -> BoxResults:
         """Evaluate boxes between corners (boxes, n)."""
-        found = self.inside(low, high)
-        own = found.proved & (found.sign == self.sign)
+        inside = self.inside(low, high)
+        own = inside.proved & (inside.sign == self.sign)
         # Singular values are needed at the centres of boxes that are not proved.
         values = np.full(len(low), np.inf)
         if not own.all():
             values[~own] = self.domain.singular_values((low + high)[~own] / 2)
-        near, widest = self._select_promising(values, low, high), self._avoid_slivers(values, low, high, found.widest)
+        near, widest = self._select_promising(values, low, high), self._avoid_slivers(values, low, high, inside.widest)
         outside = np.zeros(len(low), dtype=bool)
         if near.any():
             with one_blas_thread():
                 outside[near], widest[near] = self.check_outside(low[near], high[near])
-        regular, sign = found.regular & ~outside, np.where(outside, 0, found.sign)
+        regular, sign = inside.regular & ~outside, np.where(outside, 0, inside.sign)
         if self.guarded:
             widest[regular & ~own & (values > self.domain.least_singular_value)] = NEVER
             regular, sign = regular & (sign == self.sign), np.where(sign == self.sign, sign, 0)
@@ -209,7 +209,7 @@ class OutsideCheck:
             proved=own | outside,
             regular=regular,
             sign=sign,
-            conditioning=np.where(outside, np.inf, found.conditioning),
+            conditioning=np.where(outside, np.inf, inside.conditioning),
             widest=widest,
         )
 
@@ -222,8 +222,8 @@ class OutsideCheck:
         """The joint to halve: of thin boxes with a centre outside the widest one, so that they become worth a try."""
         joints = np.array(self.joints)
         half = (high - low)[:, joints] / 2
-        known = np.maximum(widest, 0)
-        thin = (high - low)[np.arange(len(low)), known] / 2 < RULES.thin * half.max(axis=1)
+        joint = np.maximum(widest, 0)
+        thin = (high - low)[np.arange(len(low)), joint] / 2 < RULES.thin * half.max(axis=1)
         thin &= (values < self.domain.least_singular_value) & (widest >= 0)
         return np.where(thin, joints[half.argmax(axis=1)], widest)
 
@@ -284,14 +284,14 @@ class CorridorCheck:
         middle, half = (low + high) / 2, (high - low) / 2
         distance: Any = np.sqrt(self.domain.squared_distance(middle))
         outside = distance > 1 + RULES.rounding + self.domain.lengths(half)
-        found = self.inside(low, high)
+        inside = self.inside(low, high)
         return BoxResults(
-            proved=(found.proved & (found.sign == self.sign)) | outside,
+            proved=(inside.proved & (inside.sign == self.sign)) | outside,
             # Only these signs are of the corridor.
-            regular=found.regular & (distance <= 1),
-            sign=np.where(outside, 0, found.sign),
-            conditioning=np.where(outside, np.inf, found.conditioning),
-            widest=found.widest,
+            regular=inside.regular & (distance <= 1),
+            sign=np.where(outside, 0, inside.sign),
+            conditioning=np.where(outside, np.inf, inside.conditioning),
+            widest=inside.widest,
         )
 
 

@@ -196,8 +196,8 @@ def build_true_gradients(task: Task, joints: Sequence[int]) -> tuple[GraphRows, 
 def _build_derivatives(function: ca.Function, joints: Sequence[int], what: str) -> tuple[GraphRows, set[int]]:
     """Columns of the Jacobian of a function of q, and the inputs that they depend on."""
     graph = TaylorGraph.build(function, what, joints)
-    known = find_gradient_dependences(graph.tape)
-    return GraphRows(graph, len(known)), {k for row in known for j in joints for k in row.get(j, ())}
+    gradients = find_gradient_dependences(graph.tape)
+    return GraphRows(graph, len(gradients)), {k for row in gradients for j in joints for k in row.get(j, ())}
 
 
 def build_joint_models(low: Array, high: Array, variables: Variables) -> tuple[list[TaylorModel], Array]:
@@ -233,8 +233,8 @@ def _build_coordinate_rows(coordinates: Coordinates) -> tuple[CoordinateRows | N
     function = dense_function("xi", [own], [xi])
     if function.n_instructions() * len(active) > _MOST_STEPS:
         raise CertifyError(f"{coordinates.label} coordinates take too many operations, expected at most {_MOST_STEPS}")
-    found, depends = _build_derivatives(function, range(len(active)), "the coordinates")
-    return found, {active[i] for i in depends}
+    graph_rows, depends = _build_derivatives(function, range(len(active)), "the coordinates")
+    return graph_rows, {active[i] for i in depends}
 
 
 @dataclass(frozen=True)
@@ -400,9 +400,9 @@ class ProductRows:
         values, errors = self._evaluate_basis(self.functions(points))
         parts, left_out = [], np.zeros((self.r, len(boxes), half_widths.shape[1]))
         for order in range(1, DEGREE + 2):
-            found, doubt = self._evaluate_derivatives(order, values, errors)
+            derivatives, doubt = self._evaluate_derivatives(order, values, errors)
             weights = compute_powers(half_widths, order - 1)
-            coefficients = found * weights
+            coefficients = derivatives * weights
             left_out += (doubt * weights + sum_error(DEGREE + 2) * np.abs(coefficients)).sum(axis=2)
             parts.append(coefficients)
         left_out += (self._bound_derivatives(DEGREE + 2, boxes) * compute_powers(half_widths, DEGREE + 1)).sum(axis=2)
@@ -433,9 +433,9 @@ class ProductRows:
     def _evaluate_derivatives(self, order: int, values: Array, errors: Array) -> tuple[Array, Array]:
         """Those of J_xi at points, of one order less, and bounds of their errors."""
         one = self.orders[order - 1]
-        found = one.table @ values[one.used]
+        derivatives = one.table @ values[one.used]
         doubt = one.sizes @ (errors[one.used] + one.rounding * np.abs(values[one.used]))
-        return self._spread(found, order), self._spread(doubt * compute_margin(len(one.used)), order)
+        return self._spread(derivatives, order), self._spread(doubt * compute_margin(len(one.used)), order)
 
     def _bound_derivatives(self, order: int, boxes: list[TaylorModel]) -> Array:
         """Bounds of the derivatives of J_xi of one order less on boxes, (r, n, multi-indices, boxes)."""
@@ -447,10 +447,12 @@ class ProductRows:
             highest = np.ones((len(last.used), boxes[0].remainder.shape[-1]))
         return self._spread(last.sizes @ highest * (1 + last.rounding) * compute_margin(len(last.used)), order)
 
-    def _spread(self, found: Array, order: int) -> Array:
+    def _spread(self, derivatives: Array, order: int) -> Array:
         """Derivatives by multi-index as those of J_xi: (r, n, multi-indices of one order less, boxes)."""
         n = self.terms.shape[1]
-        values: Array = found.reshape(-1, self.r, found.shape[1])[find_neighbours(n, order)].transpose(2, 0, 1, 3)
+        values: Array = derivatives.reshape(-1, self.r, derivatives.shape[1])[find_neighbours(n, order)].transpose(
+            2, 0, 1, 3
+        )
         return values
 
     def _evaluate_basis(self, functions: list[TaylorModel]) -> tuple[Array, Array]:

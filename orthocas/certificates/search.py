@@ -103,8 +103,8 @@ class Search:
 
     def visit(self, points: Array) -> None:
         """Note the signs of det J at points (k, n), where they are proved."""
-        found = self.check(points, points)
-        for point, regular, sign in zip(points, found.regular, found.sign.tolist(), strict=True):
+        results = self.check(points, points)
+        for point, regular, sign in zip(points, results.regular, results.sign.tolist(), strict=True):
             if regular and sign:
                 self.signs.setdefault(int(sign), point)
 

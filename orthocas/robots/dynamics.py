@@ -313,13 +313,13 @@ def check_payload(name: str, value: ArrayLike) -> Array:
     Raises:
         InvalidValueError: for another form, a negative mass, or an inertia that no body has.
     """
-    given = np.atleast_1d(as_float_array(name, value))
-    if given.shape not in ((1,), (4,), (PAYLOAD,)):
-        raise InvalidValueError(f"shape of {name}", given.shape, _FORMS)
-    require_finite(name, given)
+    values = np.atleast_1d(as_float_array(name, value))
+    if values.shape not in ((1,), (4,), (PAYLOAD,)):
+        raise InvalidValueError(f"shape of {name}", values.shape, _FORMS)
+    require_finite(name, values)
     # Missing numbers are 0: a point mass at the tip, or one elsewhere.
     numbers = np.zeros(PAYLOAD)
-    numbers[: len(given)] = given
+    numbers[: len(values)] = values
     if numbers[0] < 0:
         raise InvalidValueError(f"mass of {name}", numbers[0], "a mass >= 0")
     inertia = numbers[4:][_MATRIX].reshape(3, 3)

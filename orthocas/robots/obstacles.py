@@ -121,11 +121,11 @@ class Plane:
     point: Array
 
     def __init__(self, normal: ArrayLike, point: ArrayLike) -> None:
-        given = freeze_array("normal", normal, (3,))
-        length = float(np.linalg.norm(given))
+        direction = freeze_array("normal", normal, (3,))
+        length = float(np.linalg.norm(direction))
         if not 1e-9 < length < np.inf:
-            raise InvalidValueError("normal", given.tolist(), "a direction, of a length above 1e-9")
-        object.__setattr__(self, "normal", freeze_array("normal", given / length, (3,)))
+            raise InvalidValueError("normal", direction.tolist(), "a direction, of a length above 1e-9")
+        object.__setattr__(self, "normal", freeze_array("normal", direction / length, (3,)))
         object.__setattr__(self, "point", freeze_array("point", point, (3,)))
 
     @property
@@ -210,12 +210,12 @@ class LinkDistances:
             if isinstance(obstacle, type) or not isinstance(obstacle, Obstacle):
                 raise InvalidValueError(f"obstacles[{k}]", f"a {type(obstacle).__name__}", "a Sphere, Capsule or Plane")
         # One radius for all links, or one for each.
-        given = as_float_array("radius", radius)
-        if given.shape not in ((), (robot.n,)):
-            raise InvalidValueError("radius", f"an array of shape {given.shape}", f"one number, or {robot.n}")
-        radii = np.broadcast_to(given, (robot.n,))
+        sizes = as_float_array("radius", radius)
+        if sizes.shape not in ((), (robot.n,)):
+            raise InvalidValueError("radius", f"an array of shape {sizes.shape}", f"one number, or {robot.n}")
+        radii = np.broadcast_to(sizes, (robot.n,))
         if not ((radii >= 0) & (radii < RULES.farthest)).all():
-            raise InvalidValueError("radius", given.tolist(), "lengths >= 0 [m]")
+            raise InvalidValueError("radius", sizes.tolist(), "lengths >= 0 [m]")
         object.__setattr__(self, "robot", robot)
         object.__setattr__(self, "obstacles", tuple(obstacles))
         object.__setattr__(self, "radii", tuple(radii.tolist()))

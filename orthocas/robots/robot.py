@@ -211,8 +211,8 @@ class Robot(Shown):
         Raises:
             ShapeError, InvalidValueError: if the factors are invalid.
         """
-        given = as_float_array("factor", factor)
-        factors = freeze_array("factor", np.full(self.n, given) if given.ndim == 0 else given, (self.n,))
+        values = as_float_array("factor", factor)
+        factors = freeze_array("factor", np.full(self.n, values) if values.ndim == 0 else values, (self.n,))
         if factors.min() <= 0:
             raise InvalidValueError("factor", factors.min(), "numbers > 0")
         masses, inertias = self.tree.masses * factors, self.tree.inertias * factors[:, None, None]
@@ -258,10 +258,10 @@ class Robot(Shown):
             >>> robot.with_gravity([0.0, -1.62, 0.0]).gravity([0.0]).round(9).tolist()
             [4.86]
         """
-        given = freeze_array("gravity", gravity, (3,))
-        if self.tree.floating and given.any():
-            raise RobotError(f"gravity is {given.tolist()}, expected none: a base that nothing holds has no gravity")
-        return type(self)(replace(self.tree, gravity=given), self.homes)
+        vector = freeze_array("gravity", gravity, (3,))
+        if self.tree.floating and vector.any():
+            raise RobotError(f"gravity is {vector.tolist()}, expected none: a base that nothing holds has no gravity")
+        return type(self)(replace(self.tree, gravity=vector), self.homes)
 
     def home(self, name: str) -> Array:
         """A named posture (n,) of the robot's files.
@@ -506,8 +506,8 @@ def _check_tips(tip: str | None, tips: Sequence[str]) -> tuple[str, ...]:
     """
     if tip is not None and tips:
         raise InvalidValueError("tips", repr(tips)[:80], "none beside tip: name all tips in tips")
-    known = not isinstance(tips, str) and isinstance(tips, Sequence) and all(isinstance(name, str) for name in tips)
-    if not known or len(set(tips)) < len(tips):
+    valid = not isinstance(tips, str) and isinstance(tips, Sequence) and all(isinstance(name, str) for name in tips)
+    if not valid or len(set(tips)) < len(tips):
         raise InvalidValueError("tips", repr(tips)[:80], "different names of frames")
     return tuple(tips) if tip is None else (tip,)
 

@@ -245,12 +245,12 @@ class _Arm:
         moved = np.ones(robot.n, dtype=bool)
         if task is not None:
             moved = np.asarray(_evaluate_jacobians(task.with_reference_at(whole.centre), points[:20]).any(axis=(0, 1)))
-        found = []
+        arms = []
         for tip in robot.tips:
             joints = robot.tree.carriers(robot.tree.frame(tip).parent)[-RULES.arm :]
             if joints and moved[joints].any():
-                found.append(cls._build(robot, Task.pose(robot, frame=tip), whole, joints, points))
-        return found
+                arms.append(cls._build(robot, Task.pose(robot, frame=tip), whole, joints, points))
+        return arms
 
     @classmethod
     def _build(cls, robot: Robot, task: Task, whole: Box, joints: list[int], points: Array) -> "_Arm":
@@ -278,7 +278,7 @@ class _Arm:
         """The cuts of joint k."""
         low, high = (self.whole.centre[k] + side * self.whole.half_width[k] for side in (-1, 1))
         values = np.linspace(low, high, RULES.slices)
-        found: list[tuple[Cut, float]] = []
+        cuts: list[tuple[Cut, float]] = []
         of_slices = np.array([self._measure_slice(k, v, RULES.on_slice) for v in values])
         # Minima over the slices are refined, singular ones first, and those near another cut are dropped.
         for singular, sizes in zip((True, False), of_slices.T, strict=True):
@@ -286,10 +286,10 @@ class _Arm:
                 continue
             for i in _find_minima(sizes, RULES.low * float(np.nanmax(sizes))):
                 cut, size = self._refine_cut(k, values, i, singular)
-                if all(abs(cut.value - other.value) > RULES.apart for other, _ in found):
-                    found.append((cut, size))
+                if all(abs(cut.value - other.value) > RULES.apart for other, _ in cuts):
+                    cuts.append((cut, size))
         # Few cuts are kept, and none that is not singular beside a part with hardly any nonsingular slice.
-        strongest = sorted(found, key=lambda pair: pair[1])[: RULES.most_cuts]
+        strongest = sorted(cuts, key=lambda pair: pair[1])[: RULES.most_cuts]
         while weakest := _find_sliver_cut(strongest, low, high, values, of_slices[:, 0]):
             strongest.remove(weakest)
         return sorted((cut for cut, _ in strongest), key=lambda cut: cut.value)
@@ -331,8 +331,8 @@ def _find_sliver_cut(
     ends = [low, *(cut.value for cut, _ in placed), high]
     enough = min(RULES.well, RULES.well_of_joint * float(sizes.max()))
     slivers = [sizes[(values > start) & (values < end)].max(initial=0.0) <= enough for start, end in pairwise(ends)]
-    found = [pair for i, pair in enumerate(placed) if not pair[0].singular and (slivers[i] or slivers[i + 1])]
-    return max(found, key=lambda pair: pair[1], default=None)
+    candidates = [pair for i, pair in enumerate(placed) if not pair[0].singular and (slivers[i] or slivers[i + 1])]
+    return max(candidates, key=lambda pair: pair[1], default=None)
 
 
 def sample_nonsingular(robot: Robot, task: Task, box: Box, samples: int, seed: int | tuple[int, ...]) -> Array:
@@ -346,14 +346,14 @@ def sample_nonsingular(robot: Robot, task: Task, box: Box, samples: int, seed: i
         seed: of the positions.
     """
     values, rng = _scale_to_range(robot, task), np.random.default_rng(seed)
-    found, count = [np.empty((0, robot.n))], 0
+    kept, count = [np.empty((0, robot.n))], 0
     for _ in range(RULES.drawn):
         points = rng.uniform(box.centre - box.half_width, box.centre + box.half_width, (samples, robot.n))
-        found.append(points[values(points) > RULES.nonsingular])
-        count += len(found[-1])
+        kept.append(points[values(points) > RULES.nonsingular])
+        count += len(kept[-1])
         if count >= samples:
             break
-    return np.concatenate(found)[:samples]
+    return np.concatenate(kept)[:samples]
 
 
 def sample_centres(robot: Robot, task: Task, box: Box) -> tuple[Array, Array]:
@@ -393,12 +393,12 @@ def _evaluate_jacobians(task: Task, points: Array) -> Array:
 
 def _find_minima(sizes: Array, limit: float) -> list[int]:
     """Inner slices that are the lowest of their neighbours and below a limit, the lowest first."""
-    found = []
+    minima = []
     for i in range(1, len(sizes) - 1):
         near = sizes[max(0, i - RULES.neighbours) : i + RULES.neighbours + 1]
         if sizes[i] <= limit and sizes[i] == np.nanmin(near):
-            found.append(i)
-    return sorted(found, key=lambda i: float(sizes[i]))
+            minima.append(i)
+    return sorted(minima, key=lambda i: float(sizes[i]))
 
 
 def _build_branch(

@@ -190,9 +190,9 @@ class ClearBox(Box):
         """s(q) at points (n,) or (N, n): a number, or (N,); NaN where the task has no finite Jacobian."""
         points, single = as_point_set("q", q, len(self.centre))
         J = self._evaluate_jacobians(points) / self.scale[:, None]
-        known = np.isfinite(J).all(axis=(1, 2))
+        finite = np.isfinite(J).all(axis=(1, 2))
         values = np.full(len(points), np.nan)
-        values[known] = np.linalg.svd(J[known], compute_uv=False)[:, -1]
+        values[finite] = np.linalg.svd(J[finite], compute_uv=False)[:, -1]
         return values[0] if single else values
 
     @cached_property
@@ -240,12 +240,12 @@ class ClearBox(Box):
     def _measure_rows(self) -> Array:
         """The scale of the rows at samples of the box, without those where they are not finite, (m,)."""
         J = self._evaluate_jacobians(sample_uniform(Box(self.centre, self.half_width), RULES.samples, RULES.seed))
-        known = np.isfinite(J).all(axis=(1, 2))
-        if not known.any():
+        finite = np.isfinite(J).all(axis=(1, 2))
+        if not finite.any():
             raise SingularTaskError(
                 f"the Jacobian of task '{self.task.name}' is not finite at any of {RULES.samples} samples"
             )
-        return compute_row_scale(J[known], self.task.units)
+        return compute_row_scale(J[finite], self.task.units)
 
 
 def compute_row_scale(J: Array, units: tuple[str, ...]) -> Array:

@@ -71,8 +71,8 @@ class Corridor(Box):
             raise ShapeError("radius", sizes.shape, (n,))
         finite = np.isfinite(sizes)
         if not ((sizes > NARROWEST) & (~finite | (sizes <= WIDEST))).all() or not finite.any():
-            wanted = f"numbers above {NARROWEST:g} up to {WIDEST:g}, or infinite ones for some of the joints"
-            raise InvalidValueError("radius", sizes.tolist(), wanted)
+            expected = f"numbers above {NARROWEST:g} up to {WIDEST:g}, or infinite ones for some of the joints"
+            raise InvalidValueError("radius", sizes.tolist(), expected)
         sizes = np.array(np.broadcast_to(sizes, (n,)))
         sizes.setflags(write=False)
         for field, value in (("postures", path), ("radius", sizes)):

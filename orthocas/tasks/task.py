@@ -410,8 +410,8 @@ class Task(Shown, HoldsFunctions):
         name, _, words = kind.partition(":")
         if name not in _REGISTERED or (name == "polar" and words):
             raise UnknownNameError("task", kind, list_task_kinds())
-        wanted = f"'{name}' or '{name}:WORDS' with words that its builder takes"
-        task: Task = call_user(f"task '{kind}'", wanted, _REGISTERED[name], robot, words)
+        expected = f"'{name}' or '{name}:WORDS' with words that its builder takes"
+        task: Task = call_user(f"task '{kind}'", expected, _REGISTERED[name], robot, words)
         require_kind(f"what the builder of task '{name}' returns", task, Task)
         return task
 
@@ -431,8 +431,8 @@ class Task(Shown, HoldsFunctions):
     def of_tip(self) -> bool:
         """Whether the task is a function of the pose of the (first) tip in the world, of a kind that is known."""
         kind = self.recipe["kind"]
-        known = TipTurn.from_kind(kind) is not None or kind == "polar" or kind.startswith("position:")
-        return known and Frames.from_recipe(self.recipe) == _OF_TIP
+        of_pose = TipTurn.from_kind(kind) is not None or kind == "polar" or kind.startswith("position:")
+        return of_pose and Frames.from_recipe(self.recipe) == _OF_TIP
 
     @property
     def lacks_reference(self) -> bool:
@@ -572,8 +572,8 @@ class Task(Shown, HoldsFunctions):
     @cached_property
     def batched_frame_jacobian(self) -> BlockedFunction:
         """Evaluates the rows of `frame_jacobian_function` at many points."""
-        known = self.turn is None and not self.parts
-        return self.batched_jacobian if known else BlockedFunction(self.frame_jacobian_function)
+        plain = self.turn is None and not self.parts
+        return self.batched_jacobian if plain else BlockedFunction(self.frame_jacobian_function)
 
     def value(self, position: ArrayLike | None, orientation: ArrayLike) -> Array:
         """The task value x, (m,) or (N, m), of a pose of the tip, for tasks of a whole orientation.
@@ -729,27 +729,27 @@ def _find_independent_frames(tasks: Sequence[Task]) -> list[tuple[Task, Frames]]
     world. What is seen from a frame with a known pose is as good as what the world sees of it.
     """
     stands: dict[int, Frames] = {}
-    known: set[str | None] = {None}  #: frames with a known pose; None: the world
+    settled: set[str | None] = {None}  #: frames with a known pose; None: the world
     poses = [task for task in tasks if task.turn is not None and task.turn.whole and task.turn.with_position]
     for _ in poses:
         for task in poses:
             ends = task._frames.relative_to, task._frames.frame or task.robot.tree.tip_name
-            new = [end for end in ends if end not in known]
+            new = [end for end in ends if end not in settled]
             if len(new) == 1:
                 stands[id(task)] = Frames(new[0])
-                known.add(new[0])
-    seen = {id(task): Frames(task._frames.frame) for task in tasks if task._frames.relative_to in known}
+                settled.add(new[0])
+    seen = {id(task): Frames(task._frames.frame) for task in tasks if task._frames.relative_to in settled}
     return [(task, stands.get(id(task), seen.get(id(task), task._frames))) for task in tasks]
 
 
 def _read_rotations(name: str, value: ArrayLike) -> tuple[Array, bool]:
     """Rotation matrices (N, 3, 3) from such, or from unit quaternions, and whether it was one."""
-    given = as_float_array(name, value)
-    require_finite(name, given)
-    single = given.shape in ((4,), (3, 3))
-    if not single and given.shape[1:] not in ((4,), (3, 3)):
-        raise InvalidValueError(f"shape of {name}", given.shape, "(3, 3), (N, 3, 3), (4,) or (N, 4)")
-    rows = given[None] if single else given
+    values = as_float_array(name, value)
+    require_finite(name, values)
+    single = values.shape in ((4,), (3, 3))
+    if not single and values.shape[1:] not in ((4,), (3, 3)):
+        raise InvalidValueError(f"shape of {name}", values.shape, "(3, 3), (N, 3, 3), (4,) or (N, 4)")
+    rows = values[None] if single else values
     if rows.ndim == 2:
         off = np.abs(np.linalg.norm(rows, axis=1) - 1)
         if len(rows) and off.max() > 1e-6:

@@ -195,8 +195,8 @@ def require_kind(name: str, value: object, kind: type) -> None:
     """Raise InvalidValueError unless `value` is an instance of `kind`."""
     if not isinstance(value, kind):
         plain = isinstance(value, str | int | float | None)
-        given = repr(value)[:80] if plain else f"a {type(value).__name__}"
-        raise InvalidValueError(name, given, f"a {kind.__name__}{suggest_attribute(value, kind)}")
+        received = repr(value)[:80] if plain else f"a {type(value).__name__}"
+        raise InvalidValueError(name, received, f"a {kind.__name__}{suggest_attribute(value, kind)}")
 
 
 def suggest_attribute(value: object, kind: type) -> str:

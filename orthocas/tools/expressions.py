@@ -261,14 +261,14 @@ def build_expression(what: str, function: Callable[[ca.SX], ca.SX] | ca.Function
     if not callable(function):
         raise InvalidValueError(what, repr(function), "a function of an SX column q")
     value: ca.SX = call_user(what, f"a function of an SX column q {q.shape}", lambda: ca.SX(function(q)))
-    known = {str(symbol) for symbol in ca.vertsplit(q)}
-    free = [str(symbol) for symbol in ca.symvar(value) if str(symbol) not in known]
+    symbols = {str(symbol) for symbol in ca.vertsplit(q)}
+    free = [str(symbol) for symbol in ca.symvar(value) if str(symbol) not in symbols]
     if free:
         raise InvalidValueError(what, f"using the free symbols {', '.join(free[:5])}", "an expression in q alone")
     return value
 
 
-def call_user(what: str, wanted: str, function: Callable[..., Any], *arguments: Any) -> Any:
+def call_user(what: str, expected: str, function: Callable[..., Any], *arguments: Any) -> Any:
     """What a user's function returns.
 
     Raises:
@@ -278,7 +278,7 @@ def call_user(what: str, wanted: str, function: Callable[..., Any], *arguments: 
         return function(*arguments)
     except (RuntimeError, TypeError, ValueError, LookupError, ArithmeticError, AttributeError) as error:
         reason = " ".join(str(error).split())[:120]
-        raise InvalidValueError(what, f"failing ({reason})", wanted) from None
+        raise InvalidValueError(what, f"failing ({reason})", expected) from None
 
 
 def compute_determinant(matrix: ca.SX) -> ca.SX:

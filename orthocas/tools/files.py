@@ -101,11 +101,11 @@ def read_list(folder: Path) -> dict[str, list[str]]:
 
 def write_list(folder: Path, drafts: Iterable[Path]) -> str:
     """The list of a folder once these drafts are there; what they replace stays known, should that never happen."""
-    known = read_list(folder)
+    files = read_list(folder)
     for draft in drafts:
         now = folder / draft.name
-        known[draft.name] = [compute_digest(file) for file in (now, draft) if file.is_file()]
-    return json.dumps({"format": "orthocas-list", "files": known}, indent=1) + "\n"
+        files[draft.name] = [compute_digest(file) for file in (now, draft) if file.is_file()]
+    return json.dumps({"format": "orthocas-list", "files": files}, indent=1) + "\n"
 
 
 def refuse_xml(path: Path, what: str, error: type[ArchiveError]) -> None:
@@ -327,14 +327,14 @@ def read_table(
         raise PathFileError(f"{what} {path}: {error}") from None
 
 
-def find_columns(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
+def find_columns(names: Sequence[str], columns: Sequence[str]) -> list[int]:
     """Where the wanted names stand in a header, for `read_table`; every one has to be there once."""
-    for name in wanted:
+    for name in columns:
         if name not in names:
-            raise ValueError(f"line 1: column {name[: RULES.cell]!r} is missing, expected {', '.join(wanted)}")
+            raise ValueError(f"line 1: column {name[: RULES.cell]!r} is missing, expected {', '.join(columns)}")
         if names.count(name) > 1:
             raise ValueError(f"line 1: column {name[: RULES.cell]!r} comes twice")
-    return [names.index(name) for name in wanted]
+    return [names.index(name) for name in columns]
 
 
 def _read_lines(path: Path, what: str) -> list[tuple[int, list[str]]]:
