@@ -105,9 +105,8 @@ class WaveSeries:
         """Expansions of all sums, (sums, monomials, boxes), for boxes of given centres and half-widths (n, boxes)."""
         (sine, error), (cosine, _) = evaluate_sine_cosine(self.frequencies @ centre)
         values = np.concatenate([cosine, sine])
-        coefficients = (self.table @ values).reshape(len(self.sizes), -1, centre.shape[1]) * build_power_table(
-            half, DEGREE
-        )
+        coefficients = (self.table @ values).reshape(len(self.sizes), -1, centre.shape[1])
+        coefficients = coefficients * build_power_table(half, DEGREE)
         # |k . h|.
         turns = np.abs(self.frequencies) @ half * UP
         phases = sum_error(len(centre)) * (np.abs(self.frequencies).max(axis=0, initial=0) @ np.abs(centre))

@@ -449,10 +449,8 @@ class ProductRows:
 
     def _spread(self, derivatives: Array, order: int) -> Array:
         """Derivatives by multi-index as those of J_xi: (r, n, multi-indices of one order less, boxes)."""
-        n = self.terms.shape[1]
-        values: Array = derivatives.reshape(-1, self.r, derivatives.shape[1])[find_neighbours(n, order)].transpose(
-            2, 0, 1, 3
-        )
+        n, boxes = self.terms.shape[1], derivatives.shape[1]
+        values: Array = derivatives.reshape(-1, self.r, boxes)[find_neighbours(n, order)].transpose(2, 0, 1, 3)
         return values
 
     def _evaluate_basis(self, functions: list[TaylorModel]) -> tuple[Array, Array]:
