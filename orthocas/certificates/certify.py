@@ -412,7 +412,7 @@ def _build_certificate(
         getattr(domain, "least_singular_value", 0.0),
         getattr(domain, "least_volume", 0.0),
         _estimate_proved_fraction(domain, parts),
-    ).sealed()
+    ).seal()
 
 
 def _estimate_proved_fraction(domain: Domain, parts: Subdivision) -> float:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from orthocas.certificates.box_checks import NEVER, UNKNOWN, BoxCheck, BoxResults
-from orthocas.charts.certificate import MOST_BOXES, OPEN, PROVED, Subdivision, halfway
+from orthocas.charts.certificate import MOST_BOXES, OPEN, PROVED, Subdivision, halve_interval
 from orthocas.errors import CertifyError
 from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import check_remembered
@@ -196,7 +196,7 @@ class Search:
                 self.failed = min(self.failed, rank)
 
     def _split_box(self, place: int, low: Array, high: Array, joint: int) -> None:
-        middle = halfway(low[joint], high[joint])
+        middle = halve_interval(low[joint], high[joint])
         top, bottom = high.copy(), low.copy()
         top[joint] = bottom[joint] = middle
         self._codes[place], self._children[place] = joint, len(self._codes)

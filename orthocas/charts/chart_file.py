@@ -86,7 +86,7 @@ def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored],
     )
     if "dead" not in data:
         return known
-    return known.without_given_up(require_count("dead boxes of a certificate", int(_number(data, "dead")), least=0))
+    return known.remove_given_up(require_count("dead boxes of a certificate", int(_number(data, "dead")), least=0))
 
 
 def _tree(arrays: Mapping[str, Stored], name: str, n: int) -> Subdivision:

@@ -23,7 +23,7 @@ from orthocas.certificates.determinant import (
 )
 from orthocas.certificates.outside import OutsideCheck, choose_check, choose_inside_check
 from orthocas.certificates.rows import build_chart_rows
-from orthocas.charts.certificate import COFACTORS, ELIMINATION, OPEN, PROVED, Subdivision, halfway
+from orthocas.charts.certificate import COFACTORS, ELIMINATION, OPEN, PROVED, Subdivision, halve_interval
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import CertifyError
 from orthocas.tasks.samples import sample_uniform
@@ -212,9 +212,9 @@ def test_the_domain_keeps_folds_out_of_what_is_not_proved(tmp_path: Path) -> Non
     assert again.certificate is not None
     assert again.certificate.as_dict() == found.as_dict()
     assert oc.check_certificate(again)
-    assert not oc.check_certificate(chart, replace(found, clear_share=0.9999).sealed())
+    assert not oc.check_certificate(chart, replace(found, clear_share=0.9999).seal())
     with pytest.raises(CertifyError, match="by another volume"):
-        oc.check_certificate(chart, replace(found, least_volume=0.2).sealed())
+        oc.check_certificate(chart, replace(found, least_volume=0.2).seal())
 
 
 def test_what_the_domain_keeps_out_is_not_halved() -> None:
@@ -241,7 +241,7 @@ def test_parts_are_found_in_order() -> None:
         if code >= PROVED:
             return k + 1, [(code, low.tolist(), high.tolist())]
         top, bottom = high.copy(), low.copy()
-        top[code] = bottom[code] = halfway(low[code], high[code])
+        top[code] = bottom[code] = halve_interval(low[code], high[code])
         middle, first = walked(k + 1, low, top)
         end, second = walked(middle, bottom, high)
         return end, first + second

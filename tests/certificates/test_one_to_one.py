@@ -176,7 +176,7 @@ def test_one_to_one_part_of_an_older_method_is_void() -> None:
 def test_forged_one_to_one_box_in_one_part_does_not_pass_the_check() -> None:
     regular = certified(0.4).regular
     box = Subdivision(regular.low, regular.high, np.array([PROVED], dtype=np.uint8))
-    assert not oc.check_certificate(chart(0.4), replace(certified(0.4), injective=box).sealed())
+    assert not oc.check_certificate(chart(0.4), replace(certified(0.4), injective=box).seal())
 
 
 def test_angle_of_a_whole_turn_is_no_difference() -> None:
