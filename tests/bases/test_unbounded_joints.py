@@ -36,7 +36,7 @@ def forged(chart: oc.Chart, **changes: object) -> Certificate:
     base = cover_domain(chart.problem.domain)
     whole = Subdivision(base.low, base.high, np.array([PROVED], dtype=np.uint8))
     made = Certificate(fingerprint(chart.problem, chart.coordinates), ELIMINATION, 0.0, whole, 0.0)
-    return replace(made, **changes).sealed()  # type: ignore[arg-type]
+    return replace(made, **changes).seal()  # type: ignore[arg-type]
 
 
 WAVE = lambda q: q[0] + 0.3 * ca.sin(q[1])  # noqa: E731

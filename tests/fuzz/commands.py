@@ -234,7 +234,7 @@ def _files() -> Path:
 _kept: list[TemporaryDirectory[str]] = []
 
 
-def _describe(words: list[str]) -> str | None:
+def _verdict(words: list[str]) -> str | None:
     """What is wrong with how a command line ends."""
     out, err, argv = io.StringIO(), io.StringIO(), sys.argv
     sys.argv = ["orthocas", *words]

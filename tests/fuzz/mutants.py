@@ -82,7 +82,7 @@ def packed(entries: Entries, method: int = zipfile.ZIP_DEFLATED) -> bytes:
     return buffer.getvalue()
 
 
-def seal(header: Any, arrays: Entries) -> Entries:
+def sealed(header: Any, arrays: Entries) -> Entries:
     """Entries with checksums that match, as far as the header is an object."""
     if isinstance(header, dict) and isinstance(header.get("sha256"), dict):
         header = {**header, "sha256": {name: digest(content) for name, content in arrays.items()}}
