@@ -14,7 +14,7 @@ import numpy as np
 from benchmark import run, table
 
 import orthocas as oc
-from orthocas.tasks.domains import Domain, bounds_of
+from orthocas.tasks.domains import Domain
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import wrap_shortest
@@ -45,7 +45,7 @@ def near_corners(domain: Domain, count: int, seed: int) -> Array:
     faces = rng.uniform(-1, 1, (count // 4, n))
     held = rng.uniform(size=faces.shape) < rng.uniform(size=(len(faces), 1))
     unit[: len(faces)] = np.where(held, np.sign(faces), faces)
-    return np.clip(domain.centre + domain.half_width * unit, *bounds_of(domain))
+    return np.clip(domain.centre + domain.half_width * unit, *domain.bounds)
 
 
 def misses(name: str, count: int) -> str:
@@ -139,7 +139,7 @@ def nearest(name: str, count: int) -> str:
 
 def at_task_value(chart: oc.Chart, x: Array, pool: Array) -> Array:
     """Positions of the domain with the task value x (m,) to which damped least squares lead from a pool (S, n)."""
-    m, sizes, (low, high) = chart.m, chart.phi_sizes[: chart.m], bounds_of(chart.problem.domain)
+    m, sizes, (low, high) = chart.m, chart.phi_sizes[: chart.m], chart.problem.domain.bounds
     q, wanted = pool.copy(), np.broadcast_to(x, (len(pool), chart.m))
     for _ in range(15):
         e = chart.relative.difference(wanted, chart.task(q)) / sizes

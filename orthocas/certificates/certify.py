@@ -18,7 +18,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
 from orthocas.errors import CertifyError, Interrupted, InvalidValueError
 from orthocas.robots.tree import require_driven
-from orthocas.tasks.domains import Box, Domain, contains, reach, slack
+from orthocas.tasks.domains import Box, Domain
 from orthocas.tasks.samples import sample_boundary_weighted
 from orthocas.tools.checks import Array, as_number, require_at_least, require_executor, require_kind
 from orthocas.tools.display import percent
@@ -257,8 +257,8 @@ def cover_domain(domain: Domain) -> Subdivision:
 
     That of a full turn is pi, rounded down. With the slack, the box holds every angle.
     """
-    half = reach(domain)
-    half = np.where(np.isfinite(half), half, domain.half_width + slack(domain))
+    half = domain.reach
+    half = np.where(np.isfinite(half), half, domain.half_width + domain.slack)
     low, high = domain.centre - half, domain.centre + half
     return Subdivision.whole(np.nextafter(low, -np.inf), np.nextafter(high, np.inf))
 
@@ -303,7 +303,7 @@ def _sample_suspects(chart: Chart) -> Array:
     unit = rng.uniform(-1, 1, (RULES.samples, chart.n))
     powers = rng.choice([1.0, 0.5, 0.25], (RULES.samples, 1))
     points = np.vstack([domain.centre, domain.centre + domain.half_width * np.sign(unit) * np.abs(unit) ** powers])
-    points = points[contains(domain, points)]
+    points = points[domain.contains(points)]
     if domain.draws_itself:
         points = sample_boundary_weighted(domain, RULES.samples, 0)
     # det J of the samples, relative to its sign at the centre.
@@ -469,7 +469,7 @@ def _check_regular(certificate: Certificate, parts: list[BoxResults]) -> bool:
 def _check_fold(chart: Chart, check: BoxCheck, points: Array) -> bool:
     """Whether det J is proved to have opposite signs at two points (2, n) of the domain."""
     results = check(points, points)
-    return bool(contains(chart.problem.domain, points).all() and results.regular.all() and results.sign.prod() < 0)
+    return bool(chart.problem.domain.contains(points).all() and results.regular.all() and results.sign.prod() < 0)
 
 
 def _is_around_centre(certificate: Certificate, box: Subdivision) -> bool:

@@ -35,7 +35,7 @@ from orthocas.charts.certificate import COFACTORS, ELIMINATION
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import CertifyError
-from orthocas.tasks.domains import PathBound, SingularBound, bounds_of
+from orthocas.tasks.domains import PathBound, SingularBound
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import dense_function, one_blas_thread
 from orthocas.tools.checks import Array
@@ -67,7 +67,7 @@ def require_all_positions(chart: Chart, variables: Collection[int]) -> None:
     """
     problem = chart.problem
     # Joints without bounds on which the proof depends must repeat after a turn.
-    endless = np.flatnonzero(np.isinf(bounds_of(problem.domain)[1])).tolist()
+    endless = np.flatnonzero(np.isinf(problem.domain.bounds[1])).tolist()
     endless_variables = [joint for joint in endless if joint in variables]
     if not endless_variables:
         return

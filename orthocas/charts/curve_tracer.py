@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from orthocas.charts.in_domain import BoxedPhi
 from orthocas.charts.newton import inverses
-from orthocas.tasks.domains import bounds_of
 from orthocas.tasks.relative import Relative
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
@@ -163,7 +162,7 @@ class CurveTracer:
         """Whether sliding joints are in their ranges, or not far outside."""
         if self.turning.all():
             return np.ones(len(q), dtype=bool)
-        low, high = bounds_of(self.boxed.domain)
+        low, high = self.boxed.domain.bounds
         room = RULES.prismatic * self.boxed.domain.half_width
         return np.asarray((((q >= low - room) & (q <= high + room)) | self.turning).all(axis=1))
 

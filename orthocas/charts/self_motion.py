@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from orthocas.charts.newton import Newton
 from orthocas.charts.phi import counted_on, largest, require_no_turns
 from orthocas.errors import InvalidValueError, degrees_hint
-from orthocas.tasks.domains import StopKind, bounds_of, contains
+from orthocas.tasks.domains import StopKind
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, Indices, as_number, as_point, freeze_array, require_count
 from orthocas.tools.display import Shown, listed, number_list
@@ -68,7 +68,7 @@ class Walls:
     def __init__(self, problem: Problem) -> None:
         domain = problem.domain
         self._domain, self._robot = domain, problem.robot
-        self._low, self._high = bounds_of(domain)
+        self._low, self._high = domain.bounds
         self._curved = domain.walls
         endless = np.isinf(self._low) & ~np.array(problem.robot.tree.prismatic)
         self.turning = endless  #: unbounded revolute joints, (n,): they are at the same place after a full turn
@@ -358,7 +358,7 @@ def start_inside(chart: "Chart", q: ArrayLike) -> Array:
     """
     point = as_point("q", q, chart.n)
     given = point.round(4).tolist()
-    if not contains(chart.problem.domain, point):
+    if not chart.problem.domain.contains(point):
         stop = Walls(chart.problem).worst(point)
         hint = degrees_hint(*point[~np.array(chart.problem.robot.tree.prismatic)])
         raise InvalidValueError("q", given, f"a point of the domain, which ends at {stop}{hint}")

@@ -10,7 +10,6 @@ from orthocas.charts.chart import Chart
 from orthocas.errors import GrowError
 from orthocas.exact.flow import GrownCoordinates
 from orthocas.exact.leaves import find_turning_joints
-from orthocas.tasks.domains import contains
 from orthocas.tasks.metric import evaluate_metric
 from orthocas.tasks.problem import Problem, evaluate_task_jacobians
 from orthocas.tasks.samples import sample_evenly
@@ -68,7 +67,7 @@ def singular_points(problem: Problem, seed: int = 0) -> tuple[SingularPoint, ...
     turns = np.floor((q - problem.domain.centre) / (2 * np.pi) + 0.5 - _SAME)  # an angle of half a turn becomes +pi
     q = q - 2 * np.pi * turns * find_turning_joints(problem)
     flat = np.abs(evaluate_task_jacobians(problem, q)).max(axis=(1, 2)) < _FLAT * size
-    found = _distinct(q[flat & contains(problem.domain, q)])
+    found = _distinct(q[flat & problem.domain.contains(q)])
     return tuple(_classified(problem, point, hessian) for point in found)
 
 

@@ -41,7 +41,6 @@ from orthocas.simulation.figure import FORMATS, require_format, save_animation, 
 from orthocas.simulation.mujoco_plant import MUJOCO, MuJoCo
 from orthocas.simulation.run import simulate as run_closed_loop
 from orthocas.simulation.trajectory import Outcome, Trajectory, coupling_index
-from orthocas.tasks.domains import contains
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import require_known
 from orthocas.tools.display import percent
@@ -73,7 +72,7 @@ def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajector
     """
     bad = np.flatnonzero(seen.fell_back)
     first = int(bad[0]) if bad.size else None
-    inside = np.asarray(contains(chart.problem.domain, seen.q))
+    inside = np.asarray(chart.problem.domain.contains(seen.q))
     judged = plan.has_steps and not plan.pushes and seen.outcome is Outcome.COMPLETE and inside.all() and not bad.size
     largest = np.abs(seen.command).max(axis=0)
     lasting = {status.name: seconds for status, seconds in seen.seconds_in_status.items()}

@@ -8,7 +8,6 @@ from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, ControlStatus
 from orthocas.control.linear_algebra import ROUNDS, SOFTEST
 from orthocas.control.operational_space import Impedance, PDPlus
 from orthocas.errors import InvalidValueError
-from orthocas.tasks.domains import reach
 from orthocas.tools.batch import dense_function
 from orthocas.tools.expressions import wrap_shortest
 
@@ -47,7 +46,7 @@ def law_form(law: Impedance | PDPlus) -> Form:
     model = law.model
     if model.gains(law.problem, law.feed_forward):
         raise InvalidValueError("model of the law", ", ".join(model.gains(law.problem, law.feed_forward)), "its own")
-    bound, domain = reach(law.problem.domain), law.problem.domain
+    bound, domain = law.problem.domain.reach, law.problem.domain
     stiffness = law.stiffness if law.damping_stiffness is None else law.damping_stiffness
     turn = np.zeros(law.problem.n)
     turn[list(law.problem.turning)] = 2 * np.pi

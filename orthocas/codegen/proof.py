@@ -18,7 +18,7 @@ from orthocas.control.controller import (
     squared_volume,
 )
 from orthocas.errors import ProofError
-from orthocas.tasks.domains import Domain, contains
+from orthocas.tasks.domains import Domain
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array, require_kind
 from orthocas.tools.expressions import wrap_shortest
@@ -170,7 +170,7 @@ def _chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array, dq: Ar
     largest = library.precision.largest
     known, moving = _are_numbers(largest, q), _are_numbers(largest, q, dq)
     somewhere, speed = np.where(known[:, None], q, domain.centre), np.where(moving[:, None], dq, 0)
-    inside = np.where(contains(domain, somewhere), ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN)
+    inside = np.where(domain.contains(somewhere), ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN)
     wanted = {"phi": chart.phi(somewhere), "jacobian": chart.jacobian(somewhere)}
     has_value = known & np.isfinite(wanted["phi"]).all(axis=1) & np.isfinite(wanted["jacobian"]).all(axis=(1, 2))
     status = np.select([~known, ~has_value], [ControlStatus.NOT_FINITE, ControlStatus.SINGULAR], inside)
@@ -229,7 +229,7 @@ def _inverse_error(library: CompiledLibrary, chart: Chart, target: Array, start:
     """Largest remaining error in phi. Infinite without a solution; status and output must then be as documented."""
     solution, status = library.inverse(target, start)
     if status in (ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN):
-        if (status == ControlStatus.OK) != contains(chart.problem.domain, solution.astype(float)):
+        if (status == ControlStatus.OK) != chart.problem.domain.contains(solution.astype(float)):
             raise ProofError(f"the status of inverse is {status} at q = {solution.tolist()}")
         return float(np.abs(wrap_shortest(chart.phi(solution.astype(float)) - target, chart.turns)).max())
     if status == ControlStatus.STOPPED_EARLY:

@@ -11,7 +11,6 @@ from orthocas.codegen.generate import generate_c
 from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
 from orthocas.control.controller import Controller
 from orthocas.control.operational_space import PDPlus
-from orthocas.tasks.domains import contains
 from orthocas.tools.checks import Array
 from orthocas.tools.files import open_draft_folder
 from orthocas.tools.interrupts import deferred
@@ -74,6 +73,6 @@ def _states(law: Controller) -> Array:
     """States inside the domain with references nearby, (64, 2 n + 3 k)."""
     rng, domain, n, k = np.random.default_rng(0), law.problem.domain, law.problem.n, len(law.labels)
     q = domain.centre + 0.4 * domain.half_width * rng.uniform(-1, 1, (_STATES, n))
-    q[~contains(domain, q)] = domain.centre
+    q[~domain.contains(q)] = domain.centre
     reference = np.array([law.measured(point).full().ravel() for point in q]) + 0.01 * rng.normal(size=(_STATES, k))
     return np.hstack([q, rng.normal(size=(_STATES, n)), reference, rng.normal(size=(_STATES, 2 * k))])

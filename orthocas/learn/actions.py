@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike
 from orthocas.charts.chart import Chart
 from orthocas.charts.solutions import Tracker, TrackerStatus
 from orthocas.errors import DomainError, InvalidValueError, InverseError, MissingExtraError
-from orthocas.tasks.domains import bounds_of
 from orthocas.tools.checks import (
     Array,
     as_float_array,
@@ -129,7 +128,7 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
     def _observed(self, observation: Array) -> Array:
         """An observation with xi and the distance to the boundary."""
         q = self._here()
-        low, high = bounds_of(self.chart.problem.domain)
+        low, high = self.chart.problem.domain.bounds
         distance = np.minimum(q - low, high - q).min()
         return np.asarray(np.concatenate([observation, self.chart.xi(q), [distance]]))
 

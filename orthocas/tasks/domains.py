@@ -76,6 +76,24 @@ class Domain(ABC):
         """Whether points (n,) or (N, n) lie in the domain: a bool, or (N,)."""
 
     @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest joint positions, (n,) each. They are infinite for unbounded joints, and for a torus."""
+        half_width = self.half_width.copy()
+        half_width[slice(None) if self.full_turns else list(self.unbounded)] = np.inf
+        return self.centre - half_width, self.centre + half_width
+
+    @property
+    def slack(self) -> Array:
+        """What the boundaries give for rounding, (n,)."""
+        return np.asarray(1e-12 * self.half_width + 4 * np.finfo(float).eps * np.abs(self.centre))
+
+    @property
+    def reach(self) -> Array:
+        """Largest distance from the centre that counts as inside, (n,), with slack for rounding at the boundaries."""
+        lower, upper = self.bounds
+        return np.asarray((upper - lower) / 2 + self.slack)
+
+    @property
     def condition(self) -> "Condition | None":
         """The condition that holds in a part of the box, as an expression; None for the whole box.
 
@@ -375,26 +393,6 @@ def contains(domain: Domain, q: ArrayLike) -> Any:
     return domain.contains(q)
 
 
-def bounds_of(domain: Domain) -> tuple[Array, Array]:
-    """Lowest and highest joint positions, (n,) each. They are infinite for unbounded joints, and for a torus."""
-    half_width = domain.half_width.copy()
-    half_width[slice(None) if domain.full_turns else list(domain.unbounded)] = np.inf
-    return domain.centre - half_width, domain.centre + half_width
-
-
-def reach(domain: Domain) -> Array:
-    """Largest distance from the centre that counts as inside, (n,), with slack for rounding at the boundaries."""
-    lower, upper = bounds_of(domain)
-    values: Array = (upper - lower) / 2 + slack(domain)
-    return values
-
-
-def slack(domain: Domain) -> Array:
-    """What the boundaries of a domain give for rounding, (n,)."""
-    values: Array = 1e-12 * domain.half_width + 4 * np.finfo(float).eps * np.abs(domain.centre)
-    return values
-
-
 def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: ArrayLike | None = None) -> Box:
     """A box inside the joint limits.
 
@@ -440,7 +438,7 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
         raise DomainError(f"joint '{name}' is prismatic, expected a Box domain instead of a Torus")
     low, high = domain.centre - domain.half_width, domain.centre + domain.half_width
     if not domain.full_turns:
-        low, high = bounds_of(domain)
+        low, high = domain.bounds
     # Limits in a URDF are decimal, so sums are not exact.
     slack = 1e-9 * domain.half_width
     outside = np.flatnonzero((low < robot.lower - slack) | (high > robot.upper + slack))
@@ -451,7 +449,7 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
 def _between_boundaries(domain: Domain, q: ArrayLike) -> Any:
     """Whether points (n,) or (N, n) lie between the boundaries of a domain: a bool, or (N,)."""
     points, single = as_point_set("q", q, len(domain.centre))
-    inside = np.all(np.abs(points - domain.centre) <= reach(domain), axis=1)
+    inside = np.all(np.abs(points - domain.centre) <= domain.reach, axis=1)
     return inside[0] if single else inside
 
 
