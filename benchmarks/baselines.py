@@ -405,7 +405,7 @@ class SecondTask(Protocol):
         """dJ_2/dt dq, (k_2, 1)."""
         ...
 
-    def wrap_shortest(self, difference: ca.MX) -> ca.MX:
+    def shortest(self, difference: ca.MX) -> ca.MX:
         """A difference of two [x; x_2], without whole turns of joints that turn without end."""
         ...
 
@@ -462,7 +462,7 @@ class _Joints:
     def curvature(self, q: ca.MX, dq: ca.MX) -> ca.MX:
         return ca.MX.zeros(self.problem.n)
 
-    def wrap_shortest(self, difference: ca.MX) -> ca.MX:
+    def shortest(self, difference: ca.MX) -> ca.MX:
         return difference
 
     def runnable(self, graph: ca.Function) -> ca.Function:
@@ -526,7 +526,7 @@ class _OwnTask:
     def curvature(self, q: ca.MX, dq: ca.MX) -> ca.MX:
         return self.task.second_derivative_function(q, dq, dq)
 
-    def wrap_shortest(self, difference: ca.MX) -> ca.MX:
+    def shortest(self, difference: ca.MX) -> ca.MX:
         return difference
 
     def runnable(self, graph: ca.Function) -> ca.Function:
@@ -568,7 +568,7 @@ class _ExtraCoordinates:
     def curvature(self, q: ca.MX, dq: ca.MX) -> ca.MX:
         return self.chart.coordinates.functions["second_derivative"](q, dq, dq)
 
-    def wrap_shortest(self, difference: ca.MX) -> ca.MX:
+    def shortest(self, difference: ca.MX) -> ca.MX:
         shorter: ca.MX = wrap_shortest(difference, self.chart.turns)
         return shorter
 
