@@ -18,7 +18,7 @@ from orthocas.exact.flow import GrownCoordinates, TaskFlow
 from orthocas.exact.harmonic import build_level_surface, compute_signed_areas
 from orthocas.exact.leaves import DiskLeaf, build_disk_leaf
 from orthocas.tasks.domains import Box
-from orthocas.tasks.problem import Problem, evaluate_task_jacobians
+from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array
@@ -144,7 +144,7 @@ def _flow_numbers(coordinates: GrownCoordinates) -> dict[str, float]:
     points = sample_uniform(problem.domain, _SAMPLES, 3)
     pulled = coordinates.pull(points)
     points, on_leaf = points[pulled.reached], pulled.points[pulled.reached]
-    J_xi, J_x = coordinates.jacobian(points), evaluate_task_jacobians(problem, points)
+    J_xi, J_x = coordinates.jacobian(points), problem.task.evaluate_jacobian(points)
     lengths = np.linalg.norm(J_xi, axis=2) * np.linalg.norm(J_x, axis=2)
     cosines = (J_xi @ J_x.transpose(0, 2, 1))[:, :, 0] / lengths
     moved = [coordinates.flow.move(on_leaf, np.full((len(on_leaf), 1), dx)).points for dx in (_STEP, -_STEP)]

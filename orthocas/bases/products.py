@@ -14,8 +14,7 @@ from orthocas.bases import cyclic as cyclic_choice
 from orthocas.bases.cyclic import Cyclic
 from orthocas.bases.family import BasisFamily, ClosedForm, JointSpace
 from orthocas.errors import InvalidValueError, SingularTaskError
-from orthocas.tasks.metric import evaluate_metric
-from orthocas.tasks.problem import Problem, evaluate_task_jacobians
+from orthocas.tasks.problem import Problem
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, freeze_array, require_count, require_known
 
@@ -368,7 +367,7 @@ class Linear:
             InvalidValueError, SingularTaskError: if the task is singular at the base.
         """
         base = freeze_array("base", problem.domain.centre if self.base is None else self.base, (problem.n,))
-        J, A = evaluate_task_jacobians(problem, base[None])[0], evaluate_metric(problem.metric, base[None])[0]
+        J, A = problem.task.evaluate_jacobian(base[None])[0], problem.metric.evaluate(base[None])[0]
         if not (J**2).sum(axis=1).all():
             raise InvalidValueError("base", base.tolist(), "a joint position where no task gradient vanishes")
         theta = self.normal_vectors(np.linalg.solve(A, J.T).T).ravel()

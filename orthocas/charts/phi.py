@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocas.charts.coordinates import CoordinateMap, Coordinates
 from orthocas.errors import InvalidValueError
-from orthocas.tasks.problem import Problem, evaluate_task_jacobians
+from orthocas.tasks.problem import Problem
 from orthocas.tasks.relative import Relative
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_point_set, require_shape
@@ -176,7 +176,7 @@ class PhiFunctions:
             return self._expression("jacobian", q)
         points, single = as_point_set("q", q, self.n)
         J = np.empty((len(points), self.n, self.n))
-        evaluate_task_jacobians(self.problem, points, J[:, : self.m])
+        self.problem.task.evaluate_jacobian(points, J[:, : self.m])
         self._coordinates_into("jacobian", J[:, self.m :], points)
         return J[0] if single else J
 

@@ -11,7 +11,7 @@ from orthocas.charts.angles import MOST_JOINTS, judge_by_columns, judge_by_lapac
 from orthocas.charts.coordinates import CoordinateMap
 from orthocas.errors import SingularTaskError
 from orthocas.tasks.domains import Domain
-from orthocas.tasks.problem import Problem, evaluate_task_jacobians, measure_half_turn_distance
+from orthocas.tasks.problem import Problem, measure_half_turn_distance
 from orthocas.tasks.problem_samples import Samples, evaluate_samples
 from orthocas.tasks.samples import sample_boundary_weighted
 from orthocas.tools.batch import run_in_threads
@@ -62,7 +62,7 @@ def _judged(problem: Problem, coordinates: CoordinateMap, points: Array) -> dict
     samples = evaluate_samples(problem, points)
     kept = np.ones(len(points), dtype=bool)
     if len(samples) < len(points):
-        kept = np.asarray((evaluate_task_jacobians(problem, points) != 0).any(axis=2).all(axis=1))
+        kept = np.asarray((problem.task.evaluate_jacobian(points) != 0).any(axis=2).all(axis=1))
     J = coordinates.jacobian(samples.points)
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         squares = np.einsum("sij,sij->si", J, J)

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocas.errors import NoExpressionError
 from orthocas.exact.leaves import LeafChart, LeafValues, remove_turns
-from orthocas.tasks.metric import evaluate_metric
-from orthocas.tasks.problem import Problem, evaluate_task_jacobians
+from orthocas.tasks.problem import Problem
 from orthocas.tasks.problem_samples import Samples
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
@@ -176,10 +175,10 @@ class TaskFlow:
         ker J_x(q).
         """
         n, r = self.problem.n, self.problem.r
-        A = evaluate_metric(self.problem.metric, points)
+        A = self.problem.metric.evaluate(points)
         inverse = np.asarray(np.linalg.inv(A), dtype=float)
         # Tangent vectors start as an A-orthonormal basis of ker J_x.
-        samples = Samples(points, evaluate_task_jacobians(self.problem, points), inverse)
+        samples = Samples(points, self.problem.task.evaluate_jacobian(points), inverse)
         Z = samples.null_basis
         lengths = np.linalg.norm(Z, axis=1)
         directions = (Z / lengths[:, None, :]).transpose(0, 2, 1).reshape(-1, r * n)

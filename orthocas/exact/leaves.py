@@ -13,8 +13,7 @@ from orthocas.errors import GrowError, InvalidValueError
 from orthocas.exact.harmonic import TriangleMesh, build_level_surface, map_to_disk
 from orthocas.exact.mesh import TriangleLocator
 from orthocas.tasks.domains import Box
-from orthocas.tasks.metric import evaluate_metric
-from orthocas.tasks.problem import Problem, evaluate_task_jacobians
+from orthocas.tasks.problem import Problem
 from orthocas.tasks.problem_samples import evaluate_samples
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.cached import building, cached_property
@@ -78,7 +77,7 @@ def is_covered(region: Box, points: Array) -> NDArray[np.bool_]:
 
 def require_on_leaf(problem: Problem, level: Array, points: Array) -> None:
     """Raise InvalidValueError unless points (N, n) lie on the leaf h(q) = level (m,), relative to the size of J_x."""
-    J = evaluate_task_jacobians(problem, points)
+    J = problem.task.evaluate_jacobian(points)
     off = np.abs(problem.task.batched(points)[0] - level).max(axis=1)
     size = np.sqrt((J**2).sum(axis=(1, 2)).mean())
     if not off.max() <= RULES.on_leaf * size:
@@ -283,7 +282,7 @@ class LinearLeaf:
                 residual = self._compute_residual(q, start + share * (xi - start))
                 if np.abs(residual).max(initial=0.0) < RULES.solved:
                     break
-                J = np.concatenate([evaluate_task_jacobians(self.problem, q) / self._scale, N], axis=1)
+                J = np.concatenate([self.problem.task.evaluate_jacobian(q) / self._scale, N], axis=1)
                 q = q - (np.linalg.pinv(J) @ residual[:, :, None])[:, :, 0]
         solved = np.abs(self._compute_residual(q, xi)).max(axis=1) < 1e3 * RULES.solved
         return np.where(solved[:, None], q, np.nan)
@@ -299,13 +298,13 @@ class LinearLeaf:
     @cached_property
     def _scale(self) -> float:
         """Size of J_x at q0, which makes the units of the task irrelevant."""
-        return float(np.linalg.norm(evaluate_task_jacobians(self.problem, self.centre[None])))
+        return float(np.linalg.norm(self.problem.task.evaluate_jacobian(self.centre[None])))
 
 
 def build_linear_leaf(problem: Problem, centre: Array) -> LinearLeaf:
     """The leaf through a joint position (n,), with coordinates along its tangent space there."""
     points = centre[None]
-    normals = (evaluate_metric(problem.metric, points) @ evaluate_samples(problem, points).null_basis)[0]
+    normals = (problem.metric.evaluate(points) @ evaluate_samples(problem, points).null_basis)[0]
     level = problem.task.batched(points)[0][0]
     return LinearLeaf(problem, level, centre, normals / np.linalg.norm(normals, axis=0))
 
@@ -426,7 +425,7 @@ def _close_circle(problem: Problem, level: Array, start: Array, length: float, s
         last = curve[-1] - curve[-2]
         length -= float(last @ remove_turns(problem, curve[-1] - start)) / float(np.linalg.norm(last))
     curve = trace(start, length)
-    sizes = np.linalg.svd(evaluate_task_jacobians(problem, curve), compute_uv=False)
+    sizes = np.linalg.svd(problem.task.evaluate_jacobian(curve), compute_uv=False)
     # The integrator may step across a singular point.
     if sizes[:, -1].min() < RULES.singular * sizes[:, 0].max():
         _raise_singular(level)

@@ -98,6 +98,19 @@ class Metric(HoldsFunctions):
         """Evaluates A at many points."""
         return Batched(self.function)
 
+    def evaluate(self, points: Array) -> Array:
+        """A at points (N, n), as an array (N, n, n).
+
+        Raises:
+            MetricError: if a matrix is not symmetric positive definite.
+        """
+        n = points.shape[1]
+        if self.is_identity:
+            return np.broadcast_to(np.eye(n), (len(points), n, n))
+        A = self.batched(points)[0].reshape(-1, n, n)
+        require_spd(A, points)
+        return A
+
     @property
     def is_identity(self) -> bool:
         """Whether A = I everywhere."""
@@ -136,16 +149,6 @@ def register_metric(name: str, build: Callable[[Robot], Callable[[ca.SX], ca.SX]
     if not callable(build):
         raise InvalidValueError("build", repr(build)[:80], "a function of a robot")
     _REGISTERED[name] = build
-
-
-def evaluate_metric(metric: Metric, points: Array) -> Array:
-    """A at points (N, n), as an array (N, n, n). Each matrix is checked to be symmetric positive definite."""
-    n = points.shape[1]
-    if metric.is_identity:
-        return np.broadcast_to(np.eye(n), (len(points), n, n))
-    A = metric.batched(points)[0].reshape(-1, n, n)
-    require_spd(A, points)
-    return A
 
 
 def require_spd(matrices: Array, points: Array) -> None:

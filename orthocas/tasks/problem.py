@@ -13,7 +13,7 @@ from orthocas.robots.robot import Robot
 from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.clear_box import compute_row_scale, exclude_singular
 from orthocas.tasks.domains import Domain, domain_from_data, require_within_limits
-from orthocas.tasks.metric import Metric, MetricSpec, evaluate_metric
+from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.regular_box import regular_box
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import Task
@@ -204,7 +204,7 @@ def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
     require_kind("problem", problem, Problem)
     # Each metric matrix is checked, then the rank of the task.
     points = sample_uniform(problem.domain, samples, seed)
-    evaluate_metric(problem.metric, points)
+    problem.metric.evaluate(points)
     smallest = relative_singular_values(problem, points)
     if smallest.max() < _RANK_LOST:
         raise SingularTaskError(
@@ -231,7 +231,7 @@ def relative_singular_values(problem: Problem, points: Array) -> Array:
         SingularTaskError: if a task component does not depend on any joint, or J_x is not finite at a point.
     """
     task, domain = problem.task, problem.domain
-    J = evaluate_task_jacobians(problem, points)
+    J = problem.task.evaluate_jacobian(points)
     idle = np.flatnonzero((J == 0).all(axis=(0, 2)))
     if idle.size:
         raise SingularTaskError(f"task component '{task.labels[idle[0]]}' does not depend on any joint")
@@ -267,21 +267,6 @@ def measure_task_sizes(problem: Problem) -> Array:
     J = problem.task.batched_jacobian(points)[0].reshape(-1, problem.m, problem.n)
     sizes = (np.abs(J) @ problem.domain.half_width).mean(axis=0)
     return np.where(np.isfinite(sizes) & (sizes > 0), sizes, 1.0)
-
-
-def evaluate_task_jacobians(problem: Problem, points: Array, results: Array | None = None) -> Array:
-    """J_x at points (N, n), as an array (N, m, n): a new one, or `results`.
-
-    Raises:
-        SingularTaskError: if J_x is not finite at a point (for example polar coordinates at the origin).
-    """
-    J = np.empty((len(points), problem.m, problem.n)) if results is None else results
-    problem.task.batched_jacobian.into(J, points)
-    if not np.isfinite(J).all():
-        bad = ~np.isfinite(J).all(axis=(1, 2))
-        at = np.round(points[np.flatnonzero(bad)[0]], 4).tolist()
-        raise SingularTaskError(f"the Jacobian of task '{problem.task.name}' is not finite at q = {at}")
-    return J
 
 
 def write_problem(problem: Problem) -> tuple[dict[str, Any], dict[str, Stored]]:

@@ -7,8 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.tasks.metric import evaluate_metric
-from orthocas.tasks.problem import Problem, evaluate_task_jacobians
+from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
@@ -137,13 +136,13 @@ def sample_problem(problem: Problem, samples: int, seed: int | tuple[int, ...]) 
 
 def evaluate_samples(problem: Problem, points: Array) -> Samples:
     """Samples at given joint positions (N, n)."""
-    J = evaluate_task_jacobians(problem, points)
+    J = problem.task.evaluate_jacobian(points)
     kept = np.all(np.einsum("sij,sij->si", J, J) > 0, axis=1)
     if not kept.all():
         points, J = points[kept], J[kept]
     inverse: Array | None = None
     if not problem.metric.is_identity:
-        inverse = np.asarray(np.linalg.inv(evaluate_metric(problem.metric, points)), dtype=float)
+        inverse = np.asarray(np.linalg.inv(problem.metric.evaluate(points)), dtype=float)
     samples = Samples(points, J, inverse)
     return samples.project_to_zero_momentum(problem.robot.tree.floating) if problem.robot.tree.floating else samples
 

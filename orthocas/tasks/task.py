@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
+from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError, UnknownNameError
 from orthocas.robots.kinematics import TipTurn, align_frame
 from orthocas.robots.robot import FrameQuantity, Robot
 from orthocas.robots.spatial import build_rotations, find_quaternion, multiply_quaternions, rotation_matrix, skew
@@ -574,6 +574,20 @@ class Task(Shown, HoldsFunctions):
         """Evaluates the rows of `frame_jacobian_function` at many points."""
         plain = self.turn is None and not self.parts
         return self.batched_jacobian if plain else BlockedFunction(self.frame_jacobian_function)
+
+    def evaluate_jacobian(self, points: Array, results: Array | None = None) -> Array:
+        """J_x at points (N, n), as an array (N, m, n): a new one, or `results`.
+
+        Raises:
+            SingularTaskError: if J_x is not finite at a point (for example polar coordinates at the origin).
+        """
+        J = np.empty((len(points), self.m, self.robot.n)) if results is None else results
+        self.batched_jacobian.into(J, points)
+        if not np.isfinite(J).all():
+            bad = ~np.isfinite(J).all(axis=(1, 2))
+            at = np.round(points[np.flatnonzero(bad)[0]], 4).tolist()
+            raise SingularTaskError(f"the Jacobian of task '{self.name}' is not finite at q = {at}")
+        return J
 
     def value(self, position: ArrayLike | None, orientation: ArrayLike) -> Array:
         """The task value x, (m,) or (N, m), of a pose of the tip, for tasks of a whole orientation.

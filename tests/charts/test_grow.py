@@ -26,7 +26,6 @@ from orthocas.errors import (
 )
 from orthocas.exact.flow import Arrival, GrownCoordinates, TaskFlow
 from orthocas.exact.leaves import read_leaf
-from orthocas.tasks.metric import evaluate_metric
 from orthocas.tools.archive import read_archive, write_archive
 
 ARM = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
@@ -83,7 +82,7 @@ def test_coordinates_do_not_change_along_flow_lines(chart: oc.Chart) -> None:
 def test_gradients_are_orthogonal_to_the_task(chart: oc.Chart) -> None:
     """True by construction; that the gradients are those of xi is what the test after this one shows."""
     points = known_points(chart)
-    J, A = chart.jacobian(points), evaluate_metric(chart.problem.metric, points)
+    J, A = chart.jacobian(points), chart.problem.metric.evaluate(points)
     raised = np.linalg.solve(A, J[:, : chart.m].transpose(0, 2, 1))
     assert np.abs(J[:, chart.m :] @ raised).max() < 1e-6
     assert oc.evaluate(chart, 300).task_angle.max < 1e-4

@@ -11,7 +11,6 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.errors import GrowError
 from orthocas.exact.flow import Arrival, BatchedFlow, TaskFlow
-from orthocas.tasks.metric import evaluate_metric
 
 ARM = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
 STIFFNESS = np.diag([3.0, 2.0, 1.0]) + 0.2
@@ -54,7 +53,7 @@ def test_pull_ends_where_the_paper_s_gradient_flow_ends(metric: object) -> None:
     h, J = problem.task.function, problem.task.jacobian_function
 
     def rate(t: float, q: np.ndarray) -> np.ndarray:
-        A = evaluate_metric(problem.metric, q[None])[0]
+        A = problem.metric.evaluate(q[None])[0]
         return (0.3 - float(h(q))) * np.linalg.solve(A, np.array(J(q))[0])
 
     for start, end in zip(points, pulled.points, strict=True):

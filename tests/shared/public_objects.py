@@ -32,7 +32,7 @@ from orthocas.simulation import (
     coupling_index,
     simulate,
 )
-from orthocas.tasks.metric import Metric, evaluate_metric
+from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem_samples import sample_problem
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched
@@ -371,7 +371,7 @@ def _of_task(task: oc.Task) -> Iterator[Any]:
 @_numbers.register
 def _of_problem(problem: oc.Problem) -> Iterator[Any]:
     yield from (*_numbers(problem.task), *_numbers(problem.robot), *_numbers(problem.domain), problem.name)
-    yield evaluate_metric(problem.metric, sample_uniform(problem.domain, 5, 0))
+    yield problem.metric.evaluate(sample_uniform(problem.domain, 5, 0))
 
 
 @_numbers.register
