@@ -22,7 +22,7 @@ from orthocas.fitting.basis_gradients import gradients_of
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.dense_objectives import ArrayObjective
 from orthocas.fitting.terms import Weights
-from orthocas.tasks.problem_samples import sample_problem
+from orthocas.tasks.samples import sample_problem
 from orthocas.tools.batch import one_blas_thread
 
 HEADER = (

@@ -35,7 +35,7 @@ from orthocas.bases.products import ProductFamily
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.singularities import singular_points
 from orthocas.solvers import GaussNewton
-from orthocas.tasks.problem_samples import evaluate_samples
+from orthocas.tasks.samples import evaluate_samples
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import wrap_shortest
 

@@ -26,7 +26,7 @@ import orthocas as oc
 from orthocas import problems, solvers
 from orthocas.fitting.residuals import Loss
 from orthocas.fitting.terms import Sizes
-from orthocas.tasks.problem_samples import Samples, evaluate_samples
+from orthocas.tasks.samples import Samples, evaluate_samples
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
 

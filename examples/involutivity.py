@@ -22,7 +22,7 @@ from matplotlib.ticker import StrMethodFormatter
 import orthocas as oc
 from orthocas import problems
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Weights
-from orthocas.tasks.problem_samples import sample_problem
+from orthocas.tasks.samples import sample_problem
 
 METRICS = {"euclidean": "I", "inertia": "M"}
 COLOURS = {

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 from orthocas.charts.chart import Chart
-from orthocas.tasks.problem_samples import evaluate_samples
+from orthocas.tasks.samples import evaluate_samples
 from orthocas.tools.checks import Array
 
 from .drawing import Drawing

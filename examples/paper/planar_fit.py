@@ -18,8 +18,7 @@ from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.terms import Weights
 from orthocas.solvers import GaussNewton
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.problem_samples import evaluate_samples, sample_problem
-from orthocas.tasks.samples import sample_evenly
+from orthocas.tasks.samples import evaluate_samples, sample_evenly, sample_problem
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array
 

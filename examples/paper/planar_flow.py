@@ -17,7 +17,7 @@ from orthocas.exact.flow import GrownCoordinates, TaskFlow
 from orthocas.exact.leaves import CircleLeaf
 from orthocas.tasks.domains import Torus
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.problem_samples import evaluate_samples
+from orthocas.tasks.samples import evaluate_samples
 from orthocas.tools.checks import Array
 
 from .self_motion import pieces_in_cube, wrapped

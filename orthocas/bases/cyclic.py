@@ -13,8 +13,7 @@ from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.domains import Box
 from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem import Problem, is_regular
-from orthocas.tasks.problem_samples import NEGLIGIBLE
-from orthocas.tasks.samples import sample_uniform
+from orthocas.tasks.samples import NEGLIGIBLE, sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, require_kind
 from orthocas.tools.expressions import find_gradient_dependences, write_tape

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.tasks.problem_samples import Samples
+from orthocas.tasks.samples import Samples
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import BlockFunction, ColumnFunction, fill
 

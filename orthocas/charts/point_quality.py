@@ -12,8 +12,7 @@ from orthocas.charts.coordinates import CoordinateMap
 from orthocas.errors import SingularTaskError
 from orthocas.tasks.domains import Domain
 from orthocas.tasks.problem import Problem, measure_half_turn_distance
-from orthocas.tasks.problem_samples import Samples, evaluate_samples
-from orthocas.tasks.samples import sample_boundary_weighted
+from orthocas.tasks.samples import Samples, evaluate_samples, sample_boundary_weighted
 from orthocas.tools.batch import run_in_threads
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import MANY

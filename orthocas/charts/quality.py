@@ -12,8 +12,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import Judged, WorstPoints, worst_points
 from orthocas.errors import InvalidValueError, SingularTaskError
-from orthocas.tasks.problem_samples import evaluate_samples, find_idle_joints
-from orthocas.tasks.samples import sample_uniform
+from orthocas.tasks.samples import evaluate_samples, find_idle_joints, sample_uniform
 from orthocas.tools.batch import run_in_threads
 from orthocas.tools.checks import Array, Indices, as_point_set, require_count, require_kind, require_memory
 from orthocas.tools.display import Shown, listed, percent

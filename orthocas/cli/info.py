@@ -24,7 +24,7 @@ from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import RULES as BRANCH_RULES
 from orthocas.tasks.branches import branches as find_branches
 from orthocas.tasks.problem import Problem, check
-from orthocas.tasks.problem_samples import NEGLIGIBLE
+from orthocas.tasks.samples import NEGLIGIBLE
 from orthocas.tasks.task import Task
 from orthocas.tools.display import percent
 from orthocas.tools.json import clean

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocas.errors import NoExpressionError
 from orthocas.exact.leaves import LeafChart, LeafValues, remove_turns
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.problem_samples import Samples
+from orthocas.tasks.samples import Samples
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_point_set

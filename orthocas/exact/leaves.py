@@ -14,8 +14,7 @@ from orthocas.exact.harmonic import TriangleMesh, build_level_surface, map_to_di
 from orthocas.exact.mesh import TriangleLocator
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.problem_samples import evaluate_samples
-from orthocas.tasks.samples import sample_uniform
+from orthocas.tasks.samples import evaluate_samples, sample_uniform
 from orthocas.tools.cached import building, cached_property
 from orthocas.tools.checks import Array, Indices, freeze_array, freeze_indices, require_known, require_memory
 from orthocas.tools.expressions import compute_determinant, wrap_shortest

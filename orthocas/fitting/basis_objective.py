@@ -13,7 +13,7 @@ from orthocas.bases.family import LinearFamily
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
 from orthocas.fitting.residuals import Loss, Pairs, curvature_columns, loss_columns, residual_columns, value_columns
 from orthocas.fitting.terms import Sizes, Weights
-from orthocas.tasks.problem_samples import Draw, Samples, split_samples
+from orthocas.tasks.samples import Draw, Samples, split_samples
 from orthocas.tools.batch import count_threads, run_in_threads, run_in_threads_with
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import COLUMNS, Run, arrange_blocks, build_weights, split_by_sample

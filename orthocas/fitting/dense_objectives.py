@@ -12,7 +12,7 @@ import numpy as np
 from orthocas.bases.family import ArrayFamily, ArrayMemory, Family, Memories
 from orthocas.fitting.residuals import Loss, loss_columns, loss_with_slopes, value_columns
 from orthocas.fitting.terms import Sizes, Weights
-from orthocas.tasks.problem_samples import Draw, Samples, split_samples
+from orthocas.tasks.samples import Draw, Samples, split_samples
 from orthocas.tools.batch import count_threads, run_in_threads, run_in_threads_with
 from orthocas.tools.blas_graph import NumpyGraph
 from orthocas.tools.cached import cached_property

@@ -25,7 +25,7 @@ from orthocas.solvers.protocol import Solver, Status
 from orthocas.tasks.clear_box import ClearBox
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem, ProblemCheck, check
-from orthocas.tasks.problem_samples import Samples, find_idle_joints, sample_problem
+from orthocas.tasks.samples import Samples, find_idle_joints, sample_problem
 from orthocas.tools.batch import use_threads
 from orthocas.tools.checks import Array, require_count
 from orthocas.tools.display import Shown, listed, percent

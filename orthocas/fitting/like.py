@@ -16,7 +16,7 @@ from orthocas.fitting.basis_gradients import BasisGradients
 from orthocas.fitting.terms import Data, Sizes, metric_lengths
 from orthocas.robots.robot import Robot
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.problem_samples import Samples, sample_problem
+from orthocas.tasks.samples import Samples, sample_problem
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property

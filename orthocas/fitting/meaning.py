@@ -13,7 +13,7 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError, RobotError
 from orthocas.fitting.like import SWIVEL, Like, Likeness, like_label, quantity_of
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.problem_samples import sample_problem
+from orthocas.tasks.samples import sample_problem
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array

@@ -26,8 +26,7 @@ from orthocas.tasks.problem import (
     measure_half_turn_distance,
     relative_singular_values,
 )
-from orthocas.tasks.problem_samples import Samples, evaluate_samples
-from orthocas.tasks.samples import sample_boundary_weighted, sample_evenly
+from orthocas.tasks.samples import Samples, evaluate_samples, sample_boundary_weighted, sample_evenly
 from orthocas.tools.batch import one_blas_thread
 from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import deferred

@@ -20,8 +20,7 @@ from orthocas.solvers.lbfgs import LBFGS
 from orthocas.solvers.protocol import SolveResult
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.problem_samples import NEGLIGIBLE
-from orthocas.tasks.samples import sample_boundary_weighted, sample_uniform
+from orthocas.tasks.samples import NEGLIGIBLE, sample_boundary_weighted, sample_uniform
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 from orthocas.tools.progress import Monitor, Watch

@@ -41,8 +41,7 @@ from orthocas.solvers.protocol import (
     Status,
 )
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.problem_samples import Samples, evaluate_samples, sample_problem
-from orthocas.tasks.samples import sample_evenly
+from orthocas.tasks.samples import Samples, evaluate_samples, sample_evenly, sample_problem
 from orthocas.tools.batch import one_blas_thread
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_memory

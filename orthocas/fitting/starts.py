@@ -12,7 +12,7 @@ from orthocas.bases.family import JointSpace, LinearFamily
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
 from orthocas.fitting.residuals import Pairs, coordinates_of
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.problem_samples import Samples, compute_directions
+from orthocas.tasks.samples import Samples, compute_directions
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 

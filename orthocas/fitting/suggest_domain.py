@@ -21,8 +21,8 @@ from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM, require_driven
 from orthocas.tasks.domains import Box, Domain
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.problem import Problem, check
-from orthocas.tasks.problem_samples import find_idle_joints, sample_problem
 from orthocas.tasks.regular_box import find_home
+from orthocas.tasks.samples import find_idle_joints, sample_problem
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, as_number, require_count, require_kind
 from orthocas.tools.display import Shown, listed, number_list

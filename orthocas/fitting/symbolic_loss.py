@@ -12,8 +12,7 @@ from orthocas.fitting.settings import require_parametrisation
 from orthocas.fitting.starts import spectral_start
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Sizes, WeightNumbers, Weights
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.problem_samples import Samples, evaluate_samples
-from orthocas.tasks.samples import sample_evenly
+from orthocas.tasks.samples import Samples, evaluate_samples, sample_evenly
 from orthocas.tools.checks import Array, as_point_set, freeze_array, require_count, require_kind
 
 

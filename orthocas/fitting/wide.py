@@ -39,8 +39,8 @@ from orthocas.tasks.branches import Branch, Branches, branches, sample_centres, 
 from orthocas.tasks.domains import Box
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.problem import Problem, check
-from orthocas.tasks.problem_samples import find_idle_joints, sample_problem
 from orthocas.tasks.regular_box import find_home
+from orthocas.tasks.samples import find_idle_joints, sample_problem
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, as_number, require_count, require_kind
 from orthocas.tools.display import number_list, percent

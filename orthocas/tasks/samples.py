@@ -1,14 +1,25 @@
-"""Seeded samples of a domain: uniform, boundary-weighted, and evenly spread."""
+"""Samples: seeded points of a domain, and the data of the loss there that do not depend on the coordinates."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocas.errors import DomainError
 from orthocas.tasks.domains import Domain
+from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_count, require_memory
+
+if TYPE_CHECKING:
+    from orthocas.tasks.problem import Problem
+
+#: of the largest entry of J_x: columns below are of joints that do not move the task. Robot files round angles to nine
+#: decimals and more, and such a joint then tilts the axis that it turns about by so little
+NEGLIGIBLE = 1e-8
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,3 +117,179 @@ def _keep_inside(domain: Domain, samples: int, draw: Callable[[int], Array]) -> 
         drawn, count = drawn + size, count + len(kept[-1])
         size = max(samples - count, RULES.block)
     return np.concatenate(kept)[:samples]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Samples:
+    """N joint positions with their task gradients and metrics. Samples with a vanishing gradient are left out."""
+
+    points: Array  #: q, (N, n)
+    task_jacobian: Array  #: J_x, (N, m, n)
+    metric_inverse: Array | None  #: A^-1, (N, n, n); None for the identity
+
+    def __repr__(self) -> str:
+        N, m, n = self.task_jacobian.shape
+        return f"Samples({N} joint positions, n = {n}, m = {m})"
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, part: slice | NDArray[np.bool_]) -> "Samples":
+        inverse = None if self.metric_inverse is None else self.metric_inverse[part]
+        return Samples(self.points[part], self.task_jacobian[part], inverse)
+
+    def restricted_to(self, joints: list[int]) -> "Samples":
+        """The samples of some joints only. The metric must not couple them to the others."""
+        inverse = None if self.metric_inverse is None else self.metric_inverse[:, joints][:, :, joints]
+        return Samples(self.points[:, joints], self.task_jacobian[:, :, joints], inverse)
+
+    def project_to_zero_momentum(self, base: Sequence[int]) -> "Samples":
+        """The samples as velocities with zero momentum see them, on a base that floats.
+
+        For A = M, with the joints a of the arms: J_x becomes the generalised Jacobian J_a - J_b M_bb^-1 M_ba, which is
+        (J_x M^-1)_a ((M^-1)_aa)^-1, and M the generalised inertia, whose inverse is (M^-1)_aa. Then the base's joints
+        neither move the task nor are coupled to the others, and count as idle.
+
+        Source:
+            [UY1989]; the metric is ours.
+        """
+        assert self.metric_inverse is not None
+        n, k = self.task_jacobian.shape[2], len(base)
+        arms = self.metric_inverse[:, k:, k:]
+        J, inverse = np.zeros_like(self.task_jacobian), np.repeat(np.eye(n)[None], len(self), axis=0)
+        gradients = self.compute_metric_gradients(self.task_jacobian)[:, :, k:]
+        J[:, :, k:] = np.linalg.solve(arms, gradients.transpose(0, 2, 1)).transpose(0, 2, 1)
+        inverse[:, k:, k:] = arms
+        return Samples(self.points, J, inverse)
+
+    def compute_metric_gradients(self, covectors: Array) -> Array:
+        """A^-1 v for covectors v (N, k, n): gradients in the metric ([AS2023] eq. (16))."""
+        gradients: Array = covectors if self.metric_inverse is None else covectors @ self.metric_inverse
+        return gradients
+
+    @property
+    def unit_task_gradients(self) -> Array:
+        """A^-1 v_x,i / |A^-1 v_x,i| with Euclidean norms, as in [AS2023] eq. (24), (N, m, n)."""
+        gradients = self.compute_metric_gradients(self.task_jacobian)
+        unit: Array = gradients / np.linalg.norm(gradients, axis=2, keepdims=True)
+        return unit
+
+    @property
+    def task_basis(self) -> Array:
+        """An A-orthonormal basis e_1..e_m of span{grad_A h_i}, (N, m, n)."""
+        gradients = self.compute_metric_gradients(self.task_jacobian)
+        gram = gradients @ self.task_jacobian.transpose(0, 2, 1)
+        # Rows are normalised first, so that units do not matter.
+        scale = np.sqrt(np.einsum("sii->si", gram))
+        gram = gram / scale[:, :, None] / scale[:, None, :]
+        # The least eigenvalue keeps singular samples finite.
+        values, vectors = np.linalg.eigh(gram)
+        values = np.maximum(values, 1e-14)
+        whitening = (vectors / np.sqrt(values)[:, None, :]).transpose(0, 2, 1)
+        basis: Array = whitening @ (gradients / scale[:, :, None])
+        return basis
+
+    @cached_property
+    def null_basis(self) -> Array:
+        """An A-orthonormal basis z_1..z_r of ker J_x, (N, n, r), oriented so that det [J_x; Z^T] > 0."""
+        m = self.task_jacobian.shape[1]
+        Z = np.linalg.qr(self.task_jacobian.transpose(0, 2, 1), mode="complete")[0][:, :, m:]
+        if self.metric_inverse is not None:
+            gram = Z.transpose(0, 2, 1) @ np.linalg.solve(self.metric_inverse, Z)
+            Z = Z @ np.linalg.inv(np.linalg.cholesky(gram)).transpose(0, 2, 1)
+        stacked = np.concatenate([self.task_jacobian, Z.transpose(0, 2, 1)], axis=1)
+        Z[:, :, -1] *= np.where(np.linalg.det(stacked) < 0, -1.0, 1.0)[:, None]
+        return Z
+
+    def orientation(self, coordinate_jacobians: Array) -> float:
+        """Sign (+1 or -1), at most of the samples, of the volume that J_xi (N, r, n) spans across the task."""
+        return 1.0 if np.median(np.linalg.det(coordinate_jacobians @ self.null_basis)) >= 0 else -1.0
+
+    def collect_data(self, names: Iterable[str], orientation: float | None) -> list[Array]:
+        """The data of every sample that a loss needs, by name: arrays (N, rows, columns) or (N, rows).
+
+        Args:
+            names: see `orthocas.fitting.terms.SAMPLE_DATA`.
+            orientation: result of `orientation` for the coordinates that a fit starts from. The null basis is oriented
+                like them, so that the volume of their gradients is positive.
+        """
+        data: dict[str, Array] = {name: getattr(self, name) for name in names}
+        if "null_basis" in data:
+            oriented = data["null_basis"].copy()
+            oriented[:, :, -1] *= orientation or 1.0
+            data["null_basis"] = oriented
+        return list(data.values())
+
+
+Draw = Callable[[int, tuple[int, ...]], Samples]  #: draws a number of fresh samples of a problem, with a seed
+
+
+def split_samples(samples: Samples, count: int) -> Iterator[Samples]:
+    """Split samples into `count` parts of nearly equal size. Sizes differ if samples were left out."""
+    edges = np.linspace(0, len(samples), count + 1).astype(int)
+    for start, stop in pairwise(edges):
+        yield samples[int(start) : int(stop)]
+
+
+def sample_problem(problem: "Problem", samples: int, seed: int | tuple[int, ...]) -> Samples:
+    """Draw samples uniformly from the problem's domain."""
+    return evaluate_samples(problem, sample_uniform(problem.domain, samples, seed))
+
+
+def evaluate_samples(problem: "Problem", points: Array) -> Samples:
+    """Samples at given joint positions (N, n)."""
+    J = problem.task.evaluate_jacobian(points)
+    kept = np.all(np.einsum("sij,sij->si", J, J) > 0, axis=1)
+    if not kept.all():
+        points, J = points[kept], J[kept]
+    inverse: Array | None = None
+    if not problem.metric.is_identity:
+        inverse = np.asarray(np.linalg.inv(problem.metric.evaluate(points)), dtype=float)
+    samples = Samples(points, J, inverse)
+    return samples.project_to_zero_momentum(problem.robot.tree.floating) if problem.robot.tree.floating else samples
+
+
+def find_idle_joints(problem: "Problem", samples: Samples) -> list[int]:
+    """Joints k on which the task does not depend, and which the metric does not couple to the others.
+
+    At every sample column k of J_x vanishes, up to `NEGLIGIBLE`, row k of A^-1 is zero off the diagonal, and A does not
+    depend on q_k. Then J_x A^-1 e_k = 0, so xi = q_k is exact and orthogonal to every coordinate of the other joints.
+    The rest of the problem does not depend on joint k. So are the joints of a floating base in
+    `Samples.project_to_zero_momentum`: the generalised inertia does not depend on where it is.
+    """
+    J = samples.task_jacobian
+    size = np.abs(J).max(axis=(0, 1))
+    idle = size <= NEGLIGIBLE * size.max()
+    if samples.metric_inverse is not None:
+        B = np.abs(samples.metric_inverse).max(axis=0)
+        off_diagonal = (B - np.diag(B.diagonal())).max(axis=1)
+        idle &= off_diagonal <= NEGLIGIBLE * B.diagonal()
+        felt_by_metric = {*problem.metric.function.jac_sparsity(0, 0).get_col()} - {*problem.robot.tree.floating}
+        idle[list(felt_by_metric)] = False
+    return [int(k) for k in np.flatnonzero(idle)]
+
+
+def compute_directions(problem: "Problem", joints: Sequence[int], points: Array) -> Array:
+    """Compute what a symmetry of the joints keeps: A^-1, and the projector on the task gradients.
+
+    The second index of the projector is raised by the metric.
+
+    Args:
+        problem: robot, task, metric; the other joints stay at the centre of its domain.
+        joints: the k joints.
+        points: their positions, (N, k).
+
+    Returns:
+        Both matrices over the largest entry of the pair, (N, 2, k, k); NaN everywhere if a gradient vanishes at any.
+    """
+    q = np.repeat(problem.domain.centre[None], len(points), axis=0)
+    q[:, list(joints)] = points
+    samples = evaluate_samples(problem, q).restricted_to(list(joints))
+    if len(samples) < len(points):
+        return np.full((len(points), 2, len(joints), len(joints)), np.nan)
+    basis = samples.task_basis
+    projector = basis.transpose(0, 2, 1) @ basis
+    inverse = samples.metric_inverse
+    inverse = np.broadcast_to(np.eye(len(joints)), projector.shape) if inverse is None else inverse
+    both = np.stack([inverse, projector], axis=1)
+    return np.asarray(both / np.abs(both).max(axis=(1, 2, 3), keepdims=True))

@@ -18,8 +18,7 @@ from orthocas.control import ControlStatus, Kinematic, PDPlus
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.probe import judged_chart, leak_and_conditioning
-from orthocas.tasks.problem_samples import evaluate_samples
-from orthocas.tasks.samples import sample_boundary_weighted, sample_uniform
+from orthocas.tasks.samples import evaluate_samples, sample_boundary_weighted, sample_uniform
 from orthocas.tools.archive import read_archive
 from orthocas.tools.batch import Batched
 

@@ -12,7 +12,7 @@ from conftest import Run, robot_data
 import orthocas as oc
 from orthocas.errors import BranchWarning
 from orthocas.fitting.probe import Bounds, Verdict
-from orthocas.tasks.problem_samples import NEGLIGIBLE
+from orthocas.tasks.samples import NEGLIGIBLE
 
 TASK = "position+axis:z"
 UR5 = "ur_description/urdf/ur5_robot.urdf"

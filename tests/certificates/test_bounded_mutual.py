@@ -11,7 +11,7 @@ from orthocas.fitting.basis_objective import BasisObjective, BoundedMutual
 from orthocas.fitting.stages import missed_bound
 from orthocas.fitting.terms import Weights
 from orthocas.solvers.protocol import SolveResult, Status
-from orthocas.tasks.problem_samples import sample_problem
+from orthocas.tasks.samples import sample_problem
 
 
 @pytest.fixture(scope="module")

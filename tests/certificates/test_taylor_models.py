@@ -23,7 +23,7 @@ from orthocas.certificates.taylor import (
     list_monomials,
     sum_error,
 )
-from orthocas.tasks.problem_samples import evaluate_samples
+from orthocas.tasks.samples import evaluate_samples
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
 

@@ -13,8 +13,7 @@ import orthocas as oc
 from orthocas.charts.angles import judge_by_columns, judge_by_lapack
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
 from orthocas.fitting.fit import Fit
-from orthocas.tasks.problem_samples import evaluate_samples
-from orthocas.tasks.samples import sample_uniform
+from orthocas.tasks.samples import evaluate_samples, sample_uniform
 
 
 def leaks_by_hand(chart: oc.Chart, q: np.ndarray) -> np.ndarray:

@@ -15,8 +15,7 @@ from orthocas.fitting.residuals import Loss, sample_loss
 from orthocas.fitting.stages import FoldSearch
 from orthocas.fitting.starts import Mirror, find_mirror
 from orthocas.fitting.terms import LEAST_CONDITIONING, Sizes, Weights
-from orthocas.tasks.problem_samples import sample_problem
-from orthocas.tasks.samples import sample_boundary_weighted
+from orthocas.tasks.samples import sample_boundary_weighted, sample_problem
 
 ACTIVE = list(range(6))
 SPACE = JointSpace(np.zeros(2), np.ones(2), (False, False), ("a", "b"))

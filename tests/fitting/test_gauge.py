@@ -10,7 +10,7 @@ import orthocas as oc
 from orthocas.bases import JointSpace
 from orthocas.errors import InvalidValueError
 from orthocas.fitting.fit import align, fix_gauge
-from orthocas.tasks.problem_samples import sample_problem
+from orthocas.tasks.samples import sample_problem
 from orthocas.tools.checks import Array
 
 

@@ -33,7 +33,7 @@ from orthocas.fitting.terms import (
     task_cosines,
     volume_hinges,
 )
-from orthocas.tasks.problem_samples import Draw, Samples, evaluate_samples, sample_problem
+from orthocas.tasks.samples import Draw, Samples, evaluate_samples, sample_problem
 from orthocas.tools import columns
 from orthocas.tools.expressions import compute_determinant
 

@@ -13,7 +13,7 @@ from orthocas.errors import InvalidValueError, SolveError
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.starts import spectral_start
 from orthocas.solvers.protocol import ConstrainedObjective, Objective, Solver, Status
-from orthocas.tasks.problem_samples import sample_problem
+from orthocas.tasks.samples import sample_problem
 
 
 def test_ipopt_keeps_constraints() -> None:

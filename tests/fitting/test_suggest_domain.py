@@ -16,9 +16,8 @@ from orthocas.bases.family import JointSpace
 from orthocas.charts.quality import evaluate
 from orthocas.errors import DomainError, InvalidValueError, NotRedundantError, SingularTaskError, UnknownNameError
 from orthocas.fitting.probe import Prober, judged_chart, leak_and_conditioning
-from orthocas.tasks.problem_samples import evaluate_samples
 from orthocas.tasks.regular_box import find_home
-from orthocas.tasks.samples import sample_boundary_weighted
+from orthocas.tasks.samples import evaluate_samples, sample_boundary_weighted
 from orthocas.tools.progress import Progress
 
 HOME = (0.6, 0.8, 0.8)

@@ -11,8 +11,7 @@ from orthocas.bases import JointSpace, Parametrisation
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.dense_objectives import GraphObjective
-from orthocas.tasks.problem_samples import evaluate_samples
-from orthocas.tasks.samples import sample_evenly
+from orthocas.tasks.samples import evaluate_samples, sample_evenly
 
 EVERY_TERM = oc.Weights(length=3.0, angles="paper")
 CASES = [

@@ -72,7 +72,7 @@ def test_loss_term_acts_and_its_gauss_newton_matrix_and_hessian_are_right(tmp_pa
     more = """
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.bases import JointSpace
-from orthocas.tasks.problem_samples import samples_at
+from orthocas.tasks.samples import samples_at
 from orthocas.tasks.samples import sample_evenly
 weights = oc.Weights(extra={"quiet": 3000.0}, angles="metric")
 points = np.repeat(sample_evenly(problem.domain, 30, 3), 2, axis=0)  # every second one makes the Gauss-Newton matrix

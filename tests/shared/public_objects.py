@@ -33,8 +33,7 @@ from orthocas.simulation import (
     simulate,
 )
 from orthocas.tasks.metric import Metric
-from orthocas.tasks.problem_samples import sample_problem
-from orthocas.tasks.samples import sample_uniform
+from orthocas.tasks.samples import sample_problem, sample_uniform
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
 

@@ -7,7 +7,7 @@ import pytest
 import orthocas as oc
 from orthocas import problems
 from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError, UnknownNameError
-from orthocas.tasks.problem_samples import evaluate_samples, sample_problem
+from orthocas.tasks.samples import evaluate_samples, sample_problem
 
 
 def arm(joints: int = 3) -> oc.Robot:
