@@ -72,13 +72,13 @@ def test_loss_term_acts_and_its_gauss_newton_matrix_and_hessian_are_right(tmp_pa
     more = """
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.bases import JointSpace
-from orthocas.tasks.samples import samples_at
+from orthocas.tasks.samples import evaluate_samples
 from orthocas.tasks.samples import sample_evenly
 weights = oc.Weights(extra={"quiet": 3000.0}, angles="metric")
 points = np.repeat(sample_evenly(problem.domain, 30, 3), 2, axis=0)  # every second one makes the Gauss-Newton matrix
 family = oc.Polynomial(2).family(JointSpace.of(problem), 2)
 theta = family.initial(1)
-fast = BasisObjective(family, samples_at(problem, points), weights, theta, None)
+fast = BasisObjective(family, evaluate_samples(problem, points), weights, theta, None)
 slow = oc.loss(problem, oc.Polynomial(2), weights=weights, samples=points, start=theta)
 x = ca.MX.sym("x", family.size)
 H, g, value = ca.hessian(slow(x), x)[0], ca.gradient(slow(x), x), slow(x)
@@ -86,7 +86,7 @@ exact = ca.Function("exact", [x], [value, g, H])
 value, gradient, hessian = (part.full().squeeze() for part in exact(theta))
 print(abs(fast.value(theta) / value - 1), np.abs(fast.value_and_gradient(theta)[1] - gradient).max())
 print(np.abs(fast.hessian(theta) - hessian).max() / np.abs(hessian).max())
-without = BasisObjective(family, samples_at(problem, points), oc.Weights(angles="metric"), theta, None)
+without = BasisObjective(family, evaluate_samples(problem, points), oc.Weights(angles="metric"), theta, None)
 assert fast.value(theta) > without.value(theta)
 """
     (
