@@ -143,10 +143,9 @@ class PolynomialSeries:
             for j, b in enumerate(kept):
                 if len(a) + len(b) <= degree:
                     table[:, i, j] = values[:, own[tuple(sorted(a + b))]]
-        weights = build_power_table(np.ones((len(variables), 1)), degree)[:, 0]  # 1 / a!
-        sizes, errors = (
-            np.asarray(each @ weights * compute_margin(len(kept))) for each in (np.abs(values) + doubts, doubts)
-        )
+        # 1 / a!.
+        weights, margin = build_power_table(np.ones((len(variables), 1)), degree)[:, 0], compute_margin(len(kept))
+        sizes, errors = (np.asarray(each @ weights * margin) for each in (np.abs(values) + doubts, doubts))
         centre, scale = family.space.centre[variables], family.space.half_width[variables]
         return cls(centre, scale, degree, table.reshape(len(values) * len(kept), len(kept)), sizes, errors)
 

@@ -297,9 +297,8 @@ class TipJets:
         if self.rows.axis is not None:
             u = R[:, :, self.rows.axis]
             across = R[:, :, [k for k in range(3) if k != self.rows.axis]]
-            nested = _nest_products(
-                outer, np.cross(outer, np.broadcast_to(u.T[None], outer.shape), axis=1), around.order
-            )
+            first = np.cross(outer, np.broadcast_to(u.T[None], outer.shape), axis=1)
+            nested = _nest_products(outer, first, around.order)
             parts.append([np.einsum("bxk,mxb->mkb", across, each) for each in nested])
             rests.append(np.repeat(self._bound_rest_of_turns(around, turning & carried)[None], 2, axis=0))
         n = len(self.columns)

@@ -9,7 +9,7 @@ components of x lose rank though the arm does not, these rows are as regular as 
 The stored rotations of a robot are rotations up to rounding only. Each of the at most n factors then changes an entry
 by at most their deviation times the length of the chain, and an allowance covers all changes. It also covers the
 constants that CasADi multiplies and adds while it builds these rows: fewer than 10 n roundings of numbers up to the
-length, and the allowance is 512 n of them. All other rows come from `derivative_graph`, which rounds nothing unseen.
+length, and the allowance is 512 n of them. All other rows come from `graph`, which rounds nothing unseen.
 
 Source:
     ours, docs/explanation/certificates.md.
@@ -268,15 +268,11 @@ def transform_task_rows(task: Task, domain: Domain) -> tuple[ca.Function, float]
     if tip is None or tip.position not in ((), (0, 1, 2)):
         return task.jacobian_function, 0.0
     q = ca.SX.sym("q", task.robot.n)
-    parts = []
+    parts, rows = [], [build_velocity_rows(tree, q, body) for body in tree.carriers(tree.tip_parent)]
     if tip.position:
-        parts.append(
-            _choose_sparsest(q, [build_velocity_rows(tree, q, body)[:3, :] for body in tree.carriers(tree.tip_parent)])
-        )
+        parts.append(_choose_sparsest(q, [J[:3, :] for J in rows]))
     if tip.rotation:
-        parts.append(
-            _choose_sparsest(q, [build_velocity_rows(tree, q, body)[3:, :] for body in tree.carriers(tree.tip_parent)])
-        )
+        parts.append(_choose_sparsest(q, [J[3:, :] for J in rows]))
     if tip.axis is not None:
         parts.append(build_axis_rows(tree, q, tip.axis))
     return dense_function("task_rows", [q], [ca.vertcat(*parts)]), _bound_entry_error(tree, domain)
@@ -424,9 +420,8 @@ class ProductRows:
         known = [self._evaluate_derivatives(order, values, errors) for order in range(1, around.order + 2)]
         linear = np.stack([around.centre, around.reach, *np.zeros((2, *around.centre.shape))], axis=1)
         boxes = [TaylorModel((k,), each, np.zeros(each.shape[1:])) for k, each in enumerate(linear)]
-        left_out = self._bound_derivatives(around.order + 2, boxes) * average_largest(
-            build_power_weights(around, around.order + 1)
-        )
+        weights = average_largest(build_power_weights(around, around.order + 1))
+        left_out = self._bound_derivatives(around.order + 2, boxes) * weights
         derivatives, doubts = zip(*known, strict=True)
         return Jets(derivatives, doubts, left_out.sum(axis=2) * compute_margin(left_out.shape[2]) + TINY)
 

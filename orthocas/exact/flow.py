@@ -74,9 +74,8 @@ class BatchedFlow:
             good = ratio <= 1
             y[running[good]] = moved[good]
             s[running[good]] += tried[good]
-            step[running] = tried * np.clip(
-                RULES.safety * np.maximum(ratio, 1e-16) ** (-1 / 8), RULES.shrink, RULES.grow
-            )
+            growth = RULES.safety * np.maximum(ratio, 1e-16) ** (-1 / 8)
+            step[running] = tried * np.clip(growth, RULES.shrink, RULES.grow)
             running = running[(s[running] < 1) & (step[running] > RULES.smallest)]
         return y, s >= 1
 

@@ -78,9 +78,8 @@ def build_level_surface(
     # Marching cubes, then Newton steps onto the surface, then flips and smoothing in turns.
     gap, largest = _sample_gap(h, level, axes)
     points, faces, free, ends = _march_cubes(gap, axes)
-    sheet = _Sheet(
-        h, gradient, level, corners, free, RULES.on_level * max(1.0, largest), float(axes[0][1] - axes[0][0])
-    )
+    tolerance, cell = RULES.on_level * max(1.0, largest), float(axes[0][1] - axes[0][0])
+    sheet = _Sheet(h, gradient, level, corners, free, tolerance, cell)
     points = sheet.start(points, ends)
     for _ in range(RULES.rounds):
         faces = flip_to_delaunay(points, faces)

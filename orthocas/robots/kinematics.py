@@ -221,9 +221,8 @@ class TipTurn:
         if self.axis is None:
             return 2 * p[1:] * ca.if_else(p[0] < 0, -1, 1)
         cross = skew(p[1:])
-        return self._split_about_axis(
-            ca.SX.eye(3) + 2 * (p[0] * cross + cross @ cross), p * ca.if_else(p[0] < 0, -1, 1)
-        )
+        turned = ca.SX.eye(3) + 2 * (p[0] * cross + cross @ cross)
+        return self._split_about_axis(turned, p * ca.if_else(p[0] < 0, -1, 1))
 
     @property
     def order(self) -> Array:

@@ -268,10 +268,10 @@ class LinkDistances:
             )
         links = list(ends.values())
         points = Batched(dense_function("ends", [self._q], [ca.vertcat(*(ca.vertcat(*link[1:]) for link in links))]))
-        seen = points(np.random.default_rng(0).uniform(-1, 1, (RULES.postures, tree.n)))[0].reshape(
-            RULES.postures, -1, 6
-        )
-        moves = np.ptp(seen, axis=0).max(axis=1) > RULES.move
+        # Links that do not move between seeded postures stand still.
+        postures = np.random.default_rng(0).uniform(-1, 1, (RULES.postures, tree.n))
+        places = points(postures)[0].reshape(RULES.postures, -1, 6)
+        moves = np.ptp(places, axis=0).max(axis=1) > RULES.move
         return [link for link, moving in zip(links, moves, strict=True) if moving]
 
     @cached_property

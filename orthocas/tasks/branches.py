@@ -239,9 +239,8 @@ class _Arm:
         points = sample_evenly(Box(whole.centre, whole.half_width), 2000, RULES.seed)
         if len(robot.tips) == 1:
             joints = list(range(max(0, robot.n - RULES.arm), robot.n))
-            return [
-                cls._build(robot, Task.pose(robot) if robot.n >= 6 or task is None else task, whole, joints, points)
-            ]
+            one = Task.pose(robot) if robot.n >= 6 or task is None else task
+            return [cls._build(robot, one, whole, joints, points)]
         moved = np.ones(robot.n, dtype=bool)
         if task is not None:
             moved = np.asarray(_evaluate_jacobians(task.with_reference_at(whole.centre), points[:20]).any(axis=(0, 1)))
@@ -254,9 +253,9 @@ class _Arm:
 
     @classmethod
     def _build(cls, robot: Robot, task: Task, whole: Box, joints: list[int], points: Array) -> "_Arm":
-        judged = task.with_reference_at(whole.centre)
-        J = _evaluate_jacobians(judged, points)
-        return cls(robot, judged, whole, joints, compute_row_scale(J[:, :, joints], judged.units))
+        centred = task.with_reference_at(whole.centre)
+        J = _evaluate_jacobians(centred, points)
+        return cls(robot, centred, whole, joints, compute_row_scale(J[:, :, joints], centred.units))
 
     @property
     def inner(self) -> list[int]:
@@ -365,14 +364,12 @@ def sample_centres(robot: Robot, task: Task, box: Box) -> tuple[Array, Array]:
 def _scale_to_range(robot: Robot, task: Task) -> Callable[[Array], Array]:
     """Relative singular values of a task at points (N, n), (N,); rows are scaled over the joint range."""
     whole = find_joint_range(robot, 0)
-    judged = task.with_reference_at(whole.centre)
-    scale = compute_row_scale(
-        _evaluate_jacobians(judged, sample_evenly(Box(whole.centre, whole.half_width), RULES.samples, RULES.seed)),
-        judged.units,
-    )
+    centred = task.with_reference_at(whole.centre)
+    samples = sample_evenly(Box(whole.centre, whole.half_width), RULES.samples, RULES.seed)
+    scale = compute_row_scale(_evaluate_jacobians(centred, samples), centred.units)
 
     def values(points: Array) -> Array:
-        return np.asarray(np.linalg.svd(_evaluate_jacobians(judged, points) / scale[:, None], compute_uv=False)[:, -1])
+        return np.asarray(np.linalg.svd(_evaluate_jacobians(centred, points) / scale[:, None], compute_uv=False)[:, -1])
 
     return values
 

@@ -198,9 +198,8 @@ class ClearBox(Box):
     @cached_property
     def share(self) -> float:
         """Fraction of the box that is clear, from 20,000 samples."""
-        return float(
-            self.is_clear(sample_evenly(Box(self.centre, self.half_width), RULES.fraction_samples, RULES.seed)).mean()
-        )
+        points = sample_evenly(Box(self.centre, self.half_width), RULES.fraction_samples, RULES.seed)
+        return float(self.is_clear(points).mean())
 
     @cached_property
     def gram(self) -> ca.Function:

@@ -343,9 +343,8 @@ class Box(Domain):
         """The box of a file."""
         # Older files have no unbounded joints.
         unbounded = json.get_part(data, "unbounded", list) if "unbounded" in data else ()
-        return Box(
-            json.get_part(arrays, "centre", np.ndarray), json.get_part(arrays, "half_width", np.ndarray), unbounded
-        )
+        centre, half_width = (json.get_part(arrays, name, np.ndarray) for name in ("centre", "half_width"))
+        return Box(centre, half_width, unbounded)
 
 
 @register_domain

@@ -189,10 +189,8 @@ class PostureScore:
         unit = np.vstack([np.zeros(n), sample_evenly(Box(np.zeros(n), 1.0), samples, 0)])
         points = centres[:, None] + default_half_width(self.robot, centres)[:, None] * unit
         at = np.broadcast_to(centres[:, None], points.shape)
-        J = _fill_singular(self.jacobian(points.reshape(-1, n), at.reshape(-1, n))[0]).reshape(
-            *points.shape[:2], self.m, n
-        )
-        J = J / self.scale[:, None]
+        J = _fill_singular(self.jacobian(points.reshape(-1, n), at.reshape(-1, n))[0])
+        J = J.reshape(*points.shape[:2], self.m, n) / self.scale[:, None]
         rest = np.linalg.svd(J[:, 0])[2][:, None, self.m :]
         stacked = np.concatenate([J, np.broadcast_to(rest, (*points.shape[:2], n - self.m, n))], axis=2)
         return np.asarray(np.linalg.svd(stacked, compute_uv=False)[..., -1])
