@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from orthocas.bases.family import Family, LinearFamily
 from orthocas.bases.mlp import MLPFamily
@@ -36,7 +35,6 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import CertifyError
 from orthocas.tasks.domains import PathBound, SingularBound
-from orthocas.tasks.task import Task
 from orthocas.tools.batch import dense_function, one_blas_thread
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import Tape, evaluate_tape, find_gradient_dependences, write_tape
@@ -196,7 +194,10 @@ class OutsideCheck:
         values = np.full(len(low), np.inf)
         if not own.all():
             values[~own] = self.domain.singular_values((low + high)[~own] / 2)
-        near, widest = self._select_promising(values, low, high), self._avoid_slivers(values, low, high, inside.widest)
+        # Boxes that may lie outside: others, too large for the value at their centre, are rarely proved to.
+        half = (high - low)[:, list(self.variables)] / 2
+        near = np.asarray(self.domain.least_singular_value - values > RULES.steep * half.sum(axis=1))
+        widest = self._avoid_slivers(values, low, high, inside.widest)
         outside = np.zeros(len(low), dtype=bool)
         if near.any():
             with one_blas_thread():
@@ -212,11 +213,6 @@ class OutsideCheck:
             conditioning=np.where(outside, np.inf, inside.conditioning),
             widest=widest,
         )
-
-    def _select_promising(self, values: Array, low: Array, high: Array) -> NDArray[np.bool_]:
-        """Boxes that may lie outside: others, too large for the value at their centre, are rarely proved to."""
-        half = (high - low)[:, list(self.variables)] / 2
-        return np.asarray(self.domain.least_singular_value - values > RULES.steep * half.sum(axis=1))
 
     def _avoid_slivers(self, values: Array, low: Array, high: Array, widest: Array) -> Array:
         """The joint to halve: of thin boxes with a centre outside the widest one, so that they become worth a try."""
@@ -314,7 +310,10 @@ def choose_check(chart: Chart, rows: ChartRows, bound: float, method: str | None
     require_all_positions(chart, rows.variables)
     check, near, clear = choose_inside_check(chart, rows, bound, method), domain.path_bound, domain.singular_bound
     if near is not None:
-        _require_uncounted(near, chart.problem.robot.joint_names)
+        # After a turn of an unbounded joint that counts, what is far from the path may be near it.
+        for joint in {*near.unbounded} & {*near.counted.tolist()}:
+            name = chart.problem.robot.joint_names[joint]
+            raise CertifyError(f"joint '{name}' is unbounded and counts in the corridor, expected an infinite radius")
         start = near.postures[near.contains(near.postures)][:1]
         return CorridorCheck(check, near, float(check(start, start).sign[0]))
     if clear is None:
@@ -343,24 +342,11 @@ def _choose_rows(chart: Chart, domain: SingularBound) -> tuple[GraphRows, set[in
     changes no singular value, and rows in the axes of a body of the arm depend on fewer joints.
     """
     task, joints = chart.problem.task, range(chart.n)
-    if _is_turned_freely(chart.problem.task, domain):
-        return build_task_rows(task, chart.problem.domain, joints)
+    tip = TipRows.build(task)
+    if tip is not None and tip.axis is None and len(domain.scale) % 3 == 0:
+        own_axes = domain.jacobian_function is task.frame_jacobian_function or not tip.rotation
+        if own_axes and (domain.scale[::3] == domain.scale.reshape(-1, 3).T).all():
+            return build_task_rows(task, chart.problem.domain, joints)
     if domain.jacobian_function is not task.jacobian_function:
         return build_closed_form(domain.jacobian_function, joints)
     return build_true_gradients(task, joints)
-
-
-def _is_turned_freely(task: Task, domain: SingularBound) -> bool:
-    """Whether no singular value depends on the axes in which position and orientation are taken."""
-    tip = TipRows.build(task)
-    if tip is None or tip.axis is not None or len(domain.scale) % 3:
-        return False
-    own_axes = domain.jacobian_function is task.frame_jacobian_function or not tip.rotation
-    return own_axes and bool((domain.scale[::3] == domain.scale.reshape(-1, 3).T).all())
-
-
-def _require_uncounted(domain: PathBound, joint_names: Sequence[str]) -> None:
-    """Raise CertifyError if an unbounded joint counts: after a turn, what is far from the path may be near it."""
-    for joint in {*domain.unbounded} & {*domain.counted.tolist()}:
-        name = joint_names[joint]
-        raise CertifyError(f"joint '{name}' is unbounded and counts in the corridor, expected an infinite radius")

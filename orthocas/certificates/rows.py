@@ -275,7 +275,9 @@ def transform_task_rows(task: Task, domain: Domain) -> tuple[ca.Function, float]
         parts.append(_choose_sparsest(q, [J[3:, :] for J in rows]))
     if tip.axis is not None:
         parts.append(build_axis_rows(tree, q, tip.axis))
-    return dense_function("task_rows", [q], [ca.vertcat(*parts)]), _bound_entry_error(tree, domain)
+    # What stored rotations change in an entry: 16 n deviations times the length of the chain.
+    error = 16 * (tree.n + 1) * bound_rotation_error(tree) * bound_reach(tree, domain)
+    return dense_function("task_rows", [q], [ca.vertcat(*parts)]), error
 
 
 def build_velocity_rows(tree: KinematicTree, q: ca.SX, body: int) -> ca.SX:
@@ -318,11 +320,6 @@ def bound_reach(tree: KinematicTree, domain: Domain) -> float:
     furthest = np.abs(domain.centre) + domain.half_width
     slides = float(furthest[np.array(tree.prismatic)].sum())
     return float(np.abs(tree.translations).sum() + np.abs(tree.tip_translation).sum()) + slides + 1.0
-
-
-def _bound_entry_error(tree: KinematicTree, domain: Domain) -> float:
-    """A bound of what stored rotations change in an entry: 16 n deviations times the length of the chain."""
-    return 16 * (tree.n + 1) * bound_rotation_error(tree) * bound_reach(tree, domain)
 
 
 def _choose_sparsest(q: ca.SX, choices: list[ca.SX]) -> ca.SX:
