@@ -64,8 +64,8 @@ class DeterminantRules:
 
 
 RULES = DeterminantRules()
-DEGREE = 5  #: of the polynomials: more of it costs more and leaves less out
-_SPLITS = 2**DEGREE  #: products of two coefficients that add up to one, for each pair of factors
+SERIES_DEGREE = 5  #: of the polynomials: more of it costs more and leaves less out
+_SPLITS = 2**SERIES_DEGREE  #: products of two coefficients that add up to one, for each pair of factors
 
 Expansion = tuple[Array, Array]  #: coefficients (..., monomials, boxes) in t from -1 to 1, and a bound of the rest
 
@@ -94,7 +94,7 @@ class WaveSeries:
                 else:
                     own[place[tuple(-i for i in k)]] += np.conj(value)
         waves: Array = np.array(kept, dtype=float).reshape(len(kept), len(joints))
-        slopes = [np.prod(1j * waves[:, list(m)], axis=1) for m in list_indices(len(joints), DEGREE)]
+        slopes = [np.prod(1j * waves[:, list(m)], axis=1) for m in list_indices(len(joints), SERIES_DEGREE)]
         products = c[:, None] * np.array(slopes)
         table = np.concatenate([products.real, -products.imag], axis=2).reshape(-1, 2 * len(kept))
         sizes = np.abs(c) * UP
@@ -106,13 +106,13 @@ class WaveSeries:
         (sine, error), (cosine, _) = evaluate_sine_cosine(self.frequencies @ centre)
         values = np.concatenate([cosine, sine])
         coefficients = (self.table @ values).reshape(len(self.sizes), -1, centre.shape[1])
-        coefficients = coefficients * build_power_table(half, DEGREE)
+        coefficients = coefficients * build_power_table(half, SERIES_DEGREE)
         # |k . h|.
         turns = np.abs(self.frequencies) @ half * UP
         phases = sum_error(len(centre)) * (np.abs(self.frequencies).max(axis=0, initial=0) @ np.abs(centre))
         relative = 2 * (sum_error(len(values) + RULES.roundings) + error.max(axis=0, initial=0) + phases) * UP
-        truncated = sum(turns**d / factorial(d) for d in range(DEGREE + 1))
-        rest = self.sizes @ (turns ** (DEGREE + 1) / factorial(DEGREE + 1) + relative * truncated)
+        truncated = sum(turns**d / factorial(d) for d in range(SERIES_DEGREE + 1))
+        rest = self.sizes @ (turns ** (SERIES_DEGREE + 1) / factorial(SERIES_DEGREE + 1) + relative * truncated)
         return coefficients, rest * compute_margin(len(self.frequencies)) + self.errors[:, None] + TINY
 
 
@@ -266,13 +266,13 @@ def _plan_products(n: int, degree: int) -> tuple[tuple[bool, int, slice, NDArray
 
     Each entry is whether that one belongs to a, its place, those of the others, and where the products go.
     """
-    every = list_indices(n, max(DEGREE, degree))
+    every = list_indices(n, max(SERIES_DEGREE, degree))
     place = {m: k for k, m in enumerate(every)}
-    starts = [len(list_indices(n, d - 1)) if d else 0 for d in range(max(DEGREE, degree) + 2)]
+    starts = [len(list_indices(n, d - 1)) if d else 0 for d in range(max(SERIES_DEGREE, degree) + 2)]
     plan = []
     for k, one in enumerate(every):
         own = len(one)
-        for of_a, least, most in ((True, own, DEGREE - own), (False, own + 1, min(degree, DEGREE - own))):
+        for of_a, least, most in ((True, own, SERIES_DEGREE - own), (False, own + 1, min(degree, SERIES_DEGREE - own))):
             if least <= most and (not of_a or own <= degree):
                 others = slice(starts[least], starts[most + 1])
                 where = np.array([place[tuple(sorted(one + other))] for other in every[others]])
@@ -281,15 +281,15 @@ def _plan_products(n: int, degree: int) -> tuple[tuple[bool, int, slice, NDArray
 
 
 def _multiply_expansions(A: Array, B: Array, degree: int, n: int) -> Expansion:
-    """sum_i A_i B_i up to `DEGREE`, for factors (pairs, monomials, boxes), and what is left out, (pairs, boxes)."""
+    """sum_i A_i B_i for factors (pairs, monomials, boxes), and what the degree leaves out, (pairs, boxes)."""
     out = np.zeros((B.shape[1], A.shape[2]))
     for of_a, k, others, where in _plan_products(n, degree):
         one, many = (A[:, k], B[:, others]) if of_a else (B[:, k], A[:, others])
         out[where] += np.einsum("in,ikn->kn", one, many)
-    size_a, size_b = _sum_by_degree(A, n, degree), _sum_by_degree(B, n, DEGREE)
+    size_a, size_b = _sum_by_degree(A, n, degree), _sum_by_degree(B, n, SERIES_DEGREE)
     left_out = np.zeros(A[:, 0].shape)
     for i, a in enumerate(size_a):
-        left_out += a * size_b[max(0, DEGREE + 1 - i) :].sum(axis=0)
+        left_out += a * size_b[max(0, SERIES_DEGREE + 1 - i) :].sum(axis=0)
     return out, left_out
 
 
@@ -363,7 +363,7 @@ def compute_gains(coefficients: Array, rest: Array, n: int) -> Array:
     The rest is shared out like the terms of the highest degree, which it is most like.
     """
     sizes, taken = np.abs(coefficients), _weigh_halving(n)
-    highest = len(list_indices(n, DEGREE - 1))
+    highest = len(list_indices(n, SERIES_DEGREE - 1))
     last = taken[:, highest:] @ sizes[highest:]
     gains: Array = taken @ sizes + last / (last.sum(axis=0) + TINY) * rest
     return gains.T
@@ -372,7 +372,7 @@ def compute_gains(coefficients: Array, rest: Array, n: int) -> Array:
 @cache
 def _weigh_halving(n: int) -> Array:
     """1 - 2^-power of each variable in each monomial, (n, monomials)."""
-    return np.array([[1 - 0.5 ** m.count(v) for m in list_indices(n, DEGREE)] for v in range(n)])
+    return np.array([[1 - 0.5 ** m.count(v) for m in list_indices(n, SERIES_DEGREE)] for v in range(n)])
 
 
 @cache

@@ -48,8 +48,16 @@ from orthocas.tasks.domains import Domain
 from orthocas.tools.batch import one_blas_thread
 from orthocas.tools.checks import Array
 
-_AT_ONCE = 48  #: boxes, whose terms fit into the cache of a processor
-_ROUNDS = 2  #: of bounds of the differences by the coordinates
+
+@dataclass(frozen=True, slots=True)
+class OneToOneRules:
+    """Numbers of the one-to-one proof."""
+
+    at_once: int = 48  #: boxes, whose terms fit into the cache of a processor
+    rounds: int = 2  #: of bounds of the differences by the coordinates
+
+
+RULES = OneToOneRules()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -77,14 +85,14 @@ class OneToOneCheck:
         """Evaluate boxes between corners (boxes, n)."""
         parts = []
         with one_blas_thread(), np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            for k in range(0, len(low), _AT_ONCE):
-                parts.append(self._check_few(low[k : k + _AT_ONCE], high[k : k + _AT_ONCE]))
+            for k in range(0, len(low), RULES.at_once):
+                parts.append(self._check_few(low[k : k + RULES.at_once], high[k : k + RULES.at_once]))
         return _join_results(parts)
 
     def _check_few(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array]:
         q, around = (low + high).T / 2, self._build_around(low, high)
         if self.still and self.coordinates is not None:
-            for _ in range(_ROUNDS):
+            for _ in range(RULES.rounds):
                 around = self._narrow_differences(around, self.coordinates.build_jets(around))
         proved, widest, promising = self._check_at_order(q, around)
         for order in ORDERS[1:]:
@@ -172,8 +180,8 @@ class ConvexCheck:
         """Evaluate boxes between corners (boxes, n)."""
         parts = []
         with one_blas_thread(), np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            for k in range(0, len(low), _AT_ONCE):
-                parts.append(self._check_few(self.rows(low[k : k + _AT_ONCE], high[k : k + _AT_ONCE])))
+            for k in range(0, len(low), RULES.at_once):
+                parts.append(self._check_few(self.rows(low[k : k + RULES.at_once], high[k : k + RULES.at_once])))
         return _join_results(parts)
 
     def _check_few(self, J: TaylorModel) -> tuple[NDArray[np.bool_], Array]:

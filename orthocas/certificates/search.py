@@ -17,10 +17,19 @@ from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import check_remembered
 from orthocas.tools.processes import ATTEMPTS, worker_died
 
-BATCH = 512  #: most boxes of one task
-_SMALL = 128  #: boxes; smaller tasks take longer for each
-_TASKS = 8  #: that the waiting boxes are cut into if they are few
-_IN_FLIGHT = 64  #: most tasks of an executor at a time
+
+@dataclass(frozen=True, slots=True)
+class SearchRules:
+    """How boxes are shared between workers."""
+
+    batch: int = 512  #: most boxes of one task
+    small: int = 128  #: boxes; smaller tasks take longer for each
+    tasks: int = 8  #: that the waiting boxes are cut into if they are few
+    in_flight: int = 64  #: most tasks of an executor at a time
+
+
+RULES = SearchRules()
+
 _log = logging.getLogger(__name__)
 Priority = Callable[[Array, Array], Array]  #: corners (boxes, n) -> numbers, smallest first
 Look = Callable[["Search"], None]  #: called after each batch
@@ -133,7 +142,7 @@ class Search:
             self._apply(batch, results)
             return
         # Keep the executor busy, and take back what is done.
-        while self._waiting and len(pending) < _IN_FLIGHT:
+        while self._waiting and len(pending) < RULES.in_flight:
             batch = self._take()
             try:
                 pending[self.executor.submit(self.check, *_stack_corners(batch))] = batch
@@ -159,8 +168,9 @@ class Search:
     def _take(self) -> list[tuple[float, int, Array, Array]]:
         # As many boxes as there are, but enough tasks for all workers of an executor.
         waiting = len(self._waiting)
-        size = min(BATCH, waiting if self.executor is None else max(waiting // _TASKS, min(_SMALL, waiting)))
-        return [heapq.heappop(self._waiting) for _ in range(size)]
+        if self.executor is not None:
+            waiting = max(waiting // RULES.tasks, min(RULES.small, waiting))
+        return [heapq.heappop(self._waiting) for _ in range(min(RULES.batch, waiting))]
 
     def _return(self, batch: list[tuple[float, int, Array, Array]]) -> None:
         for box in batch:

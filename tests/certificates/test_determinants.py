@@ -12,7 +12,7 @@ import orthocas as oc
 from orthocas.bases.family import JointSpace
 from orthocas.certificates.box_checks import NEVER
 from orthocas.certificates.determinant import (
-    DEGREE,
+    SERIES_DEGREE,
     CofactorCheck,
     Determinant,
     Waves,
@@ -35,7 +35,7 @@ ROUNDING = 1e-12  # of plain evaluations that bounds are compared with
 
 def values_at(coefficients: Array, t: Array) -> Array:
     """Polynomials (monomials, boxes) at t (boxes, n)."""
-    terms = [t[:, list(m)].prod(axis=1) for m in list_indices(t.shape[1], DEGREE)]
+    terms = [t[:, list(m)].prod(axis=1) for m in list_indices(t.shape[1], SERIES_DEGREE)]
     return np.asarray((coefficients * np.array(terms)).sum(axis=0))
 
 
@@ -147,13 +147,13 @@ def test_joints_on_which_self_motions_do_not_depend_do_not_count() -> None:
 def test_least_values_are_below_all_values_and_exact_at_corners() -> None:
     rng = np.random.default_rng(5)
     for n in (1, 3, 5):
-        size = np.array([0.3 ** len(m) for m in list_indices(n, DEGREE)])
+        size = np.array([0.3 ** len(m) for m in list_indices(n, SERIES_DEGREE)])
         coefficients = rng.normal(size=(len(size), 40)) * size[:, None]
         least = bound_polynomial(coefficients, n)
         corners = rng.choice([-1.0, 1.0], (40, n))
         for t in [*rng.uniform(-1, 1, (20, 40, n)), corners]:
             assert (values_at(coefficients, t) >= least).all()
-    bilinear = np.zeros((len(list_indices(2, DEGREE)), 1))
+    bilinear = np.zeros((len(list_indices(2, SERIES_DEGREE)), 1))
     bilinear[[0, 1, 2, 4], 0] = 1.0, 1.0, 1.0, 0.5  # 1 + x + y + x y / 2, least at (-1, -1); sizes alone give -1.5
     assert bound_polynomial(bilinear, 2)[0] == pytest.approx(-0.5, abs=1e-12)
 
