@@ -18,7 +18,15 @@ from orthocas.control.controller import (
     named_inputs,
 )
 from orthocas.control.errors import drift, errors
-from orthocas.control.gains import FEEDBACK, FEEDBACK_SETTING, LIMIT, Setting, command_limit, non_negative_gains
+from orthocas.control.gains import (
+    FEEDBACK,
+    FEEDBACK_RATE,
+    FEEDBACK_SETTING,
+    LIMIT,
+    Setting,
+    command_limit,
+    non_negative_gains,
+)
 from orthocas.control.linear_algebra import block_inertia, median_volume
 from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
@@ -33,9 +41,12 @@ from orthocas.tools.display import Shown
 class Kinematic(Shown):
     """Joint velocity dq = J^-1 (d_phi_d + Lambda (phi_d - phi)).
 
+    The error e = phi - phi_d obeys de/dt = -Lambda e, so every start ends on the reference.
+
     Args:
         chart: a chart with a closed expression (not a grown one).
-        feedback: diagonal of Lambda, >= 0, (n,) or one number [1/s]; the paper uses 0.
+        feedback: diagonal of Lambda, >= 0, (n,) or one number [1/s]; default 10. The paper uses 0, which keeps every
+            error: of the start, of the integration, and of jumps of the reference or the sensors.
         limit: largest speed of each joint, (n,) or one number [rad/s] or [m/s]; default those of the robot.
 
     Raises:
@@ -59,7 +70,7 @@ class Kinematic(Shown):
     settings = MappingProxyType[str, str]({})
     options: ClassVar[Mapping[str, Setting]] = {"feedback": FEEDBACK_SETTING}
 
-    def __init__(self, chart: Chart, feedback: ArrayLike = 0.0, limit: ArrayLike | None = None) -> None:
+    def __init__(self, chart: Chart, feedback: ArrayLike = FEEDBACK_RATE, limit: ArrayLike | None = None) -> None:
         require_kind("chart", chart, Chart)
         require_driven(f"the law {self.name}", chart.problem.robot.tree)
         chart.function("xi")  # raises for grown charts
@@ -68,7 +79,7 @@ class Kinematic(Shown):
         object.__setattr__(self, "limit", command_limit("limit", limit, chart.problem.robot.velocity_limits))
 
     @classmethod
-    def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, *, feedback: ArrayLike = 0.0) -> Self:
+    def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, *, feedback: ArrayLike = FEEDBACK_RATE) -> Self:
         """Build the law on a chart."""
         return cls(chart, feedback, limit)
 
