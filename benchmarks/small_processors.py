@@ -21,8 +21,8 @@ from benchmark import run, table
 
 import orthocas as oc
 from orthocas.codegen import GeneratedC
-from orthocas.codegen.description import numbers
 from orthocas.codegen.precision import DOUBLE, SINGLE
+from orthocas.codegen.rendering import write_numbers
 from orthocas.control import PDPlus
 from orthocas.tools.checks import Array
 
@@ -66,7 +66,7 @@ class States:
         lines = [f"#define NUMBER {kind}", f"#define STATES {count}", f"#define ITERATIONS {iterations}"]
         arrays = {"q": self.q, "dq": self.dq, "references": self.reference, "start": self.start}
         for name, rows in arrays.items():
-            values = ",\n".join(f"{{{numbers(row)}}}" for row in rows)
+            values = ",\n".join(f"{{{write_numbers(row)}}}" for row in rows)
             lines.append(f"static const NUMBER {name}[STATES][{rows.shape[1]}] = {{{values}}};")
         text = "\n".join(lines)
         return SINGLE.code(text) if single else text

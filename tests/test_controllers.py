@@ -167,7 +167,7 @@ def ends_on_its_reference(
     delay: float,
     seconds: float = 3.0,
 ) -> bool:
-    """Whether x and xi of an ideal plant end within 1e-6 of a reference at rest, from starts up to 0.3 rad beside it."""
+    """Whether x and xi of an ideal plant end within 1e-6 of a reference at rest, from starts 0.3 rad beside it."""
     for start in np.random.default_rng(5).uniform(-0.3, 0.3, (4, chart.n)):
         q, reference = chart.problem.domain.centre + start, chart.phi(chart.problem.domain.centre)
         command = command_from(q)

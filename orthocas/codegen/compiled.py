@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import casadi as ca
@@ -17,6 +16,7 @@ import scipy
 
 from orthocas.codegen.kernels import generate_kernels
 from orthocas.codegen.library import compilers
+from orthocas.codegen.rendering import render
 from orthocas.errors import CompileError, SimulationError
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_path
@@ -29,7 +29,7 @@ _PREFIX = "kernel"
 _ENTRY = """int {name}(const double **arg, double **res, int *iw, double *w) {{
   return {prefix}_{name}(arg, res, iw, w, 0);
 }}"""
-_STAGES = 12  # as in templates/runner.c.in
+_STAGES = 12  # as in templates/runner.c.jinja
 
 
 def kept_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], folder: str | Path | None = None) -> Path:
@@ -115,7 +115,7 @@ def _cache() -> Path:
 
 
 class Kernel(ctypes.Structure):
-    """`kernel` of templates/runner.c.in: a function with its own work arrays, for one thread."""
+    """`kernel` of templates/runner.c.jinja: a function with its own work arrays, for one thread."""
 
     _fields_ = (
         ("run", ctypes.c_void_p),
@@ -197,11 +197,10 @@ class CompiledFunctions:
 
 @cache
 def runner(name: str) -> Any:
-    """A function of templates/runner.c.in, which calls kernels."""
+    """A function of templates/runner.c.jinja, which calls kernels."""
     method = scipy.integrate.DOP853
     tables = {"a": method.A, "b": method.B, "c": method.C, "e3": method.E3[:-1], "e5": method.E5[:-1]}
-    values = {key: ", ".join(repr(float(x)) for x in table.ravel()) for key, table in tables.items()}
-    source = Template(template("runner.c.in")).substitute(values)
+    source = render("runner.c", tables)
     return getattr(loaded(kept_library("runner", {"runner.c": source}, ("-O3",))), f"orthocas_{name}")
 
 
@@ -210,7 +209,7 @@ def _pointers(arrays: Sequence[Array]) -> Any:
 
 
 class _State(ctypes.Structure):
-    """`loop` of templates/runner.c.in."""
+    """`loop` of templates/runner.c.jinja."""
 
     _fields_ = (
         *((name, Kernel) for name in ("law", "plant", "profile")),

@@ -12,8 +12,8 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.curve_tracer import RULES
 from orthocas.charts.curves import Nearest, SelfMotionCurves
 from orthocas.codegen.compiled import template
-from orthocas.codegen.description import flags, numbers
 from orthocas.codegen.kernels import generate_kernels
+from orthocas.codegen.rendering import write_numbers
 from orthocas.tasks.domains import bounds_of
 from orthocas.tools.batch import dense_function, in_threads
 from orthocas.tools.checks import Array
@@ -77,8 +77,8 @@ def curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
     low, high = bounds_of(domain)
     arrays = {"low": low, "high": high, "centre": domain.centre, "half_width": domain.half_width}
     lines = [f"#define {name} {value}" for name, value in sizes.items()]
-    lines += [f"static const double {name}[N] = {{{numbers(values)}}};" for name, values in arrays.items()]
+    lines += [f"static const double {name}[N] = {{{write_numbers(values)}}};" for name, values in arrays.items()]
     kinds = {"turning": curves.tracer.turning, "bounded": np.isfinite(low), "winding": curves.winding}
-    lines += [f"static const int {name}[N] = {{{flags(values)}}};" for name, values in kinds.items()]
+    lines += [f"static const int {name}[N] = {{{write_numbers(values)}}};" for name, values in kinds.items()]
     head = "#include <math.h>\n#include <stddef.h>\n#include <string.h>"
     return "\n".join([head, kernels.code, *lines, template("curve_rows.c")])

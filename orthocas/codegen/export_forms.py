@@ -116,7 +116,7 @@ class Form:
     """The functions `_xi` and `_xi_jacobian` of columns q (n, N): a template, and what it uses."""
 
     template: str  #: name of a file in templates/
-    values: Mapping[str, str]  #: of its placeholders
+    values: Mapping[str, Any]  #: that it is filled with
     functions: str  #: further functions
     tables: Mapping[str, Array]
     indices: Mapping[str, Sequence[int]]
@@ -150,7 +150,7 @@ def network_form(coordinates: Coordinates) -> Form | None:
     for k, (W, b) in enumerate(layers[:depth]):
         tables |= {f"W_{k}": W, f"b_{k}": b}
     plain = {name: [int(k) for k in of] for name, of in indices.items()}
-    return Form("network", {"depth": str(depth)}, "", tables, plain)
+    return Form("coordinates", {"kind": "network", "depth": depth}, "", tables, plain)
 
 
 def _layers(family: MLPFamily, theta: Array) -> list[tuple[Array, Array]]:
@@ -164,7 +164,7 @@ def _layers(family: MLPFamily, theta: Array) -> list[tuple[Array, Array]]:
 
 
 @dataclass(frozen=True)
-class Plan:
+class TermLevels:
     """Terms by number of factors. Each is a term of the level before times its last factor.
 
     In every level, the terms that derivatives need come first.
@@ -175,7 +175,7 @@ class Plan:
 
     @classmethod
     def of(cls, terms: Iterable[Term], of_derivatives: Iterable[Term]) -> Self:
-        """The plan for these terms, with what they are made of."""
+        """The levels of these terms, with what they are made of."""
         every, lower = with_parts(terms), with_parts(of_derivatives)
         every |= {_split(term)[1] for term in every}
         lower = lower or {min(term for term in every if np.count_nonzero(term) == 1)}
@@ -214,7 +214,7 @@ def product_form(coordinates: Coordinates) -> Form | None:
         return None
     slopes = coordinates.scale[:, None, None] * family.derivative_tables(coordinates.theta).transpose(1, 0, 2)
     used = np.flatnonzero(slopes[:, :, 1:].any(axis=(0, 1)))
-    plan = Plan.of(family.terms, [family.terms[k] for k in used])
+    plan = TermLevels.of(family.terms, [family.terms[k] for k in used])
     rows = {term: k for k, term in enumerate(family.terms)}
     if not set(plan.levels[0]) <= set(rows):  # then the family has no term for a function that its terms contain
         return None
@@ -222,10 +222,10 @@ def product_form(coordinates: Coordinates) -> Form | None:
     functions = family.basis(q[coordinates.active])[[rows[term] for term in plan.levels[0]]]
     code = function_code("_one_joint", "Functions of one joint each, (k, N).", dense_function("f", [q], [functions]))
     tables = _coefficients(coordinates, plan, rows) | _slopes(coordinates, slopes, plan, rows)
-    return Form("products", plan.counts, code, tables, plan.indices)
+    return Form("coordinates", {"kind": "products", **plan.counts}, code, tables, plan.indices)
 
 
-def _coefficients(coordinates: Coordinates, plan: Plan, rows: dict[Term, int]) -> dict[str, Array]:
+def _coefficients(coordinates: Coordinates, plan: TermLevels, rows: dict[Term, int]) -> dict[str, Array]:
     """C (r, terms), A (r, n) and c (r, 1)."""
     fitted, scale = len(coordinates.offset), coordinates.scale[:, None]
     A, c = idle_part(coordinates)
@@ -238,7 +238,7 @@ def _coefficients(coordinates: Coordinates, plan: Plan, rows: dict[Term, int]) -
     return {"C": C, "A": A, "c": c}
 
 
-def _slopes(coordinates: Coordinates, slopes: Array, plan: Plan, rows: dict[Term, int]) -> dict[str, Array]:
+def _slopes(coordinates: Coordinates, slopes: Array, plan: TermLevels, rows: dict[Term, int]) -> dict[str, Array]:
     """T (r n, terms of derivatives) and D (r, n, 1), from the slopes (fitted, active, 1 + K)."""
     r, n, fitted, active = coordinates.r, coordinates.space.n, len(coordinates.offset), coordinates.active
     lower = [term for term in plan.terms if term in plan.lower]
@@ -285,4 +285,4 @@ def expression_form(chart: Chart) -> Form:
         function_code("_xi", "Coordinates, (r, N), of columns q (n, N).", xi),
         function_code("_xi_and_slopes", "Coordinates, then their Jacobian row by row, (r + r n, N).", xi, slopes),
     ]
-    return Form("expression", {}, "\n\n".join(code), {}, {})
+    return Form("coordinates", {"kind": "expression"}, "\n\n".join(code), {}, {})

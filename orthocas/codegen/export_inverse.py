@@ -68,7 +68,7 @@ def _nearest(chart: Chart) -> Form:
         "half_width": domain.half_width[:, None],
         "identity": np.eye(chart.n + _rooms(domain)),
     }
-    return Form("nearest", {"rooms": str(_rooms(domain))}, "", tables, {})
+    return Form("nearest", {"rooms": _rooms(domain)}, "", tables, {})
 
 
 def _rooms(domain: Domain) -> int:
@@ -89,34 +89,35 @@ def _condition(chart: Chart) -> list[Form]:
     if domain.path_bound is not None:
         return [_near_path(domain.path_bound)]
     if domain.condition is None:
-        return [Form("box", {}, "", {}, {})]
+        return [Form("room", {"kind": "box"}, "", {}, {})]
     summary = "Numbers (k, N) that are positive at columns q that meet the condition of the domain."
-    return [Form("condition", {}, function_code("_pivots", summary, domain.condition.pivots), {}, {})]
+    return [Form("room", {"kind": "condition"}, function_code("_pivots", summary, domain.condition.pivots), {}, {})]
 
 
 def _clear(chart: Chart, clear: SingularBound, fold: FoldBound | None) -> Form:
     own = clear.jacobian_function
     code = function_code("_frame_rows", "Rows that must not be singular, one by one, (m n, N).", own)
     values = {
-        "squared_bound": repr(clear.least_singular_value**2),
-        "and_regular": "" if fold is None else ", and the coordinates do not fold",
-        "fold": "" if fold is None else ", _room_to_fold(q, rows)",
+        "kind": "clear",
+        "squared_bound": clear.least_singular_value**2,
+        "folds": fold is not None,
     }
     tables = {"row_scale": clear.scale[:, None], "unit": np.eye(chart.m)}
-    return Form("clear", values, code, tables, {})
+    return Form("room", values, code, tables, {})
 
 
 def _unfolded(chart: Chart, fold: FoldBound) -> Form:
+    same = _same_directions(chart, fold)
     values = {
-        "least_volume": repr(fold.least_volume),
-        "orientation": "" if fold.orientation > 0 else "-",
-        "gradients": "_xi_jacobian(q)",
+        "kind": "fold",
+        "least_volume": fold.least_volume,
+        "orientation": fold.orientation,
+        "own_gradients": not same,
     }
-    if _same_directions(chart, fold):
-        return Form("fold", values, "", {}, {})
+    if same:
+        return Form("room", values, "", {}, {})
     code = function_code("_own_gradients", "Gradients of the domain's coordinates, (r n, N).", fold.gradients)
-    values["gradients"] = "_own_gradients(q).reshape(len(LABELS) - len(UNITS), q.shape[0], q.shape[1])"
-    return Form("fold", values, code, {}, {})
+    return Form("room", values, code, {}, {})
 
 
 def _same_directions(chart: Chart, fold: FoldBound) -> bool:
@@ -138,4 +139,4 @@ def _near_path(corridor: PathBound) -> Form:
         "path_axes": axes[:, :, None],
         "path_lengths": np.sqrt(squares)[:, None],
     }
-    return Form("path", {}, "", tables, {"path_joints": corridor.counted.tolist()})
+    return Form("room", {"kind": "path"}, "", tables, {"path_joints": corridor.counted.tolist()})

@@ -211,13 +211,19 @@ class Kernels:
     work: dict[str, tuple[int, int, int, int]]  #: lengths of arg, res, iw and w that a call needs, by function name
     numbers: dict[str, int]  #: length of the first output, by function name
 
-    def sizes(self) -> dict[str, str]:
-        """Values of the placeholders for these lengths: NAME_arg, NAME_res, NAME_iw, NAME_w and NAME_numbers."""
+    def sizes(self) -> dict[str, dict[str, int]]:
+        """These lengths for templates, at least 1: `work.NAME.arg`, `.res`, `.iw`, `.w` and `.numbers`."""
+        words = ("arg", "res", "iw", "w", "numbers")
         return {
-            f"{kernel}_{word}": str(max(1, size))
-            for kernel, sizes in self.work.items()
-            for word, size in zip(("arg", "res", "iw", "w", "numbers"), (*sizes, self.numbers[kernel]), strict=True)
+            name: {word: max(1, size) for word, size in zip(words, (*sizes, self.numbers[name]), strict=True)}
+            for name, sizes in self.work.items()
         }
+
+    def declare_arrays(self, name: str, numbers: str = "", integers: str = "") -> str:
+        """C that declares the arrays of a call of a function, and with them further numbers and integers."""
+        arg, res, iw, w = (max(1, size) for size in self.work[name])
+        lines = f"const double *arg[{arg}] = {{0}};", f"double *res[{res}] = {{0}};"
+        return "\n  ".join([*lines, f"double w[{w}]{numbers};", f"int iw[{iw}]{integers};"])
 
     def array_bytes(self, name: str, number_size: int) -> int:
         """Size of the work arrays that a call of a function needs, with numbers of a size, in bytes."""
@@ -333,7 +339,7 @@ def _without_warnings(block: str) -> str:
     return f"{static}{{{silenced}{body}"
 
 
-def with_shared_calls(functions: list[ca.Function], states: Mapping[str, int]) -> list[ca.Function]:
+def share_calls(functions: list[ca.Function], states: Mapping[str, int]) -> list[ca.Function]:
     """The same graphs after a graph `shared` of (q, dq), which computes what they call several times for these alone.
 
     Args:
@@ -389,7 +395,7 @@ def _are_first(arguments: list[ca.MX], given: list[ca.MX]) -> bool:
     return len(arguments) <= len(given) and all(hash(a) == hash(b) for a, b in zip(arguments, given, strict=False))
 
 
-def with_turns_once(functions: list[ca.Function]) -> list[ca.Function]:
+def share_sines(functions: list[ca.Function]) -> list[ca.Function]:
     """The same graphs, in which sines and cosines of joint positions are computed once for all that is called.
 
     Args:

@@ -8,9 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from orthocas.charts.chart import Chart
 from orthocas.charts.reaching import RULES, ReachingRules
-from orthocas.codegen.description import numbers
 from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, Controller, with_smallest_volume
 from orthocas.tasks.domains import Domain, bounds_of, reach
 from orthocas.tools.checks import Array
@@ -78,10 +76,11 @@ class Precision:
         """C code that was written in double, in this type. Comments, strings and integers stay as they are."""
         return text if self is DOUBLE else _TOKEN.sub(_in_single_precision, text)
 
-    def words(self) -> dict[str, str]:
-        """Values of the placeholders that depend on the type."""
+    def describe(self) -> dict[str, Any]:
+        """Values of the templates that depend on the type."""
         names = ("largest", "smallest", "farthest", "rounding", "solved", "exact", "coarse", "pivot", "checked")
-        return {"number": self.c_name, **{name: _EXPONENT.sub(r"e\1", f"{getattr(self, name):.0e}") for name in names}}
+        rules = {name: _EXPONENT.sub(r"e\1", f"{getattr(self, name):.0e}") for name in names}
+        return {"number": self.c_name, "single": self is SINGLE, "reaching": self.reaching, **rules}
 
 
 DOUBLE = Precision(
@@ -148,27 +147,3 @@ def _is_beyond(domain: Domain, q: Array, precision: Precision) -> Any:
     distance, largest = abs(q - domain.centre), reach(domain)
     in_c = precision.rounded(abs(q - precision.rounded(domain.centre)))
     return (distance > largest) | (in_c > precision.rounded(largest))
-
-
-def check_values(chart: Chart, controller: Controller | None, q: Array, precision: Precision) -> dict[str, str]:
-    """Values of the placeholders: a state, and what every function gives there."""
-    n, robot = chart.n, chart.problem.robot
-    dq = precision.rounded(np.round(np.linspace(0.1, -0.2, n), 3))
-    values = {
-        "check_q": q,
-        "check_dq": dq,
-        "check_phi": chart.phi(q),
-        "check_jacobian": chart.jacobian(q).ravel(),
-        "check_curvature": chart.function("second_derivative")(q, dq, dq).full().ravel(),
-        "check_mass_matrix": robot.mass_matrix(q).ravel(),
-        "check_bias": robot.bias(q, dq),
-    }
-    if controller is not None:
-        value = controller.measured(q).full().ravel() + 0.001
-        reference = [precision.rounded(part) for part in (value, *np.full((2, len(value)), 0.01))]
-        command, _ = controller.function(q, dq, *reference, *controller.gains.values())
-        values["check_command"] = command.full().ravel()
-    words = {name: numbers(value) for name, value in values.items()}
-    if controller is not None:
-        words["check_reference"] = ", ".join(f"{{{numbers(part)}}}" for part in reference)
-    return words
