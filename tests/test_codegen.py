@@ -250,13 +250,13 @@ def test_an_inverse_that_stopped_early_goes_on_where_it_stopped(
     q, wanted = box.centre - 0.5 * box.half_width, chart.phi(box.centre + 0.5 * box.half_width)
     whole, status = supervised_library.inverse(wanted, q)
     assert status == ControlStatus.OK
-    errors, seen = [], []
-    while status != ControlStatus.OK or not seen:
+    errors, collect = [], []
+    while status != ControlStatus.OK or not collect:
         errors.append(np.abs(chart.phi(q) - wanted).max())
         q, status = supervised_library.inverse(wanted, q, max_iterations=2)
-        seen.append(status)
-    assert seen[:-1] == [ControlStatus.STOPPED_EARLY] * (len(seen) - 1)
-    assert len(seen) > 2
+        collect.append(status)
+    assert collect[:-1] == [ControlStatus.STOPPED_EARLY] * (len(collect) - 1)
+    assert len(collect) > 2
     assert errors == sorted(errors, reverse=True)
     np.testing.assert_allclose(q, whole, atol=1e-8)
 

@@ -1,6 +1,6 @@
 """`check_c`: compiles C with gcc and clang, and compares it with Python at random states."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,64 +25,22 @@ from orthocas.tools.checks import Array, require_kind
 from orthocas.tools.expressions import shortest
 from orthocas.tools.files import draft_folder
 
-_BAD = (np.nan, np.inf, -np.inf, 1e200)
-_REACH = 1.2  # random states lie in the domain enlarged by this factor
-_NEARBY = 0.01  # [half-widths] in single precision, a status may be that of a place so near
+
+@dataclass(frozen=True, slots=True)
+class CheckRules:
+    """Numbers of the comparison."""
+
+    bad: tuple[float, ...] = (np.nan, np.inf, -np.inf, 1e200)  #: numbers that spoil an input
+    spoil_every: int = 20  #: states
+    reach: float = 1.2  #: random states lie in the domain enlarged by this factor
+    nearby: float = 0.01  #: in single precision, a status may be that of a place so near, in half-widths
+    start: float = 0.01  #: starts of the inverse map beside the solution [rad]
+    far: float = 1e3  #: change of phi that has no solution
+    solved: float = 0.9  #: least fraction of targets that the inverse map must solve from nearby
+    regular: float = 1e6  #: largest condition number of J where it must
 
 
-def corner_cases(n: int) -> Array:
-    """Centre, two corners and centres of the faces of the box from -1 to 1, (3 + 2 n, n)."""
-    return np.vstack([np.zeros(n), np.full(n, -1), np.full(n, 1), -np.eye(n), np.eye(n)])
-
-
-def spoiled(rng: np.random.Generator, *arrays: Array) -> list[Array]:
-    """Copies with a NaN, infinite or huge number in every twentieth row of one array; corner cases stay as they are."""
-    copies = [array.copy() for array in arrays]
-    for row in range(0, len(arrays[0]) - len(corner_cases(arrays[0].shape[1])), 20):
-        array = copies[rng.integers(len(copies))]
-        array[row, rng.integers(array.shape[1])] = _BAD[rng.integers(len(_BAD))]
-    return copies
-
-
-def random_gains(controller: Controller, rows: int, rng: np.random.Generator) -> list[Array]:
-    """Random gains around those of the controller, (rows, length) each; limits are finite or, at times, infinite."""
-    gains = []
-    for name, gain in controller.gains.items():
-        values = _RANDOM.get(name, _scaled)(gain, rows, rng)
-        if name == "limit":
-            values[::3] = np.inf  # states of a weak arm may all saturate, which would say little of the law
-            values[7::40, 0] = rng.choice([0.0, -1.0, np.nan, np.inf], size=len(values[7::40]))
-        gains.append(values)
-    return gains
-
-
-def _scaled(gain: Array, rows: int, rng: np.random.Generator) -> Array:
-    return np.where(np.isfinite(gain), gain, 50.0) * rng.uniform(0.5, 1.5, (rows, len(gain)))
-
-
-def _shifted(gain: Array, rows: int, rng: np.random.Generator) -> Array:
-    return np.asarray(gain + rng.normal(size=(rows, len(gain))))
-
-
-def _payloads(gain: Array, rows: int, rng: np.random.Generator) -> Array:
-    """Payloads of up to 2 kg, within some 0.1 m of the tip, with positive definite inertias."""
-    mass, factors = rng.uniform(0, 2, (rows, 1)), 0.05 * rng.normal(size=(rows, 3, 3))
-    inertia = factors @ factors.transpose(0, 2, 1)
-    return np.hstack([mass, 0.1 * rng.normal(size=(rows, 3)), inertia[:, *np.triu_indices(3)]])
-
-
-def _symmetric(gain: Array, rows: int, rng: np.random.Generator) -> Array:
-    """The matrix (n * n,) times one factor and plus a diagonal, so that it stays symmetric positive definite."""
-    n = round(len(gain) ** 0.5)
-    diagonal = np.eye(n) * rng.uniform(0, 0.1, (rows, 1, n))
-    return np.asarray((gain.reshape(n, n) * rng.uniform(0.5, 1.5, (rows, 1, 1)) + diagonal).reshape(rows, -1))
-
-
-_RANDOM: Mapping[str, Callable[[Array, int, np.random.Generator], Array]] = {  # inputs that are not just positive
-    "payload": _payloads,
-    "mass_matrix": _symmetric,
-    **dict.fromkeys(("wrench", "extra_torque", "coriolis_torque", "gravity_torque"), _shifted),
-}
+RULES = CheckRules()
 
 
 @dataclass(frozen=True)
@@ -124,14 +82,14 @@ def check_c(
     """
     require_kind("chart", chart, Chart)
     n, precision = chart.n, SINGLE if generated.single_precision else DOUBLE
-    q = _positions(chart.problem.domain, np.random.default_rng(seed).uniform(-1, 1, (states, n)), precision)
+    q = _sample_positions(chart.problem.domain, np.random.default_rng(seed).uniform(-1, 1, (states, n)), precision)
     differences: dict[str, float] = {}
     for compiler in compilers():
         with draft_folder() as folder:
             path = compile_shared(generated, folder, compiler=compiler)
             library = CompiledLibrary(path, generated.name, n, generated.single_precision)
-            found = _compared(library, chart, controller, q, seed)
-        for name, value in found.items():
+            results = _compare(library, chart, controller, q, seed)
+        for name, value in results.items():
             if not value <= precision.tolerance:
                 raise AgreementError(
                     f"C, compiled by {compiler}, differs from Python by {value:.3g} in {name}, "
@@ -141,14 +99,28 @@ def check_c(
     return AgreementCheck(len(q), tuple(Path(compiler).name for compiler in compilers()), differences)
 
 
-def _positions(domain: Domain, places: Array, precision: Precision) -> Array:
+def _sample_positions(domain: Domain, places: Array, precision: Precision) -> Array:
     """Random positions in and around the domain, then the corner cases, which belong to it."""
-    corners = domain.centre + domain.half_width * corner_cases(places.shape[1])
-    around = domain.centre + domain.half_width * _REACH * places
+    corners = domain.centre + domain.half_width * list_corners(places.shape[1])
+    around = domain.centre + domain.half_width * RULES.reach * places
     return precision.rounded(np.vstack([around, np.clip(corners, *bounds_inside(domain, precision))]))
 
 
-def _compared(
+def list_corners(n: int) -> Array:
+    """Centre, two corners and centres of the faces of the box from -1 to 1, (3 + 2 n, n)."""
+    return np.vstack([np.zeros(n), np.full(n, -1), np.full(n, 1), -np.eye(n), np.eye(n)])
+
+
+def spoil(rng: np.random.Generator, *arrays: Array) -> list[Array]:
+    """Copies with a NaN, infinite or huge number in every twentieth row of one array; corner cases stay as they are."""
+    copies = [array.copy() for array in arrays]
+    for row in range(0, len(arrays[0]) - len(list_corners(arrays[0].shape[1])), RULES.spoil_every):
+        array = copies[rng.integers(len(copies))]
+        array[row, rng.integers(array.shape[1])] = RULES.bad[rng.integers(len(RULES.bad))]
+    return copies
+
+
+def _compare(
     library: CompiledLibrary, chart: Chart, controller: Controller | None, q: Array, seed: int
 ) -> dict[str, float]:
     """Largest relative differences by function; the last positions are corner cases, taken at rest."""
@@ -156,32 +128,32 @@ def _compared(
     if not np.array_equal(library.domain, bounds_inside(chart.problem.domain, library.precision)):
         raise AgreementError("the domain in C differs from the domain of the chart")
     dq = library.precision.rounded(rng.normal(size=q.shape))
-    dq[len(q) - len(corner_cases(chart.n)) :] = 0
-    differences = _chart_and_dynamics(library, chart, *spoiled(rng, q, dq))
-    differences["curvature"] = _curvature(library, chart, q, dq, rng)
+    dq[len(q) - len(list_corners(chart.n)) :] = 0
+    differences = _compare_chart_and_dynamics(library, chart, *spoil(rng, q, dq))
+    differences["curvature"] = _compare_curvature(library, chart, q, dq, rng)
     differences["check"] = library.check()
-    differences["inverse"] = _inverse(library, chart, q)
+    differences["inverse"] = _compare_inverse(library, chart, q)
     if controller is not None:
-        differences["control"] = _control(library, controller, q, dq, rng)
+        differences["control"] = _compare_control(library, controller, q, dq, rng)
     return differences
 
 
-def _chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array, dq: Array) -> dict[str, float]:
+def _compare_chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array, dq: Array) -> dict[str, float]:
     domain, robot = chart.problem.domain, chart.problem.robot
     largest = library.precision.largest
-    known, moving = _are_numbers(largest, q), _are_numbers(largest, q, dq)
-    somewhere, speed = np.where(known[:, None], q, domain.centre), np.where(moving[:, None], dq, 0)
+    finite, moving = _are_numbers(largest, q), _are_numbers(largest, q, dq)
+    somewhere, speed = np.where(finite[:, None], q, domain.centre), np.where(moving[:, None], dq, 0)
     inside = np.where(contains(domain, somewhere), ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN)
-    wanted = {"phi": chart.phi(somewhere), "jacobian": chart.jacobian(somewhere)}
-    has_value = known & np.isfinite(wanted["phi"]).all(axis=1) & np.isfinite(wanted["jacobian"]).all(axis=(1, 2))
-    status = np.select([~known, ~has_value], [ControlStatus.NOT_FINITE, ControlStatus.SINGULAR], inside)
-    found = [library.chart(row) for row in q]
-    _require_status("chart", [row[-1] for row in found], status, q)
-    phi, J = (np.array([row[k] for row in found]) for k in range(2))
-    wanted = {name: _zero_unless(has_value, value) for name, value in wanted.items()}
-    phi = wanted["phi"] + shortest(phi - wanted["phi"], chart.turns)  # pi and -pi are one angle
-    differences = {"phi": _difference(phi, wanted["phi"]), "jacobian": _difference(J, wanted["jacobian"])}
-    wanted = {
+    expected = {"phi": chart.phi(somewhere), "jacobian": chart.jacobian(somewhere)}
+    has_value = finite & np.isfinite(expected["phi"]).all(axis=1) & np.isfinite(expected["jacobian"]).all(axis=(1, 2))
+    status = np.select([~finite, ~has_value], [ControlStatus.NOT_FINITE, ControlStatus.SINGULAR], inside)
+    results = [library.chart(row) for row in q]
+    _require_status("chart", [row[-1] for row in results], status, q)
+    phi, J = (np.array([row[k] for row in results]) for k in range(2))
+    expected = {name: _blank(has_value, value) for name, value in expected.items()}
+    phi = expected["phi"] + shortest(phi - expected["phi"], chart.turns)  # pi and -pi are one angle
+    differences = {"phi": _compute_largest(phi, expected["phi"]), "jacobian": _compute_largest(J, expected["jacobian"])}
+    expected = {
         "mass_matrix": robot.mass_matrix(somewhere),
         "bias": robot.bias(somewhere, speed),
         "gravity": robot.gravity(somewhere),
@@ -189,31 +161,34 @@ def _chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array, dq: Ar
     pushed = [library.dynamics(*row) for row in zip(q, dq, strict=True)]
     _require_status("dynamics", [row[-1] for row in pushed], np.where(moving, inside, ControlStatus.NOT_FINITE), q)
     return differences | {
-        name: _difference(np.array([row[k] for row in pushed]), _zero_unless(moving, value))
-        for k, (name, value) in enumerate(wanted.items())
+        name: _compute_largest(np.array([row[k] for row in pushed]), _blank(moving, value))
+        for k, (name, value) in enumerate(expected.items())
     }
 
 
-def _curvature(library: CompiledLibrary, chart: Chart, q: Array, dq: Array, rng: np.random.Generator) -> float:
+def _compare_curvature(library: CompiledLibrary, chart: Chart, q: Array, dq: Array, rng: np.random.Generator) -> float:
     """Largest relative difference of dJ/dt v where it has a value, with any v."""
     v = library.precision.rounded(rng.normal(size=q.shape))
-    wanted = Batched(chart.function("second_derivative"))(q, dq, v)[0]
-    found = [library.curvature(*row) for row in zip(q, dq, v, strict=True)]
-    good = np.asarray(np.isfinite(wanted).all(axis=1))
-    return _difference(np.array([row[0] for row in found]), _zero_unless(good, wanted))
+    expected = Batched(chart.function("second_derivative"))(q, dq, v)[0]
+    results = [library.curvature(*row) for row in zip(q, dq, v, strict=True)]
+    good = np.asarray(np.isfinite(expected).all(axis=1))
+    return _compute_largest(np.array([row[0] for row in results]), _blank(good, expected))
 
 
-def _inverse(library: CompiledLibrary, chart: Chart, q: Array) -> float:
+def _compare_inverse(library: CompiledLibrary, chart: Chart, q: Array) -> float:
     """Largest remaining error in phi of the solutions. Most targets must be solved from nearby, but not from afar."""
     inner = q[: len(q) // 10]
-    regular = [_is_regular(*pair) for pair in zip(chart.phi(inner), chart.jacobian(inner), strict=True)]
-    inner = inner[np.array(regular, dtype=bool)]
-    targets, starts = chart.phi(inner), library.precision.rounded(inner + 0.01)
-    near = [_inverse_error(library, chart, *pair) for pair in zip(targets, starts, strict=True)]
-    far = [_inverse_error(library, chart, *pair) for pair in zip(targets + 1e3, inner, strict=True)]
+    J = chart.jacobian(inner)
+    finite = np.asarray(np.isfinite(chart.phi(inner)).all(axis=1) & np.isfinite(J).all(axis=(1, 2)))
+    inner = inner[finite & (np.linalg.cond(np.where(finite[:, None, None], J, np.eye(chart.n))) < RULES.regular)]
+    targets, starts = chart.phi(inner), library.precision.rounded(inner + RULES.start)
+    near = [_measure_inverse(library, chart, *pair) for pair in zip(targets, starts, strict=True)]
+    far = [_measure_inverse(library, chart, *pair) for pair in zip(targets + RULES.far, inner, strict=True)]
     solved = np.isfinite(near).sum()
-    if solved < 0.9 * len(inner):
-        raise AgreementError(f"the inverse map solved {solved} of {len(inner)} targets from 0.01 away, expected most")
+    if solved < RULES.solved * len(inner):
+        raise AgreementError(
+            f"the inverse map solved {solved} of {len(inner)} targets from {RULES.start:g} away, expected most"
+        )
     nothing = np.full(chart.n, np.nan)
     for given in ((nothing, q[0]), (q[0], nothing)):
         solution, status = library.inverse(*given)
@@ -224,11 +199,7 @@ def _inverse(library: CompiledLibrary, chart: Chart, q: Array) -> float:
     return max((error for error in (*near, *far) if np.isfinite(error)), default=0.0)
 
 
-def _is_regular(phi: Array, J: Array) -> bool:
-    return bool(np.isfinite(phi).all() and np.isfinite(J).all() and np.linalg.cond(J) < 1e6)
-
-
-def _inverse_error(library: CompiledLibrary, chart: Chart, target: Array, start: Array) -> float:
+def _measure_inverse(library: CompiledLibrary, chart: Chart, target: Array, start: Array) -> float:
     """Largest remaining error in phi. Infinite without a solution; status and output must then be as documented."""
     solution, status = library.inverse(target, start)
     if status in (ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN):
@@ -236,7 +207,7 @@ def _inverse_error(library: CompiledLibrary, chart: Chart, target: Array, start:
             raise AgreementError(f"the status of inverse is {status} at q = {solution.tolist()}")
         return float(np.abs(shortest(chart.phi(solution.astype(float)) - target, chart.turns)).max())
     if status == ControlStatus.STOPPED_EARLY:
-        after, before = (_remaining(library, chart, target, q) for q in (solution, start))
+        after, before = (_measure_remaining(library, chart, target, q) for q in (solution, start))
         if not after <= before * (1 + 1e-5):
             raise AgreementError(
                 f"inverse returns {solution.tolist()}, farther off than its start: {after} for {before}"
@@ -246,45 +217,89 @@ def _inverse_error(library: CompiledLibrary, chart: Chart, target: Array, start:
     return np.inf
 
 
-def _remaining(library: CompiledLibrary, chart: Chart, target: Array, q: Array) -> float:
+def _measure_remaining(library: CompiledLibrary, chart: Chart, target: Array, q: Array) -> float:
     """The largest error in phi as the library has it, with its own phi and scale: far outside, rounding is large."""
     phi = library.chart(q)[0].astype(float)
     scale = chart.phi_sizes + library.precision.coarse * np.abs(target)
     return float(np.abs(chart.phi_map.difference(target[None], phi[None])[0] / scale).max())
 
 
-def _control(library: CompiledLibrary, controller: Controller, q: Array, dq: Array, rng: np.random.Generator) -> float:
+def _compare_control(
+    library: CompiledLibrary, controller: Controller, q: Array, dq: Array, rng: np.random.Generator
+) -> float:
     numbers = library.precision.rounded(gain_numbers(controller))
     if not np.array_equal(library.default_gains(len(numbers)), numbers):
         raise AgreementError("the default gains in C differ from the gains of the controller")
-    inputs = _law_inputs(library.precision, controller, q, dq, rng)
+    inputs = _sample_law_inputs(library.precision, controller, q, dq, rng)
     law = Batched(count_turns_from_centre(library.precision.graph(controller), controller.problem))
     command, status = law(*inputs)
     if not (status == ControlStatus.OK).any():
         raise AgreementError(f"{controller.name} is well defined at none of {len(q)} states, expected at least one")
     rows = zip(*inputs[:2], np.hstack(inputs[2:5]), np.hstack(inputs[5:]), strict=True)
-    found, statuses = zip(*(library.control(*row) for row in rows), strict=True)
+    results, statuses = zip(*(library.control(*row) for row in rows), strict=True)
     same = np.array(statuses) == status[:, 0]
     if library.single_precision:
-        wanted = np.where(_is_near_another_status(controller, law, inputs), statuses, status[:, 0])
+        expected = np.where(_is_near_another_status(controller, law, inputs), statuses, status[:, 0])
     else:
-        wanted = status[:, 0]
-    _require_status("control", statuses, wanted, inputs[0])
-    relative = _differences(np.array(found), command) / _amplification(library.precision, controller, law, inputs)
+        expected = status[:, 0]
+    _require_status("control", statuses, expected, inputs[0])
+    relative = _compute_differences(np.array(results), command) / _estimate_amplification(
+        library.precision, controller, law, inputs
+    )
     return float(relative[same].max())
 
 
-def _law_inputs(
+def _sample_law_inputs(
     precision: Precision, controller: Controller, q: Array, dq: Array, rng: np.random.Generator
 ) -> list[Array]:
     """Positions, velocities, references with two derivatives, and gains, some of them spoiled."""
     around = np.nan_to_num(Batched(controller.measured)(q)[0])
     reference = (around + 0.1 * rng.normal(size=around.shape), *rng.normal(size=(2, *around.shape)))
-    state = spoiled(rng, q, dq, *reference)
-    return [precision.rounded(values) for values in (*state, *random_gains(controller, len(q), rng))]
+    state = spoil(rng, q, dq, *reference)
+    return [precision.rounded(values) for values in (*state, *sample_gains(controller, len(q), rng))]
 
 
-def _amplification(precision: Precision, controller: Controller, law: Batched, inputs: list[Array]) -> Array:
+def sample_gains(controller: Controller, rows: int, rng: np.random.Generator) -> list[Array]:
+    """Random gains around those of the controller, (rows, length) each; limits are finite or, at times, infinite."""
+    shifts = dict.fromkeys(("wrench", "extra_torque", "coriolis_torque", "gravity_torque"), _sample_shifted)
+    samplers: dict[str, Callable[[Array, int, np.random.Generator], Array]] = {  # of inputs that are not just positive
+        "payload": _sample_payloads,
+        "mass_matrix": _sample_symmetric,
+        **shifts,
+    }
+    gains = []
+    for name, gain in controller.gains.items():
+        values = samplers.get(name, _sample_scaled)(gain, rows, rng)
+        if name == "limit":
+            values[::3] = np.inf  # states of a weak arm may all saturate, which would say little of the law
+            values[7::40, 0] = rng.choice([0.0, -1.0, np.nan, np.inf], size=len(values[7::40]))
+        gains.append(values)
+    return gains
+
+
+def _sample_scaled(gain: Array, rows: int, rng: np.random.Generator) -> Array:
+    return np.where(np.isfinite(gain), gain, 50.0) * rng.uniform(0.5, 1.5, (rows, len(gain)))
+
+
+def _sample_shifted(gain: Array, rows: int, rng: np.random.Generator) -> Array:
+    return np.asarray(gain + rng.normal(size=(rows, len(gain))))
+
+
+def _sample_payloads(gain: Array, rows: int, rng: np.random.Generator) -> Array:
+    """Payloads of up to 2 kg, within some 0.1 m of the tip, with positive definite inertias."""
+    mass, factors = rng.uniform(0, 2, (rows, 1)), 0.05 * rng.normal(size=(rows, 3, 3))
+    inertia = factors @ factors.transpose(0, 2, 1)
+    return np.hstack([mass, 0.1 * rng.normal(size=(rows, 3)), inertia[:, *np.triu_indices(3)]])
+
+
+def _sample_symmetric(gain: Array, rows: int, rng: np.random.Generator) -> Array:
+    """The matrix (n * n,) times one factor and plus a diagonal, so that it stays symmetric positive definite."""
+    n = round(len(gain) ** 0.5)
+    diagonal = np.eye(n) * rng.uniform(0, 0.1, (rows, 1, n))
+    return np.asarray((gain.reshape(n, n) * rng.uniform(0.5, 1.5, (rows, 1, 1)) + diagonal).reshape(rows, -1))
+
+
+def _estimate_amplification(precision: Precision, controller: Controller, law: Batched, inputs: list[Array]) -> Array:
     """How much more than the tolerance the command may differ at each state, (N,) >= 1."""
     q, others = inputs[0], inputs[1:]
     command, status = law(*inputs)
@@ -292,19 +307,19 @@ def _amplification(precision: Precision, controller: Controller, law: Batched, i
     for joints in (np.ones(q.shape[1], dtype=bool), *np.eye(q.shape[1], dtype=bool)):  # effects of joints may cancel
         moved, status_there = law(np.where(joints, precision.next_above(q), q), *others)
         same = (status_there == status)[:, 0]
-        change = np.where(same, np.maximum(change, _differences(moved, command)), change)
-    found: Array = change.clip(precision.sensitive, 1) / precision.sensitive
+        change = np.where(same, np.maximum(change, _compute_differences(moved, command)), change)
+    results: Array = change.clip(precision.sensitive, 1) / precision.sensitive
     volume = squared_volume(controller.graph)  # it does not depend on whole turns
     if precision is SINGLE and volume is not None:
         squares = np.where(np.isin(status, FROM_THE_LAW), Batched(volume)(*inputs)[0], 1.0)[:, 0]
-        found /= squares.clip(precision.smallest_volume**2, 1)
-    return found
+        results /= squares.clip(precision.smallest_volume**2, 1)
+    return results
 
 
 def _is_near_another_status(controller: Controller, law: Batched, inputs: list[Array]) -> NDArray[np.bool_]:
     """Whether the status of the law is another one at a place next to q along a joint, (N,)."""
     q, others = inputs[0], inputs[1:]
-    step = np.diag(_NEARBY * controller.problem.domain.half_width)
+    step = np.diag(RULES.nearby * controller.problem.domain.half_width)
     here = law(*inputs)[1][:, 0]
     near = [law(q + way, *others)[1][:, 0] != here for way in np.vstack([step, -step])]
     return np.asarray(np.any(near, axis=0))
@@ -312,32 +327,32 @@ def _is_near_another_status(controller: Controller, law: Batched, inputs: list[A
 
 def _are_numbers(largest: float, *arrays: Array) -> NDArray[np.bool_]:
     """Rows without NaN, infinities and numbers that the C code rejects."""
-    known: NDArray[np.bool_] = np.all([(np.abs(array) <= largest).all(axis=1) for array in arrays], axis=0)
-    return known
+    finite: NDArray[np.bool_] = np.all([(np.abs(array) <= largest).all(axis=1) for array in arrays], axis=0)
+    return finite
 
 
-def _zero_unless(good: NDArray[np.bool_], values: Array) -> Array:
+def _blank(good: NDArray[np.bool_], values: Array) -> Array:
     """Values at good states, zeros at the others."""
     return np.where(good.reshape(-1, *[1] * (values.ndim - 1)), values, 0.0)
 
 
-def _require_status(function: str, found: Sequence[int], wanted: Array, q: Array) -> None:
-    unequal = np.flatnonzero(np.array(found) != wanted)
+def _require_status(function: str, results: Sequence[int], expected: Array, q: Array) -> None:
+    unequal = np.flatnonzero(np.array(results) != expected)
     if unequal.size:
         row = int(unequal[0])
         raise AgreementError(
-            f"the status of {function} is {found[row]} at q = {q[row].tolist()}, expected {wanted[row]:.0f}"
+            f"the status of {function} is {results[row]} at q = {q[row].tolist()}, expected {expected[row]:.0f}"
         )
 
 
-def _difference(found: Array, wanted: Array) -> float:
-    """Largest of `_differences`."""
-    return float(_differences(found, wanted).max())
+def _compute_largest(results: Array, expected: Array) -> float:
+    """Largest of `_compute_differences`."""
+    return float(_compute_differences(results, expected).max())
 
 
-def _differences(found: Array, wanted: Array) -> Array:
+def _compute_differences(results: Array, expected: Array) -> Array:
     """Difference at each state relative to the largest entry, (N,); infinite where an entry is not finite."""
-    flat = (len(found), -1)
-    scale = np.abs(wanted.reshape(flat)).max(axis=1).clip(1e-300)
-    difference = np.abs(found - wanted).reshape(flat).max(axis=1) / scale
+    flat = (len(results), -1)
+    scale = np.abs(expected.reshape(flat)).max(axis=1).clip(1e-300)
+    difference = np.abs(results - expected).reshape(flat).max(axis=1) / scale
     return np.where(np.isfinite(difference), difference, np.inf)

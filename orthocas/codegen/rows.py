@@ -10,7 +10,7 @@ import numpy as np
 from orthocas.bases.family import LinearFamily
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
-from orthocas.codegen.kernels import POWER
+from orthocas.codegen.kernels import write_power
 from orthocas.codegen.precision import Precision
 from orthocas.codegen.rendering import render, write_number
 from orthocas.errors import InvalidValueError
@@ -74,7 +74,7 @@ def render_rows(chart: Chart, values: Mapping[str, Any], precision: Precision) -
         "far": RULES.far,
         "sines": any("lane_" in line for line in operations),
         "powers": any(" power(" in line for line in operations),
-        "power": POWER.replace("NAME", "power"),
+        "power": write_power("power"),
         "slots": slots,
         "operations": operations,
         "places": [*places, *(k for k in range(chart.n) if k not in places)],

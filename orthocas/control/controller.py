@@ -1,22 +1,23 @@
-"""What all control laws share: gains, guard at the boundary, status, and the function for C."""
+"""What all control laws share: the protocol, names, errors of phi, the guard at the boundary, and status."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
 
 import casadi as ca
 import numpy as np
 
-from orthocas.control.gains import Setting
-from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError
 from orthocas.tasks.domains import Domain, reach
 from orthocas.tasks.problem import Problem
-from orthocas.tools.checks import Array
+from orthocas.tools.checks import Array, require_known
 from orthocas.tools.display import listed, number_list
+from orthocas.tools.expressions import shortest
 
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
+    from orthocas.control.reference import Reference
 
 LARGEST = 1e100  #: larger numbers count as not finite, because their squares may overflow
 GUARD = "guard"  #: name of the guard's function
@@ -55,84 +56,6 @@ class ControlStatus(IntEnum):
 FROM_THE_LAW = (ControlStatus.OK, ControlStatus.SATURATED, ControlStatus.NEAR_BOUNDARY)
 
 
-def guard(domain: Domain | None, n: int, numbers: int, keep_direction: bool) -> ca.Function:
-    """Choose the command if all is well and the fallback otherwise, cut it to +- limit, and report the status.
-
-    Args:
-        domain: where the law is valid; None for everywhere.
-        n: number of joints.
-        numbers: count of input numbers of the law.
-        keep_direction: whether the limit scales the whole command, instead of cutting entries one by one.
-
-    Returns:
-        A function with the outputs command (n, 1) and status (1, 1). Its inputs are: the command of the law (n, 1),
-        which may be NaN; the fallback (n, 1), whose entries become zero where they are not finite; the limit (n, 1) of
-        each entry, which may be infinite; q (n, 1); all input numbers of the law; and det(J A^-1 J^T) relative to its
-        median over the domain, and the smallest regular value of that.
-    """
-    command, fallback, limit, q = (ca.SX.sym(name, n) for name in ("command", "fallback", "limit", "q"))
-    inputs, volume, smallest = ca.SX.sym("inputs", numbers), ca.SX.sym("volume"), ca.SX.sym("smallest")
-    regular = ca.logic_and(volume > smallest, _all_finite(command))
-    status = ca.if_else(regular, float(ControlStatus.OK), float(ControlStatus.SINGULAR))
-    status = ca.if_else(_is_inside(domain, q), status, float(ControlStatus.OUTSIDE_DOMAIN))
-    meant = ca.logic_and(_all_finite(inputs), _all(limit > 0))
-    status = ca.if_else(meant, status, float(ControlStatus.NOT_FINITE))
-    from_law = status == float(ControlStatus.OK)
-    chosen = _chosen(from_law, command, fallback)
-    cut = _cut(chosen, limit, keep_direction)
-    saturated = ca.logic_and(from_law, ca.logic_not(_all(ca.fabs(chosen) <= limit)))
-    status = ca.if_else(saturated, float(ControlStatus.SATURATED), status)
-    given = [command, fallback, limit, q, inputs, volume, smallest]
-    names = ["command", "fallback", "limit", "q", "inputs", "volume", "smallest"]
-    return ca.Function(GUARD, given, [cut, status], names, ["cut", "status"])
-
-
-def _chosen(from_law: ca.SX, command: ca.SX, fallback: ca.SX) -> ca.SX:
-    rows = range(command.shape[0])
-    safe = [ca.if_else(_is_finite(fallback[i]), fallback[i], 0) for i in rows]
-    return ca.vertcat(*(ca.if_else(from_law, command[i], safe[i]) for i in rows))
-
-
-def _cut(command: ca.SX, limit: ca.SX, keep_direction: bool) -> ca.SX:
-    """The command within +- limit; zero where the limit is NaN or not > 0."""
-    rows = range(command.shape[0])
-    bound = ca.vertcat(*(ca.if_else(limit[i] > 0, limit[i], 0) for i in rows))
-    if keep_direction:
-        excess = [ca.if_else(ca.fabs(command[i]) > bound[i], ca.fabs(command[i]) / bound[i], 1) for i in rows]
-        command = command / ca.mmax(ca.vertcat(1, *excess))
-    return ca.fmin(ca.fmax(command, -bound), bound)
-
-
-def _is_inside(domain: Domain | None, q: ca.SX) -> ca.SX:
-    """Whether q (n, 1) lies in the domain: between its boundaries, and where its condition holds, if it has one."""
-    condition = None if domain is None else domain.condition
-    clear = ca.SX(1) if condition is None else _all(condition.pivots(q) > 0)
-    return ca.logic_and(_is_between_boundaries(domain, q), clear)
-
-
-def _is_between_boundaries(domain: Domain | None, q: ca.SX) -> ca.SX:
-    """Whether q (n, 1) lies in the box; always true for joints without boundaries, such as the angles of a torus."""
-    widths = np.full(q.shape[0], np.inf) if domain is None else reach(domain)
-    bounded = np.flatnonzero(np.isfinite(widths)).tolist()
-    if domain is None or not bounded:
-        return ca.SX(1)
-    return _all(ca.fabs(q[bounded] - ca.DM(domain.centre[bounded])) <= ca.DM(widths[bounded]))
-
-
-def _is_finite(value: ca.SX) -> ca.SX:
-    """Whether a number is finite; false also for NaN, since comparisons with NaN are false."""
-    return ca.fabs(value) <= LARGEST
-
-
-def _all_finite(values: ca.SX) -> ca.SX:
-    return _all(_is_finite(values))
-
-
-def _all(conditions: ca.SX) -> ca.SX:
-    """Whether all conditions hold. Their sum needs no branches, and less code than `ca.logic_all`."""
-    return ca.sum1(conditions) == conditions.shape[0]
-
-
 Command = Literal["torque", "velocity"]
 
 
@@ -145,41 +68,33 @@ class Controller(Protocol):
     @property
     def formula(self) -> str:
         """The law in one line, for generated C."""
-        ...
 
     @property
     def chart(self) -> "Chart | None":
         """The chart whose coordinates the law uses and whose domain it respects; None for laws without a chart."""
-        ...
 
     @property
     def problem(self) -> Problem:
         """Robot (the model that the law uses), task, metric and domain."""
-        ...
 
     @property
     def labels(self) -> tuple[str, ...]:
         """Names of the k controlled quantities, in the order of the reference."""
-        ...
 
     @property
     def gains(self) -> dict[str, Array]:
         """Values of the gains by input name."""
-        ...
 
     @property
     def gain_units(self) -> Mapping[str, str]:
         """Units and admissible values of the gains, in words, by name."""
-        ...
 
     @property
     def settings(self) -> Mapping[str, str]:
         """Choices that are not numbers, for example the coupling."""
-        ...
 
     def remarks(self) -> list[str]:
         """Warnings to read before the controller is switched on, as sentences; empty if there are none."""
-        ...
 
     @property
     def function(self) -> ca.Function:
@@ -187,7 +102,6 @@ class Controller(Protocol):
 
         Joints that turn without end count from the domain's centre, so that q and q + 2 pi give the same command.
         """
-        ...
 
     @property
     def graph(self) -> ca.Function:
@@ -195,35 +109,44 @@ class Controller(Protocol):
 
         C is generated from it, and simulations use it.
         """
-        ...
 
     @property
     def fallback(self) -> ca.Function:
         """q (n, 1), gains -> command without the law (n, 1): the gravity torque, or zero for velocity controllers."""
-        ...
 
     @property
     def energy(self) -> ca.Function | None:
         """The same inputs -> storage V [J] and power dissipated by damping [W]; None for velocity controllers."""
-        ...
 
     @property
     def energy_graph(self) -> ca.Function | None:
         """The same function as a graph with shared subexpressions; compiled simulations use it."""
-        ...
 
     @property
     def measured(self) -> ca.Function:
         """q (n, 1) -> the controlled quantities (k, 1)."""
-        ...
 
-    def require_reachable(self, reference: Reference, q_start: Array) -> None:
+    def require_reachable(self, reference: "Reference", q_start: Array) -> None:
         """Raise UnreachableReferenceError, with time and place, if the law cannot follow the reference."""
-        ...
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A setting of a law that commands offer as an option.
+
+    Example:
+        >>> from orthocas.control import Setting
+        >>> Setting("Damping of the joints [N m s/rad]; default: 1.")
+        Setting(help='Damping of the joints [N m s/rad]; default: 1.', is_word=False, codegen_only=False)
+    """
+
+    help: str  #: what it is, with its unit and default
+    is_word: bool = False  #: passed on as text; otherwise it is one number, or several with commas between
+    codegen_only: bool = False  #: about inputs that simulations do not give, so `orthocas simulate` does not offer it
 
 
 class Law(Controller, Protocol):
-    """A controller that can be built by name on a chart, for the command line; see `orthocas.control.registry`."""
+    """A controller that can be built by name on a chart, for the command line; see `register`."""
 
     options: ClassVar[Mapping[str, Setting]]  #: the settings that `on_chart` takes, by name
 
@@ -235,7 +158,41 @@ class Law(Controller, Protocol):
             args: the chart, and the largest command of each joint, which may be left out or None.
             settings: gains and choices by the names in `options`; those left out take their defaults.
         """
-        ...
+
+
+_LAWS: dict[str, type[Law]] = {}
+
+
+def register(law: type[Law]) -> None:
+    """Register a law under its name, so that `orthocas simulate` and `orthocas codegen` can build it on a chart.
+
+    Raises:
+        InvalidValueError: if another law has that name.
+    """
+    named = isinstance(getattr(law, "name", None), str)
+    if named and _LAWS.get(law.name, law) is not law:
+        raise InvalidValueError("name", repr(law.name), f"a free name, because {_LAWS[law.name].__name__} has this one")
+    if not named or not callable(getattr(law, "on_chart", None)):
+        raise InvalidValueError("law", repr(law)[:80], "the class of a law")
+    options = getattr(law, "options", None)
+    if not isinstance(options, Mapping) or not all(isinstance(setting, Setting) for setting in options.values()):
+        raise InvalidValueError(f"options of {law.__name__}", repr(options)[:80], "a dictionary of Setting by name")
+    _LAWS[law.name] = law
+
+
+def law_names() -> tuple[str, ...]:
+    """Names of all registered laws."""
+    return tuple(_LAWS)
+
+
+def law_of(name: str) -> type[Law]:
+    """The law with a name.
+
+    Raises:
+        UnknownNameError: if no law has that name.
+    """
+    require_known("controller", name, _LAWS)
+    return _LAWS[name]
 
 
 def law_facts(controller: Controller) -> dict[str, str]:
@@ -262,6 +219,33 @@ def named_inputs(n: int, gains: dict[str, Array], k: int) -> dict[str, ca.MX]:
     return {name: ca.MX.sym(name, size) for name, size in sizes.items()}
 
 
+def compute_errors(chart: "Chart", q: ca.MX, reference: ca.MX) -> tuple[ca.MX, ca.MX]:
+    """phi relative to phi_d, e (n, 1), and de/dq (n, n) for a reference at rest.
+
+    For most tasks e = phi - phi_d and de/dq = J. A whole orientation counts from its target, see `Relative`.
+    Coordinates that are angles take the shorter way around. No other error is taken modulo anything: whole turns of
+    joints are resolved in q, before phi is evaluated (`orthocas.tasks.problem.Problem.unwrap`).
+    """
+    m, own = chart.m, chart.coordinates.functions
+    e, slope = chart.relative.error(q, reference[:m])
+    rest = shortest(own["xi"](q) - reference[m:], chart.turns[m:])
+    return ca.vertcat(e, rest), ca.vertcat(slope, own["jacobian"](q))
+
+
+def compute_drift(chart: "Chart", q: ca.MX, reference: ca.MX, velocity: ca.MX) -> ca.MX:
+    """The rate de/dq dq at which q stays with a reference that moves, (n, 1): d_phi_d for most tasks."""
+    m = chart.m
+    return ca.vertcat(chart.relative.drift(q, reference[:m], velocity[:m]), velocity[m:])
+
+
+def compute_bias(chart: "Chart", q: ca.MX, dq: ca.MX, w: ca.MX, reference: tuple[ca.MX, ca.MX, ca.MX]) -> ca.MX:
+    """(d/dt) (de/dq w - drift), (n, 1), with phi_d and its two derivatives: dJ/dt w - dd_phi_d for most tasks."""
+    m = chart.m
+    x, dx, ddx = (part[:m] for part in reference)
+    rest = chart.coordinates.functions["second_derivative"](q, dq, w) - reference[2][m:]
+    return ca.vertcat(chart.relative.bend(q, dq, w, (x, dx, ddx)), rest)
+
+
 def guarded_graph(
     name: str,
     inputs: dict[str, ca.MX],
@@ -277,6 +261,84 @@ def guarded_graph(
     smallest = ca.MX(SMALLEST_VOLUME**2)
     safe, status = check(command, fallback, inputs["limit"], inputs["q"], numbers, volume, smallest)
     return named_function(name, inputs, {"command": safe, "status": status})
+
+
+def guard(domain: Domain | None, n: int, numbers: int, keep_direction: bool) -> ca.Function:
+    """Choose the command if all is well and the fallback otherwise, cut it to +- limit, and report the status.
+
+    Args:
+        domain: where the law is valid; None for everywhere.
+        n: number of joints.
+        numbers: count of input numbers of the law.
+        keep_direction: whether the limit scales the whole command, instead of cutting entries one by one.
+
+    Returns:
+        A function with the outputs command (n, 1) and status (1, 1). Its inputs are: the command of the law (n, 1),
+        which may be NaN; the fallback (n, 1), whose entries become zero where they are not finite; the limit (n, 1) of
+        each entry, which may be infinite; q (n, 1); all input numbers of the law; and det(J A^-1 J^T) relative to its
+        median over the domain, and the smallest regular value of that.
+    """
+    command, fallback, limit, q = (ca.SX.sym(name, n) for name in ("command", "fallback", "limit", "q"))
+    inputs, volume, smallest = ca.SX.sym("inputs", numbers), ca.SX.sym("volume"), ca.SX.sym("smallest")
+    regular = ca.logic_and(volume > smallest, _are_finite(command))
+    status = ca.if_else(regular, float(ControlStatus.OK), float(ControlStatus.SINGULAR))
+    status = ca.if_else(_is_inside(domain, q), status, float(ControlStatus.OUTSIDE_DOMAIN))
+    meant = ca.logic_and(_are_finite(inputs), _all_hold(limit > 0))
+    status = ca.if_else(meant, status, float(ControlStatus.NOT_FINITE))
+    from_law = status == float(ControlStatus.OK)
+    chosen = _choose(from_law, command, fallback)
+    cut = _limit(chosen, limit, keep_direction)
+    saturated = ca.logic_and(from_law, ca.logic_not(_all_hold(ca.fabs(chosen) <= limit)))
+    status = ca.if_else(saturated, float(ControlStatus.SATURATED), status)
+    given = [command, fallback, limit, q, inputs, volume, smallest]
+    names = ["command", "fallback", "limit", "q", "inputs", "volume", "smallest"]
+    return ca.Function(GUARD, given, [cut, status], names, ["cut", "status"])
+
+
+def _choose(from_law: ca.SX, command: ca.SX, fallback: ca.SX) -> ca.SX:
+    rows = range(command.shape[0])
+    safe = [ca.if_else(_is_finite(fallback[i]), fallback[i], 0) for i in rows]
+    return ca.vertcat(*(ca.if_else(from_law, command[i], safe[i]) for i in rows))
+
+
+def _limit(command: ca.SX, limit: ca.SX, keep_direction: bool) -> ca.SX:
+    """The command within +- limit; zero where the limit is NaN or not > 0."""
+    rows = range(command.shape[0])
+    bound = ca.vertcat(*(ca.if_else(limit[i] > 0, limit[i], 0) for i in rows))
+    if keep_direction:
+        excess = [ca.if_else(ca.fabs(command[i]) > bound[i], ca.fabs(command[i]) / bound[i], 1) for i in rows]
+        command = command / ca.mmax(ca.vertcat(1, *excess))
+    return ca.fmin(ca.fmax(command, -bound), bound)
+
+
+def _is_inside(domain: Domain | None, q: ca.SX) -> ca.SX:
+    """Whether q (n, 1) lies in the domain: between its boundaries, and where its condition holds, if it has one."""
+    condition = None if domain is None else domain.condition
+    clear = ca.SX(1) if condition is None else _all_hold(condition.pivots(q) > 0)
+    return ca.logic_and(_is_in_box(domain, q), clear)
+
+
+def _is_in_box(domain: Domain | None, q: ca.SX) -> ca.SX:
+    """Whether q (n, 1) lies in the box; always true for joints without boundaries, such as the angles of a torus."""
+    widths = np.full(q.shape[0], np.inf) if domain is None else reach(domain)
+    bounded = np.flatnonzero(np.isfinite(widths)).tolist()
+    if domain is None or not bounded:
+        return ca.SX(1)
+    return _all_hold(ca.fabs(q[bounded] - ca.DM(domain.centre[bounded])) <= ca.DM(widths[bounded]))
+
+
+def _is_finite(value: ca.SX) -> ca.SX:
+    """Whether a number is finite; false also for NaN, since comparisons with NaN are false."""
+    return ca.fabs(value) <= LARGEST
+
+
+def _are_finite(values: ca.SX) -> ca.SX:
+    return _all_hold(_is_finite(values))
+
+
+def _all_hold(conditions: ca.SX) -> ca.SX:
+    """Whether all conditions hold. Their sum needs no branches, and less code than `ca.logic_all`."""
+    return ca.sum1(conditions) == conditions.shape[0]
 
 
 def count_turns_from_centre(graph: ca.Function, problem: Problem) -> ca.Function:

@@ -13,6 +13,10 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.point_quality import Judged
 from orthocas.control.controller import (
     Command,
+    Setting,
+    compute_bias,
+    compute_drift,
+    compute_errors,
     count_turns_from_centre,
     fallback_function,
     guarded_graph,
@@ -20,7 +24,6 @@ from orthocas.control.controller import (
     named_function,
     named_inputs,
 )
-from orthocas.control.errors import bend, drift, errors
 from orthocas.control.gains import (
     DAMPING_RATIO,
     DAMPING_RATIO_SETTING,
@@ -28,80 +31,39 @@ from orthocas.control.gains import (
     LIMIT,
     STIFFNESS,
     STIFFNESS_SETTING,
-    Setting,
+    Modes,
     command_limit,
-    fastest_posture,
+    compute_mobility,
+    compute_modes,
+    find_fastest_posture,
+    find_holding_doubts,
     matched_stiffness,
-    mobility,
     non_negative_gains,
     positive_gains,
 )
-from orthocas.control.holding import holding_doubts
-from orthocas.control.linear_algebra import DAMPING_DESIGNS, DampingDesign, block_inertia, damped, median_volume
+from orthocas.control.linear_algebra import (
+    DAMPING_DESIGNS,
+    DampingDesign,
+    apply_damping,
+    build_block_inertia,
+    compute_median_volume,
+)
 from orthocas.control.memory import MEMORIES, Memory, Remembers
-from orthocas.control.posture import joint_path
-from orthocas.control.reference import Reference
+from orthocas.control.reference import Reference, joint_path
 from orthocas.control.run_time_model import Gravity, RunTimeModel, Source
 from orthocas.errors import InvalidValueError, LawWarning
 from orthocas.robots.tree import require_driven
 from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem import Problem
 from orthocas.tools.batch import Batched
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_point_set, require_kind, require_known
-from orthocas.tools.display import Shown, number_list, percent
+from orthocas.tools.display import Shown, percent
 
 _MODE_SAMPLES = 256
 _MUCH_DEG = 15.0  # leak from which on decoupled laws are warned of
 _LARGE_RATIO = 5.0  # damping ratio from which on a percentage is suspected
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Modes(Shown):
-    """Modes of M_phi dde + D de + K e = 0 at one posture (n,) or at several (N, n).
-
-    Mode i has the shape v_i with K v_i = omega_i^2 M_phi v_i and v_i^T M_phi v_i = 1. Its damping ratio is
-    v_i^T D v_i / (2 omega_i). This is exact if D is diagonal in the modes, as for coupled laws with `double_diagonal`
-    and one damping ratio for all.
-    """
-
-    frequencies: Array  #: [Hz], in ascending order
-    damping_ratios: Array  #: infinite for a mode without a spring
-    delays: Array  #: longest delay of the loop with which the mode alone stays stable [s]
-
-    def facts(self) -> dict[str, str]:
-        """Frequencies, damping ratios and delay."""
-        return {
-            "modes": f"{number_list(np.median(np.atleast_2d(self.frequencies), axis=0))} Hz",
-            "fastest": f"{self.frequencies.max():.4g} Hz",
-            "damping ratios": f"{self.damping_ratios.min():.3g} to {self.damping_ratios.max():.3g}",
-            "delay": f"stable up to {1e3 * self.delays.min():.3g} ms",
-        }
-
-
-def modes_of(mobility: Array, stiffness: Array, damping: Array) -> Modes:
-    """Modes for M_phi^-1 (N, n, n), the diagonal of K (n,), and D (N, n, n).
-
-    With S = M_phi^-1/2 and the unit eigenvectors u_i of S K S, v_i = S u_i.
-    """
-    values, vectors = np.linalg.eigh(mobility)
-    half = (vectors * np.sqrt(values.clip(0))[:, None, :]) @ vectors.transpose(0, 2, 1)
-    squares, shapes = np.linalg.eigh((half * stiffness) @ half)
-    omega = np.sqrt(squares.clip(0))
-    rates = np.einsum("kij,kij->kj", shapes, half @ damping @ half @ shapes)  # 2 zeta omega [1/s]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratios = rates / (2 * omega)
-    return Modes(omega / (2 * np.pi), ratios, _longest_delays(omega, rates))
-
-
-def _longest_delays(omega: Array, rates: Array) -> Array:
-    """Delay [s] at which s^2 + (rate s + omega^2) exp(-s T) = 0 gets a root i Omega.
-
-    The modulus gives Omega^2 = rate^2/2 + sqrt(rate^4/4 + omega^4), the phase T = atan(rate Omega / omega^2) / Omega.
-    """
-    crossing = np.sqrt(rates**2 / 2 + np.sqrt(rates**4 / 4 + omega**4))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.arctan2(rates * crossing, omega**2) / crossing)
 
 
 Coupling = Literal["coupled", "decoupled"]
@@ -221,7 +183,7 @@ class _OperationalSpace(Shown):
             object.__setattr__(self, name, value)
         if remembers is not None:
             _ = self.memory  # raises for bounds of another size
-        doubts = [*_like_a_percentage(self.damping_ratio), *self._holding_doubts()]
+        doubts = [*_doubt_ratio(self.damping_ratio), *self._find_holding_doubts()]
         if coupling == "decoupled" and (metric := chart.problem.metric.name) != "inertia":
             doubts.append(f"a decoupled law relies on A = M (inertia), but the metric of this chart is {metric}")
         for doubt in doubts:
@@ -307,14 +269,14 @@ class _OperationalSpace(Shown):
         The motors cannot hold the arm, the metric does not decouple task and extra coordinates, a damping ratio looks
         like a percentage, a decoupled law has a chart that leaks much, or D is not positive semi-definite.
         """
-        found, metric = [*self._holding_doubts()], self.problem.metric.name
+        found, metric = [*self._find_holding_doubts()], self.problem.metric.name
         if metric != "inertia":
             found.append(
                 f"the metric of this chart is {metric}, but task and extra coordinates are decoupled only for A = M "
                 "(inertia)"
             )
-        found += _like_a_percentage(self.damping_ratio)
-        if self.coupling == "decoupled" and (leak := self._leak_deg()) > _MUCH_DEG:
+        found += _doubt_ratio(self.damping_ratio)
+        if self.coupling == "decoupled" and (leak := self._compute_leak_deg()) > _MUCH_DEG:
             found.append(
                 f"the gradients of this chart lean into the task by {leak:.0f} deg (rms): decoupled springs pull at "
                 "both, which coupled ones do not; see docs/how-to/wide.md"
@@ -324,13 +286,13 @@ class _OperationalSpace(Shown):
             found.append(f"the damping matrix (29) is indefinite {where}; the damping design double_diagonal never is")
         return found + self.model.remarks()
 
-    def _holding_doubts(self) -> list[str]:
+    def _find_holding_doubts(self) -> list[str]:
         """Of an arm that the motors cannot hold; none if the robot compensates gravity itself."""
         if self.model.gravity == "robot":
             return []
-        return holding_doubts(self.model.robot(self.problem), self.problem.domain, self.limit)
+        return find_holding_doubts(self.model.robot(self.problem), self.problem.domain, self.limit)
 
-    def _leak_deg(self) -> float:
+    def _compute_leak_deg(self) -> float:
         """Root mean square of the chart's leaks at samples [deg]."""
         points = sample_uniform(self.problem.domain, _MODE_SAMPLES, 0)
         sines = Judged.at(self.problem, self.chart.coordinates, points).leak_sines
@@ -379,7 +341,7 @@ class _OperationalSpace(Shown):
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
         robot = self.problem.robot
         gravity = self.model.gravity_torque(robot, inputs)
-        force, volume, J = self._force(inputs)
+        force, volume, J = self._compute_force(inputs)
         torque = J.T @ force + gravity + self.model.feed_forward(robot, inputs)
         relative = volume / self.median_volume
         return guarded_graph(self.name, inputs, torque, gravity, relative, self.problem.domain)
@@ -406,9 +368,9 @@ class _OperationalSpace(Shown):
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
         K = ca.diag(inputs["stiffness"])
         M = self.model.own_mass_matrix(self.problem.robot, inputs)
-        e, de, J = self._errors(inputs)
-        damping_force = self._damped(self._inertia(J, M)[1], inputs, de)
-        M_phi = block_inertia(self.chart.n, (self.chart.n,))(J, M)[1]
+        e, de, J = self._compute_errors(inputs)
+        damping_force = self._apply_damping(self._compute_inertia(J, M)[1], inputs, de)
+        M_phi = build_block_inertia(self.chart.n, (self.chart.n,))(J, M)[1]
         kinetic = ca.bilin(M_phi, de, de) if self.feed_forward else ca.bilin(M, inputs["dq"], inputs["dq"])
         storage = (kinetic + ca.bilin(K, e, e)) / 2
         outputs = {"storage": storage, "dissipated_power": ca.dot(de, damping_force)}
@@ -418,15 +380,15 @@ class _OperationalSpace(Shown):
     def damping_matrix(self) -> ca.Function:
         """q, stiffness, damping_ratio, then damping_stiffness and payload if they are inputs -> D(q), (n, n)."""
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
-        chosen = {name: inputs[name] for name in ("q", *self._of_the_damping)}
+        chosen = {name: inputs[name] for name in ("q", *self._damping_inputs)}
         J, M = self.chart.rates(inputs["q"]), self.model.own_mass_matrix(self.problem.robot, inputs)
-        D = self._damped(self._inertia(J, M)[1], inputs, ca.MX.eye(self.chart.n))
+        D = self._apply_damping(self._compute_inertia(J, M)[1], inputs, ca.MX.eye(self.chart.n))
         return self.chart.runnable(named_function("damping_matrix", chosen, {"D": D}))
 
     def check_damping(self, samples: int = 1000, seed: int = 0) -> DampingCheck:
         """Find the smallest eigenvalue of D over uniform samples of the domain; (29) can make it negative."""
         points = sample_uniform(self.problem.domain, samples, seed)
-        values = np.linalg.eigvalsh(self._damping_at(points))
+        values = np.linalg.eigvalsh(self._compute_damping(points))
         ratio = values[:, 0] / np.abs(values).max(axis=1).clip(np.finfo(float).tiny)
         worst = int(np.argmin(ratio))
         return DampingCheck(samples, float(ratio[worst]), float((ratio < -1e-12).mean()), tuple(points[worst].tolist()))
@@ -441,19 +403,19 @@ class _OperationalSpace(Shown):
         Raises:
             ShapeError, InvalidValueError: if q has another shape, or is not finite.
         """
-        points, single = as_point_set("q", self._mode_points() if q is None else q, self.chart.n)
-        W = mobility(self.chart, points, self.model.robot(self.problem))
-        found = modes_of(W, self.stiffness, self._damping_at(points))
+        points, single = as_point_set("q", self._sample_postures() if q is None else q, self.chart.n)
+        W = compute_mobility(self.chart, points, self.model.robot(self.problem))
+        found = compute_modes(W, self.stiffness, self._compute_damping(points))
         return Modes(*(values[0] for values in vars(found).values())) if single else found
 
-    def _mode_points(self) -> Array:
+    def _sample_postures(self) -> Array:
         """Samples of the domain, and the posture with the fastest mode that a search finds, (N, n)."""
-        fastest = fastest_posture(self.chart, self.stiffness, self.model.robot(self.problem))
+        fastest = find_fastest_posture(self.chart, self.stiffness, self.model.robot(self.problem))
         return np.vstack([sample_uniform(self.problem.domain, _MODE_SAMPLES, 0), fastest])
 
-    def _damping_at(self, points: Array) -> Array:
+    def _compute_damping(self, points: Array) -> Array:
         """D(q) with the law's gains at points (N, n), (N, n, n)."""
-        rows = [np.tile(self.gains[name], (len(points), 1)) for name in self._of_the_damping]
+        rows = [np.tile(self.gains[name], (len(points), 1)) for name in self._damping_inputs]
         return Batched(self.damping_matrix)(points, *rows)[0].reshape(-1, self.chart.n, self.chart.n)
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
@@ -461,7 +423,7 @@ class _OperationalSpace(Shown):
         joint_path(self.chart, reference, q_start)
 
     @property
-    def _of_the_damping(self) -> tuple[str, ...]:
+    def _damping_inputs(self) -> tuple[str, ...]:
         """The inputs that the damping depends on."""
         return tuple(n for n in ("stiffness", "damping_ratio", "damping_stiffness", "payload") if n in self.gains)
 
@@ -469,46 +431,47 @@ class _OperationalSpace(Shown):
     def _blocks(self) -> tuple[int, ...]:
         return (self.chart.n,) if self.coupling == "coupled" else (self.chart.m, self.chart.r)
 
-    def _inertia(self, J: ca.MX, M: ca.MX) -> tuple[ca.MX, ca.MX, ca.MX]:
+    def _compute_inertia(self, J: ca.MX, M: ca.MX) -> tuple[ca.MX, ca.MX, ca.MX]:
         """B = M^-1 J^T, the inertia Lambda in blocks, and its volume."""
-        B, Lambda, volume = block_inertia(self.chart.n, self._blocks)(J, M)
+        B, Lambda, volume = build_block_inertia(self.chart.n, self._blocks)(J, M)
         return B, Lambda, volume
 
-    def _damped(self, Lambda: ca.MX, inputs: dict[str, ca.MX], velocities: ca.MX) -> ca.MX:
+    def _apply_damping(self, Lambda: ca.MX, inputs: dict[str, ca.MX], velocities: ca.MX) -> ca.MX:
         """D V, with the same blocks, for V (n, c)."""
         designed_for = inputs.get("damping_stiffness", inputs["stiffness"])
-        function = _block_damping(self.damping, self._blocks, velocities.shape[1])
+        function = _build_block_damping(self.damping, self._blocks, velocities.shape[1])
         return function(Lambda, designed_for, inputs["damping_ratio"], velocities)
 
-    def _errors(self, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
+    def _compute_errors(self, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
         """The error e, how fast it changes, and J = de/dq."""
-        e, J = errors(self.chart, inputs["q"], inputs["reference"])
+        e, J = compute_errors(self.chart, inputs["q"], inputs["reference"])
         velocity = J @ inputs["dq"]
-        return e, velocity - self._drift(inputs) if self.feed_forward else velocity, J
+        return e, velocity - self._compute_drift(inputs) if self.feed_forward else velocity, J
 
-    def _drift(self, inputs: dict[str, ca.MX]) -> ca.MX:
-        return drift(self.chart, inputs["q"], inputs["reference"], inputs["reference_velocity"])
+    def _compute_drift(self, inputs: dict[str, ca.MX]) -> ca.MX:
+        return compute_drift(self.chart, inputs["q"], inputs["reference"], inputs["reference_velocity"])
 
-    def _force(self, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
+    def _compute_force(self, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
         """Force in the coordinates, (n, 1), the volume of the gradients, and J."""
         q, dq, robot, model = inputs["q"], inputs["dq"], self.problem.robot, self.model
-        e, de, J = self._errors(inputs)
-        B, Lambda, volume = self._inertia(J, model.mass_matrix(robot, inputs))
-        force = -inputs["stiffness"] * e - self._damped(Lambda, inputs, de)
+        e, de, J = self._compute_errors(inputs)
+        B, Lambda, volume = self._compute_inertia(J, model.mass_matrix(robot, inputs))
+        force = -inputs["stiffness"] * e - self._apply_damping(Lambda, inputs, de)
         if self.feed_forward:
-            w = B @ (Lambda @ self._drift(inputs))  # J^-1 d_phi_d; if (5) holds, by (8) also when decoupled
+            w = B @ (Lambda @ self._compute_drift(inputs))  # J^-1 d_phi_d; if (5) holds, by (8) also when decoupled
             wanted = inputs["reference"], inputs["reference_velocity"], inputs["reference_acceleration"]
-            bent = bend(self.chart, q, dq, dq if model.source == "given" else w, wanted)
-            force += Lambda @ (B.T @ model.coriolis_torque(robot, inputs, w) - bent)
+            bias = compute_bias(self.chart, q, dq, dq if model.source == "given" else w, wanted)
+            force += Lambda @ (B.T @ model.coriolis_torque(robot, inputs, w) - bias)
         return force, volume, J
 
     @cached_property
     def median_volume(self) -> float:
         """Of the gradients over the domain, squared; in blocks if the law is decoupled."""
-        return median_volume(self.problem, self.chart.rates, "inertia", self._blocks)
+        inertia = Metric.from_spec(self.problem.robot, "inertia")
+        return compute_median_volume(self.problem, self.chart.rates, inertia, self._blocks)
 
 
-def _like_a_percentage(damping_ratio: Array) -> list[str]:
+def _doubt_ratio(damping_ratio: Array) -> list[str]:
     """A remark on damping ratios that are far above 1."""
     largest = float(damping_ratio.max())
     if largest <= _LARGE_RATIO:
@@ -559,10 +522,10 @@ def _positive_or_none(name: str, value: ArrayLike | None, length: int) -> Array 
     return None if value is None else positive_gains(name, value, length)
 
 
-def _block_damping(design: DampingDesign, blocks: tuple[int, ...], columns: int) -> ca.Function:
+def _build_block_damping(design: DampingDesign, blocks: tuple[int, ...], columns: int) -> ca.Function:
     """Lambda (block diagonal), stiffness, damping_ratio, V (n, columns) -> D V; D has the same blocks."""
     n = sum(blocks)
     Lambda, K, Z, V = (ca.MX.sym(*of) for of in (("Lambda", n, n), ("K", n), ("Z", n), ("V", n, columns)))
     places = [place.tolist() for place in np.split(np.arange(n), np.cumsum(blocks)[:-1])]
-    parts = [damped(design, Lambda[p, p], K[p], Z[p], V[p, :]) for p in places]
+    parts = [apply_damping(design, Lambda[p, p], K[p], Z[p], V[p, :]) for p in places]
     return ca.Function("damping", [Lambda, K, Z, V], [ca.densify(ca.vertcat(*parts))])

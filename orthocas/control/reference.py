@@ -1,4 +1,4 @@
-"""References over time: steps, splines, and low-pass filters of what is measured."""
+"""References over time: steps, splines, low-pass filters, and whether joints can follow them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,10 +11,22 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from orthocas.errors import InvalidValueError
+from orthocas.charts.chart import Chart
+from orthocas.charts.self_motion import too_far
+from orthocas.charts.solutions import Tracker, TrackerStatus
+from orthocas.errors import InvalidValueError, InverseError, OrthocasError, UnreachableReferenceError, degrees_hint
+from orthocas.tasks.domains import bounds_of, contains
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, frozen_array, require_kind, require_known, require_shape
+from orthocas.tools.checks import (
+    Array,
+    as_float_array,
+    as_point,
+    frozen_array,
+    require_kind,
+    require_known,
+    require_shape,
+)
 from orthocas.tools.display import Shown, listed, number_list
 
 NATURAL_FREQUENCY = 2 * np.pi  #: omega0 [rad/s] of [AS2023] Sec. 8
@@ -22,6 +34,7 @@ DAMPING_RATIO = 0.7  #: zeta of [AS2023] Sec. 8
 _GRID = 0.05  # [s]
 _SWING = 0.3  # [rad] phase of the low-pass oscillation between two grid times; 0.048 s for the paper's filter
 _DEGREE = 5  # of splines through points
+_VALUES = "; targets of a Reference are values of phi, not changes of it ('move' in a steps file is a change)"
 
 
 @lru_cache(32)
@@ -239,3 +252,81 @@ def _require_number(name: str, value: float, above: float = -np.inf) -> float:
             name, value, "a finite number" if above == -np.inf else f"a finite number > {above:.0f}"
         )
     return float(array)
+
+
+def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
+    """Joint positions with phi(q) equal to the reference, followed from q_start, (N, n) on `reference.grid()`.
+
+    Raises:
+        UnreachableReferenceError: names the first time at which no such q exists near the previous one, or q lies
+            outside the domain.
+    """
+    require_kind("chart", chart, Chart)
+    require_kind("reference", reference, Reference)
+    q_start = as_point("q_start", q_start, chart.n)
+    if reference.labels != chart.labels:
+        raise InvalidValueError("labels of the reference", reference.labels, f"those of the chart {chart.labels}")
+    if not contains(chart.problem.domain, q_start):
+        hint = degrees_hint(*q_start[~np.array(chart.problem.robot.tree.prismatic)])
+        raise UnreachableReferenceError(f"the start lies outside the domain: {_explain_outside(chart, q_start)}{hint}")
+    times = reference.grid()
+    values = reference.sample(times)[0]
+    path, q = np.empty((len(times), chart.n)), q_start
+    targets = reference.targets[reference.segment(times)]
+    follower = _Follower(chart, q_start)
+    for k, value in enumerate(values):
+        where = f"at t = {times[k]:.3g} s, at {_write_values(reference.labels, value)}"
+        try:
+            new = follower.step(value, q)
+        except InverseError as error:
+            text = (
+                f"the reference cannot be reached {where}: {error}{too_far(chart, q, targets[k, chart.m :])}{_VALUES}"
+            )
+            raise UnreachableReferenceError(text) from None
+        if not contains(chart.problem.domain, new):
+            reason = f"{_explain_outside(chart, new)}{too_far(chart, q, targets[k, chart.m :])}"
+            raise UnreachableReferenceError(f"the reference leaves the domain {where}: {reason}{_VALUES}")
+        path[k] = q = new
+    return path
+
+
+class _Follower:
+    """Solves phi(q) = phi step by step: with a tracker, or with more care where that gives up or J is singular."""
+
+    def __init__(self, chart: Chart, q_start: Array) -> None:
+        self._chart = chart
+        self._tracker = self._tracker_at(q_start)
+
+    def step(self, phi: Array, q: Array) -> Array:
+        """The solution near q.
+
+        Raises:
+            InverseError: if there is none.
+        """
+        if self._tracker is not None:
+            found = self._tracker.step(phi)
+            if self._tracker.status == TrackerStatus.OK:
+                return found
+        found = self._chart.inverse(phi, q, outside=True)  # the caller says where it leaves the domain
+        self._tracker = self._tracker_at(found)
+        return found
+
+    def _tracker_at(self, q: Array) -> Tracker | None:
+        try:
+            return self._chart.tracker(q)
+        except OrthocasError:  # grown coordinates, a singular J, or a point outside the domain
+            return None
+
+
+def _explain_outside(chart: Chart, q: Array) -> str:
+    domain = chart.problem.domain
+    if domain.condition is not None and not np.all(np.asarray(domain.condition.pivots(q)) > 0):
+        return domain.explained(q)
+    low, high = bounds_of(domain)
+    i = int(np.argmax(np.abs(q - domain.centre) / (high - low)))
+    low, high = low[i], high[i]
+    return f"joint '{chart.problem.robot.joint_names[i]}' at {q[i]:.4g}, expected within [{low:.4g}, {high:.4g}]"
+
+
+def _write_values(labels: tuple[str, ...], value: Array) -> str:
+    return ", ".join(f"{label} = {number:.3g}" for label, number in zip(labels, value, strict=True))
