@@ -141,9 +141,9 @@ def test_every_operation_is_written(library: str) -> None:
     """Against CasADi: also comparisons, choices, constants and infinity."""
     array, q = array_of(library), ca.SX.sym("q", 3)
     function = dense_function("f", [q], [every_operation(q)])
-    code = LIBRARIES[library].code(function_code("f", "All operations.", function))
+    code = function_code("f", "All operations.", function)
     scope: dict[str, Any] = {"_shared": lambda value, q: value}
-    exec(f"{LIBRARIES[library].imports_for(code)}\n{code}", scope)
+    exec(f"{LIBRARIES[library].imports_for(code)}\n{LIBRARIES[library].code(code)}", scope)
     points = np.random.default_rng(1).uniform(0.4, 0.6, (5, 3))
     found = np.asarray(scope["f"](array(np.ascontiguousarray(points.T))))
     np.testing.assert_allclose(found, Batched(function)(points)[0].T, rtol=1e-14, atol=1e-14)

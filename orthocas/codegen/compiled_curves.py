@@ -71,7 +71,8 @@ def curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
         functions.append(dense_function("curve_pivots", [q], [domain.condition.pivots(q)]))
         sizes["CONDITION"] = functions[-1].numel_out(0)
     kernels, turn = generate_kernels(functions, "kernel"), float(chart.turns[chart.m])
-    sizes |= {**kernels.sizes(), **{name.upper(): repr(value) for name, value in asdict(RULES).items()}}
+    sizes |= {f"{name}_{word}": size for name, work in kernels.sizes().items() for word, size in work.items()}
+    sizes |= {name.upper(): repr(value) for name, value in asdict(RULES).items()}
     sizes["XI_SIZE"] = repr(float(chart.phi_sizes[chart.m]))
     sizes["PERIOD"] = repr(turn) if turn > 0 else "INFINITY"
     low, high = bounds_of(domain)

@@ -3,21 +3,20 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
+from typing import Any, ClassVar, Literal, Protocol, Self
 
 import casadi as ca
 import numpy as np
 
+from orthocas.charts.chart import Chart
+from orthocas.control.reference import Reference, joint_path
 from orthocas.errors import InvalidValueError
 from orthocas.tasks.domains import Domain, reach
 from orthocas.tasks.problem import Problem
+from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_known
-from orthocas.tools.display import listed, number_list
+from orthocas.tools.display import Shown, listed, number_list
 from orthocas.tools.expressions import shortest
-
-if TYPE_CHECKING:
-    from orthocas.charts.chart import Chart
-    from orthocas.control.reference import Reference
 
 LARGEST = 1e100  #: larger numbers count as not finite, because their squares may overflow
 GUARD = "guard"  #: name of the guard's function
@@ -70,7 +69,7 @@ class Controller(Protocol):
         """The law in one line, for generated C."""
 
     @property
-    def chart(self) -> "Chart | None":
+    def chart(self) -> Chart | None:
         """The chart whose coordinates the law uses and whose domain it respects; None for laws without a chart."""
 
     @property
@@ -126,7 +125,7 @@ class Controller(Protocol):
     def measured(self) -> ca.Function:
         """q (n, 1) -> the controlled quantities (k, 1)."""
 
-    def require_reachable(self, reference: "Reference", q_start: Array) -> None:
+    def require_reachable(self, reference: Reference, q_start: Array) -> None:
         """Raise UnreachableReferenceError, with time and place, if the law cannot follow the reference."""
 
 
@@ -206,6 +205,41 @@ def law_facts(controller: Controller) -> dict[str, str]:
     }
 
 
+class LawOfChart(Shown):
+    """What laws in the coordinates of a chart have in common."""
+
+    chart: Chart
+    graph: Any  #: a `ca.Function`, as `Controller` has it
+
+    @property
+    def problem(self) -> Problem:
+        """Robot, task, metric and domain of the chart."""
+        return self.chart.problem
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Task labels, then xi1, xi2, ..."""
+        return self.chart.labels
+
+    @property
+    def measured(self) -> ca.Function:
+        """Phi(q)."""
+        return self.chart.function("phi")
+
+    @cached_property
+    def function(self) -> ca.Function:
+        """q, dq (n, 1), reference and its derivatives (n, 1), gains -> command (n, 1), status (1, 1)."""
+        return self.chart.runnable(count_turns_from_centre(self.graph, self.problem))
+
+    def facts(self: Any) -> dict[str, str]:
+        """Quantities, gains, settings and problem."""
+        return law_facts(self)
+
+    def require_reachable(self, reference: Reference, q_start: Array) -> None:
+        """Raise UnreachableReferenceError if the motion from q_start along the reference leaves the chart's domain."""
+        joint_path(self.chart, reference, q_start)
+
+
 def require_controller(controller: Controller) -> None:
     """Raise InvalidValueError for an object without the attributes of a controller. Builds none of its functions."""
     if not all(hasattr(controller, name) for name in ("name", "problem", "command", "labels", "gains")):
@@ -219,7 +253,7 @@ def named_inputs(n: int, gains: dict[str, Array], k: int) -> dict[str, ca.MX]:
     return {name: ca.MX.sym(name, size) for name, size in sizes.items()}
 
 
-def compute_errors(chart: "Chart", q: ca.MX, reference: ca.MX) -> tuple[ca.MX, ca.MX]:
+def compute_errors(chart: Chart, q: ca.MX, reference: ca.MX) -> tuple[ca.MX, ca.MX]:
     """phi relative to phi_d, e (n, 1), and de/dq (n, n) for a reference at rest.
 
     For most tasks e = phi - phi_d and de/dq = J. A whole orientation counts from its target, see `Relative`.
@@ -232,13 +266,13 @@ def compute_errors(chart: "Chart", q: ca.MX, reference: ca.MX) -> tuple[ca.MX, c
     return ca.vertcat(e, rest), ca.vertcat(slope, own["jacobian"](q))
 
 
-def compute_drift(chart: "Chart", q: ca.MX, reference: ca.MX, velocity: ca.MX) -> ca.MX:
+def compute_drift(chart: Chart, q: ca.MX, reference: ca.MX, velocity: ca.MX) -> ca.MX:
     """The rate de/dq dq at which q stays with a reference that moves, (n, 1): d_phi_d for most tasks."""
     m = chart.m
     return ca.vertcat(chart.relative.drift(q, reference[:m], velocity[:m]), velocity[m:])
 
 
-def compute_bias(chart: "Chart", q: ca.MX, dq: ca.MX, w: ca.MX, reference: tuple[ca.MX, ca.MX, ca.MX]) -> ca.MX:
+def compute_bias(chart: Chart, q: ca.MX, dq: ca.MX, w: ca.MX, reference: tuple[ca.MX, ca.MX, ca.MX]) -> ca.MX:
     """(d/dt) (de/dq w - drift), (n, 1), with phi_d and its two derivatives: dJ/dt w - dd_phi_d for most tasks."""
     m = chart.m
     x, dx, ddx = (part[:m] for part in reference)

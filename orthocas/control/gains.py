@@ -8,7 +8,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.point_quality import least_in_domain
-from orthocas.control.controller import Setting
 from orthocas.errors import InvalidValueError
 from orthocas.robots.robot import Robot
 from orthocas.tasks.domains import Domain, sample_uniform
@@ -49,22 +48,17 @@ class GainRules:
 
 RULES = GainRules()
 
-STIFFNESS_SETTING = Setting('"100", or "100,50,..." per quantity; default: modes around 6 Hz.')
-DAMPING_RATIO_SETTING = Setting('"0.7", or "0.7,1,..." per quantity; default: 0.7.')
-DELAY_SETTING = Setting("Delay from measurement to torque that the default stiffness is to bear [s]; default: 0.")
-FEEDBACK_SETTING = Setting("Feedback gain [1/s]; default: 10.")
-
 
 def positive_gains(name: str, value: ArrayLike, length: int) -> Array:
     """Finite numbers > 0, (length,), from one number or (length,)."""
-    gains = _spread(name, value, length)
+    gains = spread_gains(name, value, length)
     _require(name, gains, gains > 0, "positive numbers")
     return gains
 
 
 def non_negative_gains(name: str, value: ArrayLike, length: int) -> Array:
     """Finite numbers >= 0, (length,), from one number or (length,)."""
-    gains = _spread(name, value, length)
+    gains = spread_gains(name, value, length)
     _require(name, gains, gains >= 0, "numbers >= 0")
     return gains
 
@@ -78,7 +72,8 @@ def command_limit(name: str, value: ArrayLike | None, default: Array) -> Array:
     return limit
 
 
-def _spread(name: str, value: ArrayLike, length: int) -> Array:
+def spread_gains(name: str, value: ArrayLike, length: int) -> Array:
+    """Finite numbers (length,), from one number or (length,)."""
     return frozen_array(name, np.broadcast_to(_check_length(name, value, length), (length,)), (length,))
 
 

@@ -12,28 +12,24 @@ from numpy.typing import ArrayLike
 from orthocas.charts.chart import Chart
 from orthocas.control.controller import (
     Command,
+    LawOfChart,
     Setting,
     compute_drift,
     compute_errors,
-    count_turns_from_centre,
     fallback_function,
     guarded_graph,
-    law_facts,
     named_inputs,
 )
 from orthocas.control.gains import (
     FEEDBACK,
-    FEEDBACK_SETTING,
     LIMIT,
     RULES,
     command_limit,
     non_negative_gains,
 )
 from orthocas.control.linear_algebra import build_block_inertia, compute_median_volume
-from orthocas.control.reference import Reference, joint_path
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.robots.tree import require_driven
-from orthocas.tasks.problem import Problem
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, require_at_least, require_kind
 from orthocas.tools.display import Shown, listed, number_list
@@ -41,7 +37,7 @@ from orthocas.tools.expressions import shortest
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Kinematic(Shown):
+class Kinematic(LawOfChart):
     """Joint velocity dq = J^-1 (d_phi_d + Lambda (phi_d - phi)).
 
     The error e = phi - phi_d obeys de/dt = -Lambda e, so every start ends on the reference.
@@ -71,7 +67,7 @@ class Kinematic(Shown):
     energy_graph = None
     gain_units = MappingProxyType({"feedback": FEEDBACK, "limit": LIMIT})
     settings = MappingProxyType[str, str]({})
-    options: ClassVar[Mapping[str, Setting]] = {"feedback": FEEDBACK_SETTING}
+    options: ClassVar[Mapping[str, Setting]] = {"feedback": Setting("Feedback gain [1/s]; default: 10.")}
 
     def __init__(self, chart: Chart, feedback: ArrayLike = RULES.feedback, limit: ArrayLike | None = None) -> None:
         require_kind("chart", chart, Chart)
@@ -91,33 +87,9 @@ class Kinematic(Shown):
         return []
 
     @property
-    def problem(self) -> Problem:
-        """Robot, task, metric and domain of the chart."""
-        return self.chart.problem
-
-    def facts(self) -> dict[str, str]:
-        """Quantities, gains and problem."""
-        return law_facts(self)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Task labels, then xi1, xi2, ..."""
-        return self.chart.labels
-
-    @property
     def gains(self) -> dict[str, Array]:
         """Inputs of the law besides state and targets: the feedback gain [1/s] and the limit of the task speed."""
         return {"feedback": self.feedback, "limit": self.limit}
-
-    @property
-    def measured(self) -> ca.Function:
-        """Phi(q)."""
-        return self.chart.function("phi")
-
-    @cached_property
-    def function(self) -> ca.Function:
-        """q, dq (n, 1), reference and its derivatives (n, 1), gains -> command (n, 1), status (1, 1)."""
-        return self.chart.runnable(count_turns_from_centre(self.graph, self.problem))
 
     @cached_property
     def graph(self) -> ca.Function:
@@ -136,10 +108,6 @@ class Kinematic(Shown):
     def fallback(self) -> ca.Function:
         """q, gains -> zero velocity."""
         return fallback_function(named_inputs(self.chart.n, self.gains, 0), ca.MX(self.chart.n, 1))
-
-    def require_reachable(self, reference: Reference, q_start: Array) -> None:
-        """Raise UnreachableReferenceError if the motion from q_start along the reference leaves the chart's domain."""
-        joint_path(self.chart, reference, q_start)
 
 
 class XiTask(Shown):

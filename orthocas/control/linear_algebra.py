@@ -16,7 +16,6 @@ from orthocas.tools.expressions import WRITTEN_OUT
 LARGE_INVERSE = "large_inverse"  #: name of the functions for which generated C has code of its own
 ROOT_TIMES = "root_times"  #: likewise
 ROUNDS = 8  #: accurate to rounding up to a condition number of 1e6 (tests/test_control_algebra.py)
-_SAMPLES, _SEED = 256, 0
 SOFTEST = 1e-6  #: smallest squared frequency in double_diagonal, relative to the largest: K_i = 0 divides by zero
 
 
@@ -127,7 +126,7 @@ def compute_median_volume(problem: Problem, jacobian: ca.Function, metric: Metri
     """Median of the volume of `build_block_inertia` over the domain. It sets the scale for "near singular"."""
     q = ca.MX.sym("q", problem.n)
     volume = build_block_inertia(problem.n, blocks)(jacobian(q), metric.function(q))[2]
-    points = sample_uniform(problem.domain, _SAMPLES, _SEED)
+    points = sample_uniform(problem.domain, 256, 0)
     return float(np.nanmedian(Batched(dense_function("volume", [q], [volume]))(points)[0]))
 
 

@@ -19,6 +19,7 @@ from orthocas.control.controller import (
     named_inputs,
     require_controller,
 )
+from orthocas.control.gains import positive_gains
 from orthocas.control.linear_algebra import build_block_inertia
 from orthocas.errors import InvalidValueError
 from orthocas.robots import dynamics
@@ -38,9 +39,17 @@ from orthocas.tools.display import Shown, number_list
 if TYPE_CHECKING:
     from orthocas.control.operational_space import _OperationalSpace
 
-_SHARE = 0.5  # of the law's limit that a correction may use, by default
-_GRAVITY = 9.81  # [m/s^2]
-_CROSSED = 0.5  # weight of the error in J^-1 (de + weight e), in the decay rate of the slowest mode
+
+@dataclass(frozen=True, slots=True)
+class MemoryRules:
+    """Numbers of the memories that come with orthocas."""
+
+    fraction: float = 0.5  #: of the law's limit that a correction may use, by default
+    gravity: float = 9.81  #: to compare moments with torques [m/s^2]
+    crossed: float = 0.5  #: weight of the error in J^-1 (de + weight e), in the decay rate of the slowest mode
+
+
+RULES = MemoryRules()
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,11 +308,11 @@ class Adaptation(_Correcting):
         wanted = inputs["reference"], inputs["reference_velocity"], inputs["reference_acceleration"]
         a = -B @ (Lambda @ compute_bias(chart, q, dq, w, wanted))
         Y = regressor(q, dq, w, a)
-        springs = self._compute_joint_stiffness(law)[list(joints)] / _GRAVITY**2
+        springs = self._compute_joint_stiffness(law)[list(joints)] / RULES.gravity**2
         slowest = self._compute_crossing(law)
         slope = -min(self.rate, slowest) * springs * (Y.T @ (B @ (Lambda @ (de / slowest + e))))
         change = ca.if_else(inputs["active"] > 0, inputs["active"] * inputs["period"] * slope, 0)
-        largest = np.full(len(joints), float(bound.max()) / _GRAVITY)
+        largest = np.full(len(joints), float(bound.max()) / RULES.gravity)
         moments = _clip(inputs["moments"] + _replace_invalid(change), largest)
         offset = ca.if_else(inputs["period"] > 0, inputs["offset"], inputs["correction"] - Y @ moments)
         found = {
@@ -320,7 +329,7 @@ class Adaptation(_Correcting):
         decays = 2 * np.pi * modes.frequencies[sprung] * np.minimum(modes.damping_ratios[sprung], 1.0)
         if not (decays > 0).any():
             raise InvalidValueError("law with a memory", "without springs and damping", "both, to learn from errors")
-        return _CROSSED * float(decays[decays > 0].min())
+        return RULES.crossed * float(decays[decays > 0].min())
 
     def _compute_joint_stiffness(self, law: "_OperationalSpace") -> Array:
         """Stiffness of the law at the joints, the diagonal of J^T K J in the middle of the domain, (n,)."""
@@ -337,13 +346,12 @@ def _check_bound(bound: ArrayLike | None, law: "_OperationalSpace") -> Array:
     """Largest corrections (n,)."""
     if law.model.source == "given":
         raise InvalidValueError("model of a law with a memory", "given", "own, because it needs the momentum")
-    given = _SHARE * law.limit if bound is None else as_float_array("bound", bound)
-    if given.ndim:
-        require_shape("bound", given.shape, (law.problem.n,))
-    found = np.broadcast_to(given, (law.problem.n,))
-    if not (np.isfinite(found) & (found > 0)).all():
-        raise InvalidValueError("bound of the correction", found.tolist(), "finite numbers > 0, or a finite limit")
-    return np.asarray(found)
+    if bound is not None:
+        return positive_gains("bound", bound, law.problem.n)
+    largest = RULES.fraction * law.limit
+    if not np.isfinite(largest).all():
+        raise InvalidValueError("bound of the correction", largest.tolist(), "finite numbers > 0, or a finite limit")
+    return largest
 
 
 def _name_inputs(law: "_OperationalSpace", fields: Mapping[str, Array]) -> dict[str, ca.MX]:

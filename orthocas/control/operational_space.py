@@ -13,6 +13,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.point_quality import Judged
 from orthocas.control.controller import (
     Command,
+    LawOfChart,
     Setting,
     compute_bias,
     compute_drift,
@@ -20,17 +21,13 @@ from orthocas.control.controller import (
     count_turns_from_centre,
     fallback_function,
     guarded_graph,
-    law_facts,
     named_function,
     named_inputs,
 )
 from orthocas.control.gains import (
     DAMPING_RATIO,
-    DAMPING_RATIO_SETTING,
-    DELAY_SETTING,
     LIMIT,
     STIFFNESS,
-    STIFFNESS_SETTING,
     Modes,
     command_limit,
     compute_mobility,
@@ -49,22 +46,27 @@ from orthocas.control.linear_algebra import (
     compute_median_volume,
 )
 from orthocas.control.memory import MEMORIES, Memory, Remembers
-from orthocas.control.reference import Reference, joint_path
 from orthocas.control.run_time_model import Gravity, RunTimeModel, Source
 from orthocas.errors import InvalidValueError, LawWarning
 from orthocas.robots.tree import require_driven
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.metric import Metric
-from orthocas.tasks.problem import Problem
 from orthocas.tools.batch import Batched
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_point_set, require_kind, require_known
-from orthocas.tools.display import Shown, percent
+from orthocas.tools.display import percent
 
-_MODE_SAMPLES = 256
-_MUCH_DEG = 15.0  # leak from which on decoupled laws are warned of
-_LARGE_RATIO = 5.0  # damping ratio from which on a percentage is suspected
 
+@dataclass(frozen=True, slots=True)
+class TorqueRules:
+    """Numbers of torque laws."""
+
+    samples: int = 256  #: of the domain, for modes and leaks
+    much_deg: float = 15.0  #: leak from which on decoupled laws are warned of [deg]
+    large_ratio: float = 5.0  #: damping ratio from which on a percentage is suspected
+
+
+RULES = TorqueRules()
 
 Coupling = Literal["coupled", "decoupled"]
 COUPLINGS: tuple[Coupling, ...] = ("coupled", "decoupled")
@@ -81,7 +83,7 @@ class DampingCheck:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class _OperationalSpace(Shown):
+class _OperationalSpace(LawOfChart):
     """The common part of impedance control and PD+: settings, inertia and damping in the coordinates of a chart.
 
     Args:
@@ -121,9 +123,9 @@ class _OperationalSpace(Shown):
     force: ClassVar[str]  #: the formula, without torques that do not act through the coordinates
     command: ClassVar[Command] = "torque"
     options: ClassVar[Mapping[str, Setting]] = {
-        "stiffness": STIFFNESS_SETTING,
-        "delay": DELAY_SETTING,
-        "damping_ratio": DAMPING_RATIO_SETTING,
+        "stiffness": Setting('"100", or "100,50,..." per quantity; default: modes around 6 Hz.'),
+        "delay": Setting("Delay from measurement to torque that the default stiffness is to bear [s]; default: 0."),
+        "damping_ratio": Setting('"0.7", or "0.7,1,..." per quantity; default: 0.7.'),
         "coupling": Setting("coupled (default) or decoupled.", is_word=True),
         "damping": Setting("double_diagonal (default) or square_root.", is_word=True),
         "damping_stiffness": Setting("Design the damping for this stiffness, so that --stiffness may be 0 in places."),
@@ -206,21 +208,11 @@ class _OperationalSpace(Shown):
         memory: Literal["none", "momentum", "adaptive"] = "none",
         delay: float = 0.0,
     ) -> Self:
-        """Build the law on a chart.
+        """Build the law on a chart from numbers and words; other settings are those of the law itself.
 
-        Args:
-            chart: the chart.
-            limit: largest torque of each joint.
-            stiffness: default: `matched_stiffness`, modes around 6 Hz, or slower ones that bear the delay.
-            damping_ratio: as for the law itself.
-            coupling: as for the law itself.
-            damping: as for the law itself.
-            damping_stiffness: as for the law itself.
-            model: the source of the `RunTimeModel`.
-            gravity: its gravity.
-            inputs: its inputs, such as "payload,wrench,extra_torque".
-            memory: none, momentum for a `MomentumObserver`, or adaptive for an `Adaptation`.
-            delay: from the measurement to the torque [s], for the default stiffness.
+        `model`, `gravity` and `inputs` ("payload,wrench,extra_torque") are those of a `RunTimeModel`, `memory` names a
+        `MomentumObserver` or an `Adaptation`. Without a stiffness, `matched_stiffness` puts the modes around 6 Hz, or
+        lower so that they bear a `delay` from the measurement to the torque [s].
 
         Raises:
             ShapeError, InvalidValueError, UnknownNameError: as for the law itself, and for a delay beside a stiffness.
@@ -276,7 +268,7 @@ class _OperationalSpace(Shown):
                 "(inertia)"
             )
         found += _doubt_ratio(self.damping_ratio)
-        if self.coupling == "decoupled" and (leak := self._compute_leak_deg()) > _MUCH_DEG:
+        if self.coupling == "decoupled" and (leak := self._compute_leak_deg()) > RULES.much_deg:
             found.append(
                 f"the gradients of this chart lean into the task by {leak:.0f} deg (rms): decoupled springs pull at "
                 "both, which coupled ones do not; see docs/how-to/wide.md"
@@ -294,23 +286,9 @@ class _OperationalSpace(Shown):
 
     def _compute_leak_deg(self) -> float:
         """Root mean square of the chart's leaks at samples [deg]."""
-        points = sample_uniform(self.problem.domain, _MODE_SAMPLES, 0)
+        points = sample_uniform(self.problem.domain, RULES.samples, 0)
         sines = Judged.at(self.problem, self.chart.coordinates, points).leak_sines
         return float(np.degrees(np.sqrt(np.mean(np.arcsin(np.clip(sines, 0.0, 1.0)) ** 2))))
-
-    @property
-    def problem(self) -> Problem:
-        """Robot, task, metric and domain of the chart."""
-        return self.chart.problem
-
-    def facts(self) -> dict[str, str]:
-        """Quantities, gains, design and problem."""
-        return law_facts(self)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Task labels, then xi1, xi2, ..."""
-        return self.chart.labels
 
     @property
     def gains(self) -> dict[str, Array]:
@@ -324,16 +302,6 @@ class _OperationalSpace(Shown):
             **design,
             **inputs,
         }
-
-    @property
-    def measured(self) -> ca.Function:
-        """Phi(q)."""
-        return self.chart.function("phi")
-
-    @cached_property
-    def function(self) -> ca.Function:
-        """q, dq (n, 1), reference and its derivatives (n, 1), gains -> command (n, 1), status (1, 1)."""
-        return self.chart.runnable(count_turns_from_centre(self.graph, self.problem))
 
     @cached_property
     def graph(self) -> ca.Function:
@@ -411,16 +379,12 @@ class _OperationalSpace(Shown):
     def _sample_postures(self) -> Array:
         """Samples of the domain, and the posture with the fastest mode that a search finds, (N, n)."""
         fastest = find_fastest_posture(self.chart, self.stiffness, self.model.robot(self.problem))
-        return np.vstack([sample_uniform(self.problem.domain, _MODE_SAMPLES, 0), fastest])
+        return np.vstack([sample_uniform(self.problem.domain, RULES.samples, 0), fastest])
 
     def _compute_damping(self, points: Array) -> Array:
         """D(q) with the law's gains at points (N, n), (N, n, n)."""
         rows = [np.tile(self.gains[name], (len(points), 1)) for name in self._damping_inputs]
         return Batched(self.damping_matrix)(points, *rows)[0].reshape(-1, self.chart.n, self.chart.n)
-
-    def require_reachable(self, reference: Reference, q_start: Array) -> None:
-        """Raise UnreachableReferenceError if the motion from q_start along the reference leaves the chart's domain."""
-        joint_path(self.chart, reference, q_start)
 
     @property
     def _damping_inputs(self) -> tuple[str, ...]:
@@ -474,7 +438,7 @@ class _OperationalSpace(Shown):
 def _doubt_ratio(damping_ratio: Array) -> list[str]:
     """A remark on damping ratios that are far above 1."""
     largest = float(damping_ratio.max())
-    if largest <= _LARGE_RATIO:
+    if largest <= RULES.large_ratio:
         return []
     return [f"damping_ratio = {largest:g} is far above critical damping, which is 1; 0.7 is usual"]
 

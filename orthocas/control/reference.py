@@ -270,52 +270,32 @@ def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
         hint = degrees_hint(*q_start[~np.array(chart.problem.robot.tree.prismatic)])
         raise UnreachableReferenceError(f"the start lies outside the domain: {_explain_outside(chart, q_start)}{hint}")
     times = reference.grid()
-    values = reference.sample(times)[0]
-    path, q = np.empty((len(times), chart.n)), q_start
     targets = reference.targets[reference.segment(times)]
-    follower = _Follower(chart, q_start)
-    for k, value in enumerate(values):
-        where = f"at t = {times[k]:.3g} s, at {_write_values(reference.labels, value)}"
-        try:
-            new = follower.step(value, q)
-        except InverseError as error:
-            text = (
-                f"the reference cannot be reached {where}: {error}{too_far(chart, q, targets[k, chart.m :])}{_VALUES}"
-            )
-            raise UnreachableReferenceError(text) from None
-        if not contains(chart.problem.domain, new):
-            reason = f"{_explain_outside(chart, new)}{too_far(chart, q, targets[k, chart.m :])}"
-            raise UnreachableReferenceError(f"the reference leaves the domain {where}: {reason}{_VALUES}")
-        path[k] = q = new
+    path, q, tracker = np.empty((len(times), chart.n)), q_start, _start_tracker(chart, q_start)
+    for k, value in enumerate(reference.sample(times)[0]):
+        words = ", ".join(f"{label} = {number:.3g}" for label, number in zip(reference.labels, value, strict=True))
+        where, hint = f"at t = {times[k]:.3g} s, at {words}", f"{too_far(chart, q, targets[k, chart.m :])}{_VALUES}"
+        # A tracker solves phi(q) = value; where it gives up or J is singular, the inverse map takes more care.
+        solution = q if tracker is None else tracker.step(value)
+        if tracker is None or tracker.status != TrackerStatus.OK:
+            try:
+                solution = chart.inverse(value, q, outside=True)
+            except InverseError as error:
+                raise UnreachableReferenceError(f"the reference cannot be reached {where}: {error}{hint}") from None
+            tracker = _start_tracker(chart, solution)
+        if not contains(chart.problem.domain, solution):
+            reason = _explain_outside(chart, solution)
+            raise UnreachableReferenceError(f"the reference leaves the domain {where}: {reason}{hint}")
+        path[k] = q = solution
     return path
 
 
-class _Follower:
-    """Solves phi(q) = phi step by step: with a tracker, or with more care where that gives up or J is singular."""
-
-    def __init__(self, chart: Chart, q_start: Array) -> None:
-        self._chart = chart
-        self._tracker = self._tracker_at(q_start)
-
-    def step(self, phi: Array, q: Array) -> Array:
-        """The solution near q.
-
-        Raises:
-            InverseError: if there is none.
-        """
-        if self._tracker is not None:
-            found = self._tracker.step(phi)
-            if self._tracker.status == TrackerStatus.OK:
-                return found
-        found = self._chart.inverse(phi, q, outside=True)  # the caller says where it leaves the domain
-        self._tracker = self._tracker_at(found)
-        return found
-
-    def _tracker_at(self, q: Array) -> Tracker | None:
-        try:
-            return self._chart.tracker(q)
-        except OrthocasError:  # grown coordinates, a singular J, or a point outside the domain
-            return None
+def _start_tracker(chart: Chart, q: Array) -> Tracker | None:
+    """None for grown coordinates, a singular J, or a point outside the domain."""
+    try:
+        return chart.tracker(q)
+    except OrthocasError:
+        return None
 
 
 def _explain_outside(chart: Chart, q: Array) -> str:
@@ -326,7 +306,3 @@ def _explain_outside(chart: Chart, q: Array) -> str:
     i = int(np.argmax(np.abs(q - domain.centre) / (high - low)))
     low, high = low[i], high[i]
     return f"joint '{chart.problem.robot.joint_names[i]}' at {q[i]:.4g}, expected within [{low:.4g}, {high:.4g}]"
-
-
-def _write_values(labels: tuple[str, ...], value: Array) -> str:
-    return ", ".join(f"{label} = {number:.3g}" for label, number in zip(labels, value, strict=True))

@@ -8,11 +8,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from orthocas.control.gains import spread_gains
 from orthocas.errors import InvalidValueError
 from orthocas.robots.dynamics import payload_numbers
 from orthocas.robots.robot import Robot
 from orthocas.tasks.problem import Problem
-from orthocas.tools.checks import Array, as_float_array, frozen_array, require_finite, require_known, require_shape
+from orthocas.tools.checks import Array, frozen_array, require_known
 
 Source = Literal["own", "given"]
 Gravity = Literal["law", "robot"]
@@ -101,7 +102,7 @@ class RunTimeModel:
             if (value := getattr(self, name)) is not None:
                 found[name] = value
         if self.extra_torque is not None:
-            found["extra_torque"] = _per_joint(self.extra_torque, problem.n)
+            found["extra_torque"] = spread_gains("extra_torque", self.extra_torque, problem.n)
         if self.source == "given":
             robot, q = problem.robot, problem.domain.centre
             found["mass_matrix"] = frozen_array("mass_matrix", robot.mass_matrix(q).ravel(), (problem.n**2,))
@@ -162,11 +163,3 @@ def _of(robot: Robot, name: str, inputs: Mapping[str, ca.MX], *arguments: ca.MX)
     if "payload" in inputs:
         return robot.function(f"{name}_with_payload")(*arguments, inputs["payload"])
     return robot.function(name)(*arguments)
-
-
-def _per_joint(value: ArrayLike, n: int) -> Array:
-    given = as_float_array("extra_torque", value)
-    require_finite("extra_torque", given)
-    if given.ndim:
-        require_shape("extra_torque", given.shape, (n,))
-    return frozen_array("extra_torque", np.broadcast_to(given, (n,)), (n,))
