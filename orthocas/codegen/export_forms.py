@@ -61,37 +61,37 @@ def function_code(name: str, summary: str, *functions: ca.Function) -> str:
 def tape_lines(tape: Tape) -> list[str]:
     """The lines that compute a tape's output from columns q (n, N), and return it as (k, N)."""
     lines: list[str] = []
-    known: dict[int, str] = {}  # words for the constants in work slots
+    constants: dict[int, str] = {}  # words for the constants in work slots
     results: dict[int, str] = {}
     for (name, into, *of), uses in zip(tape["steps"], _uses(tape["steps"]), strict=True):
         if name == "const":
-            known[into] = _literal(float(of[0]))
+            constants[into] = _literal(float(of[0]))
         elif name == "output":
             results[into] = f"y{into}"
-            lines.append(f"y{into} = {_array(of[0], known)}")
+            lines.append(f"y{into} = {_array(of[0], constants)}")
         else:
-            text = f"q[{of[0]}]" if name == "input" else _operation(name, of, known)
-            known.pop(into, None)
+            text = f"q[{of[0]}]" if name == "input" else _operation(name, of, constants)
+            constants.pop(into, None)
             lines.append(f"w{into} = _shared({text}, q)" if uses > 1 and name != "input" else f"w{into} = {text}")
     return [*lines, f"return np.stack([{', '.join(results[k] for k in range(len(results)))}])"]
 
 
 def _uses(steps: Sequence[Sequence[Any]]) -> list[int]:
     """How many operands of later steps each step's result is."""
-    found, writer = [0] * len(steps), dict[int, int]()
+    result, writer = [0] * len(steps), dict[int, int]()
     for k, (name, into, *of) in enumerate(steps):
         for slot in () if name in ("const", "input") else of:
-            found[writer[slot]] += 1
+            result[writer[slot]] += 1
         if name != "output":
             writer[into] = k
-    return found
+    return result
 
 
-def _operation(name: str, of: list[Any], known: dict[int, str]) -> str:
+def _operation(name: str, of: list[Any], constants: dict[int, str]) -> str:
     """One operation on work slots."""
     if name in _OPERATORS:
-        return _OPERATORS[name].format(*(known.get(slot, f"w{slot}") for slot in of))
-    words = [_array(slot, known) for slot in of]
+        return _OPERATORS[name].format(*(constants.get(slot, f"w{slot}") for slot in of))
+    words = [_array(slot, constants) for slot in of]
     if name in _CONDITIONS:
         return f"({_CONDITIONS[name].format(*words)}) * np.ones_like(q[0])"
     if name == "if_else_zero":
@@ -99,9 +99,9 @@ def _operation(name: str, of: list[Any], known: dict[int, str]) -> str:
     return f"_erf({words[0]})" if name == "erf" else f"np.{_FUNCTIONS[name]}({', '.join(words)})"
 
 
-def _array(slot: int, known: dict[int, str]) -> str:
+def _array(slot: int, constants: dict[int, str]) -> str:
     """The value in a work slot as an array, for functions that take nothing else."""
-    return f"np.full_like(q[0], {known[slot]})" if slot in known else f"w{slot}"
+    return f"np.full_like(q[0], {constants[slot]})" if slot in constants else f"w{slot}"
 
 
 def _literal(value: float) -> str:
@@ -197,14 +197,14 @@ class TermLevels:
     @property
     def indices(self) -> dict[str, list[int]]:
         """For the terms of each level, rows of the level before and rows of one-joint functions."""
-        found: dict[str, list[int]] = {}
+        result: dict[str, list[int]] = {}
         functions = {term: k for k, term in enumerate(self.levels[0])}
         for k, (before, level) in enumerate(pairwise(self.levels), start=1):
             rows = {term: row for row, term in enumerate(before)}
             split = [_split(term) for term in level]
-            found[f"parents_{k}"] = [rows[rest] for rest, _ in split]
-            found[f"factors_{k}"] = [functions[alone] for _, alone in split]
-        return found
+            result[f"parents_{k}"] = [rows[rest] for rest, _ in split]
+            result[f"factors_{k}"] = [functions[alone] for _, alone in split]
+        return result
 
 
 def product_form(coordinates: Coordinates) -> Form | None:
@@ -271,8 +271,8 @@ def form_of(chart: Chart) -> Form:
     """
     if isinstance(chart.coordinates, Coordinates):
         for form in _SPECIAL:
-            if (found := form(chart.coordinates)) is not None:
-                return found
+            if (result := form(chart.coordinates)) is not None:
+                return result
     return expression_form(chart)
 
 

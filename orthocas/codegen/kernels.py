@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -18,7 +17,6 @@ from orthocas.errors import CompileError
 _VERSION = f"by CasADi {ca.CasadiMeta.version()}"
 _PLACE = re.compile(r"\*w(\d+)=w\+(\d+)")
 _CALL = re.compile(r"\bcasadi_f\d+(?=\(arg1, res1, iw, w, 0\))")
-_OPTIONS: dict[str, Any] = {"with_header": False, "with_export": False, "casadi_int": "int"}
 _FUNCTION = re.compile(r"^(?:static |inline |const )*\w+\s?\*?\s+\**(\w+)\((.*)", re.DOTALL)
 _DATA = re.compile(r"^static const \w+ (\w+)\[")
 _PRODUCT = re.compile(r"casadi_mtimes_dense\((\w+), (\d+), (\d+), (\w+), (\d+), (\w+), 0\)")
@@ -59,26 +57,36 @@ def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
         functions: functions with different names.
         prefix: prefix of every C name that the code defines.
     """
-    generator = ca.CodeGenerator("kernels.c", _OPTIONS)
+    # CasADi writes the functions and all that they call, as casadi_f0, casadi_f1, ...
+    generator = ca.CodeGenerator("kernels.c", {"with_header": False, "with_export": False, "casadi_int": "int"})
     for function in functions:
         generator.add(function)
-    items, doubles = compact_work_arrays(_split_definitions(_fix_product_sizes(generator.dump())), functions)
-    items = replace_bodies(items, functions)
+    blocks = _split_definitions(_fix_product_sizes(generator.dump()))
+
+    # Functions at work reuse the arrays of those that have ended; inverses and roots get faster bodies.
+    blocks, doubles = _compact_work_arrays(blocks, functions)
+    for number, function in enumerate(_order_functions(functions)):
+        name = f"casadi_f{number}"
+        if (body := _write_body(function, blocks[name])) is not None:
+            blocks[name] = blocks[name].split("{", 1)[0] + body
+
+    # What is used remains, as C99 that compilers do not warn of, with our prefix.
     names = [function.name() for function in functions]
-    code = "\n\n".join(_silence_warnings(items[name]) for name in _find_needed(items, names))
+    code = "\n\n".join(_silence_warnings(blocks[name]) for name in _find_needed(blocks, names))
     code = re.sub(r"\bcasadi_inf\b", "INFINITY", re.sub(r"\bcasadi_nan\b", "NAN", code))
     code = _make_conditions_explicit(code)
     code = re.sub(r"CASADI_CAST\((\w+), ([^()]+)\)", r"(\1)(\2)", code)
     code = re.sub(r"\bcasadi_real\b", "double", re.sub(r"\bcasadi_int\b", "int", code))
     code = re.sub(rf"\b(?:casadi_(?=\w)|(?={'|'.join(names)})(?=\w+\(const double\*\* arg))", f"{prefix}_", code)
-    code = _replace_pow(code, f"{prefix}_power")
+    if re.search(r"\bpow\(", code):
+        code = f"{write_power(f'{prefix}_power')}\n\n" + re.sub(r"\bpow\(", f"{prefix}_power(", code)
     work = {f.name(): (f.sz_arg(), f.sz_res(), f.sz_iw(), doubles[f.name()]) for f in functions}
     return Kernels(code, work, {f.name(): f.numel_out(0) for f in functions})
 
 
 def _fix_product_sizes(text: str) -> str:
     """Replace dense products by versions with constant sizes, which compilers vectorise; CasADi passes the sizes."""
-    sizes = sorted({found.group(2, 3, 5) for found in _PRODUCT.finditer(text)})
+    sizes = sorted({result.group(2, 3, 5) for result in _PRODUCT.finditer(text)})
     calls = _PRODUCT.sub(r"casadi_product_\2_\3_\5(\1, \4, \6)", text)
     return "\n\n".join([*(_write_product(*map(int, size)) for size in sizes), calls])
 
@@ -106,7 +114,7 @@ def _write_product(rows: int, columns: int, count: int) -> str:
 
 def _split_definitions(text: str) -> dict[str, str]:
     """Functions and constants by name, in order, without the preprocessor lines and comments between them."""
-    found: dict[str, str] = {}
+    result: dict[str, str] = {}
     lines = iter(text.splitlines())
     for line in lines:
         data = _DATA.match(line)
@@ -118,11 +126,11 @@ def _split_definitions(text: str) -> dict[str, str]:
             block[-1].endswith(";") if data else block[-1] == "}" or line.endswith("}")
         ):  # or the definition is a single line
             block.append(next(lines))
-        found[name.group(1)] = "\n".join(block)
-    return found
+        result[name.group(1)] = "\n".join(block)
+    return result
 
 
-def compact_work_arrays(blocks: dict[str, str], functions: list[ca.Function]) -> tuple[dict[str, str], dict[str, int]]:
+def _compact_work_arrays(blocks: dict[str, str], functions: list[ca.Function]) -> tuple[dict[str, str], dict[str, int]]:
     """C code with smaller work arrays, and the number of doubles that each function needs.
 
     Args:
@@ -132,7 +140,7 @@ def compact_work_arrays(blocks: dict[str, str], functions: list[ca.Function]) ->
     Raises:
         CompileError: if a new version of CasADi lays the code out in another way.
     """
-    names = {hash(f): f"casadi_f{number}" for number, f in enumerate(order_functions(functions))}
+    names = {hash(f): f"casadi_f{number}" for number, f in enumerate(_order_functions(functions))}
     changed = dict(blocks)
     needed: dict[str, int] = {}
 
@@ -149,19 +157,19 @@ def compact_work_arrays(blocks: dict[str, str], functions: list[ca.Function]) ->
     return changed, {function.name(): need(function) for function in functions}
 
 
-def order_functions(functions: list[ca.Function]) -> list[ca.Function]:
+def _order_functions(functions: list[ca.Function]) -> list[ca.Function]:
     """The functions and all that they call, callers before callees."""
-    found: dict[int, ca.Function] = {}
+    result: dict[int, ca.Function] = {}
 
     def visit(function: ca.Function) -> None:
-        if hash(function) not in found:
-            found[hash(function)] = function
+        if hash(function) not in result:
+            result[hash(function)] = function
             for callee in _find_callees(function):
                 visit(callee)
 
     for function in functions:
         visit(function)
-    return list(found.values())
+    return list(result.values())
 
 
 def _find_callees(function: ca.Function) -> list[ca.Function]:
@@ -184,37 +192,21 @@ def _move_slots(block: str, function: ca.Function, below: int) -> tuple[str, int
     if not places:
         return block, below
     shift = below - places[0][0]
-    return _PLACE.sub(lambda found: f"*w{found[1]}=w+{int(found[2]) + shift}", block), sum(places[-1]) + shift
+    return _PLACE.sub(lambda result: f"*w{result[1]}=w+{int(result[2]) + shift}", block), sum(places[-1]) + shift
 
 
 def _measure_slots(function: ca.Function) -> dict[int, int]:
     """Size of every slot of the work array, in numbers."""
-    found: dict[int, int] = {}
+    result: dict[int, int] = {}
     for k in range(function.n_instructions() if function.is_a("MXFunction") else 0):
         node = function.instruction_MX(k)
         places = [] if function.instruction_id(k) == ca.OP_OUTPUT else function.instruction_output(k)
         for index, place in enumerate(places):
             if function.instruction_id(k) == ca.OP_CALL:
-                found[place] = node.which_function().nnz_out(index)
+                result[place] = node.which_function().nnz_out(index)
             else:
-                found[place] = (node.get_output(index) if len(places) > 1 else node).nnz()
-    return {place: size for place, size in found.items() if place >= 0}
-
-
-def replace_bodies(blocks: dict[str, str], functions: list[ca.Function]) -> dict[str, str]:
-    """C code by name, with that of inverses and roots replaced.
-
-    Args:
-        blocks: as in `work_arrays.compact_work_arrays`.
-        functions: as in `work_arrays.compact_work_arrays`.
-    """
-    changed = dict(blocks)
-    for number, function in enumerate(order_functions(functions)):
-        name = f"casadi_f{number}"
-        body = _write_body(function, blocks[name])
-        if body is not None:
-            changed[name] = blocks[name].split("{", 1)[0] + body
-    return changed
+                result[place] = (node.get_output(index) if len(places) > 1 else node).nnz()
+    return {place: size for place, size in result.items() if place >= 0}
 
 
 def _write_body(function: ca.Function, block: str) -> str | None:
@@ -267,12 +259,6 @@ def _make_conditions_explicit(code: str) -> str:
     return re.sub(rf"\({name}(&&|\|\|){name}\)", r"((\1 != 0)\2(\3 != 0))", code)
 
 
-def _replace_pow(code: str, name: str) -> str:
-    """C code with a function of its own, of this name, for powers."""
-    changed = re.sub(r"\bpow\(", f"{name}(", code)
-    return code if changed == code else f"{write_power(name)}\n\n{changed}"
-
-
 def write_power(name: str) -> str:
     """C of a function that stands for `pow`, which is slow on small processors."""
     return render("algebra.c", {"what": "power", "name": name}).rstrip("\n")
@@ -286,16 +272,19 @@ def share_calls(functions: list[ca.Function], states: Mapping[str, int]) -> list
         states: which graphs share, by name: 1 if only their first input is of the state (q, dq), 2 if the second one is
             dq. They take what `shared` computes as an additional last input.
     """
+    # Open calls until what several graphs call is called by name.
     sharing = {function.name(): function for function in functions if function.name() in states}
     while True:
-        called = [found for name, function in sharing.items() for found in _find_calls(function, states[name])]
+        called = [result for name, function in sharing.items() for result in _find_calls(function, states[name])]
         times = Counter(hash(function) for function, _ in called)
         several = {key for key, count in times.items() if count > 1}
         opened = partial(_open_call, but=several)
-        changed = {name: found for name, function in sharing.items() if (found := _replace_calls(function, opened))}
+        changed = {name: result for name, function in sharing.items() if (result := _replace_calls(function, opened))}
         if not changed:
             break
         sharing |= changed
+
+    # What they have in common gets a place in `shared`.
     common = {hash(function): (function, inputs) for function, inputs in called if hash(function) in several}
     n = functions[0].size1_in(0)
     ends = np.cumsum([0, *(function.numel_out(0) for function, _ in common.values())]).tolist()
@@ -306,6 +295,7 @@ def share_calls(functions: list[ca.Function], states: Mapping[str, int]) -> list
         place = places.get(hash(called)) if _are_first(arguments, given) else None
         return None if place is None else ca.reshape(shared[place], *called.size_out(0))
 
+    # The graphs take it from there.
     for name, function in sharing.items():
         symbols = function.mx_in()
         with_shared = _replace_calls(function, partial(take_shared, symbols[: states[name]]), [shared])
@@ -317,16 +307,16 @@ def share_calls(functions: list[ca.Function], states: Mapping[str, int]) -> list
 
 def _find_calls(function: ca.Function, states: int) -> list[tuple[ca.Function, int]]:
     """What a graph calls for its first inputs alone, in this order, and for how many; and what that calls for q."""
-    found: list[tuple[ca.Function, int]] = []
+    result: list[tuple[ca.Function, int]] = []
     given = function.mx_in()[:states]
 
     def collect(called: ca.Function, arguments: list[ca.MX]) -> None:
         if _are_first(arguments, given):
-            found.append((called, len(arguments)))
-            found.extend(_find_calls(called, 1))
+            result.append((called, len(arguments)))
+            result.extend(_find_calls(called, 1))
 
     _replace_calls(function, collect)
-    return found
+    return result
 
 
 def _are_first(arguments: list[ca.MX], given: list[ca.MX]) -> bool:

@@ -39,11 +39,11 @@ def compilers() -> tuple[str, ...]:
     Raises:
         CompileError: if there is no compiler.
     """
-    found = [path for name in ("gcc", "clang") if (path := shutil.which(name)) is not None]
-    found = found or [path for path in (shutil.which("cc"),) if path is not None]
-    if not found:
+    result = [path for name in ("gcc", "clang") if (path := shutil.which(name)) is not None]
+    result = result or [path for path in (shutil.which("cc"),) if path is not None]
+    if not result:
         raise CompileError("no C compiler found, expected gcc, clang or cc on the PATH")
-    return tuple(found)
+    return tuple(result)
 
 
 def compile_shared(
@@ -205,11 +205,17 @@ class Supervisor:
         if safety is not None:
             require_kind("safety", safety, Safety)
         values = (safety or Safety.of(controller)).in_c(controller.command)
-        settings = _settings_type(values, library.precision)
-        self._safety = library.address("default_safety") if safety is None else _packed(values, settings)
+        number = library.precision.c_type
+        kinds = {name: ctypes.c_int if isinstance(value, int) else number for name, value in values.items()}
+        arrays = {name: number * value.size for name, value in values.items() if isinstance(value, np.ndarray)}
+        settings = _build_struct("Safety", kinds | arrays)
+        self._safety: Any = library.address("default_safety")
+        if safety is not None:
+            struct = settings(*(tuple(value) if isinstance(value, np.ndarray) else value for value in values.values()))
+            self._safety = ctypes.pointer(struct)
         memory = memory_of(controller)
-        remembered = {} if memory is None else {name: len(value) for name, value in memory.start.items()}
-        self._state = _state_type(self._n, self._k, library.precision, settings, remembered)()
+        fields = {} if memory is None else {name: number * len(value) for name, value in memory.start.items()}
+        self._state = _build_state(self._n, self._k, number, settings, _build_struct("Memory", fields))()
         self._command = library.numbers(np.zeros(self._n))
         self.gains = gain_numbers(controller)  #: numbers of the gains in the order of the C struct
 
@@ -255,12 +261,12 @@ class Supervisor:
         OK, NEAR_BOUNDARY if the target lies beyond the boundary, so that the stream stops before it, or NOT_FINITE.
         """
         numbers = self._reference(reference)
-        wanted, speed, time = (
+        goal, speed, time = (
             self._numbers("target", target, self._k),
             as_number("omega", omega),
             as_number("period", period),
         )
-        status = self._functions["stream"](self._here, _pointer(numbers), _pointer(wanted), speed, time)
+        status = self._functions["stream"](self._here, _pointer(numbers), _pointer(goal), speed, time)
         reference[:] = numbers
         return ControlStatus(status)
 
@@ -301,59 +307,29 @@ class Supervisor:
         return ctypes.byref(self._state)
 
 
-def _state_type(
-    n: int,
-    k: int,
-    precision: Precision,
-    settings: type[ctypes.Structure],
-    remembered: dict[str, int],
+def _build_state(
+    n: int, k: int, number: Any, settings: type[ctypes.Structure], memory: type[ctypes.Structure]
 ) -> type[ctypes.Structure]:
-    joints, quantities = precision.c_type * n, precision.c_type * k
-    names = ("q", "dq", "seen_q", "seen_dq", "command", "led", "impulse", "impulse_from", "law", "anchor", "safe")
+    """The struct `NAME_state` of templates/robot.h.jinja."""
+    joints, quantities = number * n, number * k
     has_spring = any(field[0] == "brake_stiffness" for field in settings._fields_)
-    layout = [
-        *(
-            (name, ctypes.c_int)
-            for name in ("mode", "cause", "asked", "bad_ticks", "fresh", "stale_ticks", "same_ticks")
-        ),
-        *((name, precision.c_type) for name in ("weight", "brake", "unseen")),
-        *((name, joints) for name in names),
-        *((name, quantities) for name in ("offset", "integral")),
-        *((name, joints) for name in ("load", "drive", "speed") if has_spring),
-        *(("inertia", precision.c_type * n**2) for _ in range(has_spring)),
-        *((name, joints) for name in ("expected", "unexplained") if has_spring),
-        *(("memory", _memory_type(remembered, precision)) for _ in range(bool(remembered))),
-        *((name, quantities) for name in ("value", "velocity", "acceleration")),
-        ("safety", settings),
-        ("limit", joints),
-    ]
-    return type("State", (ctypes.Structure,), {"_fields_": layout})
+    counts = ("mode", "cause", "asked", "bad_ticks", "fresh", "stale_ticks", "same_ticks")
+    names = ("q", "dq", "seen_q", "seen_dq", "command", "led", "impulse", "impulse_from", "law", "anchor", "safe")
+    layout: dict[str, Any] = dict.fromkeys(counts, ctypes.c_int)
+    layout |= dict.fromkeys(("weight", "brake", "unseen"), number)
+    layout |= dict.fromkeys(names, joints) | dict.fromkeys(("offset", "integral"), quantities)
+    if has_spring:
+        layout |= dict.fromkeys(("load", "drive", "speed"), joints) | {"inertia": number * n**2}
+        layout |= dict.fromkeys(("expected", "unexplained"), joints)
+    if memory._fields_:
+        layout["memory"] = memory
+    layout |= dict.fromkeys(("value", "velocity", "acceleration"), quantities)
+    return _build_struct("State", layout | {"safety": settings, "limit": joints})
 
 
-def _memory_type(remembered: dict[str, int], precision: Precision) -> type[ctypes.Structure]:
-    """The struct of what a law remembers."""
-    layout = [(name, precision.c_type * size) for name, size in remembered.items()]
-    return type("Memory", (ctypes.Structure,), {"_fields_": layout})
-
-
-def _settings_type(values: dict[str, Any], precision: Precision) -> type[ctypes.Structure]:
-    """The struct of settings in C."""
-    layout = [(name, _kind(value, precision)) for name, value in values.items()]
-    return type("Safety", (ctypes.Structure,), {"_fields_": layout})
-
-
-def _packed(values: dict[str, Any], settings: type[ctypes.Structure]) -> Any:
-    """The settings as the C struct."""
-    struct: Any = settings()
-    for name, value in values.items():
-        setattr(struct, name, tuple(value.tolist()) if isinstance(value, np.ndarray) else value)
-    return ctypes.pointer(struct)
-
-
-def _kind(value: Any, precision: Precision) -> Any:
-    if isinstance(value, np.ndarray):
-        return precision.c_type * value.size
-    return ctypes.c_int if isinstance(value, int) else precision.c_type
+def _build_struct(name: str, layout: dict[str, Any]) -> type[ctypes.Structure]:
+    """A struct of C with these fields, in order."""
+    return type(name, (ctypes.Structure,), {"_fields_": list(layout.items())})
 
 
 def _pointer(array: Array) -> Any:

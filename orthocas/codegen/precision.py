@@ -132,14 +132,14 @@ def _in_single_precision(token: re.Match[str]) -> str:
 
 def bounds_inside(domain: Domain, precision: Precision) -> tuple[Array, Array]:
     """Lower and upper bounds in a precision, (n,) each, that belong to the domain in Python and in C."""
-    centre, found = precision.rounded(domain.centre), []
+    centre, bounds = precision.rounded(domain.centre), []
     for boundary in bounds_of(domain):
         bound = precision.rounded(boundary)
         while (beyond := _is_beyond(domain, bound, precision)).any():
             inwards = np.nextafter(bound.astype(precision.scalar), centre.astype(precision.scalar))
             bound = np.where(beyond, inwards, bound)
-        found.append(bound)
-    return found[0], found[1]
+        bounds.append(bound)
+    return bounds[0], bounds[1]
 
 
 def _is_beyond(domain: Domain, q: Array, precision: Precision) -> Any:

@@ -10,7 +10,7 @@ from orthocas.codegen.rendering import clean_word, clean_words, write_number, wr
 from orthocas.control.controller import Controller
 from orthocas.control.memory import memory_of
 from orthocas.control.safety import SIGNED, UNBOUNDED, Safety
-from orthocas.tasks.domains import Domain, PathBound, SingularBound, bounds_of, sample_uniform
+from orthocas.tasks.domains import Domain, bounds_of, sample_uniform
 from orthocas.tasks.relative import Relative
 from orthocas.tools.batch import Batched
 from orthocas.tools.expressions import scalar_code, shortest
@@ -177,12 +177,17 @@ def _describe_boundary(controller: Controller) -> dict[str, Any] | None:
     domain = None if controller.chart is None else find_condition(controller.chart)
     if domain is None:
         return None
-    if domain.singular_bound is not None:
-        return _describe_singular_bound(domain, domain.singular_bound)
-    return None if domain.path_bound is None else _describe_path(domain.path_bound)
-
-
-def _describe_singular_bound(domain: Domain, bound: SingularBound) -> dict[str, Any]:
+    if (path := domain.path_bound) is not None:
+        starts, axes, squares = path.lines
+        return {
+            "meaning": "The distance to the path of postures is a part of the boundary; it counts in radii.",
+            "path": {"starts": starts, "axes": axes, "lengths": np.sqrt(squares)},
+            "joints": list(path.counted),
+            "radii": path.radius[path.counted],
+            "fold_span": None,
+        }
+    if (bound := domain.singular_bound) is None:
+        return None
     meaning = (
         "The bound on the relative singular value of the task is a part of the boundary; its\n"
         " * distance counts in shares of that from the centre."
@@ -190,25 +195,14 @@ def _describe_singular_bound(domain: Domain, bound: SingularBound) -> dict[str, 
     fold_span = None
     if (room := domain.room_to_fold) is not None:
         meaning += " So is\n * the bound on the volume of the coordinates, in shares of the median."
-        points = sample_uniform(domain, _USUAL, 0)  # the centre may be near the bound
-        fold_span = float(np.median(Batched(room)(points)[0]))
+        # of a median position, because the centre may be near the bound
+        fold_span = float(np.median(Batched(room)(sample_uniform(domain, _USUAL, 0))[0]))
     return {
         "meaning": meaning,
         "path": None,
         "bound": bound.least_singular_value,
         "span": float(bound.singular_values(bound.centre)) - bound.least_singular_value,
         "fold_span": fold_span,
-    }
-
-
-def _describe_path(corridor: PathBound) -> dict[str, Any]:
-    starts, axes, squares = corridor.lines
-    return {
-        "meaning": "The distance to the path of postures is a part of the boundary; it counts in radii.",
-        "path": {"starts": starts, "axes": axes, "lengths": np.sqrt(squares)},
-        "joints": list(corridor.counted),
-        "radii": corridor.radius[corridor.counted],
-        "fold_span": None,
     }
 
 

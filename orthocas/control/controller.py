@@ -317,16 +317,16 @@ def guard(domain: Domain | None, n: int, numbers: int, keep_direction: bool) -> 
     regular = ca.logic_and(volume > smallest, _are_finite(command))
     status = ca.if_else(regular, float(ControlStatus.OK), float(ControlStatus.SINGULAR))
     status = ca.if_else(_is_inside(domain, q), status, float(ControlStatus.OUTSIDE_DOMAIN))
-    meant = ca.logic_and(_are_finite(inputs), _all_hold(limit > 0))
-    status = ca.if_else(meant, status, float(ControlStatus.NOT_FINITE))
+    usable = ca.logic_and(_are_finite(inputs), _all_hold(limit > 0))
+    status = ca.if_else(usable, status, float(ControlStatus.NOT_FINITE))
     from_law = status == float(ControlStatus.OK)
-    chosen = _choose(from_law, command, fallback)
-    cut = _limit(chosen, limit, keep_direction)
-    saturated = ca.logic_and(from_law, ca.logic_not(_all_hold(ca.fabs(chosen) <= limit)))
+    selected = _choose(from_law, command, fallback)
+    cut = _limit(selected, limit, keep_direction)
+    saturated = ca.logic_and(from_law, ca.logic_not(_all_hold(ca.fabs(selected) <= limit)))
     status = ca.if_else(saturated, float(ControlStatus.SATURATED), status)
-    given = [command, fallback, limit, q, inputs, volume, smallest]
+    arguments = [command, fallback, limit, q, inputs, volume, smallest]
     names = ["command", "fallback", "limit", "q", "inputs", "volume", "smallest"]
-    return ca.Function(GUARD, given, [cut, status], names, ["cut", "status"])
+    return ca.Function(GUARD, arguments, [cut, status], names, ["cut", "status"])
 
 
 def _choose(from_law: ca.SX, command: ca.SX, fallback: ca.SX) -> ca.SX:
@@ -425,8 +425,8 @@ def _guard_call(graph: ca.Function) -> tuple[list[ca.MX], ca.MX | None]:
 def fallback_function(inputs: dict[str, ca.MX], command: ca.MX) -> ca.Function:
     """The fallback of a controller as a function of q and its gains."""
     state = ("dq", "reference", "reference_velocity", "reference_acceleration")
-    chosen = {key: value for key, value in inputs.items() if key not in state}
-    return named_function("fallback", chosen, {"command": command})
+    selected = {key: value for key, value in inputs.items() if key not in state}
+    return named_function("fallback", selected, {"command": command})
 
 
 def named_function(name: str, inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:

@@ -134,15 +134,15 @@ def matched_stiffness(
     bearable = _bound_modes(delay, damping_ratio, chart.n) if delay else np.inf
     bound = min(as_number("fastest", fastest), bearable)
     points = sample_uniform(chart.problem.domain, RULES.samples, RULES.seed)
-    known = compute_mobility(chart, points, chart.problem.robot)
-    return _match(known, frequency, bound) if not delay else _match_everywhere(chart, known, frequency, bound)
+    mobilities = compute_mobility(chart, points, chart.problem.robot)
+    return _match(mobilities, frequency, bound) if not delay else _match_everywhere(chart, mobilities, frequency, bound)
 
 
-def _match_everywhere(chart: Chart, known: Array, frequency: float, bound: float) -> Array:
+def _match_everywhere(chart: Chart, mobilities: Array, frequency: float, bound: float) -> Array:
     """The stiffness with all modes below the bound: postures that descents find to be too fast join the samples."""
     robot, corners = chart.problem.robot, np.empty((0, chart.n, chart.n))
     for _ in range(RULES.rounds):
-        stiffness = _match(known, frequency, bound, corners)
+        stiffness = _match(mobilities, frequency, bound, corners)
         W = compute_mobility(chart, find_fastest_posture(chart, stiffness, robot)[None], robot)
         root = np.sqrt(stiffness)
         excess = float(np.linalg.eigvalsh(root[:, None] * W[0] * root)[-1]) / bound**2
@@ -168,8 +168,8 @@ def find_fastest_posture(chart: Chart, stiffness: Array, robot: Robot) -> Array:
 
     def slowness(q: Array) -> Array:
         W = scale[:, None] * compute_mobility(chart, q, robot) * scale
-        known = np.asarray(np.isfinite(W).all(axis=(1, 2)))
-        return np.where(known, -np.linalg.eigvalsh(np.where(known[:, None, None], W, 0))[:, -1], np.nan)
+        finite = np.asarray(np.isfinite(W).all(axis=(1, 2)))
+        return np.where(finite, -np.linalg.eigvalsh(np.where(finite[:, None, None], W, 0))[:, -1], np.nan)
 
     return least_in_domain(slowness, chart.problem.domain)
 
@@ -194,8 +194,8 @@ def _match(mobilities: Array, frequency: float, fastest: float, bounded: Array |
     bound, count = 2 * np.log(fastest / omega), len(W)
     W = W if bounded is None else np.concatenate([W, bounded])
     spread, excess = (np.append(np.full(count, 1 / count), np.full(len(W) - count, more)) for more in (0.0, 1.0))
-    found = scipy.optimize.minimize(_compute_spread, start, (W, bound, spread, excess), method="BFGS", jac=True)
-    return np.asarray(omega**2 * np.exp(found.x))
+    solution = scipy.optimize.minimize(_compute_spread, start, (W, bound, spread, excess), method="BFGS", jac=True)
+    return np.asarray(omega**2 * np.exp(solution.x))
 
 
 def _compute_spread(log_stiffness: Array, W: Array, bound: float, spread: Array, excess: Array) -> tuple[float, Array]:

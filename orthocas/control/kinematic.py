@@ -97,11 +97,15 @@ class Kinematic(LawOfChart):
         n, problem = self.chart.n, self.problem
         inputs = named_inputs(n, self.gains, n)
         q = inputs["q"]
+
+        # The rate d_phi_d - Lambda_feedback e that phi is to have
         e, J = compute_errors(self.chart, q, inputs["reference"])
-        B, Lambda, volume = build_block_inertia(n, (n,))(J, problem.metric.function(q))
         rate = compute_drift(self.chart, q, inputs["reference"], inputs["reference_velocity"]) - inputs["feedback"] * e
+
+        # dq = J^-1 rate, with J^-1 = A^-1 J^T (J A^-1 J^T)^-1
+        B, Lambda, volume = build_block_inertia(n, (n,))(J, problem.metric.function(q))
+        velocity = B @ (Lambda @ rate)
         scale = compute_median_volume(problem, self.chart.rates, problem.metric, (n,))
-        velocity = B @ (Lambda @ rate)  # J^-1 = A^-1 J^T (J A^-1 J^T)^-1
         return guarded_graph(self.name, inputs, velocity, ca.MX(n, 1), volume / scale, problem.domain, True)
 
     @cached_property
@@ -231,8 +235,8 @@ class XiTask(Shown):
         if of_mujoco:
             joints = [model.joint(name) for name in self.joints]
             return [(int(joint.qposadr[0]), int(joint.dofadr[0])) for joint in joints]
-        found = []
+        places = []
         for name in self.joints:
             joint = model.joints[model.getJointId(name)]
-            found.append((joint.idx_q if joint.nq == 1 else slice(joint.idx_q, joint.idx_q + joint.nq), joint.idx_v))
-        return found
+            places.append((joint.idx_q if joint.nq == 1 else slice(joint.idx_q, joint.idx_q + joint.nq), joint.idx_v))
+        return places

@@ -48,8 +48,8 @@ def _build_sweeps(k: int) -> ca.Function:
     A = ca.reshape(state[:-1], k, k)
     p, w = A[0, 0], A[1:, 0]
     share = w / p
-    moved = ca.vertcat(ca.horzcat(A[1:, 1:] - w @ share.T, share), ca.horzcat(share.T, -1 / p))
-    sweeps = ca.Function("sweep", [state], [ca.vertcat(ca.vec(moved), state[-1] * p)]).fold(k)
+    swept = ca.vertcat(ca.horzcat(A[1:, 1:] - w @ share.T, share), ca.horzcat(share.T, -1 / p))
+    sweeps = ca.Function("sweep", [state], [ca.vertcat(ca.vec(swept), state[-1] * p)]).fold(k)
     matrix = ca.MX.sym("A", k, k)
     end = sweeps(ca.vertcat(ca.vec(matrix), 1))
     return ca.Function(LARGE_INVERSE, [matrix], [-ca.reshape(end[:-1], k, k), end[-1]])
@@ -73,22 +73,22 @@ def multiply_by_root(matrix: Expression, vectors: Expression) -> Expression:
 @cache
 def _build_rounds(k: int, c: int) -> ca.Function:
     A, V = ca.MX.sym("A", k, k), ca.MX.sym("V", k, c)
-    product, found = A, A @ V
+    product, result = A, A @ V
     for _ in range(ROUNDS):
-        product, found = _build_newton_round(k, c)(product, found)
-    return ca.Function(ROOT_TIMES, [A, V], [found])
+        product, result = _build_newton_round(k, c)(product, result)
+    return ca.Function(ROOT_TIMES, [A, V], [result])
 
 
 @cache
 def _build_newton_round(k: int, c: int) -> ca.Function:
     """One round on the product X (k, k), a rational function of A and therefore symmetric, and on S V (k, c)."""
     kind = choose_kind(k)
-    product, found, identity = kind.sym("X", k, k), kind.sym("SV", k, c), ca.DM.eye(k)
+    product, result, identity = kind.sym("X", k, k), kind.sym("SV", k, c), ca.DM.eye(k)
     inverse, determinant = invert_spd(product)
     mu_squared = determinant ** (-1 / k)
-    next_found = ca.sqrt(mu_squared) * (found + inverse @ found / mu_squared) / 2
+    next_result = ca.sqrt(mu_squared) * (result + inverse @ result / mu_squared) / 2
     next_product = (identity + (mu_squared * product + inverse / mu_squared) / 2) / 2
-    return ca.Function("newton_round", [product, found], [_mirror(next_product), ca.densify(next_found)])
+    return ca.Function("newton_round", [product, result], [_mirror(next_product), ca.densify(next_result)])
 
 
 def _mirror(matrix: Any) -> Any:

@@ -85,24 +85,23 @@ class Memory:
             if not re.fullmatch(r"[a-z]\w*", name, flags=re.ASCII):
                 raise InvalidValueError("name of a field", repr(name), "small letters, digits and underscores, for C")
         object.__setattr__(self, "start", start)
-        wanted = {name: len(value) for name, value in start.items()}
-        known = self.step.name_in()
-        found = {name.removeprefix("next_"): self.step.size1_out(name) for name in self.step.name_out()}
-        last = {name: self.step.size1_in(name) for name in known[len(known) - len(start) :]}
-        if found != wanted or last != wanted:
-            raise InvalidValueError("outputs and last inputs of step", f"{found} and {last}", str(wanted))
+        sizes, inputs = {name: len(value) for name, value in start.items()}, self.step.name_in()
+        outputs = {name.removeprefix("next_"): self.step.size1_out(name) for name in self.step.name_out()}
+        last = {name: self.step.size1_in(name) for name in inputs[len(inputs) - len(start) :]}
+        if outputs != sizes or last != sizes:
+            raise InvalidValueError("outputs and last inputs of step", f"{outputs} and {last}", str(sizes))
         for gain, name in self.adds.items():
-            if name not in start or gain not in known:
+            if name not in start or gain not in inputs:
                 raise InvalidValueError("adds", f"{name} to {gain}", "a field, and a gain that is an input of step")
 
     def require_fitting(self, controller: Controller) -> None:
         """Raise InvalidValueError unless the step takes what the law has, and fields have the sizes of their gains."""
         n, gains = controller.problem.n, controller.gains
-        wanted = {name: symbol.shape[0] for name, symbol in named_inputs(n, gains, len(controller.labels)).items()}
-        wanted |= {"command": n, "active": 1, "period": 1} | {name: len(value) for name, value in self.start.items()}
-        found = {name: self.step.size1_in(name) for name in self.step.name_in()}
-        if list(found.items()) != list(wanted.items()):
-            raise InvalidValueError("inputs of step", found, str(wanted))
+        sizes = {name: symbol.shape[0] for name, symbol in named_inputs(n, gains, len(controller.labels)).items()}
+        sizes |= {"command": n, "active": 1, "period": 1} | {name: len(value) for name, value in self.start.items()}
+        inputs = {name: self.step.size1_in(name) for name in self.step.name_in()}
+        if list(inputs.items()) != list(sizes.items()):
+            raise InvalidValueError("inputs of step", inputs, str(sizes))
         for gain, name in self.adds.items():
             if len(self.start[name]) != len(gains[gain]) or gain == "limit":
                 raise InvalidValueError("adds", f"{name} to {gain}", "a field of the size of its gain, not the limit")
@@ -258,12 +257,15 @@ class MomentumObserver(_Correcting):
         q, dq, period = inputs["q"], inputs["dq"], inputs["period"]
         payload = [inputs["payload"]] if "payload" in inputs else []
         p, rate = _build_momentum(law.problem.robot.tree, bool(payload), model.gravity == "law")(q, dq, *payload)
+
+        # The momentum that the last tick foresaw; after a start, the one that explains the correction
         anew, later = p + inputs["correction"] / self.rate, inputs["expected"] + period * inputs["drive"]
         expected = ca.if_else(ca.logic_and(period > 0, ca.fabs(later) <= LARGEST), later, anew)
+
+        # r follows tau_ext; dp/dt = tau + C^T dq - g + r drives the momentum until the next tick
         r = self.rate * (p - expected)
         drive = inputs["command"] - model.feed_forward(law.problem.robot, inputs) + rate + r
-        found = {"expected": expected, "drive": drive, "correction": _clip(-r, bound)}
-        return _build_memory(fields, inputs, found)
+        return _build_memory(fields, inputs, {"expected": expected, "drive": drive, "correction": _clip(-r, bound)})
 
 
 @dataclass(frozen=True)
@@ -302,25 +304,28 @@ class Adaptation(_Correcting):
         fields = {"moments": np.zeros(len(joints)), "offset": np.zeros(problem.n), "correction": np.zeros(problem.n)}
         inputs = _name_inputs(law, fields)
         q, dq = inputs["q"], inputs["dq"]
+
+        # Y at the desired velocity w and acceleration a of the joints
         e, de, J = law._compute_errors(inputs)
         B, Lambda, _ = build_block_inertia(chart.n, (chart.n,))(J, law.model.own_mass_matrix(problem.robot, inputs))
         w = B @ (Lambda @ law._compute_drift(inputs))
-        wanted = inputs["reference"], inputs["reference_velocity"], inputs["reference_acceleration"]
-        a = -B @ (Lambda @ compute_bias(chart, q, dq, w, wanted))
+        reference = inputs["reference"], inputs["reference_velocity"], inputs["reference_acceleration"]
+        a = -B @ (Lambda @ compute_bias(chart, q, dq, w, reference))
         Y = regressor(q, dq, w, a)
+
+        # dp/dt = -rate gain Y^T J^-1 (de / c + e), while the law commands
         springs = self._compute_joint_stiffness(law)[list(joints)] / RULES.gravity**2
         slowest = self._compute_crossing(law)
         slope = -min(self.rate, slowest) * springs * (Y.T @ (B @ (Lambda @ (de / slowest + e))))
         change = ca.if_else(inputs["active"] > 0, inputs["active"] * inputs["period"] * slope, 0)
         largest = np.full(len(joints), float(bound.max()) / RULES.gravity)
         moments = _clip(inputs["moments"] + _replace_invalid(change), largest)
+
+        # What no moment explains is known from the start only
         offset = ca.if_else(inputs["period"] > 0, inputs["offset"], inputs["correction"] - Y @ moments)
-        found = {
-            "moments": moments,
-            "offset": _replace_invalid(offset),
-            "correction": _clip(Y @ moments + offset, bound),
-        }
-        return _build_memory(fields, inputs, found)
+        correction = _clip(Y @ moments + offset, bound)
+        offset = _replace_invalid(offset)
+        return _build_memory(fields, inputs, {"moments": moments, "offset": offset, "correction": correction})
 
     def _compute_crossing(self, law: "_OperationalSpace") -> float:
         """c [1/s]; larger weights, and faster learning, make soft laws swing."""
@@ -361,9 +366,9 @@ def _name_inputs(law: "_OperationalSpace", fields: Mapping[str, Array]) -> dict[
     return named_inputs(law.problem.n, law.gains, len(law.labels)) | symbols
 
 
-def _build_memory(fields: Mapping[str, Array], inputs: dict[str, ca.MX], found: Mapping[str, ca.MX]) -> Memory:
+def _build_memory(fields: Mapping[str, Array], inputs: dict[str, ca.MX], values: Mapping[str, ca.MX]) -> Memory:
     """A memory whose `correction` is a torque."""
-    outputs = {f"next_{name}": value for name, value in found.items()}
+    outputs = {f"next_{name}": value for name, value in values.items()}
     return Memory(fields, {"extra_torque": "correction"}, named_function("memory", inputs, outputs))
 
 

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self, get_args
 
 import casadi as ca
 import numpy as np
@@ -46,7 +46,7 @@ from orthocas.control.linear_algebra import (
     compute_median_volume,
 )
 from orthocas.control.memory import MEMORIES, Memory, Remembers
-from orthocas.control.run_time_model import Gravity, RunTimeModel, Source
+from orthocas.control.run_time_model import UNITS, Gravity, RunTimeModel, Source
 from orthocas.errors import InvalidValueError, LawWarning
 from orthocas.robots.tree import require_driven
 from orthocas.tasks.domains import sample_uniform
@@ -69,7 +69,6 @@ class TorqueRules:
 RULES = TorqueRules()
 
 Coupling = Literal["coupled", "decoupled"]
-COUPLINGS: tuple[Coupling, ...] = ("coupled", "decoupled")
 
 
 @dataclass(frozen=True)
@@ -156,7 +155,7 @@ class _OperationalSpace(LawOfChart):
         model: RunTimeModel | None = None,
         remembers: Remembers | None = None,
     ) -> None:
-        require_known("coupling", coupling, COUPLINGS)
+        require_known("coupling", coupling, get_args(Coupling))
         require_known("damping", damping, DAMPING_DESIGNS)
         require_kind("chart", chart, Chart)
         require_driven(f"the law {self.name}", chart.problem.robot.tree)
@@ -170,11 +169,15 @@ class _OperationalSpace(LawOfChart):
             model = replace(model, extra_torque=0.0)
         chart.function("xi")  # raises for grown charts
         n, as_stiffness = chart.n, damping_stiffness is None
+        if damping_stiffness is not None:
+            damping_stiffness = positive_gains("damping_stiffness", damping_stiffness, n)
         model.gains(chart.problem, self.feed_forward)  # raises for values of another size
         for name, value in {
             "chart": chart,
             "stiffness": (positive_gains if as_stiffness else non_negative_gains)("stiffness", stiffness, n),
-            "damping_stiffness": _positive_or_none("damping_stiffness", damping_stiffness, n),
+            "damping_stiffness": None
+            if damping_stiffness is None
+            else positive_gains("damping_stiffness", damping_stiffness, n),
             "model": model,
             "damping_ratio": non_negative_gains("damping_ratio", damping_ratio, n),
             "coupling": coupling,
@@ -223,7 +226,11 @@ class _OperationalSpace(LawOfChart):
             stiffness = matched_stiffness(chart, delay=delay, damping_ratio=damping_ratio)
         elif delay:
             raise InvalidValueError("delay", delay, "none with a given stiffness")
-        run_time = RunTimeModel.with_inputs(model, gravity, inputs.split(",") if inputs else ())
+        zeros: dict[str, ArrayLike] = {"payload": 0.0, "wrench": np.zeros(6), "extra_torque": 0.0}
+        names = inputs.split(",") if inputs else []
+        for name in names:
+            require_known("input", name, zeros)
+        run_time = RunTimeModel(model, gravity, **{name: zeros[name] for name in names})
         return cls(chart, stiffness, damping_ratio, coupling, damping, limit, damping_stiffness, run_time, remembers)
 
     @cached_property
@@ -253,7 +260,7 @@ class _OperationalSpace(LawOfChart):
     def gain_units(self) -> Mapping[str, str]:
         """Units and admissible values of the gains, in words, by name."""
         design = {"damping_stiffness": "like stiffness, > 0; damping is designed for it"}
-        return {"stiffness": STIFFNESS, "damping_ratio": DAMPING_RATIO, "limit": LIMIT, **design, **self.model.units}
+        return {"stiffness": STIFFNESS, "damping_ratio": DAMPING_RATIO, "limit": LIMIT, **design, **UNITS}
 
     def remarks(self) -> list[str]:
         """Warnings.
@@ -261,22 +268,22 @@ class _OperationalSpace(LawOfChart):
         The motors cannot hold the arm, the metric does not decouple task and extra coordinates, a damping ratio looks
         like a percentage, a decoupled law has a chart that leaks much, or D is not positive semi-definite.
         """
-        found, metric = [*self._find_holding_doubts()], self.problem.metric.name
+        result, metric = [*self._find_holding_doubts()], self.problem.metric.name
         if metric != "inertia":
-            found.append(
+            result.append(
                 f"the metric of this chart is {metric}, but task and extra coordinates are decoupled only for A = M "
                 "(inertia)"
             )
-        found += _doubt_ratio(self.damping_ratio)
+        result += _doubt_ratio(self.damping_ratio)
         if self.coupling == "decoupled" and (leak := self._compute_leak_deg()) > RULES.much_deg:
-            found.append(
+            result.append(
                 f"the gradients of this chart lean into the task by {leak:.0f} deg (rms): decoupled springs pull at "
                 "both, which coupled ones do not; see docs/how-to/wide.md"
             )
         if share := self.check_damping().indefinite_share:
             where = f"in {percent(share, fault=True)} of the domain with these gains"
-            found.append(f"the damping matrix (29) is indefinite {where}; the damping design double_diagonal never is")
-        return found + self.model.remarks()
+            result.append(f"the damping matrix (29) is indefinite {where}; the damping design double_diagonal never is")
+        return result + self.model.remarks()
 
     def _find_holding_doubts(self) -> list[str]:
         """Of an arm that the motors cannot hold; none if the robot compensates gravity itself."""
@@ -307,10 +314,23 @@ class _OperationalSpace(LawOfChart):
     def graph(self) -> ca.Function:
         """The same function as a graph with shared subexpressions; C is generated from it."""
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
-        robot = self.problem.robot
-        gravity = self.model.gravity_torque(robot, inputs)
-        force, volume, J = self._compute_force(inputs)
-        torque = J.T @ force + gravity + self.model.feed_forward(robot, inputs)
+        q, dq, robot, model = inputs["q"], inputs["dq"], self.problem.robot, self.model
+
+        # f_imp = -K e - D de, (33); Lambda is M_phi, or its blocks
+        e, de, J = self._compute_errors(inputs)
+        B, Lambda, volume = self._compute_inertia(J, model.mass_matrix(robot, inputs))
+        force = -inputs["stiffness"] * e - self._apply_damping(Lambda, inputs, de)
+
+        # f_FF = Lambda (dd_phi_d + (J M^-1 C - dJ/dt) w), (35), with w = J^-1 d_phi_d: by (8) also when decoupled
+        if self.feed_forward:
+            w = B @ (Lambda @ self._compute_drift(inputs))
+            reference = inputs["reference"], inputs["reference_velocity"], inputs["reference_acceleration"]
+            bias = compute_bias(self.chart, q, dq, dq if model.source == "given" else w, reference)
+            force += Lambda @ (B.T @ model.coriolis_torque(robot, inputs, w) - bias)
+
+        # tau = J^T f + g + J_tip^T wrench + extra_torque
+        gravity = model.gravity_torque(robot, inputs)
+        torque = J.T @ force + gravity + model.feed_forward(robot, inputs)
         relative = volume / self.median_volume
         return guarded_graph(self.name, inputs, torque, gravity, relative, self.problem.domain)
 
@@ -371,15 +391,13 @@ class _OperationalSpace(LawOfChart):
         Raises:
             ShapeError, InvalidValueError: if q has another shape, or is not finite.
         """
-        points, single = as_point_set("q", self._sample_postures() if q is None else q, self.chart.n)
+        if q is None:
+            fastest = find_fastest_posture(self.chart, self.stiffness, self.model.robot(self.problem))
+            q = np.vstack([sample_uniform(self.problem.domain, RULES.samples, 0), fastest])
+        points, single = as_point_set("q", q, self.chart.n)
         W = compute_mobility(self.chart, points, self.model.robot(self.problem))
-        found = compute_modes(W, self.stiffness, self._compute_damping(points))
-        return Modes(*(values[0] for values in vars(found).values())) if single else found
-
-    def _sample_postures(self) -> Array:
-        """Samples of the domain, and the posture with the fastest mode that a search finds, (N, n)."""
-        fastest = find_fastest_posture(self.chart, self.stiffness, self.model.robot(self.problem))
-        return np.vstack([sample_uniform(self.problem.domain, RULES.samples, 0), fastest])
+        result = compute_modes(W, self.stiffness, self._compute_damping(points))
+        return Modes(*(values[0] for values in vars(result).values())) if single else result
 
     def _compute_damping(self, points: Array) -> Array:
         """D(q) with the law's gains at points (N, n), (N, n, n)."""
@@ -414,19 +432,6 @@ class _OperationalSpace(LawOfChart):
 
     def _compute_drift(self, inputs: dict[str, ca.MX]) -> ca.MX:
         return compute_drift(self.chart, inputs["q"], inputs["reference"], inputs["reference_velocity"])
-
-    def _compute_force(self, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
-        """Force in the coordinates, (n, 1), the volume of the gradients, and J."""
-        q, dq, robot, model = inputs["q"], inputs["dq"], self.problem.robot, self.model
-        e, de, J = self._compute_errors(inputs)
-        B, Lambda, volume = self._compute_inertia(J, model.mass_matrix(robot, inputs))
-        force = -inputs["stiffness"] * e - self._apply_damping(Lambda, inputs, de)
-        if self.feed_forward:
-            w = B @ (Lambda @ self._compute_drift(inputs))  # J^-1 d_phi_d; if (5) holds, by (8) also when decoupled
-            wanted = inputs["reference"], inputs["reference_velocity"], inputs["reference_acceleration"]
-            bias = compute_bias(self.chart, q, dq, dq if model.source == "given" else w, wanted)
-            force += Lambda @ (B.T @ model.coriolis_torque(robot, inputs, w) - bias)
-        return force, volume, J
 
     @cached_property
     def median_volume(self) -> float:
@@ -480,10 +485,6 @@ class PDPlus(_OperationalSpace):
     feed_forward = True
     name: ClassVar[str] = "pd_plus"
     force = "Operational space PD+: tau = J^T (f_imp + f_FF)"
-
-
-def _positive_or_none(name: str, value: ArrayLike | None, length: int) -> Array | None:
-    return None if value is None else positive_gains(name, value, length)
 
 
 def _build_block_damping(design: DampingDesign, blocks: tuple[int, ...], columns: int) -> ca.Function:

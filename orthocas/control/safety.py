@@ -194,10 +194,10 @@ def _spread(name: str, value: ArrayLike, default: object) -> object:
     """One number for all entries of an array; other values are checked."""
     if not isinstance(default, np.ndarray):
         return value
-    given = as_float_array(name, value)
-    if given.ndim:
-        require_shape(name, given.shape, default.shape)
-    return np.full(default.shape, given)
+    numbers = as_float_array(name, value)
+    if numbers.ndim:
+        require_shape(name, numbers.shape, default.shape)
+    return np.full(default.shape, numbers)
 
 
 def _require_number(name: str, value: float) -> None:
