@@ -225,6 +225,7 @@ def _describe_library(
         "kernels": kernels.code,
         "work": kernels.sizes(),
         "arrays": kernels.declare_arrays,
+        "call": kernels.write_call,
         "law": None,
     }
 

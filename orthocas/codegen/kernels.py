@@ -29,6 +29,7 @@ class Kernels:
     code: str
     work: dict[str, tuple[int, int, int, int]]  #: lengths of arg, res, iw and w that a call needs, by function name
     numbers: dict[str, int]  #: length of the first output, by function name
+    prefix: str
 
     def sizes(self) -> dict[str, dict[str, int]]:
         """These lengths for templates, at least 1: `work.NAME.arg`, `.res`, `.iw`, `.w` and `.numbers`."""
@@ -43,6 +44,12 @@ class Kernels:
         arg, res, iw, w = (max(1, size) for size in self.work[name])
         lines = f"const double *arg[{arg}] = {{0}};", f"double *res[{res}] = {{0}};"
         return "\n  ".join([*lines, f"double w[{w}]{numbers};", f"int iw[{iw}]{integers};"])
+
+    def write_call(self, name: str, inputs: list[str], outputs: list[str]) -> str:
+        """C that calls a function with such arrays, for the places of its inputs and outputs."""
+        lines = [f"arg[{i}] = {place};" for i, place in enumerate(inputs)]
+        lines += [f"res[{i}] = {place};" for i, place in enumerate(outputs)]
+        return "\n  ".join([*lines, f"{self.prefix}_{name}(arg, res, iw, w, 0);"])
 
     def array_bytes(self, name: str, number_size: int) -> int:
         """Size of the work arrays that a call of a function needs, with numbers of a size, in bytes."""
@@ -81,7 +88,7 @@ def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
     if re.search(r"\bpow\(", code):
         code = f"{write_power(f'{prefix}_power')}\n\n" + re.sub(r"\bpow\(", f"{prefix}_power(", code)
     work = {f.name(): (f.sz_arg(), f.sz_res(), f.sz_iw(), doubles[f.name()]) for f in functions}
-    return Kernels(code, work, {f.name(): f.numel_out(0) for f in functions})
+    return Kernels(code, work, {f.name(): f.numel_out(0) for f in functions}, prefix)
 
 
 def _fix_product_sizes(text: str) -> str:

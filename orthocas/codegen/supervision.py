@@ -129,6 +129,7 @@ def describe_law(controller: Controller) -> dict[str, Any]:
             }
             for name, values in controller.gains.items()
         ],
+        "gain_arguments": [f"gains->{name}" for name in controller.gains],
         "command": controller.command,
         "torque": torque,
         "fallback": fallback if torque else "zero velocity",
@@ -213,6 +214,8 @@ def _describe_memory(controller: Controller) -> dict[str, Any] | None:
         return None
     return {
         "torque": memory.torque,
+        "last": [f"last.{name}" for name in memory.start],
+        "kept": [f"state->memory.{name}" for name in memory.start],
         "fields": [{"name": name, "size": len(values), "numbers": values} for name, values in memory.start.items()],
         "adds": [
             {"name": gain, "size": len(controller.gains[gain]), "field": name} for gain, name in memory.adds.items()
