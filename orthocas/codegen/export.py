@@ -12,8 +12,8 @@ import numpy as np
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
-from orthocas.codegen.export_forms import Form, form_of, function_code
-from orthocas.codegen.export_inverse import inverse_forms, statuses
+from orthocas.codegen.export_forms import Form, build_form, write_function
+from orthocas.codegen.export_inverse import build_inverse_forms, statuses
 from orthocas.codegen.rendering import is_generated, render
 from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, ControlStatus
 from orthocas.control.linear_algebra import ROUNDS, SOFTEST
@@ -142,7 +142,7 @@ def export(chart: Chart | Impedance | PDPlus, to: str, path: str | Path, force: 
         raise InvalidValueError("path", repr(str(target))[:200], f"a module NAME.py, other than {to}.py")
     require_writable(target)
     require_replaceable(target, is_generated(target), force)
-    text = module_text(chart, to)
+    text = write_module(chart, to)
     try:
         with published(target.parent) as drafts:
             (drafts / target.name).write_text(text, encoding="utf-8")
@@ -151,7 +151,7 @@ def export(chart: Chart | Impedance | PDPlus, to: str, path: str | Path, force: 
     return target
 
 
-def module_text(chart: Chart | Impedance | PDPlus, to: str) -> str:
+def write_module(chart: Chart | Impedance | PDPlus, to: str) -> str:
     """The module as text."""
     laws = []
     if isinstance(chart, TORQUE_LAWS):
@@ -159,10 +159,10 @@ def module_text(chart: Chart | Impedance | PDPlus, to: str) -> str:
             raise InvalidValueError("library", "'numpy'", "'torch' or 'jax' for a law, which differentiates")
         laws, chart = [_build_law(chart)], chart.chart
     library, problem, task = LIBRARIES[to], chart.problem, chart.problem.task
-    coordinates, *others = forms = [form_of(chart), *inverse_forms(chart), *laws]
-    task_code = function_code("_task", "Task values, (m, N), of columns q (n, N).", task.function)
+    coordinates, *others = forms = [build_form(chart), *build_inverse_forms(chart), *laws]
+    task_code = write_function("_task", "Task values, (m, N), of columns q (n, N).", task.function)
     both = "Task values, then their Jacobian row by row, (m + m n, N)."
-    task_code += "\n\n" + function_code("_task_and_slopes", both, task.function, task.jacobian_function)
+    task_code += "\n\n" + write_function("_task_and_slopes", both, task.function, task.jacobian_function)
     code = {
         "coordinates": _write_form(coordinates),
         "task": task_code.strip("\n"),
@@ -182,8 +182,8 @@ def module_text(chart: Chart | Impedance | PDPlus, to: str) -> str:
         "centre": tuple(problem.domain.centre.tolist()),
         "half_width": tuple(problem.domain.half_width.tolist()),
         "statuses": statuses(),
-        "numbers": "\n".join(_numbers(name, table) for form in forms for name, table in form.tables.items()),
-        "indices": "\n".join(_indices(name, rows) for form in forms for name, rows in form.indices.items()),
+        "numbers": "\n".join(_write_table(name, table) for form in forms for name, table in form.tables.items()),
+        "indices": "\n".join(_write_indices(name, rows) for form in forms for name, rows in form.indices.items()),
     }
     return render("module.py", values)
 
@@ -239,16 +239,16 @@ def _write_law_functions(law: Impedance | PDPlus) -> list[str]:
     error, slope = chart.relative.error(q, x_d)
     e = ca.SX.sym("e", n)
     result = [
-        _code("_task_errors", "e, then de/dq row by row, of q, x_d.", [q, x_d], [error, ca.vec(slope.T)]),
-        function_code(
+        _write_graph("_task_errors", "e, then de/dq row by row, of q, x_d.", [q, x_d], [error, ca.vec(slope.T)]),
+        write_function(
             "_shortest",
             "Errors by the shorter way around for coordinates that are angles, (n, N).",
             dense_function("f", [e], [shortest(e, chart.turns)]),
         ),
-        _code(
+        _write_graph(
             "_mass_matrix", "Entries of M row by row, (n n, N).", [q], [ca.vec(law.model.mass_matrix(robot, inputs))]
         ),
-        _code("_gravity", "Gravity torque, (n, N).", [q], [law.model.gravity_torque(robot, inputs)]),
+        _write_graph("_gravity", "Gravity torque, (n, N).", [q], [law.model.gravity_torque(robot, inputs)]),
     ]
     if law.feed_forward:
         drift = chart.relative.drift(q, x_d, dx_d)
@@ -256,19 +256,19 @@ def _write_law_functions(law: Impedance | PDPlus) -> list[str]:
         coriolis = law.model.coriolis_torque(robot, inputs, w)
         states = [q, dq, w, x_d, dx_d, ddx_d]
         result += [
-            _code(
+            _write_graph(
                 "_task_drift",
                 "Rate of the errors of a robot at rest, less its sign, of q, x_d, dx_d.",
                 [q, x_d, dx_d],
                 [drift],
             ),
-            _code(
+            _write_graph(
                 "_task_bend",
                 "How the rates of the errors change, of q, dq, w, x_d and its derivatives.",
                 states,
                 [bend],
             ),
-            _code("_coriolis_torque", "C(q, dq) w, of q, dq, w.", [q, dq, w], [coriolis]),
+            _write_graph("_coriolis_torque", "C(q, dq) w, of q, dq, w.", [q, dq, w], [coriolis]),
             _BEND,
         ]
     return result
@@ -283,14 +283,14 @@ _BEND = '''def _bend(q, dq, w, wanted):
 '''
 
 
-def _code(name: str, summary: str, inputs: list[ca.MX], outputs: list[ca.MX]) -> str:
+def _write_graph(name: str, summary: str, inputs: list[ca.MX], outputs: list[ca.MX]) -> str:
     """A Python function of columns of the inputs, one below the other."""
     graph = ca.Function("graph", inputs, [ca.densify(ca.vertcat(*outputs))])
     symbols = [ca.SX.sym("s", part.numel()) for part in inputs]
-    return function_code(name, summary, dense_function("f", [ca.vertcat(*symbols)], [graph(*symbols)]))
+    return write_function(name, summary, dense_function("f", [ca.vertcat(*symbols)], [graph(*symbols)]))
 
 
-def _numbers(name: str, table: Array) -> str:
+def _write_table(name: str, table: Array) -> str:
     """A table in base64."""
     text = b64encode((np.asarray(table, dtype="<f8") + 0.0).tobytes()).decode()
     parts = [text[k : k + _WIDTH] for k in range(0, max(len(text), 1), _WIDTH)]
@@ -298,7 +298,7 @@ def _numbers(name: str, table: Array) -> str:
     return f'    "{name}": (\n        {table.shape},\n        (\n{lines}\n        ),\n    ),'
 
 
-def _indices(name: str, values: Sequence[int]) -> str:
+def _write_indices(name: str, values: Sequence[int]) -> str:
     """Indices as plain numbers."""
     lines = textwrap.fill("".join(f"{value}, " for value in values), _WIDTH)
     return f'    "{name}": (\n{textwrap.indent(lines, " " * 8)}\n    ),'

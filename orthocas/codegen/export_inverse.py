@@ -5,7 +5,7 @@ import numpy as np
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.solutions import InverseStatus
-from orthocas.codegen.export_forms import Form, function_code
+from orthocas.codegen.export_forms import Form, write_function
 from orthocas.tasks.domains import Domain, FoldBound, PathBound, SingularBound, bounds_of, sample_uniform
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
@@ -27,7 +27,7 @@ def statuses() -> str:
     return ", ".join(str(int(InverseStatus[name])) for name in STATUSES)
 
 
-def inverse_forms(chart: Chart) -> list[Form]:
+def build_inverse_forms(chart: Chart) -> list[Form]:
     """The functions `_inverse` of columns phi and q_start (2 n, N), and `_nearest` of columns q_wish and x (n + m, N).
 
     And what they call beside the functions of phi.
@@ -45,7 +45,7 @@ def _newton(chart: Chart) -> Form:
     target, value = ca.SX.sym("target", n), ca.SX.sym("value", n)
     difference = chart.phi_map.difference(target, value)
     functions = [
-        function_code(
+        write_function(
             "_difference",
             "Targets less values of phi by the shorter way around, (n, N), of both in columns (2 n, N).",
             dense_function("f", [ca.vertcat(target, value)], [difference]),
@@ -55,7 +55,7 @@ def _newton(chart: Chart) -> Form:
     if chart.relative.turned:
         summary = "Task values, then how fast they move, angular velocities in the tip's axes, (m + m n, N)."
         rates = "_task_and_rates"
-        functions.append(function_code(rates, summary, problem.task.function, chart.relative.rates))
+        functions.append(write_function(rates, summary, problem.task.function, chart.relative.rates))
     tables = {"centre": domain.centre[:, None], "sizes": chart.phi_sizes[:, None], "bounds": bounds[:, :, None]}
     return Form("inverse", {"rates": rates}, "\n\n".join(functions), tables, {})
 
@@ -91,12 +91,12 @@ def _condition(chart: Chart) -> list[Form]:
     if domain.condition is None:
         return [Form("room", {"kind": "box"}, "", {}, {})]
     summary = "Numbers (k, N) that are positive at columns q that meet the condition of the domain."
-    return [Form("room", {"kind": "condition"}, function_code("_pivots", summary, domain.condition.pivots), {}, {})]
+    return [Form("room", {"kind": "condition"}, write_function("_pivots", summary, domain.condition.pivots), {}, {})]
 
 
 def _clear(chart: Chart, clear: SingularBound, fold: FoldBound | None) -> Form:
     own = clear.jacobian_function
-    code = function_code("_frame_rows", "Rows that must not be singular, one by one, (m n, N).", own)
+    code = write_function("_frame_rows", "Rows that must not be singular, one by one, (m n, N).", own)
     values = {
         "kind": "clear",
         "squared_bound": clear.least_singular_value**2,
@@ -116,7 +116,7 @@ def _unfolded(chart: Chart, fold: FoldBound) -> Form:
     }
     if same:
         return Form("room", values, "", {}, {})
-    code = function_code("_own_gradients", "Gradients of the domain's coordinates, (r n, N).", fold.gradients)
+    code = write_function("_own_gradients", "Gradients of the domain's coordinates, (r n, N).", fold.gradients)
     return Form("room", values, code, {}, {})
 
 
