@@ -1,6 +1,6 @@
 """`check_c`: compiles C with gcc and clang, and compares it with Python at random states."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from orthocas.control.controller import (
     squared_volume,
 )
 from orthocas.errors import AgreementError
-from orthocas.tasks.domains import Domain, contains
+from orthocas.tasks.domains import contains
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array, require_kind
 from orthocas.tools.expressions import shortest
@@ -82,7 +82,12 @@ def check_c(
     """
     require_kind("chart", chart, Chart)
     n, precision = chart.n, SINGLE if generated.single_precision else DOUBLE
-    q = _sample_positions(chart.problem.domain, np.random.default_rng(seed).uniform(-1, 1, (states, n)), precision)
+    domain = chart.problem.domain
+
+    # Random positions in and around the domain, then corner cases, which belong to it.
+    corners = np.clip(domain.centre + domain.half_width * list_corners(n), *bounds_inside(domain, precision))
+    around = domain.half_width * RULES.reach * np.random.default_rng(seed).uniform(-1, 1, (states, n))
+    q = precision.rounded(np.vstack([domain.centre + around, corners]))
     differences: dict[str, float] = {}
     for compiler in compilers():
         with draft_folder() as folder:
@@ -97,13 +102,6 @@ def check_c(
                 )
             differences[name] = max(value, differences.get(name, 0.0))
     return AgreementCheck(len(q), tuple(Path(compiler).name for compiler in compilers()), differences)
-
-
-def _sample_positions(domain: Domain, places: Array, precision: Precision) -> Array:
-    """Random positions in and around the domain, then the corner cases, which belong to it."""
-    corners = domain.centre + domain.half_width * list_corners(places.shape[1])
-    around = domain.centre + domain.half_width * RULES.reach * places
-    return precision.rounded(np.vstack([around, np.clip(corners, *bounds_inside(domain, precision))]))
 
 
 def list_corners(n: int) -> Array:
@@ -261,42 +259,27 @@ def _sample_law_inputs(
 
 def sample_gains(controller: Controller, rows: int, rng: np.random.Generator) -> list[Array]:
     """Random gains around those of the controller, (rows, length) each; limits are finite or, at times, infinite."""
-    shifts = dict.fromkeys(("wrench", "extra_torque", "coriolis_torque", "gravity_torque"), _sample_shifted)
-    samplers: dict[str, Callable[[Array, int, np.random.Generator], Array]] = {  # of inputs that are not just positive
-        "payload": _sample_payloads,
-        "mass_matrix": _sample_symmetric,
-        **shifts,
-    }
     gains = []
     for name, gain in controller.gains.items():
-        values = samplers.get(name, _sample_scaled)(gain, rows, rng)
+        if name == "payload":
+            # up to 2 kg, within some 0.1 m of the tip, with positive definite inertias
+            mass, factors = rng.uniform(0, 2, (rows, 1)), 0.05 * rng.normal(size=(rows, 3, 3))
+            inertia = factors @ factors.transpose(0, 2, 1)
+            values = np.hstack([mass, 0.1 * rng.normal(size=(rows, 3)), inertia[:, *np.triu_indices(3)]])
+        elif name == "mass_matrix":
+            # one factor and a diagonal, so that it stays symmetric positive definite
+            n = controller.problem.n
+            diagonal = np.eye(n) * rng.uniform(0, 0.1, (rows, 1, n))
+            values = (gain.reshape(n, n) * rng.uniform(0.5, 1.5, (rows, 1, 1)) + diagonal).reshape(rows, -1)
+        elif name in ("wrench", "extra_torque", "coriolis_torque", "gravity_torque"):
+            values = gain + rng.normal(size=(rows, len(gain)))
+        else:
+            values = np.where(np.isfinite(gain), gain, 50.0) * rng.uniform(0.5, 1.5, (rows, len(gain)))
         if name == "limit":
             values[::3] = np.inf  # states of a weak arm may all saturate, which would say little of the law
             values[7::40, 0] = rng.choice([0.0, -1.0, np.nan, np.inf], size=len(values[7::40]))
         gains.append(values)
     return gains
-
-
-def _sample_scaled(gain: Array, rows: int, rng: np.random.Generator) -> Array:
-    return np.where(np.isfinite(gain), gain, 50.0) * rng.uniform(0.5, 1.5, (rows, len(gain)))
-
-
-def _sample_shifted(gain: Array, rows: int, rng: np.random.Generator) -> Array:
-    return np.asarray(gain + rng.normal(size=(rows, len(gain))))
-
-
-def _sample_payloads(gain: Array, rows: int, rng: np.random.Generator) -> Array:
-    """Payloads of up to 2 kg, within some 0.1 m of the tip, with positive definite inertias."""
-    mass, factors = rng.uniform(0, 2, (rows, 1)), 0.05 * rng.normal(size=(rows, 3, 3))
-    inertia = factors @ factors.transpose(0, 2, 1)
-    return np.hstack([mass, 0.1 * rng.normal(size=(rows, 3)), inertia[:, *np.triu_indices(3)]])
-
-
-def _sample_symmetric(gain: Array, rows: int, rng: np.random.Generator) -> Array:
-    """The matrix (n * n,) times one factor and plus a diagonal, so that it stays symmetric positive definite."""
-    n = round(len(gain) ** 0.5)
-    diagonal = np.eye(n) * rng.uniform(0, 0.1, (rows, 1, n))
-    return np.asarray((gain.reshape(n, n) * rng.uniform(0.5, 1.5, (rows, 1, 1)) + diagonal).reshape(rows, -1))
 
 
 def _estimate_amplification(precision: Precision, controller: Controller, law: Batched, inputs: list[Array]) -> Array:
