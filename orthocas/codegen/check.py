@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from orthocas.charts.chart import Chart
 from orthocas.codegen.generate import GeneratedC
 from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
-from orthocas.codegen.precision import DOUBLE, SINGLE, Precision, bounds_inside
+from orthocas.codegen.precision import DOUBLE, SINGLE, Precision, find_bounds_inside
 from orthocas.control.controller import (
     FROM_THE_LAW,
     Controller,
@@ -85,9 +85,9 @@ def check_c(
     domain = chart.problem.domain
 
     # Random positions in and around the domain, then corner cases, which belong to it.
-    corners = np.clip(domain.centre + domain.half_width * list_corners(n), *bounds_inside(domain, precision))
+    corners = np.clip(domain.centre + domain.half_width * list_corners(n), *find_bounds_inside(domain, precision))
     around = domain.half_width * RULES.reach * np.random.default_rng(seed).uniform(-1, 1, (states, n))
-    q = precision.rounded(np.vstack([domain.centre + around, corners]))
+    q = precision.round(np.vstack([domain.centre + around, corners]))
     differences: dict[str, float] = {}
     for compiler in compilers():
         with draft_folder() as folder:
@@ -123,9 +123,9 @@ def _compare(
 ) -> dict[str, float]:
     """Largest relative differences by function; the last positions are corner cases, taken at rest."""
     rng = np.random.default_rng(seed)
-    if not np.array_equal(library.domain, bounds_inside(chart.problem.domain, library.precision)):
+    if not np.array_equal(library.domain, find_bounds_inside(chart.problem.domain, library.precision)):
         raise AgreementError("the domain in C differs from the domain of the chart")
-    dq = library.precision.rounded(rng.normal(size=q.shape))
+    dq = library.precision.round(rng.normal(size=q.shape))
     dq[len(q) - len(list_corners(chart.n)) :] = 0
     differences = _compare_chart_and_dynamics(library, chart, *spoil(rng, q, dq))
     differences["curvature"] = _compare_curvature(library, chart, q, dq, rng)
@@ -166,7 +166,7 @@ def _compare_chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array
 
 def _compare_curvature(library: CompiledLibrary, chart: Chart, q: Array, dq: Array, rng: np.random.Generator) -> float:
     """Largest relative difference of dJ/dt v where it has a value, with any v."""
-    v = library.precision.rounded(rng.normal(size=q.shape))
+    v = library.precision.round(rng.normal(size=q.shape))
     expected = Batched(chart.function("second_derivative"))(q, dq, v)[0]
     results = [library.curvature(*row) for row in zip(q, dq, v, strict=True)]
     good = np.asarray(np.isfinite(expected).all(axis=1))
@@ -179,7 +179,7 @@ def _compare_inverse(library: CompiledLibrary, chart: Chart, q: Array) -> float:
     J = chart.jacobian(inner)
     finite = np.asarray(np.isfinite(chart.phi(inner)).all(axis=1) & np.isfinite(J).all(axis=(1, 2)))
     inner = inner[finite & (np.linalg.cond(np.where(finite[:, None, None], J, np.eye(chart.n))) < RULES.regular)]
-    targets, starts = chart.phi(inner), library.precision.rounded(inner + RULES.start)
+    targets, starts = chart.phi(inner), library.precision.round(inner + RULES.start)
     near = [_measure_inverse(library, chart, *pair) for pair in zip(targets, starts, strict=True)]
     far = [_measure_inverse(library, chart, *pair) for pair in zip(targets + RULES.far, inner, strict=True)]
     solved = np.isfinite(near).sum()
@@ -225,7 +225,7 @@ def _measure_remaining(library: CompiledLibrary, chart: Chart, target: Array, q:
 def _compare_control(
     library: CompiledLibrary, controller: Controller, q: Array, dq: Array, rng: np.random.Generator
 ) -> float:
-    numbers = library.precision.rounded(gain_numbers(controller))
+    numbers = library.precision.round(gain_numbers(controller))
     if not np.array_equal(library.default_gains(len(numbers)), numbers):
         raise AgreementError("the default gains in C differ from the gains of the controller")
     inputs = _sample_law_inputs(library.precision, controller, q, dq, rng)
@@ -254,7 +254,7 @@ def _sample_law_inputs(
     around = np.nan_to_num(Batched(controller.measured)(q)[0])
     reference = (around + 0.1 * rng.normal(size=around.shape), *rng.normal(size=(2, *around.shape)))
     state = spoil(rng, q, dq, *reference)
-    return [precision.rounded(values) for values in (*state, *sample_gains(controller, len(q), rng))]
+    return [precision.round(values) for values in (*state, *sample_gains(controller, len(q), rng))]
 
 
 def sample_gains(controller: Controller, rows: int, rng: np.random.Generator) -> list[Array]:

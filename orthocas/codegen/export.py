@@ -48,7 +48,7 @@ class Library:
     names: Mapping[str, str] = field(default_factory=dict)  #: of functions that have another one than in NumPy
     fuses: bool = False  #: whether it computes shared values again for everything that needs them, if we let it
 
-    def code(self, text: str) -> str:
+    def translate(self, text: str) -> str:
         """Code for NumPy as code for this library."""
         text = text if self.fuses else _SHARED.sub(r"\1", text)
         for name, own in self.names.items():

@@ -12,7 +12,7 @@ import numpy as np
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
 from orthocas.codegen.kernels import Kernels, generate_kernels, share_calls, share_sines
-from orthocas.codegen.precision import DOUBLE, SINGLE, Precision, bounds_inside
+from orthocas.codegen.precision import DOUBLE, SINGLE, Precision, find_bounds_inside
 from orthocas.codegen.rendering import clean_word, clean_words, is_generated, render
 from orthocas.codegen.rows import render_rows
 from orthocas.codegen.supervision import (
@@ -115,8 +115,8 @@ def generate_c(
     if controller is not None and safety is not None:
         values |= describe_law(controller) | describe_supervision(controller, safety)
     contents = {
-        f"{name}.h": precision.code(render("robot.h", values)),
-        f"{name}.c": precision.code(render("robot.c", values)),
+        f"{name}.h": precision.translate(render("robot.h", values)),
+        f"{name}.c": precision.translate(render("robot.c", values)),
         "CMakeLists.txt": render("CMakeLists.txt", values),
         f"{name}.pc.in": render("pkgconfig.pc", values),
         "README.md": render("README.md", values),
@@ -239,7 +239,7 @@ def _describe_chart(chart: Chart, precision: Precision) -> dict[str, Any]:
     task_units = [f" [{unit}]" if unit else "" for unit in clean_words(problem.task.units)]
     task_labels = zip(clean_words(problem.task.labels), task_units, strict=True)
     proof, turns = chart.certificate, chart.turns
-    lower, upper = bounds_inside(domain, precision)
+    lower, upper = find_bounds_inside(domain, precision)
     return {
         "n": chart.n,
         "m": chart.m,
@@ -308,8 +308,8 @@ def _write_row(values: Array) -> str:
 def _compute_check(chart: Chart, controller: Controller | None, precision: Precision) -> dict[str, Any]:
     """A state, and what every function gives there, for `NAME_check`."""
     n, robot = chart.n, chart.problem.robot
-    q = precision.rounded(_choose_position(chart.problem.domain))
-    dq = precision.rounded(np.round(np.linspace(0.1, -0.2, n), 3))
+    q = precision.round(_choose_position(chart.problem.domain))
+    dq = precision.round(np.round(np.linspace(0.1, -0.2, n), 3))
     check: dict[str, Any] = {
         "q": q,
         "dq": dq,
@@ -321,7 +321,7 @@ def _compute_check(chart: Chart, controller: Controller | None, precision: Preci
     }
     if controller is not None:
         value = controller.measured(q).full().ravel() + 0.001
-        reference = [precision.rounded(part) for part in (value, *np.full((2, len(value)), 0.01))]
+        reference = [precision.round(part) for part in (value, *np.full((2, len(value)), 0.01))]
         command, _ = controller.function(q, dq, *reference, *controller.gains.values())
         check |= {"reference": reference, "command": command}
     return check

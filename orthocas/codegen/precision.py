@@ -33,7 +33,7 @@ _TOKEN = re.compile(
 
 @dataclass(frozen=True)
 class Precision:
-    """A number type of C. Templates and kernels are written in double; `code` puts them into this type."""
+    """A number type of C. Templates and kernels are written in double; `translate` puts them into this type."""
 
     c_name: str
     scalar: type[np.floating[Any]]
@@ -48,8 +48,8 @@ class Precision:
     coarse: float  #: share of a wanted value that counts as size, so that `solved` of it is not below rounding
     pivot: float  #: of the scaled Jacobian; smaller ones are singular
     checked: float  #: largest difference that `NAME_check` returns
-    tolerance: float  #: of the proof, relative to the largest entry of a result
-    sensitive: float  #: relative change of a command by one rounding of q, from which the proof accepts more
+    tolerance: float  #: of the comparison with Python, relative to the largest entry of a result
+    sensitive: float  #: relative change of a command by one rounding of q, from which the comparison accepts more
     reaching: ReachingRules  #: of the descent to the nearest x
 
     @property
@@ -57,7 +57,7 @@ class Precision:
         """Bytes of a number."""
         return ctypes.sizeof(self.c_type)
 
-    def rounded(self, values: Array) -> Array:
+    def round(self, values: Array) -> Array:
         """The nearest numbers of this type; those beyond its range become infinite."""
         with np.errstate(over="ignore"):
             return np.asarray(values, dtype=self.scalar).astype(float)
@@ -72,9 +72,9 @@ class Precision:
             return controller.graph
         return with_smallest_volume(controller.graph, self.smallest_volume)
 
-    def code(self, text: str) -> str:
+    def translate(self, text: str) -> str:
         """C code that was written in double, in this type. Comments, strings and integers stay as they are."""
-        return text if self is DOUBLE else _TOKEN.sub(_in_single_precision, text)
+        return text if self is DOUBLE else _TOKEN.sub(_make_single, text)
 
     def describe(self) -> dict[str, Any]:
         """Values of the templates that depend on the type."""
@@ -121,7 +121,7 @@ SINGLE = Precision(
 )
 
 
-def _in_single_precision(token: re.Match[str]) -> str:
+def _make_single(token: re.Match[str]) -> str:
     if token["call"] in _MATHEMATICS:
         return f"{token['call']}f"
     if token["literal"] is not None:
@@ -130,20 +130,20 @@ def _in_single_precision(token: re.Match[str]) -> str:
     return SINGLE.c_name if token["word"] == DOUBLE.c_name else token[0]
 
 
-def bounds_inside(domain: Domain, precision: Precision) -> tuple[Array, Array]:
+def find_bounds_inside(domain: Domain, precision: Precision) -> tuple[Array, Array]:
     """Lower and upper bounds in a precision, (n,) each, that belong to the domain in Python and in C."""
-    centre, bounds = precision.rounded(domain.centre), []
+    centre, bounds = precision.round(domain.centre), []
     for boundary in bounds_of(domain):
-        bound = precision.rounded(boundary)
-        while (beyond := _is_beyond(domain, bound, precision)).any():
+        bound = precision.round(boundary)
+        while (beyond := _lies_beyond(domain, bound, precision)).any():
             inwards = np.nextafter(bound.astype(precision.scalar), centre.astype(precision.scalar))
             bound = np.where(beyond, inwards, bound)
         bounds.append(bound)
     return bounds[0], bounds[1]
 
 
-def _is_beyond(domain: Domain, q: Array, precision: Precision) -> Any:
+def _lies_beyond(domain: Domain, q: Array, precision: Precision) -> Any:
     """Whether Python or C finds the joints of q outside, (n,)."""
     distance, largest = abs(q - domain.centre), reach(domain)
-    in_c = precision.rounded(abs(q - precision.rounded(domain.centre)))
-    return (distance > largest) | (in_c > precision.rounded(largest))
+    in_c = precision.round(abs(q - precision.round(domain.centre)))
+    return (distance > largest) | (in_c > precision.round(largest))

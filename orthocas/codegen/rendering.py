@@ -37,7 +37,7 @@ def _environment() -> Environment:
 @pass_context
 def _translate(context: Context, text: str) -> str:
     """Python for NumPy as that of the template's library."""
-    return str(context["library"].code(text))
+    return str(context["library"].translate(text))
 
 
 def is_generated(path: Path) -> bool:

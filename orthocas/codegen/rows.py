@@ -83,7 +83,7 @@ def render_rows(chart: Chart, values: Mapping[str, Any], precision: Precision) -
         "rows_stack": RULES.lanes * precision.size * arrays + RULES.locals_bytes,
     }
     files = {f"{values['name']}_rows.{kind}": render(f"rows.{kind}", values) for kind in ("h", "c")}
-    return {file: precision.code(text) for file, text in files.items()}
+    return {file: precision.translate(text) for file, text in files.items()}
 
 
 def _split_phi(chart: Chart) -> tuple[ca.Function, list[int], ca.Function, Array, Array]:

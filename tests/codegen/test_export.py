@@ -143,7 +143,7 @@ def test_every_operation_is_written(library: str) -> None:
     function = dense_function("f", [q], [every_operation(q)])
     code = write_function("f", "All operations.", function)
     scope: dict[str, Any] = {"_shared": lambda value, q: value}
-    exec(f"{LIBRARIES[library].imports_for(code)}\n{LIBRARIES[library].code(code)}", scope)
+    exec(f"{LIBRARIES[library].imports_for(code)}\n{LIBRARIES[library].translate(code)}", scope)
     points = np.random.default_rng(1).uniform(0.4, 0.6, (5, 3))
     found = np.asarray(scope["f"](array(np.ascontiguousarray(points.T))))
     np.testing.assert_allclose(found, Batched(function)(points)[0].T, rtol=1e-14, atol=1e-14)

@@ -69,7 +69,7 @@ def in_double(law: Controller, tmp_path_factory: pytest.TempPathFactory) -> Comp
     ],
 )
 def test_code_is_translated_word_by_word(double: str, single: str) -> None:
-    assert SINGLE.code(double) == single
+    assert SINGLE.translate(double) == single
 
 
 @pytest.mark.slow
