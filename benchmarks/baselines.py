@@ -17,11 +17,11 @@ from numpy.typing import ArrayLike
 from orthocas.charts.chart import Chart
 from orthocas.control.controller import (
     Command,
+    build_function,
     count_turns_from_centre,
     fallback_function,
     guarded_graph,
     law_facts,
-    named_function,
     named_inputs,
 )
 from orthocas.control.gains import (
@@ -344,7 +344,7 @@ class Projector(TwoTaskLaw):
         storage = (ca.bilin(problem.robot.mass_matrix(q), dq, dq) + ca.dot(e, inputs["stiffness"] * e)) / 2
         power = ca.dot(J @ dq, damped_x(J @ dq)) + ca.dot(J_2 @ through, damped_2(J_2 @ dq))
         outputs = {"storage": storage, "dissipated_power": power}
-        return named_function("energy", inputs, outputs)
+        return build_function("energy", inputs, outputs)
 
     def _inputs(self) -> dict[str, ca.MX]:
         return named_inputs(self.problem.n, self.gains, len(self.labels))

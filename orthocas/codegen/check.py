@@ -16,7 +16,7 @@ from orthocas.control.controller import (
     Controller,
     ControlStatus,
     count_turns_from_centre,
-    squared_volume,
+    find_squared_volume,
 )
 from orthocas.errors import AgreementError
 from orthocas.tasks.domains import contains
@@ -292,7 +292,7 @@ def _estimate_amplification(precision: Precision, controller: Controller, law: B
         same = (status_there == status)[:, 0]
         change = np.where(same, np.maximum(change, _compute_differences(moved, command)), change)
     results: Array = change.clip(precision.sensitive, 1) / precision.sensitive
-    volume = squared_volume(controller.graph)  # it does not depend on whole turns
+    volume = find_squared_volume(controller.graph)  # it does not depend on whole turns
     if precision is SINGLE and volume is not None:
         squares = np.where(np.isin(status, FROM_THE_LAW), Batched(volume)(*inputs)[0], 1.0)[:, 0]
         results /= squares.clip(precision.smallest_volume**2, 1)

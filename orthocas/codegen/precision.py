@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.charts.reaching import RULES, ReachingRules
-from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, Controller, with_smallest_volume
+from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, Controller, replace_smallest_volume
 from orthocas.tasks.domains import Domain, bounds_of, reach
 from orthocas.tools.checks import Array
 
@@ -70,7 +70,7 @@ class Precision:
         """The graph of a law, whose guard knows how near to a singularity this type still gives good numbers."""
         if self.smallest_volume == SMALLEST_VOLUME:
             return controller.graph
-        return with_smallest_volume(controller.graph, self.smallest_volume)
+        return replace_smallest_volume(controller.graph, self.smallest_volume)
 
     def translate(self, text: str) -> str:
         """C code that was written in double, in this type. Comments, strings and integers stay as they are."""

@@ -291,13 +291,13 @@ def guarded_graph(
 ) -> ca.Function:
     """The graph of a controller: its law, protected by the guard of `orthocas.control.controller`."""
     numbers = ca.vertcat(*(value for key, value in inputs.items() if key != "limit"))
-    check = guard(domain, command.shape[0], numbers.shape[0], keep_direction)
+    check = build_guard(domain, command.shape[0], numbers.shape[0], keep_direction)
     smallest = ca.MX(SMALLEST_VOLUME**2)
     safe, status = check(command, fallback, inputs["limit"], inputs["q"], numbers, volume, smallest)
-    return named_function(name, inputs, {"command": safe, "status": status})
+    return build_function(name, inputs, {"command": safe, "status": status})
 
 
-def guard(domain: Domain | None, n: int, numbers: int, keep_direction: bool) -> ca.Function:
+def build_guard(domain: Domain | None, n: int, numbers: int, keep_direction: bool) -> ca.Function:
     """Choose the command if all is well and the fallback otherwise, cut it to +- limit, and report the status.
 
     Args:
@@ -390,13 +390,13 @@ def count_turns_from_centre(graph: ca.Function, problem: Problem) -> ca.Function
     return ca.Function(graph.name(), inputs, graph.call(counted), graph.name_in(), graph.name_out())
 
 
-def counted_function(controller: Controller, name: Literal["function", "energy"] = "function") -> Any:
+def get_counted_function(controller: Controller, name: Literal["function", "energy"] = "function") -> Any:
     """The function or energy of a law for joint positions whose turns are counted already, as in simulations."""
     graph = {"function": "graph", "energy": "energy_graph"}[name]
     return getattr(controller, graph if controller.problem.turning else name)
 
 
-def with_smallest_volume(graph: ca.Function, smallest: float) -> ca.Function:
+def replace_smallest_volume(graph: ca.Function, smallest: float) -> ca.Function:
     """The same graph of a controller, with another smallest volume of the gradients, relative to the median."""
     inputs, call = _guard_call(graph)
     if call is None:
@@ -406,7 +406,7 @@ def with_smallest_volume(graph: ca.Function, smallest: float) -> ca.Function:
     return ca.Function(graph.name(), inputs, list(outputs), graph.name_in(), graph.name_out())
 
 
-def squared_volume(graph: ca.Function) -> ca.Function | None:
+def find_squared_volume(graph: ca.Function) -> ca.Function | None:
     """Inputs of a controller -> squared volume of its gradients, relative to the median; None without a guard."""
     inputs, call = _guard_call(graph)
     if call is None:
@@ -426,10 +426,10 @@ def fallback_function(inputs: dict[str, ca.MX], command: ca.MX) -> ca.Function:
     """The fallback of a controller as a function of q and its gains."""
     state = ("dq", "reference", "reference_velocity", "reference_acceleration")
     selected = {key: value for key, value in inputs.items() if key not in state}
-    return named_function("fallback", selected, {"command": command})
+    return build_function("fallback", selected, {"command": command})
 
 
-def named_function(name: str, inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
+def build_function(name: str, inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
     """A function with named inputs and dense outputs."""
     dense = [ca.densify(out) for out in outputs.values()]
     return ca.Function(name, list(inputs.values()), dense, list(inputs), list(outputs))

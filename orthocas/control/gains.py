@@ -49,47 +49,6 @@ class GainRules:
 RULES = GainRules()
 
 
-def positive_gains(name: str, value: ArrayLike, length: int) -> Array:
-    """Finite numbers > 0, (length,), from one number or (length,)."""
-    gains = spread_gains(name, value, length)
-    _require(name, gains, gains > 0, "positive numbers")
-    return gains
-
-
-def non_negative_gains(name: str, value: ArrayLike, length: int) -> Array:
-    """Finite numbers >= 0, (length,), from one number or (length,)."""
-    gains = spread_gains(name, value, length)
-    _require(name, gains, gains >= 0, "numbers >= 0")
-    return gains
-
-
-def command_limit(name: str, value: ArrayLike | None, default: Array) -> Array:
-    """Numbers > 0, (n,), possibly infinite; the limits of the robot if `value` is None."""
-    length = len(default)
-    limit = np.array(np.broadcast_to(_check_length(name, default if value is None else value, length), (length,)))
-    _require(name, limit, limit > 0, "positive numbers")
-    limit.setflags(write=False)
-    return limit
-
-
-def spread_gains(name: str, value: ArrayLike, length: int) -> Array:
-    """Finite numbers (length,), from one number or (length,)."""
-    return frozen_array(name, np.broadcast_to(_check_length(name, value, length), (length,)), (length,))
-
-
-def _check_length(name: str, value: ArrayLike, length: int) -> Array:
-    array = as_float_array(name, value)
-    if array.ndim:
-        require_shape(name, array.shape, (length,))
-    return array
-
-
-def _require(name: str, gains: Array, good: NDArray[np.bool_], want: str) -> None:
-    bad = np.flatnonzero(~good)
-    if bad.size:
-        raise InvalidValueError(f"{name}[{bad[0]}]", gains[bad[0]], want)
-
-
 def matched_stiffness(
     chart: Chart,
     frequency: float = RULES.frequency,
@@ -162,24 +121,6 @@ def _bound_modes(delay: float, damping_ratio: ArrayLike, n: int) -> float:
     return float(phase / (crossing * delay))
 
 
-def find_fastest_posture(chart: Chart, stiffness: Array, robot: Robot) -> Array:
-    """The posture of the domain with the fastest mode that descents find, (n,)."""
-    scale = np.sqrt(stiffness)
-
-    def slowness(q: Array) -> Array:
-        W = scale[:, None] * compute_mobility(chart, q, robot) * scale
-        finite = np.asarray(np.isfinite(W).all(axis=(1, 2)))
-        return np.where(finite, -np.linalg.eigvalsh(np.where(finite[:, None, None], W, 0))[:, -1], np.nan)
-
-    return least_in_domain(slowness, chart.problem.domain)
-
-
-def compute_mobility(chart: Chart, points: ArrayLike, robot: Robot) -> Array:
-    """M_phi^-1 = J M^-1 J^T of a robot at points (N, n), (N, n, n)."""
-    J, M = chart.batched_rates(as_point_set("points", points, chart.n)[0]), robot.mass_matrix(points)
-    return np.asarray(J @ np.linalg.solve(M, J.transpose(0, 2, 1)))
-
-
 def _match(mobilities: Array, frequency: float, fastest: float, bounded: Array | None = None) -> Array:
     """The stiffness for M_phi^-1 at several postures, (N, n, n); singular postures are left out.
 
@@ -210,6 +151,24 @@ def _compute_spread(log_stiffness: Array, W: Array, bound: float, spread: Array,
     slopes = 2 * (spread[:, None] * logs + RULES.too_fast * excess[:, None] * above)
     cost = spread @ (logs**2).sum(axis=1) + RULES.too_fast * excess @ (above**2).sum(axis=1)
     return float(cost), (vectors**2 @ slopes[..., None])[..., 0].sum(axis=0)
+
+
+def find_fastest_posture(chart: Chart, stiffness: Array, robot: Robot) -> Array:
+    """The posture of the domain with the fastest mode that descents find, (n,)."""
+    scale = np.sqrt(stiffness)
+
+    def slowness(q: Array) -> Array:
+        W = scale[:, None] * compute_mobility(chart, q, robot) * scale
+        finite = np.asarray(np.isfinite(W).all(axis=(1, 2)))
+        return np.where(finite, -np.linalg.eigvalsh(np.where(finite[:, None, None], W, 0))[:, -1], np.nan)
+
+    return least_in_domain(slowness, chart.problem.domain)
+
+
+def compute_mobility(chart: Chart, points: ArrayLike, robot: Robot) -> Array:
+    """M_phi^-1 = J M^-1 J^T of a robot at points (N, n), (N, n, n)."""
+    J, M = chart.batched_rates(as_point_set("points", points, chart.n)[0]), robot.mass_matrix(points)
+    return np.asarray(J @ np.linalg.solve(M, J.transpose(0, 2, 1)))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -287,3 +246,44 @@ def find_holding_doubts(robot: Robot, domain: Domain, limit: Array) -> list[str]
         f"joint '{robot.joint_names[joint]}', the limit is {limit[joint]:.4g} {unit}, and at {share} of "
         f"{RULES.samples} samples of the domain gravity alone exceeds a limit"
     ]
+
+
+def positive_gains(name: str, value: ArrayLike, length: int) -> Array:
+    """Finite numbers > 0, (length,), from one number or (length,)."""
+    gains = spread_gains(name, value, length)
+    _require(name, gains, gains > 0, "positive numbers")
+    return gains
+
+
+def non_negative_gains(name: str, value: ArrayLike, length: int) -> Array:
+    """Finite numbers >= 0, (length,), from one number or (length,)."""
+    gains = spread_gains(name, value, length)
+    _require(name, gains, gains >= 0, "numbers >= 0")
+    return gains
+
+
+def command_limit(name: str, value: ArrayLike | None, default: Array) -> Array:
+    """Numbers > 0, (n,), possibly infinite; the limits of the robot if `value` is None."""
+    length = len(default)
+    limit = np.array(np.broadcast_to(_check_length(name, default if value is None else value, length), (length,)))
+    _require(name, limit, limit > 0, "positive numbers")
+    limit.setflags(write=False)
+    return limit
+
+
+def spread_gains(name: str, value: ArrayLike, length: int) -> Array:
+    """Finite numbers (length,), from one number or (length,)."""
+    return frozen_array(name, np.broadcast_to(_check_length(name, value, length), (length,)), (length,))
+
+
+def _check_length(name: str, value: ArrayLike, length: int) -> Array:
+    array = as_float_array(name, value)
+    if array.ndim:
+        require_shape(name, array.shape, (length,))
+    return array
+
+
+def _require(name: str, gains: Array, good: NDArray[np.bool_], want: str) -> None:
+    bad = np.flatnonzero(~good)
+    if bad.size:
+        raise InvalidValueError(f"{name}[{bad[0]}]", gains[bad[0]], want)

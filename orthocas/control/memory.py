@@ -13,9 +13,9 @@ from orthocas.control.controller import (
     LARGEST,
     Controller,
     ControlStatus,
+    build_function,
     compute_bias,
-    counted_function,
-    named_function,
+    get_counted_function,
     named_inputs,
     require_controller,
 )
@@ -151,7 +151,7 @@ class Remembering(Shown):
         require_controller(controller)
         memory = memory_of(controller)
         self._controller, self._memory = controller, memory
-        self._law = _call_with_arrays(counted_function(controller))
+        self._law = _call_with_arrays(get_counted_function(controller))
         self._step = None if memory is None else _call_with_arrays(memory.step)
         self.fields: dict[str, Array] = {}  #: what it remembers
         self.q: Array | None = None  #: the last position with its turns counted, (n,); None before the first tick
@@ -369,7 +369,7 @@ def _name_inputs(law: "_OperationalSpace", fields: Mapping[str, Array]) -> dict[
 def _build_memory(fields: Mapping[str, Array], inputs: dict[str, ca.MX], values: Mapping[str, ca.MX]) -> Memory:
     """A memory whose `correction` is a torque."""
     outputs = {f"next_{name}": value for name, value in values.items()}
-    return Memory(fields, {"extra_torque": "correction"}, named_function("memory", inputs, outputs))
+    return Memory(fields, {"extra_torque": "correction"}, build_function("memory", inputs, outputs))
 
 
 def _clip(values: ca.MX, bound: Array) -> Any:

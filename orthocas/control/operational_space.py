@@ -15,13 +15,13 @@ from orthocas.control.controller import (
     Command,
     LawOfChart,
     Setting,
+    build_function,
     compute_bias,
     compute_drift,
     compute_errors,
     count_turns_from_centre,
     fallback_function,
     guarded_graph,
-    named_function,
     named_inputs,
 )
 from orthocas.control.gains import (
@@ -362,7 +362,7 @@ class _OperationalSpace(LawOfChart):
         kinetic = ca.bilin(M_phi, de, de) if self.feed_forward else ca.bilin(M, inputs["dq"], inputs["dq"])
         storage = (kinetic + ca.bilin(K, e, e)) / 2
         outputs = {"storage": storage, "dissipated_power": ca.dot(de, damping_force)}
-        return named_function("energy", inputs, outputs)
+        return build_function("energy", inputs, outputs)
 
     @cached_property
     def damping_matrix(self) -> ca.Function:
@@ -371,7 +371,7 @@ class _OperationalSpace(LawOfChart):
         chosen = {name: inputs[name] for name in ("q", *self._damping_inputs)}
         J, M = self.chart.rates(inputs["q"]), self.model.own_mass_matrix(self.problem.robot, inputs)
         D = self._apply_damping(self._compute_inertia(J, M)[1], inputs, ca.MX.eye(self.chart.n))
-        return self.chart.runnable(named_function("damping_matrix", chosen, {"D": D}))
+        return self.chart.runnable(build_function("damping_matrix", chosen, {"D": D}))
 
     def check_damping(self, samples: int = 1000, seed: int = 0) -> DampingCheck:
         """Find the smallest eigenvalue of D over uniform samples of the domain; (29) can make it negative."""

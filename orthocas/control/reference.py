@@ -31,46 +31,11 @@ from orthocas.tools.display import Shown, listed, number_list
 
 NATURAL_FREQUENCY = 2 * np.pi  #: omega0 [rad/s] of [AS2023] Sec. 8
 DAMPING_RATIO = 0.7  #: zeta of [AS2023] Sec. 8
+Change = tuple[float, Mapping[str, float]]  #: a time [s] and the new targets by label
 _GRID = 0.05  # [s]
 _SWING = 0.3  # [rad] phase of the low-pass oscillation between two grid times; 0.048 s for the paper's filter
 _DEGREE = 5  # of splines through points
 _VALUES = "; targets of a Reference are values of phi, not changes of it ('move' in a steps file is a change)"
-
-
-@lru_cache(32)
-def low_pass_response(k: int, natural_frequency: float, damping_ratio: float) -> ca.Function:
-    """Response of k equal low-pass filters to a constant target, from any start.
-
-    The error e = value - target obeys dd_e + 2 zeta omega0 d_e + omega0^2 e = 0, solved in closed form for
-    underdamped, critically damped and overdamped filters.
-
-    Args:
-        k: number of quantities.
-        natural_frequency: omega0 > 0 [rad/s].
-        damping_ratio: zeta >= 0.
-
-    Returns:
-        A function of time t >= 0 and [target; value at t = 0; velocity at t = 0] (3 k, 1) -> value, velocity and
-        acceleration, each (k, 1).
-    """
-    t, parameters = ca.SX.sym("t"), ca.SX.sym("parameters", 3 * k)
-    target, value0, velocity0 = parameters[:k], parameters[k : 2 * k], parameters[2 * k :]
-    decay, beat = damping_ratio * natural_frequency, natural_frequency * np.sqrt(abs(1 - damping_ratio**2))
-    if np.isclose(damping_ratio, 1.0, rtol=0, atol=1e-9):
-        cosine, sine = ca.exp(-decay * t), t * ca.exp(-decay * t)
-    elif damping_ratio < 1:
-        cosine, sine = ca.exp(-decay * t) * ca.cos(beat * t), ca.exp(-decay * t) * ca.sin(beat * t) / beat
-    else:  # hyperbolic functions, written so that they do not overflow
-        slow, fast = ca.exp((beat - decay) * t), ca.exp(-(beat + decay) * t)
-        cosine, sine = (slow + fast) / 2, (slow - fast) / (2 * beat)
-    e0 = value0 - target
-    e = e0 * cosine + (velocity0 + decay * e0) * sine
-    velocity = velocity0 * cosine - (decay * velocity0 + natural_frequency**2 * e0) * sine
-    acceleration = -2 * decay * velocity - natural_frequency**2 * e
-    return dense_function("low_pass", [t, parameters], [target + e, velocity, acceleration])
-
-
-Change = tuple[float, Mapping[str, float]]  #: a time [s] and the new targets by label
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -119,13 +84,13 @@ class Reference(Shown):
             >>> value.round(2).tolist()
             [[1.0, 0.0], [1.2, 0.0]]
         """
-        names = _names(labels)
+        names = _check_names(labels)
         value = frozen_array("start", start, (len(labels),))
         omega0 = _require_number("natural_frequency", natural_frequency, above=0.0)
         _require_number("duration", duration, above=0.0)
         zeta = _require_number("damping_ratio", damping_ratio, above=-np.finfo(float).tiny)
-        times, targets = _stairs(names, value, changes, duration)
-        profile = low_pass_response(len(names), omega0, zeta)
+        times, targets = _build_stairs(names, value, changes, duration)
+        profile = build_low_pass(len(names), omega0, zeta)
         run = Batched(profile)
         parameters = [np.concatenate([targets[0], value, np.zeros_like(value)])]
         for target, lasted in zip(targets[1:], np.diff(times)[:-1], strict=True):
@@ -145,7 +110,7 @@ class Reference(Shown):
         Raises:
             InvalidValueError, ShapeError: for arguments of the wrong value or shape.
         """
-        names = _names(labels)
+        names = _check_names(labels)
         t = frozen_array("times", times, (None,))
         values = frozen_array("points", points, (len(t), len(names)))
         if len(t) < 2 or t[0] != 0 or np.diff(t).min() <= 0:
@@ -155,7 +120,7 @@ class Reference(Shown):
         taylor = [spline(t[:-1], order) / factorial(order) for order in reversed(range(_DEGREE + 1))]
         coefficients = np.stack(taylor, axis=2).reshape(len(t) - 1, -1)
         spacing = min(_GRID, float(np.diff(t).min()) / 4)
-        return cls(names, t, values[1:], values[0], coefficients, _polynomial(len(names)), spacing)
+        return cls(names, t, values[1:], values[0], coefficients, _build_polynomial(len(names)), spacing)
 
     def facts(self) -> dict[str, str]:
         """Quantities, time, start and targets."""
@@ -199,14 +164,57 @@ class Reference(Shown):
         return Batched(self.profile)
 
 
-def _names(labels: Sequence[str]) -> tuple[str, ...]:
+@lru_cache(32)
+def build_low_pass(k: int, natural_frequency: float, damping_ratio: float) -> ca.Function:
+    """Response of k equal low-pass filters to a constant target, from any start.
+
+    The error e = value - target obeys dd_e + 2 zeta omega0 d_e + omega0^2 e = 0, solved in closed form for
+    underdamped, critically damped and overdamped filters.
+
+    Args:
+        k: number of quantities.
+        natural_frequency: omega0 > 0 [rad/s].
+        damping_ratio: zeta >= 0.
+
+    Returns:
+        A function of time t >= 0 and [target; value at t = 0; velocity at t = 0] (3 k, 1) -> value, velocity and
+        acceleration, each (k, 1).
+    """
+    t, parameters = ca.SX.sym("t"), ca.SX.sym("parameters", 3 * k)
+    target, value0, velocity0 = parameters[:k], parameters[k : 2 * k], parameters[2 * k :]
+    decay, beat = damping_ratio * natural_frequency, natural_frequency * np.sqrt(abs(1 - damping_ratio**2))
+    if np.isclose(damping_ratio, 1.0, rtol=0, atol=1e-9):
+        cosine, sine = ca.exp(-decay * t), t * ca.exp(-decay * t)
+    elif damping_ratio < 1:
+        cosine, sine = ca.exp(-decay * t) * ca.cos(beat * t), ca.exp(-decay * t) * ca.sin(beat * t) / beat
+    else:  # hyperbolic functions, written so that they do not overflow
+        slow, fast = ca.exp((beat - decay) * t), ca.exp(-(beat + decay) * t)
+        cosine, sine = (slow + fast) / 2, (slow - fast) / (2 * beat)
+    e0 = value0 - target
+    e = e0 * cosine + (velocity0 + decay * e0) * sine
+    velocity = velocity0 * cosine - (decay * velocity0 + natural_frequency**2 * e0) * sine
+    acceleration = -2 * decay * velocity - natural_frequency**2 * e
+    return dense_function("low_pass", [t, parameters], [target + e, velocity, acceleration])
+
+
+@lru_cache(32)
+def _build_polynomial(k: int) -> ca.Function:
+    """Time and coefficients of k polynomials, highest power first -> value and two derivatives."""
+    t, coefficients = ca.SX.sym("t"), ca.SX.sym("coefficients", k * (_DEGREE + 1))
+    table = ca.reshape(coefficients, _DEGREE + 1, k).T
+    value = ca.SX(table @ ca.vertcat(*(t ** (_DEGREE - i) for i in range(_DEGREE + 1))))
+    velocity = ca.jacobian(value, t)
+    return dense_function("spline", [t, coefficients], [value, velocity, ca.jacobian(velocity, t)])
+
+
+def _check_names(labels: Sequence[str]) -> tuple[str, ...]:
     require_kind("labels", labels, Sequence)
     if isinstance(labels, str) or not all(isinstance(label, str) for label in labels):
         raise InvalidValueError("labels", repr(labels)[:80], "a sequence of names")
     return tuple(labels)
 
 
-def _pairs(changes: Sequence[Change]) -> Sequence[Change]:
+def _check_changes(changes: Sequence[Change]) -> Sequence[Change]:
     require_kind("changes", changes, Sequence)
     for change in changes:
         if not isinstance(change, Sequence) or len(change) != 2:
@@ -214,10 +222,12 @@ def _pairs(changes: Sequence[Change]) -> Sequence[Change]:
     return changes
 
 
-def _stairs(labels: tuple[str, ...], start: Array, changes: Sequence[Change], duration: float) -> tuple[Array, Array]:
+def _build_stairs(
+    labels: tuple[str, ...], start: Array, changes: Sequence[Change], duration: float
+) -> tuple[Array, Array]:
     """Segment boundaries (S + 1,) and targets (S, k)."""
     times, targets = [0.0], [start]
-    for time, moves in _pairs(changes):
+    for time, moves in _check_changes(changes):
         at = _require_number("time of a step", time)
         if not times[-1] <= at < duration:
             raise InvalidValueError("time of a step", at, f"from {times[-1]:g} to below the duration {duration:g} s")
@@ -232,16 +242,6 @@ def _stairs(labels: tuple[str, ...], start: Array, changes: Sequence[Change], du
             times.append(at)
             targets.append(target)
     return np.array([*times, float(duration)]), np.array(targets)
-
-
-@lru_cache(32)
-def _polynomial(k: int) -> ca.Function:
-    """Time and coefficients of k polynomials, highest power first -> value and two derivatives."""
-    t, coefficients = ca.SX.sym("t"), ca.SX.sym("coefficients", k * (_DEGREE + 1))
-    table = ca.reshape(coefficients, _DEGREE + 1, k).T
-    value = ca.SX(table @ ca.vertcat(*(t ** (_DEGREE - i) for i in range(_DEGREE + 1))))
-    velocity = ca.jacobian(value, t)
-    return dense_function("spline", [t, coefficients], [value, velocity, ca.jacobian(velocity, t)])
 
 
 def _require_number(name: str, value: float, above: float = -np.inf) -> float:
