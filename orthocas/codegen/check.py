@@ -149,7 +149,8 @@ def _compare_chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array
     _require_status("chart", [row[-1] for row in results], status, q)
     phi, J = (np.array([row[k] for row in results]) for k in range(2))
     expected = {name: _blank(has_value, value) for name, value in expected.items()}
-    phi = expected["phi"] + shortest(phi - expected["phi"], chart.turns)  # pi and -pi are one angle
+    # pi and -pi are one angle.
+    phi = expected["phi"] + shortest(phi - expected["phi"], chart.turns)
     differences = {"phi": _compute_largest(phi, expected["phi"]), "jacobian": _compute_largest(J, expected["jacobian"])}
     expected = {
         "mass_matrix": robot.mass_matrix(somewhere),
@@ -276,7 +277,8 @@ def sample_gains(controller: Controller, rows: int, rng: np.random.Generator) ->
         else:
             values = np.where(np.isfinite(gain), gain, 50.0) * rng.uniform(0.5, 1.5, (rows, len(gain)))
         if name == "limit":
-            values[::3] = np.inf  # states of a weak arm may all saturate, which would say little of the law
+            # States of a weak arm may all saturate, which would say little of the law.
+            values[::3] = np.inf
             values[7::40, 0] = rng.choice([0.0, -1.0, np.nan, np.inf], size=len(values[7::40]))
         gains.append(values)
     return gains
@@ -287,12 +289,14 @@ def _estimate_amplification(precision: Precision, controller: Controller, law: B
     q, others = inputs[0], inputs[1:]
     command, status = law(*inputs)
     change = np.zeros(len(q))
-    for joints in (np.ones(q.shape[1], dtype=bool), *np.eye(q.shape[1], dtype=bool)):  # effects of joints may cancel
+    # Effects of joints may cancel, so each moves alone, too.
+    for joints in (np.ones(q.shape[1], dtype=bool), *np.eye(q.shape[1], dtype=bool)):
         moved, status_there = law(np.where(joints, precision.next_above(q), q), *others)
         same = (status_there == status)[:, 0]
         change = np.where(same, np.maximum(change, _compute_differences(moved, command)), change)
     results: Array = change.clip(precision.sensitive, 1) / precision.sensitive
-    volume = find_squared_volume(controller.graph)  # it does not depend on whole turns
+    # The volume does not depend on whole turns.
+    volume = find_squared_volume(controller.graph)
     if precision is SINGLE and volume is not None:
         squares = np.where(np.isin(status, FROM_THE_LAW), Batched(volume)(*inputs)[0], 1.0)[:, 0]
         results /= squares.clip(precision.smallest_volume**2, 1)

@@ -83,7 +83,8 @@ def _require_own(place: Path) -> None:
     Raises:
         CompileError: if a folder or file belongs to somebody else but root, or others may write there.
     """
-    if not hasattr(os, "geteuid"):  # Windows: the rights of a folder come from the one above
+    # On Windows, the rights of a folder come from the one above.
+    if not hasattr(os, "geteuid"):
         return
     try:
         result = place.stat()

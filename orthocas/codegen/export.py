@@ -168,7 +168,8 @@ def write_module(chart: Chart | Impedance | PDPlus, to: str) -> str:
         "task": task_code.strip("\n"),
         "others": "\n\n\n".join(map(_write_form, others)),
     }
-    values = {  # names and numbers about the chart as Python that is plain ASCII
+    # Names and numbers about the chart, as Python that is plain ASCII
+    values = {
         "to": to,
         "library": library,
         "imports": library.imports_for("".join(code.values())),

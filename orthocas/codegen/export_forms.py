@@ -84,7 +84,8 @@ def _build_products(coordinates: Coordinates) -> Form | None:
     used = np.flatnonzero(slopes[:, :, 1:].any(axis=(0, 1)))
     plan = TermLevels.of(family.terms, [family.terms[k] for k in used])
     rows = {term: k for k, term in enumerate(family.terms)}
-    if not set(plan.levels[0]) <= set(rows):  # then the family has no term for a function that its terms contain
+    # The family may have no term for a function that its terms contain.
+    if not set(plan.levels[0]) <= set(rows):
         return None
     q = ca.SX.sym("q", coordinates.space.n)
     functions = family.basis(q[coordinates.active])[[rows[term] for term in plan.levels[0]]]
@@ -237,7 +238,8 @@ def write_function(name: str, summary: str, *functions: ca.Function) -> str:
 def _write_tape(tape: Tape) -> list[str]:
     """The lines that compute a tape's output from columns q (n, N), and return it as (k, N)."""
     lines: list[str] = []
-    constants: dict[int, str] = {}  # words for the constants in work slots
+    # Constants in slots of the work array stay words.
+    constants: dict[int, str] = {}
     results: dict[int, str] = {}
     for (name, into, *of), uses in zip(tape["steps"], _count_uses(tape["steps"]), strict=True):
         if name == "const":

@@ -32,14 +32,24 @@ from orthocas.tools.expressions import fast_form, scalar_code
 from orthocas.tools.files import output_folder, published, require_writable
 from orthocas.version import VERSION
 
-_LOCALS = 5 * 1024  # bytes; 1 to 4.5 KiB with gcc and clang for up to seven joints (tests/codegen/test_c_safety.py)
-_MAX_EVALUATIONS = 100  # largest number of chart evaluations in one call of the inverse map
-_TAKEN = (  # names of C headers and libraries
+# Names of C headers and libraries, which no library of ours can have
+_TAKEN = (
     *("assert", "complex", "ctype", "errno", "fenv", "float", "inttypes", "iso646", "limits", "locale", "math"),
     *("setjmp", "signal", "stdarg", "stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath", "time"),
     *("wchar", "wctype", "features", "endian", "strings", "unistd", "pthread", "sched", "dlfcn", "alloca", "threads"),
     *("uchar", "stdalign", "stdatomic", "stdnoreturn", "m", "c", "dl", "rt"),
 )
+
+
+@dataclass(frozen=True, slots=True)
+class LibraryRules:
+    """Numbers of generated libraries."""
+
+    locals_bytes: int = 5120  #: of stack; 1 to 4.5 KiB with up to seven joints (tests/codegen/test_c_safety.py)
+    evaluations: int = 100  #: of the chart, at most, in one call of the inverse map
+
+
+RULES = LibraryRules()
 
 
 @dataclass(frozen=True)
@@ -131,7 +141,8 @@ def generate_c(
         with output_folder("out", folder) as place, published(place) as drafts:
             for file, text in contents.items():
                 (drafts / file).write_text(text, encoding="utf-8")
-    except OSError as error:  # a name that is too long, for example
+    except OSError as error:
+        # A name may be too long, for example.
         raise ArchiveError(f"cannot write to {out}: {error.strerror}") from error
     return GeneratedC(folder, name, stack_bytes, single_precision)
 
@@ -193,8 +204,10 @@ def _bound_stack(kernels: Kernels, chart: Chart, controller: Controller | None, 
     inverse = kernels.array_bytes("chart", size) + size * n * (n + 6)
     compose = kernels.array_bytes("dynamics", size) + size * n * (n + 5)
     supervised = size * (9 * n + 8 * k + kernels.numbers["shared"]) if k else 0
-    locals_ = round(_LOCALS * max(1.0, n / 7) ** 2)  # compilers keep matrices in local variables
-    inner = [name for name in ("pivots", "gram", "room") if name in kernels.work]  # inside others
+    # Compilers keep matrices in local variables.
+    locals_ = round(RULES.locals_bytes * max(1.0, n / 7) ** 2)
+    # These kernels run inside others.
+    inner = [name for name in ("pivots", "gram", "room") if name in kernels.work]
     clear = sum(kernels.array_bytes(name, size) for name in inner)
     work = max(kernels.array_bytes(name, size) for name in kernels.work)
 
@@ -220,7 +233,7 @@ def _describe_library(
         "version": VERSION,
         "casadi_version": ca.CasadiMeta.version(),
         "rows": rows,
-        "max_evaluations": _MAX_EVALUATIONS,
+        "max_evaluations": RULES.evaluations,
         **precision.describe(),
         "kernels": kernels.code,
         "work": kernels.sizes(),

@@ -190,7 +190,8 @@ def _move_slots(block: str, function: ca.Function, below: int) -> tuple[str, int
     """Code whose slots in the work array begin at `below`, and the end of these slots."""
     body = _PLACE.sub("", block.split("{", 1)[1])
     if re.search(r"\bw\b", re.sub(rf"{_CALL.pattern}\(arg1, res1, iw, w, 0\)", "", body)):
-        return block, function.sz_w()  # an operation uses the array in a way of its own
+        # An operation uses the array in a way of its own.
+        return block, function.sz_w()
     sizes = _measure_slots(function)
     places = sorted((int(offset), sizes[int(place)]) for place, offset in _PLACE.findall(block))
     for (offset, size), (following, _) in pairwise(places):
@@ -337,7 +338,8 @@ def share_sines(functions: list[ca.Function]) -> list[ca.Function]:
     Args:
         functions: graphs whose first inputs are joint positions (n, 1); others are returned as they are.
     """
-    made: dict[int, ca.Function | None] = {}  # one form of each called function, so that its code appears once
+    # One form of each called function, so that its code appears once.
+    made: dict[int, ca.Function | None] = {}
     at = ca.SX.sym("q", max((function.size1_in(0) for function in functions), default=0))
     turns = ca.Function("turns", [at], [ca.sin(at), ca.cos(at)])
 
@@ -391,7 +393,8 @@ def _replace_calls(
                 old.append(node.get_output(0))
     if not old:
         return None
-    outputs = ca.cse(ca.graph_substitute(outputs, old, new))  # substitution copies what is between
+    # Substitution copies what is between.
+    outputs = ca.cse(ca.graph_substitute(outputs, old, new))
     inputs, names = inputs + (more or []), function.name_in() + [symbol.name() for symbol in more or []]
     return ca.Function(function.name(), inputs, outputs, names, function.name_out())
 
@@ -403,7 +406,8 @@ def _take_sines(function: ca.Function) -> ca.Function | None:
     n, inputs = function.size1_in(0), function.sx_in()
     turns = {ca.OP_SIN: ca.SX.sym("sine", n), ca.OP_COS: ca.SX.sym("cosine", n)}
     work: dict[int, ca.SX] = {}
-    joints: dict[int, int] = {}  # which joint a place of the work array holds
+    # Which joint a place of the work array holds.
+    joints: dict[int, int] = {}
     entries: dict[int, ca.SX] = {}
     has_turns = False
     for k in range(function.n_instructions()):

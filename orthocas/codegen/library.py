@@ -171,7 +171,8 @@ class CompiledLibrary:
     def _call(self, function: str, inputs: list[Array], outputs: list[Array]) -> int:
         run = getattr(self._c, f"{self.name}_{function}")
         arrays = [self.numbers(array) for array in inputs] + outputs
-        for array in arrays[: len(inputs)][:2]:  # q and dq; C would read beyond the end of a short array
+        # C would read beyond the end of a short q or dq.
+        for array in arrays[: len(inputs)][:2]:
             require_shape(f"an argument of {function}", array.shape[:1], (self.n,))
         return int(run(*(array.ctypes.data_as(ctypes.c_void_p) for array in arrays)))
 
@@ -296,7 +297,8 @@ class Supervisor:
     def _numbers(self, name: str, values: ArrayLike, size: int) -> Array:
         """Numbers of the library's type, which may be NaN or infinite."""
         array = as_float_array(name, values)
-        require_shape(name, array.shape, (size,))  # C would read beyond the end
+        # C would read beyond the end of a short array.
+        require_shape(name, array.shape, (size,))
         return self._library.numbers(array)
 
     def _point(self, name: str, values: ArrayLike) -> Array:
@@ -354,7 +356,8 @@ def control_tick(chart: Chart) -> float:
         CompileError: if there is no C compiler.
     """
     with draft_folder() as folder:
-        with deferred():  # CasADi may lose Ctrl-C while it builds functions
+        # CasADi may lose Ctrl-C while it builds functions.
+        with deferred():
             law = PDPlus(chart, 50.0, coupling="decoupled")
             generated = generate_c(chart, folder, law, "tick")
         library = CompiledLibrary(compile_shared(generated, folder), "tick", chart.n)

@@ -1,5 +1,6 @@
 """The supervised law in generated C: what its kernels compute, and what its templates are filled with."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -15,9 +16,17 @@ from orthocas.tasks.relative import Relative
 from orthocas.tools.batch import Batched
 from orthocas.tools.expressions import scalar_code, shortest
 
-_UNIT = 1.001  # squared length of a quaternion, to rounding
-_DAMPED = 1e-6  # of least squares: joint motions of single quantities, and of more quantities than joints
-_USUAL = 256  # positions of a domain whose median room to a fold is the usual one
+
+@dataclass(frozen=True, slots=True)
+class SupervisionRules:
+    """Numbers of the kernels of the supervised law."""
+
+    unit: float = 1.001  #: squared length of a quaternion, to rounding
+    damping: float = 1e-6  #: of least squares, for joint motions of fewer or more quantities than joints
+    samples: int = 256  #: of a domain, whose median room to a fold is the usual one
+
+
+RULES = SupervisionRules()
 
 
 def build_supervision_kernels(controller: Controller) -> list[ca.Function]:
@@ -63,8 +72,9 @@ def _subtract(controller: Controller, relative: Relative, end: ca.MX, start: ca.
     """The difference of two values of the controlled quantities, (k, 1), by the shorter turns. NaN: end is no value."""
     m = controller.problem.m
     difference = ca.vertcat(relative.difference(end[:m], start[:m]), end[m:] - start[m:])
-    if relative.turned:  # sines of half an angle
-        unit = ca.sumsqr(relative.task.quaternion_function(end[:m])) < _UNIT
+    # Orientations differ by sines of half an angle.
+    if relative.turned:
+        unit = ca.sumsqr(relative.task.quaternion_function(end[:m])) < RULES.unit
         difference = ca.if_else(unit, difference, ca.MX.nan(len(controller.labels)))
     if controller.chart is not None and controller.labels == controller.chart.labels:
         difference = shortest(difference, controller.chart.turns)
@@ -92,7 +102,7 @@ def _build_implied(controller: Controller, relative: Relative) -> ca.Function:
     velocity, acceleration = (ca.vertcat(a, b[m:]) for a, b in zip(turned, rates, strict=True))
     B = ca.horzcat(change, velocity, acceleration - bias)
     if k != n:
-        J, B = J.T @ J + _DAMPED * ca.trace(J.T @ J) * ca.MX.eye(n), J.T @ B
+        J, B = J.T @ J + RULES.damping * ca.trace(J.T @ J) * ca.MX.eye(n), J.T @ B
     return ca.Function("implied", [q, dq, value, *rates, change], [ca.densify(J.T), ca.densify(B)])
 
 
@@ -197,7 +207,7 @@ def _describe_boundary(controller: Controller) -> dict[str, Any] | None:
     if (room := domain.room_to_fold) is not None:
         meaning += " So is\n * the bound on the volume of the coordinates, in shares of the median."
         # of a median position, because the centre may be near the bound
-        fold_span = float(np.median(Batched(room)(sample_uniform(domain, _USUAL, 0))[0]))
+        fold_span = float(np.median(Batched(room)(sample_uniform(domain, RULES.samples, 0))[0]))
     return {
         "meaning": meaning,
         "path": None,

@@ -86,7 +86,8 @@ def matched_stiffness(
         ours, docs/explanation/derivations_control.md#stiffness
     """
     require_kind("chart", chart, Chart)
-    chart.function("xi")  # raises for grown charts
+    # Grown charts raise here.
+    chart.function("xi")
     require_mass(chart.problem.robot, "gains by modes")
     if not 0 <= as_number("delay", delay) < np.inf:
         raise InvalidValueError("delay", delay, "a finite number >= 0")
@@ -131,7 +132,8 @@ def _match(mobilities: Array, frequency: float, fastest: float, bounded: Array |
         raise InvalidValueError("fastest", fastest, "a number > 0 or infinity")
     W = mobilities[np.isfinite(mobilities).all(axis=(1, 2))]
     W = W[np.linalg.eigvalsh(W)[:, 0] > 0]
-    start = -np.log(np.median(np.diagonal(W, axis1=1, axis2=2), axis=0))  # the solution where W is diagonal
+    # The start is the solution where W is diagonal.
+    start = -np.log(np.median(np.diagonal(W, axis1=1, axis2=2), axis=0))
     bound, count = 2 * np.log(fastest / omega), len(W)
     W = W if bounded is None else np.concatenate([W, bounded])
     spread, excess = (np.append(np.full(count, 1 / count), np.full(len(W) - count, more)) for more in (0.0, 1.0))
@@ -203,7 +205,8 @@ def compute_modes(mobility: Array, stiffness: Array, damping: Array) -> Modes:
     half = (vectors * np.sqrt(values.clip(0))[:, None, :]) @ vectors.transpose(0, 2, 1)
     squares, shapes = np.linalg.eigh((half * stiffness) @ half)
     omega = np.sqrt(squares.clip(0))
-    rates = np.einsum("kij,kij->kj", shapes, half @ damping @ half @ shapes)  # 2 zeta omega [1/s]
+    # 2 zeta omega of each mode [1/s]
+    rates = np.einsum("kij,kij->kj", shapes, half @ damping @ half @ shapes)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = rates / (2 * omega)
     return Modes(omega / (2 * np.pi), ratios, _compute_delays(omega, rates))

@@ -72,7 +72,8 @@ class Kinematic(LawOfChart):
     def __init__(self, chart: Chart, feedback: ArrayLike = RULES.feedback, limit: ArrayLike | None = None) -> None:
         require_kind("chart", chart, Chart)
         require_driven(f"the law {self.name}", chart.problem.robot.tree)
-        chart.function("xi")  # raises for grown charts
+        # Grown charts raise here.
+        chart.function("xi")
         object.__setattr__(self, "chart", chart)
         object.__setattr__(self, "feedback", non_negative_gains("feedback", feedback, chart.n))
         object.__setattr__(self, "limit", command_limit("limit", limit, chart.problem.robot.velocity_limits))
@@ -150,7 +151,8 @@ class XiTask(Shown):
     ) -> None:
         require_kind("chart", chart, Chart)
         require_driven("a task of a quadratic program", chart.problem.robot.tree)
-        chart.function("xi")  # raises for grown charts
+        # Grown charts raise here.
+        chart.function("xi")
         require_at_least("gain", gain, 0)
         require_at_least("lm_damping", lm_damping, 0)
         if gain > 1:
@@ -162,8 +164,10 @@ class XiTask(Shown):
         if len(self.joints) != chart.n:
             raise ShapeError("joints", (len(self.joints),), (chart.n,))
         self.target_xi: Array | None = None
-        self._last: Array | None = None  # the last position: turns of joints that turn without end count from there
-        self._known: tuple[Any, list[tuple[Any, int]]] = (None, [])  # the last model, and the places of joints in it
+        # Turns of joints that turn without end count from the last position.
+        self._last: Array | None = None
+        # The last model, and the places of joints in it: looking them up takes longer than xi.
+        self._known: tuple[Any, list[tuple[Any, int]]] = (None, [])
 
     def facts(self) -> dict[str, str]:
         """Cost, gain and target."""

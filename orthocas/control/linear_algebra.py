@@ -44,7 +44,8 @@ def _build_sweeps(k: int) -> ca.Function:
 
     A sweep turns [[p, w^T], [w, R]] into [[R - w w^T / p, w / p], [w^T / p, -1 / p]]; k of them lead to -A^-1.
     """
-    state = ca.MX.sym("state", k * k + 1)  # the matrix and the product of the pivots: what `fold` carries along
+    # `fold` carries the matrix and the product of the pivots along.
+    state = ca.MX.sym("state", k * k + 1)
     A = ca.reshape(state[:-1], k, k)
     p, w = A[0, 0], A[1:, 0]
     share = w / p

@@ -401,8 +401,10 @@ def _build_regressor(tree: KinematicTree) -> tuple[ca.Function, tuple[int, ...]]
     numbers = ca.SX.sym("numbers", len(dynamics.inertial_numbers(tree)))
     rest, weightless = ca.SX(tree.n, 1), np.zeros(3)
     force = dynamics.inverse_dynamics(tree, q, rest, a, tree.gravity, inertials=numbers)
-    for sign in (1, -1):  # C(q, dq) w by polarisation, as in `dynamics.coriolis_product`
+    # C(q, dq) w by polarisation, as in `dynamics.coriolis_product`
+    for sign in (1, -1):
         force += sign / 4 * dynamics.bias(tree, q, dq + sign * w, weightless, inertials=numbers)
     places, joints = dynamics.first_moments(tree)
-    Y = ca.jacobian(force, numbers)[:, places]  # linear, but for the rotors' inertias, which do not depend on them
+    # The force is linear in them, but for the rotors' inertias, which do not depend on the first moments.
+    Y = ca.jacobian(force, numbers)[:, places]
     return ca.Function("regressor", [q, dq, w, a], [ca.densify(Y)]), joints

@@ -167,11 +167,12 @@ class _OperationalSpace(LawOfChart):
             )
         if remembers is not None and model.extra_torque is None:
             model = replace(model, extra_torque=0.0)
-        chart.function("xi")  # raises for grown charts
+        # Grown charts, and values of another size, raise here.
+        chart.function("xi")
         n, as_stiffness = chart.n, damping_stiffness is None
         if damping_stiffness is not None:
             damping_stiffness = positive_gains("damping_stiffness", damping_stiffness, n)
-        model.gains(chart.problem, self.feed_forward)  # raises for values of another size
+        model.gains(chart.problem, self.feed_forward)
         for name, value in {
             "chart": chart,
             "stiffness": (positive_gains if as_stiffness else non_negative_gains)("stiffness", stiffness, n),
@@ -187,7 +188,8 @@ class _OperationalSpace(LawOfChart):
         }.items():
             object.__setattr__(self, name, value)
         if remembers is not None:
-            _ = self.memory  # raises for bounds of another size
+            # Bounds of another size raise here.
+            _ = self.memory
         doubts = [*_doubt_ratio(self.damping_ratio), *self._find_holding_doubts()]
         if coupling == "decoupled" and (metric := chart.problem.metric.name) != "inertia":
             doubts.append(f"a decoupled law relies on A = M (inertia), but the metric of this chart is {metric}")

@@ -32,9 +32,18 @@ from orthocas.tools.display import Shown, listed, number_list
 NATURAL_FREQUENCY = 2 * np.pi  #: omega0 [rad/s] of [AS2023] Sec. 8
 DAMPING_RATIO = 0.7  #: zeta of [AS2023] Sec. 8
 Change = tuple[float, Mapping[str, float]]  #: a time [s] and the new targets by label
-_GRID = 0.05  # [s]
-_SWING = 0.3  # [rad] phase of the low-pass oscillation between two grid times; 0.048 s for the paper's filter
-_DEGREE = 5  # of splines through points
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceRules:
+    """Numbers of references."""
+
+    grid: float = 0.05  #: largest distance of grid times [s]
+    swing: float = 0.3  #: phase of the low-pass oscillation between them; 0.048 s for the paper's filter [rad]
+    degree: int = 5  #: of splines through points
+
+
+RULES = ReferenceRules()
 _VALUES = "; targets of a Reference are values of phi, not changes of it ('move' in a steps file is a change)"
 
 
@@ -48,7 +57,7 @@ class Reference(Shown):
     start: Array  #: (k,) value at the start
     parameters: Array  #: (S, p) inputs of the profile
     profile: ca.Function  #: time since the start of the segment, parameters -> value, velocity, acceleration (k, 1)
-    spacing: float = _GRID  #: [s], fine enough to resolve every oscillation
+    spacing: float = RULES.grid  #: [s], fine enough to resolve every oscillation
 
     @classmethod
     def steps(
@@ -96,7 +105,7 @@ class Reference(Shown):
         for target, lasted in zip(targets[1:], np.diff(times)[:-1], strict=True):
             position, velocity, _ = (out[0] for out in run(np.array([[lasted]]), parameters[-1][None]))
             parameters.append(np.concatenate([target, position, velocity]))
-        return cls(names, times, targets, value, np.array(parameters), profile, min(_GRID, _SWING / omega0))
+        return cls(names, times, targets, value, np.array(parameters), profile, min(RULES.grid, RULES.swing / omega0))
 
     @classmethod
     def through(cls, labels: Sequence[str], times: ArrayLike, points: ArrayLike) -> Self:
@@ -116,10 +125,10 @@ class Reference(Shown):
         if len(t) < 2 or t[0] != 0 or np.diff(t).min() <= 0:
             raise InvalidValueError("times", t.tolist(), "at least two increasing times that begin with 0")
         rest = [(order, np.zeros(len(names))) for order in (1, 2)]
-        spline = scipy.interpolate.make_interp_spline(t, values, _DEGREE, bc_type=(rest, rest))
-        taylor = [spline(t[:-1], order) / factorial(order) for order in reversed(range(_DEGREE + 1))]
+        spline = scipy.interpolate.make_interp_spline(t, values, RULES.degree, bc_type=(rest, rest))
+        taylor = [spline(t[:-1], order) / factorial(order) for order in reversed(range(RULES.degree + 1))]
         coefficients = np.stack(taylor, axis=2).reshape(len(t) - 1, -1)
-        spacing = min(_GRID, float(np.diff(t).min()) / 4)
+        spacing = min(RULES.grid, float(np.diff(t).min()) / 4)
         return cls(names, t, values[1:], values[0], coefficients, _build_polynomial(len(names)), spacing)
 
     def facts(self) -> dict[str, str]:
@@ -187,7 +196,8 @@ def build_low_pass(k: int, natural_frequency: float, damping_ratio: float) -> ca
         cosine, sine = ca.exp(-decay * t), t * ca.exp(-decay * t)
     elif damping_ratio < 1:
         cosine, sine = ca.exp(-decay * t) * ca.cos(beat * t), ca.exp(-decay * t) * ca.sin(beat * t) / beat
-    else:  # hyperbolic functions, written so that they do not overflow
+    else:
+        # Hyperbolic functions, written so that they do not overflow.
         slow, fast = ca.exp((beat - decay) * t), ca.exp(-(beat + decay) * t)
         cosine, sine = (slow + fast) / 2, (slow - fast) / (2 * beat)
     e0 = value0 - target
@@ -200,9 +210,9 @@ def build_low_pass(k: int, natural_frequency: float, damping_ratio: float) -> ca
 @lru_cache(32)
 def _build_polynomial(k: int) -> ca.Function:
     """Time and coefficients of k polynomials, highest power first -> value and two derivatives."""
-    t, coefficients = ca.SX.sym("t"), ca.SX.sym("coefficients", k * (_DEGREE + 1))
-    table = ca.reshape(coefficients, _DEGREE + 1, k).T
-    value = ca.SX(table @ ca.vertcat(*(t ** (_DEGREE - i) for i in range(_DEGREE + 1))))
+    t, coefficients = ca.SX.sym("t"), ca.SX.sym("coefficients", k * (RULES.degree + 1))
+    table = ca.reshape(coefficients, RULES.degree + 1, k).T
+    value = ca.SX(table @ ca.vertcat(*(t ** (RULES.degree - i) for i in range(RULES.degree + 1))))
     velocity = ca.jacobian(value, t)
     return dense_function("spline", [t, coefficients], [value, velocity, ca.jacobian(velocity, t)])
 

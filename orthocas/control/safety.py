@@ -181,7 +181,8 @@ class Safety:
 def _compute_joint_motion(controller: Controller, points: Array, slow: Array) -> Array:
     """Time that joints take at slow speeds (n,) per unit of each controlled quantity, at 90 % of the points (k,)."""
     n, m, relative = controller.problem.n, controller.problem.m, Relative(controller.problem.task)
-    with deferred(), building:  # threads share the law
+    # Threads share the law.
+    with deferred(), building:
         q = ca.MX.sym("q", n)
         moving = ca.vertcat(relative.rates(q), ca.jacobian(controller.measured(q)[m:], q))
         function = dense_function("J", [q], [moving])
