@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.charts.phi import ROUNDING, PhiMap, largest
-from orthocas.tasks.domains import Domain, bounds_of, sample_uniform
+from orthocas.tasks.domains import Domain
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
@@ -297,17 +298,17 @@ class BoxedPhi:
     @cached_property
     def low(self) -> Array:
         """Lowest u, (n,): -1, or -inf for joints without boundaries."""
-        return (bounds_of(self.domain)[0] - self.domain.centre) / self.domain.half_width
+        return (self.domain.bounds[0] - self.domain.centre) / self.domain.half_width
 
     @cached_property
     def high(self) -> Array:
         """Highest u, (n,)."""
-        return (bounds_of(self.domain)[1] - self.domain.centre) / self.domain.half_width
+        return (self.domain.bounds[1] - self.domain.centre) / self.domain.half_width
 
     def points(self, u: Array) -> Array:
         """q at u (N, n), within the boundaries, (N, n)."""
         domain = self.domain
-        return np.clip(domain.centre + domain.half_width * u, *bounds_of(domain))
+        return np.clip(domain.centre + domain.half_width * u, *domain.bounds)
 
     def of_points(self, q: Array) -> Array:
         """u of the points of the box nearest to q (N, n), (N, n)."""

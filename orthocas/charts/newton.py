@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from orthocas.charts.coordinates import InvertibleMap
 from orthocas.charts.phi import ROUNDING, Differences, PhiMap, largest
-from orthocas.tools.batch import dense_function, in_threads
+from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.interrupts import deferred
 
@@ -178,7 +178,7 @@ def inverses(matrices: Array) -> tuple[Array, NDArray[np.bool_]]:
         found = np.empty_like(matrices)
         pieces = [slice(first, first + NEWTON.piece) for first in range(0, len(matrices), NEWTON.piece)]
         for piece, inverse in zip(
-            pieces, in_threads(lambda piece: np.linalg.inv(matrices[piece]), pieces), strict=True
+            pieces, run_in_threads(lambda piece: np.linalg.inv(matrices[piece]), pieces), strict=True
         ):
             found[piece] = inverse
     except np.linalg.LinAlgError:  # it does not say which

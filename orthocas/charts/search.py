@@ -14,7 +14,8 @@ from orthocas.charts.descent import BoxedPhi, descend
 from orthocas.charts.newton import inverses
 from orthocas.charts.phi import PhiMap
 from orthocas.errors import SingularTaskError
-from orthocas.tasks.domains import Domain, sample_heavily
+from orthocas.tasks.domains import Domain
+from orthocas.tasks.samples import sample_boundary_weighted
 from orthocas.tools.cached import BuiltOnUse, cached_property
 from orthocas.tools.checks import Array, Indices
 
@@ -100,13 +101,13 @@ class Starts:
         if relative is None or not relative.turned:
             return normalised
         first, last = relative.first, relative.task.m
-        orientations = relative.embedded(phi[:, :last]) / self._range[1][first:last].mean()
+        orientations = relative.embed(phi[:, :last]) / self._range[1][first:last].mean()
         return np.concatenate([normalised[:, :first], orientations, normalised[:, last:]], axis=1)
 
     @cached_property
     def _table(self) -> tuple[Array, Array]:
         """Points of the domain where phi is defined, and phi, (K, n) each."""
-        return where_known(self._map, sample_heavily(self._domain, RULES.points, RULES.seed))
+        return where_known(self._map, sample_boundary_weighted(self._domain, RULES.points, RULES.seed))
 
     @cached_property
     def _range(self) -> tuple[Array, Array]:

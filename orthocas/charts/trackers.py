@@ -12,7 +12,7 @@ from orthocas.charts.descent import rooms_of
 from orthocas.charts.newton import NEWTON, Bound, PointFunctions, PointSolver
 from orthocas.charts.phi import PhiMap, leave_over
 from orthocas.errors import InvalidValueError, degrees_hint
-from orthocas.tasks.domains import Domain, bounds_of, contains, reach
+from orthocas.tasks.domains import Domain
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, as_float_array, as_point, require_shape
@@ -132,8 +132,8 @@ class Tracker(Shown):
             InvalidValueError: if q lies outside the domain, or J is singular there.
         """
         point = as_point("q", q, len(self._limit))
-        if not contains(self._domain, point):
-            hint = degrees_hint(*point[np.isfinite(bounds_of(self._domain)[0])])
+        if not self._domain.contains(point):
+            hint = degrees_hint(*point[np.isfinite(self._domain.bounds[0])])
             raise InvalidValueError("q", point.tolist(), f"a point of the domain{hint}")
         self._solver.q[:] = point
         if not self._solver.refresh():
@@ -194,7 +194,7 @@ class Tracker(Shown):
 def _guard(domain: Domain, limit: Array) -> ca.Function:
     """q before, q -> the largest change relative to its limit, and a number > 0 outside the domain."""
     before, q = (ca.MX.sym(name, len(limit)) for name in ("before", "q"))
-    outside = ca.mmax(ca.fabs(q - ca.DM(domain.centre)) - ca.DM(reach(domain)))
+    outside = ca.mmax(ca.fabs(q - ca.DM(domain.centre)) - ca.DM(domain.reach))
     if domain.condition is not None:
         outside = ca.fmax(outside, ca.if_else(ca.mmin(domain.condition.pivots(q)) > 0, -1, 1))
     return dense_function("guard", [before, q], [ca.vertcat(ca.norm_inf((q - before) / ca.DM(limit)), outside)])
@@ -258,7 +258,7 @@ class ReachingTracker(Tracker):
         self._at, self._to, self._e, self._rooms = np.empty(n), np.empty(n), np.empty(n), np.empty(rooms)
         self._J, self._slopes = np.empty((n, n)), np.empty((n, rooms))
         self._near = Bound(near, [self._at, self._to], [self._e, self._J, self._rooms, self._slopes])
-        self._width, ends = domain.half_width, reach(domain) - RULES.joint_room * domain.half_width
+        self._width, ends = domain.half_width, domain.reach - RULES.joint_room * domain.half_width
         self._low, self._high = domain.centre - ends, domain.centre + ends
 
     def __getstate__(self) -> dict[str, Any]:

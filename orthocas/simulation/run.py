@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.control.controller import Controller, counted_function, require_controller
+from orthocas.control.controller import Controller, get_counted_function, require_controller
 from orthocas.control.memory import memory_of
 from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
@@ -24,7 +24,7 @@ from orthocas.simulation.physics import LawWithMemory, SupervisedLaw, law_in_tic
 from orthocas.simulation.trajectory import Outcome, Trajectory
 from orthocas.tools.batch import THREADS, Batched
 from orthocas.tools.checks import Array, as_number, as_point, require_executor, require_kind, require_known
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 from orthocas.tools.progress import Monitor, Progress, silent
 
 _MOST_TICKS = 1e7  # of a sampled run
@@ -267,7 +267,7 @@ class Prepared:
         controller = self.loop.controller
         if name == "measured":
             return Batched(controller.measured)(*arguments)
-        function = counted_function(controller, "function" if name == "command" else "energy")
+        function = get_counted_function(controller, "function" if name == "command" else "energy")
         assert function is not None
         gains = [np.tile(gain, (len(arguments[0]), 1)) for gain in controller.gains.values()]
         return Batched(function)(*arguments, *gains)
@@ -304,7 +304,7 @@ def _near(controller: Controller, value: Array, wanted: Array) -> Array:
     chart = controller.chart
     if chart is None or controller.labels != chart.labels:
         return value
-    return np.asarray(wanted + shortest(value - wanted, chart.turns)) if chart.turns.any() else value
+    return np.asarray(wanted + wrap_shortest(value - wanted, chart.turns)) if chart.turns.any() else value
 
 
 def simulate(

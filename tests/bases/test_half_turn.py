@@ -15,8 +15,7 @@ import orthocas as oc
 from orthocas import control
 from orthocas.charts.inverse import InverseStatus
 from orthocas.charts.trackers import TrackerStatus
-from orthocas.codegen.library import CompiledLibrary, compile_shared
-from orthocas.codegen.supervisor import Supervisor
+from orthocas.codegen.library import CompiledLibrary, Supervisor, compile_shared
 from orthocas.control.controller import ControlStatus
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.tasks.relative import Relative
@@ -136,9 +135,9 @@ def test_derivatives_of_errors_are_finite_differences(kind: str) -> None:
     symbols = [ca.MX.sym(name, size) for name, size in (("q", 7), ("x_d", m), ("dx", m), ("ddx", m))]
     Q, X, V, A = symbols
     e, J = relative.error(Q, X)
-    rate = J @ ca.DM(w) - relative.drift(Q, X, V)
-    bend = relative.bend(Q, ca.DM(dq), ca.DM(w), (X, V, A))
-    run = ca.Function("run", symbols, [e, J, relative.drift(Q, X, V), rate, bend])
+    rate = J @ ca.DM(w) - relative.compute_drift(Q, X, V)
+    bend = relative.compute_bias(Q, ca.DM(dq), ca.DM(w), (X, V, A))
+    run = ca.Function("run", symbols, [e, J, relative.compute_drift(Q, X, V), rate, bend])
 
     def along(s: float, k: int, rest: bool = False, still: bool = False) -> Numbers:
         here = q if rest else q + s * dq
@@ -210,7 +209,7 @@ def test_paths_of_two_full_turns_are_followed() -> None:
     ]
     for motion, known in zip(motions, (chart(), chart(turned_deg=100.0)), strict=True):
         np.testing.assert_allclose(
-            known.parts.phi_map.difference(known.phi(motion.q), np.hstack([motion.x, motion.xi])), 0, atol=1e-9
+            known.phi_map.difference(known.phi(motion.q), np.hstack([motion.x, motion.xi])), 0, atol=1e-9
         )
         speed = np.gradient(motion.q, motion.times, axis=0, edge_order=2)
         np.testing.assert_allclose(speed[2:-2], motion.dq[2:-2], atol=0.02 * np.abs(motion.dq).max())
@@ -344,7 +343,7 @@ def test_jumps_of_orientations_do_not_lead_the_law(tmp_path: Path) -> None:
     R, position = task.orientation_of(home[:6]), home[:3]
 
     def led(value: np.ndarray) -> np.ndarray:
-        error = np.concatenate([known.parts.relative.difference(value[:6], home[:6]), value[6:] - home[6:]])
+        error = np.concatenate([known.relative.difference(value[:6], home[:6]), value[6:] - home[6:]])
         return error + supervisor.offset
 
     for _ in range(300):  # the law takes over

@@ -10,7 +10,7 @@ from public_objects import clear
 import orthocas as oc
 from orthocas.charts.descent import Programs, solve_programs
 from orthocas.fitting.fit import Fit
-from orthocas.tasks.domains import bounds_of, sample_uniform
+from orthocas.tasks.samples import sample_uniform
 
 FOUND, NEAREST = oc.InverseStatus.FOUND, oc.InverseStatus.NEAREST
 
@@ -80,7 +80,7 @@ def test_descents_end_as_near_as_ipopt(iiwa_fit: Fit) -> None:
 
 def by_ipopt(chart: oc.Chart, phi: np.ndarray, starts: np.ndarray) -> np.ndarray:
     """Where Ipopt ends from starts (N, n) with the task values kept."""
-    low, high = bounds_of(chart.problem.domain)
+    low, high = chart.problem.domain.bounds
     q, target = ca.MX.sym("q", chart.n), ca.MX.sym("phi", chart.n)
     error = chart.function("phi")(q) - target
     program = {"x": q, "p": target, "f": ca.sumsqr(error[chart.m :]) / 2, "g": error[: chart.m]}

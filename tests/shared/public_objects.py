@@ -20,7 +20,7 @@ from orthocas.codegen.compiled_inverse import CompiledInverse
 from orthocas.control import Controller, Reference
 from orthocas.fitting.compare import Comparison
 from orthocas.fitting.fit import ClearPart, Fit
-from orthocas.robots.tree import on_moving_base
+from orthocas.robots.tree import place_on_base
 from orthocas.simulation import (
     Elasticity,
     Friction,
@@ -34,9 +34,8 @@ from orthocas.simulation import (
     coupling_index,
     simulate,
 )
-from orthocas.tasks.domains import sample_uniform
-from orthocas.tasks.metric import Metric, metric_matrices
-from orthocas.tasks.samples import sample_problem
+from orthocas.tasks.metric import Metric
+from orthocas.tasks.samples import sample_problem, sample_uniform
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
 
@@ -235,6 +234,7 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "task": lambda: planar().task,
     "run-time model": run_time_model,
     "momentum observer": control.MomentumObserver,
+    "ticks of a law without a memory": lambda: control.Remembering(control.Kinematic(fitted().chart, 1.0)),
     "law in ticks": lambda: control.Remembering(CONTROLLERS["PD+ with a memory"]()),
     "law without a memory in ticks": lambda: control.Remembering(CONTROLLERS["PD+"]()),
     **({"compiled inverse": compiled} if HAS_COMPILER else {}),
@@ -267,9 +267,9 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "task of a frame in another": lambda: oc.Task.relative_pose(planar().robot, "tip", "tip"),
     "stacked tasks": lambda: oc.Task.stack(oc.Task.position(planar().robot, "x"), oc.Task.axis(planar().robot)),
     "fit with a meaning": lambda: oc.fit(planar(), oc.Polynomial(1), like="q3", samples=200),
-    "robot on a rail": lambda: oc.Robot(on_moving_base(planar().robot.tree, "rail:x", 1.0, np.zeros(3), np.eye(3))),
+    "robot on a rail": lambda: oc.Robot(place_on_base(planar().robot.tree, "rail:x", 1.0, np.zeros(3), np.eye(3))),
     "robot that floats": lambda: oc.Robot(
-        on_moving_base(planar().robot.tree, "floating:xy", 1.0, np.zeros(3), np.eye(3))
+        place_on_base(planar().robot.tree, "floating:xy", 1.0, np.zeros(3), np.eye(3))
     ),
     "task of a quadratic program": lambda: oc.control.XiTask(fitted().chart, cost=1.0),
     "mobile": lambda: oc.Mobile(oc.Polynomial(2)),
@@ -393,7 +393,7 @@ def _of_task(task: oc.Task) -> Iterator[Any]:
 @_numbers.register
 def _of_problem(problem: oc.Problem) -> Iterator[Any]:
     yield from (*_numbers(problem.task), *_numbers(problem.robot), *_numbers(problem.domain), problem.name)
-    yield metric_matrices(problem.metric, sample_uniform(problem.domain, 5, 0))
+    yield problem.metric.evaluate(sample_uniform(problem.domain, 5, 0))
 
 
 @_numbers.register
