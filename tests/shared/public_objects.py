@@ -236,7 +236,6 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "momentum observer": control.MomentumObserver,
     "ticks of a law without a memory": lambda: control.Remembering(control.Kinematic(fitted().chart, 1.0)),
     "law in ticks": lambda: control.Remembering(CONTROLLERS["PD+ with a memory"]()),
-    "law without a memory in ticks": lambda: control.Remembering(CONTROLLERS["PD+"]()),
     **({"compiled inverse": compiled} if HAS_COMPILER else {}),
     "safety": lambda: control.Safety.of(impedance(), fade_in=0.1),
     "modes": lambda: impedance().modes(),
