@@ -86,7 +86,9 @@ def moved(chart: oc.Chart, q: Array, target: Array, stick: Array) -> Array:
     m, here, none = chart.m, np.array(chart.phi(q)), np.zeros(chart.m)
     change = PERIOD * SPEEDS * np.where(np.abs(stick) < DEAD, 0.0, np.clip(stick, -1.0, 1.0))
     ahead = np.clip(chart.parts.phi_map.difference(target[None], here[None])[0] + change, -LEAD, LEAD)
-    x = chart.parts.relative.moved(here[:m], ahead[:m], here[:m], none, none)[0]  # orientations turn about the hand's axes
+    x = chart.parts.relative.moved(here[:m], ahead[:m], here[:m], none, none)[
+        0
+    ]  # orientations turn about the hand's axes
     return np.concatenate([np.array(x).ravel(), here[m:] + ahead[m:]])
 
 

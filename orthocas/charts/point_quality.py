@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from orthocas.charts.angles import MOST_JOINTS, judge_by_columns, judge_by_lapack
 from orthocas.charts.coordinates import CoordinateMap
 from orthocas.errors import SingularTaskError
-from orthocas.tasks.domains import Domain, contains
+from orthocas.tasks.domains import Domain
 from orthocas.tasks.problem import Problem, measure_half_turn_distance
 from orthocas.tasks.samples import Samples, evaluate_samples, sample_boundary_weighted
 from orthocas.tools.batch import run_in_threads
@@ -152,7 +152,7 @@ def point_quality(problem: Problem, coordinates: CoordinateMap, points: Array) -
     conditioning[judged.kept] = judged.conditioning
     lower, upper = problem.domain.bounds
     distance = np.minimum(points - lower, upper - points).min(axis=1)
-    distance = np.where(contains(problem.domain, points), distance, np.minimum(distance, 0.0))  # too near a singularity
+    distance = np.where(problem.domain.contains(points), distance, np.minimum(distance, 0.0))  # too near a singularity
     return PointQuality(leak, conditioning, distance)
 
 
@@ -218,7 +218,7 @@ def least_in_domain(value: Value, domain: Domain, seed: int = 0) -> Array:
 
     def inside(u: Array) -> Array:
         q = domain.centre + domain.half_width * u
-        return np.where(contains(domain, q), value(q), np.nan)
+        return np.where(domain.contains(q), value(q), np.nan)
 
     u, _ = descended(inside, (points - domain.centre) / domain.half_width, value(points), seed, thorough=True)
     best: Array = domain.centre + domain.half_width * u[0]
@@ -264,7 +264,7 @@ def _step(value: Value, u: Array, found: Array, step: Array, rng: np.random.Gene
 def _signed_conditioning(problem: Problem, coordinates: CoordinateMap, u: Array) -> Array:
     """Conditioning times the sign of det J at points of the cube, (N,); NaN outside the domain."""
     points, values = _joint_positions(problem, u), np.full(len(u), np.nan)
-    inside = np.flatnonzero(contains(problem.domain, points))
+    inside = np.flatnonzero(problem.domain.contains(points))
     try:
         judged = Judged.at(problem, coordinates, points[inside])
     except SingularTaskError:  # for example at half a turn

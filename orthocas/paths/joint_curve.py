@@ -172,7 +172,7 @@ class TimeLaw:
         return np.clip(s, 0.0, 1.0), np.maximum(self.speed[k] + acceleration * since, 0.0), acceleration
 
 
-def checked_places() -> Array:
+def list_places() -> Array:
     """The parameters s at which `fastest` wants q' and q'', (P,)."""
     return np.linspace(0.0, 1.0, _BINS * _PLACES)
 
@@ -237,5 +237,5 @@ def _worst(values: Array) -> Indices:
 def _basis(k: Indices, knots: Array) -> tuple[coo_array, coo_array]:
     """Values and derivatives of the basis at places k (P,), (P, size) each."""
     basis = BSpline(knots, np.eye(len(knots) - _DEGREE - 1), _DEGREE)
-    s = checked_places()[k]
+    s = list_places()[k]
     return coo_array(np.asarray(basis(s))), coo_array(np.asarray(basis.derivative()(s)))
