@@ -20,7 +20,7 @@ from orthocas import problems
 from orthocas.bases import JointSpace, LinearFamily
 from orthocas.fitting.basis_gradients import gradients_of
 from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.fitting.dense_objectives import ArrayObjective
+from orthocas.fitting.network_objective import ArrayObjective
 from orthocas.fitting.terms import Weights
 from orthocas.tasks.samples import sample_problem
 from orthocas.tools.batch import one_blas_thread

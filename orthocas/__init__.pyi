@@ -49,8 +49,8 @@ from orthocas.fitting.compare import compare as compare
 from orthocas.fitting.distil import distil as distil
 from orthocas.fitting.fit import Fit as Fit
 from orthocas.fitting.fit import fit as fit
+from orthocas.fitting.loss import loss as loss
 from orthocas.fitting.suggest_domain import suggest_domain as suggest_domain
-from orthocas.fitting.symbolic_loss import loss as loss
 from orthocas.fitting.terms import Weights as Weights
 from orthocas.fitting.terms import register_loss_term as register_loss_term
 from orthocas.fitting.wide import WideFit as WideFit

@@ -11,10 +11,10 @@ from orthocas.bases import JointSpace
 from orthocas.charts.point_quality import Judged, least_in_domain, worst_points
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.fit import Fit
-from orthocas.fitting.residuals import Loss, sample_loss
+from orthocas.fitting.loss import Loss, sample_loss
 from orthocas.fitting.stages import FoldSearch
 from orthocas.fitting.starts import Mirror, find_mirror
-from orthocas.fitting.terms import LEAST_CONDITIONING, Sizes, Weights
+from orthocas.fitting.terms import RULES, Sizes, Weights
 from orthocas.tasks.domains import sample_heavily
 from orthocas.tasks.samples import sample_problem
 
@@ -118,7 +118,7 @@ def test_fold_term_acts_at_collected_points_with_its_exact_gradient(iiwa: oc.Pro
     unsafe = oc.fit(iiwa, oc.Polynomial(2), weights=Weights(folds=0))
     folds = FoldSearch(iiwa, ACTIVE, 1000.0)
     folds.search(unsafe.stages[-1], oc.Polynomial(2), 0, lambda progress: None)
-    assert folds.least < LEAST_CONDITIONING
+    assert folds.least < RULES.least_conditioning
     family = unsafe.chart.coordinates.family
     theta = unsafe.stages[-1].result.theta
     samples = sample_problem(iiwa, 300, 4).restricted_to(ACTIVE)

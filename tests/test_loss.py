@@ -10,11 +10,10 @@ import orthocas as oc
 from orthocas.bases import JointSpace
 from orthocas.cli.problem_argument import parse_weights
 from orthocas.errors import InvalidValueError, ShapeError
-from orthocas.fitting import dense_objectives
+from orthocas.fitting import network_objective
 from orthocas.fitting.basis_gradients import gradients_of
 from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.fitting.dense_objectives import ArrayObjective, GraphObjective
-from orthocas.fitting.residuals import (
+from orthocas.fitting.loss import (
     Loss,
     loss_columns,
     loss_with_slopes,
@@ -22,9 +21,10 @@ from orthocas.fitting.residuals import (
     sample_loss,
     value_columns,
 )
+from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
 from orthocas.fitting.starts import spectral_start
 from orthocas.fitting.terms import (
-    REGULAR_VOLUME,
+    RULES,
     Sizes,
     Weights,
     gradient_volume,
@@ -60,7 +60,7 @@ def loss_by_hand(J_x: np.ndarray, J_xi: np.ndarray, B: np.ndarray, weights: Weig
     across[-1] *= np.sign(np.linalg.det(np.vstack([white_task, across])))
     volume = sign * np.linalg.det(white @ across.T)
     total += weights.length / (2 * r) * (np.log(np.linalg.norm(J_xi, axis=1)) ** 2).sum()
-    return float(total + weights.regularity / 2 * max(REGULAR_VOLUME - volume, 0) ** 2)
+    return float(total + weights.regularity / 2 * max(RULES.regular_volume - volume, 0) ** 2)
 
 
 def draw_from(problem: oc.Problem) -> Draw:
@@ -139,7 +139,7 @@ def test_graph_cut_into_blocks_gives_the_same_loss(planar_x: oc.Problem, monkeyp
     family = oc.MLP((6, 5)).family(JointSpace.of(planar_x), 2)
     settings = (family, sample_problem(planar_x, 50, 2), REGULAR, family.initial(1), draw_from(planar_x))
     value, gradient = GraphObjective(*settings).value_and_gradient(family.initial(1))
-    monkeypatch.setattr(dense_objectives, "_CHUNK_ENTRIES", 7 * 2 * family.width)  # blocks of 7, 1 left over
+    monkeypatch.setattr(network_objective, "_CHUNK_ENTRIES", 7 * 2 * family.width)  # blocks of 7, 1 left over
     blocked = GraphObjective(*settings)
     assert len(blocked._blocks) == 8
     np.testing.assert_allclose(blocked.value_and_gradient(family.initial(1))[0], value, rtol=1e-13)

@@ -81,14 +81,6 @@ class BasisGradients(ABC):
         J: Array = rows.reshape(B, self.n, len(C), c).transpose(0, 3, 2, 1).reshape(B * c, len(C), self.n)
         return J[:samples]
 
-    def pullback(self, X: Array, slopes: Array) -> Array:
-        """dL/dC, (r, K), of a function L of J_xi at all samples, with slopes dL/dJ_xi (N, r, n)."""
-        B, g, _, c = X.shape
-        padded = np.zeros((B * c, self.n * slopes.shape[1]))
-        padded[: len(slopes)] = slopes.transpose(0, 2, 1).reshape(len(slopes), -1)
-        rows = padded.reshape(B, c, g, -1).transpose(0, 2, 3, 1)  # (B, g, n r / g, c)
-        return self.collected(np.matmul(rows, X.transpose(0, 1, 3, 2)).sum(axis=0))
-
     def along(self, X: Array, directions: Array) -> Array:
         """Derivatives a . d psi / dq along directions a (N, n) at samples, (N, K)."""
         found, c = [], X.shape[3]

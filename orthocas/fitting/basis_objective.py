@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from orthocas.bases.family import LinearFamily
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
-from orthocas.fitting.residuals import Loss, Pairs, curvature_columns, loss_columns, residual_columns, value_columns
-from orthocas.fitting.terms import Sizes, Weights
+from orthocas.fitting.loss import Loss, curvature_columns, loss_columns, residual_columns, value_columns
+from orthocas.fitting.terms import Pairs, Sizes, Weights
 from orthocas.tasks.samples import Draw, Samples, even_parts
 from orthocas.tools.batch import in_threads, in_threads_with, thread_count
 from orthocas.tools.checks import Array
@@ -110,6 +110,7 @@ class BasisObjective:
             C and J_xi are those of the components.
         gradients: gradients of the basis, if they are known already, or of another type than float64; products with
             them are computed with numbers of that type. Default: those of the family.
+        orientation: sign of the volume of the coordinates that the regularity term keeps. Default: that of the start.
     """
 
     def __init__(
@@ -122,6 +123,7 @@ class BasisObjective:
         kept: NDArray[np.bool_] | None = None,
         exchanged: Pairs = (),
         gradients: BasisGradients | None = None,
+        orientation: float | None = None,
     ) -> None:
         self.family, self.weights, self._draw = family, weights, draw
         self.r, self.K = family.outputs, family.width
@@ -129,12 +131,13 @@ class BasisObjective:
         m, self.n = samples.task_jacobian.shape[1:]
         self._gradients = gradients_of(family, self.n) if gradients is None else gradients
         self._loss = Loss.of(Sizes(self.n, m, self.r, samples.metric_inverse is None), weights.by_name, exchanged)
-        self._begin(samples, start)
+        self._begin(samples, start, orientation)
 
-    def _begin(self, samples: Samples, start: Array) -> None:
+    def _begin(self, samples: Samples, start: Array, orientation: float | None = None) -> None:
         self._put(samples)
-        oriented = self._loss.oriented or self.weights.folds > 0
-        self._orientation = samples.orientation(self.coordinate_jacobians(start)) if oriented else None
+        self._orientation = orientation
+        if orientation is None and (self._loss.oriented or self.weights.folds > 0):
+            self._orientation = samples.orientation(self.coordinate_jacobians(start))
         self._describe(samples)
 
     def _put(self, samples: Samples) -> None:

@@ -8,7 +8,8 @@ import numpy as np
 from orthocas.bases.family import GradedParametrisation, Parametrisation
 from orthocas.bases.products import Polynomial
 from orthocas.errors import InvalidValueError
-from orthocas.fitting.like import WEIGHT, Like, Likeness, LikeTerm
+from orthocas.fitting.like import RULES as LIKE_RULES
+from orthocas.fitting.like import Like, Likeness, LikeTerm
 from orthocas.fitting.terms import WeightNumbers, Weights, register_loss_term
 from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.ipopt import Ipopt
@@ -86,7 +87,7 @@ class FitSettings:
     def with_term(self, term: LikeTerm) -> Self:
         """The settings with the term that holds coordinates to quantities among the weights."""
         register_loss_term(term)
-        return replace(self, weights=replace(self.weights, extra={**self.weights.extra, term.name: WEIGHT}))
+        return replace(self, weights=replace(self.weights, extra={**self.weights.extra, term.name: LIKE_RULES.weight}))
 
     @property
     def single(self) -> bool:

@@ -3,7 +3,9 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import reduce
 from math import ceil
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,22 +26,13 @@ from orthocas.charts.point_quality import WorstPoints, worst_points
 from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
 from orthocas.fitting.basis_objective import STRIDE, BasisObjective, BoundedMutual, expanded
-from orthocas.fitting.dense_objectives import ArrayObjective, GraphObjective
 from orthocas.fitting.like import LikeTerm
+from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
 from orthocas.fitting.settings import FitSettings
 from orthocas.fitting.starts import Mirror, find_mirror, spectral_start
-from orthocas.fitting.terms import DEFAULT_WEIGHTS, FOLD_TERM, LEAST_CONDITIONING
+from orthocas.fitting.terms import DEFAULT_WEIGHTS, FOLD_TERM, RULES
 from orthocas.solvers.gauss_newton import GaussNewton
-from orthocas.solvers.protocol import (
-    EstimatedObjective,
-    LeastSquaresObjective,
-    Objective,
-    SampledObjective,
-    SmoothObjective,
-    Solver,
-    SolveResult,
-    Status,
-)
+from orthocas.solvers.protocol import Objective, SampledObjective, Solver, SolveResult, Status
 from orthocas.tasks.domains import sample_evenly
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import Samples, sample_problem, samples_at
@@ -56,7 +49,7 @@ _FRESH = 2000  # seed tag of samples drawn while a solver runs; stages use other
 _SEARCHED = 3  # degree from which worst points are searched: those of lower degrees differ from the last ones
 _ROUNDS = 4  # of the last degree
 _LEAST_GAIN = 0.01  # of the conditioning in a round
-_COLLECTED = 1.5 * LEAST_CONDITIONING  # points below it are collected, before they become worse
+_COLLECTED = 1.5 * RULES.least_conditioning  # points below it are collected, before they become worse
 Begin = Callable[[ProductFamily], Array | None]  #: parameters to start from, (size,), if some are known
 
 
@@ -159,7 +152,7 @@ class Continuation:
         """Solve the last step again until there is no point of small conditioning."""
         folds, before = self._runner.folds, 0.0
         for k in range(2, 2 + _ROUNDS):
-            if folds.least >= LEAST_CONDITIONING or 0 <= folds.least < before + _LEAST_GAIN:
+            if folds.least >= RULES.least_conditioning or 0 <= folds.least < before + _LEAST_GAIN:
                 break
             before = folds.least
             self._solve(step, f"{step.label}, round {k}", final=True)
@@ -210,53 +203,89 @@ class FoldSearch:
             return objective
         samples = samples_at(self._problem, self._points).restricted_to(self._active)
         penalty = objective.elsewhere(samples, {FOLD_TERM.name: self._weight})
-        return _LinearSum(objective, penalty) if isinstance(objective, BasisObjective) else _Sum(objective, penalty)
+        return (LinearSum if isinstance(objective, BasisObjective) else WeightedSum)([(1.0, objective), (1.0, penalty)])
 
 
-class _Sum:
-    """A loss on samples of the domain plus a penalty on fixed points."""
+class WeightedSum:
+    """A sum of losses of the same parameters on several sets of samples, each times a weight.
 
-    def __init__(self, loss: Objective, penalty: Objective) -> None:
-        self._loss, self._penalty = loss, penalty
+    Only the first one may draw fresh samples, such as the loss on the domain beside a penalty on its worst points.
+    """
+
+    def __init__(self, parts: Sequence[tuple[float, Objective]]) -> None:
+        self.parts = parts
 
     def value(self, theta: Array) -> float:
-        """Loss plus the penalty of points that fold, at theta (p,)."""
-        return self._loss.value(theta) + self._penalty.value(theta)
+        """The sum at theta (size,)."""
+        return sum(weight * part.value(theta) for weight, part in self.parts)
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
-        """Loss and penalty, and their gradient."""
-        (value, gradient), (more, slope) = (part.value_and_gradient(theta) for part in (self._loss, self._penalty))
-        return value + more, gradient + slope
+        """The sum and its gradient, (size,)."""
+        results = [(weight, *part.value_and_gradient(theta)) for weight, part in self.parts]
+        value = sum(weight * value for weight, value, _ in results)
+        return value, _add([weight * slope for weight, _, slope in results])
 
-    def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator["_Sum"]:
-        """The loss on fresh samples, each time with the same penalty."""
-        assert isinstance(self._loss, SampledObjective)
-        for loss in self._loss.batches(size, count, seed):
-            yield type(self)(loss, self._penalty)
+    def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
+        """The first loss on fresh samples, each time with the same others."""
+        (weight, first), *others = self.parts
+        assert isinstance(first, SampledObjective)
+        for loss in first.batches(size, count, seed):
+            yield type(self)([(weight, loss), *others])
 
 
-class _LinearSum(_Sum):
+class LinearSum(WeightedSum):
     """The same for families linear in theta, with second derivatives."""
 
     def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
-        """Loss and penalty, their gradient and their Gauss-Newton matrix."""
-        assert isinstance(self._loss, LeastSquaresObjective)
-        assert isinstance(self._penalty, LeastSquaresObjective)
-        value, gradient, H = self._loss.normal_equations(theta)
-        more, slope, curvature = self._penalty.normal_equations(theta)
-        return value + more, gradient + slope, H + curvature
+        """The sum, its gradient and its Gauss-Newton matrix."""
+        results = [(weight, *part.normal_equations(theta)) for weight, part in self._least_squares]
+        value = sum(weight * value for weight, value, _, _ in results)
+        slopes = _add([weight * slope for weight, _, slope, _ in results])
+        return value, slopes, _add([weight * H for weight, *_, H in results])
 
     def curvature_estimate(self, theta: Array) -> Array:
-        """A rough Gauss-Newton matrix of loss and penalty."""
-        assert isinstance(self._loss, EstimatedObjective)
-        assert isinstance(self._penalty, EstimatedObjective)
-        return self._loss.curvature_estimate(theta) + self._penalty.curvature_estimate(theta)
+        """A rough Gauss-Newton matrix of the sum."""
+        return _add([weight * part.curvature_estimate(theta) for weight, part in self._least_squares])
 
     def hessian(self, theta: Array) -> Array:
-        """Hessian of loss and penalty."""
-        assert isinstance(self._loss, SmoothObjective)
-        assert isinstance(self._penalty, SmoothObjective)
-        return self._loss.hessian(theta) + self._penalty.hessian(theta)
+        """The Hessian of the sum."""
+        return _add([weight * part.hessian(theta) for weight, part in self._least_squares])
+
+    @property
+    def _least_squares(self) -> list[tuple[float, BasisObjective]]:
+        return [(weight, part) for weight, part in self.parts if isinstance(part, BasisObjective)]
+
+
+def _add(arrays: Sequence[Array]) -> Array:
+    return np.asarray(reduce(np.add, arrays))
+
+
+class Resampled:
+    """A loss of networks on some of its samples. Steps take others, drawn from all.
+
+    Args:
+        whole: the loss on all samples.
+        watched: places of the samples on which it is watched.
+        count: number of all samples.
+    """
+
+    def __init__(self, whole: ArrayObjective | GraphObjective, watched: NDArray[np.int_], count: int) -> None:
+        self._whole, self._count = whole, count
+        self._watched = whole.part(watched)
+
+    def value(self, theta: Array) -> float:
+        """The mean over the samples that are watched."""
+        return self._watched.value(theta)
+
+    def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
+        """The mean over the samples that are watched, and its gradient."""
+        return self._watched.value_and_gradient(theta)
+
+    def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Objective]:
+        """The mean over `size` samples drawn from all, `count` times."""
+        rng = np.random.default_rng(seed)
+        for _ in range(count):
+            yield self._whole.part(rng.integers(self._count, size=size))
 
 
 @dataclass(frozen=True, eq=False)

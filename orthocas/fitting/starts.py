@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from orthocas.bases.family import JointSpace, LinearFamily
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
-from orthocas.fitting.residuals import Pairs, coordinates_of
+from orthocas.fitting.terms import Pairs, coordinates_of
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import Samples, directions
 from orthocas.tools.cached import cached_property

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import casadi as ca
 import numpy as np
@@ -13,10 +13,23 @@ from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, as_float_array, as_number, require_kind, require_known, require_shape
 from orthocas.tools.expressions import MOST_ROWS, determinant
 
-REGULAR_VOLUME = 0.9  #: volume of the gradients below which the regularity term acts
-LEAST_CONDITIONING = 0.2  #: that fits aim at on the whole domain
-_NEARLY_FOLDED = 1e-4  # volume below which an inverse loses digits
-_FOLD_VOLUME = 1.6 * LEAST_CONDITIONING  # enough for it: det D <= sqrt(e) times the conditioning
+
+@dataclass(frozen=True, slots=True)
+class LossRules:
+    """Numbers of the terms of the loss."""
+
+    least_conditioning: float = 0.2  #: that fits aim at on the whole domain
+    regular_volume: float = 0.9  #: volume of the gradients below which the regularity term acts
+    fold_volume: float = 0.32  #: the same at the worst points: enough, as det D <= sqrt(e) times the conditioning
+    wide_volume: float = 0.5  #: volume that a wide fit asks for at its first samples
+    worst_volume: float = 0.3  #: the same once the worst samples have joined, and for networks
+    least_volume: float = 0.05  #: over r: bound of the domain of a wide chart, in the identity metric
+    beyond: float = 1.2  #: over that bound: the volume in the identity metric that is enough beside another metric
+    nearly_folded: float = 1e-4  #: volume below which an inverse loses digits
+    shortest: float = 1e-12  #: length of a gradient that counts as zero
+
+
+RULES = LossRules()
 Angles = Literal["paper", "metric"]
 ANGLES: tuple[Angles, ...] = ("paper", "metric")  #: kinds of angles in the loss
 
@@ -65,6 +78,17 @@ class LossTerm(Protocol):
     def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
         """J_xi (r, n) -> rho (k, 1), where k may be 0. The term adds weight |rho|^2 / 2 to the loss of a sample."""
         ...
+
+
+Pairs = tuple[tuple[int, int], ...]  #: rows of J_xi
+
+
+def coordinates_of(rows: Sequence[Any], exchanged: Pairs) -> list[Any]:
+    """Rows with (a + b) / sqrt 2 and (b - a) / sqrt 2 in place of the rows a, b of each pair: a rotation."""
+    turned = list(rows)
+    for i, j in exchanged:
+        turned[i], turned[j] = (rows[i] + rows[j]) * 0.5**0.5, (rows[j] - rows[i]) * 0.5**0.5
+    return turned
 
 
 def require_sample_data(name: str) -> None:
@@ -165,6 +189,20 @@ class LengthTerm:
     def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
         """Logarithms over sqrt(r), (r, 1)."""
         rho: ca.SX = (1 / sizes.r) ** 0.5 * log_lengths(coordinate_jacobian)
+        return rho
+
+
+@dataclass(frozen=True)
+class MetricLengthTerm:
+    """Sum over coordinates of log^2 |dxi_j| with the lengths of the metric: xi is a similar motion everywhere."""
+
+    name: str = "metric length"
+    data: tuple[str, ...] = ("metric_inverse",)
+    hinge: bool = False
+
+    def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
+        """Logarithms, (r, 1)."""
+        rho: ca.SX = ca.log(metric_lengths(coordinate_jacobian, data.get("metric_inverse")))
         return rho
 
 
@@ -300,7 +338,7 @@ def volume_hinges(J: Array, null_basis: Array, metric_inverse: Array | None, bou
 
 def _cofactors(D: Array, volume: Array) -> Array:
     """Cofactors of matrices (N, r, r) with these determinants: det D D^-T, or by singular values next to folds."""
-    cofactors, folded = np.empty(D.shape), np.abs(volume) < _NEARLY_FOLDED
+    cofactors, folded = np.empty(D.shape), np.abs(volume) < RULES.nearly_folded
     cofactors[~folded] = volume[~folded, None, None] * np.linalg.inv(D[~folded]).transpose(0, 2, 1)
     U, s, Vt = np.linalg.svd(D[folded])
     sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
@@ -311,21 +349,41 @@ def _cofactors(D: Array, volume: Array) -> Array:
 
 @dataclass(frozen=True)
 class RegularityTerm:
-    """max(bound - det D, 0)^2, where det D is the `gradient_volume`."""
+    """max(bound - det D, 0)^2, where det D is the `gradient_volume`.
+
+    Coordinates that are orthogonal in the inertia may be nearly parallel otherwise. A Euclidean term takes the volume
+    in the identity metric, and its bound is over r.
+    """
 
     name: str = "regularity"
-    bound: float = REGULAR_VOLUME
+    bound: float = RULES.regular_volume
     data: tuple[str, ...] = ("metric_inverse", "null_basis")
     hinge: bool = True
+    euclidean: bool = False
+
+    def bound_for(self, r: int) -> float:
+        """The bound for r coordinates."""
+        return self.bound / r if self.euclidean else self.bound
 
     def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
         """One residual, (1, 1)."""
-        volume = gradient_volume(coordinate_jacobian, data["null_basis"], data.get("metric_inverse"))
-        hinge: ca.SX = ca.fmax(self.bound - volume, 0)
+        Z, metric_inverse = data["null_basis"], data.get("metric_inverse")
+        if self.euclidean and metric_inverse is not None:
+            # a basis with the volume of an orthonormal one
+            columns = [Z[:, 0] / ca.sqrt(determinant(Z.T @ Z)), *(Z[:, k] for k in range(1, sizes.r))]
+            Z, metric_inverse = ca.horzcat(*columns), None
+        hinge: ca.SX = ca.fmax(self.bound_for(sizes.r) - gradient_volume(coordinate_jacobian, Z, metric_inverse), 0)
         return hinge
 
+    def hinges(self, J: Array, null_basis: Array, metric_inverse: Array | None) -> tuple[Array, Array]:
+        """The residual (N,) and its derivative with respect to J_xi (N, r, n), by LAPACK; see `volume_hinges`."""
+        if self.euclidean and metric_inverse is not None:
+            null_basis, metric_inverse = null_basis.copy(), None
+            null_basis[:, :, 0] /= np.sqrt(np.linalg.det(null_basis.transpose(0, 2, 1) @ null_basis))[:, None]
+        return volume_hinges(J, null_basis, metric_inverse, self.bound_for(J.shape[1]))
 
-FOLD_TERM = RegularityTerm("folds", _FOLD_VOLUME)  #: for the worst points of the domain only
+
+FOLD_TERM = RegularityTerm("folds", RULES.fold_volume)  #: for the worst points of the domain only
 
 _TERMS: dict[str, LossTerm] = {}
 
@@ -374,8 +432,14 @@ def term_of(name: str) -> LossTerm:
     return _TERMS[name]
 
 
+_OF_WIDE_FITS = (
+    RegularityTerm("volume", RULES.wide_volume),
+    RegularityTerm("volume with the worst", RULES.worst_volume),
+    RegularityTerm("euclidean volume", RULES.beyond * RULES.least_volume, euclidean=True),
+    MetricLengthTerm(),
+)
 _OURS = (MetricTaskTerm(), MetricMutualTerm(), LengthTerm(), RegularityTerm(), FOLD_TERM)
-for _term in (TaskTerm(), MutualTerm(), *_OURS):
+for _term in (TaskTerm(), MutualTerm(), *_OURS, *_OF_WIDE_FITS):
     register_loss_term(_term)
 
 WeightNumbers = Sequence[float]  #: two to five numbers: task, mutual, regularity, length, folds

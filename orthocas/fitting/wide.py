@@ -3,34 +3,36 @@
 import math
 import time
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.bases.cyclic import leaves_stay, over_cyclic_joints
-from orthocas.bases.family import ArrayFamily, CyclicParametrisation, JointSpace, LinearFamily, Parametrisation
+from orthocas.bases.family import CyclicParametrisation, JointSpace, LinearFamily, Parametrisation
 from orthocas.bases.mlp import MLP
 from orthocas.bases.products import Polynomial
+from orthocas.bases.registry import warn_unless_savable
 from orthocas.charts.chart import Chart
+from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import worst_points
 from orthocas.charts.regular_part import RegularPart
 from orthocas.errors import BranchWarning, DomainError, Interrupted, InvalidValueError
 from orthocas.fitting.fit import Fit, fix_gauge, normalise
-from orthocas.fitting.like import Like, Likeness
-from orthocas.fitting.meaning import Meaning, MeaningError
-from orthocas.fitting.regular_search import (
-    JUDGED,
-    BasisSearch,
-    IdleSearch,
-    NetworkSearch,
-    Search,
-    beside_the_middle,
-)
+from orthocas.fitting.like import Like, Likeness, Meaning, MeaningError
 from orthocas.fitting.settings import require_parametrisation
-from orthocas.fitting.volume_loss import LEAST_VOLUME
+from orthocas.fitting.terms import RULES as LOSS_RULES
+from orthocas.fitting.terms import Weights, term_of
+from orthocas.fitting.wide_search import (
+    RULES,
+    Search,
+    WideSettings,
+    WideSolution,
+    find_best,
+    is_on_side_of_centre,
+    search_families,
+)
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import require_driven
 from orthocas.solvers.protocol import Status
@@ -46,40 +48,7 @@ from orthocas.tools.display import number_list, percent
 from orthocas.tools.interrupts import remembered
 from orthocas.tools.progress import Monitor, silent
 
-CLEARANCE = 0.1  #: default least relative singular value
-DEGREE = 6
-_DEGREE_OF_ALL = 5  # where base and tool joints count like all others
-_NETWORK = MLP((64, 64, 64), raw=True)
-_FIRST, _FIRST_TAG = 200, 1000  # samples that scale coordinates, and their seed tag
-# of the positions that judge coordinates, those that are not regular; above these shares another family is tried:
-_POOR, _POOR_SEVERAL = 1e-3, 4e-3  # polynomials in all joints; the same with r > 1
-_VERY_POOR = 2e-2  # a network in place of these
-_STILL_POOR = 6e-3  # a network after these
-_STAGE = "whole branch"  # begins the names of stages
-_COUNTED_TAG = 3003  # seed tag of the positions of the branch that count for its share
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class WideFit(Fit):
-    """A chart of a branch, and how it was found."""
-
-    branch: Branch | None = None  #: the branch of the chart
-    regular_share: float = float("nan")  #: of the clear positions of the branch, the share in the domain, from samples
-    left_out: str = ""  #: what the fit left out of the branch from the start, and why
-    meaning: MeaningError | None = None  #: how far xi is from what it is like, for r = 1
-
-    def facts(self) -> dict[str, str]:
-        """The facts of a fit, with branch and regular share."""
-        known = super().facts()
-        branch = "" if self.branch is None else self.branch.name
-        share = percent(self.regular_share, 2)
-        own = {
-            "branch": branch,
-            "regular": f"{share} of the branch's clear positions (samples); the domain is this part",
-            **({"left out": self.left_out} if self.left_out else {}),
-            **({"meaning": f"{self.meaning.explained}: xi1, {self.chart.notes['meaning']}"} if self.meaning else {}),
-        }
-        return {"fit": known.pop("fit"), "problem": known.pop("problem"), **own, **known}
+CLEARANCE = RULES.clearance  #: default least relative singular value
 
 
 def fit_wide(
@@ -92,17 +61,18 @@ def fit_wide(
     parametrisation: Parametrisation | None = None,
     home: ArrayLike | str | None = None,
     like: Likeness | None = None,
+    weights: Weights | Mapping[str, float] | None = None,
     samples: int | None = None,
     seed: int = 0,
     monitor: Monitor = silent,
-) -> WideFit:
+) -> "WideFit":
     """Find coordinates that are regular on a whole branch of the joint range, and as orthogonal as that permits.
 
     Coordinates are regular where their volume v(q) is not zero: det of an orthonormal basis of the task's gradients and
     of the unit gradients of xi, all in the metric; for r = 1 it is the cosine between the gradient and the self-motion.
     The fit looks for the least
 
-        mean max(0, 1 - v(q) / t)^2 + 0.03 mean |log(l(q) / L)|^2
+        mean_q [ max(0, 1 - v(q) / t)^2 + 0.03 sum_j log^2(l_j(q) / L_j) ]
 
     over samples of the branch that are clear of singular positions, half of them uniform and half boundary-heavy. The
     second mean keeps the lengths l of gradients near one length, so that xi is a similar motion everywhere. The fit
@@ -147,9 +117,9 @@ def fit_wide(
             place, see `left_out`.
         metric: as in `Problem`.
         clearance: least relative singular value of the task, > 0; see `orthocas.ClearBox`.
-        parametrisation: a family that is linear in its parameters, or an MLP. Default: Polynomial(6), with one linear
-            term for each joint on whose position self-motions do not depend, such as the first and the last one; or
-            another one, see above.
+        parametrisation: a family, as in `fit`. Those that are not linear in their parameters descend like networks.
+            Default: Polynomial(6), with one linear term for each joint on whose position self-motions do not depend,
+            such as the first and the last one; or another one, see above.
         home: posture whose branch is meant, (n,) or its name. Default: as for `suggest_domain`.
         like: what coordinates are to be like: a function of an SX column q, the name of a joint, or "swivel", the angle
             of the elbow about the line from shoulder to wrist [rad]. With r = 1, xi then has nearly the values of that
@@ -157,6 +127,9 @@ def fit_wide(
             there. With r > 1, several are allowed, or a task of lower priority: the gradients of the first coordinates
             are held against the parts of theirs that are orthogonal to the task. Default: with shoulder, elbow and
             wrist and r = 1, the scale and the sense of the swivel there.
+        weights: weights of terms that join the loss, by name or as `Weights`, such as `Weights(task=0.1, mutual=0.0,
+            regularity=0.0)` for coordinates that are more orthogonal to the task, or `{"name": 0.1}` for a term of
+            `register_loss_term`. A search for folds has no place here. Default: none.
         samples: number of samples. Default: 30 for each function, 5,000 to 20,000; 100,000 for a network.
         seed: seed of the samples, and of the first network.
         monitor: called with progress.
@@ -189,35 +162,37 @@ def fit_wide(
     if not 0 < bound < np.inf:
         raise InvalidValueError("clearance", clearance, "positive and finite")
     require_count("seed", seed, least=0)
-    chosen = _chosen(robot, task, branch, home)
-    problem = _problem(robot, task, metric, chosen, bound)
-    meant = like is not None
-    wanted = _families(problem, meant) if parametrisation is None else (parametrisation,)
-    cases = [_case(problem, family, meant) for family in wanted]
+    chosen = _choose_branch(robot, task, branch, home)
+    problem = _build_problem(robot, task, metric, chosen, bound)
+    families = _default_families(problem, like) if parametrisation is None else (parametrisation,)
+    cases = [_prepare(problem, family, like) for family in families]
     problem, _ = cases[0]
     count = None if samples is None else require_count("samples", samples, least=2)
-    posture = chosen.posture if home is None else home_posture(robot, task, home).q
+    terms = None if weights is None else _check_weights(weights)
     meaning, quantities = None, None
     if problem.r == 1:
+        posture = chosen.posture if home is None else home_posture(robot, task, home).q
         meaning = Meaning.by_default(problem, posture) if like is None else Meaning.of(problem, like, posture)
     elif like is not None:
         quantities = Like.of(problem, like)
         quantities.require_at_most(problem.r)
-    idle = idle_joints(problem, sample_problem(problem, _FIRST, (seed, _FIRST_TAG)))[-problem.r :]
-    if len(idle) == problem.r and parametrisation is None and not meant:
-        meaning = None
-        searches: list[Search] = [IdleSearch(problem, cases[0][1], tuple(idle), seed, monitor)]
-    else:
-        searches = [_search(*case, count, seed, monitor, meaning, quantities) for case in cases]
+    settings = WideSettings(count, seed, monitor, terms, meaning, quantities)
+    idle = idle_joints(problem, sample_problem(problem, RULES.first, (seed, RULES.first_tag)))[-problem.r :]
     with remembered() as pressed:
-        finish = partial(_finished, searches, meaning, quantities, chosen, start)
-        try:
-            _run(searches)
-            result = finish(interrupted=pressed())
-        except KeyboardInterrupt:
-            if searches[0].best is None:
-                raise
-            result = finish(interrupted=True)
+        if len(idle) == problem.r and parametrisation is None and like is None:
+            none = np.zeros(0)
+            joints = Coordinates(cases[0][1], JointSpace.of(problem), tuple(idle), none, none, none)
+            solution = WideSolution(problem, joints, "none", 0, ())
+            result = _finish(solution, replace(settings, meaning=None), chosen, start, interrupted=pressed())
+        else:
+            searches = [Search(*case, settings) for case in cases]
+            try:
+                best = search_families(searches)
+                result = _finish(best.solution, settings, chosen, start, interrupted=pressed())
+            except KeyboardInterrupt:
+                if searches[0].best is None:
+                    raise
+                result = _finish(find_best(searches).solution, settings, chosen, start, interrupted=True)
         if result.status is Status.INTERRUPTED or pressed():
             raise Interrupted(result)
     if result.left_out:
@@ -225,94 +200,57 @@ def fit_wide(
     return result
 
 
-def _case(problem: Problem, family: Parametrisation, meant: bool) -> tuple[Problem, Parametrisation]:
+def _check_weights(weights: Weights | Mapping[str, float]) -> Weights:
+    """Weights of terms that join the loss."""
+    if isinstance(weights, Weights):
+        return weights
+    require_kind("weights", weights, Mapping)
+    return Weights(0.0, 0.0, 0.0, 0.0, 0.0, {name: weight for name, weight in weights.items() if term_of(name)})
+
+
+def _prepare(problem: Problem, family: Parametrisation, like: Likeness | None) -> tuple[Problem, Parametrisation]:
     """A problem and a family that suit each other."""
     require_parametrisation(family)
     family = family.for_problem(problem)
     if isinstance(family, CyclicParametrisation):
         problem = over_cyclic_joints(problem, tuple(family.cyclic))
-    kind = None if family.closed_form is not None else family.family(JointSpace.of(problem), problem.r)
-    if not isinstance(kind, LinearFamily | ArrayFamily):
-        known = "one that is linear in its parameters, or an MLP"
-        raise InvalidValueError("parametrisation", family.label, known)
-    if meant and not isinstance(kind, LinearFamily):
+    if family.closed_form is not None:
+        raise InvalidValueError("parametrisation", family.label, "one that is fitted, such as a polynomial, or an MLP")
+    if like is not None and not isinstance(family.family(JointSpace.of(problem), problem.r), LinearFamily):
         raise InvalidValueError("parametrisation", family.label, "one that is linear in its parameters, for like")
+    warn_unless_savable(family)
     return problem, family
 
 
-def _search(
-    problem: Problem,
-    family: Parametrisation,
-    samples: int | None,
-    seed: int,
-    monitor: Monitor,
-    meaning: Meaning | None,
-    quantities: Like | None,
-) -> Search:
-    """The search of a family."""
-    if isinstance(family.family(JointSpace.of(problem), problem.r), LinearFamily):
-        return BasisSearch(problem, family, samples, seed, monitor, meaning, quantities)
-    return NetworkSearch(problem, family, samples, seed, monitor)
-
-
-def _run(searches: Sequence[Search]) -> None:
-    """Search in the first family and, as long as results are poor, in others, then go on in the best one."""
-    first, *others = searches
-    first.begin(_STAGE)
-    missed, bad, _ = first.rank
-    if missed or bad > (_POOR if first.problem.r == 1 else _POOR_SEVERAL):
-        networks = [search for search in others if isinstance(search, NetworkSearch)]
-        polynomials = [search for search in others if isinstance(search, BasisSearch)]
-        for search in (*networks, *polynomials) if bad > _VERY_POOR else (*polynomials, *networks):
-            search.begin(f"{_STAGE}, network" if search in networks else f"{_STAGE}, all joints")
-            missed, bad, _ = search.rank
-            if not missed and (search in networks or bad <= _STILL_POOR):
-                break
-    _better(searches).go_on()
-
-
-def _better(searches: Sequence[Search]) -> Search:
-    """The search with the best coordinates."""
-    return min((search for search in searches if search.best is not None), key=lambda search: search.rank)
-
-
-def _finished(
-    searches: Sequence[Search],
-    meaning: Meaning | None,
-    quantities: Like | None,
-    branch: Branch,
-    start: float,
-    *,
-    interrupted: bool,
-) -> WideFit:
-    """The result of the best search, normalised and judged."""
-    search = _better(searches)
-    assert search.best is not None
-    clear, seed = search.problem, search.seed
+def _finish(
+    solution: WideSolution, settings: WideSettings, branch: Branch, start: float, *, interrupted: bool
+) -> "WideFit":
+    """The chart of a solution, normalised and evaluated."""
+    clear, raw, seed = solution.problem, solution.coordinates, settings.seed
+    meaning, quantities = settings.meaning, settings.quantities
     centre, status = clear.domain.centre, Status.INTERRUPTED if interrupted else Status.CONVERGED
-    if search.rank[0]:
+    if solution.misses_centre:
         if interrupted:
             raise KeyboardInterrupt
         wrong = f"in the middle of branch '{branch.name}', coordinates fold or have another sign than on most of it"
         raise DomainError(f"{wrong}: give a smaller box as branch, another branch, or another parametrisation")
-    first = sample_problem(clear, _FIRST, (seed, _FIRST_TAG))
-    raw = search.coordinates(search.best)
+    first = sample_problem(clear, RULES.first, (seed, RULES.first_tag))
     if meaning is not None:
         coordinates = meaning.named(raw)
     elif quantities is not None:
         coordinates = quantities.named(normalise(raw, centre, first), clear)
     else:
         coordinates = fix_gauge(normalise(raw, centre, first), centre) if len(raw.offset) else raw
-    domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
+    domain = RegularPart(clear.domain, coordinates, LOSS_RULES.least_volume / clear.r)
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
-    counted = clear_positions(clear.robot, clear.task, branch.box, JUDGED, (seed, _COUNTED_TAG))
+    counted = clear_positions(clear.robot, clear.task, branch.box, RULES.held_out, (seed, RULES.counted_tag))
     share = float(domain.contains(counted).mean()) if len(counted) else float("nan")
     error = None if meaning is None else meaning.error(problem, coordinates, seed)
     worst = worst_points(problem, coordinates, seed, thorough=True)
     notes: dict[str, str | float] = {
-        "solver": search.solver,
+        "solver": solution.solver,
         "seed": seed,
-        "samples": search.samples,
+        "samples": solution.samples,
         "status": status.value,
         "branch": branch.name,
         "share of the branch": share,
@@ -322,21 +260,44 @@ def _finished(
     }
     return WideFit(
         chart=Chart(problem, coordinates, notes),
-        stages=tuple(stage.interrupted() if interrupted else stage for stage in search.stages),
+        stages=tuple(stage.interrupted() if interrupted else stage for stage in solution.stages),
         problem_check=check(problem, seed=seed),
         idle_joints=tuple(problem.robot.joint_names[k] for k in coordinates.idle),
         worst=worst,
         seconds=time.perf_counter() - start,
         branch=branch,
         regular_share=share,
-        left_out=_left_out(clear, branch, counted),
+        left_out=_describe_left_out(clear, branch, counted),
         meaning=error,
         like={} if quantities is None else quantities.distances(problem, coordinates, seed),
     )
 
 
-def _chosen(robot: Robot, task: Task, branch: Branch | Box | str | None, home: ArrayLike | str | None) -> Branch:
-    """The branch that is meant."""
+@dataclass(frozen=True, eq=False, repr=False)
+class WideFit(Fit):
+    """A chart of a branch, and how it was found."""
+
+    branch: Branch | None = None  #: the branch of the chart
+    regular_share: float = float("nan")  #: of the clear positions of the branch, the share in the domain, from samples
+    left_out: str = ""  #: what the fit left out of the branch from the start, and why
+    meaning: MeaningError | None = None  #: how far xi is from what it is like, for r = 1
+
+    def facts(self) -> dict[str, str]:
+        """The facts of a fit, with branch and regular share."""
+        known = super().facts()
+        branch = "" if self.branch is None else self.branch.name
+        share = percent(self.regular_share, 2)
+        own = {
+            "branch": branch,
+            "regular": f"{share} of the branch's clear positions (samples); the domain is this part",
+            **({"left out": self.left_out} if self.left_out else {}),
+            **({"meaning": f"{self.meaning.explained}: xi1, {self.chart.notes['meaning']}"} if self.meaning else {}),
+        }
+        return {"fit": known.pop("fit"), "problem": known.pop("problem"), **own, **known}
+
+
+def _choose_branch(robot: Robot, task: Task, branch: Branch | Box | str | None, home: ArrayLike | str | None) -> Branch:
+    """The branch itself, by its name, or that of the home."""
     if isinstance(branch, Branch):
         return branch
     if isinstance(branch, Box):
@@ -347,7 +308,7 @@ def _chosen(robot: Robot, task: Task, branch: Branch | Box | str | None, home: A
     return found.of(home_posture(robot, task, home).q) or found[0]
 
 
-def _families(problem: Problem, meant: bool) -> tuple[Polynomial | MLP, ...]:
+def _default_families(problem: Problem, like: Likeness | None) -> tuple[Polynomial | MLP, ...]:
     """Polynomials that are linear in the joints on whose position the self-motions do not depend, by proof.
 
     Then those that are so in such slides without limits only, if there are others: a joint that turns has one turn.
@@ -358,15 +319,15 @@ def _families(problem: Problem, meant: bool) -> tuple[Polynomial | MLP, ...]:
     slides = robot.tree.prismatic
     endless = [k for k in free if slides[k] and np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
     names, fewer = (tuple(robot.joint_names[k] for k in joints) for joints in (free, endless))
-    found: list[Polynomial | MLP] = [Polynomial(DEGREE, names)]
+    families: list[Polynomial | MLP] = [Polynomial(RULES.degree, names)]
     if names != fewer:
-        found.append(Polynomial(_DEGREE_OF_ALL, fewer))
-    if not (meant or endless):
-        found.append(_NETWORK)
-    return tuple(found)
+        families.append(Polynomial(RULES.degree_of_all, fewer))
+    if like is None and not endless:
+        families.append(MLP(RULES.network, raw=True))
+    return tuple(families)
 
 
-def _problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Branch, clearance: float) -> Problem:
+def _build_problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Branch, clearance: float) -> Problem:
     """The problem on the clear part of a branch; if its middle is not clear, of the largest box whose middle is."""
     box = branch.box
     try:
@@ -384,14 +345,14 @@ def _problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Bran
     return Problem(robot, task, metric, domain, branch.name, clearance)
 
 
-def _left_out(problem: Problem, branch: Branch, counted: Array) -> str:
+def _describe_left_out(problem: Problem, branch: Branch, counted: Array) -> str:
     """What a problem leaves out of a branch, of which some positions (N, n) are clear; empty for nothing."""
     domain, reasons = problem.domain, []
     inside = np.asarray(Box(domain.centre, domain.half_width, domain.unbounded).contains(counted))
     if not inside.all():
         box = f"around q = ({number_list(domain.centre)}) with half-widths ({number_list(domain.half_width)})"
         reasons.append(f"its middle is not clear, so the chart has a smaller box, {box}")
-    beside = beside_the_middle(problem, counted)
+    beside = is_on_side_of_centre(problem, counted)
     if not beside.all():
         reasons.append("singular positions divide it, so the chart has one side of them")
     kept = percent(float((inside & beside).mean()))

@@ -8,9 +8,10 @@ from typing import NamedTuple, Self
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocas.bases.family import ArrayFamily, ArrayMemory, Family, Memories
-from orthocas.fitting.residuals import Loss, loss_columns, loss_with_slopes, value_columns
+from orthocas.fitting.loss import Loss, loss_columns, loss_with_slopes, value_columns
 from orthocas.fitting.terms import Sizes, Weights
 from orthocas.tasks.samples import Draw, Samples, even_parts
 from orthocas.tools.batch import in_threads, in_threads_with, thread_count
@@ -48,6 +49,7 @@ class ArrayObjective:
         start: parameters, (size,), whose orientation the regularity term keeps.
         draw: draws fresh samples.
         single: whether the products of the network are computed in single precision.
+        orientation: sign of the volume of the coordinates that the regularity term keeps. Default: that of the start.
     """
 
     def __init__(
@@ -58,14 +60,15 @@ class ArrayObjective:
         start: Array,
         draw: Draw,
         single: bool = False,
+        orientation: float | None = None,
     ) -> None:
         m, self.n = samples.task_jacobian.shape[1:]
         self.r, self._family, self._draw = family.outputs, family, draw
         self._single = single
         self._memories = Memories()
         self._loss = Loss.of(Sizes(self.n, m, self.r, samples.metric_inverse is None), weights.by_name)
-        self._orientation: float | None = None
-        if self._loss.oriented or weights.folds > 0:
+        self._orientation = orientation
+        if orientation is None and (self._loss.oriented or weights.folds > 0):
             some = samples[:_ORIENTING]
             self._orientation = some.orientation(family.pullback(some.points, start)[0])
         self._put(samples)
@@ -123,20 +126,29 @@ class ArrayObjective:
         other._put(samples)
         return other
 
+    def part(self, places: NDArray[np.int_]) -> Self:
+        """The same loss on some of its samples, which may repeat."""
+        other = copy(self)
+        other._divide(self._points[places], [array[places] for array in self._described])
+        return other
+
     def _rounded(self, theta: Array) -> Array:
         """Parameters with numbers of the type of the products."""
         return theta.astype(np.float32 if self._single else np.float64)
 
     def _put(self, samples: Samples) -> None:
+        self._divide(samples.points, samples.described(self._loss.data, self._orientation))
+
+    def _divide(self, points: Array, data: list[Array]) -> None:
         """Use these samples, in pieces of nearly equal size."""
-        N, most = len(samples), max(_LEAST, _ENTRIES // (self.r * self._family.width))
+        self._points, self._described = points, data
+        N, most = len(points), max(_LEAST, _ENTRIES // (self.r * self._family.width))
         size = ceil(N / ceil(N / most))
-        data = samples.described(self._loss.data, self._orientation)
         self._pieces = []
         for k in range(0, N, size):
-            points = samples.points[k : k + size]
             blocks = [blocked(array[k : k + size]) for array in data]
-            self._pieces.append(_Piece(points, blocks, shares(len(points)) * (len(points) / N)))
+            own = points[k : k + size]
+            self._pieces.append(_Piece(own, blocks, shares(len(own)) * (len(own) / N)))
 
 
 class GraphObjective:
@@ -148,14 +160,23 @@ class GraphObjective:
         weights: weights of the loss.
         start: parameters, (size,), whose orientation the regularity term keeps.
         draw: draws fresh samples.
+        orientation: sign of the volume of the coordinates that the regularity term keeps. Default: that of the start.
     """
 
-    def __init__(self, family: Family, samples: Samples, weights: Weights, start: Array, draw: Draw) -> None:
+    def __init__(
+        self,
+        family: Family,
+        samples: Samples,
+        weights: Weights,
+        start: Array,
+        draw: Draw,
+        orientation: float | None = None,
+    ) -> None:
         m, n = samples.task_jacobian.shape[1:]
         loss = Loss.of(Sizes(n, m, family.outputs, samples.metric_inverse is None), weights.by_name)
-        oriented = loss.oriented or weights.folds > 0
-        self._graphs, self._draw = _Graphs(family, loss), draw
-        self._orientation = _orientation(family, start, samples[:_ORIENTING]) if oriented else None
+        self._graphs, self._draw, self._orientation = _Graphs(family, loss), draw, orientation
+        if orientation is None and (loss.oriented or weights.folds > 0):
+            self._orientation = _orientation(family, start, samples[:_ORIENTING])
         self._put(samples, len(samples))
 
     def value(self, theta: Array) -> float:
@@ -186,13 +207,23 @@ class GraphObjective:
         other._put(samples, len(samples))
         return other
 
+    def part(self, places: NDArray[np.int_]) -> Self:
+        """The same loss on some of its samples, which may repeat."""
+        other = copy(self)
+        other._divide(self._points[places], self._entries[places], len(places))
+        return other
+
     def _put(self, samples: Samples, room: int) -> None:
+        described = samples.described(self._graphs.loss.data, self._orientation)
+        self._divide(samples.points, _entries(described, len(samples)), room)
+
+    def _divide(self, points: Array, entries: Array, room: int) -> None:
         """Use these samples. Graphs are built for `room` samples, so that smaller sets share them."""
-        entries = _entries(samples.described(self._graphs.loss.data, self._orientation), len(samples))
+        self._points, self._entries = points, entries
         graph = self._graphs.of_size(room)
         self._blocks = [
-            _Block.filled(graph, samples.points[k : k + graph.columns], entries[k : k + graph.columns], len(samples))
-            for k in range(0, len(samples), graph.columns)
+            _Block.filled(graph, points[k : k + graph.columns], entries[k : k + graph.columns], len(points))
+            for k in range(0, len(points), graph.columns)
         ]
 
 

@@ -1,4 +1,4 @@
-"""The loss of one sample as least squares in J_xi, and its derivatives on columns of samples."""
+"""The loss of a fit: as one CasADi expression of the parameters, and of one sample, as least squares in J_xi."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -8,14 +8,135 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
-from orthocas.fitting.terms import SAMPLE_DATA, LossTerm, RegularityTerm, Sizes, term_of, volume_hinges
+from orthocas.bases.family import Family, JointSpace, LinearFamily, Parametrisation
+from orthocas.fitting.settings import require_parametrisation
+from orthocas.fitting.starts import spectral_start
+from orthocas.fitting.terms import (
+    DEFAULT_WEIGHTS,
+    SAMPLE_DATA,
+    LossTerm,
+    Pairs,
+    RegularityTerm,
+    Sizes,
+    WeightNumbers,
+    Weights,
+    coordinates_of,
+    term_of,
+)
+from orthocas.tasks.domains import sample_evenly
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import Samples, samples_at
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array
+from orthocas.tools.checks import Array, as_point_set, frozen_array, require_count, require_kind
 from orthocas.tools.columns import COLUMNS, ColumnFunction, Run
 
-Pairs = tuple[tuple[int, int], ...]
 _BY_LAPACK = 8  # coordinates from which determinants of numbers are faster than written-out ones
+
+
+def loss(
+    problem: Problem,
+    parametrisation: Parametrisation,
+    *,
+    weights: Weights | WeightNumbers = DEFAULT_WEIGHTS,
+    samples: int | ArrayLike = 500,
+    seed: int = 0,
+    start: ArrayLike | None = None,
+) -> ca.Function:
+    """L(theta), the mean loss (25) of [AS2023] on given samples, for `ca.nlpsol`, `ca.gradient` and `ca.hessian`.
+
+    The function is a graph of plain operations without callbacks, so it can be differentiated any number of times.
+    `fit` evaluates the same numbers faster. All r coordinates depend on all joints: idle joints are not split off,
+    and no mirror symmetry is used. The fold term is left out, because it acts at points that only a fit searches.
+
+    Args:
+        problem: robot, task, metric and domain.
+        parametrisation: the family with parameters theta (size, 1). For bases they are the coefficients row by row.
+        weights: weights of the terms, and the kind of angles; see `Weights`.
+        samples: number of samples to draw, or joint positions (N, n) [rad] or [m].
+        seed: seed of drawn samples, and of the start of a network.
+        start: parameters (size,) whose orientation the regularity term keeps. Default: where `fit` starts.
+
+    Returns:
+        A function `loss` with input `theta` (size, 1) and output `loss` (1, 1).
+
+    Raises:
+        InvalidValueError, ShapeError: if an argument is invalid.
+
+    Example:
+        >>> import casadi as ca
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> L = oc.loss(problems.get("planar_3r_xy"), oc.Polynomial(2), samples=50)
+        >>> theta = ca.MX.sym("theta", L.size1_in(0))
+        >>> H = ca.hessian(L(theta), theta)[0]
+        >>> H.shape
+        (9, 9)
+    """
+    require_kind("problem", problem, Problem)
+    require_parametrisation(parametrisation)
+    family = parametrisation.for_problem(problem).family(JointSpace.of(problem), problem.r)
+    drawn = _drawn(problem, samples, seed)
+    theta0 = _start(family, drawn, seed) if start is None else frozen_array("start", start, (family.size,))
+    theta = ca.MX.sym("theta", family.size)
+    J = _jacobians(family, drawn.points, theta)  # (r n, N), each J_xi column by column
+    identity = drawn.metric_inverse is None
+    known = Weights.of(weights).for_problem(problem)
+    of_sample = Loss.of(Sizes(problem.n, problem.m, problem.r, identity), known.by_name)
+    orientation = _orientation(drawn, ca.Function("J", [theta], [J])(theta0).full(), problem.r)
+    data = [_columns(part) for part in drawn.described(of_sample.data, orientation)]
+    mean = ca.sum2(_mapped(of_sample, len(drawn))(J, *data)) / len(drawn)
+    return ca.Function("loss", [theta], [mean], ["theta"], ["loss"])
+
+
+def _drawn(problem: Problem, samples: int | ArrayLike, seed: int) -> Samples:
+    if isinstance(samples, int | np.integer):
+        count = require_count("samples", int(samples))
+        return samples_at(problem, sample_evenly(problem.domain, count, require_count("seed", seed, least=0)))
+    return samples_at(problem, as_point_set("samples", samples, problem.n)[0])
+
+
+def _start(family: Family, samples: Samples, seed: int) -> Array:
+    return spectral_start(family, samples) if isinstance(family, LinearFamily) else family.initial(seed)
+
+
+def _jacobians(family: Family, points: Array, theta: ca.MX) -> ca.MX:
+    """J_xi of every sample column by column, (r n, N)."""
+    N, n = points.shape
+    if isinstance(family, LinearFamily):
+        q = ca.SX.sym("q", n)
+        slopes = ca.Function("slopes", [q], [ca.densify(ca.jacobian(family.basis(q), q))])  # (K, n)
+        G = slopes.map(N)(ca.DM(points.T))  # (K, n N)
+        C = ca.reshape(theta, family.width, family.outputs).T
+        linear: ca.MX = ca.reshape(C @ G, family.outputs * n, N)
+        return linear
+    place = ca.MX.sym("q", n, N)
+    gradients = ca.Function("gradients", [place, theta], family.jacobian(place, theta))
+    by_component: list[Any] = gradients.call([ca.MX(ca.DM(points.T)), theta])
+    stacked: ca.MX = ca.vertcat(*(gradient[i, :] for i in range(n) for gradient in by_component))
+    return stacked
+
+
+def _mapped(loss_of: "Loss", count: int) -> ca.Function:
+    """The loss of `count` samples side by side: J_xi (r n, N) and data as columns -> (1, N)."""
+    one = sample_loss(loss_of)
+    J = ca.SX.sym("J", loss_of.sizes.r * loss_of.sizes.n)
+    data = [ca.SX.sym(name, one.numel_in(1 + k)) for k, name in enumerate(loss_of.data)]
+    shaped = [ca.reshape(part, *one.size_in(1 + k)) for k, part in enumerate(data)]
+    value = one(ca.reshape(J, loss_of.sizes.r, loss_of.sizes.n), *shaped)
+    return ca.Function("losses", [J, *data], [value]).map(count)
+
+
+def _columns(part: Array) -> ca.DM:
+    """Data of samples (N, rows, columns) or (N, rows) as columns (entries, N), matrices column by column."""
+    flat = (part.transpose(0, 2, 1) if part.ndim == 3 else part).reshape(len(part), -1)
+    return ca.DM(flat.T)
+
+
+def _orientation(samples: Samples, J: Array, r: int) -> float:
+    """Orientation of coordinates with gradients J_xi, (r n, N)."""
+    return samples.orientation(J.T.reshape(len(samples), -1, r).transpose(0, 2, 1))
 
 
 @dataclass(frozen=True)
@@ -128,14 +249,6 @@ class Loss:
     def arguments(self) -> tuple[ca.SX, list[ca.SX]]:
         """Symbols of J_xi (r, n) and of the data of one sample."""
         return ca.SX.sym("J", self.sizes.r, self.sizes.n), self.symbols()
-
-
-def coordinates_of(rows: Sequence[Any], exchanged: Pairs) -> list[Any]:
-    """Rows with (a + b) / sqrt 2 and (b - a) / sqrt 2 in place of the rows a, b of each pair: a rotation."""
-    turned = list(rows)
-    for i, j in exchanged:
-        turned[i], turned[j] = (rows[i] + rows[j]) * 0.5**0.5, (rows[j] - rows[i]) * 0.5**0.5
-    return turned
 
 
 @cache
@@ -271,6 +384,6 @@ class LossWithVolumes:
         A = named.get("metric_inverse")
         metric_inverse = None if A is None else A.reshape(sizes.n, sizes.n, -1).transpose(2, 1, 0)
         turned = np.stack(coordinates_of(rows, pairs), axis=1)
-        rho, slopes = volume_hinges(turned, Z, metric_inverse, term.bound)
+        rho, slopes = term.hinges(turned, Z, metric_inverse)
         back = coordinates_of(list(slopes.transpose(1, 0, 2)), tuple((j, i) for i, j in pairs))
         return rho, np.ascontiguousarray(np.stack(back).transpose(2, 0, 1)).reshape(J.shape)
