@@ -18,7 +18,7 @@ from orthocas.errors import (
     NoExpressionError,
     UnreachableReferenceError,
 )
-from orthocas.problems.iiwa import urdf_path
+from orthocas.problems.arms import urdf_path
 from orthocas.tasks.domains import sample_uniform
 from orthocas.tools.checks import Array
 

@@ -62,7 +62,7 @@ def fitted_from_grown(problem: Problem, quick: bool) -> Chart:
     start = _cosine_of_grown(problem, family, points)
 
     objective = BasisObjective(family, samples_at(problem, points), _WEIGHTS, start, partial(sample_problem, problem))
-    theta = GaussNewton().minimise(objective, start).finished().theta
+    theta = GaussNewton().minimise(objective, start).require_finished().theta
     return Chart(problem, Coordinates(series, space, (), theta, np.zeros(1), np.ones(1)))
 
 

@@ -7,11 +7,10 @@ from dataclasses import asdict, dataclass, fields, is_dataclass
 from typing import Any, cast
 
 from orthocas.bases.circle import Circle
-from orthocas.bases.cyclic import Cyclic, parse_suffix
+from orthocas.bases.cyclic import Cyclic, Mobile, parse_suffix
 from orthocas.bases.family import Parametrisation
 from orthocas.bases.given import SEW, Given, SEWKind
 from orthocas.bases.mlp import MLP
-from orthocas.bases.mobile import Mobile
 from orthocas.bases.products import JOINTS, Fourier, Linear, Polynomial
 from orthocas.errors import InvalidValueError, NotSavableWarning
 from orthocas.tools.checks import require_kind, require_known

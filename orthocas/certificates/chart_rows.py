@@ -9,8 +9,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocas.bases.cyclic import Mobile
 from orthocas.bases.mlp import MLPFamily
-from orthocas.bases.mobile import Mobile
 from orthocas.bases.products import ProductFamily
 from orthocas.certificates.graph import TaylorGraph
 from orthocas.certificates.jets import Around, Jets, largest_average, multi_indices, neighbours, power_weights, powers

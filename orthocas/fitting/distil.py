@@ -203,7 +203,7 @@ def _least_squares(family: LinearFamily, targets: _Targets, watch: Watch) -> tup
 
 def _minimised(family: Family, targets: _Targets, solver: Solver, seed: int, watch: Watch) -> tuple[Array, Array]:
     """Parameters by a minimiser. The offset stays 0, because the output bias of a network includes it."""
-    result = solver.minimise(_Distance(family, targets), family.initial(seed), watch).finished()
+    result = solver.minimise(_Distance(family, targets), family.initial(seed), watch).require_finished()
     return result.theta, np.zeros(family.outputs)
 
 

@@ -9,9 +9,8 @@ import scipy
 from numpy.typing import NDArray
 
 from orthocas.bases.circle import CircleFamily
-from orthocas.bases.cyclic import over_cyclic_joints
+from orthocas.bases.cyclic import Mobile, anywhere, over_cyclic_joints
 from orthocas.bases.family import CyclicParametrisation, JointSpace, Parametrisation, ReorderableFamily
-from orthocas.bases.mobile import Mobile, anywhere
 from orthocas.bases.registry import warn_unless_savable
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates

@@ -11,8 +11,8 @@ from orthocas.errors import InvalidValueError
 from orthocas.fitting.like import RULES as LIKE_RULES
 from orthocas.fitting.like import Like, Likeness, LikeTerm
 from orthocas.fitting.terms import WeightNumbers, Weights, register_loss_term
+from orthocas.solvers.casadi_solvers import Ipopt
 from orthocas.solvers.gauss_newton import GaussNewton
-from orthocas.solvers.ipopt import Ipopt
 from orthocas.solvers.lbfgs import LBFGS, QuasiNewton
 from orthocas.solvers.protocol import Solver
 from orthocas.tasks.problem import Problem

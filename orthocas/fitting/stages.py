@@ -453,7 +453,7 @@ class StageRunner:
         bounded = BoundedMutual(objective, self.settings.max_mutual * (all_pairs / fitted) ** 0.5)
         if fresh:  # solve the weighted problem first: minima far from its own are worse
             weighted = replace(self.settings.weights, mutual=DEFAULT_WEIGHTS.mutual)
-            theta = GaussNewton().minimise(objective.reweighted(weighted), theta).finished().theta
+            theta = GaussNewton().minimise(objective.reweighted(weighted), theta).require_finished().theta
         return bounded, bounded.in_gauge(theta)
 
     def _spectral_start(self, family: LinearFamily, count: int, kept: NDArray[np.bool_] | None) -> Array:

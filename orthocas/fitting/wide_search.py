@@ -344,7 +344,7 @@ class Search:
         if self.best is None or rank < self.rank:
             self.best, self.rank = theta, rank
         self._done = bad <= RULES.enough and low >= RULES.well / self.problem.r
-        result.finished()
+        result.require_finished()
 
     def _evaluate_volumes(self, theta: Array, samples: Samples) -> Array:
         """The volumes of `RegularPart` in the identity metric, (N,)."""
