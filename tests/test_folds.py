@@ -123,7 +123,7 @@ def test_fold_term_acts_at_collected_points_with_its_exact_gradient(iiwa: oc.Pro
     theta = unsafe.stages[-1].result.theta
     samples = sample_problem(iiwa, 300, 4).restricted_to(ACTIVE)
     plain = BasisObjective(family, samples, Weights(), theta, lambda count, seed: samples)
-    both = folds.added_to(plain)
+    both = folds.add_to(plain)
     assert both.value(theta) > plain.value(theta)
     direction = np.random.default_rng(0).normal(size=theta.size)
     slope = both.value_and_gradient(theta)[1] @ direction
@@ -131,7 +131,7 @@ def test_fold_term_acts_at_collected_points_with_its_exact_gradient(iiwa: oc.Pro
     central = (both.value(theta + step * direction) - both.value(theta - step * direction)) / (2 * step)
     assert slope == pytest.approx(central, rel=1e-5)
     folds.give_up()
-    assert folds.added_to(plain) is plain
+    assert folds.add_to(plain) is plain
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import WorstPoints
 from orthocas.errors import DomainError, Interrupted, InvalidValueError, OrthocasError
 from orthocas.fitting.like import Likeness
-from orthocas.fitting.settings import FitSettings, Precision
+from orthocas.fitting.settings import RULES, FitSettings, Precision
 from orthocas.fitting.stages import Begin, Continuation, FoldSearch, Solution, Stage, StageRunner
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.solvers.protocol import Solver, Status
@@ -30,14 +30,6 @@ from orthocas.tools.checks import Array, require_count
 from orthocas.tools.display import Shown, listed, percent
 from orthocas.tools.interrupts import remembered
 from orthocas.tools.progress import Monitor, silent
-
-_FIRST_SAMPLES = 1000  # seed tag of the samples that scale coordinates; stages use other tags
-_DIGITS = 6  # of gradients at the centre that count for the order: fits end with about as many
-_STEP = 0.05  # of the bounds that are offered
-_FAILS = 0.05  # conditioning below which a chart is of no use; folds have less than 0
-_MOST = 0.9  # share of such points that a bound should leave out
-_LARGEST = 0.25  # bound; charts that fail at larger singular values have other reasons
-_ANY = 1e-12  # bound of a ClearBox that only measures
 
 
 def fit(
@@ -121,7 +113,7 @@ def fit(
         >>> fit.chart.xi([0.6, 0.8, 0.8]).shape
         (1,)
     """
-    settings = FitSettings.checked(
+    settings = FitSettings.check(
         problem, parametrisation, solver, weights, samples, seed, max_mutual_deg, split_idle, precision, like
     )
     if like is not None and align_to is not None:
@@ -139,7 +131,7 @@ def fit_from(
     monitor: Monitor,
 ) -> "Fit":
     """The fit of `fit`, from known coordinates if there are some."""
-    settings = FitSettings.checked(problem, parametrisation, None, weights, None, seed, None)
+    settings = FitSettings.check(problem, parametrisation, None, weights, None, seed, None)
     return _fit(problem, settings, monitor, begin=begin)
 
 
@@ -156,7 +148,7 @@ def _fit(
     problem = _choose_domain(problem, settings)
     with remembered() as pressed:
         problem_check = check(problem, seed=settings.seed)
-        samples = sample_problem(problem, 200, (settings.seed, _FIRST_SAMPLES))
+        samples = sample_problem(problem, RULES.first, (settings.seed, RULES.first_tag))
         if settings.parametrisation.closed_form is not None:
             solution = Solution((), settings.parametrisation, None)
             coordinates = _evaluate_closed_form(problem, settings.parametrisation, samples)
@@ -262,7 +254,7 @@ def fix_gauge(coordinates: Coordinates, centre: Array) -> Coordinates:
     moved = (g**2 @ np.arange(g.shape[1])) / np.where(size > 0, size, 1.0)  # g = 0: a fold at the centre
     largest = np.take_along_axis(g, np.abs(g).argmax(axis=1)[:, None], axis=1)[:, 0]
     signs = np.where(largest < 0, -1.0, 1.0)
-    keys = np.round(np.column_stack([moved, -signs[:, None] * g]), _DIGITS)
+    keys = np.round(np.column_stack([moved, -signs[:, None] * g]), RULES.digits)
     return _reorder(coordinates, np.lexsort(keys.T[::-1]), signs)
 
 
@@ -344,17 +336,17 @@ def offer_clear_part(problem: Problem, check: ProblemCheck, worst: WorstPoints |
         The offer; None if nothing is wrong, if charts fail elsewhere too, or if the centre itself would be left out.
     """
     domain = problem.domain
-    failed = np.zeros((0, problem.n)) if worst is None else worst.below(_FAILS)
+    failed = np.zeros((0, problem.n)) if worst is None else worst.below(RULES.failed)
     clear = domain.singular_bound
     if not (isinstance(domain, Box) and (domain.is_box or clear)) or not (len(failed) or check.singular_samples):
         return None
     try:
-        measured = clear or ClearBox(domain, problem.task, _ANY)
+        measured = clear or ClearBox(domain, problem.task, RULES.any_bound)
         values = measured.singular_values(failed)
-        target = float(np.quantile(values, _MOST)) if len(failed) else 0.0
-        if not target <= _LARGEST:
+        target = float(np.quantile(values, RULES.failed_fraction)) if len(failed) else 0.0
+        if not target <= RULES.largest_bound:
             return None
-        bound = round(_STEP * (1 + target // _STEP), 2)
+        bound = round(RULES.bound_step * (1 + target // RULES.bound_step), 2)
         return ClearPart(bound, ClearBox(domain, problem.task, bound, measured.scale, measured.rows).share)
     except DomainError:  # the centre is not clear
         return None

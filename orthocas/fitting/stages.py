@@ -28,9 +28,10 @@ from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
 from orthocas.fitting.basis_objective import STRIDE, BasisObjective, BoundedMutual, expanded
 from orthocas.fitting.like import LikeTerm
 from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
-from orthocas.fitting.settings import FitSettings
+from orthocas.fitting.settings import RULES, FitSettings
 from orthocas.fitting.starts import Mirror, find_mirror, spectral_start
-from orthocas.fitting.terms import DEFAULT_WEIGHTS, FOLD_TERM, RULES
+from orthocas.fitting.terms import DEFAULT_WEIGHTS, FOLD_TERM
+from orthocas.fitting.terms import RULES as LOSS_RULES
 from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.protocol import Objective, SampledObjective, Solver, SolveResult, Status
 from orthocas.tasks.domains import sample_evenly
@@ -42,14 +43,6 @@ from orthocas.tools.checks import Array, require_memory
 from orthocas.tools.interrupts import deferred
 from orthocas.tools.progress import Monitor, Progress, Watch
 
-MLP_SAMPLES = 2000  #: default sample count of families that are not linear in theta
-_START_SEED = 0  # seed of the samples of spectral starts, the same for all fits
-_TRIAL_DEGREE = 3  # of the trial that chooses among symmetric coordinates
-_FRESH = 2000  # seed tag of samples drawn while a solver runs; stages use other tags
-_SEARCHED = 3  # degree from which worst points are searched: those of lower degrees differ from the last ones
-_ROUNDS = 4  # of the last degree
-_LEAST_GAIN = 0.01  # of the conditioning in a round
-_COLLECTED = 1.5 * RULES.least_conditioning  # points below it are collected, before they become worse
 Begin = Callable[[ProductFamily], Array | None]  #: parameters to start from, (size,), if some are known
 
 
@@ -112,7 +105,7 @@ class Continuation:
                 raise
             self._stages[-1] = self._stages[-1].interrupted()
         assert self._reached is not None
-        return Solution(tuple(self._stages), self._reached[0], self._runner.folds.found)
+        return Solution(tuple(self._stages), self._reached[0], self._runner.folds.worst)
 
     def _steps(self, target: Parametrisation) -> Sequence[Parametrisation]:
         if not isinstance(target, GradedParametrisation):
@@ -130,7 +123,7 @@ class Continuation:
         self._reached = step, family
         if stage.result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
-        if final or degree >= _SEARCHED:
+        if final or degree >= RULES.searched:
             runner.folds.search(stage, step, len(self._stages), runner.monitor)
 
     def _start(self, family: Family) -> Array | None:
@@ -151,8 +144,8 @@ class Continuation:
     def _unfold(self, step: Parametrisation) -> None:
         """Solve the last step again until there is no point of small conditioning."""
         folds, before = self._runner.folds, 0.0
-        for k in range(2, 2 + _ROUNDS):
-            if folds.least >= RULES.least_conditioning or 0 <= folds.least < before + _LEAST_GAIN:
+        for k in range(2, 2 + RULES.rounds):
+            if folds.least >= LOSS_RULES.least_conditioning or 0 <= folds.least < before + RULES.least_gain:
                 break
             before = folds.least
             self._solve(step, f"{step.label}, round {k}", final=True)
@@ -173,12 +166,12 @@ class FoldSearch:
     def __init__(self, problem: Problem, active: list[int], weight: float) -> None:
         self._problem, self._active, self._weight = problem, active, weight
         self._points = np.zeros((0, problem.n))
-        self.found: WorstPoints | None = None  #: of the last search
+        self.worst: WorstPoints | None = None  #: of the last search
 
     @property
     def least(self) -> float:
         """Least conditioning of the last search; 1, the largest there is, without a search."""
-        return 1.0 if self.found is None else self.found.least
+        return 1.0 if self.worst is None else self.worst.least
 
     def give_up(self) -> None:
         """Forget all points."""
@@ -194,10 +187,10 @@ class FoldSearch:
         fitted = problem.r - len(idle)
         space = JointSpace.of(problem)
         coordinates = Coordinates(parametrisation, space, idle, stage.result.theta, np.zeros(fitted), np.ones(fitted))
-        self.found = worst_points(problem, coordinates, seed)
-        self._points = np.concatenate([self._points, self.found.below(_COLLECTED)])
+        self.worst = worst_points(problem, coordinates, seed)
+        self._points = np.concatenate([self._points, self.worst.below(RULES.collected)])
 
-    def added_to(self, objective: BasisObjective | ArrayObjective | GraphObjective) -> Objective:
+    def add_to(self, objective: BasisObjective | ArrayObjective | GraphObjective) -> Objective:
         """The objective plus the fold term at all points collected."""
         if not len(self._points):
             return objective
@@ -311,10 +304,106 @@ class StageRunner:
     folds: FoldSearch
     like: LikeTerm | None = None  #: what the first coordinates follow
 
+    def run(self, plan: Plan) -> Stage:
+        """Draw samples, find a start if none is given, and minimise.
+
+        Raises:
+            SolveError: if there is no usable point. Only the final stage has to satisfy a bound on mutual angles.
+        """
+        family, mirror = plan.family, self.mirror
+        kept = mirror.kept(family) if isinstance(family, LinearFamily) and mirror is not None else None
+        count = self._count_samples(family, kept)
+        self.monitor(Progress(plan.label, 0.0, f"sampling {count} points"))
+        # graphs of other families are few large products: they need the threads of BLAS more than the last digits
+        with one_blas_thread() if isinstance(family, LinearFamily | ArrayFamily) else nullcontext():
+            samples = self._sample(count, 1 + plan.tag)
+            with deferred():  # CasADi may swallow Ctrl-C while graphs are built
+                objective, start = self._build_objective(plan, samples, None if kept is None else mirror)
+            result = plan.solver.minimise(objective, start, Watch(self.monitor, plan.label))
+        if isinstance(objective, BoundedMutual) and not np.isfinite(result.value):
+            if plan.final:
+                assert self.settings.max_mutual is not None
+                raise explain_missed_bound(plan.label, self.settings.max_mutual, objective, result)
+        else:
+            result.raise_if_failed()
+        if kept is not None and mirror is not None:
+            result = replace(result, theta=mirror.coordinates(expanded(result.theta, kept)))
+        return Stage(plan.label, family.size, len(samples), result)
+
+    def _build_objective(self, plan: Plan, samples: Samples, mirror: Mirror | None) -> tuple[Objective, Array]:
+        """The loss of a family on samples, and the start in the parameters that it leaves free."""
+        family, theta, settings = plan.family, plan.start, self.settings
+        if isinstance(family, LinearFamily):
+            objective, start = self._build_in_basis(family, samples, theta, mirror)
+            if settings.max_mutual is None:
+                return self.folds.add_to(objective), start
+            return self._bound_mutual_angles(objective, start, fresh=theta is None)
+        if settings.max_mutual is not None:
+            wanted = "a parametrisation linear in its parameters, such as polynomial"
+            raise InvalidValueError("max_mutual_deg", f"given with {plan.label}", wanted)
+        numbers = 60 * family.size + 100 * len(samples) * self.space.n  # with the state of the solver
+        require_memory(f"{plan.label} with {family.size} parameters", 8.0 * numbers)
+        start = family.initial(settings.seed) if theta is None else theta
+        if isinstance(family, ArrayFamily):
+            network = ArrayObjective(family, samples, settings.weights, start, self._draw, settings.single)
+            return self.folds.add_to(network), start
+        if settings.single:
+            label = settings.parametrisation.label
+            raise InvalidValueError("precision", f"'single' with {label}", "double, or a basis or a network (mlp)")
+        return self.folds.add_to(GraphObjective(family, samples, settings.weights, start, self._draw)), start
+
+    def _build_in_basis(
+        self, family: LinearFamily, samples: Samples, theta: Array | None, mirror: Mirror | None
+    ) -> tuple[BasisObjective, Array]:
+        """The loss of a family that is linear in its parameters, and the start in those that a mirror leaves free."""
+        kept = None if mirror is None else mirror.kept(family)
+        if theta is None:
+            theta = self._start_spectral(family, len(samples), kept)
+        elif mirror is not None:
+            theta = mirror.components(theta)
+        theta = theta if kept is None else theta.reshape(kept.shape)[kept]
+        exchanged = () if mirror is None else mirror.exchanged
+        objective = BasisObjective(
+            family, samples, self.settings.weights, theta, self._draw, kept, exchanged, self._gradients(family)
+        )
+        return objective, theta
+
+    def _start_spectral(self, family: LinearFamily, count: int, kept: NDArray[np.bool_] | None) -> Array:
+        """A start that does not depend on the seed: eigenvalues are close, so other samples would mix coordinates."""
+        key = family, count, kept is not None
+        if key not in self._starts:
+            points = sample_evenly(self.problem.domain, count, RULES.start_seed)
+            samples = samples_at(self.problem, points).restricted_to(self.active)
+            start = spectral_start(family, samples, kept, self._gradients(family))
+            if self.like is not None:
+                start = self.like.turned(family, start, samples, self._gradients(family))
+            self._starts[key] = start
+        return self._starts[key]
+
+    def _bound_mutual_angles(self, objective: BasisObjective, theta: Array, fresh: bool) -> tuple[Objective, Array]:
+        """The problem with a bound on the mutual angles, and its start."""
+        assert self.settings.max_mutual is not None
+        fitted, all_pairs = len(pairs(objective.r)), len(pairs(self.problem.r))
+        if not fitted:
+            raise InvalidValueError("max_mutual_deg", "given", "a problem with two or more coordinates to fit")
+        # pairs with an idle joint are exactly orthogonal, so the other pairs may use their part
+        bounded = BoundedMutual(objective, self.settings.max_mutual * (all_pairs / fitted) ** 0.5)
+        if fresh:  # solve the weighted problem first: minima far from its own are worse
+            weighted = replace(self.settings.weights, mutual=DEFAULT_WEIGHTS.mutual)
+            theta = GaussNewton().minimise(objective.reweighted(weighted), theta).require_finished().theta
+        return bounded, bounded.in_gauge(theta)
+
     @property
     def space(self) -> JointSpace:
         """The active joints."""
         return JointSpace.of(self.problem).restricted_to(self.active)
+
+    def family(self, parametrisation: Parametrisation, r: int) -> Family:
+        """The family on the active joints: the same object every time, so that what it needs is built once."""
+        key = parametrisation.label, r
+        if key not in self._families:
+            self._families[key] = parametrisation.family(self.space, r)
+        return self._families[key]
 
     @cached_property
     def mirror(self) -> Mirror | None:
@@ -323,20 +412,63 @@ class StageRunner:
         Of the coordinates that it allows, those with the least loss at degree 3 are chosen.
         """
         free = self.settings.max_mutual is None and self.like is None
-        found = find_mirror(self.problem, self.active) if free else None
+        mirror = find_mirror(self.problem, self.active) if free else None
         target = self.settings.parametrisation
-        if found is None or not isinstance(target, GradedParametrisation):
-            return found
-        family = self.family(target.of_degree(min(target.degree, _TRIAL_DEGREE)), len(found.parities))
+        if mirror is None or not isinstance(target, GradedParametrisation):
+            return mirror
+        family = self.family(target.of_degree(min(target.degree, RULES.trial_degree)), len(mirror.parities))
         assert isinstance(family, LinearFamily)
-        return min(found.choices(), key=lambda mirror: self._trial(family, mirror))
+        return min(mirror.choices(), key=lambda choice: self._try(family, choice))
 
-    def family(self, parametrisation: Parametrisation, r: int) -> Family:
-        """The family on the active joints: the same object every time, so that what it needs is built once."""
-        key = parametrisation.label, r
-        if key not in self._families:
-            self._families[key] = parametrisation.family(self.space, r)
-        return self._families[key]
+    def _try(self, family: LinearFamily, mirror: Mirror) -> float:
+        """The loss that a family reaches with these symmetric coordinates."""
+        samples = self._sample(self._count_samples(family, mirror.kept(family)), 0)
+        with one_blas_thread():
+            with deferred():
+                objective, start = self._build_in_basis(family, samples, None, mirror)
+            result = GaussNewton().coarser().minimise(objective, start)
+        if result.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        return result.value
+
+    def require_memory(self, target: GradedParametrisation, r: int) -> None:
+        """Refuse a degree that exceeds the memory, before building anything."""
+        n, half = self.space.n, 1 if self.mirror is None else 2
+        K = target.term_count(n)
+        N = self._count_for_basis(K, r) / half
+        of_a_joint = K - target.term_count(n - 1) if n > 1 else K
+        numbers = 1 + K if isinstance(target, Polynomial | Fourier) else n * of_a_joint  # see BasisGradients
+        gradients = 2 * (4 if self.settings.single else 8) * numbers + 4 * n * K / STRIDE  # twice while they are built
+        curvature = 16 * (n * r) ** 2 if self.settings.max_mutual is not None else 0
+        needed = N * (gradients + curvature) + 32 * (r * K / half) ** 2
+        require_memory(f"{target.label} on {self.space.n} joints with {K} basis functions", needed)
+
+    def _count_samples(self, family: Family, kept: NDArray[np.bool_] | None) -> int:
+        """Number of samples of a family. A sample of a mirror symmetric problem counts twice."""
+        if not isinstance(family, LinearFamily):
+            return self.settings.samples or RULES.network_samples
+        count = self._count_for_basis(family.width, family.outputs)
+        return count if kept is None or self.settings.samples else ceil(count / 2)
+
+    def _count_for_basis(self, terms: int, r: int) -> int:
+        """Number of samples for a linear family, so that there are about 140 residuals per coefficient."""
+        residuals = RULES.residuals * terms
+        return self.settings.samples or RULES.least_samples + ceil(residuals / (self.problem.m + r - 1))
+
+    def _sample(self, count: int, tag: int) -> Samples:
+        points = sample_evenly(self.problem.domain, count, (self.settings.seed, tag))
+        return samples_at(self.problem, points).restricted_to(self.active)
+
+    def _draw(self, count: int, seed: tuple[int, ...]) -> Samples:
+        fresh = sample_problem(self.problem, count, (self.settings.seed, RULES.fresh_tag, *seed))
+        return fresh.restricted_to(self.active)
+
+    def _gradients(self, family: LinearFamily) -> BasisGradients:
+        """Those of a basis, built once."""
+        if family not in self._bases:
+            number = np.float32 if self.settings.single else np.float64
+            self._bases[family] = gradients_of(family, self.space.n, number)
+        return self._bases[family]
 
     @cached_property
     def _families(self) -> dict[tuple[str, int], Family]:
@@ -352,167 +484,17 @@ class StageRunner:
         """Spectral starts so far, by family, number of samples, and whether a mirror is used."""
         return {}
 
-    def run(self, plan: Plan) -> Stage:
-        """Draw samples, find a start if none is given, and minimise.
 
-        Raises:
-            SolveError: if there is no usable point. Only the final stage has to satisfy a bound on mutual angles.
-        """
-        family = plan.family
-        kept = self.mirror.kept(family) if isinstance(family, LinearFamily) and self.mirror is not None else None
-        # other networks are few large products: they need the threads of BLAS more than the last digits
-        with one_blas_thread() if isinstance(family, LinearFamily | ArrayFamily) else nullcontext():
-            return self._minimise(plan, kept)
-
-    def _minimise(self, plan: Plan, kept: NDArray[np.bool_] | None) -> Stage:
-        count = self._sample_count(plan.family, kept)
-        self.monitor(Progress(plan.label, 0.0, f"sampling {count} points"))
-        samples = self._samples(count, 1 + plan.tag)
-        with deferred():  # CasADi may swallow Ctrl-C while graphs are built
-            objective, theta = self._objective(plan, samples, kept)
-        result = plan.solver.minimise(objective, theta, Watch(self.monitor, plan.label))
-        if isinstance(objective, BoundedMutual) and not np.isfinite(result.value):
-            if plan.final:
-                assert self.settings.max_mutual is not None
-                raise missed_bound(plan.label, self.settings.max_mutual, objective, result)
-        else:
-            result.raise_if_failed()
-        if kept is not None and self.mirror is not None:
-            result = replace(result, theta=self.mirror.coordinates(expanded(result.theta, kept)))
-        return Stage(plan.label, plan.family.size, len(samples), result)
-
-    def _objective(self, plan: Plan, samples: Samples, kept: NDArray[np.bool_] | None) -> tuple[Objective, Array]:
-        """The loss of a family on samples, and the start in the parameters that it leaves free."""
-        family, theta = plan.family, plan.start
-        if not isinstance(family, LinearFamily):
-            if self.settings.max_mutual is not None:
-                raise InvalidValueError(
-                    "max_mutual_deg",
-                    f"given with {plan.label}",
-                    "a parametrisation linear in its parameters, such as polynomial",
-                )
-            self._require_graph_memory(plan.label, family, len(samples))
-            theta = family.initial(self.settings.seed) if theta is None else theta
-            return self.folds.added_to(self._network_objective(family, samples, theta)), theta
-        objective, start = self._linear_objective(family, samples, theta, None if kept is None else self.mirror)
-        if self.settings.max_mutual is None:
-            return self.folds.added_to(objective), start
-        return self._bounded(objective, start, fresh=theta is None)
-
-    def _network_objective(self, family: Family, samples: Samples, theta: Array) -> ArrayObjective | GraphObjective:
-        """The loss of a family that is not linear in its parameters."""
-        weights, single = self.settings.weights, self.settings.single
-        if isinstance(family, ArrayFamily):
-            return ArrayObjective(family, samples, weights, theta, self._draw, single)
-        if single:
-            label = self.settings.parametrisation.label
-            raise InvalidValueError("precision", f"'single' with {label}", "double, or a basis or a network (mlp)")
-        return GraphObjective(family, samples, weights, theta, self._draw)
-
-    def _linear_objective(
-        self, family: LinearFamily, samples: Samples, theta: Array | None, mirror: Mirror | None
-    ) -> tuple[BasisObjective, Array]:
-        """The loss of a family that is linear in its parameters, and the start in those that a mirror leaves free."""
-        kept = None if mirror is None else mirror.kept(family)
-        if theta is None:
-            theta = self._spectral_start(family, len(samples), kept)
-        elif mirror is not None:
-            theta = mirror.components(theta)
-        theta = theta if kept is None else theta.reshape(kept.shape)[kept]
-        exchanged = () if mirror is None else mirror.exchanged
-        objective = BasisObjective(
-            family, samples, self.settings.weights, theta, self._draw, kept, exchanged, self._gradients(family)
-        )
-        return objective, theta
-
-    def _gradients(self, family: LinearFamily) -> BasisGradients:
-        """Those of a basis, built once."""
-        if family not in self._bases:
-            number = np.float32 if self.settings.single else np.float64
-            self._bases[family] = gradients_of(family, self.space.n, number)
-        return self._bases[family]
-
-    def _trial(self, family: LinearFamily, mirror: Mirror) -> float:
-        """The loss that a family reaches with these symmetric coordinates."""
-        samples = self._samples(self._sample_count(family, mirror.kept(family)), 0)
-        with one_blas_thread():
-            with deferred():
-                objective, start = self._linear_objective(family, samples, None, mirror)
-            result = GaussNewton().coarser().minimise(objective, start)
-        if result.status is Status.INTERRUPTED:
-            raise KeyboardInterrupt
-        return result.value
-
-    def _bounded(self, objective: BasisObjective, theta: Array, fresh: bool) -> tuple[Objective, Array]:
-        """The problem with a bound on the mutual angles, and its start."""
-        assert self.settings.max_mutual is not None
-        fitted, all_pairs = len(pairs(objective.r)), len(pairs(self.problem.r))
-        if not fitted:
-            raise InvalidValueError("max_mutual_deg", "given", "a problem with two or more coordinates to fit")
-        # pairs with an idle joint are exactly orthogonal, so the other pairs may use their share
-        bounded = BoundedMutual(objective, self.settings.max_mutual * (all_pairs / fitted) ** 0.5)
-        if fresh:  # solve the weighted problem first: minima far from its own are worse
-            weighted = replace(self.settings.weights, mutual=DEFAULT_WEIGHTS.mutual)
-            theta = GaussNewton().minimise(objective.reweighted(weighted), theta).require_finished().theta
-        return bounded, bounded.in_gauge(theta)
-
-    def _spectral_start(self, family: LinearFamily, count: int, kept: NDArray[np.bool_] | None) -> Array:
-        """A start that does not depend on the seed: eigenvalues are close, so other samples would mix coordinates."""
-        key = family, count, kept is not None
-        if key not in self._starts:
-            points = sample_evenly(self.problem.domain, count, _START_SEED)
-            samples = samples_at(self.problem, points).restricted_to(self.active)
-            start = spectral_start(family, samples, kept, self._gradients(family))
-            if self.like is not None:
-                start = self.like.turned(family, start, samples, self._gradients(family))
-            self._starts[key] = start
-        return self._starts[key]
-
-    def _samples(self, count: int, tag: int) -> Samples:
-        points = sample_evenly(self.problem.domain, count, (self.settings.seed, tag))
-        return samples_at(self.problem, points).restricted_to(self.active)
-
-    def _draw(self, count: int, seed: tuple[int, ...]) -> Samples:
-        return sample_problem(self.problem, count, (self.settings.seed, _FRESH, *seed)).restricted_to(self.active)
-
-    def _sample_count(self, family: Family, kept: NDArray[np.bool_] | None) -> int:
-        """A sample of a mirror symmetric problem counts twice."""
-        if not isinstance(family, LinearFamily):
-            return self.settings.samples or MLP_SAMPLES
-        count = self._linear_sample_count(family.width, family.outputs)
-        return count if kept is None or self.settings.samples else ceil(count / 2)
-
-    def _linear_sample_count(self, terms: int, r: int) -> int:
-        """Number of samples for a linear family, so that there are about 140 residuals per coefficient."""
-        return self.settings.samples or 1000 + ceil(140 * terms / (self.problem.m + r - 1))
-
-    def _require_graph_memory(self, label: str, family: Family, count: int) -> None:
-        """Refuse a network whose parameters and solver state exceed the memory."""
-        require_memory(f"{label} with {family.size} parameters", 8.0 * (60 * family.size + 100 * count * self.space.n))
-
-    def require_memory(self, target: GradedParametrisation, r: int) -> None:
-        """Refuse a degree that exceeds the memory, before building anything."""
-        n, half = self.space.n, 1 if self.mirror is None else 2
-        K = target.term_count(n)
-        N = self._linear_sample_count(K, r) / half
-        of_a_joint = K - target.term_count(n - 1) if n > 1 else K
-        numbers = 1 + K if isinstance(target, Polynomial | Fourier) else n * of_a_joint  # see BasisGradients
-        gradients = 2 * (4 if self.settings.single else 8) * numbers + 4 * n * K / STRIDE  # twice while they are built
-        curvature = 16 * (n * r) ** 2 if self.settings.max_mutual is not None else 0
-        needed = N * (gradients + curvature) + 32 * (r * K / half) ** 2
-        require_memory(f"{target.label} on {self.space.n} joints with {K} basis functions", needed)
-
-
-def missed_bound(label: str, bound: float, objective: BoundedMutual, result: SolveResult) -> SolveError:
+def explain_missed_bound(label: str, bound: float, objective: BoundedMutual, result: SolveResult) -> SolveError:
     """The error of a missed bound on mutual angles [rad]: by how much it was missed, and why."""
-    wanted = np.degrees(bound)
-    reached = wanted * objective.constraints(result.theta)[0][0] ** 0.5
-    found = f"{label} coordinates with mutual angles within {wanted:.4g} deg"
+    target = np.degrees(bound)
+    reached = target * objective.constraints(result.theta)[0][0] ** 0.5
+    missing = f"{label} coordinates with mutual angles within {target:.4g} deg"
     if result.status is Status.INFEASIBLE:
         return InfeasibleError(
-            f"there are no {found} nearby, the closest have {reached:.4g} deg: raise max_mutual_deg or the degree"
+            f"there are no {missing} nearby, the closest have {reached:.4g} deg: raise max_mutual_deg or the degree"
         )
     return SolveError(
-        f"no {found} found in {result.iterations} iterations, the closest have {reached:.4g} deg: "
+        f"no {missing} found in {result.iterations} iterations, the closest have {reached:.4g} deg: "
         "raise max_mutual_deg, the degree, or the number of iterations"
     )

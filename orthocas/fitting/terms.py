@@ -20,7 +20,7 @@ class LossRules:
 
     least_conditioning: float = 0.2  #: that fits aim at on the whole domain
     regular_volume: float = 0.9  #: volume of the gradients below which the regularity term acts
-    fold_volume: float = 0.32  #: the same at the worst points: enough, as det D <= sqrt(e) times the conditioning
+    fold_volume: float = 1.6 * 0.2  #: the same at the worst points: enough, as det D <= sqrt(e) times the conditioning
     wide_volume: float = 0.5  #: volume that a wide fit asks for at its first samples
     worst_volume: float = 0.3  #: the same once the worst samples have joined, and for networks
     least_volume: float = 0.05  #: over r: bound of the domain of a wide chart, in the identity metric
