@@ -17,7 +17,7 @@ from orthocas.codegen.proof import check_c
 from orthocas.control import ControlStatus, Kinematic, PDPlus
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.fit import Fit
-from orthocas.fitting.probe import judged_chart, leak_and_conditioning
+from orthocas.fitting.probe import compute_leak_and_conditioning, evaluate_chart
 from orthocas.tasks.domains import bounds_of, sample_heavily, sample_uniform
 from orthocas.tasks.samples import samples_at
 from orthocas.tools.archive import read_archive
@@ -94,7 +94,10 @@ def test_chart_holds_over_the_full_turn_of_the_first_axis(cyclic_fit: Fit) -> No
     here = sample_heavily(problems.get("iiwa").domain, 60, seed=8)
     there = here.copy()
     there[:, 0] = FULL_TURN
-    found = [leak_and_conditioning(samples_at(chart.problem, q), chart.coordinates.jacobian(q)) for q in (here, there)]
+    found = [
+        compute_leak_and_conditioning(samples_at(chart.problem, q), chart.coordinates.jacobian(q))
+        for q in (here, there)
+    ]
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-7)
     report = oc.evaluate(chart, 20_000, seed=5)
@@ -108,7 +111,7 @@ def test_free_fit_leaks_more_at_other_angles(cyclic_fit: Fit, iiwa_fit: Fit) -> 
     """The reason for the option: a chart of the cube does not know other angles of A1."""
     cube = iiwa_fit.chart
     outside = oc.Chart(cyclic_fit.chart.problem, cube.coordinates)
-    assert judged_chart(outside, 5000, 1).leak_deg > 1.5 * judged_chart(cyclic_fit.chart, 5000, 1).leak_deg
+    assert evaluate_chart(outside, 5000, 1).leak_deg > 1.5 * evaluate_chart(cyclic_fit.chart, 5000, 1).leak_deg
 
 
 def test_joint_without_limits_becomes_unbounded(endless: oc.Chart) -> None:
