@@ -11,7 +11,7 @@ from orthocas.bases import JointSpace
 from orthocas.charts.point_quality import Judged, least_in_domain, worst_points
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.fit import Fit
-from orthocas.fitting.loss import Loss, sample_loss
+from orthocas.fitting.loss import Loss, build_sample_loss
 from orthocas.fitting.stages import FoldSearch
 from orthocas.fitting.starts import Mirror, find_mirror
 from orthocas.fitting.terms import RULES, Sizes, Weights
@@ -76,7 +76,9 @@ def test_the_loss_of_components_is_that_of_the_coordinates_made_of_them() -> Non
     J = rng.normal(size=(3, 4))
     turned = np.array([(J[0] + J[2]) / 2**0.5, J[1], (J[2] - J[0]) / 2**0.5])
     data = [rng.normal(size=symbol.shape) for symbol in coordinates.symbols()]
-    assert float(sample_loss(components)(J, *data)) == pytest.approx(float(sample_loss(coordinates)(turned, *data)))
+    assert float(build_sample_loss(components)(J, *data)) == pytest.approx(
+        float(build_sample_loss(coordinates)(turned, *data))
+    )
 
 
 @pytest.mark.slow

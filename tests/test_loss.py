@@ -11,18 +11,18 @@ from orthocas.bases import JointSpace
 from orthocas.cli.problem_argument import parse_weights
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting import network_objective
-from orthocas.fitting.basis_gradients import gradients_of
+from orthocas.fitting.basis_gradients import build_gradients
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.loss import (
     Loss,
-    loss_columns,
-    loss_with_slopes,
-    residual_columns,
-    sample_loss,
-    value_columns,
+    build_loss_columns,
+    build_loss_with_slopes,
+    build_residual_columns,
+    build_sample_loss,
+    build_value_columns,
 )
 from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
-from orthocas.fitting.starts import spectral_start
+from orthocas.fitting.starts import find_spectral_start
 from orthocas.fitting.terms import (
     RULES,
     Sizes,
@@ -172,7 +172,7 @@ def test_arrays_of_prismatic_joints_agree_with_their_graph() -> None:
 
 def test_single_precision_of_a_basis_changes_the_last_digits(problem: oc.Problem) -> None:
     family = oc.Polynomial(3).family(JointSpace.of(problem), problem.r)
-    theta, gradients = family.initial(3), gradients_of(family, problem.n, np.float32)
+    theta, gradients = family.initial(3), build_gradients(family, problem.n, np.float32)
     settings = (family, sample_problem(problem, 300, 9), EVEN, theta, draw_from(problem))
     double, single = BasisObjective(*settings), BasisObjective(*settings, gradients=gradients)
     assert 2 * single.X.nbytes == double.X.nbytes
@@ -271,7 +271,7 @@ def test_spectral_start_finds_an_exact_linear_coordinate() -> None:
     task = oc.Task.custom(robot, "sum", lambda q: q[0] + 2 * q[1])
     problem = oc.Problem(robot, task, domain=oc.Box([0.0, 0.0], 1.0))
     family = oc.Polynomial(2).family(JointSpace.of(problem), 1)
-    theta = spectral_start(family, sample_problem(problem, 100, 0))
+    theta = find_spectral_start(family, sample_problem(problem, 100, 0))
     objective = BasisObjective(family, sample_problem(problem, 100, 1), WEIGHTS, theta, draw_from(problem))
     directions = objective.coordinate_jacobians(theta)[:, 0]
     np.testing.assert_allclose(directions @ np.array([1.0, 2.0]), 0, atol=1e-6 * np.abs(directions).max())
@@ -339,7 +339,7 @@ def test_expressions_of_too_many_coordinates_name_the_size() -> None:
     with pytest.raises(
         InvalidValueError, match="number of extra coordinates r is 13, expected at most 12 with the terms"
     ):
-        sample_loss(loss)
+        build_sample_loss(loss)
 
 
 @pytest.mark.parametrize("identity", [True, False])
@@ -377,13 +377,13 @@ def test_loss_with_volumes_is_the_loss() -> None:
     place = loss.data.index("metric_inverse")
     data[place] = data[place] @ data[place].transpose(0, 2, 1) + np.eye(sizes.n)
     inputs = [columns.blocked(rng.normal(size=(N, sizes.r, sizes.n))), *map(columns.blocked, data)]
-    value, slopes = loss_with_slopes(loss)(*inputs)
-    for found, wanted in zip(loss_columns(loss)(*inputs), (value, slopes), strict=True):
+    value, slopes = build_loss_with_slopes(loss)(*inputs)
+    for found, wanted in zip(build_loss_columns(loss)(*inputs), (value, slopes), strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-11, atol=1e-13 * np.abs(wanted).max())
-    np.testing.assert_allclose(value_columns(loss)(*inputs)[0], value, rtol=1e-11)
-    *rows, first, _, second, _ = residual_columns(loss)(*inputs)
+    np.testing.assert_allclose(build_value_columns(loss)(*inputs)[0], value, rtol=1e-11)
+    *rows, first, _, second, _ = build_residual_columns(loss)(*inputs)
     assert len(rows) == sizes.r
     only = Loss.of(sizes, {"regularity": 5.0, "folds": 7.0}, ((1, 4),))
-    (volumes,) = value_columns(only)(inputs[0], *(inputs[1 + loss.data.index(name)] for name in only.data))
+    (volumes,) = build_value_columns(only)(inputs[0], *(inputs[1 + loss.data.index(name)] for name in only.data))
     np.testing.assert_allclose((first**2 + second**2) / 2, volumes, rtol=1e-12)
     assert volumes.max() > 0

@@ -35,12 +35,12 @@ from orthocas.errors import (
     ShapeError,
     UnknownNameError,
 )
-from orthocas.fitting.basis_gradients import gradients_of
+from orthocas.fitting.basis_gradients import build_gradients
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.like import QuadraticTerm
 from orthocas.fitting.network_objective import ArrayObjective
 from orthocas.fitting.stages import Resampled
-from orthocas.fitting.wide_search import Search, WideSettings, frame_samples, search_families
+from orthocas.fitting.wide_search import Search, WideSettings, sample_frames, search_families
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.branches import _Arm
 from orthocas.tasks.domains import StopKind, sample_heavily, sample_uniform
@@ -513,14 +513,14 @@ def test_the_loss_has_volumes_and_lengths_and_its_slopes_are_differences(metric:
     basis, C = search._basis, rng.normal(size=(2, 14))
     q = [sample_uniform(problem.domain, count, seed) for seed, count in enumerate((300, 700))]
     held = QuadraticTerm(np.diag(rng.uniform(size=14)), rng.normal(size=14), 0.3)
-    search._samples = [frame_samples(problem, q[0])]
+    search._samples = [sample_frames(problem, q[0])]
     search._start_linear()  # takes the mean of products of gradients
     factor = search._factor
     search._likeness, search._last, search._sign = [held], C.ravel(), -1.0
-    weights = search._weights("volume with the worst")
-    search._in_basis(weights)
-    search._samples.append(frame_samples(problem, q[1]))
-    loss = search._in_basis(weights)
+    weights = search._choose_weights("volume with the worst")
+    search._build_in_basis(weights)
+    search._samples.append(sample_frames(problem, q[1]))
+    loss = search._build_in_basis(weights)
     theta = loss.variables(C.ravel())
     np.testing.assert_allclose(loss.parameters(theta), C.ravel(), atol=1e-12)
     value, slopes = loss.value_and_gradient(theta)
@@ -556,11 +556,11 @@ def test_the_loss_of_networks_is_that_of_bases(metric: Any) -> None:
     robot, rng = oc.Robot.planar([1.0, 0.8, 0.6, 0.5], [3.0, 2.0, 2.0, 1.0]), np.random.default_rng(2)
     problem = oc.Problem(robot, oc.Task.position(robot, "xy"), metric, oc.Box(np.full(4, 0.7), 0.6))
     family = oc.MLP((4,), raw=True).family(JointSpace.of(problem), 2)
-    samples, C, small = frame_samples(problem, sample_uniform(problem.domain, 500, 0)), rng.normal(size=(2, 4)), 1e-2
+    samples, C, small = sample_frames(problem, sample_uniform(problem.domain, 500, 0)), rng.normal(size=(2, 4)), 1e-2
     theta = np.concatenate([small * np.eye(4).ravel(), np.zeros(4), (C / small).ravel(order="F"), np.zeros(2)])
     linear = Search(problem, oc.Polynomial(1), WideSettings())
     D = linear._basis.jacobian(linear._basis.at(samples.points[:1]), np.eye(4), 1)[0]
-    weights = linear._weights("volume")
+    weights = linear._choose_weights("volume")
     start = (C @ np.linalg.inv(D)).ravel()
     assert isinstance(linear.family, LinearFamily)
     basis = BasisObjective(linear.family, samples, weights, start, linear._draw, orientation=-1.0)
@@ -582,13 +582,13 @@ def test_derivatives_along_directions_are_those_of_coordinates(parametrisation: 
     problem, rng = oc.problems.get("planar_3r_xy"), np.random.default_rng(1)
     family = parametrisation.for_problem(problem).family(JointSpace.of(problem), 2)
     q, a, C = rng.normal(size=(1500, 3)), rng.normal(size=(1500, 3)), rng.normal(size=(2, family.width))
-    basis = gradients_of(family, 3)
+    basis = build_gradients(family, 3)
     known = basis.at(q)
     own = Coordinates(
         parametrisation.for_problem(problem), JointSpace.of(problem), (), C.ravel(), np.zeros(2), np.ones(2)
     )
     moved = (own.once("xi", q + 1e-6 * a) - own.once("xi", q - 1e-6 * a)) / 2e-6
-    np.testing.assert_allclose(basis.along(known, a) @ C.T, moved, atol=1e-7 * np.abs(moved).max())
+    np.testing.assert_allclose(basis.differentiate_along(known, a) @ C.T, moved, atol=1e-7 * np.abs(moved).max())
     np.testing.assert_allclose(
         np.einsum("sri,si->sr", basis.jacobian(known, C, 1500), a), moved, atol=1e-7 * np.abs(moved).max()
     )

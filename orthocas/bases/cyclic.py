@@ -32,7 +32,7 @@ def cyclic_joints(problem: Problem) -> tuple[str, ...]:
     Joint k is cyclic if h(q + t e_k) = g_t(h(q)) with isometries g_t, and A does not depend on q_k. Then neither does
     span{grad_A h_i}, so coordinates xi = a q_k + f(other joints) are as good at every q_k as at one. That A and the
     span do not depend on q_k is proved, from the kinematics or from the steps of a custom task (see
-    `leaves_stay`). That g_t are isometries is tested at samples: A, the A-orthogonal projector on the
+    `keeps_self_motions`). That g_t are isometries is tested at samples: A, the A-orthogonal projector on the
     span and the eigenvalues of J_x A^-1 J_x^T must not change when joint k moves through its limits, or a full turn.
     Joints that do not move the task do not count, nor do those without a proof, such as the base rotation for a custom
     task that calls `robot.tip_position`.
@@ -55,10 +55,10 @@ def cyclic_joints(problem: Problem) -> tuple[str, ...]:
     names = problem.robot.joint_names
     driven = (k for k in range(problem.n) if k not in problem.robot.tree.floating)
     sampled = (k for k in driven if len(points) and _is_cyclic(problem, points, k))
-    return tuple(names[k] for k in sampled if leaves_stay(problem, k))
+    return tuple(names[k] for k in sampled if keeps_self_motions(problem, k))
 
 
-def over_cyclic_joints(problem: Problem, names: tuple[str, ...]) -> Problem:
+def widen_over_cyclic_joints(problem: Problem, names: tuple[str, ...]) -> Problem:
     """The problem on a box that covers all positions of the cyclic joints; the problem itself if there is none.
 
     The box reaches from limit to limit. A joint without limits becomes unbounded: every position of it lies inside.
@@ -136,11 +136,11 @@ def require_cyclic(problem: Problem, names: Sequence[str]) -> None:
         InvalidValueError: if one is not proved to be cyclic. The message names it.
     """
     for name in names:
-        if not leaves_stay(problem, problem.robot.joint_names.index(name)):
+        if not keeps_self_motions(problem, problem.robot.joint_names.index(name)):
             raise InvalidValueError("cyclic", repr(name), "a joint that is proved to turn or shift the whole task")
 
 
-def leaves_stay(problem: Problem, joint: int) -> bool:
+def keeps_self_motions(problem: Problem, joint: int) -> bool:
     """Whether A and span{grad_A h_i} are proved not to depend on a joint, at any position of all joints.
 
     The metric must not depend on the joint, and one of these must hold:
@@ -222,7 +222,7 @@ def _is_axis(direction: Array, k: int) -> bool:
 Cyclic = tuple[str, ...] | Literal["auto"]  #: names of joints; "auto" for all cyclic joints of the problem
 
 
-def checked_cyclic(value: Any) -> Cyclic:
+def check_cyclic(value: Any) -> Cyclic:
     """The value as names, or "auto".
 
     Raises:
@@ -276,7 +276,7 @@ def resolved(cyclic: Cyclic, problem: "Problem") -> tuple[str, ...]:
 
 def _keeps_leaves(problem: "Problem", name: str) -> bool:
     names = problem.robot.joint_names
-    return name in names and leaves_stay(problem, names.index(name))
+    return name in names and keeps_self_motions(problem, names.index(name))
 
 
 def indices(cyclic: Cyclic, space: JointSpace) -> list[int]:

@@ -25,7 +25,7 @@ Term = tuple[int, ...]  #: index of the one-joint function of every joint; 0 is 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ProductFamily(BasisFamily):
-    """psi_k(q) = prod_i f_i,k_i(q_i) over the joints. Use `product_family` to build one.
+    """psi_k(q) = prod_i f_i,k_i(q_i) over the joints. Use `build_product_family` to build one.
 
     Derivatives of terms are sums of terms. So with each term, the family contains the terms of its derivatives.
     """
@@ -69,7 +69,7 @@ class ProductFamily(BasisFamily):
             found.append((values, rows.astype(int), columns.astype(int)))
         return found
 
-    def derivative_matrix(self, joint: int) -> Any:
+    def build_derivative_matrix(self, joint: int) -> Any:
         """D_i as a sparse matrix, (1 + K, 1 + K)."""
         values, rows, columns = self.derivatives[joint]
         return scipy.sparse.csr_array((values, (rows, columns)), shape=(1 + self.width,) * 2)
@@ -83,7 +83,7 @@ class ProductFamily(BasisFamily):
         return tables
 
 
-def product_family(
+def build_product_family(
     space: JointSpace,
     outputs: int,
     terms: tuple[Term, ...],
@@ -151,15 +151,15 @@ def split(term: Term) -> tuple[Term, int, int]:
     return (*term[:joint], 0, *term[joint + 1 :]), joint, term[joint]
 
 
-def reduced_terms(
+def reduce_terms(
     degrees: list[list[int]], total: int, linear: list[int], joints: int | None = None
 ) -> tuple[Term, ...]:
-    """The terms of `terms_up_to` without those in the joints `linear`, then the term linear in each of these."""
+    """The terms of `list_terms` without those in the joints `linear`, then the term linear in each of these."""
     kept = [[0] if k in linear else own for k, own in enumerate(degrees)]
-    return (*terms_up_to(kept, total, joints), *(tuple(int(i == k) for i in range(len(degrees))) for k in linear))
+    return (*list_terms(kept, total, joints), *(tuple(int(i == k) for i in range(len(degrees))) for k in linear))
 
 
-def terms_up_to(degrees: list[list[int]], total: int, joints: int | None = None) -> Iterator[Term]:
+def list_terms(degrees: list[list[int]], total: int, joints: int | None = None) -> Iterator[Term]:
     """All non-constant choices of one function per joint whose degrees add up to at most `total`.
 
     Args:
@@ -192,7 +192,7 @@ class Products:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "degree", require_count("degree", self.degree))
-        object.__setattr__(self, "cyclic", cyclic_choice.checked_cyclic(self.cyclic))
+        object.__setattr__(self, "cyclic", cyclic_choice.check_cyclic(self.cyclic))
         if self.joints is not None:
             object.__setattr__(self, "joints", require_count("joints", self.joints))
 
@@ -267,8 +267,8 @@ class Polynomial(Products):
             return values
 
         degrees = [list(range(self.degree + 1))] * space.n
-        terms = reduced_terms(degrees, self.degree, cyclic_choice.indices(self.cyclic, space), self.joints)
-        return product_family(space, outputs, terms, legendre, derivatives)
+        terms = reduce_terms(degrees, self.degree, cyclic_choice.indices(self.cyclic, space), self.joints)
+        return build_product_family(space, outputs, terms, legendre, derivatives)
 
 
 @dataclass(frozen=True)
@@ -325,8 +325,8 @@ class Fourier(Products):
             return D
 
         degrees = [[0] + [k for k in range(1, self.degree + 1) for _ in range(2)]] * space.n
-        terms = reduced_terms(degrees, self.degree, linear, self.joints)
-        return product_family(space, outputs, terms, waves, derivatives)
+        terms = reduce_terms(degrees, self.degree, linear, self.joints)
+        return build_product_family(space, outputs, terms, waves, derivatives)
 
 
 Normals = Literal["orthonormal", "paper"]
@@ -381,7 +381,7 @@ class Linear:
         def displacement(q: Any) -> list[Any]:
             return [q - ca.repmat(ca.DM(space.centre), 1, q.shape[1])]
 
-        return product_family(space, outputs, terms, displacement, lambda i: np.array([[0.0, 0.0], [1.0, 0.0]]))
+        return build_product_family(space, outputs, terms, displacement, lambda i: np.array([[0.0, 0.0], [1.0, 0.0]]))
 
     def normal_vectors(self, gradients: Array) -> Array:
         """Rows n_j of unit length with n_j . grad_A h_i = 0, (r, n).

@@ -157,7 +157,7 @@ class ProductRows:
 
 def _orders(family: ProductFamily, terms: Array, C: Array, highest: int) -> tuple[Derivatives, ...]:
     n = family.space.n
-    steps = [family.derivative_matrix(i) for i in range(n)]
+    steps = [family.build_derivative_matrix(i) for i in range(n)]
     known: dict[Monomial, tuple[Any, Any]] = {(): (C, np.abs(C))}
     orders: list[Derivatives] = []
     for order in range(1, highest + 1):

@@ -47,7 +47,7 @@ from orthocas.errors import Interrupted, InvalidValueError, OptionError
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
 from orthocas.fitting.probe import Bounds
-from orthocas.fitting.settings import PRECISIONS, Precision, default_parametrisation
+from orthocas.fitting.settings import PRECISIONS, Precision, choose_parametrisation
 from orthocas.fitting.suggest_domain import CONDITIONING, LEAK_DEG, DomainSuggestion
 from orthocas.fitting.wide import WideFit
 from orthocas.paths.chart_along import RADIUS, corridor_problem
@@ -195,7 +195,7 @@ def _confirming(
     suggestion: DomainSuggestion | None, built: Problem, parametrisation: Parametrisation | None
 ) -> Fit | None:
     """The fit that confirmed the domain, if it has the family that is asked for."""
-    default = default_parametrisation(built, True) == default_parametrisation(built, False)
+    default = choose_parametrisation(built, True) == choose_parametrisation(built, False)
     if suggestion is None or (parametrisation is None and not default):
         return None
     return replace(suggestion.fit, chart=replace(suggestion.fit.chart, problem=built))

@@ -49,15 +49,15 @@ class BasisGradients(ABC):
         """Number g of groups."""
 
     @abstractmethod
-    def table(self, C: Array) -> Array:
+    def build_table(self, C: Array) -> Array:
         """T for coefficients C (r, K), with numbers of the type of X."""
 
     @abstractmethod
-    def collected(self, slopes: Array) -> Array:
+    def collect(self, slopes: Array) -> Array:
         """dL/dC, (r, K), of a function L with slopes dL/dT."""
 
     @abstractmethod
-    def dense_part(
+    def expand_part(
         self, X: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike | None = None
     ) -> Array:
         """Gradients d psi_k / dq_i of some functions at some samples, zeros included, (samples, n, kept).
@@ -70,23 +70,23 @@ class BasisGradients(ABC):
             dtype: type of the numbers. Default: that of X.
         """
 
-    def dense(self, X: Array, samples: int) -> Array:
+    def expand(self, X: Array, samples: int) -> Array:
         """All gradients at all samples, (N, n, K)."""
-        return self.dense_part(X, samples, np.ones(self.family.width, dtype=bool))
+        return self.expand_part(X, samples, np.ones(self.family.width, dtype=bool))
 
     def jacobian(self, X: Array, C: Array, samples: int) -> Array:
         """J_xi = T X of coefficients C (r, K) at all samples, (N, r, n)."""
-        rows = np.matmul(self.table(C), X)  # (B, g, n r / g, c)
+        rows = np.matmul(self.build_table(C), X)  # (B, g, n r / g, c)
         B, _, _, c = rows.shape
         J: Array = rows.reshape(B, self.n, len(C), c).transpose(0, 3, 2, 1).reshape(B * c, len(C), self.n)
         return J[:samples]
 
-    def along(self, X: Array, directions: Array) -> Array:
+    def differentiate_along(self, X: Array, directions: Array) -> Array:
         """Derivatives a . d psi / dq along directions a (N, n) at samples, (N, K)."""
         found, c = [], X.shape[3]
         for b in range(0, len(X), _PART):
             part = slice(b * c, min((b + _PART) * c, len(directions)))
-            G = self.dense(X[b : b + _PART], part.stop - part.start)
+            G = self.expand(X[b : b + _PART], part.stop - part.start)
             found.append(np.einsum("si,sik->sk", directions[part], G))
         return np.concatenate(found)
 
@@ -110,7 +110,7 @@ class ProductGradients(BasisGradients):
 
     def __init__(self, family: ProductFamily, n: int, dtype: DTypeLike = np.float64) -> None:
         super().__init__(family, n, dtype)
-        matrices = [family.derivative_matrix(i)[1:] for i in range(n)]
+        matrices = [family.build_derivative_matrix(i)[1:] for i in range(n)]
         self._places = np.unique(np.concatenate([D.indices for D in matrices]))  # of psi' in (1, psi)
         matrices = [D[:, self._places] for D in matrices]
         self._upright = scipy.sparse.vstack(matrices).tocsr()  # all D_i, (n K, S)
@@ -123,18 +123,18 @@ class ProductGradients(BasisGradients):
         """One."""
         return 1
 
-    def table(self, C: Array) -> Array:
+    def build_table(self, C: Array) -> Array:
         """T = C D_i, (1, n r, S)."""
         rows = (self._lying @ C.T).reshape(self.n, -1, len(C)).transpose(0, 2, 1)
         return np.ascontiguousarray(rows, dtype=self.dtype).reshape(1, self.n * len(C), -1)
 
-    def collected(self, slopes: Array) -> Array:
+    def collect(self, slopes: Array) -> Array:
         """The sum over the joints of dL/dT D_i^T."""
         by_joint = slopes.reshape(self.n, -1, slopes.shape[2]).transpose(0, 2, 1)
         found: Array = (self._back @ by_joint.reshape(-1, by_joint.shape[2])).T
         return found
 
-    def dense_part(
+    def expand_part(
         self, X: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike | None = None
     ) -> Array:
         """D_i psi'."""
@@ -144,7 +144,7 @@ class ProductGradients(BasisGradients):
         found = self._part(kept, kind) @ values.astype(kind, copy=False)  # (n kept, samples)
         return np.ascontiguousarray(found.T).reshape(found.shape[1], self.n, int(kept.sum()))
 
-    def along(self, X: Array, directions: Array) -> Array:
+    def differentiate_along(self, X: Array, directions: Array) -> Array:
         """The sum over the joints of D_i (a_i psi')."""
         K, N = self.family.width, len(directions)
         values = X[:, 0].transpose(1, 0, 2).reshape(X.shape[2], -1)[:, :N]
@@ -187,11 +187,11 @@ class SparseGradients(BasisGradients):
         width = max(len(row) for row in rows)
         return np.array([sorted(row) + [-1] * (width - len(row)) for row in rows])
 
-    def table(self, C: Array) -> Array:
+    def build_table(self, C: Array) -> Array:
         """The coefficients of the functions of each joint, (n, r, S)."""
         return np.ascontiguousarray(C[:, self.terms_of_joints].transpose(1, 0, 2), dtype=self.dtype)
 
-    def collected(self, slopes: Array) -> Array:
+    def collect(self, slopes: Array) -> Array:
         """The sum over the joints."""
         total = np.zeros((slopes.shape[1], self.family.width))
         for places, part in zip(self.terms_of_joints, slopes, strict=True):
@@ -199,7 +199,7 @@ class SparseGradients(BasisGradients):
             total[:, places[known]] += part[:, known]
         return total
 
-    def dense_part(
+    def expand_part(
         self, X: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike | None = None
     ) -> Array:
         """The numbers in their places."""
@@ -224,7 +224,7 @@ class SparseGradients(BasisGradients):
         return ca.Function("jacobian", [q], [ca.jacobian(self.family.basis(q), q)])
 
 
-def gradients_of(family: LinearFamily, n: int, dtype: DTypeLike = np.float64) -> BasisGradients:
+def build_gradients(family: LinearFamily, n: int, dtype: DTypeLike = np.float64) -> BasisGradients:
     """Gradients of a family of n joints, with numbers of a type."""
     return (
         ProductGradients(family, n, dtype) if isinstance(family, ProductFamily) else SparseGradients(family, n, dtype)

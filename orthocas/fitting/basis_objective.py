@@ -10,8 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.bases.family import LinearFamily
-from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
-from orthocas.fitting.loss import Loss, curvature_columns, loss_columns, residual_columns, value_columns
+from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
+from orthocas.fitting.loss import (
+    Loss,
+    build_curvature_columns,
+    build_loss_columns,
+    build_residual_columns,
+    build_value_columns,
+)
 from orthocas.fitting.terms import Pairs, Sizes, Weights
 from orthocas.tasks.samples import Draw, Samples, even_parts
 from orthocas.tools.batch import in_threads, in_threads_with, thread_count
@@ -28,7 +34,7 @@ _ROUGH = 12  # residuals per coefficient in a rough estimate
 Shared = Sequence[tuple[int, int, int, int]]
 
 
-def normal_matrix(derivatives: Sequence[Array], gradients: Sequence[Array], shared: Shared) -> Array:
+def build_normal_matrix(derivatives: Sequence[Array], gradients: Sequence[Array], shared: Shared) -> Array:
     """Sums over samples of X_j^T X_j, and of x_i^T x_j for residuals that two coordinates share, (size, size).
 
     X_j = D_j G_j are the derivatives of the residuals of coordinate j with respect to its coefficients. Products are
@@ -129,7 +135,7 @@ class BasisObjective:
         self.r, self.K = family.outputs, family.width
         self.kept = np.ones((self.r, self.K), dtype=bool) if kept is None else kept
         m, self.n = samples.task_jacobian.shape[1:]
-        self._gradients = gradients_of(family, self.n) if gradients is None else gradients
+        self._gradients = build_gradients(family, self.n) if gradients is None else gradients
         self._loss = Loss.of(Sizes(self.n, m, self.r, samples.metric_inverse is None), weights.by_name, exchanged)
         self._begin(samples, start, orientation)
 
@@ -168,21 +174,21 @@ class BasisObjective:
 
     def value(self, theta: Array) -> float:
         """L(theta)."""
-        (losses,) = value_columns(self._loss)(self._jacobian_entries(theta), *self._data)
+        (losses,) = build_value_columns(self._loss)(self._jacobian_entries(theta), *self._data)
         return float(np.vdot(losses[:, 0], self._share))
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """L(theta) and dL/dtheta."""
-        T, columns, parts = self._table(theta), loss_columns(self._loss), self._parts
+        T, columns, parts = self._table(theta), build_loss_columns(self._loss), self._parts
         with columns.borrowed(min(thread_count(), len(parts))) as runs:
-            sums = in_threads_with(runs, lambda run, part: self._sums(T, run, part), parts)
-        slopes = self._gradients.collected(np.sum([gradient for _, gradient in sums], axis=0))
+            sums = in_threads_with(runs, lambda run, part: self._sum_part(T, run, part), parts)
+        slopes = self._gradients.collect(np.sum([gradient for _, gradient in sums], axis=0))
         return sum(value for value, _ in sums), slopes[self.kept]
 
     def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
         """L(theta), its gradient, and the Gauss-Newton matrix, computed with products in single precision."""
         value, gradient = self.value_and_gradient(theta)
-        return value, gradient, self._matrix(theta, STRIDE)
+        return value, gradient, self._build_matrix(theta, STRIDE)
 
     def curvature_estimate(self, theta: Array) -> Array:
         """The Gauss-Newton matrix from as few samples as steer a quasi-Newton method."""
@@ -190,12 +196,12 @@ class BasisObjective:
         stride = STRIDE
         while 2 * stride <= _MOST_STRIDE and residuals >= 2 * stride * _ROUGH * theta.size:
             stride *= 2
-        return self._matrix(theta, stride)
+        return self._build_matrix(theta, stride)
 
     def hessian(self, theta: Array) -> Array:
         """d^2L/dtheta^2, exact, (size, size)."""
         r, n, K = self.r, self.n, self.K
-        (curvature,) = curvature_columns(self._loss)(self._jacobian_entries(theta), *self._data)
+        (curvature,) = build_curvature_columns(self._loss)(self._jacobian_entries(theta), *self._data)
         W = by_sample(curvature.reshape(-1, n * r, n * r, curvature.shape[2]), self.N).reshape(-1, n, r, n, r)
         G, H = self._dense, np.zeros((r, K, r, K))
 
@@ -256,33 +262,33 @@ class BasisObjective:
     def _dense(self) -> Array:
         """Gradients sample by sample, (N, n, K)."""
         if "all" not in self._expanded:
-            self._expanded["all"] = self._gradients.dense(self.X, self.N)
+            self._expanded["all"] = self._gradients.expand(self.X, self.N)
         return self._expanded["all"]
 
-    def _thinned(self, stride: int) -> list[Array]:
+    def _thin(self, stride: int) -> list[Array]:
         """Gradients of the functions of each coordinate at some samples, (N / stride, n, K_j), in single precision."""
         names = [f"{stride} {row.tobytes().hex()}" for row in self.kept]
         for name, row in zip(names, self.kept, strict=True):
             if name not in self._expanded:
-                self._expanded[name] = self._gradients.dense_part(self.X, self.N, row, stride, np.float32)
+                self._expanded[name] = self._gradients.expand_part(self.X, self.N, row, stride, np.float32)
         return [self._expanded[name] for name in names]
 
     def _table(self, theta: Array) -> Array:
         """T, (g, n r / g, S)."""
-        return self._gradients.table(expanded(theta, self.kept).reshape(self.r, self.K))
+        return self._gradients.build_table(expanded(theta, self.kept).reshape(self.r, self.K))
 
     @property
     def _parts(self) -> list[slice]:
         """The blocks of samples in parts."""
         return [slice(start, start + _BLOCKS) for start in range(0, len(self.X), _BLOCKS)]
 
-    def _sums(self, T: Array, run: Run, part: slice) -> tuple[float, Array]:
+    def _sum_part(self, T: Array, run: Run, part: slice) -> tuple[float, Array]:
         """Share of some blocks in the loss, and in its slopes with respect to T."""
         value, gradient = 0.0, np.zeros(T.shape)
         losses, slopes = np.empty(COLUMNS), np.empty((self.n * self.r, COLUMNS))
         arrays = (self.X, self._share, *self._data)
         for X, share, *data in zip(*(array[part] for array in arrays), strict=True):  # X leaves memory only once
-            run([_double(T @ X), *data], [losses, slopes])
+            run([_to_double(T @ X), *data], [losses, slopes])
             value += float(losses @ share)
             gradient += (slopes * share).astype(X.dtype, copy=False).reshape(*T.shape[:2], -1) @ X.transpose(0, 2, 1)
         return value, gradient
@@ -290,26 +296,26 @@ class BasisObjective:
     def _jacobian_entries(self, theta: Array) -> Array:
         """J_xi, (B, n r, c)."""
         T = self._table(theta)
-        J = _double(np.concatenate(in_threads(lambda part: T @ self.X[part], self._parts)))
+        J = _to_double(np.concatenate(in_threads(lambda part: T @ self.X[part], self._parts)))
         return J.reshape(len(J), self.n * self.r, -1)
 
-    def _matrix(self, theta: Array, stride: int) -> Array:
+    def _build_matrix(self, theta: Array, stride: int) -> Array:
         """Gauss-Newton matrix; that of the smooth residuals from every `stride`-th sample."""
-        derivatives = residual_columns(self._loss)(self._jacobian_entries(theta), *self._data)
-        H = self._gauss_newton_matrix(derivatives[: self.r], stride)
+        derivatives = build_residual_columns(self._loss)(self._jacobian_entries(theta), *self._data)
+        H = self._sum_smooth(derivatives[: self.r], stride)
         hinges = derivatives[self.r :]
         for residual, derivative in zip(hinges[::2], hinges[1::2], strict=True):
-            H += self._hinge_matrix(residual, derivative)
+            H += self._sum_hinges(residual, derivative)
         return H
 
-    def _gauss_newton_matrix(self, derivatives: list[Array], stride: int) -> Array:
+    def _sum_smooth(self, derivatives: list[Array], stride: int) -> Array:
         """Gauss-Newton matrix of the smooth residuals, by blocks of coordinate pairs."""
         rows = self._loss.smooth_rows
         if not any(rows):
             return np.zeros((self.kept.sum(), self.kept.sum()))
         shared = [(i, j, rows[i].index(row), rows[j].index(row)) for i, j, row in self._loss.shared_rows]
-        gradients = self._thinned(stride)
-        H = normal_matrix([self._rows(derivative, stride) for derivative in derivatives], gradients, shared)
+        gradients = self._thin(stride)
+        H = build_normal_matrix([self._rows(derivative, stride) for derivative in derivatives], gradients, shared)
         return H / len(gradients[0])
 
     def _rows(self, derivative: Array, stride: int) -> Array:
@@ -317,18 +323,18 @@ class BasisObjective:
         blocks = derivative.reshape(len(derivative), self.n, -1, derivative.shape[2])
         return by_sample(blocks, self.N, stride).astype(np.float32)
 
-    def _hinge_matrix(self, residual: Array, derivative: Array) -> Array:
+    def _sum_hinges(self, residual: Array, derivative: Array) -> Array:
         """Gauss-Newton matrix of a hinge residual. It couples all coordinates, but acts at few samples."""
         block, column = np.nonzero((residual[:, 0] > 0) & (self._share > 0))
         D = derivative[block, :, column].reshape(-1, self.n, self.r).transpose(0, 2, 1).astype(np.float32)
         chosen: Array = self.X[block, :, :, column]  # (active, g, S)
-        G = self._gradients.dense(chosen.transpose(1, 2, 0)[None], len(chosen))
+        G = self._gradients.expand(chosen.transpose(1, 2, 0)[None], len(chosen))
         rows = (D @ G.astype(np.float32))[:, self.kept]
         product: Array = (rows.T @ rows).astype(float) / self.N
         return product
 
 
-def _double(products: Array) -> Array:
+def _to_double(products: Array) -> Array:
     """Numbers of the type that CasADi's functions read."""
     return products.astype(np.float64, copy=False)
 

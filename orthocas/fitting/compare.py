@@ -19,7 +19,7 @@ from orthocas.charts.chart_file import CHART
 from orthocas.codegen.ticks import control_tick
 from orthocas.errors import ChartFileError, Interrupted, InvalidValueError, OrthocasError
 from orthocas.fitting.grid import Cell, CellResult, run_cells
-from orthocas.fitting.settings import PRECISIONS, Precision, default_solver
+from orthocas.fitting.settings import PRECISIONS, Precision, choose_solver
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.protocol import Solver
@@ -303,7 +303,7 @@ def _fits(
     """Parametrisation, solver, seed and chart file of every fit of a grid."""
     for parametrisation in parametrisations:
         closed = parametrisation.closed_form is not None
-        fitting = [default_solver(parametrisation, problem)] if closed or solvers is None else solvers
+        fitting = [choose_solver(parametrisation, problem)] if closed or solvers is None else solvers
         for solver, seed in product(fitting, range(1 if closed else seeds)):
             name = re.sub(r"[^\w.-]", "-", f"{parametrisation.label}_{solver.name}_{seed}.orthocas")
             yield parametrisation, solver, seed, None if folder is None else folder / name

@@ -131,29 +131,29 @@ def distil(
         raise InvalidValueError("samples", count, f"enough for the {family.size // chart.r} parameters of a coordinate")
     require_memory(f"distilling with {count} samples", 8.0 * count * chart.n * (chart.n + 4))
     points = sample_evenly(chart.problem.domain, count, require_count("seed", seed, least=0))
-    targets = _targets(chart, points)
-    wanted_values = targets if circle is None else _pairs(targets)
+    targets = _sample_targets(chart, points)
+    wanted_values = targets if circle is None else _take_circle_pairs(targets)
     if isinstance(family, LinearFamily):
-        theta, offset = _least_squares(family, wanted_values, watch)
+        theta, offset = _solve_least_squares(family, wanted_values, watch)
     else:
         minimiser = LBFGS(max_iterations=500, tolerance=1e-9) if solver is None else solver
         theta, offset = _minimised(family, wanted_values, minimiser, seed, watch)
     if circle is not None:
         theta, offset = np.concatenate([theta, -offset[: circle.constants]]), np.zeros(chart.r)
     coordinates = Coordinates(parametrisation, space, (), theta, offset, np.ones(chart.r))
-    return _judged(
+    return _evaluate(
         chart, Chart(chart.problem, coordinates, {"distilled from": chart.coordinates.label}), targets, count
     )
 
 
-def _pairs(targets: _Targets) -> _Targets:
+def _take_circle_pairs(targets: _Targets) -> _Targets:
     """Cosines, then sines of angles, and their gradients."""
     c, s, g = np.cos(targets.xi), np.sin(targets.xi), targets.gradients
     gradients = np.concatenate([-s[:, :, None] * g, c[:, :, None] * g], axis=1)
     return _Targets(targets.points, np.concatenate([c, s], axis=1), gradients, targets.weight)
 
 
-def _targets(chart: Chart, points: Array) -> _Targets:
+def _sample_targets(chart: Chart, points: Array) -> _Targets:
     """Grown values and gradients at the points that have them."""
     xi, gradients = chart.coordinates.xi(points), chart.coordinates.jacobian(points)
     known = np.isfinite(xi).all(axis=1) & np.isfinite(gradients).all(axis=(1, 2))
@@ -163,9 +163,9 @@ def _targets(chart: Chart, points: Array) -> _Targets:
     return _Targets(points[known], xi[known], gradients[known] * weight, weight)
 
 
-def _judged(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> Distilled:
+def _evaluate(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> Distilled:
     held_out = sample_uniform(chart.problem.domain, min(count, 5000), _HELD_OUT_SEED)
-    known = _targets(chart, held_out)
+    known = _sample_targets(chart, held_out)
     errors = shortest(distilled.coordinates.xi(known.points) - known.xi, distilled.turns[chart.m :])
     gradients = known.gradients / known.weight
     turned = np.linalg.norm(distilled.coordinates.jacobian(known.points) - gradients, axis=2)
@@ -180,7 +180,7 @@ def _judged(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> Di
     )
 
 
-def _least_squares(family: LinearFamily, targets: _Targets, watch: Watch) -> tuple[Array, Array]:
+def _solve_least_squares(family: LinearFamily, targets: _Targets, watch: Watch) -> tuple[Array, Array]:
     """Coefficients and offset of the best linear combination, by normal equations over chunks of samples."""
     n, K = targets.points.shape[1], family.width
     q = ca.SX.sym("q", n)

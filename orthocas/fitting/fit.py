@@ -9,7 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from orthocas.bases.circle import CircleFamily
-from orthocas.bases.cyclic import Mobile, anywhere, over_cyclic_joints
+from orthocas.bases.cyclic import Mobile, anywhere, widen_over_cyclic_joints
 from orthocas.bases.family import CyclicParametrisation, JointSpace, Parametrisation, ReorderableFamily
 from orthocas.bases.registry import warn_unless_savable
 from orthocas.charts.chart import Chart
@@ -156,7 +156,7 @@ def _fit(
             solution, coordinates = _solve(problem, settings, monitor, samples, align_to, begin)
         joints = [i for i in coordinates.idle if i not in problem.robot.tree.floating]
         result = Fit(
-            chart=Chart(problem, coordinates, _notes(solution, settings)),
+            chart=Chart(problem, coordinates, _write_notes(solution, settings)),
             stages=solution.stages,
             problem_check=problem_check,
             idle_joints=tuple(problem.robot.joint_names[i] for i in joints),
@@ -178,7 +178,7 @@ def _choose_domain(problem: Problem, settings: FitSettings) -> Problem:
     """
     parametrisation = settings.parametrisation
     if isinstance(parametrisation, CyclicParametrisation):
-        problem = over_cyclic_joints(problem, tuple(parametrisation.cyclic))
+        problem = widen_over_cyclic_joints(problem, tuple(parametrisation.cyclic))
     if problem.robot.tree.floating and (parametrisation.closed_form is not None or not settings.split_idle):
         expected = "one to fit in the arms' joints, such as Polynomial(1), with split_idle: the base floats"
         raise InvalidValueError("parametrisation", parametrisation.label, expected)
@@ -305,7 +305,7 @@ def _reorder(coordinates: Coordinates, order: NDArray[np.int_], signs: Array) ->
     )
 
 
-def _notes(solution: Solution, settings: FitSettings) -> dict[str, str | float]:
+def _write_notes(solution: Solution, settings: FitSettings) -> dict[str, str | float]:
     """Notes of the chart: how it was made."""
     weights, stages, worst = settings.weights, solution.stages, solution.worst
     searched = {} if worst is None else {"least conditioning": worst.least}

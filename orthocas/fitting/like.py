@@ -53,7 +53,7 @@ class LikeRules:
 RULES = LikeRules()
 
 
-def quantity_of(robot: Robot, like: Quantity | str) -> tuple[str, ca.Function]:
+def build_quantity(robot: Robot, like: Quantity | str) -> tuple[str, ca.Function]:
     """Its name with a unit, and q (n, 1) -> the quantity (1, 1): a joint, the swivel, or a function of q."""
     q = ca.SX.sym("q", robot.n)
     if isinstance(like, str):
@@ -68,7 +68,7 @@ def quantity_of(robot: Robot, like: Quantity | str) -> tuple[str, ca.Function]:
     return name if name.isidentifier() else "a function of q", dense_function("like", [q], [found])
 
 
-def like_label(name: str, where: str = "") -> str:
+def label_likeness(name: str, where: str = "") -> str:
     """What a coordinate means that is not its quantity, but like it: 'like swivel at home [rad]'."""
     words, bracket, unit = name.rpartition(" [") if name.endswith("]") else (name, "", "")
     return " ".join(filter(None, ("like", words, where))) + bracket + unit
@@ -117,7 +117,7 @@ class Like:
             names = tuple(f"{label} [{unit}]" if unit else label for label, unit in labels)
             return cls(names, _of_arms(robot, q, like.smooth_function(q)))
         parts = [like] if isinstance(like, str) or not isinstance(like, Sequence) else like
-        found = [quantity_of(robot, part) for part in parts]
+        found = [build_quantity(robot, part) for part in parts]
         if not found:
             raise InvalidValueError("like", "an empty list", "at least one quantity")
         values = ca.vertcat(*(function(q) for _, function in found))
@@ -126,7 +126,7 @@ class Like:
     @property
     def label(self) -> str:
         """What the coordinates mean, for the notes of a chart: 'like q3 [rad]; like height'."""
-        return "; ".join(like_label(name) for name in self.names)
+        return "; ".join(label_likeness(name) for name in self.names)
 
     def require_at_most(self, count: int) -> None:
         """Raise InvalidValueError if there are more quantities than coordinates."""
@@ -237,7 +237,7 @@ class LikeTerm:
     def turned(self, family: LinearFamily, theta: Array, samples: Samples, gradients: BasisGradients) -> Array:
         """Combinations of coordinates, (r K,): the first k are nearest to the quantities, the others across them."""
         C = theta.reshape(family.outputs, family.width)
-        G = gradients.dense(gradients.at(samples.points), len(samples))
+        G = gradients.expand(gradients.at(samples.points), len(samples))
         Z = samples.null_basis
         own = np.einsum("rk,snk,snz->szr", C, G, Z, optimize=True).reshape(-1, len(C))  # components across the task
         slopes = _finite(self.batched(samples.points)[0].reshape(len(samples), self.count, -1))
@@ -286,7 +286,7 @@ class Meaning:
     points: Array  #: (k, n), the posture in the middle
     values: Array  #: (k,), monotone
     home: int  #: place of the posture
-    slope: float  #: mean change of the value for a unit self-motion, in the direction of `unit_self_motion`
+    slope: float  #: mean change of the value for a unit self-motion, in the direction of `find_self_motion`
     name: str  #: with its unit
     fitted: bool  #: whether coordinates are fitted to the values; otherwise they only get their scale and offset
     quantity: ca.Function  #: q (n, 1) -> the quantity (1, 1)
@@ -295,7 +295,7 @@ class Meaning:
     @property
     def label(self) -> str:
         """What the coordinate means, for the notes of a chart."""
-        return like_label(self.name, "at home")
+        return label_likeness(self.name, "at home")
 
     @classmethod
     def by_default(cls, problem: Problem, posture: Array) -> "Meaning | None":
@@ -318,7 +318,7 @@ class Meaning:
                 raise InvalidValueError("like", f"{len(several.names)} quantities", "one, as r = 1")
             name, quantity = several.names[0], several.function
         else:
-            name, quantity = quantity_of(problem.robot, like)
+            name, quantity = build_quantity(problem.robot, like)
         sides = [_trace_self_motion(problem, posture, sign * RULES.step) for sign in (-1.0, 1.0)]
         points = np.concatenate([sides[0][:0:-1], sides[1]])
         middle = len(sides[0]) - 1
@@ -387,7 +387,7 @@ def _wrap(angles: Array) -> Array:
 
 def _trace_self_motion(problem: Problem, posture: Array, step: float) -> Array:
     """The self-motion from a posture in steps of unit self-motions, up to the boundary of the domain, (k, n)."""
-    found, slope = [posture], partial(unit_self_motion, problem)
+    found, slope = [posture], partial(find_self_motion, problem)
     while len(found) < RULES.most_steps and problem.domain.contains(found[-1]):
         q = found[-1]
         middle = q + step / 2 * slope(q)
@@ -396,7 +396,7 @@ def _trace_self_motion(problem: Problem, posture: Array, step: float) -> Array:
     return np.array(found[:-1] if len(found) > 1 else found)
 
 
-def unit_self_motion(problem: Problem, q: Array) -> Array:
+def find_self_motion(problem: Problem, q: Array) -> Array:
     """The unit self-motion z (n,) of a position for r = 1, with z^T A z = 1 and det [J_x; z^T] > 0."""
     J = problem.task.batched_frame_jacobian(q[None])[0].reshape(problem.m, problem.n)
     z = np.linalg.svd(J)[2][-1]

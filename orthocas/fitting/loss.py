@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.bases.family import Family, JointSpace, LinearFamily, Parametrisation
 from orthocas.fitting.settings import require_parametrisation
-from orthocas.fitting.starts import spectral_start
+from orthocas.fitting.starts import find_spectral_start
 from orthocas.fitting.terms import (
     DEFAULT_WEIGHTS,
     SAMPLE_DATA,
@@ -23,7 +23,7 @@ from orthocas.fitting.terms import (
     WeightNumbers,
     Weights,
     coordinates_of,
-    term_of,
+    find_term,
 )
 from orthocas.tasks.domains import sample_evenly
 from orthocas.tasks.problem import Problem
@@ -77,20 +77,20 @@ def loss(
     require_kind("problem", problem, Problem)
     require_parametrisation(parametrisation)
     family = parametrisation.for_problem(problem).family(JointSpace.of(problem), problem.r)
-    drawn = _drawn(problem, samples, seed)
+    drawn = _draw(problem, samples, seed)
     theta0 = _start(family, drawn, seed) if start is None else frozen_array("start", start, (family.size,))
     theta = ca.MX.sym("theta", family.size)
-    J = _jacobians(family, drawn.points, theta)  # (r n, N), each J_xi column by column
+    J = _build_jacobians(family, drawn.points, theta)  # (r n, N), each J_xi column by column
     identity = drawn.metric_inverse is None
     known = Weights.of(weights).for_problem(problem)
     of_sample = Loss.of(Sizes(problem.n, problem.m, problem.r, identity), known.by_name)
     orientation = _orientation(drawn, ca.Function("J", [theta], [J])(theta0).full(), problem.r)
     data = [_columns(part) for part in drawn.described(of_sample.data, orientation)]
-    mean = ca.sum2(_mapped(of_sample, len(drawn))(J, *data)) / len(drawn)
+    mean = ca.sum2(_map_loss(of_sample, len(drawn))(J, *data)) / len(drawn)
     return ca.Function("loss", [theta], [mean], ["theta"], ["loss"])
 
 
-def _drawn(problem: Problem, samples: int | ArrayLike, seed: int) -> Samples:
+def _draw(problem: Problem, samples: int | ArrayLike, seed: int) -> Samples:
     if isinstance(samples, int | np.integer):
         count = require_count("samples", int(samples))
         return samples_at(problem, sample_evenly(problem.domain, count, require_count("seed", seed, least=0)))
@@ -98,10 +98,10 @@ def _drawn(problem: Problem, samples: int | ArrayLike, seed: int) -> Samples:
 
 
 def _start(family: Family, samples: Samples, seed: int) -> Array:
-    return spectral_start(family, samples) if isinstance(family, LinearFamily) else family.initial(seed)
+    return find_spectral_start(family, samples) if isinstance(family, LinearFamily) else family.initial(seed)
 
 
-def _jacobians(family: Family, points: Array, theta: ca.MX) -> ca.MX:
+def _build_jacobians(family: Family, points: Array, theta: ca.MX) -> ca.MX:
     """J_xi of every sample column by column, (r n, N)."""
     N, n = points.shape
     if isinstance(family, LinearFamily):
@@ -118,9 +118,9 @@ def _jacobians(family: Family, points: Array, theta: ca.MX) -> ca.MX:
     return stacked
 
 
-def _mapped(loss_of: "Loss", count: int) -> ca.Function:
+def _map_loss(loss_of: "Loss", count: int) -> ca.Function:
     """The loss of `count` samples side by side: J_xi (r n, N) and data as columns -> (1, N)."""
-    one = sample_loss(loss_of)
+    one = build_sample_loss(loss_of)
     J = ca.SX.sym("J", loss_of.sizes.r * loss_of.sizes.n)
     data = [ca.SX.sym(name, one.numel_in(1 + k)) for k, name in enumerate(loss_of.data)]
     shaped = [ca.reshape(part, *one.size_in(1 + k)) for k, part in enumerate(data)]
@@ -157,13 +157,13 @@ class Loss:
         Raises:
             UnknownNameError: if there is no term for a weight.
         """
-        positive = tuple((name, weight) for name, weight in weights.items() if weight > 0 and term_of(name))
+        positive = tuple((name, weight) for name, weight in weights.items() if weight > 0 and find_term(name))
         return cls(sizes, positive, exchanged)
 
     @cached_property
     def terms(self) -> tuple[tuple[LossTerm, float], ...]:
         """Loss terms with their weights, smooth ones first."""
-        known = [(term_of(name), weight) for name, weight in self.weights]
+        known = [(find_term(name), weight) for name, weight in self.weights]
         return tuple(sorted(known, key=lambda pair: pair[0].hinge))
 
     @cached_property
@@ -252,46 +252,46 @@ class Loss:
 
 
 @cache
-def sample_loss(loss: Loss) -> ca.Function:
+def build_sample_loss(loss: Loss) -> ca.Function:
     """Loss of one sample (1, 1) as a function of J_xi (r, n) and the data in `Loss.symbols`."""
     J, data = loss.arguments()
-    return ca.Function("sample_loss", [J, *data], [ca.sumsqr(loss.residuals(J, data)) / 2])
+    return ca.Function("build_sample_loss", [J, *data], [ca.sumsqr(loss.residuals(J, data)) / 2])
 
 
 @cache
-def loss_with_slopes(loss: Loss) -> ColumnFunction:
-    """Loss of one sample (1, 1) and its derivative dL/dJ_xi (r, n), with the inputs of `sample_loss`."""
+def build_loss_with_slopes(loss: Loss) -> ColumnFunction:
+    """Loss of one sample (1, 1) and its derivative dL/dJ_xi (r, n), with the inputs of `build_sample_loss`."""
     J, data = loss.arguments()
     value = ca.sumsqr(loss.residuals(J, data)) / 2
     return ColumnFunction(ca.Function("loss", [J, *data], [value, ca.gradient(value, J)]))
 
 
 @cache
-def loss_columns(loss: Loss) -> "ColumnFunction | LossWithVolumes":
-    """Like `loss_with_slopes`, with volumes of many gradients by LAPACK."""
-    return LossWithVolumes(loss, loss_with_slopes) if loss.volume_terms else loss_with_slopes(loss)
+def build_loss_columns(loss: Loss) -> "ColumnFunction | LossWithVolumes":
+    """Like `build_loss_with_slopes`, with volumes of many gradients by LAPACK."""
+    return LossWithVolumes(loss, build_loss_with_slopes) if loss.volume_terms else build_loss_with_slopes(loss)
 
 
 @cache
-def value_columns(loss: Loss) -> "ColumnFunction | LossWithVolumes":
-    """Loss of one sample, with the inputs of `sample_loss`."""
+def build_value_columns(loss: Loss) -> "ColumnFunction | LossWithVolumes":
+    """Loss of one sample, with the inputs of `build_sample_loss`."""
 
     def written(part: Loss) -> ColumnFunction:
-        return ColumnFunction(sample_loss(part))
+        return ColumnFunction(build_sample_loss(part))
 
     return LossWithVolumes(loss, written, slopes=False) if loss.volume_terms else written(loss)
 
 
 @cache
-def residual_columns(loss: Loss) -> Callable[..., list[Array]]:
+def build_residual_columns(loss: Loss) -> Callable[..., list[Array]]:
     """Derivatives of the residuals of one sample with respect to J_xi, for the Gauss-Newton matrix.
 
-    The inputs are those of `sample_loss`. The outputs are, for every coordinate j, the derivative of `smooth_rows[j]`
-    with respect to row j of J_xi, (rows, n); then, for every hinge row and every volume term, the residual (1, 1) and
-    its derivative with respect to J_xi, (r, n).
+    The inputs are those of `build_sample_loss`. The outputs are, for every coordinate j, the derivative of
+    `smooth_rows[j]` with respect to row j of J_xi, (rows, n); then, for every hinge row and every volume term, the
+    residual (1, 1) and its derivative with respect to J_xi, (r, n).
     """
     if loss.volume_terms:
-        return LossWithVolumes(loss, residual_columns).residuals
+        return LossWithVolumes(loss, build_residual_columns).residuals
     J, data = loss.arguments()
     r, n = loss.sizes.r, loss.sizes.n
     rho = loss.residuals(J, data)
@@ -303,14 +303,14 @@ def residual_columns(loss: Loss) -> Callable[..., list[Array]]:
 
 
 @cache
-def curvature_columns(loss: Loss) -> ColumnFunction:
+def build_curvature_columns(loss: Loss) -> ColumnFunction:
     """Second derivatives of the loss of one sample with respect to J_xi column by column, (n r, n r).
 
-    The inputs are those of `sample_loss`.
+    The inputs are those of `build_sample_loss`.
     """
     J, data = loss.arguments()
     column = ca.SX.sym("v", loss.sizes.r * loss.sizes.n)
-    value = sample_loss(loss)(ca.reshape(column, loss.sizes.r, loss.sizes.n), *data)
+    value = build_sample_loss(loss)(ca.reshape(column, loss.sizes.r, loss.sizes.n), *data)
     second = ca.Function("second", [column, *data], [ca.hessian(value, column)[0]])
     return ColumnFunction(ca.Function("curvature", [J, *data], [second(ca.vec(J), *data)]))
 
@@ -349,7 +349,7 @@ class LossWithVolumes:
             yield [self._run(own) for own in written]
 
     def residuals(self, J: Array, *data: Array) -> list[Array]:
-        """The outputs of `residual_columns`."""
+        """The outputs of `build_residual_columns`."""
         if self._written is None:
             found = [np.empty((len(J), 0, COLUMNS)) for _ in range(self._loss.sizes.r)]
         else:

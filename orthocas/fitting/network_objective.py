@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.bases.family import ArrayFamily, ArrayMemory, Family, Memories
-from orthocas.fitting.loss import Loss, loss_columns, loss_with_slopes, value_columns
+from orthocas.fitting.loss import Loss, build_loss_columns, build_loss_with_slopes, build_value_columns
 from orthocas.fitting.terms import Sizes, Weights
 from orthocas.tasks.samples import Draw, Samples, even_parts
 from orthocas.tools.batch import in_threads, in_threads_with, thread_count
@@ -75,15 +75,15 @@ class ArrayObjective:
 
     def value(self, theta: Array) -> float:
         """L(theta)."""
-        small = self._rounded(theta)
+        small = self._round(theta)
         J = in_threads(lambda piece: blocked(self._family.pullback(piece.points, small)[0]), self._pieces)
-        columns = value_columns(self._loss)
+        columns = build_value_columns(self._loss)
         parts = zip(J, self._pieces, strict=True)
         return sum(float(np.vdot(columns(own, *piece.data)[0][:, 0], piece.shares)) for own, piece in parts)
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """L(theta) and dL/dtheta."""
-        small, columns = self._rounded(theta), loss_columns(self._loss)
+        small, columns = self._round(theta), build_loss_columns(self._loss)
 
         def part(tools: tuple[Run, ArrayMemory], work: tuple[_Piece, Array]) -> float:
             (run, memory), (piece, result) = tools, work
@@ -132,7 +132,7 @@ class ArrayObjective:
         other._divide(self._points[places], [array[places] for array in self._described])
         return other
 
-    def _rounded(self, theta: Array) -> Array:
+    def _round(self, theta: Array) -> Array:
         """Parameters with numbers of the type of the products."""
         return theta.astype(np.float32 if self._single else np.float64)
 
@@ -256,7 +256,9 @@ class _LossGraph:
         by_component = [ca.horzsplit(gradient.T) for gradient in gradients]  # r times n columns of samples
         entries = [column for by_joint in zip(*by_component, strict=True) for column in by_joint]
         r = loss.sizes.r
-        values, *slopes = replay(loss_with_slopes(loss).tape, [*entries, *(ca.horzsplit(data) if loss.data else [])])
+        values, *slopes = replay(
+            build_loss_with_slopes(loss).tape, [*entries, *(ca.horzsplit(data) if loss.data else [])]
+        )
         weighted = [ca.horzcat(*(share * slope for slope in slopes[j::r])) for j in range(r)]
         # chain rule, split at J_xi: the derivatives of the loss are one sample's graph, replayed on columns
         by_theta = ca.jtimes(ca.horzcat(*gradients), theta, ca.horzcat(*(part.T for part in weighted)), True)

@@ -11,9 +11,9 @@ from orthocas.bases.products import Polynomial, ProductFamily
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import in_the_metric, worst_points
-from orthocas.fitting.basis_gradients import gradients_of
+from orthocas.fitting.basis_gradients import build_gradients
 from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.fitting.starts import spectral_start
+from orthocas.fitting.starts import find_spectral_start
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Weights
 from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.lbfgs import QuasiNewton
@@ -247,8 +247,8 @@ class Prober:
         C = theta.reshape(self.outputs, family.width)
 
         def jacobian(points: Array) -> Array:
-            basis = gradients_of(family, len(self.active))
-            G = basis.dense(basis.at(points[:, self.active]), len(points))
+            basis = build_gradients(family, len(self.active))
+            G = basis.expand(basis.at(points[:, self.active]), len(points))
             J: Array = (G @ C.T).transpose(0, 2, 1)
             return J
 
@@ -261,7 +261,7 @@ class Prober:
         samples = samples_at(problem, np.vstack([even, heavy])).restricted_to(self.active)
         with deferred():
             fresh = self._start is None
-            start = spectral_start(family, samples[: len(even)]) if self._start is None else self._start.on(family)
+            start = find_spectral_start(family, samples[: len(even)]) if self._start is None else self._start.on(family)
             objective = self._build_loss(problem, family, samples, start)
         result = self._minimise(objective, start, fresh, family.space.half_width)
         if result.status is Status.INTERRUPTED:
@@ -289,7 +289,7 @@ class Prober:
             weights = replace(self.weights.for_problem(problem), length=0.0, extra={})
             self._objective = BasisObjective(family, samples, weights, start, lambda count, seed: samples)
         else:
-            self._objective = known.moved(gradients_of(family, len(self.active)), samples, start)
+            self._objective = known.moved(build_gradients(family, len(self.active)), samples, start)
         return self._objective
 
 

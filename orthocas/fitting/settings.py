@@ -93,13 +93,13 @@ class FitSettings:
         """
         require_kind("problem", problem, Problem)
         if parametrisation is None:
-            parametrisation = default_parametrisation(problem, bounded=max_mutual_deg is not None)
+            parametrisation = choose_parametrisation(problem, bounded=max_mutual_deg is not None)
         require_parametrisation(parametrisation)
         bound = parametrisation.for_problem(problem)
         if max_mutual_deg is not None:
             _require_bound(bound, max_mutual_deg)
         if solver is None:
-            solver = default_solver(bound, problem) if max_mutual_deg is None else Ipopt()
+            solver = choose_solver(bound, problem) if max_mutual_deg is None else Ipopt()
         require_solver(solver)
         if max_mutual_deg is not None and not isinstance(solver, Ipopt):
             raise InvalidValueError("solver", solver.name, "ipopt, the only solver that supports max_mutual_deg")
@@ -137,7 +137,7 @@ class FitSettings:
         return self.weights.folds if free else 0.0
 
 
-def default_parametrisation(problem: Problem, bounded: bool) -> Polynomial:
+def choose_parametrisation(problem: Problem, bounded: bool) -> Polynomial:
     """Polynomials of degree 5; of 4 with a bound or 8 joints, of 3 with more, of 2 from 12: terms grow too many."""
     fewer = [degree for joints, degree in RULES.lower_degrees if problem.n >= joints]
     return Polynomial(
@@ -145,7 +145,7 @@ def default_parametrisation(problem: Problem, bounded: bool) -> Polynomial:
     )
 
 
-def default_solver(parametrisation: Parametrisation, problem: Problem) -> Solver:
+def choose_solver(parametrisation: Parametrisation, problem: Problem) -> Solver:
     """Gauss-Newton for families linear in their parameters, with fewer matrices if these are large; else L-BFGS."""
     if not parametrisation.linear:
         return LBFGS()

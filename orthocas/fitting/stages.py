@@ -24,12 +24,12 @@ from orthocas.charts.angles import pairs
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import WorstPoints, worst_points
 from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
-from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
+from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
 from orthocas.fitting.basis_objective import STRIDE, BasisObjective, BoundedMutual, expanded
 from orthocas.fitting.like import LikeTerm
 from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
 from orthocas.fitting.settings import RULES, FitSettings
-from orthocas.fitting.starts import Mirror, find_mirror, spectral_start
+from orthocas.fitting.starts import Mirror, find_mirror, find_spectral_start
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, FOLD_TERM
 from orthocas.fitting.terms import RULES as LOSS_RULES
 from orthocas.solvers.gauss_newton import GaussNewton
@@ -99,7 +99,7 @@ class Continuation:
         try:
             for step in steps:
                 self._solve(step, step.label, final=step is steps[-1])
-            self._unfold(steps[-1])
+            self._solve_until_unfolded(steps[-1])
         except KeyboardInterrupt:  # also between minimisations
             if self._reached is None:
                 raise
@@ -141,7 +141,7 @@ class Continuation:
         assert isinstance(before, GradedFamily)
         return family.embed(theta, before)
 
-    def _unfold(self, step: Parametrisation) -> None:
+    def _solve_until_unfolded(self, step: Parametrisation) -> None:
         """Solve the last step again until there is no point of small conditioning."""
         folds, before = self._runner.folds, 0.0
         for k in range(2, 2 + RULES.rounds):
@@ -231,21 +231,21 @@ class LinearSum(WeightedSum):
 
     def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
         """The sum, its gradient and its Gauss-Newton matrix."""
-        results = [(weight, *part.normal_equations(theta)) for weight, part in self._least_squares]
+        results = [(weight, *part.normal_equations(theta)) for weight, part in self._solve_least_squares]
         value = sum(weight * value for weight, value, _, _ in results)
         slopes = _add([weight * slope for weight, _, slope, _ in results])
         return value, slopes, _add([weight * H for weight, *_, H in results])
 
     def curvature_estimate(self, theta: Array) -> Array:
         """A rough Gauss-Newton matrix of the sum."""
-        return _add([weight * part.curvature_estimate(theta) for weight, part in self._least_squares])
+        return _add([weight * part.curvature_estimate(theta) for weight, part in self._solve_least_squares])
 
     def hessian(self, theta: Array) -> Array:
         """The Hessian of the sum."""
-        return _add([weight * part.hessian(theta) for weight, part in self._least_squares])
+        return _add([weight * part.hessian(theta) for weight, part in self._solve_least_squares])
 
     @property
-    def _least_squares(self) -> list[tuple[float, BasisObjective]]:
+    def _solve_least_squares(self) -> list[tuple[float, BasisObjective]]:
         return [(weight, part) for weight, part in self.parts if isinstance(part, BasisObjective)]
 
 
@@ -374,7 +374,7 @@ class StageRunner:
         if key not in self._starts:
             points = sample_evenly(self.problem.domain, count, RULES.start_seed)
             samples = samples_at(self.problem, points).restricted_to(self.active)
-            start = spectral_start(family, samples, kept, self._gradients(family))
+            start = find_spectral_start(family, samples, kept, self._gradients(family))
             if self.like is not None:
                 start = self.like.turned(family, start, samples, self._gradients(family))
             self._starts[key] = start
@@ -467,7 +467,7 @@ class StageRunner:
         """Those of a basis, built once."""
         if family not in self._bases:
             number = np.float32 if self.settings.single else np.float64
-            self._bases[family] = gradients_of(family, self.space.n, number)
+            self._bases[family] = build_gradients(family, self.space.n, number)
         return self._bases[family]
 
     @cached_property

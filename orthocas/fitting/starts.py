@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.bases.family import JointSpace, LinearFamily
-from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
+from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
 from orthocas.fitting.terms import Pairs, coordinates_of
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import Samples, directions
@@ -27,7 +27,7 @@ _MOST_CHOICES = 8
 _SEED = 0
 
 
-def spectral_start(
+def find_spectral_start(
     family: LinearFamily,
     samples: Samples,
     kept: NDArray[np.bool_] | None = None,
@@ -49,8 +49,8 @@ def spectral_start(
     Source:
         ours, docs/explanation/derivations_fits.md#spectral-start.
     """
-    basis = gradients_of(family, samples.points.shape[1]) if gradients is None else gradients
-    G = basis.dense(basis.at(samples.points), len(samples)).astype(np.float64, copy=False)  # (N, n, K)
+    basis = build_gradients(family, samples.points.shape[1]) if gradients is None else gradients
+    G = basis.expand(basis.at(samples.points), len(samples)).astype(np.float64, copy=False)  # (N, n, K)
     N, _, K = G.shape
     along_task = (samples.task_basis @ G).reshape(-1, K)  # e_i^T d psi, the components along the task gradients
     S = along_task.T @ along_task / N
@@ -65,17 +65,17 @@ def spectral_start(
         classes = {
             allowed[j].tobytes(): j for j in reversed(left)
         }.values()  # one coordinate for all that allow the same
-        j, c = min(((j, _smallest(S, T, V, allowed[j])) for j in classes), key=lambda pair: pair[1] @ S @ pair[1])
+        j, c = min(((j, _find_smallest(S, T, V, allowed[j])) for j in classes), key=lambda pair: pair[1] @ S @ pair[1])
         left.remove(j)
         C[j] = c
         gradient = raised @ c  # (N, n)
         length = np.sqrt(np.maximum(np.einsum("sn,sn->s", gradient, G @ c), 1e-300))
         along = np.einsum("sn,snk->sk", gradient / length[:, None], G)
         S = S + _MUTUAL_WEIGHT * along.T @ along / N
-    return _mixed(C, G, allowed).ravel()
+    return _mix(C, G, allowed).ravel()
 
 
-def _smallest(S: Array, T: Array, V: Array, free: NDArray[np.bool_]) -> Array:
+def _find_smallest(S: Array, T: Array, V: Array, free: NDArray[np.bool_]) -> Array:
     """The c with c^T T c = 1 and the smallest c^T S c, zero where it is not free, (K,). Of exact ones that of V."""
     block = np.ix_(free, free)
     whitening = np.linalg.inv(np.linalg.cholesky(T[block])).T  # W^T T W = I
@@ -86,7 +86,7 @@ def _smallest(S: Array, T: Array, V: Array, free: NDArray[np.bool_]) -> Array:
     return c
 
 
-def _mixed(C: Array, G: Array, allowed: NDArray[np.bool_]) -> Array:
+def _mix(C: Array, G: Array, allowed: NDArray[np.bool_]) -> Array:
     """Scale coordinates to a mean gradient length of 1, and mix neighbours slightly that allow the same coefficients.
 
     The spectral solution inherits the symmetries of the problem, and a symmetric point is often a saddle of the loss.
@@ -139,7 +139,7 @@ class Mirror:
     def kept(self, family: LinearFamily) -> NDArray[np.bool_] | None:
         """The coefficients (r, K) that the components may have; None if a basis function is neither even nor odd."""
         if family not in self._kept:
-            self._kept[family] = self._allowed(family)
+            self._kept[family] = self._find_allowed(family)
         return self._kept[family]
 
     @cached_property
@@ -147,7 +147,7 @@ class Mirror:
         """Results of `kept` so far."""
         return {}
 
-    def _allowed(self, family: LinearFamily) -> NDArray[np.bool_] | None:
+    def _find_allowed(self, family: LinearFamily) -> NDArray[np.bool_] | None:
         q = ca.SX.sym("q", self.space.n)
         basis = ca.Function("basis", [q], [ca.densify(family.basis(q))])
         u = np.random.default_rng(_SEED).uniform(-1.0, 1.0, (self.space.n, _POINTS))
@@ -169,18 +169,18 @@ def find_mirror(problem: Problem, active: list[int]) -> Mirror | None:
     u = np.random.default_rng(_SEED).uniform(-1.0, 1.0, (_POINTS, space.n))
     left = [np.array(signs) for signs in product((1.0, -1.0), repeat=space.n)][1:]
     for points in (u[:1], u[1:]):
-        left = _symmetric(problem, active, points, left)
+        left = _keep_symmetric(problem, active, points, left)
     for signs in left:
-        parities = _parities(problem, active, signs, u)
+        parities = _find_parities(problem, active, signs, u)
         if parities is not None:
             return Mirror(space, signs, parities)
     return None
 
 
-def _symmetric(problem: Problem, active: list[int], u: Array, choices: Sequence[Array]) -> list[Array]:
+def _keep_symmetric(problem: Problem, active: list[int], u: Array, choices: Sequence[Array]) -> list[Array]:
     """The choices of signs for which task directions and metric at S u are the mirror images of those at u."""
     images = np.concatenate([u, *(signs * u for signs in choices)])
-    tensors = _tensors(problem, active, images)
+    tensors = _evaluate_tensors(problem, active, images)
     here, *there = tensors.reshape(1 + len(choices), len(u), *tensors.shape[1:])
     return [
         signs
@@ -189,19 +189,19 @@ def _symmetric(problem: Problem, active: list[int], u: Array, choices: Sequence[
     ]
 
 
-def _tensors(problem: Problem, active: list[int], u: Array) -> Array:
+def _evaluate_tensors(problem: Problem, active: list[int], u: Array) -> Array:
     """The `directions` at points of the cube (N, n)."""
     domain = problem.domain
     return directions(problem, active, domain.centre[active] + domain.half_width[active] * u)
 
 
-def _parities(problem: Problem, active: list[int], signs: Array, u: Array) -> Array | None:
+def _find_parities(problem: Problem, active: list[int], signs: Array, u: Array) -> Array | None:
     """Parities of r coordinates, odd ones first; None if the null space has other parities elsewhere on the mirror.
 
     The null space of J_x is mapped to itself where S q = q, and trace(S) on it is the number of even coordinates less
     that of odd ones.
     """
-    tensors = _tensors(problem, active, np.where(signs > 0, u, 0.0))
+    tensors = _evaluate_tensors(problem, active, np.where(signs > 0, u, 0.0))
     inverse, projector = tensors[:, 0], tensors[:, 1]
     along_task = np.einsum("sii,i->s", np.linalg.solve(inverse, projector.transpose(0, 2, 1)), signs)
     differences = signs.sum() - along_task

@@ -14,7 +14,7 @@ from orthocas.charts.point_quality import worst_points
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.fit import Fit, fit_from
 from orthocas.fitting.probe import RULES, Bounds, Miss, Prober, Quality, describe_conditioning, evaluate_chart
-from orthocas.fitting.settings import default_parametrisation, require_parametrisation
+from orthocas.fitting.settings import choose_parametrisation, require_parametrisation
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM, require_driven
@@ -117,7 +117,7 @@ def suggest_domain(
     prober = Prober(problem, joints.active, joints.cyclic, loss)
     stricter = replace(bounds, conditioning=min(1.0, RULES.margin * bounds.conditioning))
     widths, broken = WidestBox(prober, posture.q, room, joints.free, stricter, monitor).search(_propose_widths(robot))
-    wanted = default_parametrisation(problem, bounded=True) if parametrisation is None else parametrisation
+    wanted = choose_parametrisation(problem, bounded=True) if parametrisation is None else parametrisation
     found, quality = _confirm(prober, wanted, joints, widths, bounds, seed, monitor)
     return DomainSuggestion(
         fit=found,

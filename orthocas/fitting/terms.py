@@ -422,7 +422,7 @@ def register_loss_term(term: LossTerm) -> None:
     _TERMS[term.name] = term
 
 
-def term_of(name: str) -> LossTerm:
+def find_term(name: str) -> LossTerm:
     """The term with this name.
 
     Raises:

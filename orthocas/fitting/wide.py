@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.bases.cyclic import leaves_stay, over_cyclic_joints
+from orthocas.bases.cyclic import keeps_self_motions, widen_over_cyclic_joints
 from orthocas.bases.family import CyclicParametrisation, JointSpace, LinearFamily, Parametrisation
 from orthocas.bases.mlp import MLP
 from orthocas.bases.products import Polynomial
@@ -23,7 +23,7 @@ from orthocas.fitting.fit import Fit, fix_gauge, normalise
 from orthocas.fitting.like import Like, Likeness, Meaning, MeaningError
 from orthocas.fitting.settings import require_parametrisation
 from orthocas.fitting.terms import RULES as LOSS_RULES
-from orthocas.fitting.terms import Weights, term_of
+from orthocas.fitting.terms import Weights, find_term
 from orthocas.fitting.wide_search import (
     RULES,
     Search,
@@ -164,7 +164,7 @@ def fit_wide(
     require_count("seed", seed, least=0)
     chosen = _choose_branch(robot, task, branch, home)
     problem = _build_problem(robot, task, metric, chosen, bound)
-    families = _default_families(problem, like) if parametrisation is None else (parametrisation,)
+    families = _choose_families(problem, like) if parametrisation is None else (parametrisation,)
     cases = [_prepare(problem, family, like) for family in families]
     problem, _ = cases[0]
     count = None if samples is None else require_count("samples", samples, least=2)
@@ -205,7 +205,7 @@ def _check_weights(weights: Weights | Mapping[str, float]) -> Weights:
     if isinstance(weights, Weights):
         return weights
     require_kind("weights", weights, Mapping)
-    return Weights(0.0, 0.0, 0.0, 0.0, 0.0, {name: weight for name, weight in weights.items() if term_of(name)})
+    return Weights(0.0, 0.0, 0.0, 0.0, 0.0, {name: weight for name, weight in weights.items() if find_term(name)})
 
 
 def _prepare(problem: Problem, family: Parametrisation, like: Likeness | None) -> tuple[Problem, Parametrisation]:
@@ -213,7 +213,7 @@ def _prepare(problem: Problem, family: Parametrisation, like: Likeness | None) -
     require_parametrisation(family)
     family = family.for_problem(problem)
     if isinstance(family, CyclicParametrisation):
-        problem = over_cyclic_joints(problem, tuple(family.cyclic))
+        problem = widen_over_cyclic_joints(problem, tuple(family.cyclic))
     if family.closed_form is not None:
         raise InvalidValueError("parametrisation", family.label, "one that is fitted, such as a polynomial, or an MLP")
     if like is not None and not isinstance(family.family(JointSpace.of(problem), problem.r), LinearFamily):
@@ -308,14 +308,14 @@ def _choose_branch(robot: Robot, task: Task, branch: Branch | Box | str | None, 
     return found.of(home_posture(robot, task, home).q) or found[0]
 
 
-def _default_families(problem: Problem, like: Likeness | None) -> tuple[Polynomial | MLP, ...]:
+def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomial | MLP, ...]:
     """Polynomials that are linear in the joints on whose position the self-motions do not depend, by proof.
 
     Then those that are so in such slides without limits only, if there are others: a joint that turns has one turn.
     Then a network, but not for coordinates that are to mean something, nor with slides without limits.
     """
     robot = problem.robot
-    free = [k for k in range(robot.n) if leaves_stay(problem, k)]
+    free = [k for k in range(robot.n) if keeps_self_motions(problem, k)]
     slides = robot.tree.prismatic
     endless = [k for k in free if slides[k] and np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
     names, fewer = (tuple(robot.joint_names[k] for k in joints) for joints in (free, endless))

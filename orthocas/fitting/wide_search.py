@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from orthocas.bases.family import ArrayFamily, CombinableFamily, JointSpace, LinearFamily, Parametrisation
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError
-from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
+from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
 from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.fitting.like import Like, Meaning, QuadraticTerm, unit_self_motion
+from orthocas.fitting.like import Like, Meaning, QuadraticTerm, find_self_motion
 from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
 from orthocas.fitting.stages import Resampled, Stage, WeightedSum
 from orthocas.fitting.terms import RULES as LOSS
@@ -166,12 +166,12 @@ class Search:
         """Look for coordinates, in a stage of some name."""
         points = self.sample(self.samples, RULES.tag)
         if self.linear:
-            self._samples = [frame_samples(self.problem, points)]
+            self._samples = [sample_frames(self.problem, points)]
             self._last = self._start_linear()
             self._sign = 1.0 if self._evaluate_volumes(self._last, self._centre)[0] > 0 else -1.0
             self._descend(name, "volume", self.solver)
         else:
-            self._samples = [frame_samples(self.problem, np.vstack([points, self._sample_near_centre()]))]
+            self._samples = [sample_frames(self.problem, np.vstack([points, self._sample_near_centre()]))]
             self._last = self._start_at_random()
             self._descend(name, "volume with the worst", self.solver)
 
@@ -230,7 +230,7 @@ class Search:
         # mean of dpsi_i/dq A^-1 dpsi_j/dq, (K, K)
         inverse = np.eye(problem.n)[None] if some.metric_inverse is None else some.metric_inverse
         root = np.broadcast_to(np.linalg.cholesky(inverse), (len(some), problem.n, problem.n))
-        parts = (self._basis.along(known, root[:, :, i]) for i in range(problem.n))
+        parts = (self._basis.differentiate_along(known, root[:, :, i]) for i in range(problem.n))
         energy = sum((G.T @ G for G in parts), start=np.zeros(())) / len(some)
         self._factor = np.linalg.cholesky(energy + RULES.ridge * np.trace(energy) / len(energy) * np.eye(len(energy)))
         directions = scipy.linalg.null_space(self._centre.task_jacobian[0]).T
@@ -239,12 +239,15 @@ class Search:
             across = quantities.slopes(centre[None])[0] @ directions.T  # (k, r)
             Q, R = np.linalg.qr(np.vstack([across, np.eye(problem.r)]).T)
             directions = (Q * np.where(R.diagonal() < 0, -1.0, 1.0)).T @ directions
-            self._likeness = quantities.hold(some, lambda a: self._basis.along(known, a))
+            self._likeness = quantities.hold(some, lambda a: self._basis.differentiate_along(known, a))
         if meaning is not None:
-            directions = meaning.slope * unit_self_motion(problem, centre)[None]
+            directions = meaning.slope * find_self_motion(problem, centre)[None]
             assert isinstance(self.family, LinearFamily)
             self._likeness = [meaning.hold(self.family)] if meaning.fitted else []
-        sides = [self._basis.along(known, np.broadcast_to(a, some.points.shape)).mean(axis=0) for a in directions]
+        sides = [
+            self._basis.differentiate_along(known, np.broadcast_to(a, some.points.shape)).mean(axis=0)
+            for a in directions
+        ]
         return np.asarray(scipy.linalg.cho_solve((self._factor, True), np.array(sides).T).T.ravel())
 
     def _start_at_random(self) -> Array:
@@ -260,28 +263,28 @@ class Search:
         """Let those of fresh samples join at which the last coordinates have the least volumes."""
         points = self.sample(fresh, tag)
         # matrices of all would take a gigabyte
-        parts = [frame_samples(self.problem, part) for part in np.array_split(points, -(-fresh // RULES.held_out))]
+        parts = [sample_frames(self.problem, part) for part in np.array_split(points, -(-fresh // RULES.held_out))]
         volumes = np.concatenate([self._sign * self._evaluate_volumes(self._last, part) for part in parts])
-        self._samples.append(frame_samples(self.problem, points[np.argsort(volumes)[:worst]]))
+        self._samples.append(sample_frames(self.problem, points[np.argsort(volumes)[:worst]]))
 
     def _descend(self, name: str, volume: str, solver: Solver) -> None:
         """Minimise from the last parameters, and keep the result if it is the best so far."""
-        weights, count = self._weights(volume), sum(len(samples) for samples in self._samples)
+        weights, count = self._choose_weights(volume), sum(len(samples) for samples in self._samples)
         with one_blas_thread():
             if self.linear:
                 with deferred():
-                    objective = self._in_basis(weights)
+                    objective = self._build_in_basis(weights)
                 start = objective.variables(self._last)
                 result = solver.minimise(objective, start, Watch(self.settings.monitor, name))
                 self._last = objective.parameters(result.theta)
             else:
                 with deferred():
-                    resampled = self._resampled(weights)
+                    resampled = self._build_resampled(weights)
                 result = solver.minimise(resampled, self._last, Watch(self.settings.monitor, name))
                 self._last = result.theta
         self._take(name, replace(result, theta=self._last), count)
 
-    def _weights(self, volume: str) -> Weights:
+    def _choose_weights(self, volume: str) -> Weights:
         """Weights of all terms, with the name of that of the volume. Terms add weight |rho|^2 / 2."""
         r = self.problem.r
         target = LOSS.wide_volume if volume == "volume" else LOSS.worst_volume
@@ -293,7 +296,7 @@ class Search:
             return Weights(0.0, 0.0, 0.0, 0.0, 0.0, own)
         return replace(users, folds=0.0, extra={**own, **users.extra}).for_problem(self.problem)
 
-    def _in_basis(self, weights: Weights) -> "Orthonormal":
+    def _build_in_basis(self, weights: Weights) -> "Orthonormal":
         """The loss of a family that is linear in its parameters, on all samples so far, with terms of what xi means."""
         assert isinstance(self.family, LinearFamily)
         lengths = np.linalg.norm(self._last.reshape(self.problem.r, -1) @ self._factor, axis=1)
@@ -315,7 +318,7 @@ class Search:
             parts.append((1.0, Likenesses(self._likeness, lengths)))
         return Orthonormal(WeightedSum(parts), self._factor, lengths)
 
-    def _resampled(self, weights: Weights) -> Resampled:
+    def _build_resampled(self, weights: Weights) -> Resampled:
         """The loss of any other family, on samples drawn from all so far."""
         samples = join_samples(self._samples)
         self._samples = [samples]
@@ -329,7 +332,7 @@ class Search:
 
     def _draw(self, count: int, seed: tuple[int, ...]) -> Samples:
         points = sample_uniform(self.problem.domain, count, (self.settings.seed, RULES.tag, *seed))
-        return frame_samples(self.problem, points)
+        return sample_frames(self.problem, points)
 
     def _take(self, name: str, result: SolveResult, samples: int) -> None:
         """Take the result of a stage, and keep its parameters if they are the best so far."""
@@ -363,17 +366,17 @@ class Search:
     @cached_property
     def _basis(self) -> BasisGradients:  # not before this family is tried
         assert isinstance(self.family, LinearFamily)
-        return gradients_of(self.family, self.problem.n)
+        return build_gradients(self.family, self.problem.n)
 
     @cached_property
     def _centre(self) -> Samples:
         """The centre of the domain."""
-        return frame_samples(self.problem, self.problem.domain.centre[None])
+        return sample_frames(self.problem, self.problem.domain.centre[None])
 
     @cached_property
     def _held_out(self) -> Samples:
         """Samples that evaluate coordinates."""
-        return frame_samples(self.problem, self.sample(RULES.held_out, RULES.held_out_tag))
+        return sample_frames(self.problem, self.sample(RULES.held_out, RULES.held_out_tag))
 
 
 def is_on_side_of_centre(problem: Problem, points: Array) -> NDArray[np.bool_]:
@@ -387,7 +390,7 @@ def is_on_side_of_centre(problem: Problem, points: Array) -> NDArray[np.bool_]:
     return np.asarray(sides[1:] == sides[0])
 
 
-def frame_samples(problem: Problem, points: Array) -> Samples:
+def sample_frames(problem: Problem, points: Array) -> Samples:
     """Samples with the frame Jacobian, which half a turn of the tool does not spoil."""
     J = problem.task.batched_frame_jacobian(points)[0].reshape(len(points), problem.task.m, problem.n)
     inverse = None if problem.metric.is_identity else np.linalg.inv(metric_matrices(problem.metric, points))

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.bases.cyclic import cyclic_joints, over_cyclic_joints
+from orthocas.bases.cyclic import cyclic_joints, widen_over_cyclic_joints
 from orthocas.bases.products import Polynomial
 from orthocas.charts.chart import Chart
 from orthocas.errors import DomainError, InvalidValueError
@@ -96,7 +96,7 @@ def corridor_problem(problem: Problem, postures: ArrayLike, radius: float = RADI
     for k in {*idle, *map(names.index, cyclic)}:
         sizes[k] = np.inf
     free = Problem(problem.robot, problem.task, problem.metric, _around(whole, path, sizes), problem.name)
-    return over_cyclic_joints(free, cyclic)
+    return widen_over_cyclic_joints(free, cyclic)
 
 
 def _thinned(z: Array) -> list[int]:
