@@ -14,7 +14,7 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import ColumnFunction, blocked
 
-_PART = 16  # blocks
+_PART = 16  # blocks of samples at a time, so that the memory never holds all of them twice
 
 
 class BasisGradients(ABC):

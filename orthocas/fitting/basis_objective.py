@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
+from dataclasses import dataclass
 from functools import partial
 from math import ceil
 from typing import Self
@@ -24,75 +25,25 @@ from orthocas.tools.batch import in_threads, in_threads_with, thread_count
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import COLUMNS, Run, blocked, by_sample, shares
 
-_ROWS_IN_CACHE = 512  # samples in a product: the rows stay in the cache
-_CHUNK = 512  # samples per product of the Hessian, so that the rows stay in the cache
-_BLOCKS = 8  # blocks of samples per thread: a fixed number, so that sums do not depend on the number of threads
-STRIDE = 2  #: every second sample estimates the Gauss-Newton matrix, which is a mean, well enough
-_MOST_STRIDE = 16  # of rough estimates; a divisor of the samples in a block
-_ROUGH = 12  # residuals per coefficient in a rough estimate
 
+@dataclass(frozen=True, slots=True)
+class ObjectiveRules:
+    """Numbers of the products that evaluate losses. They were chosen by the time that a product takes."""
+
+    chunk: int = 512  #: samples per product of a matrix, so that the rows stay in the cache
+    blocks: int = 8  #: blocks of samples per thread: fixed, so that sums do not depend on the number of threads
+    stride: int = 2  #: every second sample estimates the Gauss-Newton matrix, which is a mean, well enough
+    most_stride: int = 16  #: of rough estimates; a divisor of the samples in a block
+    rough: int = 12  #: residuals per coefficient in a rough estimate
+
+    orienting: int = 200  #: samples that determine the orientation of a network's start
+    piece: int = 2**18  #: entries of the largest array of a piece of samples; larger ones leave the cache
+    least_piece: int = 100  #: samples in a piece; smaller products waste time
+    graph: int = 2**20  #: entries of the largest matrix in a graph; larger ones leave the cache
+
+
+RULES = ObjectiveRules()
 Shared = Sequence[tuple[int, int, int, int]]
-
-
-def build_normal_matrix(derivatives: Sequence[Array], gradients: Sequence[Array], shared: Shared) -> Array:
-    """Sums over samples of X_j^T X_j, and of x_i^T x_j for residuals that two coordinates share, (size, size).
-
-    X_j = D_j G_j are the derivatives of the residuals of coordinate j with respect to its coefficients. Products are
-    taken over chunks of samples, and added in double precision in the order of the chunks.
-
-    Args:
-        derivatives: D_j of every coordinate, (N, rows, n).
-        gradients: G_j of every coordinate, (N, n, K_j).
-        shared: coordinates i > j and the places of their shared residual among the rows of X_i and of X_j.
-    """
-    r, ends = len(derivatives), np.cumsum([G.shape[2] for G in gradients])
-    places = [slice(end - G.shape[2], end) for G, end in zip(gradients, ends, strict=True)]
-    H = np.zeros((ends[-1], ends[-1]))
-    chunks = range(0, len(gradients[0]), _ROWS_IN_CACHE)
-    together = ceil(thread_count() / r)  # chunks, so that there is work for all threads
-    for k in range(0, len(chunks), together):
-        _add(H, places, chunks[k : k + together], derivatives, gradients, shared)
-    for i, j, *_ in shared:
-        H[places[j], places[i]] = H[places[i], places[j]].T
-    return H
-
-
-def _add(
-    H: Array,
-    places: Sequence[slice],
-    starts: Sequence[int],
-    derivatives: Sequence[Array],
-    gradients: Sequence[Array],
-    shared: Shared,
-) -> None:
-    """Add the products of some chunks: every block by one thread, in the order of the chunks."""
-
-    def rows(piece: tuple[int, int]) -> Array:
-        start, j = piece
-        part = slice(start, start + _ROWS_IN_CACHE)
-        product: Array = derivatives[j][part] @ gradients[j][part]  # (chunk, rows, K_j)
-        return product
-
-    def square(j: int) -> None:
-        for start in starts:
-            flat = X[start, j].reshape(-1, X[start, j].shape[2])
-            H[places[j], places[j]] += flat.T @ flat
-
-    def mixed(pair: tuple[int, int]) -> None:
-        i, j = pair
-        for start in starts:
-            for row, other in rows_of[i, j]:
-                H[places[i], places[j]] += X[start, i][:, row].T @ X[start, j][:, other]
-
-    r = len(derivatives)
-    rows_of: dict[tuple[int, int], list[tuple[int, int]]] = {}
-    for i, j, row, other in shared:
-        rows_of.setdefault((i, j), []).append((row, other))
-    pieces = [(start, j) for start in starts for j in range(r)]
-    X = dict(zip(pieces, in_threads(rows, pieces), strict=True))
-    work: list[Callable[[], None]] = [partial(square, j) for j in range(r)]
-    work += [partial(mixed, pair) for pair in rows_of]
-    in_threads(lambda block: block(), work)
 
 
 class BasisObjective:
@@ -137,23 +88,22 @@ class BasisObjective:
         m, self.n = samples.task_jacobian.shape[1:]
         self._gradients = build_gradients(family, self.n) if gradients is None else gradients
         self._loss = Loss.of(Sizes(self.n, m, self.r, samples.metric_inverse is None), weights.by_name, exchanged)
-        self._begin(samples, start, orientation)
-
-    def _begin(self, samples: Samples, start: Array, orientation: float | None = None) -> None:
-        self._put(samples)
         self._orientation = orientation
-        if orientation is None and (self._loss.oriented or self.weights.folds > 0):
-            self._orientation = samples.orientation(self.coordinate_jacobians(start))
-        self._describe(samples)
+        self._use(samples, start)
 
-    def _put(self, samples: Samples) -> None:
+    def _use(self, samples: Samples, start: Array | None = None) -> None:
+        """Use these samples: the numbers of the basis there, and the data of the loss in blocks.
+
+        Args:
+            samples: the samples.
+            start: parameters that give the orientation, unless it is known.
+        """
         self.N, self.X = len(samples), self._gradients.at(samples.points)
-        self._share = shares(self.N)
-        self._expanded: dict[str, Array] = {}
-
-    def _describe(self, samples: Samples) -> None:
-        found = samples.described(self._loss.data, self._orientation)
-        self._described = dict(zip(self._loss.data, map(blocked, found), strict=True))
+        self._share, self._expanded = shares(self.N), dict[str, Array]()
+        if start is not None and self._orientation is None and (self._loss.oriented or self.weights.folds > 0):
+            self._orientation = samples.orientation(self.coordinate_jacobians(start))
+        data = samples.described(self._loss.data, self._orientation)
+        self._described = dict(zip(self._loss.data, map(blocked, data), strict=True))
 
     @property
     def _data(self) -> list[Array]:
@@ -164,8 +114,7 @@ class BasisObjective:
         """The same loss on `count` fresh sample sets of `size` each."""
         for part in even_parts(self._draw(size * count, seed), count):
             other = copy(self)
-            other._put(part)
-            other._describe(part)
+            other._use(part)
             yield other
 
     def coordinate_jacobians(self, theta: Array) -> Array:
@@ -188,13 +137,13 @@ class BasisObjective:
     def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
         """L(theta), its gradient, and the Gauss-Newton matrix, computed with products in single precision."""
         value, gradient = self.value_and_gradient(theta)
-        return value, gradient, self._build_matrix(theta, STRIDE)
+        return value, gradient, self._build_matrix(theta, RULES.stride)
 
     def curvature_estimate(self, theta: Array) -> Array:
         """The Gauss-Newton matrix from as few samples as steer a quasi-Newton method."""
         residuals = self.N * (self._loss.hinge_rows.start or 1)
-        stride = STRIDE
-        while 2 * stride <= _MOST_STRIDE and residuals >= 2 * stride * _ROUGH * theta.size:
+        stride = RULES.stride
+        while 2 * stride <= RULES.most_stride and residuals >= 2 * stride * RULES.rough * theta.size:
             stride *= 2
         return self._build_matrix(theta, stride)
 
@@ -207,8 +156,8 @@ class BasisObjective:
 
         def fill(pair: tuple[int, int]) -> None:
             i, j = pair
-            for start in range(0, self.N, _CHUNK):
-                part = slice(start, start + _CHUNK)
+            for start in range(0, self.N, RULES.chunk):
+                part = slice(start, start + RULES.chunk)
                 raised = W[part, :, i, :, j] @ G[part]  # (chunk, n, K)
                 H[i, :, j] += G[part].reshape(-1, K).T @ raised.reshape(-1, K) / self.N
             H[j, :, i] = H[i, :, j].T
@@ -234,8 +183,7 @@ class BasisObjective:
         """
         other = copy(self)
         other._loss = Loss.of(self._loss.sizes, weights, self._loss.exchanged)
-        other._put(samples)
-        other._describe(samples)
+        other._use(samples)
         return other
 
     def moved(self, gradients: BasisGradients, samples: Samples, start: Array) -> Self:
@@ -247,8 +195,8 @@ class BasisObjective:
             start: parameters whose orientation the regularity term keeps.
         """
         other = copy(self)
-        other._gradients = gradients
-        other._begin(samples, start)
+        other._gradients, other._orientation = gradients, None
+        other._use(samples, start)
         return other
 
     @property
@@ -275,12 +223,12 @@ class BasisObjective:
 
     def _table(self, theta: Array) -> Array:
         """T, (g, n r / g, S)."""
-        return self._gradients.build_table(expanded(theta, self.kept).reshape(self.r, self.K))
+        return self._gradients.build_table(expand(theta, self.kept).reshape(self.r, self.K))
 
     @property
     def _parts(self) -> list[slice]:
         """The blocks of samples in parts."""
-        return [slice(start, start + _BLOCKS) for start in range(0, len(self.X), _BLOCKS)]
+        return [slice(start, start + RULES.blocks) for start in range(0, len(self.X), RULES.blocks)]
 
     def _sum_part(self, T: Array, run: Run, part: slice) -> tuple[float, Array]:
         """Share of some blocks in the loss, and in its slopes with respect to T."""
@@ -302,26 +250,20 @@ class BasisObjective:
     def _build_matrix(self, theta: Array, stride: int) -> Array:
         """Gauss-Newton matrix; that of the smooth residuals from every `stride`-th sample."""
         derivatives = build_residual_columns(self._loss)(self._jacobian_entries(theta), *self._data)
-        H = self._sum_smooth(derivatives[: self.r], stride)
+        free, rows = int(self.kept.sum()), self._loss.smooth_rows
+        H = np.zeros((free, free))
+        if any(rows):
+            # blocks of coordinate pairs, from few rows per sample in single precision
+            shared = [(i, j, rows[i].index(row), rows[j].index(row)) for i, j, row in self._loss.shared_rows]
+            gradients, by_coordinate = self._thin(stride), []
+            for derivative in derivatives[: self.r]:
+                blocks = derivative.reshape(len(derivative), self.n, -1, derivative.shape[2])
+                by_coordinate.append(by_sample(blocks, self.N, stride).astype(np.float32))
+            H = build_normal_matrix(by_coordinate, gradients, shared) / len(gradients[0])
         hinges = derivatives[self.r :]
         for residual, derivative in zip(hinges[::2], hinges[1::2], strict=True):
             H += self._sum_hinges(residual, derivative)
         return H
-
-    def _sum_smooth(self, derivatives: list[Array], stride: int) -> Array:
-        """Gauss-Newton matrix of the smooth residuals, by blocks of coordinate pairs."""
-        rows = self._loss.smooth_rows
-        if not any(rows):
-            return np.zeros((self.kept.sum(), self.kept.sum()))
-        shared = [(i, j, rows[i].index(row), rows[j].index(row)) for i, j, row in self._loss.shared_rows]
-        gradients = self._thin(stride)
-        H = build_normal_matrix([self._rows(derivative, stride) for derivative in derivatives], gradients, shared)
-        return H / len(gradients[0])
-
-    def _rows(self, derivative: Array, stride: int) -> Array:
-        """Derivatives of residuals (B, n rows, c) at some samples, (N / stride, rows, n), in single precision."""
-        blocks = derivative.reshape(len(derivative), self.n, -1, derivative.shape[2])
-        return by_sample(blocks, self.N, stride).astype(np.float32)
 
     def _sum_hinges(self, residual: Array, derivative: Array) -> Array:
         """Gauss-Newton matrix of a hinge residual. It couples all coordinates, but acts at few samples."""
@@ -339,7 +281,7 @@ def _to_double(products: Array) -> Array:
     return products.astype(np.float64, copy=False)
 
 
-def expanded(theta: Array, kept: NDArray[np.bool_]) -> Array:
+def expand(theta: Array, kept: NDArray[np.bool_]) -> Array:
     """All coefficients, (r K,), from those that may differ from zero."""
     C = np.zeros(kept.shape)
     C[kept] = theta
@@ -408,3 +350,64 @@ class BoundedMutual:
         C = theta.reshape(self._r, self._K)
         scaled: Array = C / np.sqrt(((C @ self._gram) * C).sum(axis=1))[:, None]
         return scaled.ravel()
+
+
+def build_normal_matrix(derivatives: Sequence[Array], gradients: Sequence[Array], shared: Shared) -> Array:
+    """Sums over samples of X_j^T X_j, and of x_i^T x_j for residuals that two coordinates share, (size, size).
+
+    X_j = D_j G_j are the derivatives of the residuals of coordinate j with respect to its coefficients. Products are
+    taken over chunks of samples, and added in double precision in the order of the chunks.
+
+    Args:
+        derivatives: D_j of every coordinate, (N, rows, n).
+        gradients: G_j of every coordinate, (N, n, K_j).
+        shared: coordinates i > j and the places of their shared residual among the rows of X_i and of X_j.
+    """
+    r, ends = len(derivatives), np.cumsum([G.shape[2] for G in gradients])
+    places = [slice(end - G.shape[2], end) for G, end in zip(gradients, ends, strict=True)]
+    H = np.zeros((ends[-1], ends[-1]))
+    chunks = range(0, len(gradients[0]), RULES.chunk)
+    together = ceil(thread_count() / r)  # chunks, so that there is work for all threads
+    for k in range(0, len(chunks), together):
+        _add(H, places, chunks[k : k + together], derivatives, gradients, shared)
+    for i, j, *_ in shared:
+        H[places[j], places[i]] = H[places[i], places[j]].T
+    return H
+
+
+def _add(
+    H: Array,
+    places: Sequence[slice],
+    starts: Sequence[int],
+    derivatives: Sequence[Array],
+    gradients: Sequence[Array],
+    shared: Shared,
+) -> None:
+    """Add the products of some chunks: every block by one thread, in the order of the chunks."""
+
+    def rows(piece: tuple[int, int]) -> Array:
+        start, j = piece
+        part = slice(start, start + RULES.chunk)
+        product: Array = derivatives[j][part] @ gradients[j][part]  # (chunk, rows, K_j)
+        return product
+
+    def square(j: int) -> None:
+        for start in starts:
+            flat = X[start, j].reshape(-1, X[start, j].shape[2])
+            H[places[j], places[j]] += flat.T @ flat
+
+    def mixed(pair: tuple[int, int]) -> None:
+        i, j = pair
+        for start in starts:
+            for row, other in rows_of[i, j]:
+                H[places[i], places[j]] += X[start, i][:, row].T @ X[start, j][:, other]
+
+    r = len(derivatives)
+    rows_of: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for i, j, row, other in shared:
+        rows_of.setdefault((i, j), []).append((row, other))
+    pieces = [(start, j) for start in starts for j in range(r)]
+    X = dict(zip(pieces, in_threads(rows, pieces), strict=True))
+    work: list[Callable[[], None]] = [partial(square, j) for j in range(r)]
+    work += [partial(mixed, pair) for pair in rows_of]
+    in_threads(lambda block: block(), work)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.bases.family import ArrayFamily, ArrayMemory, Family, Memories
+from orthocas.fitting.basis_objective import RULES
 from orthocas.fitting.loss import Loss, build_loss_columns, build_loss_with_slopes, build_value_columns
 from orthocas.fitting.terms import Sizes, Weights
 from orthocas.tasks.samples import Draw, Samples, even_parts
@@ -20,11 +21,6 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import Run, blocked, by_sample, shares
 from orthocas.tools.expressions import replay
-
-_ORIENTING = 200  # samples that determine the orientation of the start
-_ENTRIES = 2**18  # of the largest array of a piece of samples; larger ones leave the cache
-_LEAST = 100  # samples in a piece; smaller products waste time
-_CHUNK_ENTRIES = 2**20  # entries of the largest matrix in a graph; larger ones leave the cache
 
 
 class _Piece(NamedTuple):
@@ -69,7 +65,7 @@ class ArrayObjective:
         self._loss = Loss.of(Sizes(self.n, m, self.r, samples.metric_inverse is None), weights.by_name)
         self._orientation = orientation
         if orientation is None and (self._loss.oriented or weights.folds > 0):
-            some = samples[:_ORIENTING]
+            some = samples[: RULES.orienting]
             self._orientation = some.orientation(family.pullback(some.points, start)[0])
         self._put(samples)
 
@@ -142,7 +138,7 @@ class ArrayObjective:
     def _divide(self, points: Array, data: list[Array]) -> None:
         """Use these samples, in pieces of nearly equal size."""
         self._points, self._described = points, data
-        N, most = len(points), max(_LEAST, _ENTRIES // (self.r * self._family.width))
+        N, most = len(points), max(RULES.least_piece, RULES.piece // (self.r * self._family.width))
         size = ceil(N / ceil(N / most))
         self._pieces = []
         for k in range(0, N, size):
@@ -176,7 +172,7 @@ class GraphObjective:
         loss = Loss.of(Sizes(n, m, family.outputs, samples.metric_inverse is None), weights.by_name)
         self._graphs, self._draw, self._orientation = _Graphs(family, loss), draw, orientation
         if orientation is None and (loss.oriented or weights.folds > 0):
-            self._orientation = _orientation(family, start, samples[:_ORIENTING])
+            self._orientation = _orientation(family, start, samples[: RULES.orienting])
         self._put(samples, len(samples))
 
     def value(self, theta: Array) -> float:
@@ -237,7 +233,7 @@ class _Graphs:
 
     def of_size(self, samples: int) -> "_LossGraph":
         """The graph for a set of samples: for all at once, or for as many as stay in the cache."""
-        most = max(1, _CHUNK_ENTRIES // (self.family.outputs * self.family.width))
+        most = max(1, RULES.graph // (self.family.outputs * self.family.width))
         columns = ceil(samples / ceil(samples / most))
         if columns not in self.known:
             self.known[columns] = _LossGraph(self.family, self.loss, columns)

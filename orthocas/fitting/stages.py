@@ -25,7 +25,8 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import WorstPoints, worst_points
 from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
 from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
-from orthocas.fitting.basis_objective import STRIDE, BasisObjective, BoundedMutual, expanded
+from orthocas.fitting.basis_objective import RULES as OBJECTIVE_RULES
+from orthocas.fitting.basis_objective import BasisObjective, BoundedMutual, expand
 from orthocas.fitting.like import LikeTerm
 from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
 from orthocas.fitting.settings import RULES, FitSettings
@@ -327,7 +328,7 @@ class StageRunner:
         else:
             result.raise_if_failed()
         if kept is not None and mirror is not None:
-            result = replace(result, theta=mirror.coordinates(expanded(result.theta, kept)))
+            result = replace(result, theta=mirror.coordinates(expand(result.theta, kept)))
         return Stage(plan.label, family.size, len(samples), result)
 
     def _build_objective(self, plan: Plan, samples: Samples, mirror: Mirror | None) -> tuple[Objective, Array]:
@@ -436,9 +437,10 @@ class StageRunner:
         n, half = self.space.n, 1 if self.mirror is None else 2
         K = target.term_count(n)
         N = self._count_for_basis(K, r) / half
+        # numbers of the basis at a sample, see `BasisGradients`; they are there twice while they are built
         of_a_joint = K - target.term_count(n - 1) if n > 1 else K
-        numbers = 1 + K if isinstance(target, Polynomial | Fourier) else n * of_a_joint  # see BasisGradients
-        gradients = 2 * (4 if self.settings.single else 8) * numbers + 4 * n * K / STRIDE  # twice while they are built
+        numbers = 1 + K if isinstance(target, Polynomial | Fourier) else n * of_a_joint
+        gradients = 2 * (4 if self.settings.single else 8) * numbers + 4 * n * K / OBJECTIVE_RULES.stride
         curvature = 16 * (n * r) ** 2 if self.settings.max_mutual is not None else 0
         needed = N * (gradients + curvature) + 32 * (r * K / half) ** 2
         require_memory(f"{target.label} on {self.space.n} joints with {K} basis functions", needed)

@@ -16,15 +16,23 @@ from orthocas.tasks.samples import Samples, directions
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 
-_MUTUAL_WEIGHT = 1.0
-_MIXING_ANGLE = np.radians(10)
-_EXACT = 1e-12  # squared sine of a leak; functions of an exact coordinate are exact, too
-_RIDGE = 1e-10  # relative; keeps the pencil definite if basis functions coincide on the samples
-_TOLERANCE = 1e-6  # robot files give angles with ten decimals; a symmetry broken by less costs nothing
-_MOST_JOINTS = 12  # 4,096 choices of the joints that turn round
-_POINTS = 16
-_MOST_CHOICES = 8
-_SEED = 0
+
+@dataclass(frozen=True, slots=True)
+class StartRules:
+    """Numbers of starts and of the search for a mirror."""
+
+    mutual_weight: float = 1.0  #: of coordinates that are found already, beside the task
+    mixing_angle: float = float(np.radians(10))  #: by which neighbours are mixed [rad]
+    exact: float = 1e-12  #: squared sine of a leak; functions of an exact coordinate are exact, too
+    ridge: float = 1e-10  #: relative; keeps the pencil definite if basis functions coincide on the samples
+    tolerance: float = 1e-6  #: robot files give angles with ten decimals; a symmetry broken by less costs nothing
+    most_joints: int = 12  #: 4,096 choices of the joints that turn round
+    points: int = 16  #: at which a symmetry is tested
+    most_choices: int = 8  #: of what changes places in a mirror
+    seed: int = 0
+
+
+RULES = StartRules()
 
 
 def find_spectral_start(
@@ -56,22 +64,21 @@ def find_spectral_start(
     S = along_task.T @ along_task / N
     raised = G if samples.metric_inverse is None else samples.metric_inverse @ G
     T = G.reshape(-1, K).T @ raised.reshape(-1, K) / N
-    T += _RIDGE * np.trace(T) / K * np.eye(K)
+    T += RULES.ridge * np.trace(T) / K * np.eye(K)
     middle = G.mean(axis=0)
     V = G.reshape(-1, K).T @ G.reshape(-1, K) / N - middle.T @ middle  # variance of the gradients
     allowed = np.ones((family.outputs, K), dtype=bool) if kept is None else kept
     C, left = np.zeros(allowed.shape), list(range(family.outputs))
     while left:
-        classes = {
-            allowed[j].tobytes(): j for j in reversed(left)
-        }.values()  # one coordinate for all that allow the same
+        # one coordinate for all that allow the same coefficients
+        classes = {allowed[j].tobytes(): j for j in reversed(left)}.values()
         j, c = min(((j, _find_smallest(S, T, V, allowed[j])) for j in classes), key=lambda pair: pair[1] @ S @ pair[1])
         left.remove(j)
         C[j] = c
         gradient = raised @ c  # (N, n)
         length = np.sqrt(np.maximum(np.einsum("sn,sn->s", gradient, G @ c), 1e-300))
         along = np.einsum("sn,snk->sk", gradient / length[:, None], G)
-        S = S + _MUTUAL_WEIGHT * along.T @ along / N
+        S = S + RULES.mutual_weight * along.T @ along / N
     return _mix(C, G, allowed).ravel()
 
 
@@ -80,7 +87,7 @@ def _find_smallest(S: Array, T: Array, V: Array, free: NDArray[np.bool_]) -> Arr
     block = np.ix_(free, free)
     whitening = np.linalg.inv(np.linalg.cholesky(T[block])).T  # W^T T W = I
     values, vectors = np.linalg.eigh(whitening.T @ S[block] @ whitening)
-    equal = whitening @ vectors[:, : max(1, np.count_nonzero(values < _EXACT))]
+    equal = whitening @ vectors[:, : max(1, np.count_nonzero(values < RULES.exact))]
     c = np.zeros(len(free))
     c[free] = equal @ np.linalg.eigh(equal.T @ V[block] @ equal)[1][:, 0]
     return c
@@ -92,7 +99,7 @@ def _mix(C: Array, G: Array, allowed: NDArray[np.bool_]) -> Array:
     The spectral solution inherits the symmetries of the problem, and a symmetric point is often a saddle of the loss.
     """
     C = C / np.linalg.norm(G @ C.T, axis=1).mean(axis=0)[:, None]
-    c, s = np.cos(_MIXING_ANGLE), np.sin(_MIXING_ANGLE)
+    c, s = np.cos(RULES.mixing_angle), np.sin(RULES.mixing_angle)
     for j in np.flatnonzero((allowed[1:] == allowed[:-1]).all(axis=1)):
         C[j], C[j + 1] = c * C[j] + s * C[j + 1], c * C[j + 1] - s * C[j]
     return C
@@ -123,7 +130,7 @@ class Mirror:
             for some in combinations(odd, count)
             for others in permutations(even, count)
         ]
-        return [replace(self, exchanged=chosen) for chosen in pairs[:_MOST_CHOICES]]
+        return [replace(self, exchanged=chosen) for chosen in pairs[: RULES.most_choices]]
 
     def coordinates(self, theta: Array) -> Array:
         """Coefficients of the coordinates, (r K,), from those of the components."""
@@ -150,13 +157,13 @@ class Mirror:
     def _find_allowed(self, family: LinearFamily) -> NDArray[np.bool_] | None:
         q = ca.SX.sym("q", self.space.n)
         basis = ca.Function("basis", [q], [ca.densify(family.basis(q))])
-        u = np.random.default_rng(_SEED).uniform(-1.0, 1.0, (self.space.n, _POINTS))
+        u = np.random.default_rng(RULES.seed).uniform(-1.0, 1.0, (self.space.n, RULES.points))
         here, there = (
             np.array(basis(self.space.centre[:, None] + self.space.half_width[:, None] * side))
             for side in (u, self.signs[:, None] * u)
         )
         size = np.abs(here).max(axis=1)
-        even, odd = (np.abs(there - sign * here).max(axis=1) <= _TOLERANCE * size for sign in (1, -1))
+        even, odd = (np.abs(there - sign * here).max(axis=1) <= RULES.tolerance * size for sign in (1, -1))
         allowed: NDArray[np.bool_] = np.where(even, 1, -1) == self.parities[:, None]
         return allowed if (even | odd).all() else None
 
@@ -164,9 +171,9 @@ class Mirror:
 def find_mirror(problem: Problem, active: list[int]) -> Mirror | None:
     """The first mirror symmetry of a problem in its active joints, or None."""
     space = JointSpace.of(problem).restricted_to(active)
-    if space.n > _MOST_JOINTS:
+    if space.n > RULES.most_joints:
         return None
-    u = np.random.default_rng(_SEED).uniform(-1.0, 1.0, (_POINTS, space.n))
+    u = np.random.default_rng(RULES.seed).uniform(-1.0, 1.0, (RULES.points, space.n))
     left = [np.array(signs) for signs in product((1.0, -1.0), repeat=space.n)][1:]
     for points in (u[:1], u[1:]):
         left = _keep_symmetric(problem, active, points, left)
@@ -185,7 +192,7 @@ def _keep_symmetric(problem: Problem, active: list[int], u: Array, choices: Sequ
     return [
         signs
         for signs, image in zip(choices, there, strict=True)
-        if np.abs(image - signs[:, None] * here * signs).max() <= _TOLERANCE
+        if np.abs(image - signs[:, None] * here * signs).max() <= RULES.tolerance
     ]
 
 

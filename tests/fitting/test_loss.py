@@ -12,7 +12,7 @@ from orthocas.cli.problem_argument import parse_weights
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting import network_objective
 from orthocas.fitting.basis_gradients import build_gradients
-from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.basis_objective import BasisObjective, ObjectiveRules
 from orthocas.fitting.loss import (
     Loss,
     build_loss_columns,
@@ -139,7 +139,9 @@ def test_graph_cut_into_blocks_gives_the_same_loss(planar_x: oc.Problem, monkeyp
     family = oc.MLP((6, 5)).family(JointSpace.of(planar_x), 2)
     settings = (family, sample_problem(planar_x, 50, 2), REGULAR, family.initial(1), draw_from(planar_x))
     value, gradient = GraphObjective(*settings).value_and_gradient(family.initial(1))
-    monkeypatch.setattr(network_objective, "_CHUNK_ENTRIES", 7 * 2 * family.width)  # blocks of 7, 1 left over
+    monkeypatch.setattr(
+        network_objective, "RULES", ObjectiveRules(graph=7 * 2 * family.width)
+    )  # blocks of 7, 1 left over
     blocked = GraphObjective(*settings)
     assert len(blocked._blocks) == 8
     np.testing.assert_allclose(blocked.value_and_gradient(family.initial(1))[0], value, rtol=1e-13)
