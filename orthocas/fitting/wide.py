@@ -68,46 +68,44 @@ def fit_wide(
 ) -> "WideFit":
     """Find coordinates that are regular on a whole branch of the joint range, and as orthogonal as that permits.
 
-    Coordinates are regular where their volume v(q) is not zero: det of an orthonormal basis of the task's gradients and
-    of the unit gradients of xi, all in the metric; for r = 1 it is the cosine between the gradient and the self-motion.
-    The fit looks for the least
+    The parameters theta of a family minimise, over samples q of the branch that are clear of singular positions::
 
-        mean_q [ max(0, 1 - v(q) / t)^2 + 0.03 sum_j log^2(l_j(q) / L_j) ]
+        L = mean_q [ max(0, 1 - v / t)^2 + 0.03 sum_j log^2(l_j / L_j) + terms of `weights` ]
 
-    over samples of the branch that are clear of singular positions, half of them uniform and half boundary-heavy. The
-    second mean keeps the lengths l of gradients near one length, so that xi is a similar motion everywhere. The fit
-    descends with L-BFGS from linear coordinates across the task in the middle of the branch, first with t = 0.5. As
-    long as more than 0.05 % of other samples are not regular after that, or 1 % of them have a volume below 0.28 / r,
-    the worst of 50,000 fresh samples join and t = 0.3, three times at most, and no more once that makes coordinates
-    worse. The best of these results is kept: regular in the middle, fewest bad positions, as far as these are more than
-    0.05 %, then the largest 1 % quantile of the volume. The domain of the chart is the part of the branch where
-    coordinates are regular with a margin, see `RegularPart`. It is judged in the identity metric; with another one, the
-    first mean for the volume in the identity metric and t = 0.06 / r is added.
+    v(q) is the volume of coordinates: det of an orthonormal basis of the task's gradients and of the unit gradients of
+    xi, all in the metric. Coordinates are regular where v is not zero; for r = 1 it is the cosine between the gradient
+    and the self-motion. With another metric than the identity, the same term for the volume in the identity metric and
+    a small t joins. l_j(q) is the length of the gradient of xi_j, L_j its mean where the descent begins: xi is a
+    similar motion everywhere. Half of the samples are uniform, half boundary-weighted. The numbers are those of
+    `orthocas.fitting.wide_search.WideRules`.
 
-    Coordinates that are linear in the first and the last joint are best to prove and hold at any turn of them. They ask
-    that self-motions turn base and tool in one sense on the whole branch, as far as the other joints do not outweigh
-    that. Without `parametrisation`, if more than 0.1 % of these samples (0.4 % with r > 1) are bad before the worst
-    ones join, polynomials of degree 5 in all joints are tried, too. If more than 0.6 % are bad with these, or more than
-    2 % with the first ones, as on arms whose axes pass each other at a distance, it is a network,
-    MLP((64, 64, 64), raw=True), but not with `like` or slides without limits: it takes several times as long to
-    evaluate. The best ones are kept. Where these are not the first, a joint without limits has one turn in which
-    samples lie; beyond it, positions belong to the domain as far as coordinates are regular there.
+    The stages are these:
 
-    Networks begin at random. 4,000 steps of Adam in single precision, each with 512 of the samples, lower the same two
-    means with t = 0.3. If coordinates are not regular enough then, the worst 30,000 of 200,000 fresh samples join for
-    4,000 more steps.
+    1. Polynomials that are linear in each joint on whose position self-motions do not depend, such as the first and the
+       last one, descend with L-BFGS from linear coordinates across the task at the centre of the branch. They are best
+       to prove, and hold at any turn of these joints. They ask that self-motions turn base and tool in one direction.
+    2. If these leave out much of the branch, polynomials in all joints are tried, and a network,
+       MLP((64, 64, 64), raw=True), where both leave out much, or the first ones very much, as on arms whose axes pass
+       each other at a distance. A network begins at random and descends with Adam on some of the samples at a time. It
+       takes several times as long to evaluate, and is not tried with `like` or with slides without limits.
+    3. The best ones go on: as long as they are not regular enough at other samples, and get better, the worst of many
+       fresh samples join.
+
+    The best result is kept: regular at the centre, with the fewest bad positions, then with the largest 1 % quantile of
+    the volume. The domain of the chart is the part of the branch where coordinates are regular with a margin in the
+    identity metric, see `RegularPart`. With polynomials in all joints or networks, a joint without limits has one turn
+    in which samples lie; beyond it, positions belong to the domain as far as coordinates are regular there.
 
     If r joints do not move the task at all, such as the last one under a tool with an axis, they are the coordinates,
     exact everywhere, unless `parametrisation` or `like` is given. Singular positions then divide the branch once more,
-    by the sign of det of the other joints' columns. The chart is on the middle's side.
+    by the sign of det of the other joints' columns. The chart is on the centre's side.
 
-    `regular_share` is of the branch: of all its positions that `branches` counts as clear, the share in the domain. If
-    the chart leaves out the other side, or can only serve a smaller box, `left_out` and a BranchWarning say so.
+    `regular_share` is of the branch: of all its positions that `branches` counts as clear, the fraction in the domain.
+    If the chart leaves out the other side, or can only serve a smaller box, `left_out` and a BranchWarning say so.
 
-    Wide charts hold on most of what the arm reaches without passing a singular position (`regular_share`), but their
-    leaks are large, 20 to 70 degrees on the arms that were measured. They serve inverse kinematics, closed loops,
-    trackers and laws with the whole inertia; see `fit` for decoupled control. That det J keeps its sign does not mean
-    that phi is one-to-one.
+    Wide charts hold on most of what the arm reaches without passing a singular position, but their leaks are large, 20
+    to 70 degrees on the arms that were measured. They serve inverse kinematics, closed loops, trackers and laws with
+    the whole inertia; see `fit` for decoupled control. That det J keeps its sign does not mean that phi is one-to-one.
 
     Args:
         robot: the robot.
@@ -126,7 +124,7 @@ def fit_wide(
             quantity along the self-motion of the home, or else of the branch's posture, as far as these are monotone
             there. With r > 1, several are allowed, or a task of lower priority: the gradients of the first coordinates
             are held against the parts of theirs that are orthogonal to the task. Default: with shoulder, elbow and
-            wrist and r = 1, the scale and the sense of the swivel there.
+            wrist and r = 1, the scale and the direction of the swivel there.
         weights: weights of terms that join the loss, by name or as `Weights`, such as `Weights(task=0.1, mutual=0.0,
             regularity=0.0)` for coordinates that are more orthogonal to the task, or `{"name": 0.1}` for a term of
             `register_loss_term`. A search for folds has no place here. Default: none.
@@ -162,28 +160,25 @@ def fit_wide(
     if not 0 < bound < np.inf:
         raise InvalidValueError("clearance", clearance, "positive and finite")
     require_count("seed", seed, least=0)
+    count = None if samples is None else require_count("samples", samples, least=2)
+    terms = None if weights is None else _check_weights(weights)
+
+    # the problem, and families to try; the domain of each covers all positions of its cyclic joints
     chosen = _choose_branch(robot, task, branch, home)
     problem = _build_problem(robot, task, metric, chosen, bound)
     families = _choose_families(problem, like) if parametrisation is None else (parametrisation,)
     cases = [_prepare(problem, family, like) for family in families]
-    problem, _ = cases[0]
-    count = None if samples is None else require_count("samples", samples, least=2)
-    terms = None if weights is None else _check_weights(weights)
-    meaning, quantities = None, None
-    if problem.r == 1:
-        posture = chosen.posture if home is None else home_posture(robot, task, home).q
-        meaning = Meaning.by_default(problem, posture) if like is None else Meaning.of(problem, like, posture)
-    elif like is not None:
-        quantities = Like.of(problem, like)
-        quantities.require_at_most(problem.r)
-    settings = WideSettings(count, seed, monitor, terms, meaning, quantities)
+    problem, family = cases[0]
+    posture = chosen.posture if home is None else home_posture(robot, task, home).q
+    settings = _hold_to_quantities(WideSettings(count, seed, monitor, terms), problem, like, posture)
+
     idle = idle_joints(problem, sample_problem(problem, RULES.first, (seed, RULES.first_tag)))[-problem.r :]
     with remembered() as pressed:
         if len(idle) == problem.r and parametrisation is None and like is None:
             none = np.zeros(0)
-            joints = Coordinates(cases[0][1], JointSpace.of(problem), tuple(idle), none, none, none)
-            solution = WideSolution(problem, joints, "none", 0, ())
-            result = _finish(solution, replace(settings, meaning=None), chosen, start, interrupted=pressed())
+            joints = Coordinates(family, JointSpace.of(problem), tuple(idle), none, none, none)
+            solution, settings = WideSolution(problem, joints, "none", 0, ()), replace(settings, meaning=None)
+            result = _finish(solution, settings, chosen, start, interrupted=pressed())
         else:
             searches = [Search(*case, settings) for case in cases]
             try:
@@ -208,6 +203,55 @@ def _check_weights(weights: Weights | Mapping[str, float]) -> Weights:
     return Weights(0.0, 0.0, 0.0, 0.0, 0.0, {name: weight for name, weight in weights.items() if find_term(name)})
 
 
+def _choose_branch(robot: Robot, task: Task, branch: Branch | Box | str | None, home: ArrayLike | str | None) -> Branch:
+    """The branch itself, by its name, or that of the home."""
+    if isinstance(branch, Branch):
+        return branch
+    if isinstance(branch, Box):
+        return Branch("box", branch, branch.centre, float("nan"), float("nan"))
+    found: Branches = branches(robot, task)
+    if branch is not None:
+        return found[branch]
+    return found.of(home_posture(robot, task, home).q) or found[0]
+
+
+def _build_problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Branch, clearance: float) -> Problem:
+    """The problem on the clear part of a branch; if its middle is not clear, of the largest box whose middle is."""
+    box = branch.box
+    try:
+        return Problem(robot, task, metric, box, branch.name, clearance)
+    except DomainError:
+        points, values = middles(robot, task, box)
+    clear = points[values > CLEARER * clearance]
+    room = box.half_width - np.abs(clear - box.centre)
+    if not len(clear):
+        missing = f"no position clear by {CLEARER * clearance:g}"
+        most = f"at most {math.floor(1e3 * float(values.max()) / CLEARER) / 1e3:g} can serve it"
+        raise DomainError(f"branch '{branch.name}' has {missing}, expected one for clearance = {clearance:g}: {most}")
+    best = int(np.argmax(np.log(room).sum(axis=1)))
+    domain = Box(clear[best], room[best], box.unbounded)
+    return Problem(robot, task, metric, domain, branch.name, clearance)
+
+
+def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomial | MLP, ...]:
+    """Polynomials that are linear in the joints on whose position the self-motions do not depend, by proof.
+
+    Then those that are so in such slides without limits only, if there are others: a joint that turns has one turn.
+    Then a network, but not for coordinates that are to mean something, nor with slides without limits.
+    """
+    robot = problem.robot
+    free = [k for k in range(robot.n) if keeps_self_motions(problem, k)]
+    slides = robot.tree.prismatic
+    endless = [k for k in free if slides[k] and np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
+    names, fewer = (tuple(robot.joint_names[k] for k in joints) for joints in (free, endless))
+    families: list[Polynomial | MLP] = [Polynomial(RULES.degree, names)]
+    if names != fewer:
+        families.append(Polynomial(RULES.degree_of_all, fewer))
+    if like is None and not endless:
+        families.append(MLP(RULES.network, raw=True))
+    return tuple(families)
+
+
 def _prepare(problem: Problem, family: Parametrisation, like: Likeness | None) -> tuple[Problem, Parametrisation]:
     """A problem and a family that suit each other."""
     require_parametrisation(family)
@@ -220,6 +264,20 @@ def _prepare(problem: Problem, family: Parametrisation, like: Likeness | None) -
         raise InvalidValueError("parametrisation", family.label, "one that is linear in its parameters, for like")
     warn_unless_savable(family)
     return problem, family
+
+
+def _hold_to_quantities(
+    settings: WideSettings, problem: Problem, like: Likeness | None, posture: Array
+) -> WideSettings:
+    """The settings with what coordinates mean: for r = 1 the values of a quantity along a self-motion."""
+    if problem.r == 1:
+        meaning = Meaning.by_default(problem, posture) if like is None else Meaning.of(problem, like, posture)
+        return replace(settings, meaning=meaning)
+    if like is None:
+        return settings
+    quantities = Like.of(problem, like)
+    quantities.require_at_most(problem.r)
+    return replace(settings, quantities=quantities)
 
 
 def _finish(
@@ -273,6 +331,20 @@ def _finish(
     )
 
 
+def _describe_left_out(problem: Problem, branch: Branch, counted: Array) -> str:
+    """What a problem leaves out of a branch, of which some positions (N, n) are clear; empty for nothing."""
+    domain, reasons = problem.domain, []
+    inside = np.asarray(Box(domain.centre, domain.half_width, domain.unbounded).contains(counted))
+    if not inside.all():
+        box = f"around q = ({number_list(domain.centre)}) with half-widths ({number_list(domain.half_width)})"
+        reasons.append(f"its middle is not clear, so the chart has a smaller box, {box}")
+    beside = is_on_side_of_centre(problem, counted)
+    if not beside.all():
+        reasons.append("singular positions divide it, so the chart has one side of them")
+    kept = percent(float((inside & beside).mean()))
+    return f"all but {kept} of the clear positions: {'; '.join(reasons)}" if reasons else ""
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class WideFit(Fit):
     """A chart of a branch, and how it was found."""
@@ -294,66 +366,3 @@ class WideFit(Fit):
             **({"meaning": f"{self.meaning.explained}: xi1, {self.chart.notes['meaning']}"} if self.meaning else {}),
         }
         return {"fit": known.pop("fit"), "problem": known.pop("problem"), **own, **known}
-
-
-def _choose_branch(robot: Robot, task: Task, branch: Branch | Box | str | None, home: ArrayLike | str | None) -> Branch:
-    """The branch itself, by its name, or that of the home."""
-    if isinstance(branch, Branch):
-        return branch
-    if isinstance(branch, Box):
-        return Branch("box", branch, branch.centre, float("nan"), float("nan"))
-    found: Branches = branches(robot, task)
-    if branch is not None:
-        return found[branch]
-    return found.of(home_posture(robot, task, home).q) or found[0]
-
-
-def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomial | MLP, ...]:
-    """Polynomials that are linear in the joints on whose position the self-motions do not depend, by proof.
-
-    Then those that are so in such slides without limits only, if there are others: a joint that turns has one turn.
-    Then a network, but not for coordinates that are to mean something, nor with slides without limits.
-    """
-    robot = problem.robot
-    free = [k for k in range(robot.n) if keeps_self_motions(problem, k)]
-    slides = robot.tree.prismatic
-    endless = [k for k in free if slides[k] and np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
-    names, fewer = (tuple(robot.joint_names[k] for k in joints) for joints in (free, endless))
-    families: list[Polynomial | MLP] = [Polynomial(RULES.degree, names)]
-    if names != fewer:
-        families.append(Polynomial(RULES.degree_of_all, fewer))
-    if like is None and not endless:
-        families.append(MLP(RULES.network, raw=True))
-    return tuple(families)
-
-
-def _build_problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Branch, clearance: float) -> Problem:
-    """The problem on the clear part of a branch; if its middle is not clear, of the largest box whose middle is."""
-    box = branch.box
-    try:
-        return Problem(robot, task, metric, box, branch.name, clearance)
-    except DomainError:
-        points, values = middles(robot, task, box)
-    clear = points[values > CLEARER * clearance]
-    room = box.half_width - np.abs(clear - box.centre)
-    if not len(clear):
-        missing = f"no position clear by {CLEARER * clearance:g}"
-        most = f"at most {math.floor(1e3 * float(values.max()) / CLEARER) / 1e3:g} can serve it"
-        raise DomainError(f"branch '{branch.name}' has {missing}, expected one for clearance = {clearance:g}: {most}")
-    best = int(np.argmax(np.log(room).sum(axis=1)))
-    domain = Box(clear[best], room[best], box.unbounded)
-    return Problem(robot, task, metric, domain, branch.name, clearance)
-
-
-def _describe_left_out(problem: Problem, branch: Branch, counted: Array) -> str:
-    """What a problem leaves out of a branch, of which some positions (N, n) are clear; empty for nothing."""
-    domain, reasons = problem.domain, []
-    inside = np.asarray(Box(domain.centre, domain.half_width, domain.unbounded).contains(counted))
-    if not inside.all():
-        box = f"around q = ({number_list(domain.centre)}) with half-widths ({number_list(domain.half_width)})"
-        reasons.append(f"its middle is not clear, so the chart has a smaller box, {box}")
-    beside = is_on_side_of_centre(problem, counted)
-    if not beside.all():
-        reasons.append("singular positions divide it, so the chart has one side of them")
-    kept = percent(float((inside & beside).mean()))
-    return f"all but {kept} of the clear positions: {'; '.join(reasons)}" if reasons else ""
