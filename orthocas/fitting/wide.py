@@ -125,9 +125,10 @@ def fit_wide(
             there. With r > 1, several are allowed, or a task of lower priority: the gradients of the first coordinates
             are held against the parts of theirs that are orthogonal to the task. Default: with shoulder, elbow and
             wrist and r = 1, the scale and the direction of the swivel there.
-        weights: weights of terms that join the loss, by name or as `Weights`, such as `Weights(task=0.1, mutual=0.0,
+        weights: weights of terms that join the loss, by name or as `Weights`, such as `Weights(task=3.0, mutual=0.0,
             regularity=0.0)` for coordinates that are more orthogonal to the task, or `{"name": 0.1}` for a term of
-            `register_loss_term`. A search for folds has no place here. Default: none.
+            `register_loss_term`. They are means over the first samples; the worst ones of polynomials only ask for
+            regular coordinates. A search for folds has no place here. Default: none.
         samples: number of samples. Default: 30 for each function, 5,000 to 20,000; 100,000 for a network.
         seed: seed of the samples, and of the first network.
         monitor: called with progress.

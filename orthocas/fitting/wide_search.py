@@ -269,35 +269,42 @@ class Search:
 
     def _descend(self, name: str, volume: str, solver: Solver) -> None:
         """Minimise from the last parameters, and keep the result if it is the best so far."""
-        weights, count = self._choose_weights(volume), sum(len(samples) for samples in self._samples)
+        count = sum(len(samples) for samples in self._samples)
         with one_blas_thread():
             if self.linear:
                 with deferred():
-                    objective = self._build_in_basis(weights)
+                    objective = self._build_in_basis(volume)
                 start = objective.variables(self._last)
                 result = solver.minimise(objective, start, Watch(self.settings.monitor, name))
                 self._last = objective.parameters(result.theta)
             else:
                 with deferred():
-                    resampled = self._build_resampled(weights)
+                    resampled = self._build_resampled(self._choose_weights(volume))
                 result = solver.minimise(resampled, self._last, Watch(self.settings.monitor, name))
                 self._last = result.theta
         self._take(name, replace(result, theta=self._last), count)
 
-    def _choose_weights(self, volume: str) -> Weights:
-        """Weights of all terms, with the name of that of the volume. Terms add weight |rho|^2 / 2."""
-        r = self.problem.r
+    def _weigh_regularity(self, volume: str) -> dict[str, float]:
+        """Weights of our own terms, with the name of that of the volume. Terms add weight |rho|^2 / 2."""
         target = LOSS.wide_volume if volume == "volume" else LOSS.worst_volume
-        own = {volume: 2 / target**2, "metric length": 2 * RULES.evenness}
+        weights = {volume: 2 / target**2, "metric length": 2 * RULES.evenness}
         if not self.problem.metric.is_identity:
-            own["euclidean volume"] = 2 / (LOSS.beyond * LOSS.least_volume / r) ** 2
-        users = self.settings.weights
+            weights["euclidean volume"] = 2 / (LOSS.beyond * LOSS.least_volume / self.problem.r) ** 2
+        return weights
+
+    def _choose_weights(self, volume: str) -> Weights:
+        """Weights of all terms."""
+        own, users = self._weigh_regularity(volume), self.settings.weights
         if users is None:
             return Weights(0.0, 0.0, 0.0, 0.0, 0.0, own)
         return replace(users, folds=0.0, extra={**own, **users.extra}).for_problem(self.problem)
 
-    def _build_in_basis(self, weights: Weights) -> "Orthonormal":
-        """The loss of a family that is linear in its parameters, on all samples so far, with terms of what xi means."""
+    def _build_in_basis(self, volume: str) -> "Orthonormal":
+        """The loss of a family that is linear in its parameters, on all samples so far, with terms of what xi means.
+
+        Terms of the user are means over the first samples. The worst ones only ask for regular coordinates.
+        """
+        weights = self._choose_weights(volume)
         assert isinstance(self.family, LinearFamily)
         lengths = np.linalg.norm(self._last.reshape(self.problem.r, -1) @ self._factor, axis=1)
         if len(self._samples) == 1:
@@ -308,8 +315,8 @@ class Search:
             )
             self._objectives = [first]
         else:
-            self._objectives = [known.reweighted(weights) for known in self._objectives]
-            self._objectives.append(self._objectives[0].elsewhere(self._samples[-1], weights.by_name))
+            first, own = self._objectives[0].reweighted(weights), self._weigh_regularity(volume)
+            self._objectives = [first, *self._objectives[1:], first.elsewhere(self._samples[-1], own)]
         count = sum(len(samples) for samples in self._samples)
         parts: list[tuple[float, Objective]] = [
             (len(samples) / count, known) for samples, known in zip(self._samples, self._objectives, strict=True)

@@ -517,10 +517,9 @@ def test_the_loss_has_volumes_and_lengths_and_its_slopes_are_differences(metric:
     search._start_linear()  # takes the mean of products of gradients
     factor = search._factor
     search._likeness, search._last, search._sign = [held], C.ravel(), -1.0
-    weights = search._choose_weights("volume with the worst")
-    search._build_in_basis(weights)
+    search._build_in_basis("volume with the worst")
     search._samples.append(sample_frames(problem, q[1]))
-    loss = search._build_in_basis(weights)
+    loss = search._build_in_basis("volume with the worst")
     theta = loss.variables(C.ravel())
     np.testing.assert_allclose(loss.parameters(theta), C.ravel(), atol=1e-12)
     value, slopes = loss.value_and_gradient(theta)
