@@ -5,7 +5,7 @@ from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from math import ceil
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -255,7 +255,7 @@ class BasisObjective:
         if any(rows):
             # blocks of coordinate pairs, from few rows per sample in single precision
             shared = [(i, j, rows[i].index(row), rows[j].index(row)) for i, j, row in self._loss.shared_rows]
-            gradients, by_coordinate = self._thin(stride), []
+            gradients, by_coordinate = self._thin(stride), list[Any]()
             for derivative in derivatives[: self.r]:
                 blocks = derivative.reshape(len(derivative), self.n, -1, derivative.shape[2])
                 by_coordinate.append(by_sample(blocks, self.N, stride).astype(np.float32))
