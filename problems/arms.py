@@ -11,7 +11,8 @@ from orthocas.tasks.domains import Box, Torus
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.task import Task
 
-_BENT = Box((0.6, 0.8, 0.8), np.pi / 8)  # [rad]; neither task is singular here
+# [rad]; neither task is singular here
+_BENT = Box((0.6, 0.8, 0.8), np.pi / 8)
 
 
 def _arm(joints: int) -> Robot:

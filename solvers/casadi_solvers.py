@@ -74,7 +74,8 @@ class _IpoptRun:
         self._constraints_at: tuple[bytes, Array, Array] | None = None
         self._count = 0
         self._current = self.best.theta
-        self._least = np.inf, self._current  # violation of the constraints
+        # violation of the constraints
+        self._least = np.inf, self._current
 
     def result(self) -> SolveResult:
         """Minimise. If no point meets the constraints, theta is the point with the smallest violation."""
@@ -252,7 +253,8 @@ class _Flow:
         self.best = BestPoint(objective, theta0, watch)
         self.theta = np.array(theta0, dtype=float)
         self.value, self.stretch = np.nan, 0.0
-        self.scale = float(np.abs(self.theta).max() or 1.0)  # of the theta that the flow starts from
+        # of the theta that the flow starts from
+        self.scale = float(np.abs(self.theta).max() or 1.0)
         self.direct = isinstance(objective, SmoothObjective | LeastSquaresObjective)
         self._last = np.full_like(self.theta, np.nan), self.theta
         self._kept, self._uses = (self._last[0], np.empty((0, 0))), 0

@@ -56,7 +56,8 @@ class _Run:
         self.settings, self.objective = settings, objective
         self.best = BestPoint(objective, theta0, watch)
         self.damping = 1e-3
-        self._gained_little = False  # in the last step
+        # in the last step
+        self._gained_little = False
 
     def iterate(self) -> Status:
         best = self.best
@@ -69,7 +70,8 @@ class _Run:
             damping = self.damping
             if not self._step(gradient, H):
                 return Status.STALLED if np.any(gradient) else Status.CONVERGED
-            cautious = self.damping > damping  # a step after rejections is short: a small gain is no convergence
+            # a step after rejections is short: a small gain is no convergence
+            cautious = self.damping > damping
             little = not cautious and before - best.value <= self.settings.tolerance * before
             converged, self._gained_little = little and self._gained_little, little
             best.next_iteration(self.settings.max_iterations)

@@ -19,10 +19,21 @@ from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, require_kind
 from orthocas.tools.expressions import gradient_dependences, to_tape
 
-_SAMPLES, _POSITIONS = 24, 6  # joint positions, and other positions of one joint at each of them
-_SEED = 0
+
+@dataclass(frozen=True, slots=True)
+class CyclicRules:
+    """Numbers of the test for cyclic joints, and of coordinates that move with a base."""
+
+    samples: int = 24  #: joint positions at which a symmetry is tested
+    positions: int = 6  #: other positions of one joint at each of them
+    seed: int = 0
+    largest_slide: float = 10.0  #: [m]; other positions of a prismatic joint without limits lie within
+    start: float = 0.03  #: of the arm's own start, where coordinates move with a base
+    on_plane: int = 3  #: coordinates that move with the base: two of its place, and the heading
+
+
+RULES = CyclicRules()
 _AXES = "xyz"
-_LARGEST_SLIDE = 10.0  # [m]; other positions of a prismatic joint without limits lie within
 _WORD = "cyclic"
 
 
@@ -50,7 +61,7 @@ def cyclic_joints(problem: Problem) -> tuple[str, ...]:
         (('q1',), ())
     """
     require_kind("problem", problem, Problem)
-    points = sample_uniform(problem.domain, _SAMPLES, _SEED)
+    points = sample_uniform(problem.domain, RULES.samples, RULES.seed)
     points = points[is_regular(problem, points)]
     names = problem.robot.joint_names
     driven = (k for k in range(problem.n) if k not in problem.robot.tree.floating)
@@ -92,9 +103,9 @@ def _is_cyclic(problem: Problem, points: Array, k: int) -> bool:
     """Whether nothing that matters changes when joint k moves."""
     robot, (low, high) = problem.robot, _range(problem, k)
     if robot.tree.prismatic[k] and np.isinf([robot.lower[k], robot.upper[k]]).any():
-        low, high = -_LARGEST_SLIDE, _LARGEST_SLIDE
-    places = low + (high - low) * np.random.default_rng((_SEED, k)).uniform(size=(_POSITIONS, len(points)))
-    moved = np.repeat(points[None], _POSITIONS, axis=0)
+        low, high = -RULES.largest_slide, RULES.largest_slide
+    places = low + (high - low) * np.random.default_rng((RULES.seed, k)).uniform(size=(RULES.positions, len(points)))
+    moved = np.repeat(points[None], RULES.positions, axis=0)
     moved[:, :, k] = places
     J, A = _task_and_metric(problem, points)
     if not np.abs(J[:, :, k]).max() > NEGLIGIBLE * np.abs(J).max():
@@ -125,7 +136,7 @@ def _invariants(J: Array, A: Array) -> tuple[Array, Array]:
 
 def _same(here: Array, there: Array) -> bool:
     """Whether values at the points (N, ...) equal those at the other positions (positions N, ...)."""
-    differences = there.reshape(_POSITIONS, *here.shape) - here
+    differences = there.reshape(RULES.positions, *here.shape) - here
     return bool(np.abs(differences).max() <= NEGLIGIBLE * np.abs(here).max())
 
 
@@ -209,7 +220,8 @@ def _rotation(tree: KinematicTree, joint: int, base: int) -> Array:
     """The rotation of a joint's frame, at zero, in that of a joint that carries it, or in the world for -1."""
     R: Array = np.eye(3)
     while joint != base:
-        R = tree.rotations[joint] @ R  # exact where the entries are 0, 1 and -1
+        # exact where the entries are 0, 1 and -1
+        R = tree.rotations[joint] @ R
         joint = tree.parents[joint]
     return R
 
@@ -298,10 +310,6 @@ def count(cyclic: Cyclic) -> int:
     return 0 if cyclic == "auto" else len(cyclic)
 
 
-_START = 0.03  # of the arm's own start
-_ON_PLANE = 3  # coordinates that move with the base: two of its place, and the heading
-
-
 @dataclass(frozen=True)
 class Mobile:
     """Coordinates that turn and shift with a base that moves on a plane.
@@ -343,7 +351,7 @@ class Mobile:
         if getattr(self.arm, "cyclic", ()):
             raise InvalidValueError("arm", self.arm.label, "a parametrisation without cyclic joints")
         names = tuple(self.base) if isinstance(self.base, tuple | list) else ()
-        if len({*names}) != _ON_PLANE or not all(isinstance(name, str) for name in names):
+        if len({*names}) != RULES.on_plane or not all(isinstance(name, str) for name in names):
             raise InvalidValueError("base", repr(self.base)[:80], "names of three joints: x, y and the heading")
         object.__setattr__(self, "base", names)
 
@@ -378,8 +386,8 @@ class Mobile:
         Raises:
             InvalidValueError: if there are less than three coordinates, or joints of the base are missing.
         """
-        if outputs < _ON_PLANE:
-            raise InvalidValueError("extra coordinates of a mobile base", outputs, f"at least {_ON_PLANE}")
+        if outputs < RULES.on_plane:
+            raise InvalidValueError("extra coordinates of a mobile base", outputs, f"at least {RULES.on_plane}")
         for name in self.base:
             if name not in space.joint_names:
                 raise InvalidValueError(f"joint '{name}' of the base", "an idle joint", "one that moves the task")
@@ -404,7 +412,7 @@ class MobileFamily:
     @property
     def size(self) -> int:
         """Number of parameters."""
-        return self.arm.size + 2 + self.outputs - _ON_PLANE
+        return self.arm.size + 2 + self.outputs - RULES.on_plane
 
     @property
     def as_matrices(self) -> bool:
@@ -424,7 +432,7 @@ class MobileFamily:
         ahead, aside = f[0, :] + rest[0], f[1, :] + rest[1]
         c, s = ca.cos(heading), ca.sin(heading)
         rows = [x + c * ahead - s * aside, y + s * ahead + c * aside, heading + f[2, :]]
-        rows += [rest[k - 1] * heading + f[k, :] for k in range(_ON_PLANE, self.outputs)]
+        rows += [rest[k - 1] * heading + f[k, :] for k in range(RULES.on_plane, self.outputs)]
         xi: Expression = ca.vertcat(*rows)
         return xi
 
@@ -437,7 +445,7 @@ class MobileFamily:
 
         With larger f_1 and f_2, a fit can let them grow without end, so that (xi_1, xi_2) leaves the place out.
         """
-        return np.concatenate([_START * self.arm.initial(seed), np.zeros(self.size - self.arm.size)])
+        return np.concatenate([RULES.start * self.arm.initial(seed), np.zeros(self.size - self.arm.size)])
 
 
 def anywhere(problem: Problem, base: tuple[str, ...]) -> Problem:

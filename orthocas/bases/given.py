@@ -18,7 +18,6 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_count, require_known, require_shape, require_text
 from orthocas.tools.expressions import Tape, expression_of, replay, require_tape, to_tape
 
-_MOST_JOINTS = 1000
 SEWKind = Literal["conventional", "stereographic"]
 SEW_KINDS: tuple[SEWKind, ...] = ("conventional", "stereographic")
 # (e_t, e_r) in the world. The singular half-line e_t points down into the base. With e_r = -x, an arm that reaches
@@ -27,8 +26,18 @@ _DIRECTIONS = {
     "conventional": ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
     "stereographic": ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0)),
 }
-_MEETING = 1e-5  # axes closer than this meet [m]
-_PARALLEL = 1e-6  # axes at a smaller angle are parallel [rad]
+
+
+@dataclass(frozen=True, slots=True)
+class GivenRules:
+    """Numbers of given coordinates and of the angle of the elbow."""
+
+    most_joints: int = 1000  #: of a function without a robot
+    meeting: float = 1e-5  #: axes closer than this meet [m]
+    parallel: float = 1e-6  #: axes at a smaller angle are parallel [rad]
+
+
+RULES = GivenRules()
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +77,7 @@ class Given:
             >>> chart.labels
             ('x', 'y', 'xi1')
         """
-        q = ca.SX.sym("q", require_count("n", n, most=_MOST_JOINTS))
+        q = ca.SX.sym("q", require_count("n", n, most=RULES.most_joints))
         xi = expression_of(f"coordinates '{name}'", function, q)
         require_shape(f"coordinates '{name}'", xi.shape, (None, 1))
         return cls(name, n, to_tape(dense_function("xi", [q], [xi])))
@@ -193,24 +202,25 @@ def _heights(tree: KinematicTree) -> tuple[float, float, float]:
     _, elbow, _ = _common_normal(tree, 2)
     wrist, _, gap_56 = _common_normal(tree, 4)
     for first, gap in ((0, gap_12), (1, gap_23), (4, gap_56)):
-        if gap > _MEETING:
+        if gap > RULES.meeting:
             raise RobotError(
                 f"the axes of joints '{names[first]}' and '{names[first + 1]}' are {gap:.3g} m apart, "
-                f"expected axes that meet within {_MEETING:g} m"
+                f"expected axes that meet within {RULES.meeting:g} m"
             )
-    if abs(on_2 - also_on_2) > _MEETING:
+    if abs(on_2 - also_on_2) > RULES.meeting:
         raise RobotError(
             f"the axes of joints '{names[0]}' and '{names[2]}' meet that of '{names[1]}' at points "
-            f"{abs(on_2 - also_on_2):.3g} m apart, expected one point within {_MEETING:g} m"
+            f"{abs(on_2 - also_on_2):.3g} m apart, expected one point within {RULES.meeting:g} m"
         )
     return shoulder, elbow, wrist
 
 
 def _common_normal(tree: KinematicTree, i: int) -> tuple[float, float, float]:
     """Ends of the common normal of axes i and i + 1, as heights on the two axes, and its length [m]."""
-    origin, axis = tree.translations[i + 1], tree.rotations[i + 1][:, 2]  # of joint i + 1 in body i, whose axis is z
+    # of joint i + 1 in body i, whose axis is z
+    origin, axis = tree.translations[i + 1], tree.rotations[i + 1][:, 2]
     across = axis[:2]
-    if np.linalg.norm(across) < _PARALLEL:
+    if np.linalg.norm(across) < RULES.parallel:
         names = tree.joint_names
         raise RobotError(
             f"the axes of joints '{names[i]}' and '{names[i + 1]}' are parallel, expected axes at an angle"

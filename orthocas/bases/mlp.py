@@ -71,7 +71,8 @@ class NetworkArrays:
         for k, V in enumerate(self._V[:-1], start=1):
             up, h = self._up[k][:-1], self._below[k][:-1]
             np.matmul(_flat(self._up[k - 1][:-1]), V, out=_flat(up))  # by h
-            np.einsum("rsw,rsw->sw", up, h, out=self._work[k])  # by s, times s
+            # by s, times s
+            np.einsum("rsw,rsw->sw", up, h, out=self._work[k])
             up *= self._s[k]
         np.sum(self._up[-1][:-1], axis=1, out=by_V[-1].T)
         by_b[-1][...] = 0
@@ -204,7 +205,8 @@ class MLPFamily:
         t = len(self._turning)
         by_angle = gradients[:t, :] * ca.repmat(ca.cos(q[self._turning, :]), 1, self.outputs)
         by_angle -= gradients[t : 2 * t, :] * ca.repmat(ca.sin(q[self._turning, :]), 1, self.outputs)
-        rows = np.argsort([*self._turning, *self._direct_joints]).tolist()  # back to the order of the joints
+        # back to the order of the joints
+        rows = np.argsort([*self._turning, *self._direct_joints]).tolist()
         stacked = ca.vertcat(by_angle, gradients[2 * t :, :])[rows, :]
         return [stacked[:, j * N : (j + 1) * N] for j in range(self.outputs)]
 
@@ -268,10 +270,12 @@ class MLPFamily:
 
     def reordered(self, theta: Array, order: Sequence[int]) -> Array:
         """Parameters with the outputs in another order, (size,)."""
-        return self.combined(theta, np.eye(self.outputs)[list(order)])  # the products with 0 and 1 are exact
+        # the products with 0 and 1 are exact
+        return self.combined(theta, np.eye(self.outputs)[list(order)])
 
     def combined(self, theta: Array, B: Array) -> Array:
         """Parameters of B xi, (size,), for a matrix B (r, r)."""
-        last = self.outputs * (self.widths[-2] + 1)  # W_out column by column, then b_out
+        # W_out column by column, then b_out
+        last = self.outputs * (self.widths[-2] + 1)
         columns = theta[-last:].reshape(-1, self.outputs) @ B.T
         return np.concatenate([theta[:-last], columns.ravel()])

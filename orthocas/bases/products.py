@@ -113,7 +113,8 @@ def _products(terms: tuple[Term, ...], factors: Any) -> Any:
     """
     n = len(terms[0])
     levels: list[Any] = []
-    rows: list[dict[Term, int]] = []  # of the terms in their levels
+    # of the terms in their levels
+    rows: list[dict[Term, int]] = []
     for level in by_factors(terms):
         parts = [split(term) for term in level]
         values = factors[[n * (index - 1) + joint for _, joint, index in parts], :]
@@ -186,7 +187,8 @@ class Products:
 
     degree: int
     cyclic: Cyclic = ()
-    joints: int | None = field(default=None, metadata={"stored": "if given"})  # others keep their fingerprints
+    # others keep their fingerprints
+    joints: int | None = field(default=None, metadata={"stored": "if given"})
     linear = True
     closed_form = None
 

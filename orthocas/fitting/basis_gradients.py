@@ -14,7 +14,8 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import ColumnFunction, blocked
 
-_PART = 16  # blocks of samples at a time, so that the memory never holds all of them twice
+# blocks of samples at a time, so that the memory never holds all of them twice
+_PART = 16
 
 
 class BasisGradients(ABC):
@@ -111,12 +112,16 @@ class ProductGradients(BasisGradients):
     def __init__(self, family: ProductFamily, n: int, dtype: DTypeLike = np.float64) -> None:
         super().__init__(family, n, dtype)
         matrices = [family.build_derivative_matrix(i)[1:] for i in range(n)]
-        self._places = np.unique(np.concatenate([D.indices for D in matrices]))  # of psi' in (1, psi)
+        # places of psi' in (1, psi)
+        self._places = np.unique(np.concatenate([D.indices for D in matrices]))
         matrices = [D[:, self._places] for D in matrices]
-        self._upright = scipy.sparse.vstack(matrices).tocsr()  # all D_i, (n K, S)
-        self._lying = scipy.sparse.vstack([D.T for D in matrices]).tocsr()  # all D_i^T, (n S, K)
+        # all D_i, (n K, S)
+        self._upright = scipy.sparse.vstack(matrices).tocsr()
+        # all D_i^T, (n S, K)
+        self._lying = scipy.sparse.vstack([D.T for D in matrices]).tocsr()
         self._back = self._lying.T.tocsr()
-        self._parts: dict[tuple[bytes, str], Any] = {}  # of all D_i, for some of the functions
+        # rows of all D_i for some of the functions, so far
+        self._parts: dict[tuple[bytes, str], Any] = {}
 
     @property
     def groups(self) -> int:

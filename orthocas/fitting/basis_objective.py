@@ -235,7 +235,8 @@ class BasisObjective:
         value, gradient = 0.0, np.zeros(T.shape)
         losses, slopes = np.empty(COLUMNS), np.empty((self.n * self.r, COLUMNS))
         arrays = (self.X, self._share, *self._data)
-        for X, share, *data in zip(*(array[part] for array in arrays), strict=True):  # X leaves memory only once
+        # block by block, so that X leaves memory only once
+        for X, share, *data in zip(*(array[part] for array in arrays), strict=True):
             run([_to_double(T @ X), *data], [losses, slopes])
             value += float(losses @ share)
             gradient += (slopes * share).astype(X.dtype, copy=False).reshape(*T.shape[:2], -1) @ X.transpose(0, 2, 1)
@@ -307,9 +308,11 @@ class BoundedMutual:
     """
 
     def __init__(self, objective: BasisObjective, bound: float) -> None:
-        weights, self._gram = objective.weights, objective.gram  # sampled once, and shared by the objectives below
+        # the basis is sampled once, and shared by the objectives below
+        weights, self._gram = objective.weights, objective.gram
         self._task = objective.reweighted(Weights(weights.task, 0.0, weights.regularity, angles=weights.angles))
-        only_mutual = Weights(0.0, 2.0, 0.0, angles=weights.angles)  # 2 cancels the factor 1/2 of the loss
+        # 2 cancels the factor 1/2 of the loss
+        only_mutual = Weights(0.0, 2.0, 0.0, angles=weights.angles)
         self._mutual = objective.reweighted(only_mutual)
         self._r, self._K, self._bound = objective.r, objective.K, bound
 
@@ -367,7 +370,8 @@ def build_normal_matrix(derivatives: Sequence[Array], gradients: Sequence[Array]
     places = [slice(end - G.shape[2], end) for G, end in zip(gradients, ends, strict=True)]
     H = np.zeros((ends[-1], ends[-1]))
     chunks = range(0, len(gradients[0]), RULES.chunk)
-    together = ceil(thread_count() / r)  # chunks, so that there is work for all threads
+    # so many chunks at a time that there is work for all threads
+    together = ceil(thread_count() / r)
     for k in range(0, len(chunks), together):
         _add(H, places, chunks[k : k + together], derivatives, gradients, shared)
     for i, j, *_ in shared:

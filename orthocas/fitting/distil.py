@@ -115,7 +115,8 @@ def distil(
     else:
         minimiser = LBFGS(max_iterations=500, tolerance=1e-9) if solver is None else solver
         result = minimiser.minimise(_Distance(family, own_targets), family.initial(seed), watch).require_finished()
-        theta, offset = result.theta, np.zeros(family.outputs)  # the output bias of a network includes the offset
+        # the output bias of a network includes the offset
+        theta, offset = result.theta, np.zeros(family.outputs)
     if circle is not None:
         theta, offset = np.concatenate([theta, -offset[: circle.constants]]), np.zeros(chart.r)
     coordinates = Coordinates(parametrisation, space, (), theta, offset, np.ones(chart.r))

@@ -233,7 +233,8 @@ def normalise(raw: Coordinates, origin: Array, samples: Samples) -> Coordinates:
         OrthocasError: if the gradient of a coordinate vanishes on the domain.
     """
     r = len(raw.offset)
-    if isinstance(raw.family, CircleFamily):  # an angle keeps its period
+    # angles keep their period, so they are turned instead of scaled
+    if isinstance(raw.family, CircleFamily):
         return replace(raw, theta=raw.family.turned(raw.theta, raw.once("xi", origin[None, :])[0, :r]))
     lengths = np.linalg.norm(raw.once("jacobian", samples.points)[:, :r], axis=2).mean(axis=0)
     if not lengths.min() > 0:
@@ -251,7 +252,8 @@ def fix_gauge(coordinates: Coordinates, centre: Array) -> Coordinates:
     """
     g = coordinates.once("jacobian", centre[None, :])[0, : len(coordinates.offset)]
     size = (g**2).sum(axis=1)
-    moved = (g**2 @ np.arange(g.shape[1])) / np.where(size > 0, size, 1.0)  # g = 0: a fold at the centre
+    # lengths of 0 belong to folds at the centre
+    moved = (g**2 @ np.arange(g.shape[1])) / np.where(size > 0, size, 1.0)
     largest = np.take_along_axis(g, np.abs(g).argmax(axis=1)[:, None], axis=1)[:, 0]
     signs = np.where(largest < 0, -1.0, 1.0)
     keys = np.round(np.column_stack([moved, -signs[:, None] * g]), RULES.digits)

@@ -154,7 +154,8 @@ class Like:
         whole[active] = q
         values = self.function(whole)
         slopes = dense_function("like_jacobian", [q], [ca.cse(ca.jacobian(values, q))])
-        return LikeTerm(f"like {_digest(slopes)}", len(self.names), slopes)  # functions of a loss are kept by names
+        # functions of a loss are kept by names
+        return LikeTerm(f"like {_digest(slopes)}", len(self.names), slopes)
 
     def hold(self, samples: Samples, along: Callable[[Array], Array]) -> "list[QuadraticTerm]":
         """0.01 mean |Z^T (dxi_k/dq - g_k)|^2 over mean |Z^T g_k|^2, with gradients g_k and a basis Z of ker J_x.
@@ -239,7 +240,8 @@ class LikeTerm:
         C = theta.reshape(family.outputs, family.width)
         G = gradients.expand(gradients.at(samples.points), len(samples))
         Z = samples.null_basis
-        own = np.einsum("rk,snk,snz->szr", C, G, Z, optimize=True).reshape(-1, len(C))  # components across the task
+        # components across the task
+        own = np.einsum("rk,snk,snz->szr", C, G, Z, optimize=True).reshape(-1, len(C))
         slopes = _finite(self.batched(samples.points)[0].reshape(len(samples), self.count, -1))
         wanted = (slopes @ Z).transpose(0, 2, 1)
         B = np.linalg.lstsq(own, wanted.reshape(-1, self.count), rcond=None)[0].T  # (k, r)
@@ -322,7 +324,8 @@ class Meaning:
         sides = [_trace_self_motion(problem, posture, sign * RULES.step) for sign in (-1.0, 1.0)]
         points = np.concatenate([sides[0][:0:-1], sides[1]])
         middle = len(sides[0]) - 1
-        values = np.unwrap(Batched(quantity)(points)[0][:, 0])  # angles do not jump
+        # angles do not jump
+        values = np.unwrap(Batched(quantity)(points)[0][:, 0])
         turns = like == SWIVEL
         if turns:
             values -= 2 * np.pi * np.round(values[middle] / (2 * np.pi))

@@ -32,7 +32,8 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_point_set, frozen_array, require_count, require_kind
 from orthocas.tools.columns import COLUMNS, ColumnFunction, Run
 
-_BY_LAPACK = 8  # coordinates from which determinants of numbers are faster than written-out ones
+# coordinates from which determinants of numbers are faster than written-out ones
+_BY_LAPACK = 8
 
 
 def loss(
@@ -295,7 +296,8 @@ def build_residual_columns(loss: Loss) -> Callable[..., list[Array]]:
     J, data = loss.arguments()
     r, n = loss.sizes.r, loss.sizes.n
     rho = loss.residuals(J, data)
-    by_entry = ca.jacobian(rho, ca.vec(J))  # its columns are the entries of J_xi, column by column
+    # its columns are the entries of J_xi, column by column
+    by_entry = ca.jacobian(rho, ca.vec(J))
     outputs = [by_entry[list(loss.smooth_rows[j]), j::r] for j in range(r)]
     for row in loss.hinge_rows:
         outputs += [rho[row], ca.reshape(by_entry[row, :], r, n)]
@@ -379,7 +381,8 @@ class LossWithVolumes:
         """Residuals (c,) of one block (n r, c), and their derivatives (n r, c)."""
         sizes, pairs = self._loss.sizes, self._loss.exchanged
         named = dict(zip(self._loss.data, data, strict=True))
-        rows = list(J.reshape(sizes.n, sizes.r, -1).transpose(1, 2, 0))  # r times (c, n)
+        # r times (c, n)
+        rows = list(J.reshape(sizes.n, sizes.r, -1).transpose(1, 2, 0))
         Z = named["null_basis"].reshape(sizes.r, sizes.n, -1).transpose(2, 1, 0)
         A = named.get("metric_inverse")
         metric_inverse = None if A is None else A.reshape(sizes.n, sizes.n, -1).transpose(2, 1, 0)

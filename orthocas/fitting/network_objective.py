@@ -249,7 +249,8 @@ class _LossGraph:
         data = ca.MX.sym("data", columns, sum(symbol.numel() for symbol in loss.symbols()))
         share = ca.MX.sym("share", columns)
         gradients = family.jacobian(q, theta)
-        by_component = [ca.horzsplit(gradient.T) for gradient in gradients]  # r times n columns of samples
+        # r times n columns of samples
+        by_component = [ca.horzsplit(gradient.T) for gradient in gradients]
         entries = [column for by_joint in zip(*by_component, strict=True) for column in by_joint]
         r = loss.sizes.r
         values, *slopes = replay(

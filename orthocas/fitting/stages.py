@@ -318,7 +318,8 @@ class StageRunner:
         # graphs of other families are few large products: they need the threads of BLAS more than the last digits
         with one_blas_thread() if isinstance(family, LinearFamily | ArrayFamily) else nullcontext():
             samples = self._sample(count, 1 + plan.tag)
-            with deferred():  # CasADi may swallow Ctrl-C while graphs are built
+            # CasADi may swallow Ctrl-C while graphs are built
+            with deferred():
                 objective, start = self._build_objective(plan, samples, None if kept is None else mirror)
             result = plan.solver.minimise(objective, start, Watch(self.monitor, plan.label))
         if isinstance(objective, BoundedMutual) and not np.isfinite(result.value):
@@ -342,7 +343,8 @@ class StageRunner:
         if settings.max_mutual is not None:
             wanted = "a parametrisation linear in its parameters, such as polynomial"
             raise InvalidValueError("max_mutual_deg", f"given with {plan.label}", wanted)
-        numbers = 60 * family.size + 100 * len(samples) * self.space.n  # with the state of the solver
+        # with the state of the solver
+        numbers = 60 * family.size + 100 * len(samples) * self.space.n
         require_memory(f"{plan.label} with {family.size} parameters", 8.0 * numbers)
         start = family.initial(settings.seed) if theta is None else theta
         if isinstance(family, ArrayFamily):
@@ -389,7 +391,8 @@ class StageRunner:
             raise InvalidValueError("max_mutual_deg", "given", "a problem with two or more coordinates to fit")
         # pairs with an idle joint are exactly orthogonal, so the other pairs may use their part
         bounded = BoundedMutual(objective, self.settings.max_mutual * (all_pairs / fitted) ** 0.5)
-        if fresh:  # solve the weighted problem first: minima far from its own are worse
+        # solve the weighted problem first: minima far from its own are worse
+        if fresh:
             weighted = replace(self.settings.weights, mutual=DEFAULT_WEIGHTS.mutual)
             theta = GaussNewton().minimise(objective.reweighted(weighted), theta).require_finished().theta
         return bounded, bounded.in_gauge(theta)

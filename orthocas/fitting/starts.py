@@ -60,13 +60,15 @@ def find_spectral_start(
     basis = build_gradients(family, samples.points.shape[1]) if gradients is None else gradients
     G = basis.expand(basis.at(samples.points), len(samples)).astype(np.float64, copy=False)  # (N, n, K)
     N, _, K = G.shape
-    along_task = (samples.task_basis @ G).reshape(-1, K)  # e_i^T d psi, the components along the task gradients
+    # components e_i^T d psi along the task gradients
+    along_task = (samples.task_basis @ G).reshape(-1, K)
     S = along_task.T @ along_task / N
     raised = G if samples.metric_inverse is None else samples.metric_inverse @ G
     T = G.reshape(-1, K).T @ raised.reshape(-1, K) / N
     T += RULES.ridge * np.trace(T) / K * np.eye(K)
     middle = G.mean(axis=0)
-    V = G.reshape(-1, K).T @ G.reshape(-1, K) / N - middle.T @ middle  # variance of the gradients
+    # variance of the gradients
+    V = G.reshape(-1, K).T @ G.reshape(-1, K) / N - middle.T @ middle
     allowed = np.ones((family.outputs, K), dtype=bool) if kept is None else kept
     C, left = np.zeros(allowed.shape), list(range(family.outputs))
     while left:
@@ -85,7 +87,8 @@ def find_spectral_start(
 def _find_smallest(S: Array, T: Array, V: Array, free: NDArray[np.bool_]) -> Array:
     """The c with c^T T c = 1 and the smallest c^T S c, zero where it is not free, (K,). Of exact ones that of V."""
     block = np.ix_(free, free)
-    whitening = np.linalg.inv(np.linalg.cholesky(T[block])).T  # W^T T W = I
+    # whitening W with W^T T W = I
+    whitening = np.linalg.inv(np.linalg.cholesky(T[block])).T
     values, vectors = np.linalg.eigh(whitening.T @ S[block] @ whitening)
     equal = whitening @ vectors[:, : max(1, np.count_nonzero(values < RULES.exact))]
     c = np.zeros(len(free))

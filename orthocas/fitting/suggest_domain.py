@@ -363,7 +363,8 @@ def _confirm(
     for shrinkings in range(RULES.tries):
         box = Box(problem.domain.centre, widths * factors**shrinkings, unbounded)
         trial = Problem(robot, problem.task, problem.metric, box, problem.name)
-        if not prober.least(trial, seed + 1) >= enough:  # a fit would take ten times as long to find that
+        # a fit would take ten times as long to find that
+        if not prober.least(trial, seed + 1) >= enough:
             continue
         found = fit_from(prober.start_on, trial, parametrisation, prober.weights, seed, monitor)
         quality = evaluate_chart(found.chart, RULES.confirmed, seed + 1)

@@ -81,8 +81,10 @@ class WideRules:
 
 RULES = WideRules()
 _ADAM = Adam(epochs=8, steps=500, batch=512, learning_rate=1e-2)
-_SLOWER = replace(_ADAM, learning_rate=5e-3)  # with the worst of more fresh samples
-_STAGE = "whole branch"  # begins the names of stages
+# Adam once the worst of fresh samples have joined
+_SLOWER = replace(_ADAM, learning_rate=5e-3)
+# the names of first stages begin with it
+_STAGE = "whole branch"
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +162,8 @@ class Search:
         self.rank = (True, np.inf, np.inf)
         self.stages: list[Stage] = []
         self._sign = 1.0  # of the volumes
-        self._done = False  # whether coordinates are as regular as they need to be
+        # done: coordinates are as regular as they need to be
+        self._done = False
 
     def begin(self, name: str) -> None:
         """Look for coordinates, in a stage of some name."""
@@ -371,7 +374,8 @@ class Search:
         return np.asarray(volumes)
 
     @cached_property
-    def _basis(self) -> BasisGradients:  # not before this family is tried
+    # built when this family is tried, and not before
+    def _basis(self) -> BasisGradients:
         assert isinstance(self.family, LinearFamily)
         return build_gradients(self.family, self.problem.n)
 
