@@ -9,7 +9,7 @@ import pytest
 import orthocas as oc
 from orthocas.bases import JointSpace
 from orthocas.cli.problem_argument import parse_weights
-from orthocas.errors import InvalidValueError, ShapeError
+from orthocas.errors import InvalidValueError
 from orthocas.fitting import network_objective
 from orthocas.fitting.basis_gradients import build_gradients
 from orthocas.fitting.basis_objective import BasisObjective, ObjectiveRules
@@ -25,12 +25,12 @@ from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
 from orthocas.fitting.starts import find_spectral_start
 from orthocas.fitting.terms import (
     RULES,
+    MutualTerm,
     Sizes,
+    TaskTerm,
     Weights,
     gradient_volume,
-    mutual_cosines,
     pairs,
-    task_cosines,
     volume_hinges,
 )
 from orthocas.tasks.samples import Draw, Samples, sample_problem, samples_at
@@ -233,9 +233,10 @@ def test_cosines_vanish_for_hand_derived_coordinate_of_planar_2r() -> None:
     """At q1 = pi/2, x = cos q1 + cos(q1 + q2) has J_x = -(1 + cos q2, cos q2): orthogonal to (cos q2, -1 - cos q2)."""
     c = np.cos(0.7)
     task = ca.SX(ca.DM([[-(1 + c), -c]]) / np.hypot(1 + c, c))
-    cosines = task_cosines(task, ca.SX(ca.DM([[c, -(1 + c)]])))
+    data, sizes = {"unit_task_gradients": task}, Sizes(2, 1, 1, True)
+    cosines = TaskTerm().residuals(ca.SX(ca.DM([[c, -(1 + c)]])), data, sizes)
     np.testing.assert_allclose(float(ca.evalf(cosines)), 0, atol=1e-15)
-    np.testing.assert_allclose(float(ca.evalf(task_cosines(task, task * 3))), 1.0)
+    np.testing.assert_allclose(float(ca.evalf(TaskTerm().residuals(task * 3, data, sizes))), 1.0)
 
 
 def test_pairs_are_ordered_like_the_paper_sum() -> None:
@@ -244,15 +245,13 @@ def test_pairs_are_ordered_like_the_paper_sum() -> None:
 
 
 def test_single_coordinate_has_no_mutual_cosine() -> None:
-    assert mutual_cosines(ca.SX.ones(1, 3), None).shape == (0, 1)
+    assert MutualTerm().residuals(ca.SX.ones(1, 3), {}, Sizes(3, 2, 1, True)).shape == (0, 1)
 
 
-def test_bad_weights_and_shapes_are_refused(planar_x: oc.Problem) -> None:
+def test_bad_weights_are_refused(planar_x: oc.Problem) -> None:
     for weights in ((0.0, 1.0), (-1.0, 1.0), (1.0, float("nan")), (1.0, -2.0)):
         with pytest.raises(InvalidValueError, match="lambda"):
             oc.fit(planar_x, oc.Polynomial(1), weights=weights)
-    with pytest.raises(ShapeError, match="coordinate_jacobian"):
-        task_cosines(ca.SX.ones(1, 3), ca.SX.ones(2, 4))
 
 
 @pytest.mark.slow
