@@ -119,11 +119,11 @@ class BasisObjective:
 
     def coordinate_jacobians(self, theta: Array) -> Array:
         """J_xi at every sample, (N, r, n)."""
-        return by_sample(self._jacobian_entries(theta).reshape(-1, self.n, self.r, COLUMNS), self.N)
+        return by_sample(self._evaluate_jacobians(theta).reshape(-1, self.n, self.r, COLUMNS), self.N)
 
     def value(self, theta: Array) -> float:
         """L(theta)."""
-        (losses,) = build_value_columns(self._loss)(self._jacobian_entries(theta), *self._data)
+        (losses,) = build_value_columns(self._loss)(self._evaluate_jacobians(theta), *self._data)
         return float(np.vdot(losses[:, 0], self._share))
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
@@ -150,7 +150,7 @@ class BasisObjective:
     def hessian(self, theta: Array) -> Array:
         """d^2L/dtheta^2, exact, (size, size)."""
         r, n, K = self.r, self.n, self.K
-        (curvature,) = build_curvature_columns(self._loss)(self._jacobian_entries(theta), *self._data)
+        (curvature,) = build_curvature_columns(self._loss)(self._evaluate_jacobians(theta), *self._data)
         W = by_sample(curvature.reshape(-1, n * r, n * r, curvature.shape[2]), self.N).reshape(-1, n, r, n, r)
         G, H = self._dense, np.zeros((r, K, r, K))
 
@@ -167,7 +167,7 @@ class BasisObjective:
         block: Array = H.reshape(r * K, r * K)[np.ix_(free, free)]
         return block
 
-    def reweighted(self, weights: Weights) -> Self:
+    def reweigh(self, weights: Weights) -> Self:
         """The same loss on the same samples with other weights. It cannot add terms that need other sample data."""
         other = copy(self)
         other.weights, other._loss = weights, Loss.of(self._loss.sizes, weights.by_name, self._loss.exchanged)
@@ -186,7 +186,7 @@ class BasisObjective:
         other._use(samples)
         return other
 
-    def moved(self, gradients: BasisGradients, samples: Samples, start: Array) -> Self:
+    def move_to(self, gradients: BasisGradients, samples: Samples, start: Array) -> Self:
         """The same loss of the same family on another box, without building it again.
 
         Args:
@@ -242,7 +242,7 @@ class BasisObjective:
             gradient += (slopes * share).astype(X.dtype, copy=False).reshape(*T.shape[:2], -1) @ X.transpose(0, 2, 1)
         return value, gradient
 
-    def _jacobian_entries(self, theta: Array) -> Array:
+    def _evaluate_jacobians(self, theta: Array) -> Array:
         """J_xi, (B, n r, c)."""
         T = self._table(theta)
         J = _to_double(np.concatenate(in_threads(lambda part: T @ self.X[part], self._parts)))
@@ -250,7 +250,7 @@ class BasisObjective:
 
     def _build_matrix(self, theta: Array, stride: int) -> Array:
         """Gauss-Newton matrix; that of the smooth residuals from every `stride`-th sample."""
-        derivatives = build_residual_columns(self._loss)(self._jacobian_entries(theta), *self._data)
+        derivatives = build_residual_columns(self._loss)(self._evaluate_jacobians(theta), *self._data)
         free, rows = int(self.kept.sum()), self._loss.smooth_rows
         H = np.zeros((free, free))
         if any(rows):
@@ -310,10 +310,10 @@ class BoundedMutual:
     def __init__(self, objective: BasisObjective, bound: float) -> None:
         # the basis is sampled once, and shared by the objectives below
         weights, self._gram = objective.weights, objective.gram
-        self._task = objective.reweighted(Weights(weights.task, 0.0, weights.regularity, angles=weights.angles))
+        self._task = objective.reweigh(Weights(weights.task, 0.0, weights.regularity, angles=weights.angles))
         # 2 cancels the factor 1/2 of the loss
         only_mutual = Weights(0.0, 2.0, 0.0, angles=weights.angles)
-        self._mutual = objective.reweighted(only_mutual)
+        self._mutual = objective.reweigh(only_mutual)
         self._r, self._K, self._bound = objective.r, objective.K, bound
 
     def value(self, theta: Array) -> float:
@@ -348,7 +348,7 @@ class BoundedMutual:
             H[block, block] += 2 * multiplier * self._gram
         return H
 
-    def in_gauge(self, theta: Array) -> Array:
+    def normalise_gradients(self, theta: Array) -> Array:
         """The same coordinates with E|grad xi_j|^2 = 1."""
         C = theta.reshape(self._r, self._K)
         scaled: Array = C / np.sqrt(((C @ self._gram) * C).sum(axis=1))[:, None]

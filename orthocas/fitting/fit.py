@@ -162,7 +162,7 @@ def _fit(
             idle_joints=tuple(problem.robot.joint_names[i] for i in joints),
             worst=solution.worst,
             seconds=time.perf_counter() - start,
-            like={} if settings.like is None else settings.like.distances(problem, coordinates, settings.seed),
+            like={} if settings.like is None else settings.like.measure_distances(problem, coordinates, settings.seed),
             clear_part=offer_clear_part(problem, problem_check, solution.worst),
         )
         if result.status is Status.INTERRUPTED or pressed():
@@ -212,15 +212,15 @@ def _solve(
         coordinates = Coordinates(settings.parametrisation, space, idle, none, none, none)
         return Solution((), settings.parametrisation, None), coordinates
     active = [i for i in range(problem.n) if i not in idle]
-    like = None if settings.like is None else settings.like.term(problem, active)
-    settings = settings if like is None else settings.with_term(like)
+    like = None if settings.like is None else settings.like.build_term(problem, active)
+    settings = settings if like is None else settings.add_term(like)
     folds = FoldSearch(problem, active, settings.fold_weight(problem))
     runner = StageRunner(problem, settings, active, monitor, folds, like)
     solution = Continuation(runner, r, begin).run()
     raw = Coordinates(solution.parametrisation, space, idle, solution.theta, np.zeros(r), np.ones(r))
     coordinates = normalise(raw, problem.domain.centre, samples)
     if settings.like is not None:
-        return solution, settings.like.named(coordinates, problem)
+        return solution, settings.like.name_units(coordinates, problem)
     if align_to is not None:
         return solution, align(coordinates, align_to, samples)
     return solution, fix_gauge(coordinates, problem.domain.centre)

@@ -74,7 +74,7 @@ def label_likeness(name: str, where: str = "") -> str:
     return " ".join(filter(None, ("like", words, where))) + bracket + unit
 
 
-def _finite(slopes: Array) -> Array:
+def _require_finite(slopes: Array) -> Array:
     """The gradients of quantities, if all numbers are finite."""
     if not np.isfinite(slopes).all():
         raise InvalidValueError(
@@ -83,7 +83,7 @@ def _finite(slopes: Array) -> Array:
     return slopes
 
 
-def _digest(function: ca.Function) -> str:
+def _hash(function: ca.Function) -> str:
     return hashlib.sha256(json.dumps(to_tape(function)).encode()).hexdigest()[:12]
 
 
@@ -115,13 +115,13 @@ class Like:
             like = like.with_reference_at(problem.domain.centre)
             labels = zip(like.labels, like.units, strict=True)
             names = tuple(f"{label} [{unit}]" if unit else label for label, unit in labels)
-            return cls(names, _of_arms(robot, q, like.smooth_function(q)))
+            return cls(names, _require_arms(robot, q, like.smooth_function(q)))
         parts = [like] if isinstance(like, str) or not isinstance(like, Sequence) else like
         found = [build_quantity(robot, part) for part in parts]
         if not found:
             raise InvalidValueError("like", "an empty list", "at least one quantity")
         values = ca.vertcat(*(function(q) for _, function in found))
-        return cls(tuple(name for name, _ in found), _of_arms(robot, q, values))
+        return cls(tuple(name for name, _ in found), _require_arms(robot, q, values))
 
     @property
     def label(self) -> str:
@@ -133,16 +133,16 @@ class Like:
         if len(self.names) > count:
             raise InvalidValueError("like", f"{len(self.names)} quantities", f"at most {count}, one for a coordinate")
 
-    def slopes(self, points: Array) -> Array:
+    def differentiate(self, points: Array) -> Array:
         """dy/dq at points (N, n), (N, k, n)."""
-        return _finite(self._slopes(points)[0].reshape(len(points), len(self.names), -1))
+        return _require_finite(self._slopes(points)[0].reshape(len(points), len(self.names), -1))
 
     @cached_property
     def _slopes(self) -> BlockedFunction:
         q = ca.SX.sym("q", self.function.numel_in(0))
         return BlockedFunction(dense_function("slopes", [q], [ca.jacobian(self.function(q), q)]))
 
-    def term(self, problem: Problem, active: list[int]) -> "LikeTerm":
+    def build_term(self, problem: Problem, active: list[int]) -> "LikeTerm":
         """The term of the loss for coordinates of the active joints; the others stay at the centre of the domain.
 
         Raises:
@@ -155,7 +155,7 @@ class Like:
         values = self.function(whole)
         slopes = dense_function("like_jacobian", [q], [ca.cse(ca.jacobian(values, q))])
         # functions of a loss are kept by names
-        return LikeTerm(f"like {_digest(slopes)}", len(self.names), slopes)
+        return LikeTerm(f"like {_hash(slopes)}", len(self.names), slopes)
 
     def hold(self, samples: Samples, along: Callable[[Array], Array]) -> "list[QuadraticTerm]":
         """0.01 mean |Z^T (dxi_k/dq - g_k)|^2 over mean |Z^T g_k|^2, with gradients g_k and a basis Z of ker J_x.
@@ -168,7 +168,7 @@ class Like:
             InvalidValueError: if the task leaves nothing of a quantity, or what it leaves of some follows from others.
         """
         N, m = samples.task_jacobian.shape[:2]
-        Z, slopes = np.linalg.svd(samples.task_jacobian)[2][:, m:], self.slopes(samples.points)
+        Z, slopes = np.linalg.svd(samples.task_jacobian)[2][:, m:], self.differentiate(samples.points)
         left = np.einsum("sji,ski->skj", Z, slopes)
         gram = np.einsum("ski,sli->kl", left, left) / N
         squares, least = gram.diagonal(), RULES.still_motion**2
@@ -181,7 +181,7 @@ class Like:
         weight = RULES.weight_of_wide
         return [QuadraticTerm(weight / a * E, weight / a * pulls[:, k], weight) for k, a in enumerate(squares)]
 
-    def named(self, coordinates: Coordinates, problem: Problem) -> Coordinates:
+    def name_units(self, coordinates: Coordinates, problem: Problem) -> Coordinates:
         """Coordinates in the units of their quantities, with their values at the centre of the domain."""
         k, centre = len(self.names), problem.domain.centre
         offset, scale = coordinates.offset.copy(), coordinates.scale.copy()
@@ -189,18 +189,18 @@ class Like:
         offset[:k], scale[:k] = raw - np.array(self.function(centre))[:, 0], 1.0
         return replace(coordinates, offset=offset, scale=scale)
 
-    def distances(self, problem: Problem, coordinates: Coordinates, seed: int) -> dict[str, float]:
+    def measure_distances(self, problem: Problem, coordinates: Coordinates, seed: int) -> dict[str, float]:
         """Root mean square angles between gradients of coordinates and what the task leaves of quantities' [deg]."""
         samples, k = sample_problem(problem, RULES.held_out, (seed, RULES.held_out)), len(self.names)
         J, Z = coordinates.jacobian(samples.points)[:, :k], samples.null_basis
-        left = self.slopes(samples.points) @ Z
+        left = self.differentiate(samples.points) @ Z
         lengths = np.sqrt(np.einsum("skn,skn->sk", J, samples.raised(J))) * np.linalg.norm(left, axis=2)
         cosines = np.einsum("skz,skz->sk", J @ Z, left) / np.maximum(lengths, RULES.still)
         angles = np.degrees(np.sqrt((np.arccos(np.clip(cosines, -1, 1)) ** 2).mean(axis=0)))
         return dict(zip(self.names, angles.tolist(), strict=True))
 
 
-def _of_arms(robot: Robot, q: ca.SX, values: ca.SX) -> ca.Function:
+def _require_arms(robot: Robot, q: ca.SX, values: ca.SX) -> ca.Function:
     """Quantities as a function of q, if no floating base moves them: xi depends on the arms' joints alone."""
     base = list(robot.tree.floating)
     if base and ca.depends_on(values, q[base]):
@@ -235,14 +235,14 @@ class LikeTerm:
         """Evaluates dy/dq at many points."""
         return BlockedFunction(self.slopes)
 
-    def turned(self, family: LinearFamily, theta: Array, samples: Samples, gradients: BasisGradients) -> Array:
+    def turn(self, family: LinearFamily, theta: Array, samples: Samples, gradients: BasisGradients) -> Array:
         """Combinations of coordinates, (r K,): the first k are nearest to the quantities, the others across them."""
         C = theta.reshape(family.outputs, family.width)
         G = gradients.expand(gradients.at(samples.points), len(samples))
         Z = samples.null_basis
         # components across the task
         own = np.einsum("rk,snk,snz->szr", C, G, Z, optimize=True).reshape(-1, len(C))
-        slopes = _finite(self.batched(samples.points)[0].reshape(len(samples), self.count, -1))
+        slopes = _require_finite(self.batched(samples.points)[0].reshape(len(samples), self.count, -1))
         wanted = (slopes @ Z).transpose(0, 2, 1)
         B = np.linalg.lstsq(own, wanted.reshape(-1, self.count), rcond=None)[0].T  # (k, r)
         if np.linalg.matrix_rank(B) < self.count:
@@ -272,7 +272,7 @@ class MeaningError:
         against = percent(self.against, fault=True)
         return f"{self.rms:.2g} off (rms), correlation {self.correlation:.2f}, against it on {against} of the domain"
 
-    def notes(self) -> dict[str, float]:
+    def write_notes(self) -> dict[str, float]:
         """For the notes of a chart."""
         return {
             "error of its meaning": self.rms,
@@ -352,7 +352,7 @@ class Meaning:
         weight = RULES.held_weight / len(rows) / self.slope**2
         return QuadraticTerm(weight * rows.T @ rows, weight * rows.T @ sides, weight * float(sides @ sides))
 
-    def named(self, raw: Coordinates) -> Coordinates:
+    def name_units(self, raw: Coordinates) -> Coordinates:
         """Coordinates in units of the quantity, with its value at the posture.
 
         The scale is that for which they were fitted, or the best one.
@@ -363,7 +363,7 @@ class Meaning:
             scale = float(away @ values / max(away @ away, RULES.tiny))
         return replace(raw, offset=np.array([xi[self.home] - self.values[self.home] / scale]), scale=np.array([scale]))
 
-    def error(self, problem: Problem, coordinates: Coordinates, seed: int) -> MeaningError:
+    def measure_error(self, problem: Problem, coordinates: Coordinates, seed: int) -> MeaningError:
         """What coordinates miss of the quantity at held-out samples of the domain, where it has a value."""
         samples = sample_problem(problem, RULES.held_out_of_meaning, (seed, RULES.held_out_of_meaning))
         q = ca.SX.sym("q", problem.n)

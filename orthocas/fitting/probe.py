@@ -289,7 +289,7 @@ class Prober:
             weights = replace(self.weights.for_problem(problem), length=0.0, extra={})
             self._objective = BasisObjective(family, samples, weights, start, lambda count, seed: samples)
         else:
-            self._objective = known.moved(build_gradients(family, len(self.active)), samples, start)
+            self._objective = known.move_to(build_gradients(family, len(self.active)), samples, start)
         return self._objective
 
 

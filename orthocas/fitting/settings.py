@@ -116,7 +116,7 @@ class FitSettings:
         known = None if like is None else Like.of(problem, like)
         return cls(bound, solver, loss, count, tag, max_mutual_deg, split_idle, precision, known)
 
-    def with_term(self, term: LikeTerm) -> Self:
+    def add_term(self, term: LikeTerm) -> Self:
         """The settings with the term that holds coordinates to quantities among the weights."""
         register_loss_term(term)
         return replace(self, weights=replace(self.weights, extra={**self.weights.extra, term.name: LIKE_RULES.weight}))

@@ -56,7 +56,7 @@ class Stage:
     samples: int
     result: SolveResult
 
-    def interrupted(self) -> "Stage":
+    def mark_interrupted(self) -> "Stage":
         """The same stage, marked as interrupted by Ctrl-C."""
         return replace(self, result=replace(self.result, status=Status.INTERRUPTED))
 
@@ -96,7 +96,7 @@ class Continuation:
 
     def run(self) -> Solution:
         """Run all stages. After Ctrl-C, the last one is marked as interrupted."""
-        steps = self._steps(self._runner.settings.parametrisation)
+        steps = self._list_steps(self._runner.settings.parametrisation)
         try:
             for step in steps:
                 self._solve(step, step.label, final=step is steps[-1])
@@ -104,11 +104,11 @@ class Continuation:
         except KeyboardInterrupt:  # also between minimisations
             if self._reached is None:
                 raise
-            self._stages[-1] = self._stages[-1].interrupted()
+            self._stages[-1] = self._stages[-1].mark_interrupted()
         assert self._reached is not None
         return Solution(tuple(self._stages), self._reached[0], self._runner.folds.worst)
 
-    def _steps(self, target: Parametrisation) -> Sequence[Parametrisation]:
+    def _list_steps(self, target: Parametrisation) -> Sequence[Parametrisation]:
         if not isinstance(target, GradedParametrisation):
             return [target]
         self._runner.require_memory(target, self._r)
@@ -379,7 +379,7 @@ class StageRunner:
             samples = samples_at(self.problem, points).restricted_to(self.active)
             start = find_spectral_start(family, samples, kept, self._gradients(family))
             if self.like is not None:
-                start = self.like.turned(family, start, samples, self._gradients(family))
+                start = self.like.turn(family, start, samples, self._gradients(family))
             self._starts[key] = start
         return self._starts[key]
 
@@ -394,8 +394,8 @@ class StageRunner:
         # solve the weighted problem first: minima far from its own are worse
         if fresh:
             weighted = replace(self.settings.weights, mutual=DEFAULT_WEIGHTS.mutual)
-            theta = GaussNewton().minimise(objective.reweighted(weighted), theta).require_finished().theta
-        return bounded, bounded.in_gauge(theta)
+            theta = GaussNewton().minimise(objective.reweigh(weighted), theta).require_finished().theta
+        return bounded, bounded.normalise_gradients(theta)
 
     @property
     def space(self) -> JointSpace:
@@ -422,7 +422,7 @@ class StageRunner:
             return mirror
         family = self.family(target.of_degree(min(target.degree, RULES.trial_degree)), len(mirror.parities))
         assert isinstance(family, LinearFamily)
-        return min(mirror.choices(), key=lambda choice: self._try(family, choice))
+        return min(mirror.list_choices(), key=lambda choice: self._try(family, choice))
 
     def _try(self, family: LinearFamily, mirror: Mirror) -> float:
         """The loss that a family reaches with these symmetric coordinates."""

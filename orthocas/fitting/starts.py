@@ -123,7 +123,7 @@ class Mirror:
     parities: Array  #: p of the components, (r,): as many +1 and -1 as the null space has on the mirror, where S q = q
     exchanged: Pairs = ()  #: pairs of an odd and an even component, from which two coordinates are made
 
-    def choices(self) -> list["Mirror"]:
+    def list_choices(self) -> list["Mirror"]:
         """Mirrors with the same reflection and all choices of what changes places, up to a number of them."""
         odd, even = (np.flatnonzero(self.parities == sign).tolist() for sign in (-1, 1))
         most = min(len(odd), len(even))

@@ -295,16 +295,16 @@ def _finish(
         raise DomainError(f"{wrong}: give a smaller box as branch, another branch, or another parametrisation")
     first = sample_problem(clear, RULES.first, (seed, RULES.first_tag))
     if meaning is not None:
-        coordinates = meaning.named(raw)
+        coordinates = meaning.name_units(raw)
     elif quantities is not None:
-        coordinates = quantities.named(normalise(raw, centre, first), clear)
+        coordinates = quantities.name_units(normalise(raw, centre, first), clear)
     else:
         coordinates = fix_gauge(normalise(raw, centre, first), centre) if len(raw.offset) else raw
     domain = RegularPart(clear.domain, coordinates, LOSS_RULES.least_volume / clear.r)
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
     counted = clear_positions(clear.robot, clear.task, branch.box, RULES.held_out, (seed, RULES.counted_tag))
     share = float(domain.contains(counted).mean()) if len(counted) else float("nan")
-    error = None if meaning is None else meaning.error(problem, coordinates, seed)
+    error = None if meaning is None else meaning.measure_error(problem, coordinates, seed)
     worst = worst_points(problem, coordinates, seed, thorough=True)
     notes: dict[str, str | float] = {
         "solver": solution.solver,
@@ -314,12 +314,12 @@ def _finish(
         "branch": branch.name,
         "share of the branch": share,
         "least conditioning": worst.least,
-        **({} if meaning is None or error is None else {"meaning": meaning.label, **error.notes()}),
+        **({} if meaning is None or error is None else {"meaning": meaning.label, **error.write_notes()}),
         **({} if quantities is None else {"meaning": quantities.label}),
     }
     return WideFit(
         chart=Chart(problem, coordinates, notes),
-        stages=tuple(stage.interrupted() if interrupted else stage for stage in solution.stages),
+        stages=tuple(stage.mark_interrupted() if interrupted else stage for stage in solution.stages),
         problem_check=check(problem, seed=seed),
         idle_joints=tuple(problem.robot.joint_names[k] for k in coordinates.idle),
         worst=worst,
@@ -328,7 +328,7 @@ def _finish(
         regular_share=share,
         left_out=_describe_left_out(clear, branch, counted),
         meaning=error,
-        like={} if quantities is None else quantities.distances(problem, coordinates, seed),
+        like={} if quantities is None else quantities.measure_distances(problem, coordinates, seed),
     )
 
 

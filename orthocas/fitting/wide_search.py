@@ -239,7 +239,7 @@ class Search:
         directions = scipy.linalg.null_space(self._centre.task_jacobian[0]).T
         meaning, quantities, self._likeness = self.settings.meaning, self.settings.quantities, list[QuadraticTerm]()
         if quantities is not None:
-            across = quantities.slopes(centre[None])[0] @ directions.T  # (k, r)
+            across = quantities.differentiate(centre[None])[0] @ directions.T  # (k, r)
             Q, R = np.linalg.qr(np.vstack([across, np.eye(problem.r)]).T)
             directions = (Q * np.where(R.diagonal() < 0, -1.0, 1.0)).T @ directions
             self._likeness = quantities.hold(some, lambda a: self._basis.differentiate_along(known, a))
@@ -318,7 +318,7 @@ class Search:
             )
             self._objectives = [first]
         else:
-            first, own = self._objectives[0].reweighted(weights), self._weigh_regularity(volume)
+            first, own = self._objectives[0].reweigh(weights), self._weigh_regularity(volume)
             self._objectives = [first, *self._objectives[1:], first.elsewhere(self._samples[-1], own)]
         count = sum(len(samples) for samples in self._samples)
         parts: list[tuple[float, Objective]] = [

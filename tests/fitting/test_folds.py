@@ -67,7 +67,7 @@ def test_coordinates_that_change_places_come_from_components_and_back() -> None:
 
 def test_choices_are_parities_alone_or_pairs_of_an_odd_and_an_even_component() -> None:
     mirror = Mirror(SPACE, np.ones(2), np.array([-1.0, -1.0, 1.0]))
-    assert [choice.exchanged for choice in mirror.choices()] == [(), ((0, 2),), ((1, 2),)]
+    assert [choice.exchanged for choice in mirror.list_choices()] == [(), ((0, 2),), ((1, 2),)]
 
 
 def test_the_loss_of_components_is_that_of_the_coordinates_made_of_them() -> None:

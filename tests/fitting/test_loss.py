@@ -116,7 +116,7 @@ def test_hessian_is_the_derivative_of_the_gradient(problem: oc.Problem) -> None:
 def test_weights_split_the_loss_into_its_terms(problem: oc.Problem) -> None:
     linear, _, _ = objectives(problem, oc.Polynomial(2), REGULAR)
     theta = linear.family.initial(3)
-    terms = [linear.reweighted(Weights(*w)) for w in ((1000.0, 0.0, 0.0), (0.0, 30.0, 0.0), (1000.0, 0.0, 120.0))]
+    terms = [linear.reweigh(Weights(*w)) for w in ((1000.0, 0.0, 0.0), (0.0, 30.0, 0.0), (1000.0, 0.0, 120.0))]
     task, mutual, regular = (term.value(theta) for term in terms)
     np.testing.assert_allclose(regular + mutual, linear.value(theta), rtol=1e-12)
     assert task < regular
