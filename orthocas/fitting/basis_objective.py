@@ -128,6 +128,7 @@ class BasisObjective:
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """L(theta) and dL/dtheta."""
+        # J_xi = T X block by block; the loss and its slopes there; and the slopes times X^T, which are dL/dT
         T, columns, parts = self._table(theta), build_loss_columns(self._loss), self._parts
         with columns.borrowed(min(thread_count(), len(parts))) as runs:
             sums = in_threads_with(runs, lambda run, part: self._sum_part(T, run, part), parts)
@@ -141,6 +142,7 @@ class BasisObjective:
 
     def curvature_estimate(self, theta: Array) -> Array:
         """The Gauss-Newton matrix from as few samples as steer a quasi-Newton method."""
+        # as few samples as leave enough residuals for each coefficient
         residuals = self.N * (self._loss.hinge_rows.start or 1)
         stride = RULES.stride
         while 2 * stride <= RULES.most_stride and residuals >= 2 * stride * RULES.rough * theta.size:
@@ -149,6 +151,7 @@ class BasisObjective:
 
     def hessian(self, theta: Array) -> Array:
         """d^2L/dtheta^2, exact, (size, size)."""
+        # second derivatives with respect to J_xi at each sample, then the gradients of the basis on both sides
         r, n, K = self.r, self.n, self.K
         (curvature,) = build_curvature_columns(self._loss)(self._evaluate_jacobians(theta), *self._data)
         W = by_sample(curvature.reshape(-1, n * r, n * r, curvature.shape[2]), self.N).reshape(-1, n, r, n, r)
@@ -268,6 +271,7 @@ class BasisObjective:
 
     def _sum_hinges(self, residual: Array, derivative: Array) -> Array:
         """Gauss-Newton matrix of a hinge residual. It couples all coordinates, but acts at few samples."""
+        # only samples at which the hinge acts, without the padding of the last block
         block, column = np.nonzero((residual[:, 0] > 0) & (self._share > 0))
         D = derivative[block, :, column].reshape(-1, self.n, self.r).transpose(0, 2, 1).astype(np.float32)
         chosen: Array = self.X[block, :, :, column]  # (active, g, S)

@@ -87,6 +87,7 @@ def distil(
         raise InvalidValueError(
             "parametrisation", repr(parametrisation), "a parametrisation that can be fitted, such as Polynomial(6)"
         )
+    # the family: circle-valued ones are fitted by cosine and sine
     require_kind("chart", chart, Chart)
     watch = Watch(monitor, f"distil {parametrisation.label}")
     if not isinstance(chart.coordinates, GrownCoordinates):
@@ -107,9 +108,11 @@ def distil(
     if count * (1 + chart.n) <= family.size / chart.r:
         raise InvalidValueError("samples", count, f"enough for the {family.size // chart.r} parameters of a coordinate")
     require_memory(f"distilling with {count} samples", 8.0 * count * chart.n * (chart.n + 4))
+    # values and gradients of the grown chart at the samples that have them
     points = sample_evenly(chart.problem.domain, count, require_count("seed", seed, least=0))
     targets = _sample_targets(chart, points)
     own_targets = targets if circle is None else _take_circle_pairs(targets)
+    # bases by least squares, networks by a minimiser
     if isinstance(family, LinearFamily):
         theta, offset = _solve_least_squares(family, own_targets, watch)
     else:

@@ -144,16 +144,19 @@ def _fit(
 ) -> "Fit":
     """Fit with settings that are checked."""
     start = time.perf_counter()
+    # the domain that the family asks for, and whether the task can be regular there
     warn_unless_savable(settings.parametrisation)
     problem = _choose_domain(problem, settings)
     with remembered() as pressed:
         problem_check = check(problem, seed=settings.seed)
         samples = sample_problem(problem, RULES.first, (settings.seed, RULES.first_tag))
+        # closed forms need no minimisation; others run the stages of `orthocas.fitting.stages`
         if settings.parametrisation.closed_form is not None:
             solution = Solution((), settings.parametrisation, None)
             coordinates = _evaluate_closed_form(problem, settings.parametrisation, samples)
         else:
             solution, coordinates = _solve(problem, settings, monitor, samples, align_to, begin)
+        # the chart, with what a reader of the fit asks first: idle joints, worst points, a smaller domain
         joints = [i for i in coordinates.idle if i not in problem.robot.tree.floating]
         result = Fit(
             chart=Chart(problem, coordinates, _write_notes(solution, settings)),
@@ -211,12 +214,14 @@ def _solve(
         none = np.zeros(0)
         coordinates = Coordinates(settings.parametrisation, space, idle, none, none, none)
         return Solution((), settings.parametrisation, None), coordinates
+    # coordinates are fitted in the joints that move the task; quantities to follow are one more term of the loss
     active = [i for i in range(problem.n) if i not in idle]
     like = None if settings.like is None else settings.like.build_term(problem, active)
     settings = settings if like is None else settings.add_term(like)
     folds = FoldSearch(problem, active, settings.fold_weight(problem))
     runner = StageRunner(problem, settings, active, monitor, folds, like)
     solution = Continuation(runner, r, begin).run()
+    # angles leave free where xi is zero, how long its gradient is, the order and the signs
     raw = Coordinates(solution.parametrisation, space, idle, solution.theta, np.zeros(r), np.ones(r))
     coordinates = normalise(raw, problem.domain.centre, samples)
     if settings.like is not None:
@@ -250,6 +255,7 @@ def fix_gauge(coordinates: Coordinates, centre: Array) -> Coordinates:
     the positive direction. Coordinates that change places in the arm's mirror have the same mean; the one that moves
     the first joint on which they differ further comes first. Idle joints stay last.
     """
+    # the mean index of the joints that a coordinate moves, and the sign of its largest entry
     g = coordinates.once("jacobian", centre[None, :])[0, : len(coordinates.offset)]
     size = (g**2).sum(axis=1)
     # lengths of 0 belong to folds at the centre
@@ -280,6 +286,7 @@ def align(coordinates: Coordinates, chart: Chart, samples: Samples) -> Coordinat
         for J in (coordinates.jacobian(samples.points)[:, :fitted], chart.coordinates.jacobian(samples.points))
     )
     parallel = np.einsum("sin,sjn->ij", ours, theirs[:, :fitted]) / len(samples)
+    # the assignment of coordinates whose gradients are most parallel in the mean
     theirs_in_order, order = scipy.optimize.linear_sum_assignment(-np.abs(parallel.T))
     signs = np.sign(parallel.T[theirs_in_order, order])
     back = np.empty(fitted)

@@ -175,6 +175,7 @@ class Like:
         moving = (squares > least * (slopes**2).sum(axis=2).max(axis=0)).all()
         if not moving or np.linalg.eigvalsh(gram / np.sqrt(np.outer(squares, squares)))[0] < least:
             raise InvalidValueError("like", "quantities that the task leaves nothing of", "others, or another task")
+        # the quadratic form of coefficients that the mean square is
         parts = [along(Z[:, j]) for j in range(Z.shape[1])]
         E = sum((part.T @ part for part in parts), start=np.zeros(())) / N
         pulls = sum((part.T @ left[:, :, j] for j, part in enumerate(parts)), start=np.zeros(())) / N
@@ -321,6 +322,7 @@ class Meaning:
             name, quantity = several.names[0], several.function
         else:
             name, quantity = build_quantity(problem.robot, like)
+        # the quantity along the self-motion, both ways
         sides = [_trace_self_motion(problem, posture, sign * RULES.step) for sign in (-1.0, 1.0)]
         points = np.concatenate([sides[0][:0:-1], sides[1]])
         middle = len(sides[0]) - 1
@@ -329,6 +331,7 @@ class Meaning:
         turns = like == SWIVEL
         if turns:
             values -= 2 * np.pi * np.round(values[middle] / (2 * np.pi))
+        # the stretch around the posture on which it is monotone
         steps = np.diff(values)
         if len(points) < RULES.fewest or not np.isfinite(steps).all():
             raise InvalidValueError(
@@ -376,6 +379,7 @@ class Meaning:
         missed, value = xi - value, value - self.values[self.home]
         if self.turns:
             missed, value = _wrap(missed), _wrap(value)
+        # self-motions change the two in opposite directions where the signs differ
         signs = np.einsum("sn,sn->s", J, z) * np.einsum("sn,sn->s", slopes, z)
         return MeaningError(
             rms=float(np.sqrt(np.mean(missed**2))),

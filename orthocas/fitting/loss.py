@@ -80,6 +80,7 @@ def loss(
     family = parametrisation.for_problem(problem).family(JointSpace.of(problem), problem.r)
     drawn = _draw(problem, samples, seed)
     theta0 = _start(family, drawn, seed) if start is None else frozen_array("start", start, (family.size,))
+    # J_xi of all samples as expressions of theta, then the loss of one sample on each column
     theta = ca.MX.sym("theta", family.size)
     J = _build_jacobians(family, drawn.points, theta)  # (r n, N), each J_xi column by column
     identity = drawn.metric_inverse is None
@@ -240,6 +241,7 @@ class Loss:
         """The coordinates that each row of `written_out` depends on."""
         if self.volume_terms:
             return self.written_out._touched
+        # a row depends on the coordinates whose entries of J_xi are in its sparsity pattern
         J, data = self.arguments()
         by_entry = ca.jacobian(self.residuals(J, data), ca.vec(J)).sparsity()
         touched: list[set[int]] = [set() for _ in range(by_entry.size1())]

@@ -79,6 +79,7 @@ class ArrayObjective:
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """L(theta) and dL/dtheta."""
+        # each piece: gradients of the network, loss and slopes by CasADi, slopes back to theta
         small, columns = self._round(theta), build_loss_columns(self._loss)
 
         def part(tools: tuple[Run, ArrayMemory], work: tuple[_Piece, Array]) -> float:
@@ -245,6 +246,7 @@ class _LossGraph:
 
     def __init__(self, family: Family, loss: Loss, columns: int) -> None:
         self.columns = columns
+        # the graph of one sample's loss, replayed on columns of samples
         theta, q = ca.MX.sym("theta", family.size), ca.MX.sym("q", loss.sizes.n, columns)
         data = ca.MX.sym("data", columns, sum(symbol.numel() for symbol in loss.symbols()))
         share = ca.MX.sym("share", columns)

@@ -203,6 +203,7 @@ class Prober:
             return self._evaluate(problem, lambda points: np.zeros((len(points), 0, len(self.active))))
         space = JointSpace.of(problem).restricted_to(self.active)
         family = Polynomial(RULES.degree, self.cyclic).family(space, self.outputs)
+        # the coordinates of an earlier box may do; if not, a fit begins from them
         with one_blas_thread():
             if self._start is not None and (enough is not None or leap):
                 found = self._evaluate(problem, self._gradients(family, self._start.on(family)))
@@ -275,6 +276,7 @@ class Prober:
         solver = QuasiNewton().coarser()
         if fresh:
             return solver.minimise(objective, start)
+        # the matrix of a similar box is nearly that of this one
         known = self._steered
         if known is None or np.abs(np.log(half_width / known.half_width)).max() > np.log(RULES.other):
             self._steered = _Steered(objective, half_width, objective.curvature_estimate(start))
@@ -319,6 +321,7 @@ def evaluate_at(problem: Problem, points: Array, jacobian: Callable[[Array], Arr
         active: the active joints.
     """
     samples = samples_at(problem, points)
+    # leaks count at uniform samples, conditioning at all of them
     J, own = jacobian(samples.points), samples.restricted_to(active)
     uniform = len(samples) - 2 * (len(samples) // 3)
     leaks, conditioning = compute_leak_and_conditioning(own, J)

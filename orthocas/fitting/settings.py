@@ -91,6 +91,7 @@ class FitSettings:
         Raises:
             InvalidValueError, ShapeError: if a setting is invalid, or contradicts another one.
         """
+        # the family, for this problem
         require_kind("problem", problem, Problem)
         if parametrisation is None:
             parametrisation = choose_parametrisation(problem, bounded=max_mutual_deg is not None)
@@ -98,6 +99,7 @@ class FitSettings:
         bound = parametrisation.for_problem(problem)
         if max_mutual_deg is not None:
             _require_bound(bound, max_mutual_deg)
+        # the solver; only Ipopt knows bounds
         if solver is None:
             solver = choose_solver(bound, problem) if max_mutual_deg is None else Ipopt()
         require_solver(solver)

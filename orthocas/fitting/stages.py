@@ -135,6 +135,7 @@ class Continuation:
                 return None
             assert isinstance(family, ProductFamily)
             return self._begin(family)
+        # a basis of higher degree contains the last one
         theta, before = self._stages[-1].result.theta, self._reached[1]
         if theta.size == family.size:
             return theta
@@ -150,6 +151,7 @@ class Continuation:
                 break
             before = folds.least
             self._solve(step, f"{step.label}, round {k}", final=True)
+        # the domain forces folds: their term would only spoil the rest
         if folds.least < 0:
             folds.give_up()
             self._solve(step, f"{step.label}, with folds", final=True)
@@ -188,6 +190,7 @@ class FoldSearch:
         fitted = problem.r - len(idle)
         space = JointSpace.of(problem)
         coordinates = Coordinates(parametrisation, space, idle, stage.result.theta, np.zeros(fitted), np.ones(fitted))
+        # points join before they fold, so that the next stage sees them
         self.worst = worst_points(problem, coordinates, seed)
         self._points = np.concatenate([self._points, self.worst.below(RULES.collected)])
 
@@ -311,6 +314,7 @@ class StageRunner:
         Raises:
             SolveError: if there is no usable point. Only the final stage has to satisfy a bound on mutual angles.
         """
+        # samples: half of them where a mirror symmetry halves the coefficients
         family, mirror = plan.family, self.mirror
         kept = mirror.kept(family) if isinstance(family, LinearFamily) and mirror is not None else None
         count = self._count_samples(family, kept)
@@ -322,12 +326,14 @@ class StageRunner:
             with deferred():
                 objective, start = self._build_objective(plan, samples, None if kept is None else mirror)
             result = plan.solver.minimise(objective, start, Watch(self.monitor, plan.label))
+        # a bound on mutual angles has to be met in the end only
         if isinstance(objective, BoundedMutual) and not np.isfinite(result.value):
             if plan.final:
                 assert self.settings.max_mutual is not None
                 raise explain_missed_bound(plan.label, self.settings.max_mutual, objective, result)
         else:
             result.raise_if_failed()
+        # back from the free components to all coefficients
         if kept is not None and mirror is not None:
             result = replace(result, theta=mirror.coordinates(expand(result.theta, kept)))
         return Stage(plan.label, family.size, len(samples), result)

@@ -57,6 +57,7 @@ def find_spectral_start(
     Source:
         ours, docs/explanation/derivations_fits.md#spectral-start.
     """
+    # the pencil: S is the mean square along the task, T the mean square of the gradient, both in the metric
     basis = build_gradients(family, samples.points.shape[1]) if gradients is None else gradients
     G = basis.expand(basis.at(samples.points), len(samples)).astype(np.float64, copy=False)  # (N, n, K)
     N, _, K = G.shape
@@ -77,6 +78,7 @@ def find_spectral_start(
         j, c = min(((j, _find_smallest(S, T, V, allowed[j])) for j in classes), key=lambda pair: pair[1] @ S @ pair[1])
         left.remove(j)
         C[j] = c
+        # functions of this coordinate cost as much as what lies along the task
         gradient = raised @ c  # (N, n)
         length = np.sqrt(np.maximum(np.einsum("sn,sn->s", gradient, G @ c), 1e-300))
         along = np.einsum("sn,snk->sk", gradient / length[:, None], G)
@@ -176,6 +178,7 @@ def find_mirror(problem: Problem, active: list[int]) -> Mirror | None:
     space = JointSpace.of(problem).restricted_to(active)
     if space.n > RULES.most_joints:
         return None
+    # one point excludes most choices of signs, the others the rest
     u = np.random.default_rng(RULES.seed).uniform(-1.0, 1.0, (RULES.points, space.n))
     left = [np.array(signs) for signs in product((1.0, -1.0), repeat=space.n)][1:]
     for points in (u[:1], u[1:]):

@@ -109,6 +109,7 @@ def suggest_domain(
     bounds, loss = _check_bounds(robot, task, leak_deg, conditioning, seed), Weights.of(weights)
     if parametrisation is not None:
         require_parametrisation(parametrisation)
+    # the problem around the home, and the joints whose half-widths are searched
     posture = home_posture(robot, task, home)
     room = np.minimum(_measure_room(robot, posture.q), _bound_widths(robot))
     problem = Problem(robot, task, metric, Box(posture.q, np.minimum(_propose_widths(robot), room)))
@@ -116,6 +117,7 @@ def suggest_domain(
     joints = _Joints.of(problem)
     prober = Prober(problem, joints.active, joints.cyclic, loss)
     stricter = replace(bounds, conditioning=min(1.0, RULES.margin * bounds.conditioning))
+    # the widest box for trial charts, then a fit that confirms it
     widths, broken = WidestBox(prober, posture.q, room, joints.free, stricter, monitor).search(_propose_widths(robot))
     wanted = choose_parametrisation(problem, bounded=True) if parametrisation is None else parametrisation
     found, quality = _confirm(prober, wanted, joints, widths, bounds, seed, monitor)
@@ -364,6 +366,7 @@ def _confirm(
         box = Box(problem.domain.centre, widths * factors**shrinkings, unbounded)
         trial = Problem(robot, problem.task, problem.metric, box, problem.name)
         # a fit would take ten times as long to find that
+        # descents see what samples miss
         if not prober.least(trial, seed + 1) >= enough:
             continue
         found = fit_from(prober.start_on, trial, parametrisation, prober.weights, seed, monitor)

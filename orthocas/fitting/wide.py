@@ -223,6 +223,7 @@ def _build_problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch
         return Problem(robot, task, metric, box, branch.name, clearance)
     except DomainError:
         points, values = middles(robot, task, box)
+    # of the clear positions, the one with the largest box around it
     clear = points[values > CLEARER * clearance]
     room = box.half_width - np.abs(clear - box.centre)
     if not len(clear):
@@ -241,6 +242,7 @@ def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomia
     Then a network, but not for coordinates that are to mean something, nor with slides without limits.
     """
     robot = problem.robot
+    # joints that may enter linearly, and those of them that must, since they have no ends
     free = [k for k in range(robot.n) if keeps_self_motions(problem, k)]
     slides = robot.tree.prismatic
     endless = [k for k in free if slides[k] and np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
@@ -293,6 +295,7 @@ def _finish(
             raise KeyboardInterrupt
         wrong = f"in the middle of branch '{branch.name}', coordinates fold or have another sign than on most of it"
         raise DomainError(f"{wrong}: give a smaller box as branch, another branch, or another parametrisation")
+    # scale, order and signs: those of the quantities that coordinates follow, or those of `fit`
     first = sample_problem(clear, RULES.first, (seed, RULES.first_tag))
     if meaning is not None:
         coordinates = meaning.name_units(raw)
@@ -300,6 +303,7 @@ def _finish(
         coordinates = quantities.name_units(normalise(raw, centre, first), clear)
     else:
         coordinates = fix_gauge(normalise(raw, centre, first), centre) if len(raw.offset) else raw
+    # the domain is where coordinates are regular; how much of the branch that is, and how good they are there
     domain = RegularPart(clear.domain, coordinates, LOSS_RULES.least_volume / clear.r)
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
     counted = clear_positions(clear.robot, clear.task, branch.box, RULES.held_out, (seed, RULES.counted_tag))

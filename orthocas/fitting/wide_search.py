@@ -236,6 +236,7 @@ class Search:
         parts = (self._basis.differentiate_along(known, root[:, :, i]) for i in range(problem.n))
         energy = sum((G.T @ G for G in parts), start=np.zeros(())) / len(some)
         self._factor = np.linalg.cholesky(energy + RULES.ridge * np.trace(energy) / len(energy) * np.eye(len(energy)))
+        # directions across the task at the centre; quantities to follow turn them
         directions = scipy.linalg.null_space(self._centre.task_jacobian[0]).T
         meaning, quantities, self._likeness = self.settings.meaning, self.settings.quantities, list[QuadraticTerm]()
         if quantities is not None:
@@ -247,6 +248,7 @@ class Search:
             directions = meaning.slope * find_self_motion(problem, centre)[None]
             assert isinstance(self.family, LinearFamily)
             self._likeness = [meaning.hold(self.family)] if meaning.fitted else []
+        # the combination of functions whose gradients are nearest to them in the mean
         sides = [
             self._basis.differentiate_along(known, np.broadcast_to(a, some.points.shape)).mean(axis=0)
             for a in directions
@@ -309,6 +311,7 @@ class Search:
         """
         weights = self._choose_weights(volume)
         assert isinstance(self.family, LinearFamily)
+        # the mean loss over all samples: first ones and worst ones by their number
         lengths = np.linalg.norm(self._last.reshape(self.problem.r, -1) @ self._factor, axis=1)
         if len(self._samples) == 1:
             first = BasisObjective(
@@ -348,6 +351,7 @@ class Search:
         """Take the result of a stage, and keep its parameters if they are the best so far."""
         theta, bound = result.theta, LOSS.least_volume / self.problem.r
         self.stages.append(Stage(name, theta.size, samples, result))
+        # regular at the centre, and at all but few of other samples
         at_centre, volumes = (
             self._sign * self._evaluate_volumes(theta, samples) for samples in (self._centre, self._held_out)
         )
@@ -366,6 +370,7 @@ class Search:
             J = self._basis.jacobian(self._basis.at(samples.points), C, len(samples))
         else:
             J = self.coordinates(theta).jacobian(samples.points)
+        # det of orthonormal task rows and unit gradients, by a basis across the task
         unit = J / np.maximum(np.linalg.norm(J, axis=2, keepdims=True), LOSS.shortest)
         Z = samples.null_basis
         volumes = np.linalg.det(unit @ Z)

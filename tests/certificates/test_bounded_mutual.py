@@ -48,7 +48,7 @@ def test_hessian_of_the_lagrangian_matches_its_gradients(bounded: BoundedMutual)
 
 
 def test_gauge_makes_the_mean_squared_gradient_length_one(bounded: BoundedMutual) -> None:
-    theta = bounded.in_gauge(theta_of(bounded))
+    theta = bounded.normalise_gradients(theta_of(bounded))
     np.testing.assert_allclose(bounded.constraints(theta)[0][1:], 1.0, rtol=1e-12)
     J = bounded._task.coordinate_jacobians(theta)
     np.testing.assert_allclose((J**2).sum(axis=2).mean(axis=0), 1.0, rtol=1e-12)
