@@ -310,6 +310,7 @@ def _finish(
     share = float(domain.contains(counted).mean()) if len(counted) else float("nan")
     error = None if meaning is None else meaning.measure_error(problem, coordinates, seed)
     worst = worst_points(problem, coordinates, seed, thorough=True)
+    users = {} if settings.weights is None else settings.weights.for_problem(clear).by_name
     notes: dict[str, str | float] = {
         "solver": solution.solver,
         "seed": seed,
@@ -320,6 +321,7 @@ def _finish(
         "least conditioning": worst.least,
         **({} if meaning is None or error is None else {"meaning": meaning.label, **error.write_notes()}),
         **({} if quantities is None else {"meaning": quantities.label}),
+        **{f"weight of {name}": weight for name, weight in users.items() if weight},
     }
     return WideFit(
         chart=Chart(problem, coordinates, notes),

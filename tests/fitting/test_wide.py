@@ -844,6 +844,7 @@ def test_terms_and_weights_of_users_reach_wide_fits() -> None:
     plain, less = fit(), fit(weights={"second joint": 3.0})
     assert share(less.chart) < 0.5 * share(plain.chart)
     assert less.regular_share > 0.95
+    assert less.chart.notes["weight of second joint"] == 3.0
     aligned = fit(weights=oc.Weights(task=3.0, mutual=0.0, regularity=0.0))
     leaks = [oc.evaluate(item.chart, 1000).leak.rms for item in (plain, aligned)]
     assert leaks[1] < leaks[0] - 5.0, leaks
