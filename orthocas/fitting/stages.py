@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from math import ceil
 from typing import Self
@@ -307,6 +307,10 @@ class StageRunner:
     monitor: Monitor
     folds: FoldSearch
     like: LikeTerm | None = None  #: what the first coordinates follow
+    _families: dict[tuple[str, int], Family] = field(default_factory=dict)
+    _bases: dict[LinearFamily, BasisGradients] = field(default_factory=dict)  #: gradients of the bases so far
+    #: spectral starts so far, by family, number of samples, and whether a mirror is used
+    _starts: dict[tuple[LinearFamily, int, bool], Array] = field(default_factory=dict)
 
     def run(self, plan: Plan) -> Stage:
         """Draw samples, find a start if none is given, and minimise.
@@ -480,20 +484,6 @@ class StageRunner:
             number = np.float32 if self.settings.single else np.float64
             self._bases[family] = build_gradients(family, self.space.n, number)
         return self._bases[family]
-
-    @cached_property
-    def _families(self) -> dict[tuple[str, int], Family]:
-        return {}
-
-    @cached_property
-    def _bases(self) -> dict[LinearFamily, BasisGradients]:
-        """Gradients of the bases so far."""
-        return {}
-
-    @cached_property
-    def _starts(self) -> dict[tuple[LinearFamily, int, bool], Array]:
-        """Spectral starts so far, by family, number of samples, and whether a mirror is used."""
-        return {}
 
 
 def explain_missed_bound(label: str, bound: float, objective: BoundedMutual, result: SolveResult) -> SolveError:
