@@ -38,11 +38,11 @@ class BasisGradients(ABC):
         """The numbers X at points (N, n), (B, g, S, c)."""
         blocks = blocked(points)
         if self.dtype == np.float64:
-            found = self._columns(blocks)[0]
+            numbers = self._columns(blocks)[0]
         else:  # some blocks at a time, so that the memory never holds all of them in double precision
             parts = (self._columns(blocks[k : k + _PART])[0] for k in range(0, len(blocks), _PART))
-            found = np.concatenate([part.astype(self.dtype) for part in parts])
-        return found.reshape(len(found), self.groups, -1, found.shape[2])
+            numbers = np.concatenate([part.astype(self.dtype) for part in parts])
+        return numbers.reshape(len(numbers), self.groups, -1, numbers.shape[2])
 
     @property
     @abstractmethod
@@ -84,12 +84,12 @@ class BasisGradients(ABC):
 
     def differentiate_along(self, X: Array, directions: Array) -> Array:
         """Derivatives a . d psi / dq along directions a (N, n) at samples, (N, K)."""
-        found, c = [], X.shape[3]
+        products, c = [], X.shape[3]
         for b in range(0, len(X), _PART):
             part = slice(b * c, min((b + _PART) * c, len(directions)))
             G = self.expand(X[b : b + _PART], part.stop - part.start)
-            found.append(np.einsum("si,sik->sk", directions[part], G))
-        return np.concatenate(found)
+            products.append(np.einsum("si,sik->sk", directions[part], G))
+        return np.concatenate(products)
 
     @abstractmethod
     def _numbers(self, q: ca.SX) -> ca.SX:
@@ -136,8 +136,8 @@ class ProductGradients(BasisGradients):
     def collect(self, slopes: Array) -> Array:
         """The sum over the joints of dL/dT D_i^T."""
         by_joint = slopes.reshape(self.n, -1, slopes.shape[2]).transpose(0, 2, 1)
-        found: Array = (self._back @ by_joint.reshape(-1, by_joint.shape[2])).T
-        return found
+        rows: Array = (self._back @ by_joint.reshape(-1, by_joint.shape[2])).T
+        return rows
 
     def expand_part(
         self, X: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike | None = None
@@ -146,8 +146,8 @@ class ProductGradients(BasisGradients):
         assert X.shape[3] % every == 0
         kind = X.dtype if dtype is None else np.dtype(dtype)
         values = X[:, 0, :, ::every].transpose(1, 0, 2).reshape(X.shape[2], -1)[:, : -(-samples // every)]
-        found = self._part(kept, kind) @ values.astype(kind, copy=False)  # (n kept, samples)
-        return np.ascontiguousarray(found.T).reshape(found.shape[1], self.n, int(kept.sum()))
+        dense = self._part(kept, kind) @ values.astype(kind, copy=False)  # (n kept, samples)
+        return np.ascontiguousarray(dense.T).reshape(dense.shape[1], self.n, int(kept.sum()))
 
     def differentiate_along(self, X: Array, directions: Array) -> Array:
         """The sum over the joints of D_i (a_i psi')."""
@@ -200,8 +200,8 @@ class SparseGradients(BasisGradients):
         """The sum over the joints."""
         total = np.zeros((slopes.shape[1], self.family.width))
         for places, part in zip(self.terms_of_joints, slopes, strict=True):
-            known = places >= 0
-            total[:, places[known]] += part[:, known]
+            used = places >= 0
+            total[:, places[used]] += part[:, used]
         return total
 
     def expand_part(

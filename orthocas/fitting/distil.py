@@ -172,19 +172,21 @@ def _take_circle_pairs(targets: _Targets) -> _Targets:
 def _sample_targets(chart: Chart, points: Array) -> _Targets:
     """Grown values and gradients at the points that have them."""
     xi, gradients = chart.coordinates.xi(points), chart.coordinates.jacobian(points)
-    known = np.isfinite(xi).all(axis=1) & np.isfinite(gradients).all(axis=(1, 2))
-    if not known.any():
+    finite = np.isfinite(xi).all(axis=1) & np.isfinite(gradients).all(axis=(1, 2))
+    if not finite.any():
         raise GrowError(f"the grown chart has no value at any of {len(points)} samples of the domain")
     weight = float(chart.problem.domain.half_width.mean())
-    return _Targets(points[known], xi[known], gradients[known] * weight, weight)
+    return _Targets(points[finite], xi[finite], gradients[finite] * weight, weight)
 
 
 def _evaluate(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> Distilled:
     held_out = sample_uniform(chart.problem.domain, min(count, RULES.held_out), RULES.held_out_seed)
-    known = _sample_targets(chart, held_out)
-    errors = shortest(distilled.coordinates.xi(known.points) - known.xi, distilled.turns[chart.m :])
-    gradients = known.gradients / known.weight
-    turned = np.linalg.norm(distilled.coordinates.jacobian(known.points) - gradients, axis=2)
+    held_out_targets = _sample_targets(chart, held_out)
+    errors = shortest(
+        distilled.coordinates.xi(held_out_targets.points) - held_out_targets.xi, distilled.turns[chart.m :]
+    )
+    gradients = held_out_targets.gradients / held_out_targets.weight
+    turned = np.linalg.norm(distilled.coordinates.jacobian(held_out_targets.points) - gradients, axis=2)
     relative = turned / np.linalg.norm(gradients, axis=2)
     return Distilled(
         chart=distilled,
@@ -210,9 +212,9 @@ def _solve_least_squares(family: LinearFamily, targets: _Targets, watch: Watch) 
         slopes = slopes.reshape(len(values), K, n).transpose(0, 2, 1).reshape(-1, K) * targets.weight
         constant = np.r_[np.ones(len(values)), np.zeros(len(slopes))]
         rows = np.column_stack([np.vstack([values, slopes]), constant])
-        wanted = np.vstack([targets.xi[part], targets.gradients[part].transpose(0, 2, 1).reshape(-1, family.outputs)])
+        sides = np.vstack([targets.xi[part], targets.gradients[part].transpose(0, 2, 1).reshape(-1, family.outputs)])
         normal += rows.T @ rows
-        right += rows.T @ wanted
+        right += rows.T @ sides
     solution: Array = np.asarray(np.linalg.lstsq(normal, right, rcond=1e-14)[0], dtype=float)
     return solution[:-1].T.ravel(), -solution[-1]
 

@@ -62,10 +62,10 @@ def build_quantity(robot: Robot, like: Quantity | str) -> tuple[str, ca.Function
             return f"{SWIVEL} [rad]", sew_angle(robot, "conventional")
         k = robot.joint_names.index(like)
         return f"{like} [{'m' if robot.tree.prismatic[k] else 'rad'}]", dense_function("like", [q], [q[k]])
-    found = expression_of("like", like, q)
-    require_shape("like", found.shape, (1, 1))
+    value = expression_of("like", like, q)
+    require_shape("like", value.shape, (1, 1))
     name = str(getattr(like, "__name__", ""))
-    return name if name.isidentifier() else "a function of q", dense_function("like", [q], [found])
+    return name if name.isidentifier() else "a function of q", dense_function("like", [q], [value])
 
 
 def label_likeness(name: str, where: str = "") -> str:
@@ -117,11 +117,11 @@ class Like:
             names = tuple(f"{label} [{unit}]" if unit else label for label, unit in labels)
             return cls(names, _require_arms(robot, q, like.smooth_function(q)))
         parts = [like] if isinstance(like, str) or not isinstance(like, Sequence) else like
-        found = [build_quantity(robot, part) for part in parts]
-        if not found:
+        quantities = [build_quantity(robot, part) for part in parts]
+        if not quantities:
             raise InvalidValueError("like", "an empty list", "at least one quantity")
-        values = ca.vertcat(*(function(q) for _, function in found))
-        return cls(tuple(name for name, _ in found), _require_arms(robot, q, values))
+        values = ca.vertcat(*(function(q) for _, function in quantities))
+        return cls(tuple(name for name, _ in quantities), _require_arms(robot, q, values))
 
     @property
     def label(self) -> str:
@@ -226,9 +226,9 @@ class LikeTerm:
     def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
         """Differences over sqrt(k), quantity by quantity, (k r, 1)."""
         A, Z = data.get("metric_inverse"), data["null_basis"]
-        wanted = self.slopes(data["points"])
-        whole = ca.repmat(metric_lengths(wanted, A) + RULES.still, 1, sizes.r)
-        rho: ca.SX = (1 / self.count) ** 0.5 * ca.vec(((coordinate_jacobian[: self.count, :] - wanted) @ Z / whole).T)
+        targets = self.slopes(data["points"])
+        whole = ca.repmat(metric_lengths(targets, A) + RULES.still, 1, sizes.r)
+        rho: ca.SX = (1 / self.count) ** 0.5 * ca.vec(((coordinate_jacobian[: self.count, :] - targets) @ Z / whole).T)
         return rho
 
     @cached_property
@@ -244,8 +244,8 @@ class LikeTerm:
         # components across the task
         own = np.einsum("rk,snk,snz->szr", C, G, Z, optimize=True).reshape(-1, len(C))
         slopes = _require_finite(self.batched(samples.points)[0].reshape(len(samples), self.count, -1))
-        wanted = (slopes @ Z).transpose(0, 2, 1)
-        B = np.linalg.lstsq(own, wanted.reshape(-1, self.count), rcond=None)[0].T  # (k, r)
+        targets = (slopes @ Z).transpose(0, 2, 1)
+        B = np.linalg.lstsq(own, targets.reshape(-1, self.count), rcond=None)[0].T  # (k, r)
         if np.linalg.matrix_rank(B) < self.count:
             raise InvalidValueError("like", "quantities that the task leaves nothing of", "others, or another task")
         return np.asarray((np.vstack([B, np.linalg.svd(B)[2][self.count :]]) @ C).ravel())
@@ -374,8 +374,8 @@ class Meaning:
         value, slopes = (part.reshape(len(samples), -1) for part in Batched(both)(samples.points))
         xi, J = coordinates.once("xi", samples.points), coordinates.jacobian(samples.points)[:, 0]
         z = samples.null_basis[:, :, 0]
-        known = np.isfinite(value[:, 0]) & np.isfinite(slopes).all(axis=1)
-        xi, value = xi[known, 0], value[known, 0]
+        finite = np.isfinite(value[:, 0]) & np.isfinite(slopes).all(axis=1)
+        xi, value = xi[finite, 0], value[finite, 0]
         missed, value = xi - value, value - self.values[self.home]
         if self.turns:
             missed, value = _wrap(missed), _wrap(value)
@@ -384,7 +384,7 @@ class Meaning:
         return MeaningError(
             rms=float(np.sqrt(np.mean(missed**2))),
             correlation=float(np.corrcoef(xi, value)[0, 1]),
-            against=float(np.mean(signs[known] < 0)),
+            against=float(np.mean(signs[finite] < 0)),
         )
 
 
@@ -394,13 +394,13 @@ def _wrap(angles: Array) -> Array:
 
 def _trace_self_motion(problem: Problem, posture: Array, step: float) -> Array:
     """The self-motion from a posture in steps of unit self-motions, up to the boundary of the domain, (k, n)."""
-    found, slope = [posture], partial(find_self_motion, problem)
-    while len(found) < RULES.most_steps and problem.domain.contains(found[-1]):
-        q = found[-1]
+    points, slope = [posture], partial(find_self_motion, problem)
+    while len(points) < RULES.most_steps and problem.domain.contains(points[-1]):
+        q = points[-1]
         middle = q + step / 2 * slope(q)
         again = q + step / 2 * slope(middle)
-        found.append(q + step / 6 * (slope(q) + 2 * slope(middle) + 2 * slope(again) + slope(q + step * slope(again))))
-    return np.array(found[:-1] if len(found) > 1 else found)
+        points.append(q + step / 6 * (slope(q) + 2 * slope(middle) + 2 * slope(again) + slope(q + step * slope(again))))
+    return np.array(points[:-1] if len(points) > 1 else points)
 
 
 def find_self_motion(problem: Problem, q: Array) -> Array:

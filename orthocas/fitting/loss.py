@@ -84,8 +84,8 @@ def loss(
     theta = ca.MX.sym("theta", family.size)
     J = _build_jacobians(family, drawn.points, theta)  # (r n, N), each J_xi column by column
     identity = drawn.metric_inverse is None
-    known = Weights.of(weights).for_problem(problem)
-    of_sample = Loss.of(Sizes(problem.n, problem.m, problem.r, identity), known.by_name)
+    chosen = Weights.of(weights).for_problem(problem)
+    of_sample = Loss.of(Sizes(problem.n, problem.m, problem.r, identity), chosen.by_name)
     orientation = _orientation(drawn, ca.Function("J", [theta], [J])(theta0).full(), problem.r)
     data = [_columns(part) for part in drawn.described(of_sample.data, orientation)]
     mean = ca.sum2(_map_loss(of_sample, len(drawn))(J, *data)) / len(drawn)
@@ -165,8 +165,8 @@ class Loss:
     @cached_property
     def terms(self) -> tuple[tuple[LossTerm, float], ...]:
         """Loss terms with their weights, smooth ones first."""
-        known = [(find_term(name), weight) for name, weight in self.weights]
-        return tuple(sorted(known, key=lambda pair: pair[0].hinge))
+        terms = [(find_term(name), weight) for name, weight in self.weights]
+        return tuple(sorted(terms, key=lambda pair: pair[0].hinge))
 
     @cached_property
     def data(self) -> tuple[str, ...]:
@@ -355,14 +355,14 @@ class LossWithVolumes:
     def residuals(self, J: Array, *data: Array) -> list[Array]:
         """The outputs of `build_residual_columns`."""
         if self._written is None:
-            found = [np.empty((len(J), 0, COLUMNS)) for _ in range(self._loss.sizes.r)]
+            results = [np.empty((len(J), 0, COLUMNS)) for _ in range(self._loss.sizes.r)]
         else:
-            found = self._written(J, *(data[k] for k in self._places))
+            results = self._written(J, *(data[k] for k in self._places))
         for weight, term in self._loss.volume_terms:
             parts = [self._of_block(term, J[b], [array[b] for array in data]) for b in range(len(J))]
-            found.append(weight**0.5 * np.stack([rho[None] for rho, _ in parts]))
-            found.append(weight**0.5 * np.stack([slopes for _, slopes in parts]))
-        return found
+            results.append(weight**0.5 * np.stack([rho[None] for rho, _ in parts]))
+            results.append(weight**0.5 * np.stack([slopes for _, slopes in parts]))
+        return results
 
     def _run(self, written: Run | None) -> Run:
         def run(arguments: Sequence[Array], results: Sequence[Array]) -> None:

@@ -230,15 +230,15 @@ class _Graphs:
 
     family: Family
     loss: Loss
-    known: dict[int, "_LossGraph"] = field(default_factory=dict)
+    built: dict[int, "_LossGraph"] = field(default_factory=dict)
 
     def of_size(self, samples: int) -> "_LossGraph":
         """The graph for a set of samples: for all at once, or for as many as stay in the cache."""
         most = max(1, RULES.graph // (self.family.outputs * self.family.width))
         columns = ceil(samples / ceil(samples / most))
-        if columns not in self.known:
-            self.known[columns] = _LossGraph(self.family, self.loss, columns)
-        return self.known[columns]
+        if columns not in self.built:
+            self.built[columns] = _LossGraph(self.family, self.loss, columns)
+        return self.built[columns]
 
 
 class _LossGraph:

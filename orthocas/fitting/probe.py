@@ -206,16 +206,16 @@ class Prober:
         # the coordinates of an earlier box may do; if not, a fit begins from them
         with one_blas_thread():
             if self._start is not None and (enough is not None or leap):
-                found = self._evaluate(problem, self._gradients(family, self._start.on(family)))
-                if leap or found.keeps(enough):
-                    self._kept = self._start if found.keeps(enough) else self._kept
-                    return found
+                quality = self._evaluate(problem, self._gradients(family, self._start.on(family)))
+                if leap or quality.keeps(enough):
+                    self._kept = self._start if quality.keeps(enough) else self._kept
+                    return quality
             theta = self._fit(problem, family)
-            found = self._evaluate(problem, self._gradients(family, theta))
-        if found.conditioning > 0:
+            quality = self._evaluate(problem, self._gradients(family, theta))
+        if quality.conditioning > 0:
             self._start = _Start(space.half_width, theta)
-            self._kept = self._start if found.keeps(enough) else self._kept
-        return found
+            self._kept = self._start if quality.keeps(enough) else self._kept
+        return quality
 
     def go_back(self) -> None:
         """Start from the coordinates that kept their bounds last, if there are any."""
@@ -237,8 +237,8 @@ class Prober:
         idle = tuple(k for k in range(problem.n) if k not in self.active)
         zeros, ones = np.zeros(self.outputs), np.ones(self.outputs)
         theta = self._start.on(family)
-        found = Coordinates(parametrisation, JointSpace.of(problem), idle, theta, zeros, ones)
-        return worst_points(problem, found, seed, thorough=True).least
+        coordinates = Coordinates(parametrisation, JointSpace.of(problem), idle, theta, zeros, ones)
+        return worst_points(problem, coordinates, seed, thorough=True).least
 
     def _evaluate(self, problem: Problem, jacobian: Callable[[Array], Array]) -> Quality:
         return evaluate_at(problem, sample_heavily(problem.domain, RULES.held_out, RULES.seed), jacobian, self.active)
@@ -277,21 +277,21 @@ class Prober:
         if fresh:
             return solver.minimise(objective, start)
         # the matrix of a similar box is nearly that of this one
-        known = self._steered
-        if known is None or np.abs(np.log(half_width / known.half_width)).max() > np.log(RULES.other):
+        steered = self._steered
+        if steered is None or np.abs(np.log(half_width / steered.half_width)).max() > np.log(RULES.other):
             self._steered = _Steered(objective, half_width, objective.curvature_estimate(start))
         else:
-            self._steered = replace(known, loss=objective)
+            self._steered = replace(steered, loss=objective)
         return solver.minimise(self._steered, start)
 
     def _build_loss(self, problem: Problem, family: ProductFamily, samples: Samples, start: Array) -> BasisObjective:
         """The loss of the fit that confirms the box."""
-        known = self._objective
-        if known is None:
+        objective = self._objective
+        if objective is None:
             weights = replace(self.weights.for_problem(problem), length=0.0, extra={})
             self._objective = BasisObjective(family, samples, weights, start, lambda count, seed: samples)
         else:
-            self._objective = known.move_to(build_gradients(family, len(self.active)), samples, start)
+            self._objective = objective.move_to(build_gradients(family, len(self.active)), samples, start)
         return self._objective
 
 

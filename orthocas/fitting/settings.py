@@ -115,8 +115,8 @@ class FitSettings:
         if like is not None and (max_mutual_deg is not None or bound.closed_form is not None):
             other = bound.label if max_mutual_deg is None else "max_mutual_deg"
             raise InvalidValueError("like", f"given with {other}", "a fit of the weighted loss")
-        known = None if like is None else Like.of(problem, like)
-        return cls(bound, solver, loss, count, tag, max_mutual_deg, split_idle, precision, known)
+        quantities = None if like is None else Like.of(problem, like)
+        return cls(bound, solver, loss, count, tag, max_mutual_deg, split_idle, precision, quantities)
 
     def add_term(self, term: LikeTerm) -> Self:
         """The settings with the term that holds coordinates to quantities among the weights."""

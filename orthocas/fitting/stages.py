@@ -351,8 +351,8 @@ class StageRunner:
                 return self.folds.add_to(objective), start
             return self._bound_mutual_angles(objective, start, fresh=theta is None)
         if settings.max_mutual is not None:
-            wanted = "a parametrisation linear in its parameters, such as polynomial"
-            raise InvalidValueError("max_mutual_deg", f"given with {plan.label}", wanted)
+            expected = "a parametrisation linear in its parameters, such as polynomial"
+            raise InvalidValueError("max_mutual_deg", f"given with {plan.label}", expected)
         # with the state of the solver
         numbers = 60 * family.size + 100 * len(samples) * self.space.n
         require_memory(f"{plan.label} with {family.size} parameters", 8.0 * numbers)

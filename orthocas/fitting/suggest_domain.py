@@ -119,13 +119,13 @@ def suggest_domain(
     stricter = replace(bounds, conditioning=min(1.0, RULES.margin * bounds.conditioning))
     # the widest box for trial charts, then a fit that confirms it
     widths, broken = WidestBox(prober, posture.q, room, joints.free, stricter, monitor).search(_propose_widths(robot))
-    wanted = choose_parametrisation(problem, bounded=True) if parametrisation is None else parametrisation
-    found, quality = _confirm(prober, wanted, joints, widths, bounds, seed, monitor)
+    family = choose_parametrisation(problem, bounded=True) if parametrisation is None else parametrisation
+    fit, quality = _confirm(prober, family, joints, widths, bounds, seed, monitor)
     return DomainSuggestion(
-        fit=found,
+        fit=fit,
         home=posture.q,
         home_source=posture.source,
-        joints=joints.describe(found.chart.problem, broken),
+        joints=joints.describe(fit.chart.problem, broken),
         asked=bounds,
         leak_deg=quality.leak_deg,
         conditioning=quality.conditioning,
@@ -178,15 +178,15 @@ class _Joints:
         """
         robot, domain = problem.robot, problem.domain
         limited = _measure_room(robot, domain.centre) <= _bound_widths(robot)
-        found = []
+        widths = []
         for k, name in enumerate(self.names):
             reason: Reason = "joint limit" if limited[k] else "unlimited"
             if broken.get(k):
                 reason = broken[k][0]
             if k not in self.free:
                 reason = "idle" if k in self.idle else "cyclic"
-            found.append(JointWidth(name, float(domain.half_width[k]), reason))
-        return tuple(found)
+            widths.append(JointWidth(name, float(domain.half_width[k]), reason))
+        return tuple(widths)
 
 
 def _propose_widths(robot: Robot) -> Array:
@@ -287,11 +287,11 @@ class WidestBox:
 
     def _explain_refusal(self, widths: Array) -> DomainError:
         """Which bound breaks even on a box of these half-widths (n,), and what may help."""
-        found = self.evaluate(widths)
-        miss = next(iter(found.excess(self.bounds)))
+        quality = self.evaluate(widths)
+        miss = next(iter(quality.excess(self.bounds)))
         return DomainError(
             f"no box around the home {np.round(self.home, 4).tolist()} keeps the bounds: with half-widths of "
-            f"{widths[self.free].max():.1g} {found.explained(miss, self.bounds)}; {REMEDIES}"
+            f"{widths[self.free].max():.1g} {quality.explained(miss, self.bounds)}; {REMEDIES}"
         )
 
     def _scale_to_boundary(self, unit: Array, scale: float) -> Array:
@@ -332,8 +332,8 @@ class WidestBox:
             before, factor = widths[k], RULES.wider
             while widths[k] < self.room[k]:
                 wider = self._widen(widths, k, factor)
-                found = self.evaluate(wider, self.bounds, leap=widths[k] > before).excess(self.bounds)
-                misses = [name for name, ratio in found.items() if ratio > 1]
+                ratios = self.evaluate(wider, self.bounds, leap=widths[k] > before).excess(self.bounds)
+                misses = [name for name, ratio in ratios.items() if ratio > 1]
                 if misses and factor == RULES.wider:
                     broken[k] = misses
                     break
@@ -369,11 +369,11 @@ def _confirm(
         # descents see what samples miss
         if not prober.least(trial, seed + 1) >= enough:
             continue
-        found = fit_from(prober.start_on, trial, parametrisation, prober.weights, seed, monitor)
-        quality = evaluate_chart(found.chart, RULES.confirmed, seed + 1)
-        least = worst_points(found.chart.problem, found.chart.coordinates, seed + 1, thorough=True).least
+        fit = fit_from(prober.start_on, trial, parametrisation, prober.weights, seed, monitor)
+        quality = evaluate_chart(fit.chart, RULES.confirmed, seed + 1)
+        least = worst_points(fit.chart.problem, fit.chart.coordinates, seed + 1, thorough=True).least
         if least >= enough and quality.keeps(bounds):
-            return found, quality
+            return fit, quality
         worst = describe_conditioning(min(least, quality.conditioning))
         last = f"has a leak of {quality.leak_deg:.3g} deg and {worst}"
     raise DomainError(

@@ -248,10 +248,10 @@ def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_invers
         ours, docs/explanation/derivations_fits.md#regularity.
     """
     if coordinate_jacobian.shape[0] > MOST_ROWS:
-        wanted = (
+        expected = (
             f"at most {MOST_ROWS} with the terms regularity and folds; weights of 0 leave these out, locked joints help"
         )
-        raise InvalidValueError("number of extra coordinates r", coordinate_jacobian.shape[0], wanted)
+        raise InvalidValueError("number of extra coordinates r", coordinate_jacobian.shape[0], expected)
     lengths = metric_lengths(coordinate_jacobian, metric_inverse)
     return determinant((coordinate_jacobian @ null_basis) / ca.repmat(lengths, 1, coordinate_jacobian.shape[0]))
 

@@ -210,10 +210,10 @@ def _choose_branch(robot: Robot, task: Task, branch: Branch | Box | str | None, 
         return branch
     if isinstance(branch, Box):
         return Branch("box", branch, branch.centre, float("nan"), float("nan"))
-    found: Branches = branches(robot, task)
+    parts: Branches = branches(robot, task)
     if branch is not None:
-        return found[branch]
-    return found.of(home_posture(robot, task, home).q) or found[0]
+        return parts[branch]
+    return parts.of(home_posture(robot, task, home).q) or parts[0]
 
 
 def _build_problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Branch, clearance: float) -> Problem:
@@ -363,7 +363,7 @@ class WideFit(Fit):
 
     def facts(self) -> dict[str, str]:
         """The facts of a fit, with branch and regular share."""
-        known = super().facts()
+        facts = super().facts()
         branch = "" if self.branch is None else self.branch.name
         share = percent(self.regular_share, 2)
         own = {
@@ -372,4 +372,4 @@ class WideFit(Fit):
             **({"left out": self.left_out} if self.left_out else {}),
             **({"meaning": f"{self.meaning.explained}: xi1, {self.chart.notes['meaning']}"} if self.meaning else {}),
         }
-        return {"fit": known.pop("fit"), "problem": known.pop("problem"), **own, **known}
+        return {"fit": facts.pop("fit"), "problem": facts.pop("problem"), **own, **facts}

@@ -229,11 +229,11 @@ class Search:
         The first ones are those of the gradients of quantities that coordinates follow.
         """
         problem, centre, some = self.problem, self.problem.domain.centre, self._samples[0][:: RULES.every]
-        known = self._basis.at(some.points)
+        X = self._basis.at(some.points)
         # mean of dpsi_i/dq A^-1 dpsi_j/dq, (K, K)
         inverse = np.eye(problem.n)[None] if some.metric_inverse is None else some.metric_inverse
         root = np.broadcast_to(np.linalg.cholesky(inverse), (len(some), problem.n, problem.n))
-        parts = (self._basis.differentiate_along(known, root[:, :, i]) for i in range(problem.n))
+        parts = (self._basis.differentiate_along(X, root[:, :, i]) for i in range(problem.n))
         energy = sum((G.T @ G for G in parts), start=np.zeros(())) / len(some)
         self._factor = np.linalg.cholesky(energy + RULES.ridge * np.trace(energy) / len(energy) * np.eye(len(energy)))
         # directions across the task at the centre; quantities to follow turn them
@@ -243,15 +243,14 @@ class Search:
             across = quantities.differentiate(centre[None])[0] @ directions.T  # (k, r)
             Q, R = np.linalg.qr(np.vstack([across, np.eye(problem.r)]).T)
             directions = (Q * np.where(R.diagonal() < 0, -1.0, 1.0)).T @ directions
-            self._likeness = quantities.hold(some, lambda a: self._basis.differentiate_along(known, a))
+            self._likeness = quantities.hold(some, lambda a: self._basis.differentiate_along(X, a))
         if meaning is not None:
             directions = meaning.slope * find_self_motion(problem, centre)[None]
             assert isinstance(self.family, LinearFamily)
             self._likeness = [meaning.hold(self.family)] if meaning.fitted else []
         # the combination of functions whose gradients are nearest to them in the mean
         sides = [
-            self._basis.differentiate_along(known, np.broadcast_to(a, some.points.shape)).mean(axis=0)
-            for a in directions
+            self._basis.differentiate_along(X, np.broadcast_to(a, some.points.shape)).mean(axis=0) for a in directions
         ]
         return np.asarray(scipy.linalg.cho_solve((self._factor, True), np.array(sides).T).T.ravel())
 
@@ -325,7 +324,8 @@ class Search:
             self._objectives = [first, *self._objectives[1:], first.elsewhere(self._samples[-1], own)]
         count = sum(len(samples) for samples in self._samples)
         parts: list[tuple[float, Objective]] = [
-            (len(samples) / count, known) for samples, known in zip(self._samples, self._objectives, strict=True)
+            (len(samples) / count, objective)
+            for samples, objective in zip(self._samples, self._objectives, strict=True)
         ]
         if self._likeness:
             parts.append((1.0, Likenesses(self._likeness, lengths)))
