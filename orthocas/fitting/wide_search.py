@@ -314,7 +314,11 @@ class Search:
         lengths = np.linalg.norm(self._last.reshape(self.problem.r, -1) @ self._factor, axis=1)
         if len(self._samples) == 1:
             first = BasisObjective(
-                *(self.family, self._samples[0], weights, self._last, self._draw),
+                self.family,
+                self._samples[0],
+                weights,
+                self._last,
+                self._draw,
                 gradients=self._basis,
                 orientation=self._sign,
             )
@@ -335,12 +339,12 @@ class Search:
         """The loss of any other family, on samples drawn from all so far."""
         samples = join_samples(self._samples)
         self._samples = [samples]
-        common = self.family, samples, weights, self._last, self._draw
         whole: ArrayObjective | GraphObjective
+        common = samples, weights, self._last, self._draw
         if isinstance(self.family, ArrayFamily):
-            whole = ArrayObjective(self.family, *common[1:], single=True, orientation=self._sign)
+            whole = ArrayObjective(self.family, *common, single=True, orientation=self._sign)
         else:
-            whole = GraphObjective(*common, orientation=self._sign)
+            whole = GraphObjective(self.family, *common, orientation=self._sign)
         return Resampled(whole, np.arange(0, len(samples), max(1, len(samples) // RULES.watched)), len(samples))
 
     def _draw(self, count: int, seed: tuple[int, ...]) -> Samples:
