@@ -80,7 +80,7 @@ def widen_over_cyclic_joints(problem: Problem, names: tuple[str, ...]) -> Proble
         return problem
     centre, half_width, unbounded = domain.centre.copy(), domain.half_width.copy(), set(domain.unbounded)
     for k in map(robot.joint_names.index, names):
-        low, high = _range(problem, k)
+        low, high = _find_range(problem, k)
         half_width[k] = (high - low) / 2
         if np.isinf(robot.lower[k]) and np.isinf(robot.upper[k]):
             unbounded.add(k)
@@ -90,7 +90,7 @@ def widen_over_cyclic_joints(problem: Problem, names: tuple[str, ...]) -> Proble
     return Problem(robot, problem.task, problem.metric, wider, problem.name)
 
 
-def _range(problem: Problem, k: int) -> tuple[float, float]:
+def _find_range(problem: Problem, k: int) -> tuple[float, float]:
     """Limits of joint k. Where it has none: a turn around the domain's centre, or the domain of a prismatic joint."""
     robot, domain = problem.robot, problem.domain
     reach = domain.half_width[k] if robot.tree.prismatic[k] else max(np.pi, domain.half_width[k])
@@ -101,40 +101,40 @@ def _range(problem: Problem, k: int) -> tuple[float, float]:
 
 def _is_cyclic(problem: Problem, points: Array, k: int) -> bool:
     """Whether nothing that matters changes when joint k moves."""
-    robot, (low, high) = problem.robot, _range(problem, k)
+    robot, (low, high) = problem.robot, _find_range(problem, k)
     if robot.tree.prismatic[k] and np.isinf([robot.lower[k], robot.upper[k]]).any():
         low, high = -RULES.largest_slide, RULES.largest_slide
     places = low + (high - low) * np.random.default_rng((RULES.seed, k)).uniform(size=(RULES.positions, len(points)))
     moved = np.repeat(points[None], RULES.positions, axis=0)
     moved[:, :, k] = places
-    J, A = _task_and_metric(problem, points)
+    J, A = _evaluate_task_and_metric(problem, points)
     if not np.abs(J[:, :, k]).max() > NEGLIGIBLE * np.abs(J).max():
         return False
-    J_there, A_there = _task_and_metric(problem, moved.reshape(-1, problem.n))
-    if not (np.isfinite(J_there).all() and np.isfinite(A_there).all() and _same(A, A_there)):
+    J_there, A_there = _evaluate_task_and_metric(problem, moved.reshape(-1, problem.n))
+    if not (np.isfinite(J_there).all() and np.isfinite(A_there).all() and _is_same(A, A_there)):
         return False
     try:
-        pairs = zip(_invariants(J, A), _invariants(J_there, A_there), strict=True)
-        return all(_same(*pair) for pair in pairs)
+        pairs = zip(_compute_invariants(J, A), _compute_invariants(J_there, A_there), strict=True)
+        return all(_is_same(*pair) for pair in pairs)
     except np.linalg.LinAlgError:  # the task loses rank where the joint moves
         return False
 
 
-def _task_and_metric(problem: Problem, points: Array) -> tuple[Array, Array]:
+def _evaluate_task_and_metric(problem: Problem, points: Array) -> tuple[Array, Array]:
     """J_x (N, m, n) and A (N, n, n), unchecked: they may be singular or not finite."""
     n = problem.n
     J = problem.task.batched_jacobian(points)[0].reshape(-1, problem.m, n)
     return J, problem.metric.batched(points)[0].reshape(-1, n, n)
 
 
-def _invariants(J: Array, A: Array) -> tuple[Array, Array]:
+def _compute_invariants(J: Array, A: Array) -> tuple[Array, Array]:
     """The A-orthogonal projector on the span of the task gradients (N, n, n), and the eigenvalues of J A^-1 J^T."""
     gradients = np.linalg.solve(A, J.transpose(0, 2, 1))
     gram = J @ gradients
     return gradients @ np.linalg.solve(gram, J), np.linalg.eigvalsh(gram)
 
 
-def _same(here: Array, there: Array) -> bool:
+def _is_same(here: Array, there: Array) -> bool:
     """Whether values at the points (N, ...) equal those at the other positions (positions N, ...)."""
     differences = there.reshape(RULES.positions, *here.shape) - here
     return bool(np.abs(differences).max() <= NEGLIGIBLE * np.abs(here).max())
@@ -165,12 +165,12 @@ def keeps_self_motions(problem: Problem, joint: int) -> bool:
     Rotations are taken as rotations; those of a robot's file are up to rounding. False where no proof is found: the
     joint may still be cyclic.
     """
-    return _metric_stays(problem.metric, problem.robot.tree, joint) and (
-        _moves_the_task(problem.task, joint) or _is_no_part_of_gradients(problem.task, joint)
+    return _has_constant_metric(problem.metric, problem.robot.tree, joint) and (
+        _has_motion_of_task(problem.task, joint) or _is_no_part_of_gradients(problem.task, joint)
     )
 
 
-def _moves_the_task(task: Task, joint: int) -> bool:
+def _has_motion_of_task(task: Task, joint: int) -> bool:
     """Whether the kinematics show that h(q + t e_k) = g_t(h(q))."""
     tree, kind = task.robot.tree, task.recipe["kind"]
     if not task.of_tip:
@@ -178,7 +178,7 @@ def _moves_the_task(task: Task, joint: int) -> bool:
     turn = TipTurn.of_kind(kind)
     if turn is not None and turn.whole and joint == tree.tip_parent:
         return True
-    return _turns_the_rest(tree, joint) and (turn is not None or _turns_components(tree, joint, kind))
+    return _is_turn_of_rest(tree, joint) and (turn is not None or _is_turn_of_components(tree, joint, kind))
 
 
 def _is_no_part_of_gradients(task: Task, joint: int) -> bool:
@@ -188,35 +188,35 @@ def _is_no_part_of_gradients(task: Task, joint: int) -> bool:
     )
 
 
-def _metric_stays(metric: Metric, tree: KinematicTree, joint: int) -> bool:
+def _has_constant_metric(metric: Metric, tree: KinematicTree, joint: int) -> bool:
     """Whether A is proved not to depend on a joint.
 
     The inertia M does not depend on a joint that moves all it carries as one rigid body in a world at rest.
     """
-    if metric.recipe["kind"] == "inertia" and _turns_the_rest(tree, joint):
+    if metric.recipe["kind"] == "inertia" and _is_turn_of_rest(tree, joint):
         return True
     q = ca.SX.sym("q", tree.n)
     return not ca.depends_on(metric.function(q), q[joint])
 
 
-def _turns_the_rest(tree: KinematicTree, joint: int) -> bool:
+def _is_turn_of_rest(tree: KinematicTree, joint: int) -> bool:
     """Whether all joints below one in the tree are prismatic and, if it is revolute, exactly along its axis."""
     below = tree.carriers(tree.parents[joint])
     if not all(tree.prismatic[i] for i in below):
         return False
-    return bool(tree.prismatic[joint]) or all(_is_axis(_rotation(tree, joint, i)[:, 2], 2) for i in below)
+    return bool(tree.prismatic[joint]) or all(_is_axis(_fit_rotation(tree, joint, i)[:, 2], 2) for i in below)
 
 
-def _turns_components(tree: KinematicTree, joint: int, kind: str) -> bool:
+def _is_turn_of_components(tree: KinematicTree, joint: int, kind: str) -> bool:
     """Whether rotations about the axis of a joint map the position, or two components of it, to themselves."""
     name, _, axes = ("position:xy" if kind == "polar" else kind).partition(":")
     left_out = [k for k, axis in enumerate(_AXES) if axis not in axes]
     if name != "position" or tree.prismatic[joint]:
         return False
-    return not left_out or (len(left_out) == 1 and _is_axis(_rotation(tree, joint, -1)[:, 2], left_out[0]))
+    return not left_out or (len(left_out) == 1 and _is_axis(_fit_rotation(tree, joint, -1)[:, 2], left_out[0]))
 
 
-def _rotation(tree: KinematicTree, joint: int, base: int) -> Array:
+def _fit_rotation(tree: KinematicTree, joint: int, base: int) -> Array:
     """The rotation of a joint's frame, at zero, in that of a joint that carries it, or in the world for -1."""
     R: Array = np.eye(3)
     while joint != base:

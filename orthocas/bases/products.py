@@ -101,12 +101,12 @@ def build_product_family(
     """
 
     def basis(q: Any) -> Any:
-        return _products(terms, ca.vertcat(*one_joint_functions(q)))
+        return _multiply(terms, ca.vertcat(*one_joint_functions(q)))
 
     return ProductFamily(space, outputs, basis, terms=terms, one_joint_derivatives=one_joint_derivatives)
 
 
-def _products(terms: tuple[Term, ...], factors: Any) -> Any:
+def _multiply(terms: tuple[Term, ...], factors: Any) -> Any:
     """Values of terms, (K, N), from those of the one-joint functions f_1 of all joints, then f_2 and so on.
 
     All terms with as many factors are one product of columns: to build them one by one takes CasADi ten times as long.
@@ -115,7 +115,7 @@ def _products(terms: tuple[Term, ...], factors: Any) -> Any:
     levels: list[Any] = []
     # of the terms in their levels
     rows: list[dict[Term, int]] = []
-    for level in by_factors(terms):
+    for level in group_by_factors(terms):
         parts = [split(term) for term in level]
         values = factors[[n * (index - 1) + joint for _, joint, index in parts], :]
         levels.append(levels[-1][[rows[-1][rest] for rest, *_ in parts], :] * values if levels else values)
@@ -124,7 +124,7 @@ def _products(terms: tuple[Term, ...], factors: Any) -> Any:
     return ca.vertcat(*levels)[[places[term] for term in terms], :]
 
 
-def by_factors(terms: Iterable[Term]) -> list[list[Term]]:
+def group_by_factors(terms: Iterable[Term]) -> list[list[Term]]:
     """Terms and what they are made of, by the number of factors; each level is sorted."""
     levels: dict[int, list[Term]] = {}
     for term in sorted(with_parts(terms)):
@@ -212,7 +212,7 @@ class Products:
         most = "" if self.joints is None else f":{JOINTS}={self.joints}"
         return f"{self.degree}{most}{cyclic_choice.suffix(self.cyclic)}"
 
-    def _term_count(self, n: int, functions: int) -> int:
+    def _count_terms(self, n: int, functions: int) -> int:
         """Sum over j of C(n, j) C(d, j) f^j without the constant, for f functions of each degree of a joint."""
         linear = min(n, cyclic_choice.count(self.cyclic))
         most = min(n - linear, self.degree, self.degree if self.joints is None else self.joints)
@@ -249,7 +249,7 @@ class Polynomial(Products):
 
     def term_count(self, n: int) -> int:
         """C(n + d, d) - 1 with all products of n joints that are not cyclic, plus one term for each that is."""
-        return self._term_count(n, 1)
+        return self._count_terms(n, 1)
 
     def family(self, space: JointSpace, outputs: int) -> ProductFamily:
         """Polynomials in u_i = (q_i - centre_i) / half_width_i."""
@@ -297,7 +297,7 @@ class Fourier(Products):
 
     def term_count(self, n: int) -> int:
         """Sum over j of C(n, j) C(d, j) 2^j, without the constant. Cyclic joints do not count in n, but add a term."""
-        return self._term_count(n, 2)
+        return self._count_terms(n, 2)
 
     def family(self, space: JointSpace, outputs: int) -> ProductFamily:
         """Fourier terms of the joint angles.
