@@ -478,8 +478,11 @@ class Orthonormal:
         """The loss and its derivative, (size,)."""
         value, slopes = self.loss.value_and_gradient(self._coefficients(variables).ravel())
         columns = slopes.reshape(len(self.lengths), -1).T
-        return value, np.asarray(scipy.linalg.solve_triangular(self.factor, columns, lower=True)).T.ravel()
+        # numbers that are not finite are for the solver to report
+        solved = scipy.linalg.solve_triangular(self.factor, columns, lower=True, check_finite=False)
+        return value, np.asarray(solved).T.ravel()
 
     def _coefficients(self, variables: Array) -> Array:
         columns = variables.reshape(len(self.lengths), -1).T
-        return np.asarray(scipy.linalg.solve_triangular(self.factor, columns, lower=True, trans="T").T)
+        solved = scipy.linalg.solve_triangular(self.factor, columns, lower=True, trans="T", check_finite=False)
+        return np.asarray(solved.T)
