@@ -27,7 +27,7 @@ from orthocas.fitting.compare import compare as compare_fits
 from orthocas.fitting.comparison_figures import convergence_figure, front_figure
 from orthocas.fitting.settings import PRECISIONS, Precision
 from orthocas.solvers import get as get_solver
-from orthocas.tools.files import output_folder, published, require_replaceable_files
+from orthocas.tools.files import open_output_folder, publish, require_replaceable_files
 from orthocas.tools.interrupts import INTERRUPTED
 
 _FILES = ("comparison.csv", "comparison.json", "front.png", "convergence.png")
@@ -68,7 +68,7 @@ def compare(
     parametrisations = [parse_parametrisation(name) for name in param or _PARAMETRISATIONS]
     minimisers = [get_solver(name) for name in solver] if solver else None
     loss = parse_weights(weights, angles)
-    with output_folder("--out", out) as folder, output_folder("--out", folder / "charts") as charts:
+    with open_output_folder("--out", out) as folder, open_output_folder("--out", folder / "charts") as charts:
         require_replaceable_files(folder, _FILES, force)
         try:
             with terminal_monitor() as monitor:
@@ -113,6 +113,6 @@ def save(found: Comparison, out: Path, force: bool = False) -> None:
     found.write(out, force)
     if all(result.failed for result in found.results):
         return
-    with published(out, listed=True, force=force) as drafts:
+    with publish(out, listed=True, force=force) as drafts:
         front_figure(found).savefig(drafts / "front.png", dpi=150)
         convergence_figure(found).savefig(drafts / "convergence.png", dpi=150)

@@ -13,7 +13,7 @@ from orthocas.cli.evaluate import reach_rows
 from orthocas.cli.output import Force, terminal_monitor
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
-from orthocas.tools.files import output_folder, published
+from orthocas.tools.files import open_output_folder, publish
 
 _PAPER = {"task": 2.06, "mutual": 3.44, "minutes": 100.64}  # [AS2023] Sec. 9
 
@@ -51,7 +51,7 @@ def made(out: Path, quick: bool = False, force: bool = False) -> tuple[Fit, dict
     with terminal_monitor() as monitor:
         fit = fit_chart(problems.get("iiwa"), Polynomial(degree=3 if quick else 5), monitor=monitor)
     report = evaluate(fit.chart, samples=5_000 if quick else 100_000)
-    with output_folder("--out", out) as folder, published(folder, listed=True, force=force) as drafts:
+    with open_output_folder("--out", out) as folder, publish(folder, listed=True, force=force) as drafts:
         fit.chart.save(drafts / "iiwa.orthocas")
         quality_figure(report).savefig(drafts / "iiwa_quality.png", dpi=150)
         self_motion_figure(fit.chart, reach=None).savefig(drafts / "iiwa_self_motion.png", dpi=150)

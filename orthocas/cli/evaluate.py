@@ -10,7 +10,7 @@ from orthocas.charts.coordinates import InvertibleMap
 from orthocas.charts.self_motion import XiRange
 from orthocas.cli.output import AsJson, ChartPath, print_json, print_rows, report_rows, whole_number
 from orthocas.errors import InvalidValueError
-from orthocas.tools.json import plain
+from orthocas.tools.json import clean
 
 
 def evaluate(
@@ -47,7 +47,7 @@ def reach_data(chart: Chart) -> dict[str, Any]:
     if (reach := reach_of(chart)) is None:
         return {}
     return {
-        "xi_range": {part.label: [plain(part.low), plain(part.high)] for part in reach},
+        "xi_range": {part.label: [clean(part.low), clean(part.high)] for part in reach},
         "xi_stops": {part.label: [str(part.low_stop), str(part.high_stop)] for part in reach},
     }
 

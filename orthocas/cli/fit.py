@@ -51,14 +51,14 @@ from orthocas.fitting.settings import PRECISIONS, Precision, choose_parametrisat
 from orthocas.fitting.suggest_domain import CONDITIONING, LEAK_DEG, DomainSuggestion
 from orthocas.fitting.wide import WideFit
 from orthocas.paths.chart_along import RADIUS, corridor_problem
-from orthocas.robots.homes import read_postures
 from orthocas.solvers import get as get_solver
 from orthocas.solvers.protocol import Status
+from orthocas.tasks.corridor import read_postures
 from orthocas.tasks.problem import Problem
 from orthocas.tools.archive import require_free
 from orthocas.tools.display import listed, number_list, percent
 from orthocas.tools.interrupts import INTERRUPTED
-from orthocas.tools.json import attributes
+from orthocas.tools.json import collect_attributes
 
 _WIDE_ROWS = ("regular", "left out", "meaning")  # facts of wide fits
 _IN_CORRIDOR = "polynomial:3:cyclic"  # more terms gain little there
@@ -288,7 +288,7 @@ def _wide(result: Fit) -> dict[str, Any]:
     meaning = None if result.meaning is None else {"like": result.chart.notes["meaning"], **asdict(result.meaning)}
     return {
         "branch": result.branch.name,
-        **attributes(result, "regular_share", "left_out"),
+        **collect_attributes(result, "regular_share", "left_out"),
         "meaning": meaning,
     }
 
@@ -314,10 +314,10 @@ def _as_dict(result: Fit, report: Report, target: Path, suggestion: DomainSugges
         "stages": [
             {
                 "parametrisation": stage.label,
-                **attributes(stage, "parameters", "samples"),
+                **collect_attributes(stage, "parameters", "samples"),
                 "loss": stage.result.value,
                 "status": stage.result.status.value,
-                **attributes(stage.result, "iterations", "seconds"),
+                **collect_attributes(stage.result, "iterations", "seconds"),
             }
             for stage in result.stages
         ],

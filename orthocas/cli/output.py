@@ -14,7 +14,7 @@ import typer
 
 from orthocas.errors import one_line, printable
 from orthocas.tools.display import percent
-from orthocas.tools.json import to_json
+from orthocas.tools.json import write_json
 from orthocas.tools.progress import Monitor, Progress
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def spread(
 
 def print_json(data: Mapping[str, Any]) -> None:
     """Print one JSON object."""
-    typer.echo(to_json(data))
+    typer.echo(write_json(data))
 
 
 def print_rows(rows: Mapping[str, str]) -> None:

@@ -20,10 +20,10 @@ from orthocas.fitting.loss import (
     build_value_columns,
 )
 from orthocas.fitting.terms import Pairs, Sizes, Weights
-from orthocas.tasks.samples import Draw, Samples, even_parts
-from orthocas.tools.batch import in_threads, in_threads_with, thread_count
+from orthocas.tasks.samples import Draw, Samples, split_samples
+from orthocas.tools.batch import count_threads, run_in_threads, run_in_threads_with
 from orthocas.tools.checks import Array
-from orthocas.tools.columns import COLUMNS, Run, blocked, by_sample, shares
+from orthocas.tools.columns import COLUMNS, Run, arrange_blocks, build_weights, split_by_sample
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,11 +99,11 @@ class BasisObjective:
             start: parameters that give the orientation, unless it is known.
         """
         self.N, self.X = len(samples), self._gradients.at(samples.points)
-        self._share, self._expanded = shares(self.N), dict[str, Array]()
+        self._share, self._expanded = build_weights(self.N), dict[str, Array]()
         if start is not None and self._orientation is None and (self._loss.oriented or self.weights.folds > 0):
             self._orientation = samples.orientation(self.coordinate_jacobians(start))
-        data = samples.described(self._loss.data, self._orientation)
-        self._described = dict(zip(self._loss.data, map(blocked, data), strict=True))
+        data = samples.collect_data(self._loss.data, self._orientation)
+        self._described = dict(zip(self._loss.data, map(arrange_blocks, data), strict=True))
 
     @property
     def _data(self) -> list[Array]:
@@ -112,14 +112,14 @@ class BasisObjective:
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
         """The same loss on `count` fresh sample sets of `size` each."""
-        for part in even_parts(self._draw(size * count, seed), count):
+        for part in split_samples(self._draw(size * count, seed), count):
             other = copy(self)
             other._use(part)
             yield other
 
     def coordinate_jacobians(self, theta: Array) -> Array:
         """J_xi at every sample, (N, r, n)."""
-        return by_sample(self._evaluate_jacobians(theta).reshape(-1, self.n, self.r, COLUMNS), self.N)
+        return split_by_sample(self._evaluate_jacobians(theta).reshape(-1, self.n, self.r, COLUMNS), self.N)
 
     def value(self, theta: Array) -> float:
         """L(theta)."""
@@ -130,8 +130,8 @@ class BasisObjective:
         """L(theta) and dL/dtheta."""
         # J_xi = T X block by block; the loss and its slopes there; and the slopes times X^T, which are dL/dT
         T, columns, parts = self._table(theta), build_loss_columns(self._loss), self._parts
-        with columns.borrowed(min(thread_count(), len(parts))) as runs:
-            sums = in_threads_with(runs, lambda run, part: self._sum_part(T, run, part), parts)
+        with columns.borrow(min(count_threads(), len(parts))) as runs:
+            sums = run_in_threads_with(runs, lambda run, part: self._sum_part(T, run, part), parts)
         slopes = self._gradients.collect(np.sum([gradient for _, gradient in sums], axis=0))
         return sum(value for value, _ in sums), slopes[self.kept]
 
@@ -154,7 +154,7 @@ class BasisObjective:
         # second derivatives with respect to J_xi at each sample, then the gradients of the basis on both sides
         r, n, K = self.r, self.n, self.K
         (curvature,) = build_curvature_columns(self._loss)(self._evaluate_jacobians(theta), *self._data)
-        W = by_sample(curvature.reshape(-1, n * r, n * r, curvature.shape[2]), self.N).reshape(-1, n, r, n, r)
+        W = split_by_sample(curvature.reshape(-1, n * r, n * r, curvature.shape[2]), self.N).reshape(-1, n, r, n, r)
         G, H = self._dense, np.zeros((r, K, r, K))
 
         def fill(pair: tuple[int, int]) -> None:
@@ -165,7 +165,7 @@ class BasisObjective:
                 H[i, :, j] += G[part].reshape(-1, K).T @ raised.reshape(-1, K) / self.N
             H[j, :, i] = H[i, :, j].T
 
-        in_threads(fill, [(i, j) for i in range(r) for j in range(i + 1)])
+        run_in_threads(fill, [(i, j) for i in range(r) for j in range(i + 1)])
         free = self.kept.ravel()
         block: Array = H.reshape(r * K, r * K)[np.ix_(free, free)]
         return block
@@ -248,7 +248,7 @@ class BasisObjective:
     def _evaluate_jacobians(self, theta: Array) -> Array:
         """J_xi, (B, n r, c)."""
         T = self._table(theta)
-        J = _to_double(np.concatenate(in_threads(lambda part: T @ self.X[part], self._parts)))
+        J = _to_double(np.concatenate(run_in_threads(lambda part: T @ self.X[part], self._parts)))
         return J.reshape(len(J), self.n * self.r, -1)
 
     def _build_matrix(self, theta: Array, stride: int) -> Array:
@@ -262,7 +262,7 @@ class BasisObjective:
             gradients, by_coordinate = self._thin(stride), list[Any]()
             for derivative in derivatives[: self.r]:
                 blocks = derivative.reshape(len(derivative), self.n, -1, derivative.shape[2])
-                by_coordinate.append(by_sample(blocks, self.N, stride).astype(np.float32))
+                by_coordinate.append(split_by_sample(blocks, self.N, stride).astype(np.float32))
             H = build_normal_matrix(by_coordinate, gradients, shared) / len(gradients[0])
         hinges = derivatives[self.r :]
         for residual, derivative in zip(hinges[::2], hinges[1::2], strict=True):
@@ -375,7 +375,7 @@ def build_normal_matrix(derivatives: Sequence[Array], gradients: Sequence[Array]
     H = np.zeros((ends[-1], ends[-1]))
     chunks = range(0, len(gradients[0]), RULES.chunk)
     # so many chunks at a time that there is work for all threads
-    together = ceil(thread_count() / r)
+    together = ceil(count_threads() / r)
     for k in range(0, len(chunks), together):
         _add(H, places, chunks[k : k + together], derivatives, gradients, shared)
     for i, j, *_ in shared:
@@ -415,7 +415,7 @@ def _add(
     for i, j, row, other in shared:
         rows_of.setdefault((i, j), []).append((row, other))
     pieces = [(start, j) for start in starts for j in range(r)]
-    X = dict(zip(pieces, in_threads(rows, pieces), strict=True))
+    X = dict(zip(pieces, run_in_threads(rows, pieces), strict=True))
     work: list[Callable[[], None]] = [partial(square, j) for j in range(r)]
     work += [partial(mixed, pair) for pair in rows_of]
-    in_threads(lambda block: block(), work)
+    run_in_threads(lambda block: block(), work)

@@ -27,9 +27,9 @@ from orthocas.tasks.problem import Problem
 from orthocas.tools.archive import require_free
 from orthocas.tools.checks import as_path, require_count, require_kind, require_known
 from orthocas.tools.display import Shown
-from orthocas.tools.files import published, require_writable
+from orthocas.tools.files import publish, require_writable
 from orthocas.tools.interrupts import deferred
-from orthocas.tools.json import plain, to_json
+from orthocas.tools.json import clean, write_json
 from orthocas.tools.progress import Monitor, Progress, silent
 
 if TYPE_CHECKING:
@@ -86,15 +86,15 @@ class Comparison(Shown):
         writer.writeheader()
         for result in self.results:
             writer.writerow({name: getattr(result, name) for name in names})
-        with published(folder, listed=True, force=force) as drafts:
+        with publish(folder, listed=True, force=force) as drafts:
             (drafts / "comparison.csv").write_text(text.getvalue(), newline="")
-            (drafts / "comparison.json").write_text(to_json(self.as_dict(), indent=1))
+            (drafts / "comparison.json").write_text(write_json(self.as_dict(), indent=1))
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON. NaN becomes None."""
         return {
-            "summaries": plain(self.summaries()),
-            "fits": plain(self.results),
+            "summaries": clean(self.summaries()),
+            "fits": clean(self.results),
         }
 
     def facts(self) -> dict[str, str]:

@@ -17,12 +17,12 @@ from orthocas.errors import GrowError, InvalidValueError
 from orthocas.exact.flow import GrownCoordinates
 from orthocas.solvers.lbfgs import LBFGS
 from orthocas.solvers.protocol import Solver
-from orthocas.tasks.domains import sample_evenly, sample_uniform
+from orthocas.tasks.samples import sample_evenly, sample_uniform
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.blas_graph import NumpyGraph
 from orthocas.tools.checks import Array, require_count, require_kind, require_memory
 from orthocas.tools.display import Shown, number_list, percent
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 from orthocas.tools.progress import Monitor, Progress, Watch, silent
 
 
@@ -182,7 +182,7 @@ def _sample_targets(chart: Chart, points: Array) -> _Targets:
 def _evaluate(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> Distilled:
     held_out = sample_uniform(chart.problem.domain, min(count, RULES.held_out), RULES.held_out_seed)
     held_out_targets = _sample_targets(chart, held_out)
-    errors = shortest(
+    errors = wrap_shortest(
         distilled.coordinates.xi(held_out_targets.points) - held_out_targets.xi, distilled.turns[chart.m :]
     )
     gradients = held_out_targets.gradients / held_out_targets.weight

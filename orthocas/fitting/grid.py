@@ -18,7 +18,7 @@ from orthocas.fitting.terms import Weights
 from orthocas.solvers.protocol import Solver, Status
 from orthocas.tasks.problem import Problem
 from orthocas.tools.batch import THREADS
-from orthocas.tools.files import draft_folder, write_temporary
+from orthocas.tools.files import open_draft_folder, write_temporary
 from orthocas.tools.processes import begin_worker, shared_event, starting_workers, worker_pool
 from orthocas.tools.progress import Monitor, Progress, silent
 
@@ -196,7 +196,7 @@ def _own_processes(cells: Sequence[Cell], jobs: int | None) -> Iterator[CellResu
 
     Cells are passed in files: a pool whose process dies while it receives a large argument hangs in Python 3.11.2.
     """
-    with draft_folder() as folder:
+    with open_draft_folder() as folder:
         files = {}
         for k, cell in enumerate(cells):
             try:

@@ -17,7 +17,6 @@ from orthocas.errors import InvalidValueError, RobotError
 from orthocas.fitting.basis_gradients import BasisGradients
 from orthocas.fitting.terms import Data, Sizes, metric_lengths
 from orthocas.robots.robot import Robot
-from orthocas.tasks.metric import metric_matrices
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import Samples, sample_problem
 from orthocas.tasks.task import Task
@@ -26,7 +25,7 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_known, require_shape
 from orthocas.tools.columns import BlockedFunction
 from orthocas.tools.display import percent
-from orthocas.tools.expressions import expression_of, to_tape
+from orthocas.tools.expressions import build_expression, write_tape
 
 Quantity = Callable[[ca.SX], ca.SX]  #: a function of an SX column q
 Likeness = Task | Quantity | str | Sequence[Quantity | str]  #: what coordinates may be like
@@ -62,7 +61,7 @@ def build_quantity(robot: Robot, like: Quantity | str) -> tuple[str, ca.Function
             return f"{SWIVEL} [rad]", sew_angle(robot, "conventional")
         k = robot.joint_names.index(like)
         return f"{like} [{'m' if robot.tree.prismatic[k] else 'rad'}]", dense_function("like", [q], [q[k]])
-    value = expression_of("like", like, q)
+    value = build_expression("like", like, q)
     require_shape("like", value.shape, (1, 1))
     name = str(getattr(like, "__name__", ""))
     return name if name.isidentifier() else "a function of q", dense_function("like", [q], [value])
@@ -84,7 +83,7 @@ def _require_finite(slopes: Array) -> Array:
 
 
 def _hash(function: ca.Function) -> str:
-    return hashlib.sha256(json.dumps(to_tape(function)).encode()).hexdigest()[:12]
+    return hashlib.sha256(json.dumps(write_tape(function)).encode()).hexdigest()[:12]
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +194,8 @@ class Like:
         samples, k = sample_problem(problem, RULES.held_out, (seed, RULES.held_out)), len(self.names)
         J, Z = coordinates.jacobian(samples.points)[:, :k], samples.null_basis
         left = self.differentiate(samples.points) @ Z
-        lengths = np.sqrt(np.einsum("skn,skn->sk", J, samples.raised(J))) * np.linalg.norm(left, axis=2)
+        squares = np.einsum("skn,skn->sk", J, samples.compute_metric_gradients(J))
+        lengths = np.sqrt(squares) * np.linalg.norm(left, axis=2)
         cosines = np.einsum("skz,skz->sk", J @ Z, left) / np.maximum(lengths, RULES.still)
         angles = np.degrees(np.sqrt((np.arccos(np.clip(cosines, -1, 1)) ** 2).mean(axis=0)))
         return dict(zip(self.names, angles.tolist(), strict=True))
@@ -408,5 +408,5 @@ def find_self_motion(problem: Problem, q: Array) -> Array:
     J = problem.task.batched_frame_jacobian(q[None])[0].reshape(problem.m, problem.n)
     z = np.linalg.svd(J)[2][-1]
     z = z * np.sign(np.linalg.det(np.vstack([J, z])))
-    square = 1.0 if problem.metric.is_identity else z @ metric_matrices(problem.metric, q[None])[0] @ z
+    square = 1.0 if problem.metric.is_identity else z @ problem.metric.evaluate(q[None])[0] @ z
     return np.asarray(z / np.sqrt(square))

@@ -25,11 +25,10 @@ from orthocas.fitting.terms import (
     coordinates_of,
     find_term,
 )
-from orthocas.tasks.domains import sample_evenly
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.samples import Samples, samples_at
+from orthocas.tasks.samples import Samples, evaluate_samples, sample_evenly
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_point_set, frozen_array, require_count, require_kind
+from orthocas.tools.checks import Array, as_point_set, freeze_array, require_count, require_kind
 from orthocas.tools.columns import COLUMNS, ColumnFunction, Run
 
 # coordinates from which determinants of numbers are faster than written-out ones
@@ -79,7 +78,7 @@ def loss(
     require_parametrisation(parametrisation)
     family = parametrisation.for_problem(problem).family(JointSpace.of(problem), problem.r)
     drawn = _draw(problem, samples, seed)
-    theta0 = _start(family, drawn, seed) if start is None else frozen_array("start", start, (family.size,))
+    theta0 = _start(family, drawn, seed) if start is None else freeze_array("start", start, (family.size,))
     # J_xi of all samples as expressions of theta, then the loss of one sample on each column
     theta = ca.MX.sym("theta", family.size)
     J = _build_jacobians(family, drawn.points, theta)  # (r n, N), each J_xi column by column
@@ -87,7 +86,7 @@ def loss(
     chosen = Weights.of(weights).for_problem(problem)
     of_sample = Loss.of(Sizes(problem.n, problem.m, problem.r, identity), chosen.by_name)
     orientation = _orientation(drawn, ca.Function("J", [theta], [J])(theta0).full(), problem.r)
-    data = [_columns(part) for part in drawn.described(of_sample.data, orientation)]
+    data = [_columns(part) for part in drawn.collect_data(of_sample.data, orientation)]
     mean = ca.sum2(_map_loss(of_sample, len(drawn))(J, *data)) / len(drawn)
     return ca.Function("loss", [theta], [mean], ["theta"], ["loss"])
 
@@ -95,8 +94,8 @@ def loss(
 def _draw(problem: Problem, samples: int | ArrayLike, seed: int) -> Samples:
     if isinstance(samples, int | np.integer):
         count = require_count("samples", int(samples))
-        return samples_at(problem, sample_evenly(problem.domain, count, require_count("seed", seed, least=0)))
-    return samples_at(problem, as_point_set("samples", samples, problem.n)[0])
+        return evaluate_samples(problem, sample_evenly(problem.domain, count, require_count("seed", seed, least=0)))
+    return evaluate_samples(problem, as_point_set("samples", samples, problem.n)[0])
 
 
 def _start(family: Family, samples: Samples, seed: int) -> Array:
@@ -338,18 +337,18 @@ class LossWithVolumes:
         """Outputs (B, entries, c) for contiguous inputs (B, entries, c)."""
         shapes = [(len(J), 1, COLUMNS), *([J.shape] if self._slopes else [])]
         results = [np.empty(shape) for shape in shapes]
-        with self.borrowed(1) as (run,):
+        with self.borrow(1) as (run,):
             for b in range(len(J)):
                 run([J[b], *(array[b] for array in data)], [result[b] for result in results])
         return results
 
     @contextmanager
-    def borrowed(self, count: int) -> Iterator[list[Run]]:
-        """Functions of blocks for so many threads; see `ColumnFunction.borrowed`."""
+    def borrow(self, count: int) -> Iterator[list[Run]]:
+        """Functions of blocks for so many threads; see `ColumnFunction.borrow`."""
         with ExitStack() as stack:
             written: Sequence[Run | None] = [None] * count
             if self._written is not None:
-                written = stack.enter_context(self._written.borrowed(count))
+                written = stack.enter_context(self._written.borrow(count))
             yield [self._run(own) for own in written]
 
     def residuals(self, J: Array, *data: Array) -> list[Array]:

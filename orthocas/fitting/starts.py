@@ -12,7 +12,7 @@ from orthocas.bases.family import JointSpace, LinearFamily
 from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
 from orthocas.fitting.terms import Pairs, coordinates_of
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.samples import Samples, directions
+from orthocas.tasks.samples import Samples, compute_directions
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 
@@ -203,9 +203,9 @@ def _keep_symmetric(problem: Problem, active: list[int], u: Array, choices: Sequ
 
 
 def _evaluate_tensors(problem: Problem, active: list[int], u: Array) -> Array:
-    """The `directions` at points of the cube (N, n)."""
+    """The `compute_directions` at points of the cube (N, n)."""
     domain = problem.domain
-    return directions(problem, active, domain.centre[active] + domain.half_width[active] * u)
+    return compute_directions(problem, active, domain.centre[active] + domain.half_width[active] * u)
 
 
 def _find_parities(problem: Problem, active: list[int], signs: Array, u: Array) -> Array | None:

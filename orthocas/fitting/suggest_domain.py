@@ -21,12 +21,12 @@ from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM, require_driven
 from orthocas.tasks.domains import Box, Domain
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.problem import Problem, check
-from orthocas.tasks.regular_box import home_posture
-from orthocas.tasks.samples import idle_joints, sample_problem
+from orthocas.tasks.regular_box import find_home
+from orthocas.tasks.samples import find_idle_joints, sample_problem
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, as_number, require_count, require_kind
 from orthocas.tools.display import Shown, listed, number_list
-from orthocas.tools.json import attributes
+from orthocas.tools.json import collect_attributes
 from orthocas.tools.progress import Monitor, Progress, silent
 
 _STAGE = "suggest a domain"
@@ -110,7 +110,7 @@ def suggest_domain(
     if parametrisation is not None:
         require_parametrisation(parametrisation)
     # the problem around the home, and the joints whose half-widths are searched
-    posture = home_posture(robot, task, home)
+    posture = find_home(robot, task, home)
     room = np.minimum(_measure_room(robot, posture.q), _bound_widths(robot))
     problem = Problem(robot, task, metric, Box(posture.q, np.minimum(_propose_widths(robot), room)))
     check(problem, RULES.checked)
@@ -156,7 +156,7 @@ class _Joints:
 
     @classmethod
     def of(cls, problem: Problem) -> "_Joints":
-        idle = idle_joints(problem, sample_problem(problem, RULES.checked, 0))[-problem.r :]
+        idle = find_idle_joints(problem, sample_problem(problem, RULES.checked, 0))[-problem.r :]
         return cls(problem.robot.joint_names, tuple(idle), cyclic_joints(problem))
 
     @property
@@ -442,4 +442,4 @@ class DomainSuggestion(Shown):
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
         quality = ("leak_deg", "conditioning", "worst_point", "asked", "seconds")
-        return attributes(self, "home", "home_source", "joints", *quality)
+        return collect_attributes(self, "home", "home_source", "joints", *quality)

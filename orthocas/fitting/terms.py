@@ -11,7 +11,7 @@ from orthocas.charts.angles import pairs
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, as_float_array, as_number, require_kind, require_known
-from orthocas.tools.expressions import MOST_ROWS, determinant
+from orthocas.tools.expressions import MOST_ROWS, compute_determinant
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,7 +253,7 @@ def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_invers
         )
         raise InvalidValueError("number of extra coordinates r", coordinate_jacobian.shape[0], expected)
     lengths = metric_lengths(coordinate_jacobian, metric_inverse)
-    return determinant((coordinate_jacobian @ null_basis) / ca.repmat(lengths, 1, coordinate_jacobian.shape[0]))
+    return compute_determinant((coordinate_jacobian @ null_basis) / ca.repmat(lengths, 1, coordinate_jacobian.shape[0]))
 
 
 def volume_hinges(J: Array, null_basis: Array, metric_inverse: Array | None, bound: float) -> tuple[Array, Array]:
@@ -312,7 +312,7 @@ class RegularityTerm:
         Z, metric_inverse = data["null_basis"], data.get("metric_inverse")
         if self.euclidean and metric_inverse is not None:
             # a basis with the volume of an orthonormal one
-            columns = [Z[:, 0] / ca.sqrt(determinant(Z.T @ Z)), *(Z[:, k] for k in range(1, sizes.r))]
+            columns = [Z[:, 0] / ca.sqrt(compute_determinant(Z.T @ Z)), *(Z[:, k] for k in range(1, sizes.r))]
             Z, metric_inverse = ca.horzcat(*columns), None
         hinge: ca.SX = ca.fmax(self.bound_for(sizes.r) - gradient_volume(coordinate_jacobian, Z, metric_inverse), 0)
         return hinge

@@ -36,12 +36,13 @@ from orthocas.fitting.wide_search import (
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import require_driven
 from orthocas.solvers.protocol import Status
-from orthocas.tasks.branches import CLEARER, Branch, Branches, branches, clear_positions, middles
+from orthocas.tasks.branches import RULES as BRANCH_RULES
+from orthocas.tasks.branches import Branch, Branches, branches, sample_centres, sample_nonsingular
 from orthocas.tasks.domains import Box
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.problem import Problem, check
-from orthocas.tasks.regular_box import home_posture
-from orthocas.tasks.samples import idle_joints, sample_problem
+from orthocas.tasks.regular_box import find_home
+from orthocas.tasks.samples import find_idle_joints, sample_problem
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, as_number, require_count, require_kind
 from orthocas.tools.display import number_list, percent
@@ -170,10 +171,10 @@ def fit_wide(
     families = _choose_families(problem, like) if parametrisation is None else (parametrisation,)
     cases = [_prepare(problem, family, like) for family in families]
     problem, family = cases[0]
-    posture = chosen.posture if home is None else home_posture(robot, task, home).q
+    posture = chosen.posture if home is None else find_home(robot, task, home).q
     settings = _hold_to_quantities(WideSettings(count, seed, monitor, terms), problem, like, posture)
 
-    idle = idle_joints(problem, sample_problem(problem, RULES.first, (seed, RULES.first_tag)))[-problem.r :]
+    idle = find_idle_joints(problem, sample_problem(problem, RULES.first, (seed, RULES.first_tag)))[-problem.r :]
     with remembered() as pressed:
         if len(idle) == problem.r and parametrisation is None and like is None:
             none = np.zeros(0)
@@ -213,7 +214,7 @@ def _choose_branch(robot: Robot, task: Task, branch: Branch | Box | str | None, 
     parts: Branches = branches(robot, task)
     if branch is not None:
         return parts[branch]
-    return parts.of(home_posture(robot, task, home).q) or parts[0]
+    return parts.of(find_home(robot, task, home).q) or parts[0]
 
 
 def _build_problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Branch, clearance: float) -> Problem:
@@ -222,13 +223,13 @@ def _build_problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch
     try:
         return Problem(robot, task, metric, box, branch.name, clearance)
     except DomainError:
-        points, values = middles(robot, task, box)
+        points, values = sample_centres(robot, task, box)
     # of the clear positions, the one with the largest box around it
-    clear = points[values > CLEARER * clearance]
+    clear = points[values > BRANCH_RULES.of_centre * clearance]
     room = box.half_width - np.abs(clear - box.centre)
     if not len(clear):
-        missing = f"no position clear by {CLEARER * clearance:g}"
-        most = f"at most {math.floor(1e3 * float(values.max()) / CLEARER) / 1e3:g} can serve it"
+        missing = f"no position clear by {BRANCH_RULES.of_centre * clearance:g}"
+        most = f"at most {math.floor(1e3 * float(values.max()) / BRANCH_RULES.of_centre) / 1e3:g} can serve it"
         raise DomainError(f"branch '{branch.name}' has {missing}, expected one for clearance = {clearance:g}: {most}")
     best = int(np.argmax(np.log(room).sum(axis=1)))
     domain = Box(clear[best], room[best], box.unbounded)
@@ -306,7 +307,7 @@ def _finish(
     # the domain is where coordinates are regular; how much of the branch that is, and how good they are there
     domain = RegularPart(clear.domain, coordinates, LOSS_RULES.least_volume / clear.r)
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
-    counted = clear_positions(clear.robot, clear.task, branch.box, RULES.held_out, (seed, RULES.counted_tag))
+    counted = sample_nonsingular(clear.robot, clear.task, branch.box, RULES.held_out, (seed, RULES.counted_tag))
     share = float(domain.contains(counted).mean()) if len(counted) else float("nan")
     error = None if meaning is None else meaning.measure_error(problem, coordinates, seed)
     worst = worst_points(problem, coordinates, seed, thorough=True)

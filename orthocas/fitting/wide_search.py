@@ -20,10 +20,9 @@ from orthocas.fitting.terms import Weights
 from orthocas.solvers.adam import Adam
 from orthocas.solvers.lbfgs import LBFGS
 from orthocas.solvers.protocol import Objective, Solver, SolveResult
-from orthocas.tasks.domains import Box, sample_heavily, sample_uniform
-from orthocas.tasks.metric import metric_matrices
+from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.samples import NEGLIGIBLE, Samples
+from orthocas.tasks.samples import NEGLIGIBLE, Samples, sample_boundary_weighted, sample_uniform
 from orthocas.tools.batch import one_blas_thread
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
@@ -210,7 +209,7 @@ class Search:
         """Samples: some uniform, like positions that count for the share, the others boundary-weighted."""
         domain, seed, even = self.problem.domain, self.settings.seed, int(RULES.uniform * count)
         uniform = sample_uniform(domain, even, (seed, tag, RULES.uniform_tag))
-        points = np.vstack([uniform, sample_heavily(domain, count - even, (seed, tag))])
+        points = np.vstack([uniform, sample_boundary_weighted(domain, count - even, (seed, tag))])
         points = points[is_on_side_of_centre(self.problem, points)]
         if not len(points):
             raise InvalidValueError("samples", count, "more: none lies on the centre's side of singular positions")
@@ -260,7 +259,7 @@ class Search:
         if not isinstance(self.family, CombinableFamily):
             return start
         J = self.coordinates(start).jacobian(some.points)
-        lengths = np.sqrt(np.einsum("srn,srn->sr", J, some.raised(J)).mean(axis=0))
+        lengths = np.sqrt(np.einsum("srn,srn->sr", J, some.compute_metric_gradients(J)).mean(axis=0))
         return self.family.combined(start, np.diag(1 / lengths))
 
     def _add_worst(self, fresh: int, worst: int, tag: int) -> None:
@@ -413,7 +412,7 @@ def is_on_side_of_centre(problem: Problem, points: Array) -> NDArray[np.bool_]:
 def sample_frames(problem: Problem, points: Array) -> Samples:
     """Samples with the frame Jacobian, which half a turn of the tool does not spoil."""
     J = problem.task.batched_frame_jacobian(points)[0].reshape(len(points), problem.task.m, problem.n)
-    inverse = None if problem.metric.is_identity else np.linalg.inv(metric_matrices(problem.metric, points))
+    inverse = None if problem.metric.is_identity else np.linalg.inv(problem.metric.evaluate(points))
     return Samples(points, J, None if inverse is None else np.asarray(inverse))
 
 

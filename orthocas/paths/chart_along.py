@@ -11,8 +11,8 @@ from orthocas.fitting.fit import fit
 from orthocas.tasks.corridor import Corridor
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.regular_box import joint_range
-from orthocas.tasks.samples import idle_joints, sample_problem
+from orthocas.tasks.regular_box import find_joint_range
+from orthocas.tasks.samples import find_idle_joints, sample_problem
 from orthocas.tools.checks import Array, as_number, as_point_set, require_kind
 
 RADIUS = 0.2  #: [rad]
@@ -87,12 +87,12 @@ def corridor_problem(problem: Problem, postures: ArrayLike, radius: float = RADI
         raise InvalidValueError("radius", radius, "a positive number below pi")
     prismatic = np.array(problem.robot.tree.prismatic)
     sizes = np.where(prismatic, _PRISMATIC * size, size)
-    whole = joint_range(problem.robot, margin_deg)
+    whole = find_joint_range(problem.robot, margin_deg)
     path = path[_thinned(path / sizes)]
     narrow = Problem(problem.robot, problem.task, problem.metric, _around(whole, path, sizes), problem.name)
     names = problem.robot.joint_names
     cyclic = cyclic_joints(narrow)
-    idle = idle_joints(narrow, sample_problem(narrow, _SAMPLES, _SEED))
+    idle = find_idle_joints(narrow, sample_problem(narrow, _SAMPLES, _SEED))
     for k in {*idle, *map(names.index, cyclic)}:
         sizes[k] = np.inf
     free = Problem(problem.robot, problem.task, problem.metric, _around(whole, path, sizes), problem.name)

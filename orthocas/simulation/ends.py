@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from orthocas.control.controller import Controller, ControlStatus
 from orthocas.simulation.disturbances import Push
 from orthocas.simulation.trajectory import Trajectory
-from orthocas.tasks.domains import contains
 
 _BEYOND = 1e-3  # [rad] or [m] beyond a joint limit: stops give way a little
 _LASTING = 0.1  # [s] at the limit, from which on the storage must not rise
@@ -52,7 +51,7 @@ def why_lost(run: Trajectory, controller: Controller, pushes: Sequence[Push], su
 def _away(run: Trajectory, controller: Controller) -> tuple[NDArray[np.bool_], str]:
     """At which instants the arm is outside what the law respects, (N,), and what that is."""
     if controller.chart is not None:
-        return np.asarray(~contains(controller.problem.domain, run.q)), "the domain of the chart"
+        return np.asarray(~controller.problem.domain.contains(run.q)), "the domain of the chart"
     robot = controller.problem.robot
     beyond = (run.q < robot.lower - _BEYOND) | (run.q > robot.upper + _BEYOND)
     return np.asarray(beyond.any(axis=1)), "the joint limits"

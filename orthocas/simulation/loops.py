@@ -17,7 +17,7 @@ from orthocas.robots.robot import Robot
 from orthocas.simulation.disturbances import Friction, Loads, Noise, Push, Stops
 from orthocas.tools.cached import building, cached_property
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import scalar_code
+from orthocas.tools.expressions import expand_scalars
 from orthocas.tools.interrupts import deferred
 
 KEPT = 32  #: functions of each kind that a process remembers
@@ -85,7 +85,7 @@ class ClosedLoop:
             torque -= self.friction.torque(dq, numbers[: 2 * n])
         inertials = numbers[2 * n :] if self.rubs else numbers
         tree = self.plant.tree
-        ddq = dynamics.forward_dynamics(tree, q, dq, torque, tree.gravity, inertials)
+        ddq = dynamics.build_forward_dynamics(tree, q, dq, torque, tree.gravity, inertials)
         return ca.Function("plant", [ca.vertcat(q, dq), command, load, numbers], [ca.vertcat(dq, ddq)])
 
     @property
@@ -93,7 +93,7 @@ class ClosedLoop:
         """Amounts of friction, if there is any, then the inertial parameters of the robot."""
         if not self.torque:
             return np.zeros(0)
-        inertials = dynamics.inertial_numbers(self.plant.tree)
+        inertials = dynamics.collect_inertials(self.plant.tree)
         return np.concatenate([self.friction.numbers(self.n), inertials]) if self.rubs else inertials
 
     @property
@@ -151,7 +151,7 @@ def _rate(keyed: Keyed, profile: ca.Function) -> ca.Function:
     load = ca.MX.sym("load", loop.loads.size)
     command, _ = loop.commanded(state, profile.call([t, parameters]))
     rate = ca.Function("rate", [state, t, parameters, load], [loop.plant_rate(state, command, load)])
-    return scalar_code(rate) if loop.controller.function.is_a("SXFunction") else rate
+    return expand_scalars(rate) if loop.controller.function.is_a("SXFunction") else rate
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +275,7 @@ def _renamed(name: str, function: ca.Function) -> ca.Function:
 
 
 def _with_shared_parts(function: ca.Function) -> ca.Function:
-    return scalar_code(_renamed(function.name(), function))
+    return expand_scalars(_renamed(function.name(), function))
 
 
 def integrate(

@@ -16,7 +16,7 @@ from orthocas.simulation.loops import ClosedLoop, Piece, held_plant, pieces, run
 from orthocas.simulation.mujoco_plant import MuJoCo, MuJoCoPlant
 from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, as_number, require_kind
-from orthocas.tools.files import draft_folder
+from orthocas.tools.files import open_draft_folder
 from orthocas.tools.interrupts import deferred
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def _compiled(controller: Controller, safety: Safety) -> "Supervisor":
     from orthocas import codegen  # few runs need a code generator and a compiler
 
     chart: Any = controller.chart  # laws without one have no supervised form, and were refused before
-    with draft_folder() as folder:
+    with open_draft_folder() as folder:
         generated = codegen.generate_c(chart, folder / "law", controller, "law", safety=safety)
         library = codegen.compile_shared(generated, generated.folder)
         supervisor: Supervisor = codegen.Supervisor(

@@ -24,7 +24,7 @@ from orthocas.simulation.physics import LawWithMemory, SupervisedLaw, law_in_tic
 from orthocas.simulation.trajectory import Outcome, Trajectory
 from orthocas.tools.batch import THREADS, Batched
 from orthocas.tools.checks import Array, as_number, as_point, require_executor, require_kind, require_known
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 from orthocas.tools.progress import Monitor, Progress, silent
 
 _MOST_TICKS = 1e7  # of a sampled run
@@ -304,7 +304,7 @@ def _near(controller: Controller, value: Array, wanted: Array) -> Array:
     chart = controller.chart
     if chart is None or controller.labels != chart.labels:
         return value
-    return np.asarray(wanted + shortest(value - wanted, chart.turns)) if chart.turns.any() else value
+    return np.asarray(wanted + wrap_shortest(value - wanted, chart.turns)) if chart.turns.any() else value
 
 
 def simulate(

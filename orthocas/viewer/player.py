@@ -178,7 +178,7 @@ class RobotPage:
     def __init__(self, server: Any, robot: Robot, look: Look) -> None:
         self._server, self._panel = server, RobotPanel(robot)
         self._arm = Arm(server.scene, "/arm", robot, look)
-        self._home = robot.tree.middle
+        self._home = robot.tree.centre_posture
         self._robot, self._q = robot, self._home
         self._loop = Loop(lambda: None, partial(show_error, server))
         place_floor(server, robot)
@@ -296,8 +296,8 @@ def robot_scene(robot: Robot, look: Look) -> Scene:
         arm = Arm(server.scene, "/arm", robot, look)
         place_floor(server, robot)
         place_lights(server, robot)
-        place_camera(server, robot, robot.tree.middle[None])
-        return 0.0, lambda seconds: arm.show(robot.tree.middle)
+        place_camera(server, robot, robot.tree.centre_posture[None])
+        return 0.0, lambda seconds: arm.show(robot.tree.centre_posture)
 
     return build
 

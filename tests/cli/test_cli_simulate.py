@@ -16,7 +16,7 @@ from orthocas.cli.controller_argument import build_controller
 from orthocas.control import ControlStatus, matched_stiffness
 from orthocas.fitting.fit import Fit
 from orthocas.simulation import Trajectory
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
