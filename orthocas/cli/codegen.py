@@ -14,9 +14,8 @@ from orthocas.cli.controller_argument import (
     with_settings,
 )
 from orthocas.cli.output import AsJson, Force, note, print_json, print_rows
-from orthocas.codegen.generate import generate_c
-from orthocas.codegen.library import GeneratedC
-from orthocas.codegen.proof import Proof, check_c
+from orthocas.codegen.check import AgreementCheck, check_c
+from orthocas.codegen.generate import GeneratedC, generate_c
 from orthocas.errors import OptionError
 from orthocas.tools.interrupts import deferred
 
@@ -51,8 +50,8 @@ def codegen(
         law = None if controller == _NONE else build_controller(controller, loaded, settings, limit)
         generated = generate_c(loaded, out, law, name, force, single_precision=single_precision)
         remarks = [] if law is None else law.remarks()
-    proof = check_c(generated, loaded, law) if check else None
-    report = _report(generated, proof)
+    agreement = check_c(generated, loaded, law) if check else None
+    report = _report(generated, agreement)
     if json:
         print_json(report)
     else:
@@ -61,16 +60,16 @@ def codegen(
         note(remark)
 
 
-def _report(generated: GeneratedC, proof: Proof | None) -> dict[str, Any]:
+def _report(generated: GeneratedC, agreement: AgreementCheck | None) -> dict[str, Any]:
     source = generated.folder / f"{generated.name}.c"
     return {
         "name": generated.name,
         "source": str(source),
         "lines": len(source.read_text().splitlines()),
         "stack_bytes": generated.stack_bytes,
-        "checked_states": None if proof is None else proof.states,
-        "compilers": None if proof is None else list(proof.compilers),
-        "relative_differences": None if proof is None else proof.differences,
+        "checked_states": None if agreement is None else agreement.states,
+        "compilers": None if agreement is None else list(agreement.compilers),
+        "relative_differences": None if agreement is None else agreement.differences,
     }
 
 

@@ -9,9 +9,7 @@ import typer
 from orthocas.charts.chart import Chart
 from orthocas.cli.output import spread
 from orthocas.cli.problem_argument import parse_numbers
-from orthocas.control.controller import Controller
-from orthocas.control.gains import Setting
-from orthocas.control.registry import law_names, law_of
+from orthocas.control.controller import Controller, Setting, law_names, law_of
 from orthocas.errors import LawWarning, OptionError
 from orthocas.tools.checks import Array
 

@@ -42,7 +42,7 @@ from orthocas.cli.problem_argument import (
     wide_fit,
     with_options,
 )
-from orthocas.control.holding import holding_doubts
+from orthocas.control.gains import find_holding_doubts
 from orthocas.errors import Interrupted, InvalidValueError, OptionError
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
@@ -171,7 +171,7 @@ def fit(
     if isinstance(result, WideFit) and result.left_out:
         note(f"the chart of branch '{result.chart.notes['branch']}' leaves out {result.left_out}")
     known = result.chart.problem
-    for doubt in holding_doubts(known.robot, known.domain, known.robot.effort_limits):
+    for doubt in find_holding_doubts(known.robot, known.domain, known.robot.effort_limits):
         note(doubt)
     result.chart.save(target, force)
     report = evaluate(result.chart, seed=seed + 1)

@@ -16,7 +16,7 @@ from orthocas.bases.family import Parametrisation
 from orthocas.bases.registry import require_savable
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import CHART
-from orthocas.codegen.ticks import control_tick
+from orthocas.codegen.library import control_tick
 from orthocas.errors import ChartFileError, Interrupted, InvalidValueError, OrthocasError
 from orthocas.fitting.grid import Cell, CellResult, run_cells
 from orthocas.fitting.settings import PRECISIONS, Precision, choose_solver

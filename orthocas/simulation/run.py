@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.control.controller import Controller, counted_function, require_controller
+from orthocas.control.controller import Controller, get_counted_function, require_controller
 from orthocas.control.memory import memory_of
 from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
@@ -267,7 +267,7 @@ class Prepared:
         controller = self.loop.controller
         if name == "measured":
             return Batched(controller.measured)(*arguments)
-        function = counted_function(controller, "function" if name == "command" else "energy")
+        function = get_counted_function(controller, "function" if name == "command" else "energy")
         assert function is not None
         gains = [np.tile(gain, (len(arguments[0]), 1)) for gain in controller.gains.values()]
         return Batched(function)(*arguments, *gains)
