@@ -6,13 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from orthocas.charts.chart import Chart
-from orthocas.cli.controller_argument import (
-    CONTROLLERS,
-    Limit,
-    build_controller,
-    require_settings,
-    with_settings,
-)
+from orthocas.cli.codegen import CONTROLLERS, Limit, add_law_options, build_controller, require_settings
 from orthocas.cli.output import AsJson, Force, note, print_json, print_rows
 from orthocas.codegen.check import AgreementCheck, check_c
 from orthocas.codegen.generate import GeneratedC, generate_c
@@ -22,7 +16,7 @@ from orthocas.tools.interrupts import deferred
 _NONE = "none"
 
 
-@with_settings(for_codegen=True)
+@add_law_options(for_codegen=True)
 def codegen(
     chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
     controller: Annotated[str, typer.Option("--controller", help=f"Control law: {', '.join(CONTROLLERS)} or {_NONE}.")],

@@ -6,8 +6,7 @@ from typing import Annotated, cast
 import typer
 
 from orthocas.bases.registry import parse_parametrisation
-from orthocas.cli.output import AsJson, Force, note, print_json, print_table, terminal_monitor, whole_number
-from orthocas.cli.problem_argument import (
+from orthocas.cli.options import (
     CHAIN,
     DOMAIN,
     WEIGHTS_TEXT,
@@ -19,8 +18,9 @@ from orthocas.cli.problem_argument import (
     WeightsText,
     build_problem,
     parse_weights,
-    with_options,
+    parse_whole_number,
 )
+from orthocas.cli.output import AsJson, Force, note, parse_whole_number, print_json, print_table, terminal_monitor
 from orthocas.errors import Interrupted, printable
 from orthocas.fitting.compare import Comparison
 from orthocas.fitting.compare import compare as compare_fits
@@ -34,7 +34,7 @@ _FILES = ("comparison.csv", "comparison.json", "front.png", "convergence.png")
 _PARAMETRISATIONS = ["linear", "polynomial:2", "polynomial:3", "polynomial:4", "mlp:32x32"]
 
 
-@with_options(*CHAIN, *DOMAIN)
+@parse_whole_number(*CHAIN, *DOMAIN)
 def compare(
     problem: ProblemName,
     words: ProblemOptions,
@@ -44,12 +44,12 @@ def compare(
     solver: Annotated[
         list[str] | None, typer.Option("--solver", help="Solver; repeat for more. Default: one that suits each.")
     ] = None,
-    seeds: Annotated[int, typer.Option("--seeds", parser=whole_number, help="Number of seeds per fit.")] = 1,
+    seeds: Annotated[int, typer.Option("--seeds", parser=parse_whole_number, help="Number of seeds per fit.")] = 1,
     samples: SampleCount = None,
     held_out: Annotated[
         int,
         typer.Option(
-            "--held-out", parser=whole_number, help="Number of held-out samples that every fit is evaluated on."
+            "--held-out", parser=parse_whole_number, help="Number of held-out samples that every fit is evaluated on."
         ),
     ] = 100_000,
     weights: WeightsText = WEIGHTS_TEXT,
@@ -57,7 +57,9 @@ def compare(
     precision: PrecisionName = PRECISIONS[0],
     jobs: Annotated[
         int | None,
-        typer.Option("--jobs", parser=whole_number, help="Number of processes, one thread each; default: all cores."),
+        typer.Option(
+            "--jobs", parser=parse_whole_number, help="Number of processes, one thread each; default: all cores."
+        ),
     ] = None,
     out: Annotated[Path, typer.Option("--out", help="Folder for tables, pictures and charts.")] = Path("comparison"),
     force: Force = False,

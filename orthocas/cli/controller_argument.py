@@ -7,8 +7,8 @@ from typing import Annotated, Any
 import typer
 
 from orthocas.charts.chart import Chart
+from orthocas.cli.options import parse_numbers
 from orthocas.cli.output import spread
-from orthocas.cli.problem_argument import parse_numbers
 from orthocas.control.controller import Controller, Setting, law_names, law_of
 from orthocas.errors import LawWarning, OptionError
 from orthocas.tools.checks import Array
@@ -22,7 +22,7 @@ Limit = Annotated[
 ]
 
 
-def with_settings(for_codegen: bool) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def add_law_options(for_codegen: bool) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """A decorator of commands: the settings of all laws, as options, take the place of the parameter `settings`.
 
     The command gets those that were given, by name, as texts.

@@ -9,7 +9,7 @@ from orthocas import problems
 from orthocas.bases.products import Polynomial
 from orthocas.charts.figures import quality_figure, self_motion_figure
 from orthocas.charts.quality import evaluate
-from orthocas.cli.evaluate import reach_rows
+from orthocas.cli.evaluate import format_reach_rows
 from orthocas.cli.output import Force, terminal_monitor
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
@@ -29,7 +29,7 @@ def demo(
         f"  task angles    std {found['task_std_deg']:.2f} deg   (paper's network: {_PAPER['task']})",
         f"  mutual angles  std {found['mutual_std_deg']:.2f} deg   (paper's network: {_PAPER['mutual']})",
         f"  conditioning   mean {found['conditioning_mean']:.3f}, least found {found['conditioning_min']:.3f}",
-        *(f"  {name:<13}  {text}" for name, text in reach_rows(fit.chart).items()),
+        *(f"  {name:<13}  {text}" for name, text in format_reach_rows(fit.chart).items()),
         f"  fitted in      {found['seconds']:.1f} s       (paper: {_PAPER['minutes']} min on a GPU)",
         f"  chart and pictures in {out}/; try orthocas view {out / 'iiwa.orthocas'}",
     )

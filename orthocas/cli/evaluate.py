@@ -8,7 +8,7 @@ from orthocas.charts import quality
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import InvertibleMap
 from orthocas.charts.self_motion import XiRange
-from orthocas.cli.output import AsJson, ChartPath, print_json, print_rows, report_rows, whole_number
+from orthocas.cli.output import AsJson, ChartPath, format_report_rows, parse_whole_number, print_json, print_rows
 from orthocas.errors import InvalidValueError
 from orthocas.tools.json import clean
 
@@ -16,10 +16,13 @@ from orthocas.tools.json import clean
 def evaluate(
     chart: ChartPath,
     samples: Annotated[
-        int, typer.Option("--samples", parser=whole_number, help="Number of held-out samples.")
+        int, typer.Option("--samples", parser=parse_whole_number, help="Number of held-out samples.")
     ] = 100_000,
     seed: Annotated[
-        int, typer.Option("--seed", parser=whole_number, help="Seed of the samples; use another one than for the fit.")
+        int,
+        typer.Option(
+            "--seed", parser=parse_whole_number, help="Seed of the samples; use another one than for the fit."
+        ),
     ] = 1,
     json: AsJson = False,
 ) -> None:
@@ -27,9 +30,9 @@ def evaluate(
     judged = Chart.load(chart)
     report = quality.evaluate(judged, samples, seed)
     if json:
-        print_json({**report.as_dict(), **reach_data(judged)})
+        print_json({**report.as_dict(), **build_reach_data(judged)})
     else:
-        print_rows({**report_rows(report), **reach_rows(judged)})
+        print_rows({**format_report_rows(report), **format_reach_rows(judged)})
 
 
 def reach_of(chart: Chart) -> XiRange | None:
@@ -42,7 +45,7 @@ def reach_of(chart: Chart) -> XiRange | None:
         return None
 
 
-def reach_data(chart: Chart) -> dict[str, Any]:
+def build_reach_data(chart: Chart) -> dict[str, Any]:
     """The ranges of xi and what stops them there, for JSON."""
     if (reach := reach_of(chart)) is None:
         return {}
@@ -52,7 +55,7 @@ def reach_data(chart: Chart) -> dict[str, Any]:
     }
 
 
-def reach_rows(chart: Chart) -> dict[str, str]:
+def format_reach_rows(chart: Chart) -> dict[str, str]:
     """The ranges of xi in one row."""
     if (reach := reach_of(chart)) is None:
         return {}

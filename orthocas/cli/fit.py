@@ -10,19 +10,8 @@ from orthocas.bases.family import Parametrisation
 from orthocas.bases.registry import parse_parametrisation
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.quality import Report, evaluate
-from orthocas.cli.evaluate import reach_data, reach_rows
-from orthocas.cli.output import (
-    AsJson,
-    Force,
-    note,
-    number,
-    print_json,
-    print_rows,
-    report_rows,
-    terminal_monitor,
-    whole_number,
-)
-from orthocas.cli.problem_argument import (
+from orthocas.cli.evaluate import build_reach_data, format_reach_rows
+from orthocas.cli.options import (
     BRANCH,
     CHAIN,
     DOMAIN,
@@ -38,9 +27,20 @@ from orthocas.cli.problem_argument import (
     WeightsText,
     build_problem,
     parse_weights,
+    parse_whole_number,
     suggested,
     wide_fit,
-    with_options,
+)
+from orthocas.cli.output import (
+    AsJson,
+    Force,
+    format_report_rows,
+    note,
+    number,
+    parse_whole_number,
+    print_json,
+    print_rows,
+    terminal_monitor,
 )
 from orthocas.control.gains import find_holding_doubts
 from orthocas.errors import Interrupted, InvalidValueError, OptionError
@@ -64,7 +64,7 @@ _WIDE_ROWS = ("regular", "left out", "meaning")  # facts of wide fits
 _IN_CORRIDOR = "polynomial:3:cyclic"  # more terms gain little there
 
 
-@with_options(*CHAIN, *DOMAIN, "least_singular_value")
+@parse_whole_number(*CHAIN, *DOMAIN, "least_singular_value")
 def fit(
     problem: ProblemName,
     words: ProblemOptions,
@@ -109,7 +109,7 @@ def fit(
     ] = None,
     samples: SampleCount = None,
     seed: Annotated[
-        int, typer.Option("--seed", parser=whole_number, help="Seed of the samples and of random starts.")
+        int, typer.Option("--seed", parser=parse_whole_number, help="Seed of the samples and of random starts.")
     ] = 0,
     weights: WeightsText = WEIGHTS_TEXT,
     angles: AnglesName = None,
@@ -240,7 +240,7 @@ def _bounds(
 
 def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
     coordinates, robot = result.chart.coordinates, result.chart.problem.robot
-    rows = report.facts() if isinstance(result, WideFit) else report_rows(report)  # wide fits have no --weights
+    rows = report.facts() if isinstance(result, WideFit) else format_report_rows(report)  # wide fits have no --weights
     rows["robot"] = f"{robot.n} joints, {'tip' if len(robot.tips) == 1 else 'tips'} {listed(robot.tips)}"
     rows["fit"] = f"{coordinates.label}, {result.seconds:.2f} s, {result.status.value}"
     if isinstance(result, WideFit) and result.branch is not None:
@@ -271,7 +271,7 @@ def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
         rows["clear part"] = (
             f"--least-singular-value {bound:g} leaves out singular positions and keeps {percent(share)}"
         )
-    return {**rows, **reach_rows(result.chart), "chart": str(target)}
+    return {**rows, **format_reach_rows(result.chart), "chart": str(target)}
 
 
 def _domain_rows(suggestion: DomainSuggestion) -> dict[str, str]:
@@ -299,7 +299,7 @@ def _as_dict(result: Fit, report: Report, target: Path, suggestion: DomainSugges
         **({} if suggestion is None else {"suggested_domain": suggestion.as_dict()}),
         "chart": str(target),
         "tips": list(result.chart.problem.robot.tips),
-        **reach_data(result.chart),
+        **build_reach_data(result.chart),
         "parametrisation": result.chart.coordinates.label,
         "status": result.status.value,
         "seconds": result.seconds,

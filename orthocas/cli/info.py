@@ -8,16 +8,16 @@ import typer
 
 from orthocas import problems
 from orthocas.bases.cyclic import cyclic_joints
-from orthocas.cli.output import AsJson, print_json, print_rows
-from orthocas.cli.problem_argument import (
+from orthocas.cli.options import (
     ROBOT,
     ProblemName,
     ProblemOptions,
     build_problem,
     build_robot,
     is_robot_file,
-    with_options,
+    parse_whole_number,
 )
+from orthocas.cli.output import AsJson, print_json, print_rows
 from orthocas.errors import OptionError, RobotError, SingularTaskError
 from orthocas.exact.involutivity import involutivity
 from orthocas.robots.robot import Robot
@@ -36,7 +36,7 @@ _FAULTS = ("near_singular_share", "half_turn_share")
 _SHARES = ("share", "clear_share", "share of the branch", "branches", *_FAULTS)  #: names of numbers to show in percent
 
 
-@with_options(*ROBOT)
+@parse_whole_number(*ROBOT)
 def info(
     target: ProblemName,
     words: ProblemOptions,
@@ -156,9 +156,9 @@ def _problem(problem: Problem) -> dict[str, Any]:
 
 
 def _reach(chart: "Chart") -> dict[str, Any]:
-    from orthocas.cli.evaluate import reach_data  # as _load
+    from orthocas.cli.evaluate import build_reach_data  # as _load
 
-    return reach_data(chart)
+    return build_reach_data(chart)
 
 
 def _involutivity(problem: Problem) -> dict[str, Any]:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from orthocas.charts.quality import Report
 
 
-def whole_number(text: str) -> int:
+def parse_whole_number(text: str) -> int:
     """Parse the value of an option that takes a whole number."""
     try:
         return int(text)
@@ -110,7 +110,7 @@ def note(text: str) -> None:
     typer.echo(f"note: {one_line(text)}", err=True)
 
 
-def report_rows(report: "Report") -> dict[str, str]:
+def format_report_rows(report: "Report") -> dict[str, str]:
     """The rows of a quality report, with advice on command-line options."""
     rows = report.facts()
     if report.length_ratio > _UNEVEN:

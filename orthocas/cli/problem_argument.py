@@ -11,7 +11,7 @@ import typer
 
 from orthocas import problems
 from orthocas.bases.family import Parametrisation
-from orthocas.cli.output import number, spread, whole_number
+from orthocas.cli.output import number, parse_whole_number, spread
 from orthocas.errors import BranchWarning, InvalidValueError, OptionError, UnknownNameError
 from orthocas.fitting.probe import Bounds
 from orthocas.fitting.suggest_domain import DomainSuggestion, suggest_domain
@@ -129,7 +129,7 @@ class ProblemOptions:
                 raise OptionError(f"{owner} has its own robot: leave out --{option}")
 
 
-def with_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def parse_whole_number(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """A decorator of commands: options of these names take the place of the parameter `words`, a `ProblemOptions`."""
     options = {name: _OPTIONS[name] for name in names}
     return spread("words", options, lambda given: ProblemOptions(**{**given, "lock": tuple(given.get("lock") or ())}))
@@ -226,7 +226,9 @@ def locked_joints(words: tuple[str, ...]) -> dict[str, float]:
 
 SampleCount = Annotated[
     int | None,
-    typer.Option("--samples", parser=whole_number, help="Number of training samples; default: from the problem size."),
+    typer.Option(
+        "--samples", parser=parse_whole_number, help="Number of training samples; default: from the problem size."
+    ),
 ]
 WeightsText = Annotated[
     str, typer.Option("--weights", help='"lambda1,lambda2", up to lambda5; "NAME=WEIGHT" for terms of your own.')

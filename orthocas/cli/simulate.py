@@ -11,26 +11,26 @@ import typer
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.quality import evaluate
-from orthocas.cli.controller_argument import (
+from orthocas.cli.codegen import (
     CONTROLLERS,
     Limit,
+    add_law_options,
     build_controller,
     require_settings,
     require_torques,
-    with_settings,
 )
+from orthocas.cli.options import parse_numbers
 from orthocas.cli.output import (
     AsJson,
     ChartPath,
     Force,
     note,
     number,
+    parse_whole_number,
     print_json,
     print_rows,
     terminal_monitor,
-    whole_number,
 )
-from orthocas.cli.problem_argument import parse_numbers
 from orthocas.control.controller import Controller, ControlStatus
 from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
@@ -60,7 +60,7 @@ _REASONS = {
 }
 
 
-def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajectory, seconds: float) -> dict[str, Any]:
+def build_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajectory, seconds: float) -> dict[str, Any]:
     """Numbers of a run, SI units, ready for JSON.
 
     Args:
@@ -104,7 +104,7 @@ def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajector
     return dict(clean(report))
 
 
-def run_rows(report: dict[str, Any], problem: Problem) -> dict[str, str]:
+def format_report(report: dict[str, Any], problem: Problem) -> dict[str, str]:
     """The report as rows of text."""
     units = units_of(problem)
     errors = [
@@ -140,7 +140,7 @@ def run_rows(report: dict[str, Any], problem: Problem) -> dict[str, str]:
     return rows
 
 
-def fallback_text(report: dict[str, Any]) -> str | None:
+def format_fallback(report: dict[str, Any]) -> str | None:
     """A sentence that says when and why the controller used its fallback; None if it never did."""
     fallback = report["fallback"]
     if fallback["since"] is None:
@@ -220,7 +220,7 @@ CVODES = "cvodes"  #: the default plant
 _FAILED = (Outcome.DIVERGED, Outcome.LOST)  # the input was valid, but the run failed: exit code 1
 
 
-@with_settings(for_codegen=False)
+@add_law_options(for_codegen=False)
 def simulate(
     chart: ChartPath,
     controller: Annotated[str, typer.Option("--controller", help=f"Control law: {', '.join(CONTROLLERS)}.")],
@@ -257,7 +257,7 @@ def simulate(
         ),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option("--seed", parser=whole_number, help="Seed of the noise; default: 0.")
+        int | None, typer.Option("--seed", parser=parse_whole_number, help="Seed of the noise; default: 0.")
     ] = None,
     animation: Annotated[
         str, typer.Option("--animation", help="Format of the animation: gif, mp4 (needs ffmpeg) or none.")
@@ -298,7 +298,7 @@ def simulate(
     if json:
         print_json(report)
     else:
-        print_rows(run_rows(report, loaded.problem) | {"files": str(out)})
+        print_rows(format_report(report, loaded.problem) | {"files": str(out)})
     _notes(law, report, interrupted)
     if code := INTERRUPTED if interrupted else int(run.outcome in _FAILED):
         raise typer.Exit(code)
@@ -365,7 +365,7 @@ def _finish(
     law: Controller, chart: Chart, plan: Plan, run: Trajectory, seconds: float, out: Path, force: bool
 ) -> dict[str, Any]:
     """Write the run, its picture and its report, which is returned, and remove the animation of an earlier run."""
-    report = run_report(law, chart, plan, run, seconds)
+    report = build_report(law, chart, plan, run, seconds)
     with open_output_folder("--out", out) as folder, publish(folder, listed=True, force=force) as drafts:
         run.save(drafts / "trajectory.npz")
         trajectory_figure(run, units_of(chart.problem)).savefig(drafts / "coordinates.png", dpi=130)
@@ -380,7 +380,7 @@ def _notes(law: Controller, report: dict[str, Any], interrupted: bool) -> None:
     """Print remarks about the run on standard error."""
     for remark in law.remarks():
         note(remark)
-    fallback = fallback_text(report)
+    fallback = format_fallback(report)
     if fallback is not None:
         note(fallback)
     if report["outcome"] == Outcome.LOST.value:

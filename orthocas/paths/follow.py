@@ -13,7 +13,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.phi import counted_on
 from orthocas.charts.self_motion import Walls, xi_range
 from orthocas.errors import InvalidValueError, PathError, SolveError
-from orthocas.paths.joint_curve import JointCurve, Lost, Solver, TimeLaw, checked_places, fastest
+from orthocas.paths.joint_curve import JointCurve, Lost, Solver, TimeLaw, fastest, list_places
 from orthocas.paths.joint_motion import JointMotion, Margins
 from orthocas.paths.plan import Plan
 from orthocas.robots.obstacles import LinkDistances, Obstacle
@@ -74,7 +74,7 @@ class Limits:
         J = self._rows_at(sample_uniform(domain, _SAMPLES, 0))
         return compute_row_scale(J[np.isfinite(J).all(axis=(1, 2))], self.chart.problem.task.units)
 
-    def scaled_rows(self, q: Array) -> Array:
+    def compute_scaled_jacobian(self, q: Array) -> Array:
         """D^-1 J at joint positions (P, n), (P, m, n)."""
         J: Array = self._rows_at(q) / self.scale[:, None]
         return J
@@ -87,7 +87,7 @@ class Limits:
     def _batched_rows(self) -> BlockedFunction:
         return BlockedFunction(self.rows)
 
-    def require_kept(self, plan: Plan, s: Array, q: Array) -> None:
+    def check_kept(self, plan: Plan, s: Array, q: Array) -> None:
         """Raise PathError at the first place (P,) whose joint position (P, n) is lost, outside, or at an obstacle."""
         known = np.flatnonzero(np.isfinite(q).all(axis=1))
         free = (self.distances(q[known]) >= self.clearance).all(axis=1)
@@ -136,7 +136,7 @@ class Limits:
         room = np.minimum(q - low, high - q) / self.chart.problem.domain.half_width
         worst = int(np.argmin(room.min(axis=0)))
         bounded = bool(np.isfinite(room).any())
-        values = np.linalg.svd(self.scaled_rows(q), compute_uv=False)
+        values = np.linalg.svd(self.compute_scaled_jacobian(q), compute_uv=False)
         distances = self.distances(q)
         pair = int(np.argmin(distances.min(axis=0))) if distances.size else -1
         return Margins(
@@ -177,7 +177,7 @@ class Costs:
         return residuals, gradients
 
     def _of_task(self, q: Array) -> tuple[Array, Array]:
-        left, values, right = np.linalg.svd(self.limits.scaled_rows(q), full_matrices=False)
+        left, values, right = np.linalg.svd(self.limits.compute_scaled_jacobian(q), full_matrices=False)
         clear = self.limits.chart.problem.domain.singular_bound
         bound = 0.0 if clear is None else clear.least_singular_value
         residuals, slopes = _inverse(values[:, -1:] - bound, _REGULAR, _NEARLY_SINGULAR)
@@ -279,7 +279,7 @@ class XiChoice:
             gain, state = state.cost - better.cost, better
             if gain < _GAIN * state.cost:
                 break
-        return self.plan.with_xi(self._spline(self._unit @ state.values))
+        return self.plan.replace_xi(self._spline(self._unit @ state.values))
 
     def _first(self, q: Array) -> _State | None:
         """The spline through the coordinates of joint positions, or through their mean where that has no solution."""
@@ -397,11 +397,11 @@ def follow(
     if isinstance(xi, str) and xi == OBJECTIVE:
         plan, curve = _chosen(solver, plan, curve, limits, start)
     if isinstance(curve, Lost):
-        limits.require_kept(plan, curve.s, curve.q)
+        limits.check_kept(plan, curve.s, curve.q)
         raise limits.lost(plan, curve)
     s = plan.checked()
-    limits.require_kept(plan, s, curve.q(s))
-    _, first, second = curve.at(checked_places())
+    limits.check_kept(plan, s, curve.q(s))
+    _, first, second = curve.at(list_places())
     law = fastest(first, second, limits.velocity, limits.acceleration)
     return _on_stamps(plan, curve, law, limits, stamp)
 

@@ -183,7 +183,7 @@ class Plan:
         curve = spline(s if s_xi is None else s_xi, xi, closed and len(xi) > 2)
         return cls(path.closed() if closed else path, curve, s, x, steps, callable(tool_path), closed)
 
-    def with_xi(self, xi: CubicSpline) -> "Plan":
+    def replace_xi(self, xi: CubicSpline) -> "Plan":
         """The same tool path with other coordinates."""
         return replace(self, xi=xi)
 

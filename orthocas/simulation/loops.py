@@ -185,7 +185,7 @@ def run_compiled(function: ca.Function, *arguments: Any, **named: Any) -> Any:
             raise SimulationError(f"CVODES gave up: {str(error)[:200]}") from None
 
 
-def cvodes_options(tolerance: float, stiff: bool) -> dict[str, Any]:
+def list_cvodes_options(tolerance: float, stiff: bool) -> dict[str, Any]:
     """Adams with functional iteration, which needs no Jacobian, or BDF with Newton's if Coulomb friction is stiff."""
     return {
         "linear_multistep_method": "bdf" if stiff else "adams",
@@ -342,7 +342,12 @@ def _integrator(loop: ClosedLoop, reference: Reference, tolerance: float) -> ca.
     ode = length * rate(x, since + s * length, parameters, load)
     grid = np.arange(1, _OUTPUTS + 1) / _OUTPUTS
     return ca.integrator(
-        "closed_loop", "cvodes", {"x": x, "t": s, "p": p, "ode": ode}, 0.0, grid, cvodes_options(tolerance, loop.stiff)
+        "closed_loop",
+        "cvodes",
+        {"x": x, "t": s, "p": p, "ode": ode},
+        0.0,
+        grid,
+        list_cvodes_options(tolerance, loop.stiff),
     )
 
 
@@ -398,11 +403,11 @@ def pieces(tick: Callable[[int], Array], times: Array, period: float, size: int)
         yield Piece(times[held] + period, states, Held(commands, known[:, 0], known[:, 1]))
 
 
-def held_plant(loop: ClosedLoop, length: float, tolerance: float) -> ca.Function:
+def build_held_plant(loop: ClosedLoop, length: float, tolerance: float) -> ca.Function:
     """x0, p = [command; load] -> xf, the state after a tick in which command and load are constant."""
     x, u, w = (ca.SX.sym(*of) for of in (("x", loop.plant_rate.size1_in(0)), ("u", loop.n), ("load", loop.loads.size)))
     ode = {"x": x, "p": ca.vertcat(u, w), "ode": loop.plant_rate(x, u, w)}
-    return ca.integrator("plant", "cvodes", ode, 0.0, length, cvodes_options(tolerance, loop.stiff))
+    return ca.integrator("plant", "cvodes", ode, 0.0, length, list_cvodes_options(tolerance, loop.stiff))
 
 
 def _ticks_by_cvodes(loop: ClosedLoop, period: float, k: int, tolerance: float) -> Ticks:
@@ -426,7 +431,7 @@ def _filled(rows: Array) -> Array:
 def _tick(loop: ClosedLoop, length: float, k: int, tolerance: float) -> ca.Function:
     """state, reference with derivatives (3 k, 1), noise, load -> state after the tick, command, status."""
     size = loop.plant_rate.size1_in(0)
-    plant = held_plant(loop, length, tolerance)
+    plant = build_held_plant(loop, length, tolerance)
     state, reference = ca.MX.sym("state", size), ca.MX.sym("reference", 3 * k)
     noise, load = ca.MX.sym("noise", size), ca.MX.sym("load", loop.loads.size)
     command, status = loop.commanded(state + noise, (reference[:k], reference[k : 2 * k], reference[2 * k :]))

@@ -34,7 +34,7 @@ _POSITIONAL = ("controller", "reference", "q_start")
 Plant = Robot | MuJoCo | Literal["mujoco"] | None  #: the true robot, or MuJoCo with it; None: the controller's model
 
 
-def plant_of(plant: Plant, controller: Controller) -> tuple[Robot, MuJoCo | None]:
+def _read_plant(plant: Plant, controller: Controller) -> tuple[Robot, MuJoCo | None]:
     """The true robot, and the scene if MuJoCo simulates it.
 
     Raises:
@@ -147,7 +147,7 @@ def prepare(controller: Controller, reference: Reference, q_start: ArrayLike, se
     """Check the arguments of `simulate`, and build what the run needs."""
     friction, noise, rate = settings.friction, settings.noise, settings.control_rate
     require_kinds(controller, reference, settings.pushes, {Friction: friction, Stops: settings.stops, Noise: noise})
-    robot, scene = plant_of(settings.plant, controller)
+    robot, scene = _read_plant(settings.plant, controller)
     loop = ClosedLoop(controller, robot, friction or Friction(), Loads(robot.tree, settings.pushes), settings.stops)
     settings.require_numbers()
     require_fitting(loop, reference, friction, noise, rate, scene is not None, settings.safety)

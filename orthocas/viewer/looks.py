@@ -142,7 +142,7 @@ def _decimated(solid: Solid, count: int) -> Solid:
     return replace(solid, vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces, dtype=np.intp))
 
 
-def stick_arm(tree: KinematicTree, thickness: float = 1.0, facets: int = FINE) -> Look:
+def build_stick_arm(tree: KinematicTree, thickness: float = 1.0, facets: int = FINE) -> Look:
     """Drums about the joint axes and tapered rods between the frames, thinner or thicker than usual by a factor."""
     look: Look = [[] for _ in range(tree.n + 2)]
     radii = thickness * _radii(tree)
@@ -162,7 +162,7 @@ def stick_arm(tree: KinematicTree, thickness: float = 1.0, facets: int = FINE) -
     return look
 
 
-def chain_length(tree: KinematicTree) -> float:
+def compute_chain_length(tree: KinematicTree) -> float:
     """Length of the longest chain from the base to a tip, through all joint frames [m]."""
     lengths = [1e-3]
     for frame in (tree.tip, *map(tree.frame, tree.tips)):
@@ -173,7 +173,7 @@ def chain_length(tree: KinematicTree) -> float:
 
 def _radii(tree: KinematicTree) -> Array:
     """Radius of the rods that begin at the base and at each body, (n + 1,)."""
-    total = chain_length(tree)
+    total = compute_chain_length(tree)
     run = np.zeros(tree.n + 1)
     for i, parent in enumerate(tree.parents):
         run[i + 1] = run[parent + 1] + np.linalg.norm(tree.translations[i])
@@ -407,7 +407,7 @@ class Ghosts:
     def __init__(self, scene: Any, name: str, robot: Robot) -> None:
         self._scene, self._name, self._robot = scene, name, robot
         self._poses = BodyPoses(robot.tree)
-        self._look = stick_arm(robot.tree, _SLIM, COARSE)[1:]
+        self._look = build_stick_arm(robot.tree, _SLIM, COARSE)[1:]
         self._nodes: list[Any] = []
 
     def show(self, q: Array, curve: Array) -> None:

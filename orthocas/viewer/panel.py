@@ -135,7 +135,7 @@ class JointBars:
         tops = np.where(np.isfinite(upper), upper, np.where(np.isfinite(high), high, np.pi))
         spans = np.maximum(tops - ends, 1e-9)
         bands = np.clip(np.column_stack([low - ends, high - ends]) / spans[:, None], 0, 1)
-        self.shown = without_shared_words(names)
+        self.shown = strip_shared_words(names)
         self._slides = tuple(prismatic)
         places = zip(ends.tolist(), spans.tolist(), bands.tolist(), strict=True)
         self._joints = list(zip(names, self.shown, range(len(self.shown)), places, strict=True))
@@ -161,7 +161,7 @@ class JointBars:
         )
 
 
-def without_shared_words(names: Sequence[str]) -> list[str]:
+def strip_shared_words(names: Sequence[str]) -> list[str]:
     """Names without the words before a "_" that all of them begin with, as in panda_joint1, panda_joint2."""
     words = [name.split("_") for name in names]
     shared = len(list(takewhile(lambda same: len(set(same)) == 1, zip(*(each[:-1] for each in words), strict=False))))
@@ -223,12 +223,12 @@ class RobotPanel:
     def html(self, q: Array) -> str:
         """The page at a joint position (n,)."""
         tip = zip("xyz", self._robot.tip_position(q).tolist(), strict=True)
-        rows = [plain_row(f"{axis} [m]", value) for axis, value in tip]
+        rows = [format_row(f"{axis} [m]", value) for axis, value in tip]
         return "".join([STYLE, '<div class="oc">', self._head, "<h4>tip</h4>", *rows, "<h4>joints</h4>",
                         self._joints.html(q), "</div>"])  # fmt: skip
 
 
-def plain_row(label: str, value: float, note: str = "") -> str:
+def format_row(label: str, value: float, note: str = "") -> str:
     """A row with a name and a number, and perhaps a note between them."""
     name = f'<span title="{escape(label)}">{escape(label)}</span><span class="about">{escape(note)}</span>'
     return f'<div class="row">{name}{number(label, value, f"{value:.4f}")}</div>'
@@ -256,7 +256,7 @@ class PlayerPanel:
         rows = []
         for i, label in enumerate(motion.labels):
             note = "" if motion.references is None else f"reference {motion.references[k, i]:.4f}"
-            rows.append(plain_row(label, float(motion.values[k, i]), note))
+            rows.append(format_row(label, float(motion.values[k, i]), note))
         marked = motion.marked is not None and motion.marked[k]
         stop = '<div class="stop">the controller uses its fallback</div>' if marked else ""
         head = f'<div class="name">{escape(motion.name)}</div>'

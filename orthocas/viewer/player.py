@@ -11,15 +11,15 @@ from orthocas.charts.self_motion import Fan, fan_along
 from orthocas.errors import InvalidValueError
 from orthocas.robots.robot import Robot
 from orthocas.tools.checks import Array
-from orthocas.viewer.looks import GHOSTS, Arm, Ghosts, Look, chain_length
+from orthocas.viewer.looks import GHOSTS, Arm, Ghosts, Look, compute_chain_length
 from orthocas.viewer.motion import Motion
 from orthocas.viewer.panel import PlayerPanel, RobotPanel
 from orthocas.viewer.window import (
     LOCAL,
     Loop,
+    build_page,
     close_window,
-    direction_of_camera,
-    named_page,
+    compute_camera_direction,
     open_window,
     place_camera,
     place_floor,
@@ -49,9 +49,9 @@ class Stage:
 
     def __init__(self, scene: Any, robot: Robot, look: Look, motions: Sequence[Motion]) -> None:
         self.motions = motions
-        self.shifts = side_by_side(robot, len(motions))
+        self.shifts = place_side_by_side(robot, len(motions))
         self._arms = []
-        size = chain_length(robot.tree)
+        size = compute_chain_length(robot.tree)
         for k, (motion, shift) in enumerate(zip(motions, self.shifts, strict=True)):
             self._arms.append(Arm(scene, f"/arm{k}", robot, look, shift))
             rows = np.unique(np.linspace(0, len(motion.q) - 1, _MOST_POINTS).astype(int))
@@ -160,10 +160,10 @@ class PlayerPage:
                 self._time.value = min(round(seconds, 2), self._time.max)
 
 
-def side_by_side(robot: Robot, count: int) -> Array:
+def place_side_by_side(robot: Robot, count: int) -> Array:
     """Where arms stand, (count, 3) [m]: in a row from left to right for the camera."""
-    places = (np.arange(count) - (count - 1) / 2) * _APART * chain_length(robot.tree)
-    return np.outer(places, np.cross(up_of(robot), direction_of_camera(robot)))
+    places = (np.arange(count) - (count - 1) / 2) * _APART * compute_chain_length(robot.tree)
+    return np.outer(places, np.cross(up_of(robot), compute_camera_direction(robot)))
 
 
 def few(q: Array) -> Array:
@@ -241,12 +241,12 @@ def recorded(build: Scene) -> str:
         for t in np.linspace(0.0, duration, round(_RATE * duration) + 1)[: None if duration else 0]:
             show(float(t))
             serializer.insert_sleep(1 / _RATE)
-        return named_page(str(serializer.as_html()).encode()).decode()
+        return build_page(str(serializer.as_html()).encode()).decode()
     finally:
         close_window(server)
 
 
-def chart_scene(chart: Chart, look: Look) -> Scene:
+def record_scene(chart: Chart, look: Look) -> Scene:
     """Each coordinate in turn, from its lowest to its highest value and back, with the task held."""
 
     def build(server: Any) -> tuple[float, Callable[[float], None]]:
@@ -256,7 +256,7 @@ def chart_scene(chart: Chart, look: Look) -> Scene:
         place_floor(server, robot)
         place_lights(server, robot)
         place_camera(server, robot, np.concatenate([fan.spread(5) for fan in fans]))
-        above = robot.joint_points(home).max(axis=0) @ up_of(robot) + 0.12 * chain_length(robot.tree)
+        above = robot.joint_points(home).max(axis=0) @ up_of(robot) + 0.12 * compute_chain_length(robot.tree)
         label = server.scene.add_label("/label", "", position=tuple(above * up_of(robot)), anchor="bottom-center")
         shown = -1
 
@@ -275,7 +275,7 @@ def chart_scene(chart: Chart, look: Look) -> Scene:
     return build
 
 
-def motion_scene(robot: Robot, look: Look, motions: Sequence[Motion]) -> Scene:
+def show_chart(robot: Robot, look: Look, motions: Sequence[Motion]) -> Scene:
     """Motions side by side."""
 
     def build(server: Any) -> tuple[float, Callable[[float], None]]:
@@ -289,7 +289,7 @@ def motion_scene(robot: Robot, look: Look, motions: Sequence[Motion]) -> Scene:
     return build
 
 
-def robot_scene(robot: Robot, look: Look) -> Scene:
+def show_robot(robot: Robot, look: Look) -> Scene:
     """A robot that stands still."""
 
     def build(server: Any) -> tuple[float, Callable[[float], None]]:

@@ -14,9 +14,9 @@ from orthocas.simulation.trajectory import Trajectory
 from orthocas.tools.checks import as_path, suggest_attribute
 from orthocas.tools.files import publish, require_replaceable, require_writable
 from orthocas.viewer.chart_page import ChartPage
-from orthocas.viewer.looks import Look, decimated, stick_arm, urdf_look
+from orthocas.viewer.looks import Look, build_stick_arm, decimated, urdf_look
 from orthocas.viewer.motion import Motion, require_joints
-from orthocas.viewer.player import PlayerPage, RobotPage, Scene, chart_scene, motion_scene, recorded, robot_scene
+from orthocas.viewer.player import PlayerPage, RobotPage, Scene, record_scene, recorded, show_chart, show_robot
 from orthocas.viewer.session import Session
 from orthocas.viewer.window import LOCAL, close_window, open_window
 
@@ -98,7 +98,7 @@ def view(
         RobotError: if the robot file is another robot's.
     """
     arm, motions = subject(shown, robot)
-    shape = shape_of(arm, robot_file, locked)
+    shape = build_shape(arm, robot_file, locked)
     server, url = open_window(host, port, "orthocas")
     try:
         page: ChartPage | RobotPage | PlayerPage
@@ -141,14 +141,14 @@ def export_page(
     target = as_path("path", path)
     require_page(target, force)
     arm, motions = subject(shown, robot)
-    shape = shape_of(arm, robot_file, locked)
+    shape = build_shape(arm, robot_file, locked)
     scene: Scene
     if motions:
-        scene = motion_scene(arm, shape.look, motions)
+        scene = show_chart(arm, shape.look, motions)
     elif isinstance(shown, Chart):
-        scene = chart_scene(shown, shape.look)
+        scene = record_scene(shown, shape.look)
     else:
-        scene = robot_scene(arm, shape.look)
+        scene = show_robot(arm, shape.look)
     page = recorded(scene)
     with publish(target.parent) as drafts:
         (drafts / target.name).write_bytes(page.encode() + _OURS)
@@ -196,9 +196,9 @@ def _motions(shown: Any) -> tuple[Motion, ...]:
     return tuple(several)
 
 
-def shape_of(robot: Robot, robot_file: str | Path | None, locked: Mapping[str, float] | None) -> Shape:
+def build_shape(robot: Robot, robot_file: str | Path | None, locked: Mapping[str, float] | None) -> Shape:
     """How a robot looks: as its file says, or drums and rods where that shows nothing."""
-    sticks = stick_arm(robot.tree)
+    sticks = build_stick_arm(robot.tree)
     if robot_file is None:
         return Shape(sticks)
     found = urdf_look(as_path("robot_file", robot_file), robot.tree, locked)

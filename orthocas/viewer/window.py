@@ -31,7 +31,7 @@ from orthocas.errors import InvalidValueError, OrthocasError, ViewError
 from orthocas.robots.robot import Robot
 from orthocas.robots.spatial import rotate_z_to
 from orthocas.tools.checks import Array, import_extra, require_count
-from orthocas.viewer.looks import chain_length
+from orthocas.viewer.looks import compute_chain_length
 
 _INPUT, _CAMERA = "GuiUpdateMessage", "ViewerCameraMessage"
 _HANDLE = {
@@ -397,7 +397,7 @@ def titled(answer: Any) -> Any:
     """An answer with viser's page, named after us; other answers stay as they are."""
     if answer is None or "html" not in answer.headers.get("Content-Type", ""):
         return answer
-    body = named_page(answer.body, answer.headers.get("Content-Encoding") == "gzip")
+    body = build_page(answer.body, answer.headers.get("Content-Encoding") == "gzip")
     headers = answer.headers.copy()
     del headers["Content-Length"]  # or there would be two
     headers["Content-Length"] = str(len(body))
@@ -405,7 +405,7 @@ def titled(answer: Any) -> Any:
 
 
 @lru_cache(maxsize=2)
-def named_page(body: bytes, packed: bool = False) -> bytes:
+def build_page(body: bytes, packed: bool = False) -> bytes:
     """viser's page with our title and our script, before its own."""
     page = (gzip.decompress(body) if packed else body).replace(TITLES[0].encode(), TITLES[1].encode(), 1)
     page = page.replace(b"<head>", b"<head><script>" + _SCRIPT.read_bytes() + b"</script>", 1)
@@ -483,7 +483,7 @@ def require_free(host: str, port: int) -> None:
             raise _refused(host, port, error) from None
 
 
-def url_of(host: str, port: int) -> str:
+def build_url(host: str, port: int) -> str:
     """The address for a browser, without its token."""
     shown = LOCAL if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
     return f"http://{shown}:{port}"
@@ -501,13 +501,16 @@ def place_camera(server: Any, robot: Robot, q: Array, shift: Array | None = None
     points = robot.joint_points(q).reshape(-1, 3)
     points = np.concatenate([points, *(points + other for other in ([] if shift is None else shift))])
     low, high = points.min(axis=0), points.max(axis=0)
-    middle, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 0.4 * chain_length(robot.tree))
+    middle, radius = (
+        (low + high) / 2,
+        max(float(np.linalg.norm(high - low)) / 2, 0.4 * compute_chain_length(robot.tree)),
+    )
     up = up_of(robot)
     server.scene.set_up_direction(tuple(up))
-    frame = Framing(middle, direction_of_camera(robot), _ROOM * radius / np.sin(_VIEW_ANGLE / 2))
+    frame = Framing(middle, compute_camera_direction(robot), _ROOM * radius / np.sin(_VIEW_ANGLE / 2))
     camera = server.initial_camera
     camera.fov = _VIEW_ANGLE
-    position, look_at = frame.seen_from(1, 1)
+    position, look_at = frame.compute_view(1, 1)
     camera.position, camera.look_at = tuple(position), tuple(look_at)
     server.on_client_connect(frame.keep)
 
@@ -520,7 +523,7 @@ class Framing:
     direction: Array  #: unit vector to the camera (3,)
     distance: float  #: of the camera for a picture that is as wide as high, or wider [m]
 
-    def seen_from(self, width: float, height: float) -> tuple[Array, Array]:
+    def compute_view(self, width: float, height: float) -> tuple[Array, Array]:
         """Position of the camera and the point that it looks at (3,) [m], for a picture of a size in pixels."""
         return self.middle + self.distance * height / min(width, height) * self.direction, self.middle
 
@@ -540,7 +543,7 @@ class Framing:
             elsewhere = float("inf")
             if size != (camera.image_width, camera.image_height):
                 size = camera.image_width, camera.image_height
-                position, look_at = self.seen_from(*size)
+                position, look_at = self.compute_view(*size)
                 places.append(position)
                 with client.atomic():
                     camera.position = position
@@ -567,7 +570,7 @@ def place_floor(server: Any, robot: Robot) -> None:
 
     Lines, because viser's own grid computes every point of the floor, which takes long without a graphics card.
     """
-    size = chain_length(robot.tree)
+    size = compute_chain_length(robot.tree)
     radius = _FLOOR * size
     decade = 10.0 ** np.floor(np.log10(size / 5))
     cell = decade * max(part for part in (1, 2, 5) if part * decade <= size / 5)
@@ -589,7 +592,7 @@ def place_lights(server: Any, robot: Robot) -> None:
 
     There are no shadows and no environment map: without a graphics card, they take most of the time of a picture.
     """
-    scene, up, ahead = server.scene, up_of(robot), direction_of_camera(robot)
+    scene, up, ahead = server.scene, up_of(robot), compute_camera_direction(robot)
     left = np.cross(ahead, up)
     scene.add_light_hemisphere(
         "/lights/sky", sky_color=(255, 255, 255), ground_color=(150, 156, 166), intensity=2.1, position=tuple(up)
@@ -606,7 +609,7 @@ def is_planar(robot: Robot) -> bool:
     )
 
 
-def direction_of_camera(robot: Robot) -> Array:
+def compute_camera_direction(robot: Robot) -> Array:
     """Unit vector to the camera: from the front, the side and above, or from where a plane is seen."""
     if is_planar(robot):
         return np.array([0.0, 0.0, 1.0])

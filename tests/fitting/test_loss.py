@@ -8,7 +8,7 @@ import pytest
 
 import orthocas as oc
 from orthocas.bases import JointSpace
-from orthocas.cli.problem_argument import parse_weights
+from orthocas.cli.options import parse_weights
 from orthocas.errors import InvalidValueError
 from orthocas.fitting import network_objective
 from orthocas.fitting.basis_gradients import build_gradients
@@ -23,16 +23,7 @@ from orthocas.fitting.loss import (
 )
 from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
 from orthocas.fitting.starts import find_spectral_start
-from orthocas.fitting.terms import (
-    RULES,
-    MutualTerm,
-    Sizes,
-    TaskTerm,
-    Weights,
-    gradient_volume,
-    pairs,
-    volume_hinges,
-)
+from orthocas.fitting.terms import RULES, MutualTerm, Sizes, TaskTerm, Weights, gradient_volume, pairs, volume_hinges
 from orthocas.tasks.samples import Draw, Samples, evaluate_samples, sample_problem
 from orthocas.tools import columns
 from orthocas.tools.expressions import compute_determinant

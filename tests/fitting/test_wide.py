@@ -23,7 +23,7 @@ from orthocas.bases.given import sew_angle
 from orthocas.charts.certificate import PROVED
 from orthocas.charts.coordinates import Coordinates
 from orthocas.cli.fit import _rows
-from orthocas.cli.output import report_rows
+from orthocas.cli.output import format_report_rows
 from orthocas.codegen import check_c
 from orthocas.errors import (
     BranchWarning,
@@ -689,7 +689,7 @@ def test_command_notes_what_a_chart_leaves_out_of_its_branch(run: Run) -> None:
 
 def test_command_gives_no_advice_that_wide_fits_refuse() -> None:
     uneven = replace(oc.evaluate(wide_plane().chart, 500), length_ratio=50.0)
-    assert "--weights" in report_rows(uneven)["lengths"]
+    assert "--weights" in format_report_rows(uneven)["lengths"]
     assert "--weights" not in _rows(wide_plane(), uneven, Path("a.orthocas"))["lengths"]
 
 

@@ -17,8 +17,8 @@ from orthocas.errors import (
 )
 from orthocas.robots.pinocchio_model import lock_off_chain
 from orthocas.robots.urdf import read_urdf
-from orthocas.viewer.looks import TOOL, BodyPoses, ball, block, capsule, decimated, drum, stick_arm, urdf_look
-from orthocas.viewer.view import shape_of
+from orthocas.viewer.looks import TOOL, BodyPoses, ball, block, build_stick_arm, capsule, decimated, drum, urdf_look
+from orthocas.viewer.view import build_shape
 
 
 def test_body_poses_are_those_of_pinocchio() -> None:
@@ -86,7 +86,7 @@ def test_all_tips_are_drawn() -> None:
     q = robot.tree.centre_posture
     positions, quaternions = BodyPoses(robot.tree)(q[None])
     balls = []
-    for i, solids in enumerate(stick_arm(robot.tree)):
+    for i, solids in enumerate(build_stick_arm(robot.tree)):
         turn = pin.Quaternion(*quaternions[0, i]).matrix()
         balls += [(s.vertices @ turn.T + positions[0, i]).mean(axis=0) for s in solids if s.colour == TOOL]
     model = lock_off_chain(read_urdf(path), *tips)
@@ -103,10 +103,10 @@ def test_rods_stand_for_links_whose_meshes_are_missing(tmp_path: Path) -> None:
     lonely = tmp_path / "panda.urdf"
     shutil.copy(whole, lonely)
     robot = oc.Robot.from_urdf(lonely, "panda_hand")
-    shape = shape_of(robot, lonely, None)
+    shape = build_shape(robot, lonely, None)
     assert len(shape.missing) > 8
     assert shape.missing[0].endswith(".dae")
-    assert [len(part) for part in shape.look] == [len(part) for part in stick_arm(robot.tree)]
+    assert [len(part) for part in shape.look] == [len(part) for part in build_stick_arm(robot.tree)]
 
 
 def test_shapes_of_urdf_are_drawn_at_their_origins(tmp_path: Path) -> None:
