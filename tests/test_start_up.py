@@ -2,15 +2,12 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 import orthocas as oc
 from orthocas.cli.commands import COMMANDS, app_for
-from orthocas.tools import processes
 
-INIT = Path(oc.__file__)
 HEAVY = {"casadi", "numpy", "pinocchio", "scipy", "matplotlib", "trimesh", "igl", "skimage", "rich", "PIL", "mujoco"}
 
 
@@ -78,7 +75,3 @@ def test_help_tells_the_first_lines_of_all_commands() -> None:
         assert command.callback is not None
         assert (command.callback.__doc__ or "").splitlines()[0] == COMMANDS[name]
         assert sys.modules[f"orthocas.cli.{name}"] is not None
-
-
-def test_workers_are_known_by_the_same_variable() -> None:
-    assert f'"{processes._PARENT}" in _os.environ' in INIT.read_text()

@@ -21,8 +21,6 @@ from orthocas.errors import ArchiveError, CompileError, SchedulerError
 from orthocas.tools.interrupts import deferred
 
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
-_PARENT = "ORTHOCAS_PARENT"  # environment variable with the process id of a worker's parent, until the worker reads it
-_SPAWNED = "--multiprocessing-fork"  # on the command line of processes that multiprocessing starts
 ATTEMPTS = 3  #: at work whose process dies each time
 _log = logging.getLogger(__name__)
 _SPAWN = get_context("spawn")  # new interpreters: forked ones inherit the locks of threads that no longer run
@@ -64,22 +62,20 @@ def _shared_memory_named() -> Iterator[None]:
 def starting_workers() -> Iterator[None]:
     """For the block in which an executor starts processes, that is, around its first calls of `submit`.
 
-    The processes use one thread each, so that they do not compete for cores. They end with this one from the moment
-    when they import orthocas. Ctrl-C never comes there, imports included. Here all signals wait until the end of the
-    block: half a start leaves a process that nobody knows, or one that complains that its input ends.
+    The processes use one thread each, so that they do not compete for cores. Ctrl-C never comes there, imports
+    included. Here all signals wait until the end of the block: half a start leaves a process that nobody knows, or one
+    that complains that its input ends.
     """
-    given = {"OMP_NUM_THREADS": "1", _PARENT: str(os.getpid())}
-    before = {name: os.environ.get(name) for name in given}
-    os.environ.update(given)
+    before = os.environ.get("OMP_NUM_THREADS")
+    os.environ["OMP_NUM_THREADS"] = "1"
     try:
         with deferred(), _blocked(signal.SIGINT):
             yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        if before is None:
+            del os.environ["OMP_NUM_THREADS"]
+        else:
+            os.environ["OMP_NUM_THREADS"] = before
 
 
 class Processes(Executor):
@@ -149,35 +145,21 @@ def in_order(executor: Executor, work: Callable[..., Any], *columns: Sequence[An
             future.cancel()
 
 
-def end_early_with_parent() -> None:
-    """End with the parent already while Python imports what a worker needs; `orthocas` calls it first of all.
-
-    Other processes than those of `starting_workers` only forget about it, as does what they start.
-    """
-    parent = os.environ.pop(_PARENT)
-    if _SPAWNED in sys.orig_argv:
-        _end_with(int(parent))
-
-
 def begin_worker(parent: int) -> None:
     """Initialise a worker process: Ctrl-C is for its parent, and it ends with it, however that comes about.
 
     On Linux the kernel sees to it at once. Elsewhere a thread waits for the parent, and ends the process as soon as
-    compiled code lets it run.
+    compiled code lets it run. A worker whose parent ends before this call ends here, after its imports.
 
     Args:
         parent: process id of the parent, which may have ended already.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _end_with(parent)
-    threading.Thread(target=_wait_for_parent, daemon=True).start()
-
-
-def _end_with(parent: int) -> None:
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
+    threading.Thread(target=_wait_for_parent, daemon=True).start()
 
 
 def _wait_for_parent() -> None:
