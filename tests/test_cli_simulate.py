@@ -12,7 +12,7 @@ from scipy.linalg import eigvalsh
 from simulate_command import FILES, report_of, written
 
 import orthocas as oc
-from orthocas.cli.controller_argument import build_controller
+from orthocas.cli.codegen import build_controller
 from orthocas.control import ControlStatus, matched_stiffness
 from orthocas.fitting.fit import Fit
 from orthocas.simulation import Trajectory

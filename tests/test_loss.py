@@ -8,7 +8,7 @@ import pytest
 
 import orthocas as oc
 from orthocas.bases import JointSpace
-from orthocas.cli.problem_argument import parse_weights
+from orthocas.cli.options import parse_weights
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting import dense_objectives
 from orthocas.fitting.basis_gradients import gradients_of

@@ -26,7 +26,7 @@ from orthocas.certificates.taylor import Variables
 from orthocas.charts.certificate import Subdivision
 from orthocas.cli import entry
 from orthocas.errors import Interrupted
-from orthocas.fitting.grid import run_cells
+from orthocas.fitting.compare import run_cells
 from orthocas.solvers.protocol import BestPoint, Status
 from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import deferred, ended_in_order, remembered

@@ -1,31 +1,60 @@
-"""`orthocas codegen`: a chart and a controller as a C library."""
+"""`orthocas codegen`: a chart and a controller as a C library; and the options of controllers, for `simulate` too."""
 
+import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from orthocas.charts.chart import Chart
-from orthocas.cli.controller_argument import (
-    CONTROLLERS,
-    Limit,
-    build_controller,
-    require_settings,
-    with_settings,
-)
-from orthocas.cli.output import AsJson, Force, note, print_json, print_rows
+from orthocas.cli.options import AsJson, ChartPath, Force, Limit, parse_one_or_all, spread_options
+from orthocas.cli.output import note, print_json, print_rows
 from orthocas.codegen.generate import generate_c
 from orthocas.codegen.library import GeneratedC
 from orthocas.codegen.proof import Proof, check_c
-from orthocas.errors import OptionError
+from orthocas.control.controller import Controller
+from orthocas.control.gains import Setting
+from orthocas.control.registry import law_names, law_of
+from orthocas.errors import LawWarning, OptionError
 from orthocas.tools.interrupts import deferred
 
+CONTROLLERS = law_names()
 _NONE = "none"
+
+
+def with_settings(for_codegen: bool) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """A decorator of commands: the settings of all laws, as options, take the place of the parameter `settings`.
+
+    The command gets those that were given, by name, as texts.
+    """
+    options = {
+        name: Annotated[str | None, typer.Option(_option(name, setting), help=_help(name, setting))]
+        for law in map(law_of, law_names())
+        for name, setting in law.options.items()
+        if for_codegen or not setting.codegen_only
+    }
+    return spread_options(
+        "settings", options, lambda values: {name: text for name, text in values.items() if text is not None}
+    )
+
+
+def _option(name: str, setting: Setting) -> str:
+    return setting.option or f"--{name.replace('_', '-')}"
+
+
+def _help(name: str, setting: Setting) -> str:
+    takers = _laws_with(name)
+    return setting.help + ("" if len(takers) == len(law_names()) else f" For {', '.join(takers)}.")
+
+
+def _laws_with(setting: str) -> list[str]:
+    return [law for law in law_names() if setting in law_of(law).options]
 
 
 @with_settings(for_codegen=True)
 def codegen(
-    chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
+    chart: ChartPath,
     controller: Annotated[str, typer.Option("--controller", help=f"Control law: {', '.join(CONTROLLERS)} or {_NONE}.")],
     out: Annotated[Path, typer.Option("--out", help="Folder for the generated library.")],
     settings: dict[str, str],
@@ -45,7 +74,8 @@ def codegen(
         require_settings(controller, settings)
     elif settings or limit is not None:
         raise OptionError("settings of a controller require a controller: --controller is none")
-    with deferred():  # CasADi may lose Ctrl-C while it builds functions
+    # CasADi may lose Ctrl-C while it builds functions
+    with deferred():
         loaded = Chart.load(chart)
         loaded.function("xi")  # raises for grown charts
         law = None if controller == _NONE else build_controller(controller, loaded, settings, limit)
@@ -86,3 +116,35 @@ def _rows(report: dict[str, Any]) -> dict[str, str]:
             f"largest relative difference {differences[worst]:.1e} ({worst})"
         )
     return rows
+
+
+def require_settings(name: str, settings: Mapping[str, str]) -> None:
+    """Check that a controller exists and takes every setting that was given.
+
+    Raises:
+        UnknownNameError: if there is no such controller.
+        OptionError: for a setting that the controller would ignore.
+    """
+    law = law_of(name)
+    for field in settings:
+        if field not in law.options:
+            takers = _laws_with(field)
+            option = _option(field, law_of(takers[0]).options[field])
+            raise OptionError(f"{name} has no {option}, which belongs to {', '.join(takers)}")
+
+
+def build_controller(name: str, chart: Chart, settings: Mapping[str, str], limit: str | None = None) -> Controller:
+    """Build the controller that a command line describes; `require_settings` has checked the settings.
+
+    Raises:
+        OrthocasError: if anything does not fit together.
+    """
+    law = law_of(name)
+    values: dict[str, Any] = {}
+    for field, text in settings.items():
+        setting = law.options[field]
+        values[field] = text if setting.is_word else parse_one_or_all(_option(field, setting), text)
+    with warnings.catch_warnings():
+        # commands print the remarks of the law instead
+        warnings.simplefilter("ignore", LawWarning)
+        return law.on_chart(chart, None if limit is None else parse_one_or_all("--limit", limit), **values)

@@ -1,5 +1,6 @@
 """Collects the commands, and turns errors into one line and exit code 2."""
 
+import sys
 from collections.abc import Sequence
 from importlib import import_module
 from typing import Annotated
@@ -23,7 +24,8 @@ COMMANDS = {
     "export": "Write task, xi, phi, Jacobian and inverse of a chart as one Python module that needs the library only.",
     "view": "Show a chart, a robot or a motion in the browser, until Ctrl-C.",
     "charts": "List the ready charts of known arms, show the card of one, or write it to a file.",
-}  #: names of the commands, modules of this package, and the first lines of their help
+}  #: names of the commands and the first lines of their help
+_MODULES = {"demo": "fit", "compare": "fit", "evaluate": "charts", "certify": "charts", "export": "charts"}
 
 
 def app_for(words: Sequence[str]) -> typer.Typer:
@@ -38,7 +40,8 @@ def app_for(words: Sequence[str]) -> typer.Typer:
     )
     app.callback()(_options)
     for name, summary in COMMANDS.items():
-        command = getattr(import_module(f"{__package__}.{name}"), name) if name in words else _idle
+        module = f"{__package__}.{_MODULES.get(name, name)}"
+        command = getattr(import_module(module), name) if name in words else _idle
         app.command(name, help=None if name in words else summary)(command)
     return app
 
@@ -87,7 +90,10 @@ def run(app: typer.Typer) -> int:
 def _message(error: Exception) -> str:
     """What to say of an error; raises those that are defects."""
     if isinstance(error, typer.TyperException):
-        return error.format_message()
+        # Only a command imports the options, so a refusal of one finds them imported.
+        former = getattr(sys.modules.get(f"{__package__}.options"), "FORMER", {})
+        option = getattr(error, "option_name", None)
+        return f"no such option: {option}; {former[option]}" if option in former else error.format_message()
     if isinstance(error, OrthocasError):
         return str(error)
     from_library = isinstance(error, OSError | MemoryError) or type(error).__name__ == "LinAlgError"

@@ -8,16 +8,8 @@ import typer
 
 from orthocas import problems
 from orthocas.bases.cyclic import cyclic_joints
-from orthocas.cli.output import AsJson, print_json, print_rows
-from orthocas.cli.problem_argument import (
-    ROBOT,
-    ProblemName,
-    ProblemOptions,
-    build_problem,
-    build_robot,
-    is_robot_file,
-    with_options,
-)
+from orthocas.cli.options import AsJson, ProblemName, ProblemOptions, is_robot_file, with_problem_options
+from orthocas.cli.output import print_json, print_rows, reach_data
 from orthocas.errors import OptionError, RobotError, SingularTaskError
 from orthocas.exact.involutivity import involutivity
 from orthocas.robots.robot import Robot
@@ -36,7 +28,7 @@ _FAULTS = ("near_singular_share", "half_turn_share")
 _SHARES = ("share", "clear_share", "share of the branch", "branches", *_FAULTS)  #: names of numbers to show in percent
 
 
-@with_options(*ROBOT)
+@with_problem_options("tip", "lock", "tool", "base")
 def info(
     target: ProblemName,
     words: ProblemOptions,
@@ -47,10 +39,10 @@ def info(
 ) -> None:
     """Show a chart file, a named problem, or a robot file."""
     if is_robot_file(target):
-        robot = build_robot(target, words)
+        robot = words.build_robot(target)
         data = {**_robot(robot), **_redundancy(robot), **(_branches(robot, None) if branches else {})}
     elif target in problems.names():
-        problem = build_problem(target, words)
+        problem = words.build_problem(target)
         data = {**_problem(problem), **(_branches(problem.robot, problem.task) if branches else {})}
     elif branches:
         raise OptionError(f"--branches requires a robot file or a named problem, not the chart {target}")
@@ -61,7 +53,7 @@ def info(
             **_problem(chart.problem),
             "parametrisation": chart.coordinates.label,
             "parameters": chart.coordinates.size,
-            **_reach(chart),
+            **reach_data(chart),
             "notes": dict(chart.notes),
             **({"certificate": chart.certificate.as_dict()} if chart.certificate else {}),
         }
@@ -81,7 +73,7 @@ def _chart_path(target: str) -> Path:
     """The path of a chart; a target that is no file but looks like a name raises an error with the known names."""
     path = Path(target)
     if not path.exists() and not path.suffix:
-        build_problem(target, ProblemOptions())
+        ProblemOptions().build_problem(target)
     return path
 
 
@@ -153,12 +145,6 @@ def _problem(problem: Problem) -> dict[str, Any]:
         **_involutivity(problem),
         **_robot(problem.robot),
     }
-
-
-def _reach(chart: "Chart") -> dict[str, Any]:
-    from orthocas.cli.evaluate import reach_data  # as _load
-
-    return reach_data(chart)
 
 
 def _involutivity(problem: Problem) -> dict[str, Any]:

@@ -11,28 +11,20 @@ import typer
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.quality import evaluate
-from orthocas.cli.controller_argument import (
-    CONTROLLERS,
-    Limit,
-    build_controller,
-    require_settings,
-    require_torques,
-    with_settings,
-)
-from orthocas.cli.output import (
+from orthocas.cli.codegen import CONTROLLERS, build_controller, require_settings, with_settings
+from orthocas.cli.options import (
     AsJson,
     ChartPath,
     Force,
-    note,
-    number,
-    print_json,
-    print_rows,
-    terminal_monitor,
-    whole_number,
+    Limit,
+    parse_number,
+    parse_numbers,
+    parse_whole_number,
 )
-from orthocas.cli.problem_argument import parse_numbers
+from orthocas.cli.output import note, print_json, print_rows, terminal_monitor
 from orthocas.control.controller import Controller, ControlStatus
 from orthocas.control.reference import Reference
+from orthocas.control.registry import law_of
 from orthocas.control.safety import Safety
 from orthocas.errors import ArchiveError, Interrupted, InvalidValueError, OptionError, SingularTaskError
 from orthocas.robots.robot import Robot
@@ -232,7 +224,8 @@ def simulate(
     settings: dict[str, str],
     limit: Limit = None,
     rate: Annotated[
-        float | None, typer.Option("--rate", parser=number, help="Control rate [Hz]; default: continuous control.")
+        float | None,
+        typer.Option("--rate", parser=parse_number, help="Control rate [Hz]; default: continuous control."),
     ] = None,
     plant: Annotated[
         str, typer.Option("--plant", help="Simulator: cvodes, or mujoco (needs --rate and the extra [mujoco]).")
@@ -246,7 +239,9 @@ def simulate(
     ] = False,
     mass_factor: Annotated[
         float | None,
-        typer.Option("--mass-factor", parser=number, help="True masses divided by those of the controller's model."),
+        typer.Option(
+            "--mass-factor", parser=parse_number, help="True masses divided by those of the controller's model."
+        ),
     ] = None,
     friction: Annotated[
         str | None, typer.Option("--friction", help='Joint friction, "viscous,coulomb" [N m s/rad], [N m].')
@@ -258,7 +253,7 @@ def simulate(
         ),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option("--seed", parser=whole_number, help="Seed of the noise; default: 0.")
+        int | None, typer.Option("--seed", parser=parse_whole_number, help="Seed of the noise; default: 0.")
     ] = None,
     animation: Annotated[
         str, typer.Option("--animation", help="Format of the animation: gif, mp4 (needs ffmpeg) or none.")
@@ -268,9 +263,9 @@ def simulate(
 ) -> None:
     """Run a controller in a chart's coordinates; write the run, pictures, an animation and a report."""
     require_settings(controller, settings)
-    require_torques(controller, mass_factor=mass_factor, friction=friction)
-    _require_plant(plant, rate, supervised)
-    _require_folder(out, animation, force)
+    _check_torques(controller, {"--mass-factor": mass_factor, "--friction": friction})
+    _check_plant(plant, rate, supervised)
+    _check_folder(out, animation, force)
     with deferred():  # CasADi may lose Ctrl-C while it builds functions
         loaded = Chart.load(chart)
         loaded.function("xi")  # raises for grown charts
@@ -279,7 +274,7 @@ def simulate(
     conditions = {
         "control_rate": rate,
         "plant": _plant(plant, loaded.problem.robot, mass_factor),
-        "friction": None if friction is None else Friction(*_pair("--friction", friction)),
+        "friction": None if friction is None else Friction(*parse_numbers("--friction", friction, 2).tolist()),
         "noise": _noise(law, noise, seed, rate),
         "safety": Safety.of(law) if supervised else None,
         "compiled": compiled,
@@ -305,7 +300,7 @@ def simulate(
         raise typer.Exit(code)
 
 
-def _require_folder(out: Path, animation: str, force: bool) -> None:
+def _check_folder(out: Path, animation: str, force: bool) -> None:
     """Check, before anything is written, the format, and that the folder can be made or holds no files of others."""
     if animation != "none":
         require_format(animation)
@@ -316,7 +311,15 @@ def _require_folder(out: Path, animation: str, force: bool) -> None:
     require_replaceable_files(out, names, force)
 
 
-def _require_plant(plant: str, rate: float | None, supervised: bool) -> None:
+def _check_torques(controller: str, conditions: dict[str, object]) -> None:
+    """Raise OptionError for conditions of the plant that matter only to laws that command torques."""
+    for option, value in conditions.items():
+        if value is not None and law_of(controller).command != "torque":
+            takers = ", ".join(name for name in CONTROLLERS if law_of(name).command == "torque")
+            raise OptionError(f"{controller} has no {option}, which belongs to {takers}")
+
+
+def _check_plant(plant: str, rate: float | None, supervised: bool) -> None:
     """Raise UnknownNameError for other plants, and InvalidValueError where a sampled controller is missing."""
     require_known("plant", plant, (CVODES, MUJOCO))
     if plant == MUJOCO and rate is None:
@@ -331,14 +334,6 @@ def _plant(plant: str, model: Robot, mass_factor: float | None) -> Robot | MuJoC
     return MuJoCo(robot) if plant == MUJOCO else robot
 
 
-def _pair(option: str, text: str) -> tuple[float, float]:
-    """Parse "0.1,0.2"."""
-    values = parse_numbers(option, text).tolist()
-    if len(values) != 2:
-        raise InvalidValueError(option, repr(text), "two numbers")
-    return values[0], values[1]
-
-
 def _noise(law: Controller, text: str | None, seed: int | None, rate: float | None) -> Noise | None:
     """The noise of the sensors; raises InvalidValueError for an option that would be ignored."""
     if text is None:
@@ -347,7 +342,7 @@ def _noise(law: Controller, text: str | None, seed: int | None, rate: float | No
         return None
     if rate is None:
         raise OptionError("--noise requires --rate: white noise needs control ticks")
-    position, velocity = _pair("--noise", text)
+    position, velocity = parse_numbers("--noise", text, 2).tolist()
     if law.command == "velocity" and velocity != 0:
         raise InvalidValueError("--noise", text, f"a velocity deviation of 0, because {law.name} measures no velocity")
     return Noise(position, velocity, 0 if seed is None else seed)

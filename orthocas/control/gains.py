@@ -1,6 +1,6 @@
 """Settings that laws share: gains by stiffness and damping ratio, and the stiffness that two laws have in common."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy
@@ -49,6 +49,7 @@ class Setting:
     help: str  #: what it is, with its unit and default
     is_word: bool = False  #: passed on as text; otherwise it is one number, or several with commas between
     codegen_only: bool = False  #: about inputs that simulations do not give, so `orthocas simulate` does not offer it
+    option: str = field(default="", repr=False)  #: its option of commands, if it is not named after the setting
 
 
 STIFFNESS_SETTING = Setting('"100", or "100,50,..." per quantity; default: modes around 6 Hz.')

@@ -10,11 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from orthocas.fitting.grid import CellResult
 from orthocas.tools.picture import Picture
 
 if TYPE_CHECKING:
-    from orthocas.fitting.compare import Comparison, Summary
+    from orthocas.fitting.compare import CellResult, Comparison, Summary
 
 Colour = tuple[float, float, float, float]
 _HUES = {"linear": "Greys", "polynomial": "Blues", "fourier": "Greens", "mlp": "Oranges", "sew": "Purples"}
@@ -88,11 +87,11 @@ def _problem(comparison: "Comparison") -> str:
     return comparison.results[0].problem if comparison.results else ""
 
 
-def _names(results: Sequence[CellResult], attribute: str) -> list[str]:
+def _names(results: "Sequence[CellResult]", attribute: str) -> list[str]:
     return list(dict.fromkeys(str(getattr(result, attribute)) for result in results))
 
 
-def _colours(results: Sequence[CellResult]) -> dict[str, Colour]:
+def _colours(results: "Sequence[CellResult]") -> dict[str, Colour]:
     """One hue for each kind of parametrisation, darker for labels later in the alphabet."""
     kinds: dict[str, list[str]] = {}
     for name in sorted(_names(results, "parametrisation")):
