@@ -14,7 +14,7 @@ from public_objects import clear
 import orthocas as oc
 from orthocas.errors import PathFileError
 from orthocas.paths import joint_motion
-from orthocas.paths.plan import read_path
+from orthocas.paths.tool_path import read_path
 
 LIMITS = ("--velocity-limit", "1,1.5,2", "--acceleration-limit", "4")
 
@@ -135,7 +135,7 @@ def test_ctrl_c_leaves_nothing_half_written(run: Run, chart: oc.Chart, monkeypat
         os.kill(os.getpid(), signal.SIGINT)
         return "half"
 
-    monkeypatch.setattr(joint_motion.JointMotion, "_text", pressed)
+    monkeypatch.setattr(joint_motion.JointMotion, "_format_text", pressed)
     code, _, err = run("follow", "a.orthocas", "p.csv", *LIMITS, "--out", "q.csv")
     assert (code, err) == (130, "orthocas: interrupted\n")
     assert sorted(file.name for file in Path().iterdir()) == ["a.orthocas", "p.csv"]

@@ -110,7 +110,7 @@ def test_a_mirrored_arm_holds_the_pose_within_its_joint_limits() -> None:
     session.flip(shoulder)
 
     def arm() -> np.ndarray:
-        return np.asarray(session.shown(session.q[None])[0])
+        return np.asarray(session.mirror(session.q[None])[0])
 
     assert (robot.lower <= arm()).all()
     assert (arm() <= robot.upper).all()

@@ -77,7 +77,8 @@ def codegen(
     # CasADi may lose Ctrl-C while it builds functions
     with deferred():
         loaded = Chart.load(chart)
-        loaded.function("xi")  # raises for grown charts
+        # Raises for grown charts.
+        loaded.function("xi")
         law = None if controller == _NONE else build_controller(controller, loaded, settings, limit)
         generated = generate_c(loaded, out, law, name, force, single_precision=single_precision)
         remarks = [] if law is None else law.remarks()

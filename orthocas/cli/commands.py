@@ -79,9 +79,11 @@ def run(app: typer.Typer) -> int:
         except KeyboardInterrupt:
             code = INTERRUPTED
         except Exception as error:
-            if type(error).__name__ == "NoArgsIsHelpError":  # its message is the help
+            # Its message is the help.
+            if type(error).__name__ == "NoArgsIsHelpError":
                 typer.echo(_message(error), err=True)
-            elif not (pressed() or ended()):  # otherwise it is what a library made of a signal
+            elif not (pressed() or ended()):
+                # Otherwise it is what a library made of a signal.
                 _complain(_message(error))
             code = 2
         return ended() or (interrupted() if pressed() or code == INTERRUPTED else code)
@@ -97,7 +99,8 @@ def _message(error: Exception) -> str:
     if isinstance(error, OrthocasError):
         return str(error)
     from_library = isinstance(error, OSError | MemoryError) or type(error).__name__ == "LinAlgError"
-    if from_library:  # also one line, no traceback
+    # Also one line, no traceback.
+    if from_library:
         return f"{type(error).__name__}: {error}"
     raise error
 

@@ -14,7 +14,7 @@ from orthocas.errors import InvalidValueError
 from orthocas.paths.follow import HOLD, OBJECTIVE
 from orthocas.paths.follow import follow as follow_path
 from orthocas.paths.joint_motion import JointMotion, require_place
-from orthocas.paths.plan import read_path
+from orthocas.paths.tool_path import read_path
 from orthocas.robots.obstacles import Capsule, Obstacle, Plane, Sphere
 from orthocas.tools.checks import Array, require_known
 from orthocas.tools.interrupts import deferred
@@ -63,9 +63,11 @@ def follow(
 ) -> None:
     """Follow a tool path; write joint positions, velocities and accelerations on time stamps."""
     require_place(out, force)
-    with deferred():  # CasADi may lose Ctrl-C while it builds functions
+    # CasADi may lose Ctrl-C while it builds functions.
+    with deferred():
         loaded = Chart.load(chart)
-        loaded.function("xi")  # raises for grown charts
+        # Raises for grown charts.
+        loaded.function("xi")
     waypoints, choice = _read_task(path, loaded, xi)
     begin = time.perf_counter()
     motion = follow_path(

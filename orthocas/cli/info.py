@@ -96,7 +96,8 @@ def _robot(robot: Robot) -> dict[str, Any]:
 def _redundancy(robot: Robot) -> dict[str, Any]:
     """The number r = n - m of extra coordinates of each task that has some, and the joints that do not move it."""
     kinds = ("position", "pose", *(("relative_position", "relative_pose") if len(robot.tips) == 2 else ()))
-    q = robot.tree.middle + 0.1 * np.arange(1, robot.n + 1)  # no posture in which joints happen to be parallel
+    # No posture in which joints happen to be parallel.
+    q = robot.tree.middle + 0.1 * np.arange(1, robot.n + 1)
     found, floating = {}, robot.tree.floating
     for kind in kinds:
         task = Task.named(robot, kind, q)

@@ -266,9 +266,11 @@ def simulate(
     _check_torques(controller, {"--mass-factor": mass_factor, "--friction": friction})
     _check_plant(plant, rate, supervised)
     _check_folder(out, animation, force)
-    with deferred():  # CasADi may lose Ctrl-C while it builds functions
+    # CasADi may lose Ctrl-C while it builds functions.
+    with deferred():
         loaded = Chart.load(chart)
-        loaded.function("xi")  # raises for grown charts
+        # Raises for grown charts.
+        loaded.function("xi")
         plan = read_steps(steps, loaded)
         law = build_controller(controller, loaded, settings, limit)
     conditions = {
@@ -288,7 +290,8 @@ def simulate(
             report = finish()
             if animation != "none" and not interrupted:
                 save_animation(out / f"animation.{animation}", run, loaded.problem, monitor, force)
-        except KeyboardInterrupt:  # the run is complete: keep it
+        except KeyboardInterrupt:
+            # The run is complete: keep it.
             report = finish()
             interrupted = True
     if json:

@@ -12,7 +12,7 @@ from orthocas.charts.chart import Chart
 from orthocas.cli.options import AsJson, Force, ProblemOptions, is_robot_file, parse_whole_number, with_problem_options
 from orthocas.cli.output import note, print_json, print_rows
 from orthocas.errors import OptionError
-from orthocas.paths.plan import read_path
+from orthocas.paths.tool_path import read_path
 from orthocas.robots.robot import Robot
 from orthocas.tools.interrupts import deferred
 from orthocas.viewer import view as open_view
@@ -71,7 +71,8 @@ def view(
         require_page(export, force)
     if not compare and path is not None:
         raise OptionError("--path requires --compare, which follows the path")
-    with deferred():  # CasADi may lose Ctrl-C while it builds functions
+    # CasADi may lose Ctrl-C while it builds functions.
+    with deferred():
         scene = _read_scene(target, chart, robot, words)
     if compare:
         scene = _compare_motions(scene, path)

@@ -236,8 +236,15 @@ def run_cell(cell: Cell) -> CellResult:
             history.append((time.perf_counter() - start, progress.value))
 
     try:
-        settings = {"weights": cell.weights, "samples": cell.samples, "seed": cell.seed}
-        result = fit(cell.problem, cell.parametrisation, cell.solver, monitor=record, **settings)
+        result = fit(
+            cell.problem,
+            cell.parametrisation,
+            cell.solver,
+            weights=cell.weights,
+            samples=cell.samples,
+            seed=cell.seed,
+            monitor=record,
+        )
         if cell.chart_file is not None:
             result.chart.save(cell.chart_file, cell.force)
         report = evaluate(result.chart, cell.held_out, HELD_OUT_SEED)

@@ -14,48 +14,79 @@ from contextlib import contextmanager
 from importlib import import_module
 from multiprocessing import current_process, get_context, parent_process, resource_tracker
 from multiprocessing.connection import wait
-from multiprocessing.synchronize import Event
 from typing import Any
 
 from orthocas.errors import ArchiveError, CompileError, SchedulerError
 from orthocas.tools.interrupts import deferred
 
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
+_SPAWN = get_context("spawn")  # new interpreters: forked ones inherit the locks of threads that no longer run
 ATTEMPTS = 3  #: at work whose process dies each time
 _log = logging.getLogger(__name__)
-_SPAWN = get_context("spawn")  # new interpreters: forked ones inherit the locks of threads that no longer run
 
 
-def worker_pool(size: int, begin: Callable[..., object], *arguments: object) -> ProcessPoolExecutor:
-    """An executor whose processes call `begin(*arguments)` first; they start in blocks of `starting_workers`.
+class Processes(Executor):
+    """An executor of single processes with one thread each. One that died is replaced when work is submitted to it.
 
-    A script without a main guard would call this in its workers again, while they import it: they end with one line.
+    Args:
+        size: number of processes.
+        begin: called first in each, with the arguments; calls `begin_worker`.
+        arguments: of `begin`.
 
     Raises:
         ArchiveError: if the system's shared memory is full.
+        SystemExit: in its own processes, which import a script without a main guard and would call it again.
     """
-    if getattr(current_process(), "_inheriting", False):
-        raise SystemExit("orthocas: a script that starts processes needs `if __name__ == '__main__':` around its calls")
-    with _shared_memory_named():
-        return ProcessPoolExecutor(size, _SPAWN, begin, arguments)
 
+    def __init__(self, size: int, begin: Callable[..., object], *arguments: object) -> None:
+        if getattr(current_process(), "_inheriting", False):
+            raise SystemExit(
+                "orthocas: a script that starts processes needs `if __name__ == '__main__':` around its calls"
+            )
+        self._begin = begin, arguments
+        self._pools = [self._build_pool() for _ in range(size)]
+        self._pending: list[set[Future[Any]]] = [set() for _ in range(size)]
 
-def shared_event() -> Event:
-    """An event for such processes; see `worker_pool`."""
-    with _shared_memory_named():
-        return _SPAWN.Event()
+    def submit(self, work: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
+        """Run `work` in the process with the least to do."""
+        for pending in self._pending:
+            pending -= {future for future in pending if future.done()}
+        slot = min(range(len(self._pools)), key=lambda k: len(self._pending[k]))
+        try:
+            future = self._submit_to(slot, work, *arguments, **named)
+        except (BrokenExecutor, BrokenPipeError):
+            # A pipe: it died before it had its arguments.
+            _log.warning("a worker process died, killed or out of memory: another one takes its place")
+            self._pools[slot].shutdown(wait=False)
+            self._pools[slot] = self._build_pool()
+            future = self._submit_to(slot, work, *arguments, **named)
+        self._pending[slot].add(future)
+        return future
 
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the processes at once: what they have not handed over is lost."""
+        for pool in self._pools:
+            # A pool would wait for running work.
+            for process in list((pool._processes or {}).values()):
+                process.kill()
+            pool.shutdown(wait=wait, cancel_futures=True)
 
-@contextmanager
-def _shared_memory_named() -> Iterator[None]:
-    """Name the shared memory in errors, and let the process of multiprocessing that frees it outlive a hang-up."""
-    try:
-        if hasattr(signal, "SIGHUP"):
-            with _blocked(signal.SIGHUP):  # which that process inherits, for ever
-                resource_tracker.ensure_running()
-        yield
-    except OSError as error:  # which names no file
-        raise ArchiveError(f"cannot share memory with processes: {error.strerror}, expected room in /dev/shm") from None
+    def _submit_to(self, slot: int, work: Callable[..., Any], *arguments: Any, **named: Any) -> Future[Any]:
+        with starting_workers():
+            return self._pools[slot].submit(work, *arguments, **named)
+
+    def _build_pool(self) -> ProcessPoolExecutor:
+        try:
+            # The process of multiprocessing that frees shared memory inherits what is blocked, and outlives a hang-up.
+            if hasattr(signal, "SIGHUP"):
+                with _block(signal.SIGHUP):
+                    resource_tracker.ensure_running()
+            return ProcessPoolExecutor(1, _SPAWN, *self._begin)
+        except OSError as error:
+            # It names no file.
+            raise ArchiveError(
+                f"cannot share memory with processes: {error.strerror}, expected room in /dev/shm"
+            ) from None
 
 
 @contextmanager
@@ -69,58 +100,13 @@ def starting_workers() -> Iterator[None]:
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"
     try:
-        with deferred(), _blocked(signal.SIGINT):
+        with deferred(), _block(signal.SIGINT):
             yield
     finally:
         if before is None:
             del os.environ["OMP_NUM_THREADS"]
         else:
             os.environ["OMP_NUM_THREADS"] = before
-
-
-class Processes(Executor):
-    """An executor of single processes with one thread each. One that died is replaced when work is submitted to it.
-
-    Args:
-        size: number of processes.
-        begin: called first in each, with the arguments; calls `begin_worker`.
-        arguments: of `begin`.
-    """
-
-    def __init__(self, size: int, begin: Callable[..., object], *arguments: object) -> None:
-        self._begin = begin, arguments
-        self._pools = [self._pool() for _ in range(size)]
-        self._pending: list[set[Future[Any]]] = [set() for _ in range(size)]
-
-    def submit(self, work: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
-        """Run `work` in the process with the least to do."""
-        for pending in self._pending:
-            pending -= {future for future in pending if future.done()}
-        slot = min(range(len(self._pools)), key=lambda k: len(self._pending[k]))
-        try:
-            future = self._started(slot, work, *arguments, **named)
-        except (BrokenExecutor, BrokenPipeError):  # a pipe: it died before it had its arguments
-            _log.warning("a worker process died, killed or out of memory: another one takes its place")
-            self._pools[slot].shutdown(wait=False)
-            self._pools[slot] = self._pool()
-            future = self._started(slot, work, *arguments, **named)
-        self._pending[slot].add(future)
-        return future
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes at once: what they have not handed over is lost."""
-        for pool in self._pools:
-            for process in list((pool._processes or {}).values()):  # a pool would wait for running work
-                process.kill()
-            pool.shutdown(wait=wait, cancel_futures=True)
-
-    def _started(self, slot: int, work: Callable[..., Any], *arguments: Any, **named: Any) -> Future[Any]:
-        with starting_workers():
-            return self._pools[slot].submit(work, *arguments, **named)
-
-    def _pool(self) -> ProcessPoolExecutor:
-        begin, arguments = self._begin
-        return worker_pool(1, begin, *arguments)
 
 
 def worker_died(future: Future[Any]) -> bool:
@@ -170,7 +156,7 @@ def _wait_for_parent() -> None:
 
 
 @contextmanager
-def _blocked(number: signal.Signals) -> Iterator[None]:
+def _block(number: signal.Signals) -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
