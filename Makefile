@@ -32,7 +32,7 @@ joss: $(INSTALLED)  ## the paper in docs/joss as build/joss/paper.pdf, to read
 
 COUNT ?= 1000
 fuzz: $(INSTALLED)  ## the campaign of faults; COUNT mutants of each kind, CAMPAIGN="charts ..." for some kinds
-	cd tests && PYTHONPATH=../examples ../$(BIN)/python -m fuzz $(COUNT) $(CAMPAIGN)
+	cd tests && PYTHONPATH=../examples:shared ../$(BIN)/python -m fuzz $(COUNT) $(CAMPAIGN)
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -18,7 +18,7 @@ from orthocas.certificates.search import Limits, Search, largest_first
 from orthocas.charts.certificate import Subdivision
 from orthocas.errors import OrthocasError
 
-sys.path.append(str(Path(__file__).parent.parent / "tests"))
+sys.path.append(str(Path(__file__).parent.parent / "tests" / "shared"))
 from random_arms import SPATIAL_TASKS, random_arm, second_solutions
 
 _BOXES = 300  # judged for one box of an arm

@@ -11,7 +11,7 @@ from orthocas.tools.checks import Array, Indices
 
 @dataclass(frozen=True, slots=True)
 class ContinuationRules:
-    """Numbers of the continuation. Chosen on panda-wide, held on five arms (tests/test_continuation.py)."""
+    """Numbers of the continuation. Chosen on panda-wide, held on five arms (tests/charts/test_continuation.py)."""
 
     first: float = 0.1  #: largest change of a joint in the first step [rad] or [m]
     longest: float = 0.3  #: in any step

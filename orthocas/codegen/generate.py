@@ -23,7 +23,7 @@ from orthocas.tools.checks import as_path, require_kind, require_shape
 from orthocas.tools.expressions import fast_form, scalar_code
 from orthocas.tools.files import output_folder, published, require_writable
 
-_LOCALS = 5 * 1024  # bytes; 1 to 4.5 KiB with gcc and clang for up to seven joints (tests/test_c_safety.py)
+_LOCALS = 5 * 1024  # bytes; 1 to 4.5 KiB with gcc and clang for up to seven joints (tests/codegen/test_c_safety.py)
 _TAKEN = (  # names of C headers and libraries
     *("assert", "complex", "ctype", "errno", "fenv", "float", "inttypes", "iso646", "limits", "locale", "math"),
     *("setjmp", "signal", "stdarg", "stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath", "time"),

@@ -15,7 +15,7 @@ from orthocas.tools.expressions import WRITTEN_OUT
 
 LARGE_INVERSE = "large_inverse"  #: name of the functions for which generated C has code of its own
 ROOT_TIMES = "root_times"  #: likewise
-ROUNDS = 8  #: accurate to rounding up to a condition number of 1e6 (tests/test_control_algebra.py)
+ROUNDS = 8  #: accurate to rounding up to a condition number of 1e6 (tests/control/test_control_algebra.py)
 _SAMPLES, _SEED = 256, 0
 SOFTEST = 1e-6  #: smallest squared frequency in double_diagonal, relative to the largest: K_i = 0 divides by zero
 

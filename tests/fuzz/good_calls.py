@@ -8,6 +8,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from mujoco_arm import Arm
 from public_objects import (
     circle,
     clear,
@@ -19,7 +20,6 @@ from public_objects import (
     steps,
     trajectory,
 )
-from test_learn import Arm
 
 import orthocas as oc
 from orthocas import bases, control, learn, plotting, problems, simulation, solvers, viewer

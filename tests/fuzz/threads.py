@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
-from test_threads import SERIES
+from series import SERIES
 
 from fuzz.child import Finding
 

@@ -1,0 +1,88 @@
+"""The search along self-motion curves: what it finds, against random starts, and what its parts promise."""
+
+import numpy as np
+import pytest
+from dense_search import STARTS, positions_at
+from public_objects import wide
+
+import orthocas as oc
+from orthocas.tasks.domains import sample_uniform
+
+FOUND, NEAREST = oc.InverseStatus.FOUND, oc.InverseStatus.NEAREST
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["panda-wide", "xarm7-wide"])
+def test_no_random_start_leads_to_a_nearer_xi(name: str) -> None:
+    """A wish whose x is that of another posture: a search from near the wish missed the nearest xi in one of seven."""
+    chart = oc.charts.load(name)
+    domain = chart.problem.domain
+    wishes, x = sample_uniform(domain, 24, 1), chart.task(sample_uniform(domain, 24, 2))
+    near, pool = chart.nearest_xi(wishes, x), sample_uniform(domain, STARTS, 3)
+    assert {FOUND, NEAREST} == set(near.statuses)
+    assert domain.contains(near.q).all()
+    np.testing.assert_allclose(chart.relative.difference(x, chart.task(near.q)), 0, atol=1e-8)
+    xi = chart.xi(wishes)[:, 0]
+    np.testing.assert_allclose(near.distance, np.abs(chart.xi(near.q)[:, 0] - xi), atol=1e-9)
+    known = 0
+    for k in range(len(x)):
+        others = positions_at(chart, x[k], pool)
+        known += len(others)
+        assert near.distance[k] <= np.abs(chart.xi(others)[:, 0] - xi[k]).min() + 1e-6
+    assert known > 20 * len(x)
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_positions_near_boundaries_are_found_again(inside: bool) -> None:
+    """Of 2,000, 12 were missed, and with `inside` said to lie nowhere in the domain."""
+    chart = oc.charts.load("panda-wide")
+    domain, rng = chart.problem.domain, np.random.default_rng(3)
+    unit = rng.uniform(-1, 1, (12_000, chart.n))
+    unit = np.sign(unit) * np.abs(unit) ** rng.choice([1, 0.5, 0.25, 0.05], (len(unit), 1))
+    q = domain.centre + domain.half_width * unit
+    q = q[domain.contains(q)][:1000]
+    solutions = chart.solve(chart.phi(q), inside=inside)
+    assert len(q) == 1000
+    assert solutions.found.all()
+    np.testing.assert_allclose(chart.phi_map.residual(chart.phi(q), solutions.q), 0, atol=1e-9)
+
+
+def test_curves_are_cut_by_the_limits_after_full_turns() -> None:
+    """A joint with a range of two turns: both positions count, and the nearest xi is that of the right turn."""
+    robot = oc.Robot.planar([1.0, 1.0, 1.0], [1.0, 1.0, 1.0])
+    domain = oc.Box([0.0, 0.8, 0.8], [2 * np.pi, 0.7, 0.7])
+    chart = oc.fit(
+        oc.Problem(robot, oc.Task.position(robot, "xy"), domain=domain), oc.Linear(base=(0.0, 0.8, 0.8))
+    ).chart
+    assert np.abs(chart.coordinates.jacobian(np.array([[0.0, 0.8, 0.8]]))[0, 0, 0]) > 0.05
+    q = np.array([1.0, 0.9, 0.7])
+    turn = np.array([2 * np.pi, 0.0, 0.0])
+    apart = abs(chart.xi(q) - chart.xi(q - turn))[0]
+    for own in (q, q - turn):
+        found = chart.nearest_xi(own, chart.task(q))
+        assert found.distance[0] < 1e-9 < apart
+        np.testing.assert_allclose(chart.xi(found.q[0]), chart.xi(own), atol=1e-9)
+
+
+def test_endless_joints_count_at_every_turn_near_the_wish() -> None:
+    """A turn of the first joint changes xi. Eleven of 424 wishes near x got a posture of another turn."""
+    chart = wide().chart
+    domain, rng = chart.problem.domain, np.random.default_rng(4)
+    wishes = sample_uniform(domain, 500, 3)
+    others = wishes + 0.3 * domain.half_width * rng.uniform(-1, 1, wishes.shape)
+    others = np.where(domain.contains(others)[:, None], others, wishes)
+    x, xi = chart.task(others), chart.xi(wishes)
+    found = chart.nearest_xi(wishes, x)
+    assert (found.status <= NEAREST).all()
+    assert (found.distance <= np.abs(chart.xi(others) - xi)[:, 0] + 1e-9).all()
+
+
+def test_orientations_are_embedded_without_a_seam() -> None:
+    """Numbers of orientations that differ little are as far apart as the error says, at half a turn too."""
+    chart = oc.charts.load("iiwa7-wide")
+    rng = np.random.default_rng(0)
+    q = sample_uniform(chart.problem.domain, 300, 4)
+    x, y = chart.task(q), chart.task(q + 1e-3 * rng.normal(size=q.shape))
+    error = np.linalg.norm(chart.relative.difference(x, y)[:, 3:], axis=1)
+    apart = np.linalg.norm(chart.relative.embedded(x) - chart.relative.embedded(y), axis=1)
+    np.testing.assert_allclose(apart, error, rtol=1e-4, atol=1e-12)

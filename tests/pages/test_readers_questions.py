@@ -1,0 +1,74 @@
+"""Ten questions that newcomers ask, each with the page and the sentence that answer it; some by the site's search."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[2] / "docs"
+ANSWERS = {
+    "How do I keep the elbow up?": (
+        "how-to/elbow",
+        "Hold ξ while the hand moves, at the value it has where the elbow is up.",
+    ),
+    "Does it work with my mobile base?": (
+        "how-to/mobile_base",
+        "One chart then holds at every place and every heading.",
+    ),
+    "What if the robot is pushed out of the chart?": (
+        "how-to/stops",
+        "| the arm leaves the domain, or comes near a singular position | the catcher stops and holds it |",
+    ),
+    "How do I keep joint and velocity limits?": ("how-to/limits", "Generated C keeps them by itself"),
+    "How do I drive it with a joystick?": ("how-to/joystick", "Add the joystick's speed to a **target** in (x, ξ)"),
+    "Is there a plug-in for MoveIt?": ("how-to/coming_from", "orthocas has no plug-in of its own for MoveIt"),
+    "My task needs all joints. What now?": (
+        "how-to/tasks",
+        "take as few components as the tool needs, because each one costs a coordinate",
+    ),
+    "What does pose:z mean?": ("how-to/tasks", "**`pose:z`** holds what `pose` holds: position and whole orientation."),
+    "Which of the three angles matters?": (
+        "explanation/angles",
+        "`oc.fit` minimises the **leak**, the angle in the metric, by default for A = M",
+    ),
+    "Does one (x, ξ) mean one posture?": ("how-to/inverse", "**No fold is not one solution.**"),
+}
+SEARCHED = {
+    "joint limits": "how-to/limits",
+    "ROS": "how-to/robots",
+    "ROS 2": "how-to/robots",
+    "velocity limit": "how-to/limits",
+    "elbow": "how-to/elbow",
+    "null space": "how-to/coming_from",
+    "dual arm": "how-to/two_arms",
+    "IK": "how-to/inverse",
+    "singularity": "how-to/domains",
+    "gravity compensation": "how-to/robots",
+    "torque": "explanation/control",
+    "gripper": "tutorials/own_arm",
+    "collision avoidance": "how-to/paths",
+    "install": "index",
+}
+
+
+@pytest.mark.parametrize("question", ANSWERS)
+def test_a_page_answers(question: str) -> None:
+    page, sentence = ANSWERS[question]
+    assert sentence in " ".join((DOCS / f"{page}.md").read_text().split())
+
+
+@pytest.mark.parametrize("words", SEARCHED)
+def test_the_search_finds_the_page_among_the_first_three(words: str) -> None:
+    """Sphinx ranks main entries of the index (!) first, above titles and text."""
+    assert [page for page, entries in index().items() if words.lower() in entries][:3] == [SEARCHED[words]]
+
+
+def index() -> dict[str, list[str]]:
+    """The entries of the index that pages name at their head."""
+    found = {}
+    for path in sorted(DOCS.rglob("*.md")):
+        lines = re.findall(r"^```\{index\} (! .*)$", path.read_text(), flags=re.MULTILINE)
+        found[str(path.relative_to(DOCS).with_suffix(""))] = [
+            word.strip("! ").lower() for word in ",".join(lines).split(",")
+        ]
+    return found

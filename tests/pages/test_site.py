@@ -1,0 +1,102 @@
+"""The documentation site: every public name has a place in the reference, and every page a place in the contents."""
+
+import re
+import sys
+from importlib import import_module
+from os.path import normpath
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import orthocas
+
+DOCS = Path(__file__).parents[2] / "docs"
+sys.path.insert(0, str(DOCS / "_ext"))
+DIRECTIVE = re.compile(r"^\.\. auto(?:class|function|module):: (orthocas(?:\.\w+)+)$", flags=re.MULTILINE)
+FILES = {str(path.relative_to(DOCS).with_suffix("")): path for path in DOCS.rglob("*.md")}
+PAGES = {name: path.read_text() for name, path in FILES.items() if not name.startswith("joss/")}  # the paper is no page
+
+
+def described() -> list[str]:
+    return [name for page in PAGES.values() for name in DIRECTIVE.findall(page)]
+
+
+def contents(page: str) -> set[str]:
+    """The pages that the tables of contents of a page name."""
+    folder = Path(page).parent
+    trees = re.findall(r"```\{toctree\}\n(.*?)```", PAGES[page], flags=re.DOTALL)
+    names = [line for tree in trees for line in tree.splitlines() if line and not line.startswith(":")]
+    return {normpath(folder / name) for name in names}
+
+
+def test_every_public_name_is_in_the_reference_once() -> None:
+    found = described()
+    assert len(found) == len(set(found)) > 100
+    public = {f"orthocas.{name}": getattr(orthocas, name) for name in orthocas.__all__}
+    wanted = {part.__name__ if isinstance(part, ModuleType) else name for name, part in public.items()}
+    for name in ("codegen", "control", "obstacles", "paths", "plotting", "simulation", "viewer"):
+        package = getattr(orthocas, name)
+        own = {f"{package.__name__}.{name}" for name in package.__all__}
+        wanted |= {name for name in own if f"orthocas.{name.split('.')[-1]}" not in wanted}
+    assert wanted - set(found) == set()
+
+
+def test_every_page_is_reached_from_the_first_one() -> None:
+    reached, new = set[str](), {"index"}
+    while new:
+        reached |= new
+        new = {name for page in new for name in contents(page)} - reached
+    assert reached == set(PAGES)
+
+
+def test_names_on_the_pages_exist() -> None:
+    """Whatever a page calls `oc.name` or `oc.module.name`."""
+    used = {name for page in PAGES.values() for name in re.findall(r"\boc\.(\w+(?:\.\w+)?)", page)}
+    assert len(used) > 40
+    assert [name for name in sorted(used) if not exists(name)] == []
+
+
+def exists(name: str) -> bool:
+    part: object = orthocas
+    for word in name.split("."):
+        part = getattr(part, word, None)
+    return part is not None
+
+
+def test_formulas_of_docstrings_become_markup() -> None:
+    pytest.importorskip("sphinx")
+    markup = import_module("plain_formulas").markup
+    assert markup("J_x A^-1 J_xi^T = 0") == r"J\ :sub:`x`\  A\ :sup:`-1`\  J\ :sub:`ξ`\ \ :sup:`T`\  = 0"
+    assert markup("`xi_1` and lambda1 |dxi_j|, see [AS2023]") == (
+        r"``xi_1`` and λ1 \|dξ\ :sub:`j`\ \|, see :doc:`[AS2023] </reference/references>`"
+    )
+
+
+def test_formulas_in_the_text_of_pages_get_indices_and_powers_and_names_do_not() -> None:
+    pytest.importorskip("sphinx")
+    raised = import_module("plain_formulas").raised
+
+    def shown(text: str) -> str:
+        signs = {"subscript": "<{}>", "superscript": "^<{}>"}
+        return "".join(signs.get(type(node).__name__, "{}").format(node.astext()) for node in raised(text))
+
+    assert shown("M_φ⁻¹, dξ_j(q), v_x,iᵀ and |e|²_A⁻¹") == "M<φ>⁻¹, dξ<j>(q), v<x,i>ᵀ and |e|²<A⁻¹>"
+    assert shown("K^½ZM^½ and J_x^#") == "K^<½>ZM^<½> and J<x>^<#>"
+    for name in ("planar_3r_xy", "OUTSIDE_DOMAIN", "task_std_deg", "ros2_control"):
+        assert shown(name) == name
+
+
+HOW_TO = [name for name in PAGES if name.startswith("how-to/")]
+
+
+@pytest.mark.parametrize("name", HOW_TO)
+def test_how_to_pages_are_short(name: str) -> None:
+    """At most 800 words beside their code; explanations and tables of measurements have other pages."""
+    text = re.sub(r"^( *)```.*?^\1```$", "", PAGES[name], flags=re.DOTALL | re.MULTILINE)
+    assert len(text.split()) <= 800
+
+
+def test_the_navigation_has_about_thirty_pages() -> None:
+    """Of two levels; other pages stand below one of these."""
+    assert 25 <= len(contents("index")) <= 36

@@ -1,0 +1,54 @@
+"""Series of calls that threads share."""
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from public_objects import circle, disk, fitted, impedance, network, points_of, states_of
+
+import orthocas as oc
+from orthocas.control import Controller
+from orthocas.tools.batch import Batched
+from orthocas.tools.checks import Array
+
+Call = Callable[[int], Any]  #: the k-th call of a series
+
+
+def calls_of_chart(chart: oc.Chart) -> list[Call]:
+    """Methods of a chart at points that change from call to call."""
+    q = points_of(chart)
+    phi = chart.phi(q)
+    fitted_calls: list[Call] = [
+        lambda k: np.asarray(chart.function("phi")(q[k % 6])),
+        lambda k: np.asarray(chart.function("jacobian")(q[k % 6])),
+        lambda k: np.hstack([*chart.quality(q[k % 6]).as_dict().values()]),
+    ]
+    return [
+        lambda k: chart.phi(q[k % 6]),
+        lambda k: chart.jacobian(q[: 1 + k % 6]),
+        lambda k: chart.inverse(phi[k % 6], q[k % 6] + 0.02),
+        lambda k: chart.solve(phi[k % 6 :]).q,
+        lambda k: chart.problem.robot.mass_matrix(q[k % 6]),
+        *([] if isinstance(chart, oc.GrownChart) else fitted_calls),
+    ]
+
+
+def calls_of_law(law: Controller) -> list[Call]:
+    """A law at states that change from call to call."""
+    states = states_of(law)
+    batched = Batched(law.function)
+
+    def command(k: int) -> Array:
+        return np.hstack(batched(*(part[k % 4 :][:1] for part in states)))
+
+    return [command]
+
+
+SERIES: dict[str, tuple[Callable[[], list[Call]], int]] = {  #: of 5,000 calls
+    "polynomial": (lambda: calls_of_chart(copy.deepcopy(fitted().chart)), 2400),
+    "network": (lambda: calls_of_chart(copy.deepcopy(network())), 1200),
+    "circle": (lambda: calls_of_chart(copy.deepcopy(circle())), 60),
+    "disk": (lambda: calls_of_chart(copy.deepcopy(disk())), 40),
+    "law": (lambda: calls_of_law(copy.deepcopy(impedance())), 1300),
+}
