@@ -19,13 +19,13 @@ from orthocas.charts.chart_file import CHART
 from orthocas.charts.ready import Card, card, load, names
 from orthocas.cli.options import AsJson, ChartPath, Force, parse_number, parse_whole_number
 from orthocas.cli.output import (
+    build_reach_data,
+    format_reach_rows,
+    format_report_rows,
     note,
     print_json,
     print_rows,
     print_table,
-    reach_data,
-    reach_rows,
-    report_rows,
     terminal_monitor,
 )
 from orthocas.codegen.export import LIBRARIES
@@ -56,7 +56,7 @@ def charts(
             print_json({"charts": [ready.as_dict() for ready in cards]})
         else:
             head = ("name", "robot", "n", "m", "r", "leak [deg]", "least conditioning", "licence")
-            print_table([head, *map(_card_row, cards)])
+            print_table([head, *map(_format_card, cards)])
         return
     ready = card(name)
     if out is not None:
@@ -69,7 +69,7 @@ def charts(
         print_rows({**ready.facts(), **commands, **written})
 
 
-def _card_row(ready: Card) -> tuple[str, ...]:
+def _format_card(ready: Card) -> tuple[str, ...]:
     numbers = ready.quality
     sizes = (str(numbers[name]) for name in "nmr")
     leak, least = f"{numbers['leak_deg']['rms']:.2f}", f"{numbers['conditioning']['min']:.2f}"
@@ -93,9 +93,9 @@ def evaluate(
     loaded = Chart.load(chart)
     report = quality.evaluate(loaded, samples, seed)
     if json:
-        print_json({**report.as_dict(), **reach_data(loaded)})
+        print_json({**report.as_dict(), **build_reach_data(loaded)})
     else:
-        print_rows({**report_rows(report), **reach_rows(loaded)})
+        print_rows({**format_report_rows(report), **format_reach_rows(loaded)})
 
 
 def certify(

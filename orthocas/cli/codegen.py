@@ -23,13 +23,13 @@ CONTROLLERS = law_names()
 _NONE = "none"
 
 
-def with_settings(for_codegen: bool) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def add_law_options(for_codegen: bool) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """A decorator of commands: the settings of all laws, as options, take the place of the parameter `settings`.
 
     The command gets those that were given, by name, as texts.
     """
     options = {
-        name: Annotated[str | None, typer.Option(_option(name, setting), help=_help(name, setting))]
+        name: Annotated[str | None, typer.Option(_name_option(name, setting), help=_describe_option(name, setting))]
         for law in map(law_of, law_names())
         for name, setting in law.options.items()
         if for_codegen or not setting.codegen_only
@@ -39,20 +39,20 @@ def with_settings(for_codegen: bool) -> Callable[[Callable[..., None]], Callable
     )
 
 
-def _option(name: str, setting: Setting) -> str:
+def _name_option(name: str, setting: Setting) -> str:
     return setting.option or f"--{name.replace('_', '-')}"
 
 
-def _help(name: str, setting: Setting) -> str:
-    takers = _laws_with(name)
+def _describe_option(name: str, setting: Setting) -> str:
+    takers = _find_laws_with(name)
     return setting.help + ("" if len(takers) == len(law_names()) else f" For {', '.join(takers)}.")
 
 
-def _laws_with(setting: str) -> list[str]:
+def _find_laws_with(setting: str) -> list[str]:
     return [law for law in law_names() if setting in law_of(law).options]
 
 
-@with_settings(for_codegen=True)
+@add_law_options(for_codegen=True)
 def codegen(
     chart: ChartPath,
     controller: Annotated[str, typer.Option("--controller", help=f"Control law: {', '.join(CONTROLLERS)} or {_NONE}.")],
@@ -83,16 +83,16 @@ def codegen(
         generated = generate_c(loaded, out, law, name, force, single_precision=single_precision)
         remarks = [] if law is None else law.remarks()
     proof = check_c(generated, loaded, law) if check else None
-    report = _report(generated, proof)
+    report = _build_report(generated, proof)
     if json:
         print_json(report)
     else:
-        print_rows(_rows(report))
+        print_rows(_format_rows(report))
     for remark in remarks:
         note(remark)
 
 
-def _report(generated: GeneratedC, proof: Proof | None) -> dict[str, Any]:
+def _build_report(generated: GeneratedC, proof: Proof | None) -> dict[str, Any]:
     source = generated.folder / f"{generated.name}.c"
     return {
         "name": generated.name,
@@ -105,7 +105,7 @@ def _report(generated: GeneratedC, proof: Proof | None) -> dict[str, Any]:
     }
 
 
-def _rows(report: dict[str, Any]) -> dict[str, str]:
+def _format_rows(report: dict[str, Any]) -> dict[str, str]:
     rows = {
         "library": f"{report['name']}: {report['lines']} lines of C99, {report['source']}",
         "stack": f"{report['stack_bytes']} bytes at most per call",
@@ -129,8 +129,8 @@ def require_settings(name: str, settings: Mapping[str, str]) -> None:
     law = law_of(name)
     for field in settings:
         if field not in law.options:
-            takers = _laws_with(field)
-            option = _option(field, law_of(takers[0]).options[field])
+            takers = _find_laws_with(field)
+            option = _name_option(field, law_of(takers[0]).options[field])
             raise OptionError(f"{name} has no {option}, which belongs to {', '.join(takers)}")
 
 
@@ -144,7 +144,7 @@ def build_controller(name: str, chart: Chart, settings: Mapping[str, str], limit
     values: dict[str, Any] = {}
     for field, text in settings.items():
         setting = law.options[field]
-        values[field] = text if setting.is_word else parse_one_or_all(_option(field, setting), text)
+        values[field] = text if setting.is_word else parse_one_or_all(_name_option(field, setting), text)
     with warnings.catch_warnings():
         # commands print the remarks of the law instead
         warnings.simplefilter("ignore", LawWarning)

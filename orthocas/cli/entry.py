@@ -43,14 +43,14 @@ def main() -> None:
     watched = signal.getsignal(signal.SIGINT) is _leave
     # Pictures go to files. Another name that the variable may have would stop matplotlib.
     os.environ["MPLBACKEND"] = "agg"
-    app = commands.app_for(sys.argv[1:])
+    app = commands.build_app(sys.argv[1:])
     try:
         if watched:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         code = commands.run(app)
         sys.stdout.flush()
     except KeyboardInterrupt:
-        code = commands.interrupted()
+        code = commands.report_interrupt()
     finally:
         # While Python ends, it runs no handlers any more.
         if watched:

@@ -26,20 +26,20 @@ from orthocas.cli.options import (
     ProblemOptions,
     SampleCount,
     WeightsText,
+    add_problem_options,
     is_robot_file,
     parse_number,
     parse_weights,
     parse_whole_number,
-    with_problem_options,
 )
 from orthocas.cli.output import (
+    build_reach_data,
+    format_reach_rows,
+    format_report_rows,
     note,
     print_json,
     print_rows,
     print_table,
-    reach_data,
-    reach_rows,
-    report_rows,
     terminal_monitor,
 )
 from orthocas.control.holding import holding_doubts
@@ -73,7 +73,7 @@ _IN_CORRIDOR = "polynomial:3:cyclic"  # more terms gain little there
 _WIDE_ROWS = ("regular", "left out", "meaning")  # facts of wide fits
 
 
-@with_problem_options(*CHAIN, *DOMAIN)
+@add_problem_options(*CHAIN, *DOMAIN)
 def fit(
     problem: ProblemName,
     words: ProblemOptions,
@@ -176,7 +176,7 @@ def fit(
             if kind == _AUTO:
                 built, suggestion = _suggest_problem(problem, words, parametrisation, bounds, loss, seed, monitor)
                 if (minimiser, samples, max_mutual_deg, like) == (None,) * 4:
-                    result = _confirming_fit(suggestion, built, parametrisation)
+                    result = _reuse_fit(suggestion, built, parametrisation)
             elif kind == _BRANCH:
                 result = _fit_wide(problem, words, branch, quantities, parametrisation, samples, seed, monitor)
             if result is None:
@@ -229,7 +229,7 @@ def _build_problem(name: str, words: ProblemOptions, corridor: Path | None) -> P
     if corridor is None:
         return words.build_problem(name)
     words.require_none(("centre", "home", "least_singular_value"), "--corridor is a domain")
-    radius = words.half_widths()
+    radius = words.parse_half_width()
     if radius is not None and not isinstance(radius, float):
         raise InvalidValueError("--half-width", words.half_width, "one number: the radius of the corridor")
     known = replace(words, half_width=None).build_problem(name)
@@ -249,8 +249,8 @@ def _suggest_problem(
     words.require_none(("half_width",), "--domain auto finds the half-width")
     words.require_none(("least_singular_value",), "--domain auto stays clear of singular postures")
     base = None if is_robot_file(name) else words.build_problem(name)
-    robot, task, metric = _robot_task_metric(name, words, base)
-    home = words.home or (words.centre_of(robot) if base is None else base.domain.centre)
+    robot, task, metric = _build_parts(name, words, base)
+    home = words.home or (words.find_centre(robot) if base is None else base.domain.centre)
     suggestion = suggest_domain(
         robot,
         task,
@@ -266,9 +266,7 @@ def _suggest_problem(
     return Problem(robot, task, metric, suggestion.domain, Path(name).stem if base is None else base.name), suggestion
 
 
-def _confirming_fit(
-    suggestion: DomainSuggestion, built: Problem, parametrisation: Parametrisation | None
-) -> Fit | None:
+def _reuse_fit(suggestion: DomainSuggestion, built: Problem, parametrisation: Parametrisation | None) -> Fit | None:
     """The fit that confirmed the domain, if it has the family that is asked for."""
     default = default_parametrisation(built, True) == default_parametrisation(built, False)
     if parametrisation is None and not default:
@@ -289,7 +287,7 @@ def _fit_wide(
     """Fit the wide chart of `--domain branch`; the home chooses the branch if it has no name."""
     words.require_none(("centre", "half_width"), "--domain branch is a domain")
     base = None if is_robot_file(name) else replace(words, least_singular_value=None).build_problem(name)
-    robot, task, metric = _robot_task_metric(name, words, base)
+    robot, task, metric = _build_parts(name, words, base)
     centre = None if base is None or branch else base.domain.centre
     with warnings.catch_warnings():
         # commands print a note instead
@@ -309,7 +307,7 @@ def _fit_wide(
         )
 
 
-def _robot_task_metric(name: str, words: ProblemOptions, base: Problem | None) -> tuple[Robot, Task, Metric | str]:
+def _build_parts(name: str, words: ProblemOptions, base: Problem | None) -> tuple[Robot, Task, Metric | str]:
     """Those of a named problem, or those that the options describe for a robot file."""
     if base is not None:
         return base.robot, base.task, base.metric
@@ -329,19 +327,21 @@ def _save_and_report(
     result.chart.save(target, force)
     report = evaluate(result.chart, seed=seed + 1)
     if json:
-        print_json(_fit_data(result, report, target, suggestion))
+        print_json(_describe_fit(result, report, target, suggestion))
     else:
-        print_rows({**_fit_rows(result, report, target), **({} if suggestion is None else _domain_rows(suggestion))})
+        print_rows(
+            {**_format_fit(result, report, target), **({} if suggestion is None else _format_domain(suggestion))}
+        )
     if result.status is Status.INTERRUPTED:
         note("interrupted: the chart holds the best coordinates found so far")
         raise typer.Exit(INTERRUPTED)
 
 
-def _fit_rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
+def _format_fit(result: Fit, report: Report, target: Path) -> dict[str, str]:
     """What a fit prints."""
     coordinates, robot = result.chart.coordinates, result.chart.problem.robot
     # Wide fits have no --weights.
-    rows = report.facts() if isinstance(result, WideFit) else report_rows(report)
+    rows = report.facts() if isinstance(result, WideFit) else format_report_rows(report)
     rows["robot"] = f"{robot.n} joints, {'tip' if len(robot.tips) == 1 else 'tips'} {listed(robot.tips)}"
     rows["fit"] = f"{coordinates.label}, {result.seconds:.2f} s, {result.status.value}"
     if isinstance(result, WideFit) and result.branch is not None:
@@ -372,10 +372,10 @@ def _fit_rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
         rows["clear part"] = (
             f"--least-singular-value {bound:g} leaves out singular positions and keeps {percent(share)}"
         )
-    return {**rows, **reach_rows(result.chart), "chart": str(target)}
+    return {**rows, **format_reach_rows(result.chart), "chart": str(target)}
 
 
-def _domain_rows(suggestion: DomainSuggestion) -> dict[str, str]:
+def _format_domain(suggestion: DomainSuggestion) -> dict[str, str]:
     """What ends the domain in each joint."""
     rows = {"home": f"{number_list(suggestion.home)} ({suggestion.home_source})"}
     for joint in suggestion.joints:
@@ -383,7 +383,7 @@ def _domain_rows(suggestion: DomainSuggestion) -> dict[str, str]:
     return rows
 
 
-def _wide_data(result: Fit) -> dict[str, Any]:
+def _describe_wide(result: Fit) -> dict[str, Any]:
     if not isinstance(result, WideFit) or result.branch is None:
         return {}
     meaning = None if result.meaning is None else {"like": result.chart.notes["meaning"], **asdict(result.meaning)}
@@ -394,18 +394,18 @@ def _wide_data(result: Fit) -> dict[str, Any]:
     }
 
 
-def _fit_data(result: Fit, report: Report, target: Path, suggestion: DomainSuggestion | None) -> dict[str, Any]:
+def _describe_fit(result: Fit, report: Report, target: Path, suggestion: DomainSuggestion | None) -> dict[str, Any]:
     check = result.problem_check
     return {
         **({} if suggestion is None else {"suggested_domain": suggestion.as_dict()}),
         "chart": str(target),
         "tips": list(result.chart.problem.robot.tips),
-        **reach_data(result.chart),
+        **build_reach_data(result.chart),
         "parametrisation": result.chart.coordinates.label,
         "status": result.status.value,
         "seconds": result.seconds,
         "idle_joints": list(result.idle_joints),
-        **_wide_data(result),
+        **_describe_wide(result),
         "least_conditioning": None if result.worst is None else result.worst.least,
         "cyclic_joints": list(result.cyclic_joints),
         "near_singular_share": check.singular_share,
@@ -523,7 +523,7 @@ def demo(
         f"  task angles    std {found['task_std_deg']:.2f} deg   (paper's network: {_PAPER['task']})",
         f"  mutual angles  std {found['mutual_std_deg']:.2f} deg   (paper's network: {_PAPER['mutual']})",
         f"  conditioning   mean {found['conditioning_mean']:.3f}, least found {found['conditioning_min']:.3f}",
-        *(f"  {name:<13}  {text}" for name, text in reach_rows(fit.chart).items()),
+        *(f"  {name:<13}  {text}" for name, text in format_reach_rows(fit.chart).items()),
         f"  fitted in      {found['seconds']:.1f} s       (paper: {_PAPER['minutes']} min on a GPU)",
         f"  chart and pictures in {out}/; try orthocas view {out / 'iiwa.orthocas'}",
     )

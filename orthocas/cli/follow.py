@@ -85,7 +85,7 @@ def follow(
     seconds = time.perf_counter() - begin
     motion.save_csv(out, force)
     if json:
-        print_json(_report(motion, seconds, out))
+        print_json(_build_report(motion, seconds, out))
     else:
         print_rows({**motion.facts(), "computed in": f"{seconds:.2f} s", "file": str(out)})
 
@@ -115,7 +115,7 @@ def _build_obstacle(text: str) -> Obstacle:
     return Plane(values[:3], values[3:])
 
 
-def _report(motion: JointMotion, seconds: float, out: Path) -> dict[str, Any]:
+def _build_report(motion: JointMotion, seconds: float, out: Path) -> dict[str, Any]:
     r = motion.xi.shape[1]
     return {
         "duration": motion.duration,

@@ -8,8 +8,8 @@ import typer
 
 from orthocas import problems
 from orthocas.bases.cyclic import cyclic_joints
-from orthocas.cli.options import AsJson, ProblemName, ProblemOptions, is_robot_file, with_problem_options
-from orthocas.cli.output import print_json, print_rows, reach_data
+from orthocas.cli.options import AsJson, ProblemName, ProblemOptions, add_problem_options, is_robot_file
+from orthocas.cli.output import build_reach_data, print_json, print_rows
 from orthocas.errors import OptionError, RobotError, SingularTaskError
 from orthocas.exact.involutivity import involutivity
 from orthocas.robots.robot import Robot
@@ -28,7 +28,7 @@ _FAULTS = ("near_singular_share", "half_turn_share")
 _SHARES = ("share", "clear_share", "share of the branch", "branches", *_FAULTS)  #: names of numbers to show in percent
 
 
-@with_problem_options("tip", "lock", "tool", "base")
+@add_problem_options("tip", "lock", "tool", "base")
 def info(
     target: ProblemName,
     words: ProblemOptions,
@@ -40,44 +40,43 @@ def info(
     """Show a chart file, a named problem, or a robot file."""
     if is_robot_file(target):
         robot = words.build_robot(target)
-        data = {**_robot(robot), **_redundancy(robot), **(_branches(robot, None) if branches else {})}
+        data = {
+            **_describe_robot(robot),
+            **_describe_redundancy(robot),
+            **(_describe_branches(robot, None) if branches else {}),
+        }
     elif target in problems.names():
         problem = words.build_problem(target)
-        data = {**_problem(problem), **(_branches(problem.robot, problem.task) if branches else {})}
+        data = {**_describe_problem(problem), **(_describe_branches(problem.robot, problem.task) if branches else {})}
     elif branches:
         raise OptionError(f"--branches requires a robot file or a named problem, not the chart {target}")
     else:
         words.require_no_robot(f"the chart {target}")
-        chart = _load(_chart_path(target))
+        chart = _load_chart(target)
         data = {
-            **_problem(chart.problem),
+            **_describe_problem(chart.problem),
             "parametrisation": chart.coordinates.label,
             "parameters": chart.coordinates.size,
-            **reach_data(chart),
+            **build_reach_data(chart),
             "notes": dict(chart.notes),
             **({"certificate": chart.certificate.as_dict()} if chart.certificate else {}),
         }
     if json:
         print_json(data)
     else:
-        print_rows({name: _text(value, name) for name, value in data.items()})
+        print_rows({name: _format(value, name) for name, value in data.items()})
 
 
-def _load(path: Path) -> "Chart":
+def _load_chart(target: str) -> "Chart":
+    """The chart of a file; a target that is no file but looks like a name raises an error with the known names."""
     from orthocas.charts.chart import load  # takes long to import, and problems and robots do not need it
 
-    return load(path)
-
-
-def _chart_path(target: str) -> Path:
-    """The path of a chart; a target that is no file but looks like a name raises an error with the known names."""
-    path = Path(target)
-    if not path.exists() and not path.suffix:
+    if not Path(target).exists() and not Path(target).suffix:
         ProblemOptions().build_problem(target)
-    return path
+    return load(target)
 
 
-def _robot(robot: Robot) -> dict[str, Any]:
+def _describe_robot(robot: Robot) -> dict[str, Any]:
     return {
         "joints": list(robot.joint_names),
         "kinds": list(robot.tree.joint_kinds),
@@ -93,7 +92,7 @@ def _robot(robot: Robot) -> dict[str, Any]:
     }
 
 
-def _redundancy(robot: Robot) -> dict[str, Any]:
+def _describe_redundancy(robot: Robot) -> dict[str, Any]:
     """The number r = n - m of extra coordinates of each task that has some, and the joints that do not move it."""
     kinds = ("position", "pose", *(("relative_position", "relative_pose") if len(robot.tips) == 2 else ()))
     # No posture in which joints happen to be parallel.
@@ -110,7 +109,7 @@ def _redundancy(robot: Robot) -> dict[str, Any]:
     return {"extra_coordinates": found}
 
 
-def _branches(robot: Robot, task: Task | None) -> dict[str, Any]:
+def _describe_branches(robot: Robot, task: Task | None) -> dict[str, Any]:
     """The branches of the joint range: what cuts it, and for each its share of the clear positions and a posture.
 
     Branches that are too near to singular positions for the default clearance of wide charts have the one they allow.
@@ -125,7 +124,7 @@ def _branches(robot: Robot, task: Task | None) -> dict[str, Any]:
     }
 
 
-def _problem(problem: Problem) -> dict[str, Any]:
+def _describe_problem(problem: Problem) -> dict[str, Any]:
     found = check(problem)
     return {
         "problem": problem.name,
@@ -143,12 +142,12 @@ def _problem(problem: Problem) -> dict[str, Any]:
         "near_singular_share": found.singular_share,
         "half_turn_share": found.half_turn_share,
         "most_singular_point": list(found.most_singular_point),
-        **_involutivity(problem),
-        **_robot(problem.robot),
+        **_describe_involutivity(problem),
+        **_describe_robot(problem.robot),
     }
 
 
-def _involutivity(problem: Problem) -> dict[str, Any]:
+def _describe_involutivity(problem: Problem) -> dict[str, Any]:
     try:
         found = involutivity(problem)
     except (SingularTaskError, RobotError) as error:
@@ -161,11 +160,11 @@ def _involutivity(problem: Problem) -> dict[str, Any]:
     }
 
 
-def _text(value: Any, name: str = "") -> str:
+def _format(value: Any, name: str = "") -> str:
     if isinstance(value, list):
-        return ", ".join(_text(item) for item in value) or "none"
+        return ", ".join(_format(item) for item in value) or "none"
     if isinstance(value, dict):
-        return ", ".join(f"{key} {_text(item, name if name in _SHARES else key)}" for key, item in value.items())
+        return ", ".join(f"{key} {_format(item, name if name in _SHARES else key)}" for key, item in value.items())
     if value is None:
         return "unlimited"
     if isinstance(value, float) and name in _SHARES:

@@ -169,7 +169,7 @@ class ProblemOptions:
         tool = None if self.tool is None else parse_numbers("--tool", self.tool)
         gravity = None if self.gravity is None else parse_numbers("--gravity", self.gravity)
         tips = [name.strip() for name in (self.tip or "").split(",") if name.strip()]
-        return Robot.from_file(path, None, self.locked_joints(), tool, tips=tips, base=self.base, gravity=gravity)
+        return Robot.from_file(path, None, self.parse_locks(), tool, tips=tips, base=self.base, gravity=gravity)
 
     def build_problem(self, name: str) -> Problem:
         """Build the problem of a name, or of a robot file.
@@ -181,9 +181,9 @@ class ProblemOptions:
         if is_robot_file(name):
             robot = self.build_robot(name)
             task = Task.named(robot, self.task or "position")
-            centre = self.centre_of(robot)
+            centre = self.find_centre(robot)
             centre = regular_box(robot, task).centre if centre is None else centre
-            box = default_box(robot, centre, self.half_widths())
+            box = default_box(robot, centre, self.parse_half_width())
             return Problem(robot, task, self.metric or "euclidean", box, Path(name).stem, self.least_singular_value)
         if name not in problems.names():
             raise UnknownNameError("problem", name, (*problems.names(), "or a FILE.urdf"))
@@ -191,14 +191,14 @@ class ProblemOptions:
         if all(value in (None, ()) for value in astuple(self)):
             return base
         self.require_no_robot(f"the named problem '{name}'")
-        centre, half_widths, domain = self.centre_of(base.robot), self.half_widths(), base.domain
-        if centre is not None or half_widths is not None:
-            domain = default_box(base.robot, base.domain.centre if centre is None else centre, half_widths)
+        centre, parse_half_width, domain = self.find_centre(base.robot), self.parse_half_width(), base.domain
+        if centre is not None or parse_half_width is not None:
+            domain = default_box(base.robot, base.domain.centre if centre is None else centre, parse_half_width)
         task = base.task if self.task is None else Task.named(base.robot, self.task)
         metric = base.metric if self.metric is None else self.metric
         return Problem(base.robot, task, metric, domain, name, self.least_singular_value)
 
-    def locked_joints(self) -> dict[str, float]:
+    def parse_locks(self) -> dict[str, float]:
         """The joints and values of --lock."""
         locked = {}
         for word in self.lock:
@@ -208,7 +208,7 @@ class ProblemOptions:
             locked[joint] = float(parse_numbers(f"--lock {joint}", value)[0])
         return locked
 
-    def centre_of(self, robot: Robot) -> Array | None:
+    def find_centre(self, robot: Robot) -> Array | None:
         """The centre that --centre or --home gives; None without either."""
         if self.home is None:
             return None if self.centre is None else parse_numbers("--centre", self.centre)
@@ -216,7 +216,7 @@ class ProblemOptions:
             raise OptionError("--home and --centre both give the centre of the domain: leave out one")
         return robot.home(self.home)
 
-    def half_widths(self) -> Array | float | None:
+    def parse_half_width(self) -> Array | float | None:
         """One number for all joints, or one per joint."""
         return None if self.half_width is None else parse_one_or_all("--half-width", self.half_width)
 
@@ -226,7 +226,7 @@ def is_robot_file(name: str) -> bool:
     return Path(name).suffix.lower() in (".urdf", ".xml", ".xacro")
 
 
-def with_problem_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def add_problem_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """A decorator of commands: options of these names take the place of the parameter `words`, a `ProblemOptions`."""
     options = {name: _PROBLEM_OPTIONS[name] for name in names}
     return spread_options(

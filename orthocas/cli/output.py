@@ -50,7 +50,7 @@ def note(text: str) -> None:
     typer.echo(f"note: {one_line(text)}", err=True)
 
 
-def report_rows(report: "Report") -> dict[str, str]:
+def format_report_rows(report: "Report") -> dict[str, str]:
     """The rows of a quality report, with advice on command-line options."""
     rows = report.facts()
     if report.length_ratio > _UNEVEN:
@@ -58,14 +58,14 @@ def report_rows(report: "Report") -> dict[str, str]:
     return rows
 
 
-def reach_rows(chart: "Chart") -> dict[str, str]:
+def format_reach_rows(chart: "Chart") -> dict[str, str]:
     """The ranges of xi in one row."""
     if (reach := _find_reach(chart)) is None:
         return {}
     return {"xi reach": ", ".join(f"{part.label} {part.low:.3g} to {part.high:.3g}" for part in reach)}
 
 
-def reach_data(chart: "Chart") -> dict[str, Any]:
+def build_reach_data(chart: "Chart") -> dict[str, Any]:
     """The ranges of xi and what stops them there, for JSON."""
     if (reach := _find_reach(chart)) is None:
         return {}

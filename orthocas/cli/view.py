@@ -9,7 +9,7 @@ import typer
 
 from orthocas import problems
 from orthocas.charts.chart import Chart
-from orthocas.cli.options import AsJson, Force, ProblemOptions, is_robot_file, parse_whole_number, with_problem_options
+from orthocas.cli.options import AsJson, Force, ProblemOptions, add_problem_options, is_robot_file, parse_whole_number
 from orthocas.cli.output import note, print_json, print_rows
 from orthocas.errors import OptionError
 from orthocas.paths.tool_path import read_path
@@ -33,7 +33,7 @@ class _Scene:
     locked: dict[str, float]
 
 
-@with_problem_options("tip", "lock")
+@add_problem_options("tip", "lock")
 def view(
     target: Annotated[
         str,
@@ -85,7 +85,7 @@ def view(
 def _read_scene(target: str, chart: Path | None, meshes: Path | None, words: ProblemOptions) -> _Scene:
     """What the target is: by its suffix, or a folder of a run, or the name of a problem."""
     place = Path(target)
-    locked = words.locked_joints()
+    locked = words.parse_locks()
     if is_robot_file(target):
         meshes = place if meshes is None and place.suffix.lower() == ".urdf" else meshes
         return _Scene(words.build_robot(target), None, meshes, locked)

@@ -335,30 +335,25 @@ def save_animation(
     require_format(target.suffix.removeprefix("."))
     require_writable(target, ArchiveError)
     require_replaceable_files(target.parent, [target.name], force)
-    instants, speed = _choose_instants(trajectory.times)
+    # Frames at instants of the run, which plays faster than real time if it is long.
+    times = trajectory.times
+    speed = max(1.0, float(times[-1] - times[0]) * RULES.rate / RULES.most_frames)
+    shown = np.arange(times[0], times[-1] + 1e-9, speed / RULES.rate)
+    instants = np.clip(np.searchsorted(times, shown - 1e-9), 0, len(times) - 1)
     film = MovingPicture(trajectory, problem, speed)
     samples = np.vstack(list(film.pictures(instants[[0, -1]])))
-    pictures = _report_pictures(film.pictures(instants), len(instants), monitor)
+
+    def draw() -> Iterator[Frame]:
+        for k, picture in enumerate(film.pictures(instants), start=1):
+            yield picture
+            monitor(Progress("draw animation", k / len(instants), f"frame {k} of {len(instants)}"))
+
     with published(target.parent, listed=True, force=force) as folder:
         draft = folder / target.name
         if target.suffix == ".gif":
-            _write_gif(draft, pictures, samples)
+            _write_gif(draft, draw(), samples)
         else:
-            _write_mp4(draft, pictures, (len(samples) // 2, samples.shape[1]))
-
-
-def _choose_instants(times: NDArray[np.float64]) -> tuple[NDArray[np.int_], float]:
-    """Indices of the instants to show, and the factor by which they play faster than real time."""
-    length = float(times[-1] - times[0])
-    speed = max(1.0, length * RULES.rate / RULES.most_frames)
-    wanted = np.arange(times[0], times[-1] + 1e-9, speed / RULES.rate)
-    return np.clip(np.searchsorted(times, wanted - 1e-9), 0, len(times) - 1), speed
-
-
-def _report_pictures(pictures: Iterator[Frame], count: int, monitor: Monitor) -> Iterator[Frame]:
-    for k, picture in enumerate(pictures, start=1):
-        yield picture
-        monitor(Progress("draw animation", k / count, f"frame {k} of {count}"))
+            _write_mp4(draft, draw(), (len(samples) // 2, samples.shape[1]))
 
 
 def _write_gif(path: Path, pictures: Iterator[Frame], samples: Frame) -> None:

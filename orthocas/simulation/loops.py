@@ -209,7 +209,8 @@ class CompiledLoop:
     def __init__(self, loop: ClosedLoop, reference: Reference) -> None:
         # CasADi may lose Ctrl-C while it builds functions.
         with deferred(), building:
-            self._law = _compile_law(loop.controller)
+            law = loop.controller
+            self._law = _compile_law(law.graph, law.measured, law.energy_graph)
             self._plant = _compile_plant(Keyed(loop.plant_key, loop))
             self._profile = _compile_profile(reference.profile)
         self._loop, self._gains = loop, list(loop.controller.gains.values())
@@ -240,20 +241,17 @@ class CompiledLoop:
         return compiled.Integrator(kernels, sizes, tolerance, step)
 
 
-def _compile_law(controller: Controller) -> Any:
-    """`command`, `measured` and `energy` of a law, compiled."""
-    return _compile_functions_of_law(controller.graph, controller.measured, controller.energy_graph)
-
-
 @lru_cache(KEPT)
-def _compile_functions_of_law(graph: ca.Function, measured: ca.Function, energy: ca.Function | None) -> Any:
+def _compile_law(graph: ca.Function, measured: ca.Function, energy: ca.Function | None) -> Any:
+    """`command`, `measured` and `energy` of a law, compiled."""
     functions = {"command": graph, "measured": measured, **({} if energy is None else {"energy": energy})}
     return _compile([_rename(name, function) for name, function in functions.items()])
 
 
 @lru_cache(KEPT)
 def _compile_plant(keyed: Keyed) -> Any:
-    return _compile([_share_parts(keyed.loop.plant_of_numbers)])
+    function = keyed.loop.plant_of_numbers
+    return _compile([scalar_code(_rename(function.name(), function))])
 
 
 @lru_cache(KEPT)
@@ -270,10 +268,6 @@ def _compile(functions: Sequence[ca.Function]) -> Any:
 def _rename(name: str, function: ca.Function) -> ca.Function:
     inputs = function.mx_in()
     return ca.Function(name, inputs, [ca.densify(out) for out in function.call(inputs)])
-
-
-def _share_parts(function: ca.Function) -> ca.Function:
-    return scalar_code(_rename(function.name(), function))
 
 
 def integrate(
@@ -418,17 +412,14 @@ def _build_ticks(loop: ClosedLoop, period: float, k: int, tolerance: float) -> T
         ticks = _build_tick(loop, period, k, tolerance).mapaccum(RULES.ticks)
 
     def run(state: Array, *columns: Array) -> tuple[Array, Array, Array]:
-        inputs = [ca.DM(_fill(column).T) for column in columns]
+        # The last row is repeated until there are as many rows as one call takes.
+        missing = RULES.ticks - len(columns[0])
+        inputs = [ca.DM(np.vstack([column, np.repeat(column[-1:], missing, axis=0)]).T) for column in columns]
         outputs = run_compiled(ticks, ca.DM(state), *inputs)
         states, commands, status = (np.asarray(out).T[: len(columns[0])] for out in outputs)
         return states, commands, status
 
     return run
-
-
-def _fill(rows: Array) -> Array:
-    """Repeat the last row until there are as many rows as one call takes."""
-    return np.vstack([rows, np.repeat(rows[-1:], RULES.ticks - len(rows), axis=0)])
 
 
 def _build_tick(loop: ClosedLoop, length: float, k: int, tolerance: float) -> ca.Function:

@@ -220,8 +220,12 @@ def mujoco_model(tree: KinematicTree, scene: MuJoCo, viscous: Array, coulomb: Ar
         _place_inertia(bodies[i].add_body(name=handle_name(i)), 0.0)
         joint = _add_joint(mj, bodies[i], tree, i, scene.stops)
         moved = joint if scene.elasticity is None else _add_rotor(mj, spec, joint, i, scene.elasticity.numbers(tree.n))
-        _add_friction(moved, viscous[i], coulomb[i])
-        _add_motor(mj, spec, moved.name, i, tree.effort_limits[i] if scene.effort_limits else np.inf)
+        moved.damping[0], moved.frictionloss = viscous[i], coulomb[i]
+        moved.solimp_friction[:2] = RULES.friction_impedance
+        motor = spec.add_actuator(name=f"motor{i}", target=moved.name, trntype=mj.mjtTrn.mjTRN_JOINT)
+        motor.set_to_motor()
+        if scene.effort_limits and np.isfinite(limit := tree.effort_limits[i]):
+            motor.forcelimited, motor.forcerange = mj.mjtLimited.mjLIMITED_TRUE, (-limit, limit)
     carrier = bodies[tree.tip_parent] if tree.tip_parent >= 0 else spec.worldbody
     tip = _add_body(mj, carrier, TIP, tree.tip_translation, tree.tip_rotation)
     if scene.wall is not None:
@@ -274,18 +278,6 @@ def _add_rotor(mj: ModuleType, spec: Any, joint: Any, i: int, numbers: tuple[Arr
     gear.wrap_joint(rotor.name, 1.0)
     gear.wrap_joint(joint.name, -1.0)
     return rotor
-
-
-def _add_friction(joint: Any, viscous: float, coulomb: float) -> None:
-    joint.damping[0], joint.frictionloss = viscous, coulomb
-    joint.solimp_friction[:2] = RULES.friction_impedance
-
-
-def _add_motor(mj: ModuleType, spec: Any, target: str, i: int, limit: float) -> None:
-    motor = spec.add_actuator(name=f"motor{i}", target=target, trntype=mj.mjtTrn.mjTRN_JOINT)
-    motor.set_to_motor()
-    if np.isfinite(limit):
-        motor.forcelimited, motor.forcerange = mj.mjtLimited.mjLIMITED_TRUE, (-limit, limit)
 
 
 def _add_wall(mj: ModuleType, spec: Any, tip: Any, wall: Wall) -> None:

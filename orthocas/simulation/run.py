@@ -267,9 +267,9 @@ def _check_settings(loop: ClosedLoop, reference: Reference, settings: Settings, 
         ),
         (settings.compiled and remembers, "compiled", True, "False for a law with a memory"),
     )
-    for wrong, name, value, expected in faults:
+    for wrong, argument, received, expected in faults:
         if wrong:
-            raise InvalidValueError(name, value, expected)
+            raise InvalidValueError(argument, received, expected)
 
 
 def _build_start(loop: ClosedLoop, q_start: ArrayLike, dq_start: ArrayLike | None) -> Array:
@@ -449,8 +449,8 @@ def simulate_many(
     runs = []
     for call in calls:
         named = {**_DEFAULTS, **call}
-        positional = [named.pop(name) for name in _POSITIONAL]
-        runs.append(partial(prepare(*positional, Settings(**named)).run, silent))
+        law, path, start = (named.pop(name) for name in _POSITIONAL)
+        runs.append(partial(prepare(law, path, start, Settings(**named)).run, silent))
     if THREADS > 1 and all(call.get("compiled") for call in calls):
         with ThreadPoolExecutor(THREADS) as pool:
             return _share_runs(pool, runs, monitor)

@@ -14,7 +14,7 @@ from orthocas.tools.checks import Array
 from orthocas.viewer.looks import RULES, Arm, Ghosts, Look, compute_chain_length
 from orthocas.viewer.panel import ChartPanel
 from orthocas.viewer.session import Session
-from orthocas.viewer.window import Loop, place_camera, place_floor, place_lights, place_panels, show_error
+from orthocas.viewer.window import Loop, place_panels, place_scene, show_error
 
 _NONE = "none"
 
@@ -31,9 +31,7 @@ class ChartPage:
         self._fans: list[Fan] = []
         robot = session.chart.problem.robot
         self._arm, self._ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
-        place_floor(server, robot)
-        place_lights(server, robot)
-        place_camera(server, robot, self.session.home[None])
+        place_scene(server, robot, self.session.home[None])
         self._handle = self._add_handle()
         self._readings = place_panels(server)
         self._sliders = self._add_sliders()

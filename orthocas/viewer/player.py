@@ -22,10 +22,8 @@ from orthocas.viewer.window import (
     compute_camera_direction,
     compute_up,
     open_window,
-    place_camera,
-    place_floor,
-    place_lights,
     place_panels,
+    place_scene,
     show_error,
 )
 
@@ -75,9 +73,7 @@ class PlayerPage:
         self._panel = PlayerPanel(robot, motions)
         self._loop = Loop(lambda: None, self._show_failure)
         self._now = 0.0
-        place_floor(server, robot)
-        place_lights(server, robot)
-        place_camera(server, robot, np.concatenate([pick_few(motion.q) for motion in motions]), self._stage.shifts)
+        place_scene(server, robot, np.concatenate([pick_few(motion.q) for motion in motions]), self._stage.shifts)
         self._readings = place_panels(server)
         self._add_controls()
         self._show(0.0)
@@ -105,8 +101,8 @@ class PlayerPage:
     async def _slide(self, event: Any) -> None:
         # Otherwise the page itself moved it.
         if event.client is not None:
-            wanted = float(event.target.value)
-            self._loop.ask("time", lambda: self._jump(wanted))
+            target = float(event.target.value)
+            self._loop.ask("time", lambda: self._jump(target))
 
     def _toggle(self) -> None:
         """Play from where the slider is, or stop."""
@@ -178,9 +174,7 @@ class RobotPage:
         self._home = robot.tree.middle
         self._robot, self._q = robot, self._home
         self._loop = Loop(lambda: None, partial(show_error, server))
-        place_floor(server, robot)
-        place_lights(server, robot)
-        place_camera(server, robot, self._home[None])
+        place_scene(server, robot, self._home[None])
         self._readings = place_panels(server)
         with server.gui.add_folder("Joints"):
             self._sliders = [self._add_slider(i) for i in range(robot.n)]
@@ -243,74 +237,54 @@ def record_scene(build: Scene) -> str:
         close_window(server)
 
 
-def build_chart_scene(chart: Chart, look: Look) -> Scene:
-    """Each coordinate in turn, from its lowest to its highest value and back, with the task held."""
+def show_chart(chart: Chart, look: Look, server: Any) -> tuple[float, Callable[[float], None]]:
+    """Each coordinate in turn, from its lowest to its highest value and back, with the task held; a `Scene`."""
+    robot, home = chart.problem.robot, chart.problem.domain.centre
+    fans = [fan_along(chart, home, k) for k in range(chart.r)]
+    arm, ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
+    place_scene(server, robot, np.concatenate([fan.spread(5) for fan in fans]))
+    above = robot.joint_points(home).max(axis=0) @ compute_up(robot) + 0.12 * compute_chain_length(robot.tree)
+    label = server.scene.add_label("/label", "", position=tuple(above * compute_up(robot)), anchor="bottom-center")
+    task, drawn = ", ".join(chart.labels[: chart.m]), -1
 
-    def build(server: Any) -> tuple[float, Callable[[float], None]]:
-        robot, home = chart.problem.robot, chart.problem.domain.centre
-        fans = [fan_along(chart, home, k) for k in range(chart.r)]
-        arm, ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
-        place_floor(server, robot)
-        place_lights(server, robot)
-        place_camera(server, robot, np.concatenate([fan.spread(5) for fan in fans]))
-        above = robot.joint_points(home).max(axis=0) @ compute_up(robot) + 0.12 * compute_chain_length(robot.tree)
-        label = server.scene.add_label("/label", "", position=tuple(above * compute_up(robot)), anchor="bottom-center")
-        shown = -1
+    def show(seconds: float) -> None:
+        nonlocal drawn
+        k = min(int(seconds / RULES.recorded_sweep), chart.r - 1)
+        if k != drawn:
+            ghosts.show(fans[k].spread(RULES.ghosts), fans[k].spread(4 * RULES.ghosts))
+            drawn = k
+        q = _find_position(chart, fans[k], seconds / RULES.recorded_sweep - k)
+        arm.show(q)
+        label.text = f"{fans[k].label} = {chart.xi(q)[k]:+.3f}   {task} held"
 
-        def show(seconds: float) -> None:
-            nonlocal shown
-            k = min(int(seconds / RULES.recorded_sweep), chart.r - 1)
-            if k != shown:
-                ghosts.show(fans[k].spread(RULES.ghosts), fans[k].spread(4 * RULES.ghosts))
-                shown = k
-            q = _find_position(chart, fans[k], seconds / RULES.recorded_sweep - k)
-            arm.show(q)
-            label.text = f"{fans[k].label} = {chart.xi(q)[k]:+.3f}   {_list_held(chart)} held"
-
-        return RULES.recorded_sweep * chart.r, show
-
-    return build
+    return RULES.recorded_sweep * chart.r, show
 
 
-def build_motion_scene(robot: Robot, look: Look, motions: Sequence[Motion]) -> Scene:
-    """Motions side by side."""
-
-    def build(server: Any) -> tuple[float, Callable[[float], None]]:
-        stage = Stage(server.scene, robot, look, motions)
-        place_floor(server, robot)
-        place_lights(server, robot)
-        place_camera(server, robot, np.concatenate([pick_few(motion.q) for motion in motions]), stage.shifts)
-        speed = max(1.0, stage.duration / RULES.recorded_length)
-        return stage.duration / speed, lambda seconds: stage.show(speed * seconds)
-
-    return build
+def show_motions(
+    robot: Robot, look: Look, motions: Sequence[Motion], server: Any
+) -> tuple[float, Callable[[float], None]]:
+    """Motions side by side; a `Scene`."""
+    stage = Stage(server.scene, robot, look, motions)
+    place_scene(server, robot, np.concatenate([pick_few(motion.q) for motion in motions]), stage.shifts)
+    speed = max(1.0, stage.duration / RULES.recorded_length)
+    return stage.duration / speed, lambda seconds: stage.show(speed * seconds)
 
 
-def build_robot_scene(robot: Robot, look: Look) -> Scene:
-    """A robot that stands still."""
-
-    def build(server: Any) -> tuple[float, Callable[[float], None]]:
-        arm = Arm(server.scene, "/arm", robot, look)
-        place_floor(server, robot)
-        place_lights(server, robot)
-        place_camera(server, robot, robot.tree.middle[None])
-        return 0.0, lambda seconds: arm.show(robot.tree.middle)
-
-    return build
+def show_robot(robot: Robot, look: Look, server: Any) -> tuple[float, Callable[[float], None]]:
+    """A robot that stands still; a `Scene`."""
+    arm = Arm(server.scene, "/arm", robot, look)
+    place_scene(server, robot, robot.tree.middle[None])
+    return 0.0, lambda seconds: arm.show(robot.tree.middle)
 
 
-def _find_position(chart: Chart, fan: Fan, share: float) -> Array:
-    """The joint position (n,) after a share of a sweep, exactly on the curve: from home to both ends and back."""
+def _find_position(chart: Chart, fan: Fan, fraction: float) -> Array:
+    """The joint position (n,) after a fraction of a sweep, exactly on the curve: from home to both ends and back."""
     here = np.interp(0.0, fan.arc_length, fan.xi)
     middle, half = (fan.xi[-1] + fan.xi[0]) / 2, (fan.xi[-1] - fan.xi[0]) / 2
     phase = np.arcsin(np.clip((here - middle) / max(half, 1e-12), -1, 1))
-    wanted = middle + 0.99 * half * np.sin(2 * np.pi * share + phase)
+    target = middle + 0.99 * half * np.sin(2 * np.pi * fraction + phase)
     order = np.argsort(fan.xi)
-    near = np.array([np.interp(wanted, fan.xi[order], column[order]) for column in fan.q.T])
+    near = np.array([np.interp(target, fan.xi[order], column[order]) for column in fan.q.T])
     phi = chart.phi(chart.problem.domain.centre)
-    phi[list(chart.labels).index(fan.label)] = wanted
+    phi[list(chart.labels).index(fan.label)] = target
     return chart.inverse(phi, near)
-
-
-def _list_held(chart: Chart) -> str:
-    return ", ".join(chart.labels[: chart.m])

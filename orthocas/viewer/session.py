@@ -135,7 +135,9 @@ class Session:
             if not self._find_far(here).any():
                 break
             if not self._step(here):
-                self._give_up(here)
+                # Aim at what there is in place of what cannot be, and say what is in the way.
+                self.stop = self._find_reason()
+                self._target = np.where(self._find_far(here), here, self._target)
                 break
             moved, self.stop = True, ""
         return moved
@@ -176,11 +178,6 @@ class Session:
                 self._limited = True
             share /= 2
         return False
-
-    def _give_up(self, here: Array) -> None:
-        """Wish for what there is in place of what cannot be, and say what is in the way."""
-        self.stop = self._find_reason()
-        self._target = np.where(self._find_far(here), here, self._target)
 
     def _find_far(self, here: Array) -> NDArray[np.bool_]:
         """Which components of phi are not yet what is wished for, (n,)."""

@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -16,15 +17,7 @@ from orthocas.tools.files import published, require_replaceable, require_writabl
 from orthocas.viewer.chart_page import ChartPage
 from orthocas.viewer.looks import Look, build_stick_arm, decimate, read_urdf_look
 from orthocas.viewer.motion import Motion, require_joints
-from orthocas.viewer.player import (
-    PlayerPage,
-    RobotPage,
-    Scene,
-    build_chart_scene,
-    build_motion_scene,
-    build_robot_scene,
-    record_scene,
-)
+from orthocas.viewer.player import PlayerPage, RobotPage, Scene, record_scene, show_chart, show_motions, show_robot
 from orthocas.viewer.session import Session
 from orthocas.viewer.window import LOCAL, close_window, open_window
 
@@ -152,11 +145,11 @@ def export_page(
     shape = build_shape(arm, robot_file, locked)
     scene: Scene
     if motions:
-        scene = build_motion_scene(arm, shape.look, motions)
+        scene = partial(show_motions, arm, shape.look, motions)
     elif isinstance(shown, Chart):
-        scene = build_chart_scene(shown, shape.look)
+        scene = partial(show_chart, shown, shape.look)
     else:
-        scene = build_robot_scene(arm, shape.look)
+        scene = partial(show_robot, arm, shape.look)
     page = record_scene(scene)
     with published(target.parent) as drafts:
         (drafts / target.name).write_bytes(page.encode() + _OURS)

@@ -481,6 +481,13 @@ def build_url(host: str, port: int) -> str:
     return f"http://{shown}:{port}"
 
 
+def place_scene(server: Any, robot: Robot, q: Array, shift: Array | None = None) -> None:
+    """A floor, lights, and a camera; see `place_camera`."""
+    place_floor(server, robot)
+    place_lights(server, robot)
+    place_camera(server, robot, q, shift)
+
+
 def place_camera(server: Any, robot: Robot, q: Array, shift: Array | None = None) -> None:
     """Look at an arm from the front and slightly above, or at a planar arm from the side where its plane is seen.
 

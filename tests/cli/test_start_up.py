@@ -6,7 +6,7 @@ import sys
 import pytest
 
 import orthocas as oc
-from orthocas.cli.commands import COMMANDS, app_for
+from orthocas.cli.commands import COMMANDS, build_app
 
 HEAVY = {"casadi", "numpy", "pinocchio", "scipy", "matplotlib", "trimesh", "igl", "skimage", "rich", "PIL", "mujoco"}
 
@@ -68,7 +68,7 @@ def test_unknown_names_are_errors() -> None:
 
 
 def test_help_tells_the_first_lines_of_all_commands() -> None:
-    app = app_for(list(COMMANDS))
+    app = build_app(list(COMMANDS))
     commands = {command.name: command for command in app.registered_commands}
     assert list(commands) == list(COMMANDS)
     for name, command in commands.items():

@@ -22,8 +22,8 @@ from orthocas.bases.family import JointSpace
 from orthocas.bases.given import sew_angle
 from orthocas.charts.certificate import PROVED
 from orthocas.charts.coordinates import Coordinates
-from orthocas.cli.fit import _fit_rows
-from orthocas.cli.output import report_rows
+from orthocas.cli.fit import _format_fit
+from orthocas.cli.output import format_report_rows
 from orthocas.codegen import check_c
 from orthocas.errors import (
     BranchWarning,
@@ -684,8 +684,8 @@ def test_command_notes_what_a_chart_leaves_out_of_its_branch(run: Run) -> None:
 
 def test_command_gives_no_advice_that_wide_fits_refuse() -> None:
     uneven = replace(oc.evaluate(wide_plane().chart, 500), length_ratio=50.0)
-    assert "--weights" in report_rows(uneven)["lengths"]
-    assert "--weights" not in _fit_rows(wide_plane(), uneven, Path("a.orthocas"))["lengths"]
+    assert "--weights" in format_report_rows(uneven)["lengths"]
+    assert "--weights" not in _format_fit(wide_plane(), uneven, Path("a.orthocas"))["lengths"]
 
 
 @pytest.mark.slow

@@ -243,7 +243,7 @@ def test_targets_are_drawn_for_positions_of_the_first_tip_only() -> None:
     for task, drawn in ((own, True), (other, False), (oc.Task.stack(own, other), False)):
         problem = oc.Problem(robot, task, domain=oc.Box(robot.tree.middle, 0.1))
         run: Any = SimpleNamespace(times=np.arange(3.0), q=q, reference=np.tile(task.batched(q[:1])[0], (3, 1)))
-        targets = figure._tip_targets(run, problem)
+        targets = figure._compute_tip_targets(run, problem)
         assert np.isfinite(targets).all() == drawn
         if drawn:
             np.testing.assert_allclose(targets, robot.tip_position(q), atol=1e-12)
