@@ -232,8 +232,8 @@ def _build_problem(name: str, words: ProblemOptions, corridor: Path | None) -> P
     radius = words.parse_half_width()
     if radius is not None and not isinstance(radius, float):
         raise InvalidValueError("--half-width", words.half_width, "one number: the radius of the corridor")
-    known = replace(words, half_width=None).build_problem(name)
-    return corridor_problem(known, read_postures(corridor, known.robot), RADIUS if radius is None else radius)
+    problem = replace(words, half_width=None).build_problem(name)
+    return corridor_problem(problem, read_postures(corridor, problem.robot), RADIUS if radius is None else radius)
 
 
 def _suggest_problem(
@@ -517,14 +517,14 @@ def demo(
     force: Force = False,
 ) -> None:
     """Fit coordinates for the 7-DoF arm of the paper, print their quality, save a chart and pictures (10 s)."""
-    fit, found = fit_demo(out, force=force)
+    fit, numbers = fit_demo(out, force=force)
     lines = (
         "KUKA iiwa, flange position, 4 extra coordinates on a cube of edge pi/2",
-        f"  task angles    std {found['task_std_deg']:.2f} deg   (paper's network: {_PAPER['task']})",
-        f"  mutual angles  std {found['mutual_std_deg']:.2f} deg   (paper's network: {_PAPER['mutual']})",
-        f"  conditioning   mean {found['conditioning_mean']:.3f}, least found {found['conditioning_min']:.3f}",
+        f"  task angles    std {numbers['task_std_deg']:.2f} deg   (paper's network: {_PAPER['task']})",
+        f"  mutual angles  std {numbers['mutual_std_deg']:.2f} deg   (paper's network: {_PAPER['mutual']})",
+        f"  conditioning   mean {numbers['conditioning_mean']:.3f}, least found {numbers['conditioning_min']:.3f}",
         *(f"  {name:<13}  {text}" for name, text in format_reach_rows(fit.chart).items()),
-        f"  fitted in      {found['seconds']:.1f} s       (paper: {_PAPER['minutes']} min on a GPU)",
+        f"  fitted in      {numbers['seconds']:.1f} s       (paper: {_PAPER['minutes']} min on a GPU)",
         f"  chart and pictures in {out}/; try orthocas view {out / 'iiwa.orthocas'}",
     )
     for line in lines:

@@ -97,7 +97,7 @@ def _describe_redundancy(robot: Robot) -> dict[str, Any]:
     kinds = ("position", "pose", *(("relative_position", "relative_pose") if len(robot.tips) == 2 else ()))
     # No posture in which joints happen to be parallel.
     q = robot.tree.middle + 0.1 * np.arange(1, robot.n + 1)
-    found, floating = {}, robot.tree.floating
+    coordinates, floating = {}, robot.tree.floating
     for kind in kinds:
         task = Task.named(robot, kind, q)
         J = task.batched_frame_jacobian(q[None])[0].reshape(task.m, robot.n)
@@ -105,8 +105,10 @@ def _describe_redundancy(robot: Robot) -> dict[str, Any]:
             columns = zip(robot.joint_names, J.T, strict=True)
             still = NEGLIGIBLE * np.abs(J).max()
             idle = [] if floating else [name for name, column in columns if np.abs(column).max() <= still]
-            found[kind] = f"r = {robot.n - len(floating) - task.m}" + (f", idle: {', '.join(idle)}" if idle else "")
-    return {"extra_coordinates": found}
+            coordinates[kind] = f"r = {robot.n - len(floating) - task.m}" + (
+                f", idle: {', '.join(idle)}" if idle else ""
+            )
+    return {"extra_coordinates": coordinates}
 
 
 def _describe_branches(robot: Robot, task: Task | None) -> dict[str, Any]:
@@ -114,18 +116,18 @@ def _describe_branches(robot: Robot, task: Task | None) -> dict[str, Any]:
 
     Branches that are too near to singular positions for the default clearance of wide charts have the one they allow.
     """
-    found = find_branches(robot, task)
-    lower = {item.name: item.clearance for item in found if item.clearance < CLEAR}
+    branching = find_branches(robot, task)
+    lower = {item.name: item.clearance for item in branching if item.clearance < CLEAR}
     return {
-        "cuts": [cut.explained for cut in found.cuts],
-        "branches": {item.name: item.share for item in found},
+        "cuts": [cut.explained for cut in branching.cuts],
+        "branches": {item.name: item.share for item in branching},
         **({"clearance_at_most": lower} if lower else {}),
-        "postures": {item.name: plain(item.posture) for item in found},
+        "postures": {item.name: plain(item.posture) for item in branching},
     }
 
 
 def _describe_problem(problem: Problem) -> dict[str, Any]:
-    found = check(problem)
+    checked = check(problem)
     return {
         "problem": problem.name,
         "n": problem.n,
@@ -139,9 +141,9 @@ def _describe_problem(problem: Problem) -> dict[str, Any]:
         "unbounded_joints": [problem.robot.joint_names[k] for k in problem.domain.unbounded],
         **problem.domain.numbers_of_condition(),
         "cyclic_joints": list(cyclic_joints(problem)),
-        "near_singular_share": found.singular_share,
-        "half_turn_share": found.half_turn_share,
-        "most_singular_point": list(found.most_singular_point),
+        "near_singular_share": checked.singular_share,
+        "half_turn_share": checked.half_turn_share,
+        "most_singular_point": list(checked.most_singular_point),
         **_describe_involutivity(problem),
         **_describe_robot(problem.robot),
     }
@@ -149,14 +151,14 @@ def _describe_problem(problem: Problem) -> dict[str, Any]:
 
 def _describe_involutivity(problem: Problem) -> dict[str, Any]:
     try:
-        found = involutivity(problem)
+        result = involutivity(problem)
     except (SingularTaskError, RobotError) as error:
         return {"verdict": f"unknown whether exact coordinates exist: {error}"}
     return {
-        "involutivity_defect": {"mean": found.mean, "max": found.max},
-        "expected_leak_deg": found.expected_leak_deg,
-        "expected_angle_deg": found.expected_angle_deg,
-        "verdict": found.verdict,
+        "involutivity_defect": {"mean": result.mean, "max": result.max},
+        "expected_leak_deg": result.expected_leak_deg,
+        "expected_angle_deg": result.expected_angle_deg,
+        "verdict": result.verdict,
     }
 
 

@@ -249,9 +249,11 @@ def build_report(controller: Controller, chart: Chart, plan: Plan, seen: Traject
     first = int(bad[0]) if bad.size else None
     status, cause = (ControlStatus(int(column[first or 0])) for column in (seen.status, seen.cause))
     inside = np.asarray(contains(chart.problem.domain, seen.q))
-    judged = plan.has_steps and not plan.pushes and seen.outcome is Outcome.COMPLETE and inside.all() and not bad.size
+    evaluated = (
+        plan.has_steps and not plan.pushes and seen.outcome is Outcome.COMPLETE and inside.all() and not bad.size
+    )
     largest = np.abs(seen.command).max(axis=0)
-    lasting = {status.name: seconds for status, seconds in seen.seconds_in_status.items()}
+    durations = {status.name: seconds for status, seconds in seen.seconds_in_status.items()}
     report = {
         "controller": controller.name,
         "coupling": controller.settings.get("coupling"),
@@ -260,14 +262,14 @@ def build_report(controller: Controller, chart: Chart, plan: Plan, seen: Traject
         "reason": seen.reason or None,
         "duration": float(seen.times[-1]),
         "tracking_error": dict(zip(seen.labels, seen.tracking_error, strict=True)),
-        "coupling_index": _evaluate_coupling(chart, plan.reference, seen) if judged else None,
+        "coupling_index": _evaluate_coupling(chart, plan.reference, seen) if evaluated else None,
         "angles_on_path": _evaluate_angles(chart, seen),
         "fallback": {
             "share": len(bad) / len(seen.times),
             "since": None if first is None else float(seen.times[first]),
             "reason": None if first is None else _REASONS[status if status in _REASONS else cause],
         },
-        "seconds_in_status": lasting,
+        "seconds_in_status": durations,
         "catches": [{"time": time, "cause": cause.name} for time, cause in seen.catches],
         "saturated_share": float(seen.saturated.mean()),
         "share_inside_domain": float(inside.mean()),
@@ -336,23 +338,23 @@ def format_fallback(report: dict[str, Any]) -> str | None:
 def _evaluate_angles(chart: Chart, seen: Trajectory) -> dict[str, Any] | None:
     """The paper's angles and the leak along the run; None where no gradient has a value."""
     try:
-        found = evaluate(chart, points=seen.q[np.isfinite(seen.q).all(axis=1)]).as_dict()
+        report = evaluate(chart, points=seen.q[np.isfinite(seen.q).all(axis=1)]).as_dict()
     except (SingularTaskError, InvalidValueError):
         return None
-    return {name: found[name] for name in ("task_angle_deg", "mutual_angle_deg", "leak_deg")}
+    return {name: report[name] for name in ("task_angle_deg", "mutual_angle_deg", "leak_deg")}
 
 
 def _evaluate_coupling(chart: Chart, reference: Reference, seen: Trajectory) -> dict[str, dict[str, float]]:
     """Commanded -> disturbed -> index, for quantities that were commanded alone."""
-    found = coupling_index(chart, reference, seen)
+    coupling = coupling_index(chart, reference, seen)
     return {
         commanded: {
-            disturbed: float(found.index[i, j])
-            for i, disturbed in enumerate(found.labels)
-            if isfinite(found.index[i, j])
+            disturbed: float(coupling.index[i, j])
+            for i, disturbed in enumerate(coupling.labels)
+            if isfinite(coupling.index[i, j])
         }
-        for j, commanded in enumerate(found.labels)
-        if np.isfinite(found.index[:, j]).any()
+        for j, commanded in enumerate(coupling.labels)
+        if np.isfinite(coupling.index[:, j]).any()
     }
 
 

@@ -117,10 +117,12 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
         return target
 
     def _read_joints(self) -> Array:
-        found = as_float_array("positions", self._positions(self.env))
-        if found.ndim != 1 or len(found) <= self._joints.max():
-            raise InvalidValueError("positions", f"of shape {found.shape}", f"a row with place {self._joints.max()}")
-        return np.asarray(found[self._joints])
+        positions = as_float_array("positions", self._positions(self.env))
+        if positions.ndim != 1 or len(positions) <= self._joints.max():
+            raise InvalidValueError(
+                "positions", f"of shape {positions.shape}", f"a row with place {self._joints.max()}"
+            )
+        return np.asarray(positions[self._joints])
 
     def _extend(self, observation: Array) -> Array:
         """An observation with xi and the distance to the boundary."""

@@ -100,10 +100,13 @@ def corridor_problem(problem: Problem, postures: ArrayLike, radius: float = RADI
     sizes = np.where(prismatic, RULES.prismatic * size, size)
     whole = joint_range(problem.robot, margin_deg)
     path = path[_thin_out(path / sizes)]
+
+    # Which joints only turn the whole task, or do not move it, is asked in the narrow corridor.
     narrow = Problem(problem.robot, problem.task, problem.metric, _build_corridor(whole, path, sizes), problem.name)
     names = problem.robot.joint_names
     cyclic = cyclic_joints(narrow)
     idle = idle_joints(narrow, sample_problem(narrow, RULES.samples, 0))
+    # These may take their whole range.
     for k in {*idle, *map(names.index, cyclic)}:
         sizes[k] = np.inf
     free = Problem(problem.robot, problem.task, problem.metric, _build_corridor(whole, path, sizes), problem.name)

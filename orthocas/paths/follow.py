@@ -95,16 +95,21 @@ def follow(
     stamp = as_number("period", period)
     if not 1e-5 <= stamp <= 10:
         raise InvalidValueError("period", period, "a time from 1e-5 to 10 s")
+
+    # phi(s) of the tool path, and q(s) with phi(q(s)) = phi(s).
     path = _read_tool_path(chart, tool_path, xi, start)
     solver = PhiSolver(chart)
     curve = JointCurve.trace(solver, path.phi, start)
     if isinstance(xi, str) and xi == OBJECTIVE:
         path, curve = _choose_xi(solver, path, curve, limits, start)
+    # Where it ends early, leaves the domain or comes too near to an obstacle, an error says why.
     if isinstance(curve, LostCurve):
         limits.check_kept(path, curve.s, curve.q)
         raise limits.build_lost_error(path, curve)
     s = path.list_checks()
     limits.check_kept(path, s, curve.q(s))
+
+    # The fastest s(t), then time stamps, slower until they keep the limits.
     _, first, second = curve.evaluate(list_places())
     law = compute_fastest_law(first, second, limits.velocity, limits.acceleration)
     return _sample_on_stamps(path, curve, law, limits, stamp)
@@ -140,18 +145,18 @@ def _read_limits(
     """Limits of all joints, > 0 and finite."""
     most = chart.problem.robot.velocity_limits if velocity is None else velocity
     speeds = _spread_limits(chart, "velocity_limits", most)
-    given = speeds / RULES.to_full_speed if acceleration is None else acceleration
+    accelerations = speeds / RULES.to_full_speed if acceleration is None else acceleration
     gap = as_number("clearance", clearance)
     if not 0 <= gap < np.inf:
         raise InvalidValueError("clearance", clearance, "a length >= 0 [m]")
-    return MotionLimits(chart, speeds, _spread_limits(chart, "acceleration_limits", given), distances, gap)
+    return MotionLimits(chart, speeds, _spread_limits(chart, "acceleration_limits", accelerations), distances, gap)
 
 
 def _spread_limits(chart: Chart, name: str, value: ArrayLike) -> Array:
-    given = as_float_array(name, value)
-    if given.shape not in ((), (chart.n,)):
-        raise InvalidValueError(name, f"an array of shape {given.shape}", f"one number, or {chart.n}")
-    limits = np.broadcast_to(given, (chart.n,))
+    values = as_float_array(name, value)
+    if values.shape not in ((), (chart.n,)):
+        raise InvalidValueError(name, f"an array of shape {values.shape}", f"one number, or {chart.n}")
+    limits = np.broadcast_to(values, (chart.n,))
     bad = np.flatnonzero(~((limits > 0) & np.isfinite(limits)))
     if bad.size:
         joint = chart.problem.robot.joint_names[bad[0]]
@@ -173,6 +178,7 @@ def _sample_on_stamps(
         law = law.stretch(stamps * period)
         times = period * np.arange(stamps + 1, dtype=float)
         s, q, dq, ddq = _evaluate_motion(curve, law, times)
+        # Stamps may fall on corners between the other instants.
         slower = _slow_down(law, limits, dq, ddq)
         if slower is law:
             break
@@ -239,9 +245,9 @@ class MotionLimits:
 
     def check_kept(self, path: ToolPath, s: Array, q: Array) -> None:
         """Raise PathError at the first place (P,) whose joint position (P, n) is lost, outside, or at an obstacle."""
-        known = np.flatnonzero(np.isfinite(q).all(axis=1))
-        free = (self.distances(q[known]) >= self.clearance).all(axis=1)
-        kept = known[contains(self.chart.problem.domain, q[known]) & free]
+        finite = np.flatnonzero(np.isfinite(q).all(axis=1))
+        free = (self.distances(q[finite]) >= self.clearance).all(axis=1)
+        kept = finite[contains(self.chart.problem.domain, q[finite]) & free]
         if len(kept) < len(q):
             raise self._build_error(path, s, q, int(np.setdiff1d(np.arange(len(q)), kept)[0]))
 
@@ -254,6 +260,7 @@ class MotionLimits:
         if not contains(self.chart.problem.domain, q[k]):
             reason = f"it leaves the domain, stopped by {Walls(self.chart.problem).worst(q[k])}"
             return PathError(f"the path cannot be followed {where}: {reason}{self._describe_reach(q[last])}")
+        # Neither lost nor outside: an obstacle.
         distance = self.distances(q[k])
         pair = self.distances.pairs[int(np.argmin(distance))]
         least = float(distance.min())
@@ -277,8 +284,8 @@ class MotionLimits:
             reach = xi_range(self.chart, q)
         except InvalidValueError:
             return ""
-        told = ", ".join(f"{part.label} in [{part.low:.4g}, {part.high:.4g}]" for part in reach)
-        return f"; just before, the coordinates reach {told} one at a time"
+        ranges = ", ".join(f"{part.label} in [{part.low:.4g}, {part.high:.4g}]" for part in reach)
+        return f"; just before, the coordinates reach {ranges} one at a time"
 
     def measure_margins(self, q: Array, dq: Array, ddq: Array) -> Margins:
         """What a motion leaves, at its time stamps."""
@@ -319,6 +326,7 @@ class Costs:
         domain = self.limits.chart.problem.domain
         bounded = np.flatnonzero(np.isfinite(bounds_of(domain)[0]))
         u = ((q - domain.centre) / domain.half_width)[:, bounded]
+        # u / sqrt(1 - u^2) in half-widths, and a straight line where that grows too steep.
         near = np.clip(u, -RULES.inside, RULES.inside)
         slopes = (1 - near**2) ** -1.5
         residuals = near / np.sqrt(1 - near**2) + (u - near) * slopes
@@ -357,9 +365,9 @@ def walk(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
     costs, as in resolved-rate control with gradient projection.
     """
     points = []
-    for wanted in x:
+    for target in x:
         for _ in range(RULES.walk_steps):
-            q = q + _compute_step(chart, costs, wanted, q)
+            q = q + _compute_step(chart, costs, target, q)
         points.append(q)
     return np.array(points)
 
@@ -367,6 +375,7 @@ def walk(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
 def _compute_step(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
     J = chart.relative.batched_rates(q[None])[0].reshape(chart.m, chart.n)
     inner = np.linalg.svd(J)[2][chart.m :].T  # (n, r)
+    # Within the null space a damped Gauss-Newton step, towards x the step of least norm.
     residuals, gradients = (part[0] for part in costs(q[None]))
     G = gradients @ inner
     along = -inner @ np.linalg.solve(G.T @ G + RULES.walk_damping * np.eye(chart.r), G.T @ residuals)
@@ -403,12 +412,14 @@ class XiChoice:
         pieces = _count_pieces(path)
         self.s = np.linspace(0.0, 1.0, RULES.cost_places * pieces + 1)
         self.nodes = np.linspace(0.0, 1.0, pieces + 1)
+        # Closed paths have the same value at both ends.
         unit = np.eye(pieces + 1)
         if path.closed:
             unit = np.vstack([unit[:pieces, :pieces], unit[:1, :pieces]])
         self._unit = unit
         basis = self._build_spline(unit)
         self._basis = basis(self.s)
+        # Little motion: the squares of xi' and xi'', as a quadratic form of the values.
         slopes, bends = basis(self.s, 1), basis(self.s, 2)
         self._smooth = (RULES.speed_weight * slopes.T @ slopes + RULES.bend_weight * bends.T @ bends) / len(self.s)
 
@@ -420,6 +431,7 @@ class XiChoice:
         damping = RULES.damping
         for _ in range(RULES.iterations):
             hessian, gradient = self._build_model(state)
+            # Levenberg-Marquardt: more damping until a step lowers the cost.
             better = None
             while better is None and damping < RULES.most_damping:
                 better = self._try_step(state, hessian, gradient, damping)
@@ -453,6 +465,7 @@ class XiChoice:
     def _build_model(self, state: _State) -> tuple[Array, Array]:
         """Gauss-Newton Hessian (K r, K r) and half the gradient (K r,) of the cost."""
         r, m, B = self.chart.r, self.chart.m, self._basis
+        # Gradients with respect to xi: q moves by J^-1 [0; dxi].
         G = state.gradients @ np.linalg.inv(self.solver.jacobian(state.q))[:, :, m:] / np.sqrt(len(B))
         squares = np.einsum("pka,pkb->pab", G, G)
         hessian = np.einsum("pi,pj,pab->iajb", B, B, squares, optimize=True)

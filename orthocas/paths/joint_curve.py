@@ -49,8 +49,8 @@ class PhiSolver:
 
     def solve(self, starts: Array, goals: Array) -> Array:
         """Solutions q (N, n) of phi(q) = goal near starts (N, n); NaN where Newton's method fails."""
-        found = self._newton(goals, starts)
-        return np.where((largest(found.residual) < RULES.residual)[:, None], found.q, np.nan)
+        result = self._newton(goals, starts)
+        return np.where((largest(result.residual) < RULES.residual)[:, None], result.q, np.nan)
 
 
 def solve_stack(J: Array, right: Array) -> Array:
@@ -58,10 +58,10 @@ def solve_stack(J: Array, right: Array) -> Array:
     try:
         return np.asarray(np.linalg.solve(J, right[..., None])[..., 0], dtype=float)
     except np.linalg.LinAlgError:
-        known = np.isfinite(J).all(axis=(1, 2))
-        found = np.full_like(right, np.nan)
-        found[known] = (np.linalg.pinv(J[known]) @ right[known][..., None])[..., 0]
-        return found
+        finite = np.isfinite(J).all(axis=(1, 2))
+        solution = np.full_like(right, np.nan)
+        solution[finite] = (np.linalg.pinv(J[finite]) @ right[finite][..., None])[..., 0]
+        return solution
 
 
 Goal = Callable[..., Array]  #: s, order of the derivative -> phi or its rates, (n,) or (N, n)
@@ -92,18 +92,19 @@ class JointCurve:
             return LostCurve(np.empty(0), np.empty((0, len(q_start))), 0.0)
         s, h = [0.0], RULES.first_step
         points, slopes = [q], [_compute_slope(solver, q, goal(0.0, 1))]
+        # Euler steps as long as Newton's method finds the curve again near by; shorter ones where it does not.
         while s[-1] < 1:
             h = min(h, 1 - s[-1], RULES.curve_step / max(float(np.abs(slopes[-1]).max()), 1e-12))
             new, q = s[-1] + h if s[-1] + h < 1 - 1e-12 else 1.0, points[-1]
-            found = solver.solve((q + h * slopes[-1])[None], goal(np.array([new])))[0]
-            slope = _compute_slope(solver, found, goal(new, 1))
-            if not np.isfinite(slope).all() or np.abs(found - q).max() > 2 * RULES.curve_step:
+            solution = solver.solve((q + h * slopes[-1])[None], goal(np.array([new])))[0]
+            slope = _compute_slope(solver, solution, goal(new, 1))
+            if not np.isfinite(slope).all() or np.abs(solution - q).max() > 2 * RULES.curve_step:
                 h /= 2
                 if h < RULES.shortest_step:
                     return LostCurve(np.array(s), np.array(points), new)
                 continue
             s.append(new)
-            points.append(found)
+            points.append(solution)
             slopes.append(slope)
             h *= 1.5
         return cls(solver, goal, CubicHermiteSpline(np.array(s), np.array(points), np.array(slopes)))
@@ -124,6 +125,7 @@ class JointCurve:
         bad = np.flatnonzero(np.isnan(q).any(axis=1))
         if bad.size:
             raise PathError(f"the path cannot be followed at s = {s[bad[0]]:.6g}: the chart is nearly singular there")
+        # J q' = phi', and J q'' is what of phi'' the bending of phi does not give.
         J = self.solver.jacobian(q)
         first = solve_stack(J, self.goal(s, 1))
         return q, first, solve_stack(J, self.goal(s, 2) - self.solver.compute_turning(q, first, first))
@@ -180,11 +182,14 @@ def compute_fastest_law(first: Array, second: Array, velocity: Array, accelerati
     Raises:
         SolveError: if the linear program fails.
     """
+    # z(s) = (ds/dt)^2 is a spline with q'' z + q' z' / 2 as acceleration, which is linear in its coefficients.
     knots = _build_knots()
     moves = np.maximum(np.abs(first), RULES.turning_slope * np.abs(first).max(axis=0) + 1e-12)
     speeds = ((velocity / moves) ** 2).min(axis=1)
     slowest = _find_worst(-speeds)
+    # Velocities: z <= (velocity / q')^2 where it is least in each part of the path.
     rows, bounds = [_evaluate_basis(slowest, knots)[0]], [speeds[slowest]]
+    # Accelerations of each joint, where it turns most in each part.
     for i in range(first.shape[1]):
         if np.abs(first[:, i]).max() > 1e-12:
             k = _find_worst(np.abs(second[:, i]))
@@ -195,12 +200,13 @@ def compute_fastest_law(first: Array, second: Array, velocity: Array, accelerati
     limits, matrix = np.concatenate(bounds), vstack(rows).tocsr()
     scale = float(limits[: RULES.parts].min())
     size = len(knots) - RULES.law_degree - 1
+    # From rest to rest, as fast as possible in between.
     ends = [(0.0, 0.0), *[(0.0, None)] * (size - 2), (0.0, 0.0)]
     gain = -np.asarray(rows[0].sum(axis=0)).ravel()
-    found = linprog(gain, matrix, limits / scale, bounds=ends, method="highs")
-    if found.x is None or found.x.max() <= 0:
-        raise SolveError(f"the speed profile of a path was not found: {found.message}")
-    return _integrate_time(BSpline(knots, found.x * scale, RULES.law_degree))
+    solution = linprog(gain, matrix, limits / scale, bounds=ends, method="highs")
+    if solution.x is None or solution.x.max() <= 0:
+        raise SolveError(f"the speed profile of a path was not found: {solution.message}")
+    return _integrate_time(BSpline(knots, solution.x * scale, RULES.law_degree))
 
 
 def _integrate_time(z: BSpline) -> TimeLaw:

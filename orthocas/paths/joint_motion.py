@@ -119,6 +119,7 @@ class JointMotion(Shown):
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         names = self.joint_names
+        # q, then dq, then ddq of all joints; x and xi last.
         rates = [f"{order}_{name}" for order in ("d", "dd") for name in names]
         writer.writerow([_HEAD, *names, *rates, *self.labels])
         table = np.column_stack([self.times, self.q, self.dq, self.ddq, self.x, self.xi])

@@ -73,15 +73,15 @@ class PathRules:
 RULES = PathRules()
 
 
-def sample_path(name: str, given: Any, size: int, labels: tuple[str, ...]) -> Array:
+def sample_path(name: str, path: Any, size: int, labels: tuple[str, ...]) -> Array:
     """The points (N, size) of a path: an array, or 501 values of a function of s in [0, 1].
 
     Raises:
         InvalidValueError, ShapeError: for anything else. The message names the first bad entry.
     """
-    if callable(given):
-        return np.array([_evaluate_function(name, given, s, size) for s in np.linspace(0, 1, RULES.samples)])
-    points = as_float_array(name, given)
+    if callable(path):
+        return np.array([_evaluate_function(name, path, s, size) for s in np.linspace(0, 1, RULES.samples)])
+    points = as_float_array(name, path)
     if points.ndim != 2 or points.shape[1] != size:
         raise ShapeError(f"{name} ({', '.join(labels)})", points.shape, (None, size))
     if not 2 <= len(points) <= MOST_WAYPOINTS:
@@ -108,6 +108,7 @@ class TaskSpline:
     def __init__(self, relative: Relative, s: Array, points: Array, sizes: Array) -> None:
         self._relative, self._s = relative, s
         rows = points
+        # Orientations as quaternions with signs that leave no jump.
         if relative.turned:
             p = continue_signs(Batched(relative.task.quaternion_function)(points)[0])
             rows = np.hstack([points[:, : relative.first], p])
@@ -140,6 +141,7 @@ class TaskSpline:
         if not self._relative.turned:
             return rows[order]
         first = self._relative.first
+        # omega = 2 conj(p) p' / |p|^2, and its derivative, in the tip's axes.
         p, *slopes = (row[..., first:] for row in rows)
         square = (p**2).sum(axis=-1, keepdims=True)
         omega = 2 * _multiply_conjugate(p, slopes[0]) / square
@@ -159,8 +161,8 @@ def continue_signs(quaternions: Array) -> Array:
 
 def _multiply_conjugate(a: Array, b: Array) -> Array:
     """The vector part of conj(a) b, (..., 3)."""
-    found: Array = a[..., :1] * b[..., 1:] - b[..., :1] * a[..., 1:] - np.cross(a[..., 1:], b[..., 1:])
-    return found
+    product: Array = a[..., :1] * b[..., 1:] - b[..., :1] * a[..., 1:] - np.cross(a[..., 1:], b[..., 1:])
+    return product
 
 
 def place_waypoints(steps: Array) -> Array:
@@ -224,6 +226,7 @@ class ToolPath:
         x = sample_path("tool_path", tool_path, chart.m, chart.labels[: chart.m])
         if s_xi is None and len(xi) != len(x):
             raise InvalidValueError("number of rows of xi", len(xi), f"{len(x)}, as of tool_path")
+        # s grows with the length of the chords, in units of the sizes of phi.
         steps = chart.relative.difference(x[1:], x[:-1]) / chart.phi_sizes[: chart.m]
         if callable(tool_path):
             s = np.linspace(0.0, 1.0, len(x))
@@ -271,9 +274,9 @@ def read_path(path: str | Path, chart: Chart) -> tuple[Array, Array | None]:
 def _find_columns(names: Sequence[str], chart: Chart) -> list[int]:
     """The columns in the order of the chart's labels, without those of the coordinates if there are none."""
     task, extra = chart.labels[: chart.m], chart.labels[chart.m :]
-    wanted = (*task, *extra) if set(extra) & set(names) else task
+    columns = (*task, *extra) if set(extra) & set(names) else task
     for name in names:
         if name not in chart.labels:
-            known = f"{', '.join(task)}, and if the path has a schedule {', '.join(extra)}"
-            raise ValueError(f"line 1: unknown column {name[:LONGEST]!r}, expected {known}")
-    return column_places(names, wanted)
+            expected = f"{', '.join(task)}, and if the path has a schedule {', '.join(extra)}"
+            raise ValueError(f"line 1: unknown column {name[:LONGEST]!r}, expected {expected}")
+    return column_places(names, columns)

@@ -298,6 +298,7 @@ def read_steps(path: str | Path, chart: Chart) -> Plan:
     has_steps = "steps" in data
     where = "the object with 'steps'" if has_steps else "the object with 'points'"
     reader.fields(data, where, _WITH_STEPS if has_steps else _WITH_POINTS)
+    # The motion begins at the centre of the domain, or where the file says.
     q_start = chart.problem.domain.centre
     if "start" in data:
         q_start = reader.numbers(data["start"], "start", chart.n)
@@ -305,6 +306,7 @@ def read_steps(path: str | Path, chart: Chart) -> Plan:
         reference = (_read_step_reference if has_steps else _read_point_reference)(
             reader, data, chart.labels, chart.phi(q_start)
         )
+        # A file may ask for more than a computer has room for.
         instants = reference.duration / reference.spacing
         if instants > RULES.most_instants:
             raise reader.fault(

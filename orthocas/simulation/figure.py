@@ -280,7 +280,7 @@ def _compute_tip_targets(trajectory: "Trajectory", problem: Problem) -> Array:
 def _build_axes(figure: Figure, low: Array, high: Array, names: list[str]) -> Any:
     """Axes for the arm, with the same scale in all directions."""
     longest = (high - low).max()
-    middle, extent = (low + high) / 2, high - low + 2 * RULES.margin * longest
+    centres, extent = (low + high) / 2, high - low + 2 * RULES.margin * longest
     if len(names) == 2:
         axes: Any = figure.add_axes((0.075, 0.17, 0.445, 0.74))
         shape = figure.get_size_inches() * axes.get_position().size
@@ -292,7 +292,7 @@ def _build_axes(figure: Figure, low: Array, high: Array, names: list[str]) -> An
         axes.set_box_aspect(extent, zoom=0.95)
         axes.view_init(elev=22, azim=-60)
         axes.locator_params(nbins=4)
-    for letter, name, centre, length in zip("xyz", names, middle, extent, strict=False):
+    for letter, name, centre, length in zip("xyz", names, centres, extent, strict=False):
         getattr(axes, f"set_{letter}lim")(centre - length / 2, centre + length / 2)
         getattr(axes, f"set_{letter}label")(f"{name} [m]", fontsize=9)
     axes.tick_params(labelsize=8)

@@ -75,6 +75,7 @@ class ClosedLoop:
         numbers = ca.SX.sym("numbers", len(self.plant_numbers))
         if not self.torque:
             return ca.Function("plant", [q, command, load, numbers], [command])
+        # M ddq + C dq + g = command + loads + stops - friction
         torque = command + self.loads.joint_torques(q, load)
         if self.stops is not None:
             torque += self.stops.torque(self.plant.tree, q, dq)
@@ -291,8 +292,9 @@ def integrate(
     state = start
     try:
         for begin, end in _cut_pieces(reference, loop.loads.pushes, step * RULES.outputs):
-            middle = np.array([(begin + end) / 2])
-            segment, load = int(reference.segment(middle)[0]), loop.loads.at(middle)[0]
+            centre = np.array([(begin + end) / 2])
+            segment, load = int(reference.segment(centre)[0]), loop.loads.at(centre)[0]
+            # Reference and loads do not change their formula within a piece.
             states = run((begin, end), reference.times[segment], reference.parameters[segment], load, state)
             state = states[-1]
             yield Piece(begin + (end - begin) * np.arange(1, RULES.outputs + 1) / RULES.outputs, states)
@@ -316,6 +318,7 @@ def _build_continuous(loop: ClosedLoop, reference: Reference, tolerance: float) 
 
 def _cut_pieces(reference: Reference, pushes: tuple[Push, ...], longest: float) -> Iterator[tuple[float, float]]:
     """Intervals of at most the given length, without a step of the reference or a change of load inside."""
+    # Steps of the reference, and starts and ends of pushes.
     edges = np.array([*reference.times, *(t for push in pushes for t in (push.start, push.end))])
     boundaries = np.unique(edges[edges <= reference.duration])
     boundaries = boundaries[np.diff(boundaries, prepend=-1.0) > RULES.same_time]
@@ -395,8 +398,8 @@ def yield_pieces(tick: Callable[[int], Array], times: Array, period: float, size
         held = range(first, min(first + RULES.ticks, len(times)))
         with deferred():
             rows = np.array([tick(k) for k in held])
-        states, commands, known = np.split(rows, [size, rows.shape[1] - 2], axis=1)
-        yield Piece(times[held] + period, states, Held(commands, known[:, 0], known[:, 1]))
+        states, commands, reports = np.split(rows, [size, rows.shape[1] - 2], axis=1)
+        yield Piece(times[held] + period, states, Held(commands, reports[:, 0], reports[:, 1]))
 
 
 def build_held_plant(loop: ClosedLoop, length: float, tolerance: float) -> ca.Function:

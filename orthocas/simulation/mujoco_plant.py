@@ -126,8 +126,8 @@ class Elasticity:
         Raises:
             ShapeError, InvalidValueError: for other shapes and values.
         """
-        found = [positive_gains(f"{name} of elasticity", getattr(self, name), n) for name in ("stiffness", "inertia")]
-        return found[0], found[1], non_negative_gains("damping of elasticity", self.damping, n)
+        gains = [positive_gains(f"{name} of elasticity", getattr(self, name), n) for name in ("stiffness", "inertia")]
+        return gains[0], gains[1], non_negative_gains("damping of elasticity", self.damping, n)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,6 +213,7 @@ def mujoco_model(tree: KinematicTree, scene: MuJoCo, viscous: Array, coulomb: Ar
     spec.option.gravity = tree.gravity
     # A run that diverges must say so.
     spec.option.disableflags |= mj.mjtDisableBit.mjDSBL_AUTORESET
+    # One body for each joint, with a massless handle where pushes act, and a motor.
     bodies: list[Any] = []
     for i, parent in enumerate(tree.parents):
         carrier = bodies[parent] if parent >= 0 else spec.worldbody
@@ -226,6 +227,7 @@ def mujoco_model(tree: KinematicTree, scene: MuJoCo, viscous: Array, coulomb: Ar
         motor.set_to_motor()
         if scene.effort_limits and np.isfinite(limit := tree.effort_limits[i]):
             motor.forcelimited, motor.forcerange = mj.mjtLimited.mjLIMITED_TRUE, (-limit, limit)
+    # The tip carries the payload and touches the wall.
     carrier = bodies[tree.tip_parent] if tree.tip_parent >= 0 else spec.worldbody
     tip = _add_body(mj, carrier, TIP, tree.tip_translation, tree.tip_rotation)
     if scene.wall is not None:
@@ -550,6 +552,7 @@ class MuJoCoPlant(Shown):
 
     def _divide(self, seconds: float) -> int:
         """Into how many steps of the physics a tick is divided; sets their length."""
+        # A tick that is a whole number of steps, but for rounding, gets no further one.
         count = as_number("seconds", seconds) / self._longest - 1e-9
         if not -1e-9 < count <= RULES.most_steps:
             raise InvalidValueError("seconds", seconds, f"a number > 0, at most {RULES.most_steps * self._longest:g}")

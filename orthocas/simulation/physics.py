@@ -121,6 +121,7 @@ def run_supervised(
     # CasADi may lose Ctrl-C while it builds functions.
     with deferred(), building:
         plant = build_held_plant(loop, 1 / rate, tolerance)
+    # Each tick: measure, ask the law, hold its command while the plant moves.
     law.start(start[:n] + errors[0, :n])
     state, sent = start, np.zeros(n + 2)
 

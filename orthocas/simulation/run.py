@@ -196,8 +196,8 @@ def _read_plant(plant: Plant, controller: Controller) -> tuple[Robot, MuJoCo | N
         return scene or model, None
     if isinstance(scene, MuJoCo):
         return scene.robot or model, scene
-    given = repr(plant)[:80] if isinstance(plant, str | int | float) else f"a {type(plant).__name__}"
-    raise InvalidValueError("plant", given, f"a Robot, '{MUJOCO}' or a MuJoCo")
+    received = repr(plant)[:80] if isinstance(plant, str | int | float) else f"a {type(plant).__name__}"
+    raise InvalidValueError("plant", received, f"a Robot, '{MUJOCO}' or a MuJoCo")
 
 
 def _check_settings(loop: ClosedLoop, reference: Reference, settings: Settings, scene: MuJoCo | None) -> None:
@@ -300,6 +300,7 @@ class Prepared:
         Raises:
             Interrupted: after Ctrl-C; its `result` is the trajectory up to there, with outcome INTERRUPTED.
         """
+        # A run that ends early is a result, too.
         pieces: list[Piece] = []
         outcome = Outcome.COMPLETE
         try:
@@ -324,6 +325,7 @@ class Prepared:
     def _build_trajectory(self, pieces: Sequence[Piece], outcome: Outcome) -> Trajectory:
         """Join the pieces, and add what follows from the states and the reference."""
         loop, controller, n = self.loop, self.loop.controller, self.loop.n
+        # The state at t = 0, then those at the ends of all steps.
         times = np.concatenate([[0.0], *(piece.times for piece in pieces)])
         states = np.vstack([self.start, *(piece.states for piece in pieces)])
         q = states[:, :n]
@@ -356,6 +358,7 @@ class Prepared:
             dissipated_power=power[:, 0],
             cause=cause.astype(int),
         )
+        # A law may keep running and have lost its arm.
         reason = find_loss(run, controller, loop.loads.pushes, self.supervised) if outcome is Outcome.COMPLETE else ""
         return replace(run, outcome=Outcome.LOST, reason=reason) if reason else run
 

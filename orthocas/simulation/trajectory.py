@@ -80,8 +80,8 @@ def read_run_file(
                 raise
             raise TrajectoryFileError(f"{path} contains an array or a header that cannot be read: {error}") from None
     if not isinstance(header, dict) or header.get("version") != version:
-        found = header.get("version") if isinstance(header, dict) else None
-        raise TrajectoryFileError(f"{path} has version {found}, this orthocas reads {version}")
+        saved = header.get("version") if isinstance(header, dict) else None
+        raise TrajectoryFileError(f"{path} has version {saved}, this orthocas reads {version}")
     return header, stored
 
 
@@ -294,6 +294,8 @@ def find_loss(run: Trajectory, controller: Controller, pushes: Sequence[Push], s
         first, _ = next(_find_stretches(outside))
         left = "was outside" if first == 0 else "left"
         return f"the arm {left} {what} at t = {run.times[first]:.4g} s"
+
+    # Inside, but the motors are at their limit and the errors grow.
     at_limit = np.abs(run.command) >= controller.gains["limit"]
     for first, last in _find_stretches(np.asarray(at_limit.any(axis=1))):
         since, until = run.times[[first, last]]
@@ -366,6 +368,7 @@ def coupling_index(chart: Chart, reference: Reference, trajectory: Trajectory) -
         raise InvalidValueError("labels of the reference", reference.labels, f"those of the chart {chart.labels}")
     wanted = reference.sample(np.minimum(trajectory.times, reference.duration))[0]
     away = np.abs(shortest(chart.phi(trajectory.q) - wanted, chart.turns))
+    # Between two steps of the reference, only the commanded coordinates should move.
     steps = np.diff(np.vstack([reference.start, reference.targets]), axis=0)
     index = np.full((chart.n, chart.n), np.nan)
     for segment, step in enumerate(steps):
@@ -422,6 +425,7 @@ def _build_parts(chart: Chart) -> ca.Function:
     n, m, robot = chart.n, chart.m, chart.problem.robot
     q, dq, tau = (ca.MX.sym(name, n) for name in ("q", "dq", "tau"))
     J = chart.function("jacobian")(q)
+    # Forces f_phi = J^-T (tau - g), and dd_x = J_x M^-1 (J^T f - C dq) + dJ_x/dt dq.
     f = ca.solve(J.T, tau - robot.gravity(q))
     mobility = ca.solve(robot.mass_matrix(q), J[:m, :].T).T  # J_x M^-1
     own, error = mobility @ J[:m, :].T @ f[:m], mobility @ J[m:, :].T @ f[m:]

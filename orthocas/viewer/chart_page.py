@@ -74,8 +74,8 @@ class ChartPage:
         async def moved(event: Any) -> None:
             # Otherwise the page itself moved it.
             if event.client is not None:
-                given = float(event.target.value)
-                self._loop.ask(what, lambda: self._move_towards({what: given}))
+                value = float(event.target.value)
+                self._loop.ask(what, lambda: self._move_towards({what: value}))
 
         slider.on_update(moved)
         return slider
@@ -116,12 +116,12 @@ class ChartPage:
         """Search the branches of the robot, which takes seconds, and offer those beyond a mirror."""
         self._search.label, self._search.disabled = "Searching ...", True
         problem = self._chart.problem
-        found = self.session.branches = branches(problem.robot, problem.task)
+        branching = self.session.branches = branches(problem.robot, problem.task)
         self._search.remove()
         with self._branches:
-            for cut in found.mirrors:
-                self._add_button(f"Flip the {found.cuts[cut].part}", "arrows-left-right", partial(self._flip, cut))
-            if not found.mirrors:
+            for cut in branching.mirrors:
+                self._add_button(f"Flip the {branching.cuts[cut].part}", "arrows-left-right", partial(self._flip, cut))
+            if not branching.mirrors:
                 self._server.gui.add_markdown("No mirror image of this arm has the same pose of its tip.")
 
     def _flip(self, cut: int) -> None:
@@ -182,20 +182,21 @@ class ChartPage:
             return
         self._begin()
         self._sweeping, self._sweep.label = True, "Stop"
-        middle, half = (fan.xi[-1] + fan.xi[0]) / 2, RULES.sweep_range * (fan.xi[-1] - fan.xi[0]) / 2
+        centre, half = (fan.xi[-1] + fan.xi[0]) / 2, RULES.sweep_range * (fan.xi[-1] - fan.xi[0]) / 2
+        # A sine through the present value, over nearly the whole range.
         here = float(self.session.readings.xi[self._chart.labels.index(fan.label) - self._chart.m])
-        phase = np.arcsin(np.clip((here - middle) / max(half, 1e-9), -1, 1))
+        phase = np.arcsin(np.clip((here - centre) / max(half, 1e-9), -1, 1))
 
-        told = -RULES.reading_pause
+        last_reading = -RULES.reading_pause
 
         def tick(seconds: float) -> bool:
-            nonlocal told
-            self.session.wish({fan.label: float(middle + half * np.sin(2 * np.pi * seconds / RULES.sweep + phase))})
+            nonlocal last_reading
+            self.session.wish({fan.label: float(centre + half * np.sin(2 * np.pi * seconds / RULES.sweep + phase))})
             self.session.follow()
-            if seconds - told < RULES.reading_pause:
+            if seconds - last_reading < RULES.reading_pause:
                 self._show_arm(self.session.q)
             else:
-                told = seconds
+                last_reading = seconds
                 self._show()
             return True
 

@@ -286,6 +286,7 @@ def read_urdf_look(path: Path, tree: KinematicTree, locked: Mapping[str, float] 
     tips = (tree.tip_name, *tree.tips)
     model = lock_off_chain(lock_joints(read_urdf(path, tips, locked), locked or {}), *tips)
     _check_same(path, model, tree)
+    # Frames of our tree have the joint's axis as z; Pinocchio's have those of the file.
     turns = [np.eye(3), *(rotation_z_to(joint_axis(model, i)[1]) for i in range(1, model.njoints))]
     colours = _read_materials(root)
     look: Look = [[] for _ in range(tree.n + 2)]
@@ -318,12 +319,12 @@ def _check_same(path: Path, model: pin.Model, tree: KinematicTree) -> None:
 
 def _read_materials(root: ElementTree.Element) -> dict[str, Colour]:
     """Colours of the named materials of a file."""
-    found = {}
+    colours = {}
     for material in root.iter("material"):
         colour = _read_colour(material)
         if colour is not None and material.get("name"):
-            found[material.get("name", "")] = colour
-    return found
+            colours[material.get("name", "")] = colour
+    return colours
 
 
 def _read_colour(material: ElementTree.Element) -> Colour | None:

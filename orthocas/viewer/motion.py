@@ -133,14 +133,14 @@ def cyclic_motions(chart: Chart, path: Array | None = None, cycles: int = 3) -> 
     """
     require_kind("chart", chart, Chart)
     require_count("cycles", cycles, most=RULES.most_cycles)
-    times, shares = _build_times(cycles)
+    times, fractions = _build_times(cycles)
     start = chart.problem.domain.centre
     if path is None:
-        along, q = _find_largest_circle(chart, start, shares)
+        along, q = _find_largest_circle(chart, start, fractions)
     else:
         along = _build_polygon(chart, path)
-        q = _follow_with_constant_xi(chart, along(shares), start)
-    x = along(shares)
+        q = _follow_with_constant_xi(chart, along(fractions), start)
+    x = along(fractions)
     ends = tuple(RULES.cycle * (k + 1) for k in range(cycles))
     other = _follow_by_pseudo_inverse(chart, x, q[0])
     labels = chart.labels[: chart.m]
@@ -153,24 +153,24 @@ def cyclic_motions(chart: Chart, path: Array | None = None, cycles: int = 3) -> 
 def _build_times(cycles: int) -> tuple[Array, Array]:
     """Instants [s], and the share of a cycle that is done: from rest to rest in each cycle."""
     t = np.linspace(0.0, 1.0, RULES.cycle_points + 1)
-    share = t**3 * (10 - 15 * t + 6 * t**2)
+    fraction = t**3 * (10 - 15 * t + 6 * t**2)
     times = RULES.cycle * np.concatenate([[0.0], *(k + t[1:] for k in range(cycles))])
-    return times, np.concatenate([[0.0], *(share[1:] for _ in range(cycles))])
+    return times, np.concatenate([[0.0], *(fraction[1:] for _ in range(cycles))])
 
 
-def _find_largest_circle(chart: Chart, start: Array, shares: Array) -> tuple[Place, Array]:
+def _find_largest_circle(chart: Chart, start: Array, fractions: Array) -> tuple[Place, Array]:
     """A circle in the first two components of the task, or a line in one, as large as the chart can follow."""
     x0, m = chart.task(start), min(chart.m, 2)
     radius = RULES.circle * float(chart.phi_sizes[:m].min())
     while True:
 
-        def along(share: Array, radius: float = radius) -> Array:
-            angle = 2 * np.pi * share
+        def along(fraction: Array, radius: float = radius) -> Array:
+            angle = 2 * np.pi * fraction
             across = radius * np.stack([np.cos(angle) - 1, np.sin(angle)], axis=-1)
             return x0 + np.pad(across[..., 2 - m :], ((0, 0), (0, chart.m - m)))
 
         try:
-            return along, _follow_with_constant_xi(chart, along(shares), start)
+            return along, _follow_with_constant_xi(chart, along(fractions), start)
         except PathError:
             radius /= 1.3
             if radius < RULES.smallest_circle * float(chart.phi_sizes[:m].min()):
@@ -187,7 +187,7 @@ def _build_polygon(chart: Chart, path: Array) -> Place:
     if not lengths.sum() > 0:
         raise InvalidValueError("path", "one point", "waypoints at different places")
     place = np.append(0.0, np.cumsum(lengths)) / lengths.sum()
-    return lambda share: np.column_stack([np.interp(share, place, column) for column in points.T])
+    return lambda fraction: np.column_stack([np.interp(fraction, place, column) for column in points.T])
 
 
 def _follow_with_constant_xi(chart: Chart, x: Array, start: Array) -> Array:
@@ -195,23 +195,23 @@ def _follow_with_constant_xi(chart: Chart, x: Array, start: Array) -> Array:
     xi = chart.xi(start)
     q = chart.solve(np.concatenate([x[0], xi]), start).require(inside=True).q[0]
     tracker = chart.tracker(q)
-    found = np.empty((len(x), chart.n))
+    positions = np.empty((len(x), chart.n))
     for k, value in enumerate(x):
-        found[k] = tracker.step(np.concatenate([value, xi]))
+        positions[k] = tracker.step(np.concatenate([value, xi]))
         if tracker.status is not TrackerStatus.OK:
             raise PathError(
                 f"the path cannot be followed with constant xi from point {k} of {len(x)}: {tracker.status.name}"
             )
-    return found
+    return positions
 
 
 def _follow_by_pseudo_inverse(chart: Chart, x: Array, start: Array) -> Array:
     """Joint positions (N, n) with task values x (N, m), each by the shortest step from the one before."""
     task, q = chart.problem.task, start
-    found = np.empty((len(x), chart.n))
+    positions = np.empty((len(x), chart.n))
     for k, value in enumerate(x):
         for _ in range(RULES.corrections + 1):
             J = task.batched_jacobian(q[None])[0].reshape(chart.m, chart.n)
             q = q + np.linalg.lstsq(J, value - chart.task(q), rcond=None)[0]
-        found[k] = q
-    return found
+        positions[k] = q
+    return positions

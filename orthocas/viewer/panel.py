@@ -108,10 +108,10 @@ class ChartPanel:
             format_bar(label, degrees / 15, f"{degrees:.2f}°", choose_colour(-degrees, -2, -6), value=degrees)
             for label, degrees in zip(self._labels[m:], readings.leak_deg.tolist(), strict=True)
         ]
-        joint, share = readings.nearest, readings.boundary / self._half_width
+        joint, fraction = readings.nearest, readings.boundary / self._half_width
         label = f"boundary {self._joints.shown[joint]}" if np.isfinite(readings.boundary) else "boundary"
-        text, colour = self._joints.format_value(joint, readings.boundary), choose_colour(share, 0.15, 0.04)
-        boundary = format_bar(label, share, text, colour, readings.boundary, "boundary")
+        text, colour = self._joints.format_value(joint, readings.boundary), choose_colour(fraction, 0.15, 0.04)
+        boundary = format_bar(label, fraction, text, colour, readings.boundary, "boundary")
         level = readings.conditioning
         conditioning = format_bar("conditioning", level, f"{level:.3f}", choose_colour(level, 0.4, 0.15), value=level)
         drift = format_number("drift", float(readings.drift.max()), format_drift(readings.drift, self._units))
@@ -170,9 +170,9 @@ def strip_shared_words(names: Sequence[str]) -> list[str]:
     return ["_".join(each[shared if len(names) > 1 else 0 :]) for each in words]
 
 
-def format_bar(label: str, share: float, text: str, colour: str, value: float, name: str = "") -> str:
+def format_bar(label: str, fraction: float, text: str, colour: str, value: float, name: str = "") -> str:
     """A row with a label, a bar that fills a share of its width, and a number with a name, by default the label."""
-    width = 100 * float(np.clip(share if np.isfinite(share) else 0.0, 0, 1))
+    width = 100 * float(np.clip(fraction if np.isfinite(fraction) else 0.0, 0, 1))
     number = format_number(name or label, value, text)
     return (
         f'<div class="row"><span title="{escape(label)}">{escape(label)}</span><div class="bar">'

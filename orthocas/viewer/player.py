@@ -189,12 +189,12 @@ class RobotPage:
         self._loop.stop()
 
     def _add_slider(self, i: int) -> Any:
-        robot, middle = self._robot, float(self._home[i])
-        low, high = np.clip([robot.lower[i], robot.upper[i]], middle - RULES.endless, middle + RULES.endless).tolist()
+        robot, centre = self._robot, float(self._home[i])
+        low, high = np.clip([robot.lower[i], robot.upper[i]], centre - RULES.endless, centre + RULES.endless).tolist()
         low, high = round(low + 4.9e-4, 3), round(high - 4.9e-4, 3)
         high = max(low, high)
         slider = self._server.gui.add_slider(
-            robot.joint_names[i], low, high, RULES.slider_step, min(max(round(middle, 3), low), high)
+            robot.joint_names[i], low, high, RULES.slider_step, min(max(round(centre, 3), low), high)
         )
 
         slider.on_update(self._move)
@@ -280,9 +280,9 @@ def show_robot(robot: Robot, look: Look, server: Any) -> tuple[float, Callable[[
 def _find_position(chart: Chart, fan: Fan, fraction: float) -> Array:
     """The joint position (n,) after a fraction of a sweep, exactly on the curve: from home to both ends and back."""
     here = np.interp(0.0, fan.arc_length, fan.xi)
-    middle, half = (fan.xi[-1] + fan.xi[0]) / 2, (fan.xi[-1] - fan.xi[0]) / 2
-    phase = np.arcsin(np.clip((here - middle) / max(half, 1e-12), -1, 1))
-    target = middle + 0.99 * half * np.sin(2 * np.pi * fraction + phase)
+    centre, half = (fan.xi[-1] + fan.xi[0]) / 2, (fan.xi[-1] - fan.xi[0]) / 2
+    phase = np.arcsin(np.clip((here - centre) / max(half, 1e-12), -1, 1))
+    target = centre + 0.99 * half * np.sin(2 * np.pi * fraction + phase)
     order = np.argsort(fan.xi)
     near = np.array([np.interp(target, fan.xi[order], column[order]) for column in fan.q.T])
     phi = chart.phi(chart.problem.domain.centre)

@@ -62,8 +62,8 @@ class Session:
         """The branch of a mirrored arm."""
         if not (self.branches and self.flips):
             return ""
-        found = self.branches.of(self.mirror(self.q[None])[0])
-        return f"mirrored: branch {found.name if found else 'without a name'}"
+        branch = self.branches.of(self.mirror(self.q[None])[0])
+        return f"mirrored: branch {branch.name if branch else 'without a name'}"
 
     @property
     def q(self) -> Array:
@@ -98,6 +98,7 @@ class Session:
         """
         self.remember()
         before, self.flips = self.flips, tuple(sorted({*self.flips} ^ {cut}))
+        # The nearest position on the self-motions that the joint limits of the mirrored arm allow.
         curves = [fan_along(self.chart, self.q, k).q for k in range(self.chart.r)]
         places = np.concatenate([self.q[None], *curves])
         good = places[self.find_allowed(places)]
@@ -168,15 +169,15 @@ class Session:
 
     def _step(self, here: Array) -> bool:
         """Step as far along the line as the tracker allows. Returns whether it allows any step."""
-        share, before, self._limited = 1.0, self.q, False
-        while share >= RULES.shortest_step:
-            self._tracker.step(here + share * (self._target - here))
+        fraction, before, self._limited = 1.0, self.q, False
+        while fraction >= RULES.shortest_step:
+            self._tracker.step(here + fraction * (self._target - here))
             if self._tracker.status is TrackerStatus.OK:
                 if self.find_allowed(self.q[None])[0]:
                     return True
                 self._tracker.reset(before)
                 self._limited = True
-            share /= 2
+            fraction /= 2
         return False
 
     def _find_far(self, here: Array) -> NDArray[np.bool_]:

@@ -202,7 +202,7 @@ def build_shape(robot: Robot, robot_file: str | Path | None, locked: Mapping[str
     sticks = build_stick_arm(robot.tree)
     if robot_file is None:
         return Shape(sticks)
-    found = read_urdf_look(as_path("robot_file", robot_file), robot.tree, locked)
-    bare = bool(found.missing) or not any(found.look)
-    look = [part or (sticks[i] if bare else []) for i, part in enumerate(found.look)]
-    return Shape(decimate([*look[:-1], sticks[-1]]), found.missing)
+    read = read_urdf_look(as_path("robot_file", robot_file), robot.tree, locked)
+    bare = bool(read.missing) or not any(read.look)
+    look = [part or (sticks[i] if bare else []) for i, part in enumerate(read.look)]
+    return Shape(decimate([*look[:-1], sticks[-1]]), read.missing)

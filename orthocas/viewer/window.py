@@ -71,21 +71,21 @@ class Inbox:
     def find_fault(self, raw: object) -> str | None:
         """What is wrong with a message, in a few words; None if it may pass."""
         try:
-            given = import_module("msgspec").msgpack.decode(raw)
+            message = import_module("msgspec").msgpack.decode(raw)
         except Exception as error:
             # Text, or bytes of many kinds.
             return f"it cannot be read ({type(error).__name__})"
-        kind = given.pop("type", None) if isinstance(given, dict) else None
+        kind = message.pop("type", None) if isinstance(message, dict) else None
         if not isinstance(kind, str) or kind not in (_CAMERA, _INPUT, *_HANDLE):
             return f"pages send no {_shorten(kind)}"
-        return _check_fields(given, kind) or self._check_content(given, kind)
+        return _check_fields(message, kind) or self._check_content(message, kind)
 
-    def _check_content(self, given: dict[str, Any], kind: str) -> str | None:
+    def _check_content(self, message: dict[str, Any], kind: str) -> str | None:
         if kind == _CAMERA:
-            return _check_numbers(given, _CAMERA_NUMBERS)
+            return _check_numbers(message, _CAMERA_NUMBERS)
         if kind == _INPUT:
-            return _check_words(given, "uuid") or self._check_updates(given["uuid"], given["updates"])
-        return _check_words(given, "name", "owner") or _check_numbers(given, _HANDLE[kind])
+            return _check_words(message, "uuid") or self._check_updates(message["uuid"], message["updates"])
+        return _check_words(message, "name", "owner") or _check_numbers(message, _HANDLE[kind])
 
     def _check_updates(self, uuid: str, updates: Any) -> str | None:
         """Browsers change the value of an input, and nothing else about it."""
@@ -116,42 +116,42 @@ class Inbox:
         return handle
 
 
-def _check_fields(given: dict[Any, Any], kind: str) -> str | None:
+def _check_fields(message: dict[Any, Any], kind: str) -> str | None:
     """viser ends a connection at fields that it does not know, and at those that are missing."""
-    known = fields(getattr(import_module("viser._messages"), kind))
-    needed = {field.name for field in known if field.default is MISSING}
-    if needed <= set(given) <= {field.name for field in known}:
+    names = fields(getattr(import_module("viser._messages"), kind))
+    needed = {field.name for field in names if field.default is MISSING}
+    if needed <= set(message) <= {field.name for field in names}:
         return None
-    return f"its fields are {_shorten(list(given))}, expected {', '.join(sorted(needed))}"
+    return f"its fields are {_shorten(list(message))}, expected {', '.join(sorted(needed))}"
 
 
-def _check_words(given: dict[str, Any], *names: str) -> str | None:
-    wrong = next((name for name in names if not isinstance(given.get(name, ""), str)), None)
-    return None if wrong is None else f"{wrong} is {_shorten(given[wrong])}, expected text"
+def _check_words(message: dict[str, Any], *names: str) -> str | None:
+    wrong = next((name for name in names if not isinstance(message.get(name, ""), str)), None)
+    return None if wrong is None else f"{wrong} is {_shorten(message[wrong])}, expected text"
 
 
-def _check_numbers(given: dict[str, Any], sizes: dict[str, int]) -> str | None:
+def _check_numbers(message: dict[str, Any], sizes: dict[str, int]) -> str | None:
     """Size 0 stands for one number."""
     for name, size in sizes.items():
-        numbers = given[name] if size else [given[name]]
+        numbers = message[name] if size else [message[name]]
         if not isinstance(numbers, list | tuple) or len(numbers) != (size or 1) or not all(map(_is_number, numbers)):
-            return f"{name} is {_shorten(given[name])}, expected {size or 1} finite numbers"
+            return f"{name} is {_shorten(message[name])}, expected {size or 1} finite numbers"
     return None
 
 
 def _check_value(handle: Any, value: Any) -> str | None:
     """A value is of the kind that the input has, and one that it offers."""
     if isinstance(handle.value, str):
-        wanted = f"one of {', '.join(handle.options)}"
+        expected = f"one of {', '.join(handle.options)}"
         good = isinstance(value, str) and value in handle.options
     elif isinstance(handle.value, bool):
-        wanted, good = "true or false", isinstance(value, bool)
+        expected, good = "true or false", isinstance(value, bool)
     else:
         # Limits move while somebody slides.
         slack = handle.max - handle.min
-        wanted = f"a number from {handle.min} to {handle.max}"
+        expected = f"a number from {handle.min} to {handle.max}"
         good = _is_number(value) and handle.min - slack <= value <= handle.max + slack
-    return None if good else f"a value is {_shorten(value)}, expected {wanted}"
+    return None if good else f"a value is {_shorten(value)}, expected {expected}"
 
 
 def _is_number(value: object) -> bool:
@@ -289,11 +289,12 @@ class Guard:
             hosts: all headers `Host`.
             origins: all headers `Origin`; programs that are no browsers, and browsers that open a page, send none.
         """
+        # The token must be right, and the browser's page this server's own.
         place, mark, query = path.partition("?")
         first, _, rest = place.removeprefix("/").partition("/")
-        known = hmac.compare_digest(first.encode(errors="replace"), self.token.encode())
+        right_token = hmac.compare_digest(first.encode(errors="replace"), self.token.encode())
         own = len(hosts) == 1 and self._is_own(hosts[0]) and origins in ([], [f"http://{hosts[0]}"])
-        return f"/{rest}{mark}{query}" if known and own else None
+        return f"/{rest}{mark}{query}" if right_token and own else None
 
     def _is_own(self, host: str) -> bool:
         """Whether a header `Host` can name this server. Any port can: tunnels change it.
@@ -301,10 +302,10 @@ class Guard:
         A server that other machines reach has addresses that it does not know, behind routers and in containers. So it
         takes all that are numbers: no name of somebody else can lead to them.
         """
-        found = _HOST.fullmatch(host.lower())
-        if found is None:
+        match = _HOST.fullmatch(host.lower())
+        if match is None:
             return False
-        name = found["name"].strip("[]")
+        name = match["name"].strip("[]")
         own = is_local(self.host)
         if name in ("localhost", self.host.lower()):
             return True
@@ -355,9 +356,9 @@ def _add_guard(serve: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
         """A connection that is dropped if it asks for nothing: browsers keep some, and closing waited 6 s for them."""
 
         async def handshake(self, *arguments: Any, **options: Any) -> None:
-            told = [self.request_rcvd, self.connection_lost_waiter]
-            await asyncio.wait(told, timeout=RULES.silence, return_when=asyncio.FIRST_COMPLETED)
-            if any(future.done() for future in told):
+            events = [self.request_rcvd, self.connection_lost_waiter]
+            await asyncio.wait(events, timeout=RULES.silence, return_when=asyncio.FIRST_COMPLETED)
+            if any(future.done() for future in events):
                 await super().handshake(*arguments, **options)
 
     def serve_guarded(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
@@ -370,8 +371,8 @@ def _add_guard(serve: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
             path = guard.admit(request.path, headers.get_all("Host"), headers.get_all("Origin"))
             if path is None:
                 text = b"Open the whole address that orthocas printed.\n"
-                told = headers_of({"Content-Type": "text/plain", "Content-Length": str(len(text))})
-                return answer_of(HTTPStatus.FORBIDDEN, "Forbidden", told, text)
+                fields = headers_of({"Content-Type": "text/plain", "Content-Length": str(len(text))})
+                return answer_of(HTTPStatus.FORBIDDEN, "Forbidden", fields, text)
             return rename_page(process_request(connection, replace(request, path=path)))
 
         limits = {"max_size": RULES.largest_message, "logger": connections, "create_connection": Attentive}
@@ -419,6 +420,7 @@ def open_window(host: str, port: int, title: str) -> tuple[Any, str]:
     package = viser()
     require_free(host, port)
     # It announces itself.
+    # viser starts its server with our guard before it.
     with guard_server(host) as guard, contextlib.redirect_stdout(io.StringIO()):
         server = package.ViserServer(host=host, port=port, label=title, verbose=False)
     inputs = getattr(server.gui, "_gui_input_handle_from_uuid", None)
@@ -429,6 +431,7 @@ def open_window(host: str, port: int, title: str) -> tuple[Any, str]:
     if port not in (0, server.get_port()):
         close_window(server)
         raise _build_taken_error(host, port)
+    # Nobody but this machine, unless the host says so: no sharing through a server of others.
     guard.inbox.input_of = inputs.get
     server.request_share_url = _refuse_sharing
     server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=RULES.brand)
@@ -497,16 +500,17 @@ def place_camera(server: Any, robot: Robot, q: Array, shift: Array | None = None
         q: joint positions (N, n) that should be in the picture.
         shift: places of further arms, (k, 3) [m].
     """
+    # A sphere around all arms in all positions that should be seen.
     points = robot.joint_points(q).reshape(-1, 3)
     points = np.concatenate([points, *(points + other for other in ([] if shift is None else shift))])
     low, high = points.min(axis=0), points.max(axis=0)
-    middle, radius = (
+    centre, radius = (
         (low + high) / 2,
         max(float(np.linalg.norm(high - low)) / 2, 0.4 * compute_chain_length(robot.tree)),
     )
     up = compute_up(robot)
     server.scene.set_up_direction(tuple(up))
-    frame = Framing(middle, compute_camera_direction(robot), RULES.room * radius / np.sin(RULES.view_angle / 2))
+    frame = Framing(centre, compute_camera_direction(robot), RULES.room * radius / np.sin(RULES.view_angle / 2))
     camera = server.initial_camera
     camera.fov = RULES.view_angle
     position, look_at = frame.compute_view(1, 1)
@@ -518,13 +522,13 @@ def place_camera(server: Any, robot: Robot, q: Array, shift: Array | None = None
 class Framing:
     """Keeps arms in the pictures of browsers of any shape, until somebody turns the scene."""
 
-    middle: Array  #: of the arms (3,) [m]
+    centre: Array  #: of the arms (3,) [m]
     direction: Array  #: unit vector to the camera (3,)
     distance: float  #: of the camera for a picture that is as wide as high, or wider [m]
 
     def compute_view(self, width: float, height: float) -> tuple[Array, Array]:
         """Position of the camera and the point that it looks at (3,) [m], for a picture of a size in pixels."""
-        return self.middle + self.distance * height / min(width, height) * self.direction, self.middle
+        return self.centre + self.distance * height / min(width, height) * self.direction, self.centre
 
     def keep(self, client: Any) -> None:
         """Place the camera of a browser anew when its picture changes its shape."""
@@ -578,6 +582,7 @@ def place_floor(server: Any, robot: Robot) -> None:
     cell = decade * max(part for part in (1, 2, 5) if part * decade <= size / 5)
     numbers = np.arange(-int(radius / cell), int(radius / cell) + 1)
     half = np.sqrt(radius**2 - (cell * numbers) ** 2)
+    # Lines of equal distance, cut off by the circle, in four points each: they fade towards both ends.
     along = np.outer(half, [-1.0, -RULES.fade, RULES.fade, 1.0])  # (lines, 4)
     across = np.repeat(cell * numbers[:, None], 4, axis=1)
     points = np.stack([along, across, 0 * along], axis=2)
