@@ -107,6 +107,9 @@ class TerminalBars:
     def __call__(self, progress: Progress) -> None:
         """Show a report."""
         if self._stop is None or progress.stage != self._stage:
+            # The stage before is complete.
+            if self._stop is not None:
+                self._bar.update(self._bar.task_ids[0], completed=1.0)
             self.close()
             self._start(progress.stage)
         self._bar.update(self._bar.task_ids[0], completed=progress.fraction, detail=progress.detail)

@@ -24,8 +24,8 @@ def test_the_package_itself_imports_nothing_heavy() -> None:
 
 
 def test_help_imports_nothing_heavy() -> None:
-    code = "import sys; sys.argv = ['orthocas', '--help']\nfrom orthocas.cli.commands import app_for, run\n"
-    code += "run(app_for(['--help']))"
+    code = "import sys; sys.argv = ['orthocas', '--help']\nfrom orthocas.cli.commands import build_app, run\n"
+    code += "run(build_app(['--help']))"
     loaded = modules_after(code)
     assert "orthocas.cli.commands" in loaded
     assert not HEAVY & loaded
