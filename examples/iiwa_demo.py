@@ -6,7 +6,7 @@ Reproduces [AS2023] Sec. 9 and Fig. 27 with polynomials instead of a network.
 import argparse
 from pathlib import Path
 
-from orthocas.cli.fit import fit_demo
+from orthocas.cli.compare import fit_demo
 
 
 def main(out: Path, quick: bool = False) -> dict[str, float]:

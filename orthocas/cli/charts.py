@@ -1,4 +1,4 @@
-"""`orthocas charts`, `evaluate`, `certify` and `export`: what is known of a chart, and its module of formulas."""
+"""`orthocas charts`, `evaluate` and `certify`: ready charts, and what is known of a chart."""
 
 import os
 import time
@@ -28,8 +28,6 @@ from orthocas.cli.output import (
     print_table,
     terminal_monitor,
 )
-from orthocas.codegen.export import LIBRARIES
-from orthocas.codegen.export import export as export_chart
 from orthocas.errors import Interrupted, OptionError
 from orthocas.tools.archive import require_free
 from orthocas.tools.checks import require_count
@@ -193,19 +191,3 @@ def _report_check(certificate: Certificate, holds: bool, seconds: float, json: b
         verdict = "holds" if holds else "does NOT hold"
         partly = "" if certificate.proved or not holds else " for the part that is proved"
         print_rows({"check": f"the certificate {verdict}{partly}, {seconds:.3g} s", **certificate.facts()})
-
-
-def export(
-    chart: ChartPath,
-    to: Annotated[str, typer.Option("--to", help=f"Library: {', '.join(LIBRARIES)}.")],
-    out: Annotated[Path, typer.Option("--out", help="The module to write, NAME.py.")],
-    force: Force = False,
-    json: AsJson = False,
-) -> None:
-    """Write task, xi, phi, Jacobian and inverse of a chart as one Python module that needs the library only."""
-    loaded = Chart.load(chart)
-    module = export_chart(loaded, to, out, force)
-    if json:
-        print_json({"module": str(module), "library": to, "joints": loaded.n, "labels": list(loaded.labels)})
-    else:
-        print_rows({"module": f"{module}, with {to} alone", "functions": "task, xi, phi, jacobian, inverse"})

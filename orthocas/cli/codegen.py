@@ -1,4 +1,4 @@
-"""`orthocas codegen`: a chart and a controller as a C library; and the options of controllers, for `simulate` too."""
+"""`orthocas codegen` and `export`: a chart as C or as a Python module; and the options of laws, for `simulate` too."""
 
 import warnings
 from collections.abc import Callable, Mapping
@@ -10,6 +10,8 @@ import typer
 from orthocas.charts.chart import Chart
 from orthocas.cli.options import AsJson, ChartPath, Force, Limit, parse_one_or_all, spread_options
 from orthocas.cli.output import note, print_json, print_rows
+from orthocas.codegen.export import LIBRARIES
+from orthocas.codegen.export import export as export_chart
 from orthocas.codegen.generate import generate_c
 from orthocas.codegen.library import GeneratedC
 from orthocas.codegen.proof import Proof, check_c
@@ -149,3 +151,19 @@ def build_controller(name: str, chart: Chart, settings: Mapping[str, str], limit
         # commands print the remarks of the law instead
         warnings.simplefilter("ignore", LawWarning)
         return law.on_chart(chart, None if limit is None else parse_one_or_all("--limit", limit), **values)
+
+
+def export(
+    chart: ChartPath,
+    to: Annotated[str, typer.Option("--to", help=f"Library: {', '.join(LIBRARIES)}.")],
+    out: Annotated[Path, typer.Option("--out", help="The module to write, NAME.py.")],
+    force: Force = False,
+    json: AsJson = False,
+) -> None:
+    """Write task, xi, phi, Jacobian and inverse of a chart as one Python module that needs the library only."""
+    loaded = Chart.load(chart)
+    module = export_chart(loaded, to, out, force)
+    if json:
+        print_json({"module": str(module), "library": to, "joints": loaded.n, "labels": list(loaded.labels)})
+    else:
+        print_rows({"module": f"{module}, with {to} alone", "functions": "task, xi, phi, jacobian, inverse"})

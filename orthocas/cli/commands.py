@@ -25,7 +25,7 @@ COMMANDS = {
     "view": "Show a chart, a robot or a motion in the browser, until Ctrl-C.",
     "charts": "List the ready charts of known arms, show the card of one, or write it to a file.",
 }  #: names of the commands and the first lines of their help
-_MODULES = {"demo": "fit", "compare": "fit", "evaluate": "charts", "certify": "charts", "export": "charts"}
+_MODULES = {"demo": "compare", "evaluate": "charts", "certify": "charts", "export": "codegen"}
 
 
 def build_app(words: Sequence[str]) -> typer.Typer:
