@@ -11,7 +11,6 @@ from typing import Annotated
 
 import typer
 
-from orthocas import certificates
 from orthocas.charts import quality
 from orthocas.charts.certificate import METHODS, Certificate
 from orthocas.charts.chart import Chart
@@ -32,7 +31,6 @@ from orthocas.errors import Interrupted, OptionError
 from orthocas.tools.archive import require_free
 from orthocas.tools.checks import require_count
 from orthocas.tools.interrupts import INTERRUPTED
-from orthocas.tools.processes import Processes, begin_worker, scheduler_executor
 
 _NOT_PROVED = 1  # exit code
 
@@ -126,6 +124,8 @@ def certify(
     A certificate without a fold that does not cover the domain is resumed. The exit code is 1 if not all is proved,
     with --check too.
     """
+    from orthocas import certificates  # with multiprocessing, long to import, and other commands need neither
+
     processes = 0 if "://" in workers else require_count("--workers", parse_whole_number(workers))
     target = out or chart
     require_free(target, CHART, force)
@@ -164,6 +164,8 @@ def certify(
 @contextmanager
 def _start_workers(processes: int, address: str) -> Iterator[Executor | None]:
     """What shares the work: processes, for 0 of them a Dask scheduler, for one nothing."""
+    from orthocas.tools.processes import Processes, begin_worker, scheduler_executor  # as in `certify`
+
     if processes == 0:
         with scheduler_executor(address) as executor:
             yield executor

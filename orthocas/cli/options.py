@@ -10,7 +10,6 @@ from typing import Annotated, Any, cast
 import numpy as np
 import typer
 
-from orthocas import problems
 from orthocas.errors import InvalidValueError, OptionError, UnknownNameError
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Angles, Weights
 from orthocas.robots.robot import Robot
@@ -178,6 +177,8 @@ class ProblemOptions:
             UnknownNameError: if `name` is neither a named problem nor a robot file.
             OrthocasError: if anything does not fit together.
         """
+        from orthocas import problems  # builds arms, which commands on charts do not need
+
         if is_robot_file(name):
             robot = self.build_robot(name)
             task = Task.named(robot, self.task or "position")
