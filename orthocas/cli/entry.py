@@ -41,6 +41,7 @@ def main() -> None:
     from orthocas.cli import commands  # takes a second
 
     watched = signal.getsignal(signal.SIGINT) is _leave
+    open_closed_streams()
     # Pictures go to files. Another name that the variable may have would stop matplotlib.
     os.environ["MPLBACKEND"] = "agg"
     app = commands.build_app(sys.argv[1:])
