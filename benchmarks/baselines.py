@@ -39,15 +39,15 @@ from orthocas.control.posture import joint_path
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError, SingularTaskError, UnreachableReferenceError
 from orthocas.robots.tree import require_driven
-from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.relative import Relative
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, frozen_array, require_kind
+from orthocas.tools.checks import Array, as_float_array, freeze_array, require_kind
 from orthocas.tools.display import Shown
-from orthocas.tools.expressions import fast_form, shortest
+from orthocas.tools.expressions import choose_form, wrap_shortest
 
 _SAMPLES, _RANK_LOST = 32, 1e-9
 
@@ -179,7 +179,7 @@ class KinematicProjector(TwoTaskLaw):
         J_2_inverse, _, relative = self._second.weighted(q, A)
         rest = self._second.shortest(x_d - self.measured(q))[m:]
         second = J_2_inverse @ (dx_d[m:] + gain[m:] * rest)
-        velocity = second + B @ (Lambda @ (known.drift(q, x_d[:m], dx_d[:m]) - gain[:m] * e - J @ second))
+        velocity = second + B @ (Lambda @ (known.compute_drift(q, x_d[:m], dx_d[:m]) - gain[:m] * e - J @ second))
         scale = median_volume(problem, known.rates, problem.metric, (m,))
         domain = None if self.chart is None else self.chart.problem.domain
         return guarded_graph(self.name, inputs, velocity, ca.MX(problem.n, 1), volume / scale * relative, domain, True)
@@ -263,10 +263,10 @@ class Projector(TwoTaskLaw):
         posture = springs("posture_stiffness", posture_stiffness, k_2)
         force = None if second_force is None else as_float_array("second_force", second_force)
         if force is not None:
-            force = frozen_array("second_force", force if force.ndim else np.full(k_2, force), (k_2,))
+            force = freeze_array("second_force", force if force.ndim else np.full(k_2, force), (k_2,))
         for name, value in {
             "problem": problem,
-            "stiffness": frozen_array("stiffness", np.concatenate([task, posture]), (k,)),
+            "stiffness": freeze_array("stiffness", np.concatenate([task, posture]), (k,)),
             "damping_ratio": non_negative_gains("damping_ratio", damping_ratio, k),
             "limit": command_limit("limit", limit, problem.robot.effort_limits),
             "second": second,
@@ -466,7 +466,7 @@ class _Joints:
         return difference
 
     def runnable(self, graph: ca.Function) -> ca.Function:
-        return fast_form(graph, self.problem.n)
+        return choose_form(graph, self.problem.n)
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         """Raise UnreachableReferenceError if a posture of the reference leaves the joint limits."""
@@ -530,7 +530,7 @@ class _OwnTask:
         return difference
 
     def runnable(self, graph: ca.Function) -> ca.Function:
-        return fast_form(graph, self.problem.n)
+        return choose_form(graph, self.problem.n)
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         pass
@@ -569,7 +569,7 @@ class _ExtraCoordinates:
         return self.chart.coordinates.functions["second_derivative"](q, dq, dq)
 
     def shortest(self, difference: ca.MX) -> ca.MX:
-        shorter: ca.MX = shortest(difference, self.chart.turns)
+        shorter: ca.MX = wrap_shortest(difference, self.chart.turns)
         return shorter
 
     def runnable(self, graph: ca.Function) -> ca.Function:
@@ -612,8 +612,8 @@ def two_task_forces(problem: Problem, second: SecondTask, inputs: Inputs, feed_f
     sharp, M_2, _ = second.weighted(q, M)
     x_d, rate, acceleration = (inputs[name] for name in ("reference", "reference_velocity", "reference_acceleration"))
     relative = Relative(problem.task)
-    bend = relative.bend(q, dq, dq, (x_d[:m], rate[:m], acceleration[:m]))
-    f_x += M_x @ (B.T @ C_dq - bend) - damped_x(J @ dq - relative.drift(q, x_d[:m], rate[:m]))
+    bend = relative.compute_bias(q, dq, dq, (x_d[:m], rate[:m], acceleration[:m]))
+    f_x += M_x @ (B.T @ C_dq - bend) - damped_x(J @ dq - relative.compute_drift(q, x_d[:m], rate[:m]))
     f_2 += M_2 @ (acceleration[m:] - second.curvature(q, dq)) + sharp.T @ C_dq - damped_2(J_2 @ dq - rate[m:])
     return f_x, f_2
 

@@ -22,7 +22,7 @@ from benchmark import run, table
 import orthocas as oc
 from orthocas import problems
 from orthocas.codegen.library import compilers
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 NAMES = ("xi", "phi", "jacobian")

@@ -19,7 +19,7 @@ import orthocas as oc
 from orthocas.charts.reaching import RULES
 from orthocas.charts.regular_part import RegularPart
 from orthocas.charts.solutions import TrackerStatus
-from orthocas.tasks.domains import bounds_of, sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 READY = ("panda-wide", "iiwa7-wide", "xarm7-wide", "baxter-left-wide", "pr2-left-wide")
@@ -75,7 +75,7 @@ def rooms(chart: oc.Chart, q: Array) -> Array:
 
 def nearest(chart: oc.Chart, phi: Array, q: Array) -> Array:
     """The best of what SLSQP finds from q (n,) and from places nearby, and q."""
-    rng, (low, high) = np.random.default_rng(0), bounds_of(chart.problem.domain)
+    rng, (low, high) = np.random.default_rng(0), chart.problem.domain.bounds
 
     def cost(q: Array) -> float:
         e = errors(chart, phi, q)

@@ -9,7 +9,7 @@ from benchmark import run
 import orthocas as oc
 from orthocas import problems
 from orthocas.fitting import stages, starts
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 
 HEADER = (
     "| choice | task std [deg] | mutual std [deg] | conditioning mean | 1 % quantile |\n| --- | --- | --- | --- | --- |"

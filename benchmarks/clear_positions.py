@@ -6,7 +6,7 @@ from benchmark import run, table
 from numpy.typing import NDArray
 
 import orthocas as oc
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.display import percent
 
 Numbers = NDArray[np.float64]

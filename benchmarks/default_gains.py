@@ -31,7 +31,7 @@ from orthocas.control.gains import fastest_posture, mobility
 from orthocas.errors import UnreachableReferenceError
 from orthocas.problems.iiwa import urdf_path
 from orthocas.simulation import MuJoCoPlant
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 
 CASES = (  # robot, task, metric
     *(("iiwa", "position", "euclidean"), ("iiwa", "position", "inertia"), ("iiwa", "pose", "euclidean")),

@@ -9,7 +9,7 @@ import numpy as np
 from benchmark import run
 
 import orthocas as oc
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 
 COORDINATES = {
     "conventional SEW": oc.SEW("conventional"),

@@ -20,7 +20,7 @@ from benchmark import run
 import orthocas as oc
 from orthocas import problems
 from orthocas.charts.solutions import InverseStatus
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 RUNS, AWAY, AT_ONCE, PARTS = 5, 0.1, 4096, 10

@@ -17,7 +17,7 @@ from benchmark import run
 
 import orthocas as oc
 from orthocas.charts.solutions import InverseStatus
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 CHARTS, ROWS, RUNS = {"iiwa7-pose": 0.3, "iiwa7-wide": 0.1, "panda-wide": 0.1}, 5000, 3

@@ -6,7 +6,7 @@ from suggested_domains import robot_of
 
 import orthocas as oc
 from orthocas.charts.point_quality import Judged
-from orthocas.tasks.domains import sample_heavily, sample_uniform
+from orthocas.tasks.samples import sample_boundary_weighted, sample_uniform
 
 HEADER = (
     "| problem | degree | task std [deg] | mutual std [deg] | least conditioning: the fit's search | uniform "
@@ -25,7 +25,7 @@ _CHUNK = 200_000
 
 def least(chart: oc.Chart, samples: int, heavy: bool) -> tuple[float, int]:
     """Least conditioning and number of folds at samples of the domain."""
-    draw = sample_heavily if heavy else sample_uniform
+    draw = sample_boundary_weighted if heavy else sample_uniform
     smallest, positive, negative = 1.0, 0, 0
     for k in range(max(1, samples // _CHUNK)):
         points = draw(chart.problem.domain, min(samples, _CHUNK), (1000, k))

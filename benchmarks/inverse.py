@@ -16,7 +16,7 @@ from benchmark import run
 import orthocas as oc
 from orthocas import problems
 from orthocas.codegen import CompiledInverse
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.display import percent
 
 REPEATS = 3

@@ -8,7 +8,7 @@ import igl
 import numpy as np
 from benchmark import run, table
 
-from orthocas.exact.harmonic import TriangleMesh, harmonic_disk, level_surface, require_disk
+from orthocas.exact.harmonic import TriangleMesh, build_level_surface, map_to_disk, require_disk
 from orthocas.exact.mesh import TriangleLocator
 
 HEADER = (
@@ -21,7 +21,7 @@ OFF_SURFACE = 0.01  # standard deviation of the queries from the mesh [rad]
 def leaf(cells: int) -> TriangleMesh:
     """The leaf x = 0 of the planar 3R arm with unit links and q1 in (0, pi)."""
     low, high = (0.0, -np.pi, -np.pi), (np.pi, np.pi, np.pi)
-    return level_surface(
+    return build_level_surface(
         lambda q: np.cos(np.cumsum(q, axis=1)).sum(axis=1),
         lambda q: np.cumsum(-np.sin(np.cumsum(q, axis=1))[:, ::-1], axis=1)[:, ::-1],
         *(0.0, low, high, cells),
@@ -39,7 +39,7 @@ def row(cells: int, queries: int = 100_000) -> str:
     """Build one chart and print its times."""
     rng = np.random.default_rng(7)
     surface_time, mesh = seconds(lambda: leaf(cells))
-    map_time, disk = seconds(lambda: harmonic_disk(mesh))
+    map_time, disk = seconds(lambda: map_to_disk(mesh))
     corners = mesh.vertices[mesh.faces[rng.integers(len(mesh.faces), size=queries)]]
     points = np.einsum("nc,ncd->nd", rng.dirichlet([1, 1, 1], queries), corners)
     points += OFF_SURFACE * rng.normal(size=points.shape)

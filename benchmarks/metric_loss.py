@@ -23,7 +23,7 @@ from orthocas.control import Controller, Impedance, PDPlus, Reference, matched_s
 from orthocas.errors import OrthocasError
 from orthocas.fitting.terms import ANGLES
 from orthocas.simulation import Outcome, coupling_index
-from orthocas.tasks.problem import relative_singular_values, task_jacobians
+from orthocas.tasks.problem import relative_singular_values
 from orthocas.tasks.regular_box import regular_box
 from orthocas.tools.checks import Array
 from orthocas.tools.display import percent
@@ -96,7 +96,7 @@ def goals(problem: oc.Problem, count: int, seed: int) -> Array:
     wanted = problem.task.batched(centre[None])[0]
     for _ in range(20):
         error = wanted - problem.task.batched(q)[0]
-        q = q + (np.linalg.pinv(task_jacobians(problem, q)) @ error[:, :, None])[:, :, 0]
+        q = q + (np.linalg.pinv(problem.task.evaluate_jacobian(q)) @ error[:, :, None])[:, :, 0]
     solved = np.abs(wanted - problem.task.batched(q)[0]).max(axis=1) < 1e-10
     inside = (np.abs(q - centre) < 0.6 * half).all(axis=1)
     far = (np.abs(q - centre) > 0.3 * half).any(axis=1)

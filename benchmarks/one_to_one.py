@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 import orthocas as oc
-from orthocas.certificates.chart_rows import chart_rows
-from orthocas.certificates.one_to_one import one_to_one_judge
-from orthocas.certificates.search import Limits, Search, largest_first
+from orthocas.certificates.one_to_one import choose_one_to_one_check
+from orthocas.certificates.rows import build_chart_rows
+from orthocas.certificates.search import Limits, Search, rank_by_volume
 from orthocas.charts.certificate import Subdivision
 from orthocas.errors import OrthocasError
 
@@ -38,13 +38,13 @@ def random_chart(seed: int) -> oc.Chart:
 
 def proved_box(chart: oc.Chart) -> Subdivision | None:
     """The largest of some boxes around the centre that a few parts prove."""
-    domain, rows = chart.problem.domain, chart_rows(chart)
+    domain, rows = chart.problem.domain, build_chart_rows(chart)
     for scale in _SCALES:
         box = Subdivision.whole(*(domain.centre + scale * domain.half_width * sign for sign in (-1, 1)))
-        judge = one_to_one_judge(chart, rows, box)
+        judge = choose_one_to_one_check(chart, rows, box)
         if judge is None:
             return None
-        search = Search(judge, box, Limits(boxes=_BOXES), largest_first(box))
+        search = Search(judge, box, Limits(boxes=_BOXES), rank_by_volume(box))
         search.run(lambda _: None)
         if search.finished:
             return box

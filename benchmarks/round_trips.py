@@ -14,9 +14,10 @@ import numpy as np
 from benchmark import run, table
 
 import orthocas as oc
-from orthocas.charts.phi import shortest
-from orthocas.tasks.domains import Domain, bounds_of, sample_uniform
+from orthocas.tasks.domains import Domain
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
+from orthocas.tools.expressions import wrap_shortest
 
 QUICK = ("panda-position", "ur5-position")
 SEVERAL = ("iiwa7-position", "ur5-position", "ur10-position", "xarm7-position", "panda-pose")  # for all solutions
@@ -44,7 +45,7 @@ def near_corners(domain: Domain, count: int, seed: int) -> Array:
     faces = rng.uniform(-1, 1, (count // 4, n))
     held = rng.uniform(size=faces.shape) < rng.uniform(size=(len(faces), 1))
     unit[: len(faces)] = np.where(held, np.sign(faces), faces)
-    return np.clip(domain.centre + domain.half_width * unit, *bounds_of(domain))
+    return np.clip(domain.centre + domain.half_width * unit, *domain.bounds)
 
 
 def misses(name: str, count: int) -> str:
@@ -123,7 +124,11 @@ def nearest(name: str, count: int) -> str:
     for k in range(count):
         others = at_task_value(chart, x[k], pool)
         turns = chart.turns[chart.m :]
-        away = np.linalg.norm(shortest(xi[k] - chart.xi(others), turns), axis=1) if len(others) else np.array([np.inf])
+        away = (
+            np.linalg.norm(wrap_shortest(xi[k] - chart.xi(others), turns), axis=1)
+            if len(others)
+            else np.array([np.inf])
+        )
         mine = found.distance[k] if found.status[k] <= oc.InverseStatus.NEAREST else np.inf
         worse += bool(mine > away.min() + 1e-6)
     starts, targets = ends(chart, count // 4)
@@ -134,7 +139,7 @@ def nearest(name: str, count: int) -> str:
 
 def at_task_value(chart: oc.Chart, x: Array, pool: Array) -> Array:
     """Positions of the domain with the task value x (m,) to which damped least squares lead from a pool (S, n)."""
-    m, sizes, (low, high) = chart.m, chart.phi_sizes[: chart.m], bounds_of(chart.problem.domain)
+    m, sizes, (low, high) = chart.m, chart.phi_sizes[: chart.m], chart.problem.domain.bounds
     q, wanted = pool.copy(), np.broadcast_to(x, (len(pool), chart.m))
     for _ in range(15):
         e = chart.relative.difference(wanted, chart.task(q)) / sizes

@@ -87,18 +87,18 @@ class SundialsFlow:
         """J_x A^-1 J_x^T, (1, 1)."""
         q = ca.SX.sym("q", self.problem.n)
         J = self.problem.task.jacobian_function(q)
-        return Batched(dense_function("strength", [q], [J @ TaskFlow(self.problem).gradients(q)]))
+        return Batched(dense_function("strength", [q], [J @ TaskFlow(self.problem).build_gradients(q)]))
 
     @cached_property
     def _gradient_step(self) -> Batched:
         q, p = ca.SX.sym("q", self.problem.n), ca.SX.sym("p", 2)
-        gradient = TaskFlow(self.problem).gradients(q)
+        gradient = TaskFlow(self.problem).build_gradients(q)
         return self._integrator(q, p, p[1] * (p[0] - self.problem.task.function(q)) * gradient)
 
     @cached_property
     def _task_step(self) -> Batched:
         q, p = ca.SX.sym("q", self.problem.n), ca.SX.sym("p", 2)
-        gradient = TaskFlow(self.problem).gradients(q)
+        gradient = TaskFlow(self.problem).build_gradients(q)
         strength = self.problem.task.jacobian_function(q) @ gradient
         return self._integrator(q, p, p[0] * gradient / ca.fmax(strength, p[1]))
 

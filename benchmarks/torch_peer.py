@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from orthocas.tasks.domains import sample_uniform
-from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 
@@ -76,7 +76,7 @@ def train(
 def samples(problem: Problem, count: int, seed: int) -> tuple[Array, Array]:
     """Joint angles (N, n) and unit task gradients (N, m, n) of the joints before the idle one, in single precision."""
     points = sample_uniform(problem.domain, count, seed)
-    J = task_jacobians(problem, points)[:, :, :-1]
+    J = problem.task.evaluate_jacobian(points)[:, :, :-1]
     J = J / np.linalg.norm(J, axis=2, keepdims=True)
     return points[:, :-1].astype(np.float32), J.astype(np.float32)
 

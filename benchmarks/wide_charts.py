@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 import orthocas as oc
 from orthocas.errors import DomainError, PathError
-from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.problem import relative_singular_values
-from orthocas.tasks.regular_box import joint_range
+from orthocas.tasks.regular_box import find_joint_range
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.display import percent
 
 Numbers = NDArray[np.float64]
@@ -92,7 +92,7 @@ def everywhere(name: str, task: str, quick: bool) -> str:
     """One row: (x, xi) of clear positions of the joint range, each solved from no start by the chart of its branch."""
     robot = robot_of(name)
     whole = oc.branches(robot, oc.Task.named(robot, task))
-    box, wanted = joint_range(robot, 0), 40 if quick else 10_000
+    box, wanted = find_joint_range(robot, 0), 40 if quick else 10_000
     q = sample_uniform(oc.Box(box.centre, box.half_width), 4 * wanted, 3)
     judge = oc.Problem(robot, oc.Task.named(robot, task), domain=oc.Box(box.centre, box.half_width))
     q = q[relative_singular_values(judge, q) > 0.1][:wanted]

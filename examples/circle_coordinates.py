@@ -35,9 +35,9 @@ from orthocas.bases.products import ProductFamily
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.singularities import singular_points
 from orthocas.solvers import GaussNewton
-from orthocas.tasks.samples import samples_at
+from orthocas.tasks.samples import evaluate_samples
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 
 DEGREES = (8, 16, 24, 32)  # total degree in both angles
 LEVELS = {"euclidean": 1.0, "inertia": 0.05}  # of the leaves whose arc length labels flow lines at the start [m]
@@ -130,7 +130,7 @@ class Leak:
 
     def __init__(self, pairs: SymmetricPairs, points: Array) -> None:
         self.pairs, self.u, self.v = pairs, *pairs.columns(points)
-        self.along = samples_at(pairs.problem, points).unit_task_gradients[:, 0].T  # (2, N), unit
+        self.along = evaluate_samples(pairs.problem, points).unit_task_gradients[:, 0].T  # (2, N), unit
 
     def value(self, theta: Array) -> float:
         """The loss."""
@@ -213,7 +213,7 @@ def jump_across_the_cut(chart: oc.Chart) -> float:
     leaf = grown_chart(chart.problem).coordinates.leaf
     tangent = leaf.values(leaf.cut[None]).gradients[0, 0]
     near = leaf.cut + 0.005 * np.array([[-1.0], [1.0]]) * tangent / np.linalg.norm(tangent)
-    return float(np.abs(shortest(np.diff(chart.xi(near), axis=0), np.array([2 * np.pi]))).max())
+    return float(np.abs(wrap_shortest(np.diff(chart.xi(near), axis=0), np.array([2 * np.pi]))).max())
 
 
 def draw(charts: dict[str, oc.Chart]) -> Figure:

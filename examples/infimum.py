@@ -26,7 +26,7 @@ import orthocas as oc
 from orthocas import problems, solvers
 from orthocas.fitting.residuals import Loss
 from orthocas.fitting.terms import Sizes
-from orthocas.tasks.samples import Samples, samples_at
+from orthocas.tasks.samples import Samples, evaluate_samples
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
 
@@ -59,9 +59,9 @@ class Integrand:
     @classmethod
     def of(cls, problem: oc.Problem, points: Array, shares: Array, orient: Array) -> "Integrand":
         """The default loss of a problem at points, oriented like the gradients `orient` (N, r, n)."""
-        weights, samples = WEIGHTS.for_problem(problem), samples_at(problem, points)
+        weights, samples = WEIGHTS.for_problem(problem), evaluate_samples(problem, points)
         loss = Loss.of(Sizes(problem.n, problem.m, problem.r, problem.metric.is_identity), weights.by_name)
-        described = samples.described(loss.data, samples.orientation(orient))
+        described = samples.collect_data(loss.data, samples.orientation(orient))
         flat = [part.reshape(len(points), -1) for part in described]
         rows, symbols = ca.SX.sym("J", problem.n, problem.r), loss.symbols()
         turned = [ca.SX.sym("part", s.shape[1], s.shape[0]) for s in symbols]  # NumPy has rows first

@@ -138,7 +138,7 @@ def angle_in_metric(chart: oc.Chart, samples: int, seed: int = 1) -> float:
     """Root mean square deviation from 90 degrees between dxi_j and an A-orthonormal basis of the task gradients."""
     held_out = sample_problem(chart.problem, samples, seed)
     J = chart.coordinates.jacobian(held_out.points)
-    lengths = np.sqrt(np.einsum("sjn,sjn->sj", J, held_out.raised(J)))
+    lengths = np.sqrt(np.einsum("sjn,sjn->sj", J, held_out.compute_metric_gradients(J)))
     cosines = held_out.task_basis @ (J / lengths[:, :, None]).transpose(0, 2, 1)
     return float(np.degrees(np.sqrt(np.mean(np.arcsin(np.clip(cosines, -1, 1)) ** 2))))
 

@@ -26,7 +26,6 @@ from ompl import base, geometric, util
 from spheres import Evaluator, Places, Query, World
 
 import orthocas as oc
-from orthocas.tasks.domains import bounds_of
 from orthocas.tools.checks import Array
 
 STEP = 0.05  # longest joint motion between two checks [rad]
@@ -81,7 +80,7 @@ class InJoints:
 
     def setup(self) -> geometric.SimpleSetup:
         """States in the domain."""
-        n, (low, high) = self.world.chart.n, bounds_of(self.world.domain)
+        n, (low, high) = self.world.chart.n, self.world.domain.bounds
         space, bounds = base.RealVectorStateSpace(n), base.RealVectorBounds(n)
         for i in range(n):
             bounds.setLow(i, low[i])

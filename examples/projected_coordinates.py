@@ -29,8 +29,7 @@ from paper.hidden_spring import POSTURE_STIFFNESS, HiddenSpring
 import orthocas as oc
 from orthocas.control import Controller, Impedance, Kinematic, PDPlus, Reference
 from orthocas.simulation import Trajectory
-from orthocas.tasks.domains import sample_uniform
-from orthocas.tasks.metric import metric_matrices
+from orthocas.tasks.samples import sample_uniform
 
 sys.path.append(str(Path(__file__).parent.parent / "benchmarks"))
 
@@ -129,7 +128,7 @@ def removed_shares(arm: Arm, samples: int) -> dict[str, float]:
     found, problem = {}, arm.problem
     for size in BOXES:
         points = sample_uniform(oc.Box(problem.domain.centre, size * problem.domain.half_width), samples, 1)
-        half = np.linalg.cholesky(metric_matrices(problem.metric, points))
+        half = np.linalg.cholesky(problem.metric.evaluate(points))
         for name, chart in arm.charts.items():
             unit = np.linalg.solve(half, chart.jacobian(points).transpose(0, 2, 1))  # gradients where A is I
             task, xi = (np.linalg.qr(part)[0] for part in (unit[:, :, : problem.m], unit[:, :, problem.m :]))
@@ -198,7 +197,7 @@ def error(law: Controller, run: Trajectory, along_task: bool) -> dict[str, float
         return {"xi <- x": np.nan, "xi <- x in the metric": np.nan}
     off[:, :m] = 0.0
     e = np.linalg.solve(law.chart.jacobian(run.q), off[:, :, None])
-    square = e.transpose(0, 2, 1) @ metric_matrices(law.problem.metric, run.q) @ e
+    square = e.transpose(0, 2, 1) @ law.problem.metric.evaluate(run.q) @ e
     return {"xi <- x": float(np.abs(e).max()), "xi <- x in the metric": float(np.sqrt(square.max()))}
 
 

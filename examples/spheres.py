@@ -10,7 +10,7 @@ import numpy as np
 import orthocas as oc
 from orthocas.codegen.library import CompiledLibrary, compile_shared
 from orthocas.control import ControlStatus
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 INNER = 0.9  # share of the domain for random postures

@@ -3,15 +3,26 @@
 import difflib
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-_FEW_NAMES = 10  # names that are read at a glance, in their own order
-_LONGEST = 1500  # characters of a message
-_MOST_NAMES = 30  # the most names that a message lists: those closest to the given name
+
+@dataclass(frozen=True, slots=True)
+class MessageRules:
+    """Numbers of messages, and of values that look like other units."""
+
+    few_names: int = 10  #: names that are read at a glance, in their own order
+    longest: int = 1500  #: characters of a message
+    most_names: int = 30  #: that a message lists: those closest to the given name
+    radians: float = 7.0  #: more than a turn: no bounded joint of an arm turns so far from its centre
+    metres: float = 10.0  #: no tool is so long, and few arms
+
+
+RULES = MessageRules()
 
 
 def printable(text: str) -> str:
@@ -24,7 +35,7 @@ def printable(text: str) -> str:
 def one_line(text: str) -> str:
     """The text on one printable line of bounded length."""
     line = printable(" ".join(text.split()))
-    return line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
+    return line if len(line) <= RULES.longest else f"{line[: RULES.longest // 2]} ... {line[-RULES.longest // 2 :]}"
 
 
 class OrthocasError(Exception):
@@ -90,11 +101,11 @@ class UnknownNameError(OrthocasError, ValueError):
 
     def __init__(self, what: str, got: str, known: Iterable[str]) -> None:
         names = list(known)
-        if len(names) > _FEW_NAMES:
+        if len(names) > RULES.few_names:
             near = difflib.get_close_matches(got, names, 3)
             names = [*near, *(name for name in names if name not in near)]
-        if len(names) > _MOST_NAMES:
-            close = difflib.get_close_matches(got, names, _MOST_NAMES, 0.0)
+        if len(names) > RULES.most_names:
+            close = difflib.get_close_matches(got, names, RULES.most_names, 0.0)
             names = [*close, f"and {len(names) - len(close)} more"]
         super().__init__(f"unknown {what} '{got[:80]}', known: {', '.join(names)}")
 
@@ -104,21 +115,19 @@ class RobotError(OrthocasError, ValueError):
 
 
 _SMALLER_TASKS = {"position+axis:z": 5, "position": 3, "orientation": 3, "position:xy": 2, "axis:z": 2, "position:x": 1}
-_MOST_RADIANS = 7.0  # more than a turn: no bounded joint of an arm turns so far from its middle
-_MOST_METRES = 10.0  # no tool is so long, and few arms
 
 
 def degrees_hint(*values: float) -> str:
     """The end of a message about joint positions that look like degrees; "" for others."""
     largest = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
-    return "; are these degrees? Joint positions are in radians" if largest > _MOST_RADIANS else ""
+    return "; are these degrees? Joint positions are in radians" if largest > RULES.radians else ""
 
 
 def units_hint(units: Iterable[str], values: Iterable[float]) -> str:
     """The end of a message about values whose units are "m" or "rad", if they look like millimetres or degrees."""
     sized = [(unit, abs(value)) for unit, value in zip(units, values, strict=False) if math.isfinite(value)]
-    long = any(unit == "m" and value > _MOST_METRES for unit, value in sized)
-    far = any(unit == "rad" and value > _MOST_RADIANS for unit, value in sized)
+    long = any(unit == "m" and value > RULES.metres for unit, value in sized)
+    far = any(unit == "rad" and value > RULES.radians for unit, value in sized)
     millimetres = "; are these millimetres? Lengths are in metres" if long else ""
     return millimetres + ("; are these degrees? Angles are in radians" if far else "")
 

@@ -34,7 +34,7 @@ from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_sh
 from orthocas.codegen.library import STRICT
 from orthocas.control import PDPlus, Reference
 from orthocas.fitting.fit import Fit
-from orthocas.robots import urdf
+from orthocas.robots import pinocchio_model, urdf
 from orthocas.tools.checks import Array
 
 compile_shared.__defaults__ = (("-O0",), None)  # users' -O2 takes gcc three times as long, and computes the same
@@ -87,7 +87,7 @@ def arm(name: str) -> tuple[pin.Model, str]:
     """Model and tip of one of ROBOTS, without the joints off the chain."""
     file, tip = ROBOTS[name]
     full = urdf.read_urdf(robot_data(file))
-    return full if "both arms" in name else urdf.lock_off_chain(full, tip), tip
+    return full if "both arms" in name else pinocchio_model.lock_off_chain(full, tip), tip
 
 
 def pinocchio_position(model: pin.Model, q: np.ndarray) -> np.ndarray:

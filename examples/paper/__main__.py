@@ -13,7 +13,7 @@ from orthocas.cli.commands import run
 from orthocas.cli.options import AsJson, Force, parse_whole_number
 from orthocas.cli.output import print_json, print_rows, terminal_monitor
 from orthocas.errors import InvalidValueError
-from orthocas.tools.files import output_folder
+from orthocas.tools.files import open_output_folder
 
 from .chosen_fit import ChosenFit
 from .registry import FIGURES, chosen, reproduce_log, require_fit
@@ -42,7 +42,7 @@ def paper(
     require_fit(figure, fit)
     _require_log(names, log, chart)
     known = None if chart is None else load(chart)
-    with output_folder("--out", out) as folder, terminal_monitor() as monitor:
+    with open_output_folder("--out", out) as folder, terminal_monitor() as monitor:
         if log is None:
             numbers = reproduce_figures(figure, folder, quick, monitor, force, fit)
         else:

@@ -9,7 +9,7 @@ from pathlib import Path
 import trimesh
 from matplotlib.figure import Figure
 
-from orthocas.tools.files import published
+from orthocas.tools.files import publish
 
 from .style import DPI
 
@@ -51,7 +51,7 @@ def save(drawing: Drawing, name: str, out: str | Path, force: bool = False) -> l
     for suffix, mesh in drawing.meshes.items():
         writers[f"{name}_{suffix}.stl"] = mesh.export
     writers[f"{name}.json"] = lambda draft: draft.write_text(text)
-    with published(folder, listed=True, force=force) as drafts:  # all at once, so that the numbers match the pictures
+    with publish(folder, listed=True, force=force) as drafts:  # all at once, so that the numbers match the pictures
         for file, write in writers.items():
             write(drafts / file)
     return [folder / file for file in writers]

@@ -13,7 +13,6 @@ from matplotlib.colors import to_rgba
 from matplotlib.patheffects import withStroke
 
 from orthocas.exact.flow import GrownCoordinates
-from orthocas.tasks.problem import task_jacobians
 from orthocas.tools.checks import Array
 
 from .charted_surface import add_with_lines
@@ -144,7 +143,7 @@ def _numbers(coordinates: GrownCoordinates, task_leaves: list[Grid], walls: list
 
 def _jacobians(coordinates: GrownCoordinates, points: Array) -> tuple[Array, Array]:
     """J_x (N, 1, 3) and J_xi (N, 2, 3)."""
-    return task_jacobians(coordinates.problem, points), coordinates.jacobian(points)
+    return coordinates.problem.task.evaluate_jacobian(points), coordinates.jacobian(points)
 
 
 def _angles(a: Array, b: Array) -> Array:

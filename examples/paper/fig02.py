@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from orthocas.tasks.domains import contains
 from orthocas.tools.checks import Array
 
 from .drawing import Drawing
@@ -108,7 +107,7 @@ def _draw_energy(axes: Any, spring: HiddenSpring, geodetic: bool) -> None:
 
 def _charted(spring: HiddenSpring) -> Array:
     """The part of the curve on which the chart was fitted."""
-    return np.asarray(spring.curve[contains(spring.problem.domain, spring.curve)])
+    return np.asarray(spring.curve[spring.problem.domain.contains(spring.curve)])
 
 
 def _way(spring: HiddenSpring) -> Array:

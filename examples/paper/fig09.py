@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 from orthocas.charts.chart import Chart
-from orthocas.tasks.samples import samples_at
+from orthocas.tasks.samples import evaluate_samples
 from orthocas.tools.checks import Array
 
 from .drawing import Drawing
@@ -22,7 +22,7 @@ from .planar_flow import (
     grown_chart,
     planar_problem,
 )
-from .style import INK, LABEL, TASK, TICK, joint_axis, new_figure
+from .style import INK, LABEL, TASK, TICK, find_axis, new_figure
 
 _LOW, _HIGH = np.array([1, -1]) * np.pi / 12, np.array([6, 4]) * np.pi / 12  # corners of the patch [rad]
 _LEVELS = {-0.2: "-3", 0.2: "-2", 0.6: "-1", LEVEL: "0", 1.4: "1"}  # task value [m] -> name of the leaf
@@ -53,7 +53,7 @@ def draw(quick: bool) -> Drawing:
     axes.plot(*crossings.T, "o", color="white", markeredgecolor=INK, markersize=4, zorder=6)
     _add_legend(figure)
     for k, letter in enumerate("xy"):
-        joint_axis(axes, letter, k + 1, float(_LOW[k]), float(_HIGH[k]), parts=5)
+        find_axis(axes, letter, k + 1, float(_LOW[k]), float(_HIGH[k]), parts=5)
     axes.set_aspect("equal")
     return Drawing({"": figure}, _numbers(chart, 400 if quick else 20_000))
 
@@ -78,7 +78,7 @@ def _draw_leaves(axes: Any, chart: Chart, steps: int) -> None:
 def _vectors(chart: Chart, points: Array) -> list[Array]:
     """J_x, M^-1 J_x^T, J_xi and M^-1 J_xi^T at points (N, 2), each (N, 2)."""
     J = chart.jacobian(points)
-    raised = samples_at(chart.problem, points).raised(J)
+    raised = evaluate_samples(chart.problem, points).compute_metric_gradients(J)
     return [J[:, 0], raised[:, 0], J[:, 1], raised[:, 1]]
 
 

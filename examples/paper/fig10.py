@@ -137,7 +137,7 @@ def _bracket(problem: Problem, at: Array) -> tuple[float, float]:
     q = ca.SX.sym("q", problem.n)
     lifts = [TaskFlow(problem).field(q, ca.DM.eye(2)[:, k]) for k in range(2)]
     J = problem.task.jacobian_function(q)
-    defect = TaskBrackets.of(problem).defect_function()(q)
+    defect = TaskBrackets.build(problem).build_defect_function()(q)
     evaluate = dense_function(
         "bracket", [q], [ca.norm_2(lie_bracket(lifts[0], lifts[1], q)), defect / ca.sqrt(ca.det(J @ J.T))]
     )

@@ -19,7 +19,7 @@ from matplotlib.patheffects import withStroke
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.singularities import Jump, SingularPoint, jumps, singular_points
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 from .drawing import Drawing
@@ -40,7 +40,7 @@ from .planar_flow import (
     singular_symbols,
 )
 from .self_motion import wrapped
-from .style import INK, LABEL, TICK, TURN, joint_axis, joint_plane, new_figure, pi_text
+from .style import INK, LABEL, TICK, TURN, find_axis, joint_plane, new_figure, pi_text
 
 _COLOURS = "twilight"  # this map is light at +-pi
 _HALO = [withStroke(linewidth=3.2, foreground="white")]
@@ -142,8 +142,8 @@ def _draw_region(axes: Any, field: _Field) -> None:
             mark(axes, "minimum", (line - TURN * turn)[-1:])
         mark(axes, "saddle", lines[0][:1] - TURN * turns)
     mark(axes, "maximum", np.zeros((1, 2)))
-    joint_axis(axes, "x", 1, -1.5 * np.pi, 1.5 * np.pi, parts=6)
-    joint_axis(axes, "y", 2, -2.25 * np.pi, 2.25 * np.pi, parts=8, margin=np.pi / 4)
+    find_axis(axes, "x", 1, -1.5 * np.pi, 1.5 * np.pi, parts=6)
+    find_axis(axes, "y", 2, -2.25 * np.pi, 2.25 * np.pi, parts=8, margin=np.pi / 4)
     axes.set_aspect("equal")
     axes.set_title("reassembled", fontsize=LABEL)
 

@@ -15,10 +15,11 @@ from matplotlib.colors import to_rgb, to_rgba
 from orthocas import problems
 from orthocas.charts.grow import grow
 from orthocas.exact.flow import GrownCoordinates, TaskFlow
-from orthocas.exact.harmonic import level_surface, signed_areas
-from orthocas.exact.leaves import DiskLeaf, disk_leaf
-from orthocas.tasks.domains import Box, sample_uniform
-from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.exact.harmonic import build_level_surface, compute_signed_areas
+from orthocas.exact.leaves import DiskLeaf, build_disk_leaf
+from orthocas.tasks.domains import Box
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array
 
@@ -62,7 +63,7 @@ def draw(quick: bool) -> Drawing:
     start = perf_counter()
     coordinates, fine = grown_disk(24 if quick else 70)
     seconds = perf_counter() - start
-    coarse = disk_leaf(fine.problem, fine.level, fine.region, _COARSE)
+    coarse = build_disk_leaf(fine.problem, fine.level, fine.region, _COARSE)
     figure = new_figure(6.7, layout=None)
     _draw_triangles(_cube_axes(figure, 0.0, 0.545, "(a) triangles of $S_0$"), coarse)
     _draw_disk(figure, coarse)
@@ -126,7 +127,7 @@ def _draw_leaves(axes: Any, leaf: DiskLeaf, cuts: Mapping[float, float]) -> None
 
 
 def _mesh_numbers(fine: DiskLeaf, coarse: DiskLeaf) -> dict[str, float]:
-    flipped = [np.sum(signed_areas(leaf.disk, leaf.faces) <= 0) for leaf in (fine, coarse)]
+    flipped = [np.sum(compute_signed_areas(leaf.disk, leaf.faces) <= 0) for leaf in (fine, coarse)]
     off = fine.problem.task.batched(fine.vertices)[0]
     return {
         "coarse_triangles": float(len(coarse.faces)),
@@ -143,7 +144,7 @@ def _flow_numbers(coordinates: GrownCoordinates) -> dict[str, float]:
     points = sample_uniform(problem.domain, _SAMPLES, 3)
     pulled = coordinates.pull(points)
     points, on_leaf = points[pulled.reached], pulled.points[pulled.reached]
-    J_xi, J_x = coordinates.jacobian(points), task_jacobians(problem, points)
+    J_xi, J_x = coordinates.jacobian(points), problem.task.evaluate_jacobian(points)
     lengths = np.linalg.norm(J_xi, axis=2) * np.linalg.norm(J_x, axis=2)
     cosines = (J_xi @ J_x.transpose(0, 2, 1))[:, :, 0] / lengths
     moved = [coordinates.flow.move(on_leaf, np.full((len(on_leaf), 1), dx)).points for dx in (_STEP, -_STEP)]
@@ -159,7 +160,7 @@ def _flow_numbers(coordinates: GrownCoordinates) -> dict[str, float]:
 def _covered(coordinates: GrownCoordinates, x: float) -> float:
     """Share of the area of a leaf in the domain where the coordinates have values."""
     task, low, high = coordinates.problem.task, _LOW, _HIGH
-    mesh = level_surface(
+    mesh = build_level_surface(
         lambda q: task.batched(q)[0][:, 0], lambda q: task.batched_jacobian(q)[0][:, 0], x, low, high, _COVER_CELLS
     )
     corners = mesh.vertices[mesh.faces]

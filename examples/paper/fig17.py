@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from orthocas.charts.chart import Chart
 from orthocas.charts.singularities import singular_points
 from orthocas.exact.flow import TaskFlow
-from orthocas.exact.leaves import circle_leaf
+from orthocas.exact.leaves import trace_circle_leaf
 from orthocas.tools.checks import Array
 
 from .chosen_fit import USUAL, ChosenFit
@@ -125,7 +125,7 @@ def _crossings(chart: Chart, level: float, values: int = 21) -> Array:
     """How often each of some values between the extrema of xi occurs on a closed leaf."""
     flow, x0 = TaskFlow(chart.problem), np.array([level])
     start = flow.pull(np.array([_INSIDE]), x0, 1e-12).points[0]
-    xi = chart.xi(circle_leaf(chart.problem, x0, start).curve)[:, 0]
+    xi = chart.xi(trace_circle_leaf(chart.problem, x0, start).curve)[:, 0]
     wanted = np.linspace(xi.min(), xi.max(), values + 2)[1:-1]
     crossings: Array = np.count_nonzero(np.diff(xi > wanted[:, None], axis=1), axis=1)
     return crossings

@@ -14,7 +14,7 @@ from .chosen_fit import USUAL, ChosenFit
 from .drawing import Drawing
 from .planar_fit import freely_fitted
 from .planar_flow import cell_centres, corners, deviations
-from .style import LABEL, TICK, add_3d, joint_axis, new_figure
+from .style import LABEL, TICK, add_3d, find_axis, new_figure
 
 
 def draw(quick: bool, chosen: ChosenFit = USUAL) -> Drawing:
@@ -69,7 +69,7 @@ def _draw_surface(axes: Any, q: Array, values: Array) -> None:
     ticks = MaxNLocator(4, steps=[1, 2, 5, 10]).tick_values(low, high)
     axes.set_zticks(ticks[(ticks > low - 1e-9) & (ticks < high + 1e-9)])
     for joint, letter in enumerate("xy", 1):
-        joint_axis(axes, letter, joint)
+        find_axis(axes, letter, joint)
     axes.tick_params(labelsize=TICK, pad=0)
     axes.view_init(32, -62)
     axes.set_box_aspect((1, 1, 1), zoom=0.83)

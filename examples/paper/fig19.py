@@ -13,8 +13,8 @@ from orthocas.bases import Polynomial
 from orthocas.charts.chart import Chart
 from orthocas.charts.quality import evaluate
 from orthocas.exact.involutivity import involutivity
-from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 from .chosen_fit import USUAL, ChosenFit

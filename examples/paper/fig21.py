@@ -16,7 +16,7 @@ from orthocas.charts.chart import Chart
 from orthocas.control import PDPlus, Reference
 from orthocas.control.reference import DAMPING_RATIO, NATURAL_FREQUENCY
 from orthocas.fitting.fit import fit
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
 

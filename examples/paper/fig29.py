@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.patches import Arc, Polygon
 
-from orthocas.exact.leaves import DiskLeaf, disk_leaf
+from orthocas.exact.leaves import DiskLeaf, build_disk_leaf
 from orthocas.tools.checks import Array, Indices
 
 from .charted_surface import add_with_edges
@@ -26,7 +26,7 @@ _PLAIN, _RING, _PAIR = np.array([0.93, 0.94, 0.95]), np.array([0.80, 0.87, 0.95]
 def draw(quick: bool) -> Drawing:
     """Draw a vertex with its neighbours, and both angles at one edge; the numbers check eqs. (40) to (43)."""
     fine = grown_disk(24)[1]
-    leaf = disk_leaf(fine.problem, fine.level, fine.region, _CELLS)
+    leaf = build_disk_leaf(fine.problem, fine.level, fine.region, _CELLS)
     i = _middle_vertex(leaf)
     j, a, b = _edge_at(leaf, i)
     figure = new_figure(2.9, layout=None)

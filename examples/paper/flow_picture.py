@@ -8,7 +8,7 @@ from matplotlib.lines import Line2D
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.singularities import SingularPoint, singular_points
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 from .drawing import Drawing

@@ -9,7 +9,7 @@ import numpy as np
 from orthocas.charts.chart import Chart
 from orthocas.errors import PathFileError
 from orthocas.tools.checks import Array
-from orthocas.tools.files import LONGEST, column_places, read_table
+from orthocas.tools.files import RULES, find_columns, read_table
 
 _TIME, _WANTED = "time_s", "desired_"
 _MOST = 1_000_000
@@ -60,5 +60,5 @@ def _columns(names: Sequence[str], chart: Chart) -> tuple[list[int], list[str]]:
     for name in names:
         if name not in {*needed, *unused, *(_WANTED + label for label in chart.labels)}:
             known = f"{', '.join(needed)}, and {_WANTED}{chart.labels[0]} and so on if they are known"
-            raise ValueError(f"line 1: unknown column {name[:LONGEST]!r}, expected {known}")
-    return column_places(names, (*needed, *(_WANTED + label for label in desired))), desired
+            raise ValueError(f"line 1: unknown column {name[: RULES.cell]!r}, expected {known}")
+    return find_columns(names, (*needed, *(_WANTED + label for label in desired))), desired

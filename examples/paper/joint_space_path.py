@@ -7,7 +7,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
-from orthocas.exact.harmonic import level_surface
+from orthocas.exact.harmonic import build_level_surface
 from orthocas.tools.checks import Array
 
 from .closed_loop_picture import COLOURS
@@ -45,7 +45,7 @@ def draw_path(
     scene = Scene()
     scene.add_cube(low, high, 0.004 * size)
     for target, colour in zip(np.atleast_1d(targets), SHEETS, strict=True):
-        mesh = level_surface(
+        mesh = build_level_surface(
             lambda p: task.batched(p)[0][:, 0],
             lambda p: task.batched_jacobian(p)[0][:, 0],
             float(target),

@@ -17,9 +17,8 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.terms import Weights
 from orthocas.solvers import GaussNewton
-from orthocas.tasks.domains import sample_evenly
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.samples import sample_problem, samples_at
+from orthocas.tasks.samples import evaluate_samples, sample_evenly, sample_problem
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array
 
@@ -61,7 +60,9 @@ def fitted_from_grown(problem: Problem, quick: bool) -> Chart:
     points = sample_evenly(problem.domain, _sample_count(quick), 0)
     start = _cosine_of_grown(problem, family, points)
 
-    objective = BasisObjective(family, samples_at(problem, points), _WEIGHTS, start, partial(sample_problem, problem))
+    objective = BasisObjective(
+        family, evaluate_samples(problem, points), _WEIGHTS, start, partial(sample_problem, problem)
+    )
     theta = GaussNewton().minimise(objective, start).finished().theta
     return Chart(problem, Coordinates(series, space, (), theta, np.zeros(1), np.ones(1)))
 

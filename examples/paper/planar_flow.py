@@ -17,7 +17,7 @@ from orthocas.exact.flow import GrownCoordinates, TaskFlow
 from orthocas.exact.leaves import CircleLeaf
 from orthocas.tasks.domains import Torus
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.samples import samples_at
+from orthocas.tasks.samples import evaluate_samples
 from orthocas.tools.checks import Array
 
 from .self_motion import pieces_in_cube, wrapped
@@ -114,7 +114,7 @@ def deviations(problem: Problem, points: Array, J_xi: Array) -> Array:
         points: nonsingular points, (N, 2).
         J_xi: gradients of xi, (N, 2).
     """
-    gradients = samples_at(problem, points).unit_task_gradients[:, 0]
+    gradients = evaluate_samples(problem, points).unit_task_gradients[:, 0]
     cosines = (gradients * J_xi).sum(axis=1) / np.linalg.norm(J_xi, axis=1)
     angles: Array = np.degrees(np.arcsin(np.clip(np.abs(cosines), 0, 1)))
     return angles
@@ -134,7 +134,7 @@ def cosines_by_differences(chart: Chart, points: Array, step: float = 1e-4) -> A
     shifts = step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
     xi = chart.xi((points[:, None] + shifts).reshape(-1, 2)).reshape(-1, 2, 2)
     rises = wrapped(xi[..., 0] - xi[..., 1])
-    gradients = samples_at(chart.problem, points).unit_task_gradients[:, 0]
+    gradients = evaluate_samples(chart.problem, points).unit_task_gradients[:, 0]
     cosines: Array = (gradients * rises).sum(axis=1) / np.linalg.norm(rises, axis=1)
     return cosines
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from orthocas.charts.chart import Chart
 from orthocas.errors import InvalidValueError, UnknownNameError
-from orthocas.tools.files import output_folder, require_replaceable_files
+from orthocas.tools.files import open_output_folder, require_replaceable_files
 from orthocas.tools.progress import Monitor, Progress, silent
 
 from . import (
@@ -147,7 +147,7 @@ def reproduce(
     """
     names, numbers = chosen(name), {}
     require_fit(name, fit)
-    with output_folder("out", out) as folder:
+    with open_output_folder("out", out) as folder:
         for figure in names:
             files = re.compile(rf"{figure}\w?(_\w+)?\.(png|pdf|stl|json)")
             require_replaceable_files(folder, [f.name for f in folder.iterdir() if files.fullmatch(f.name)], force)
@@ -181,7 +181,7 @@ def reproduce_log(
         PathFileError: if the log cannot be read.
         InvalidValueError, ArchiveError: as in `reproduce`.
     """
-    with output_folder("out", out) as folder:
+    with open_output_folder("out", out) as folder:
         drawing = fig28.draw_log(log, fig28.arm_chart(False, fit) if chart is None else chart)
         save(drawing, "fig28", folder, force)
     return {"fig28": dict(drawing.numbers)}

@@ -4,7 +4,7 @@ import numpy as np
 
 from orthocas import problems
 from orthocas.charts.chart import Chart
-from orthocas.exact.harmonic import level_surface
+from orthocas.exact.harmonic import build_level_surface
 from orthocas.exact.mesh import TriangleMesh
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem
@@ -24,7 +24,7 @@ def isosurface(chart: Chart, value: float, cells: int) -> TriangleMesh:
     """The leaf of a single coordinate at a value, as far as it lies in the domain."""
     domain, xi = chart.problem.domain, chart.coordinates
     low, high = domain.centre - domain.half_width, domain.centre + domain.half_width
-    return level_surface(lambda q: xi.xi(q)[:, 0], lambda q: xi.jacobian(q)[:, 0], value, low, high, cells)
+    return build_level_surface(lambda q: xi.xi(q)[:, 0], lambda q: xi.jacobian(q)[:, 0], value, low, high, cells)
 
 
 def curves_inside(problem: Problem, starts: Array, step: float) -> list[Array]:

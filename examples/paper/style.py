@@ -42,7 +42,7 @@ def pi_text(angle: float) -> str:
     return f"${top}$" if part.denominator == 1 else f"${top}/{part.denominator}$"
 
 
-def joint_axis(
+def find_axis(
     axes: Any,
     letter: str,
     joint: int,
@@ -70,8 +70,8 @@ def joint_axis(
 
 def joint_plane(axes: Any, low: float = -np.pi, high: float = np.pi, parts: int = 4) -> None:
     """Set up axes of the (q1, q2) plane with equal scales."""
-    joint_axis(axes, "x", 1, low, high, parts)
-    joint_axis(axes, "y", 2, low, high, parts)
+    find_axis(axes, "x", 1, low, high, parts)
+    find_axis(axes, "y", 2, low, high, parts)
     axes.set_aspect("equal")
 
 
@@ -81,7 +81,7 @@ def joint_cube(
     """Set up axes of a box of (q1, q2, q3) without panes; `Scene.add_cube` draws its edges with correct depth."""
     lower, upper = np.broadcast_to(low, 3), np.broadcast_to(high, 3)
     for k, letter in enumerate("xyz"):
-        joint_axis(axes, letter, k + 1, lower[k], upper[k], parts, margin)
+        find_axis(axes, letter, k + 1, lower[k], upper[k], parts, margin)
         axis = getattr(axes, f"{letter}axis")
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
         axis.line.set_visible(False)

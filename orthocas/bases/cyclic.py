@@ -10,13 +10,13 @@ from orthocas.bases.family import JointSpace
 from orthocas.errors import InvalidValueError
 from orthocas.robots.kinematics import TipTurn
 from orthocas.robots.tree import KinematicTree
-from orthocas.tasks.domains import Box, sample_uniform
+from orthocas.tasks.domains import Box
 from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem import Problem, is_regular
-from orthocas.tasks.samples import NEGLIGIBLE
+from orthocas.tasks.samples import NEGLIGIBLE, sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, require_kind
-from orthocas.tools.expressions import gradient_dependences, to_tape
+from orthocas.tools.expressions import find_gradient_dependences, write_tape
 
 _SAMPLES, _POSITIONS = 24, 6  # joint positions, and other positions of one joint at each of them
 _SEED = 0
@@ -74,7 +74,7 @@ def over_cyclic_joints(problem: Problem, names: tuple[str, ...]) -> Problem:
             unbounded.add(k)
         else:
             centre[k] = (low + high) / 2
-    wider = domain.within(Box(centre, half_width, sorted(unbounded)))
+    wider = domain.apply_to(Box(centre, half_width, sorted(unbounded)))
     return Problem(robot, problem.task, problem.metric, wider, problem.name)
 
 
@@ -163,7 +163,7 @@ def _moves_the_task(task: Task, joint: int) -> bool:
     tree, kind = task.robot.tree, task.recipe["kind"]
     if not task.of_tip:
         return False
-    turn = TipTurn.of_kind(kind)
+    turn = TipTurn.from_kind(kind)
     if turn is not None and turn.whole and joint == tree.tip_parent:
         return True
     return _turns_the_rest(tree, joint) and (turn is not None or _turns_components(tree, joint, kind))
@@ -172,7 +172,9 @@ def _moves_the_task(task: Task, joint: int) -> bool:
 def _is_no_part_of_gradients(task: Task, joint: int) -> bool:
     """Whether the steps of h show that J_x does not depend on a joint."""
     return all(
-        joint not in joints for row in gradient_dependences(to_tape(task.smooth_function)) for joints in row.values()
+        joint not in joints
+        for row in find_gradient_dependences(write_tape(task.smooth_function))
+        for joints in row.values()
     )
 
 

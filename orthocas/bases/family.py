@@ -37,7 +37,7 @@ class Memories:
         self._spare: list[ArrayMemory] = []
 
     @contextmanager
-    def borrowed(self, count: int) -> Iterator[list[ArrayMemory]]:
+    def borrow(self, count: int) -> Iterator[list[ArrayMemory]]:
         """So many memories that nobody else uses meanwhile."""
         found: list[ArrayMemory] = []
         for _ in range(count):

@@ -9,14 +9,14 @@ import numpy as np
 
 from orthocas.bases.family import ClosedForm, Expression, JointSpace, component_gradients
 from orthocas.errors import InvalidValueError, RobotError
-from orthocas.robots.kinematics import Pose, body_poses
+from orthocas.robots.kinematics import Pose, build_body_poses
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.problem import Problem
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_count, require_known, require_shape, require_text
-from orthocas.tools.expressions import Tape, expression_of, replay, require_tape, to_tape
+from orthocas.tools.expressions import Tape, build_expression, replay, require_tape, write_tape
 
 _MOST_JOINTS = 1000
 SEWKind = Literal["conventional", "stereographic"]
@@ -69,9 +69,9 @@ class Given:
             ('x', 'y', 'xi1')
         """
         q = ca.SX.sym("q", require_count("n", n, most=_MOST_JOINTS))
-        xi = expression_of(f"coordinates '{name}'", function, q)
+        xi = build_expression(f"coordinates '{name}'", function, q)
         require_shape(f"coordinates '{name}'", xi.shape, (None, 1))
-        return cls(name, n, to_tape(dense_function("xi", [q], [xi])))
+        return cls(name, n, write_tape(dense_function("xi", [q], [xi])))
 
     def for_problem(self, problem: "Problem") -> "Given":
         """The object itself: it does not depend on the problem."""
@@ -161,7 +161,7 @@ def sew_angle(robot: Robot, kind: str) -> ca.Function:
     _require_seven_revolute(robot.tree)
     shoulder, elbow, wrist = _heights(robot.tree)
     q = ca.SX.sym("q", robot.n)
-    poses = body_poses(robot.tree, q)
+    poses = build_body_poses(robot.tree, q)
     S, E, W = _on_axis(poses[0], shoulder), _on_axis(poses[3], elbow), _on_axis(poses[4], wrist)
     e_t, e_r = (ca.SX(ca.DM(direction)) for direction in _DIRECTIONS[kind])
     return dense_function("sew_angle", [q], [_angle(E - S, W - S, e_t, e_r)])

@@ -160,5 +160,5 @@ def anywhere(problem: Problem, base: tuple[str, ...]) -> Problem:
     free = {k for k in places if np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])}
     if free <= {*domain.unbounded}:
         return problem
-    wider = domain.within(Box(domain.centre, domain.half_width, sorted(free | {*domain.unbounded})))
+    wider = domain.apply_to(Box(domain.centre, domain.half_width, sorted(free | {*domain.unbounded})))
     return Problem(robot, problem.task, problem.metric, wider, problem.name)

@@ -14,10 +14,9 @@ from orthocas.bases import cyclic as cyclic_choice
 from orthocas.bases.cyclic import Cyclic
 from orthocas.bases.family import BasisFamily, ClosedForm, JointSpace
 from orthocas.errors import InvalidValueError, SingularTaskError
-from orthocas.tasks.metric import metric_matrices
-from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.tasks.problem import Problem
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, frozen_array, require_count, require_known
+from orthocas.tools.checks import Array, freeze_array, require_count, require_known
 
 JOINTS = "joints"  #: names the most joints of a product in labels
 Term = tuple[int, ...]  #: index of the one-joint function of every joint; 0 is the constant 1
@@ -349,7 +348,7 @@ class Linear:
     def __post_init__(self) -> None:
         require_known("normals", self.normals, ("orthonormal", "paper"))
         if self.base is not None:
-            object.__setattr__(self, "base", tuple(frozen_array("base", self.base, (None,)).tolist()))
+            object.__setattr__(self, "base", tuple(freeze_array("base", self.base, (None,)).tolist()))
 
     @property
     def label(self) -> str:
@@ -367,8 +366,8 @@ class Linear:
             ShapeError: if the base does not have n entries.
             InvalidValueError, SingularTaskError: if the task is singular at the base.
         """
-        base = frozen_array("base", problem.domain.centre if self.base is None else self.base, (problem.n,))
-        J, A = task_jacobians(problem, base[None])[0], metric_matrices(problem.metric, base[None])[0]
+        base = freeze_array("base", problem.domain.centre if self.base is None else self.base, (problem.n,))
+        J, A = problem.task.evaluate_jacobian(base[None])[0], problem.metric.evaluate(base[None])[0]
         if not (J**2).sum(axis=1).all():
             raise InvalidValueError("base", base.tolist(), "a joint position where no task gradient vanishes")
         theta = self.normal_vectors(np.linalg.solve(A, J.T).T).ravel()

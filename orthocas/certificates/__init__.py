@@ -1,8 +1,8 @@
 """Proofs that a chart does not fold and is one-to-one, and their check.
 
-- `certify` proves, `check` checks; `search` divides the domain, `judges` and `one_to_one` judge boxes.
-- With one coordinate, `determinant` expands det J from the `waves` of the task's rows, and bounds it.
-- `chart_rows`, `task_rows` and `jets` bound rows of the Jacobian, `outside` what lies beyond a box.
+- `certify` proves, and checks proofs; `search` divides the domain, `box_checks` and `one_to_one` prove single boxes.
+- With one coordinate, `determinant` expands det J in waves of the joints, and bounds it.
+- `rows` and `jets` bound rows of the Jacobian and their averages, `outside` what lies beyond a box.
 - `taylor` and `graph` are the arithmetic: Taylor models with remainders that cover rounding.
 """
 

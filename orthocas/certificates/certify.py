@@ -3,35 +3,50 @@
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import BrokenExecutor, Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from orthocas.certificates.chart_rows import ChartRows, chart_rows
-from orthocas.certificates.judges import Judge, Verdicts
-from orthocas.certificates.one_to_one import one_to_one_judge
-from orthocas.certificates.outside import inside_judge, judge_of
-from orthocas.certificates.search import Limits, Look, Search, distances, largest_first, nearest_first
+from orthocas.certificates.box_checks import BoxCheck, BoxResults
+from orthocas.certificates.one_to_one import choose_one_to_one_check
+from orthocas.certificates.outside import choose_check, choose_inside_check
+from orthocas.certificates.rows import ChartRows, build_chart_rows
+from orthocas.certificates.search import Limits, Look, Search, measure_distances, rank_by_distance, rank_by_volume
 from orthocas.charts.certificate import COFACTORS, ELIMINATION, METHODS, OPEN, PROVED, Certificate, Subdivision
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
 from orthocas.errors import CertifyError, Interrupted, InvalidValueError
 from orthocas.robots.tree import require_driven
-from orthocas.tasks.domains import Box, Domain, contains, reach, sample_heavily, slack
+from orthocas.tasks.domains import Box, Domain
+from orthocas.tasks.samples import sample_boundary_weighted
 from orthocas.tools.checks import Array, as_number, require_at_least, require_executor, require_kind
 from orthocas.tools.display import percent
 from orthocas.tools.processes import in_order
 from orthocas.tools.progress import Monitor, Progress, silent
 
-_SAMPLES = 20_000  # points where folds are looked for before the proof
-_SCALES = tuple(0.95**k for k in range(50, -1, -1))  # of the domain, for one-to-one boxes
-_FEW_BOXES = 300  # for one scale
-_MANY_BOXES = (500, 45_000)  # the least and the most
-_MORE_BOXES = {ELIMINATION: 3, COFACTORS: 30}  # between them, so many times what the proof without folds took
-_HELD_RANGE = 1.0  # half-width of a leading joint on which J does not depend, if its whole range is too wide
-_GUARDED_BOXES = 1_000_000  # for charts whose domain keeps folds out
-_MOMENT = 1e-9  # [s] to divide by
+
+@dataclass(frozen=True, slots=True)
+class CertifyRules:
+    """Numbers of proofs and of their check."""
+
+    samples: int = 20_000  #: points where folds are looked for before the proof
+    scales: int = 51  #: of the domain, for one-to-one boxes
+    shrink: float = 0.95  #: from each of these scales to the next one
+    few_boxes: int = 300  #: for one scale
+    least_boxes: int = 500  #: of the one-to-one proof
+    most_boxes: int = 45_000
+    held_range: float = 1.0  #: half-width of a leading joint on which J does not depend, if its whole range is too wide
+    guarded_boxes: int = 1_000_000  #: for charts whose domain keeps folds out
+    at_once: int = 512  #: boxes of one task of the check
+    same_fraction: float = 1e-4  #: of the same samples, on machines that round otherwise
+    off_centre: float = 1e-6  #: of the width of a box
+
+
+RULES = CertifyRules()
+#: boxes of the one-to-one proof, in those that the proof without folds took
+_MORE_BOXES = {ELIMINATION: 3, COFACTORS: 30}
+Mapped = Callable[..., Iterable[BoxResults]]
 _LARGEST_BOX = Limits(smallest=2.0**-6, first_failure=True, folds=False)
 
 
@@ -87,27 +102,28 @@ def certify(
         (True, 1.0)
     """
     start = time.monotonic()
-    limits = Limits(seconds=checked_options(chart, time_limit, executor))
-    bound = checked_bound(chart, bound)
-    rows = chart_rows(chart)
-    base = whole_domain(chart.problem.domain) if resume is None else _resumed(chart, bound, resume)
-    judge = judge_of(chart, rows, bound, None if resume is None else resume.method)
+    limits = Limits(seconds=check_options(chart, time_limit, executor))
+    bound = check_bound(chart, bound)
+    rows = build_chart_rows(chart)
+    base = cover_domain(chart.problem.domain) if resume is None else _resume(chart, bound, resume)
+    check = choose_check(chart, rows, bound, None if resume is None else resume.method)
     guarded = chart.problem.domain.room_to_fold is not None
-    if guarded:  # near its boundary, there is always something left to prove
-        limits = replace(limits, boxes=_GUARDED_BOXES)
-    search = Search(judge, base, limits, largest_first(base), executor)
+    # Near the boundary of such a domain, there is always something left to prove.
+    if guarded:
+        limits = replace(limits, boxes=RULES.guarded_boxes)
+    search = Search(check, base, limits, rank_by_volume(base), executor)
     injective: Subdivision | None = None
 
     def so_far() -> Certificate:
-        return _certificate(chart, judge.method, bound, search, injective, time.monotonic() - start, resume)
+        return _build_certificate(chart, check.method, bound, search, injective, time.monotonic() - start, resume)
 
     try:
-        search.visit(_suspects(chart))
-        search.run(_shown(monitor, "regular", guarded=guarded))
+        search.visit(_sample_suspects(chart))
+        search.run(_report_search(monitor, "regular", guarded=guarded))
         left = limits.seconds - (time.monotonic() - start)
         if search.finished and left > 0:
-            most = int(np.clip(_MORE_BOXES[judge.method] * search.judged, *_MANY_BOXES))
-            injective = _one_to_one(chart, rows, base, Limits(left, boxes=most), executor, monitor)
+            most = int(np.clip(_MORE_BOXES[check.method] * search.evaluated, RULES.least_boxes, RULES.most_boxes))
+            injective = _find_one_to_one_box(chart, rows, base, Limits(left, boxes=most), executor, monitor)
     except KeyboardInterrupt:
         raise Interrupted(so_far()) from None
     return so_far()
@@ -142,19 +158,75 @@ def certified_box(
         >>> bool((oc.certified_box(chart).half_width == chart.problem.domain.half_width).all())
         True
     """
-    limits = replace(_LARGEST_BOX, seconds=checked_options(chart, time_limit, executor))
-    judge = inside_judge(chart, chart_rows(chart), checked_bound(chart, bound))
-    base = whole_domain(chart.problem.domain)
-    search = Search(judge, base, limits, nearest_first(base), executor)
-    search.run(_shown(monitor, "largest box"))
-    scale = proved_scale(search.subdivision())
+    limits = replace(_LARGEST_BOX, seconds=check_options(chart, time_limit, executor))
+    check = choose_inside_check(chart, build_chart_rows(chart), check_bound(chart, bound))
+    base = cover_domain(chart.problem.domain)
+    search = Search(check, base, limits, rank_by_distance(base), executor)
+    search.run(_report_search(monitor, "largest box"))
+    scale = find_proved_scale(search.build_subdivision())
     if scale == 0:
         raise CertifyError("nothing is proved around the centre of the domain, expected a chart that is regular there")
     domain = chart.problem.domain
     return Box(domain.centre, domain.half_width * (scale if scale == 1 else scale * (1 - 1e-9)))
 
 
-def checked_options(chart: Chart, time_limit: float | None, executor: Executor | None) -> float:
+def check_certificate(
+    chart: Chart,
+    certificate: Certificate | None = None,
+    *,
+    executor: Executor | None = None,
+    monitor: Monitor = silent,
+) -> bool:
+    """Whether a certificate holds: all that it says of the chart is computed once more.
+
+    That is each part of the domain, the bound of the conditioning, the two signs of a fold, and the one-to-one box. The
+    number of boxes that were evaluated and the seconds are history, which only the digest of the certificate covers.
+
+    Args:
+        chart: the chart.
+        certificate: its certificate. Default: the one in the chart's file.
+        executor: shares the work, see `certify`.
+        monitor: called with progress.
+
+    Raises:
+        CertifyError: if there is no certificate, if it belongs to another chart or method or has been changed, or if
+            `certify` would refuse the chart.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> oc.check_certificate(chart, oc.certify(chart))
+        True
+    """
+    # The certificate must be one of this chart before any number of it is checked.
+    check_options(chart, None, executor)
+    certificate = chart.certificate if certificate is None else certificate
+    if certificate is None:
+        raise CertifyError("the chart has no certificate, expected one made by `certify`")
+    require_same(chart, certificate)
+    # All parts are checked as they were proved, by the same method.
+    bound, rows = check_bound(chart, certificate.bound), build_chart_rows(chart)
+    check = choose_check(chart, rows, bound, certificate.method)
+    mapped: Mapped = map if executor is None else partial(in_order, executor)
+    if certificate.fold and not _check_fold(chart, check, np.array(certificate.fold)):
+        return False
+    if not _check_regular(certificate, _check_parts(check, certificate.regular, mapped, monitor)):
+        return False
+    fraction = _estimate_proved_fraction(chart.problem.domain, certificate.regular)
+    if abs(fraction - certificate.clear_share) > RULES.same_fraction:
+        return False
+    # The one-to-one box has its own check, and must lie around the centre.
+    box = certificate.injective
+    if box is None:
+        return True
+    one_to_one = choose_one_to_one_check(chart, rows, box)
+    if one_to_one is None or not box.complete or not _is_around_centre(certificate, box):
+        return False
+    return all(results.proved.all() for results in _check_parts(one_to_one, box, mapped, monitor))
+
+
+def check_options(chart: Chart, time_limit: float | None, executor: Executor | None) -> float:
     """Seconds of a time limit, inf for none. Chart and executor are checked as well."""
     require_kind("chart", chart, Chart)
     require_driven("a certificate", chart.problem.robot.tree)
@@ -165,12 +237,12 @@ def checked_options(chart: Chart, time_limit: float | None, executor: Executor |
     return as_number("time_limit", time_limit)
 
 
-def checked_bound(chart: Chart, bound: float) -> float:
+def check_bound(chart: Chart, bound: float) -> float:
     """A bound of the conditioning, checked."""
     bound = as_number("bound", bound)
     if not 0 <= bound < 1:
         raise InvalidValueError("bound", bound, "a number from 0 to below 1")
-    if bound > 0 and chart_rows(chart).base:
+    if bound > 0 and build_chart_rows(chart).base:
         raise CertifyError(f"bound is {bound:g} on a moving base, expected 0: the sign of det J is proved there")
     if bound > 0 and not chart.problem.metric.is_identity:
         metric = chart.problem.metric.name
@@ -180,13 +252,13 @@ def checked_bound(chart: Chart, bound: float) -> float:
     return bound
 
 
-def whole_domain(domain: Domain) -> Subdivision:
+def cover_domain(domain: Domain) -> Subdivision:
     """The domain, with the slack of its boundaries, as a box in one part; unbounded joints have their half-width.
 
     That of a full turn is pi, rounded down. With the slack, the box holds every angle.
     """
-    half = reach(domain)
-    half = np.where(np.isfinite(half), half, domain.half_width + slack(domain))
+    half = domain.reach
+    half = np.where(np.isfinite(half), half, domain.half_width + domain.slack)
     low, high = domain.centre - half, domain.centre + half
     return Subdivision.whole(np.nextafter(low, -np.inf), np.nextafter(high, np.inf))
 
@@ -208,14 +280,14 @@ def require_same(chart: Chart, certificate: Certificate) -> None:
         )
     if certificate.least_volume != getattr(chart.problem.domain, "least_volume", 0.0):
         raise CertifyError("the certificate is void: the domain keeps out folds by another volume")
-    domain = whole_domain(chart.problem.domain)
+    domain = cover_domain(chart.problem.domain)
     if not (
         np.array_equal(domain.low, certificate.regular.low) and np.array_equal(domain.high, certificate.regular.high)
     ):
         raise CertifyError("the certificate is void: it covers another domain")
 
 
-def _resumed(chart: Chart, bound: float, certificate: Certificate) -> Subdivision:
+def _resume(chart: Chart, bound: float, certificate: Certificate) -> Subdivision:
     require_same(chart, certificate)
     if certificate.bound != bound or certificate.fold:
         raise CertifyError(
@@ -224,16 +296,17 @@ def _resumed(chart: Chart, bound: float, certificate: Certificate) -> Subdivisio
     return certificate.regular
 
 
-def _suspects(chart: Chart) -> Array:
+def _sample_suspects(chart: Chart) -> Array:
     """The centre, and the sample with the least sign(det J(centre)) det J: uniform, near faces, and near corners."""
     domain = chart.problem.domain
     rng = np.random.default_rng(0)
-    unit = rng.uniform(-1, 1, (_SAMPLES, chart.n))
-    powers = rng.choice([1.0, 0.5, 0.25], (_SAMPLES, 1))
+    unit = rng.uniform(-1, 1, (RULES.samples, chart.n))
+    powers = rng.choice([1.0, 0.5, 0.25], (RULES.samples, 1))
     points = np.vstack([domain.centre, domain.centre + domain.half_width * np.sign(unit) * np.abs(unit) ** powers])
-    points = points[contains(domain, points)]
+    points = points[domain.contains(points)]
     if domain.draws_itself:
-        points = sample_heavily(domain, _SAMPLES, 0)
+        points = sample_boundary_weighted(domain, RULES.samples, 0)
+    # det J of the samples, relative to its sign at the centre.
     J_x = chart.problem.task.batched_jacobian(points)[0].reshape(-1, chart.m, chart.n)
     volumes = np.linalg.det(np.nan_to_num(np.concatenate([J_x, chart.coordinates.jacobian(points)], axis=1)))
     worst = int(np.argmin(volumes * np.sign(volumes[0])))
@@ -241,7 +314,7 @@ def _suspects(chart: Chart) -> Array:
     return suspects
 
 
-def _one_to_one(
+def _find_one_to_one_box(
     chart: Chart, rows: ChartRows, base: Subdivision, limits: Limits, executor: Executor | None, monitor: Monitor
 ) -> Subdivision | None:
     """The largest of some boxes around the centre with a proof, and its parts; None if there is no proof for any.
@@ -250,30 +323,36 @@ def _one_to_one(
     from there, larger ones are tried with more, until one of them would take too many.
     """
     end = time.monotonic() + limits.seconds
-    judge = one_to_one_judge(chart, rows, base)
+    check = choose_one_to_one_check(chart, rows, base)
     best: Subdivision | None = None
-    if judge is None:
+    if check is None:
         return None
 
     def proved(share: Array, most: int) -> bool:
         nonlocal best
-        part = _scaled(base, share)
-        middle, own = (part.low + part.high)[None] / 2, replace(judge, low=part.low, high=part.high)
-        if not own(middle, middle).proved.all():  # the middle of points that may be farthest apart
+        # A box about the same centre, with so much of the width of each joint.
+        centre, whole = (base.low + base.high) / 2, share == 1
+        low, high = np.where(whole, base.low, centre - share * half), np.where(whole, base.high, centre + share * half)
+        part = Subdivision.whole(low, high)
+        middle, own = (part.low + part.high)[None] / 2, replace(check, low=part.low, high=part.high)
+        # At the centre of the box, the two points may be farthest apart.
+        if not own(middle, middle).proved.all():
             return False
         left = Limits(max(end - time.monotonic(), 0.0), boxes=most, hopeless=most // 4)
-        search = Search(own, part, left, largest_first(part), executor)
-        search.run(_shown(monitor, "one-to-one"))
+        search = Search(own, part, left, rank_by_volume(part), executor)
+        search.run(_report_search(monitor, "one-to-one"))
         if search.finished:
-            best = search.subdivision()
+            best = search.build_subdivision()
         return search.finished
 
     joints = np.arange(chart.n)
-    idle = ~np.isin(joints, rows.active)  # coordinates themselves: their range does not matter
-    held, half = np.isin(joints, judge.still_joints), (base.high - base.low) / 2
-    for range_ in (np.inf, _HELD_RANGE) if held.any() else (np.inf,):
+    scales = [RULES.shrink**k for k in range(RULES.scales - 1, -1, -1)]
+    # Idle joints are coordinates themselves: their range does not matter.
+    idle = ~np.isin(joints, rows.active)
+    held, half = np.isin(joints, check.still_joints), (base.high - base.low) / 2
+    for range_ in (np.inf, RULES.held_range) if held.any() else (np.inf,):
         share = np.where(idle, 1.0, np.minimum(1.0, range_ / half))
-        _try_scales([np.where(idle | held, share, scale) for scale in _SCALES], proved, limits.boxes)
+        _try_scales([np.where(idle | held, share, scale) for scale in scales], proved, limits.boxes)
         if best is not None:
             break
     return best
@@ -281,12 +360,13 @@ def _one_to_one(
 
 def _try_scales(shares: Sequence[Array], proved: Callable[[Array, int], bool], most: int) -> None:
     """Ask for proofs of boxes of increasing size: the largest one, then by bisection with few boxes, then with many."""
-    if proved(shares[-1], _FEW_BOXES):
+    if proved(shares[-1], RULES.few_boxes):
         return
-    low, high = 0, len(shares) - 1  # those before `low` are proved, those from `high` on are not with few boxes
+    # Those before `low` are proved, those from `high` on are not with few boxes.
+    low, high = 0, len(shares) - 1
     while low < high:
         middle = (low + high) // 2
-        low, high = (middle + 1, high) if proved(shares[middle], _FEW_BOXES) else (low, middle)
+        low, high = (middle + 1, high) if proved(shares[middle], RULES.few_boxes) else (low, middle)
     if low == 0:
         return
     while low + 1 < len(shares) and proved(shares[low + 1], most):
@@ -295,21 +375,13 @@ def _try_scales(shares: Sequence[Array], proved: Callable[[Array, int], bool], m
         proved(shares[low], most)
 
 
-def _scaled(base: Subdivision, share: Array) -> Subdivision:
-    """A box about the same centre, with so much of the width of each joint, (n,)."""
-    middle, half = (base.low + base.high) / 2, (base.high - base.low) / 2
-    whole = share == 1
-    low, high = np.where(whole, base.low, middle - share * half), np.where(whole, base.high, middle + share * half)
-    return Subdivision.whole(low, high)
-
-
-def proved_scale(parts: Subdivision) -> float:
+def find_proved_scale(parts: Subdivision) -> float:
     """The scale of the largest copy of a box about its centre that no open part reaches into."""
     low, high = parts.leaves(OPEN)
-    return float(distances(parts, low, high).min()) if len(low) else 1.0
+    return float(measure_distances(parts, low, high).min()) if len(low) else 1.0
 
 
-def _certificate(
+def _build_certificate(
     chart: Chart,
     method: str,
     bound: float,
@@ -319,30 +391,31 @@ def _certificate(
     resume: Certificate | None,
 ) -> Certificate:
     fold = tuple(tuple(point.tolist()) for point in search.signs.values()) if search.folded else ()
+    # What an earlier search took and found counts as well.
     before = (0, 0.0) if resume is None else (resume.boxes, resume.seconds)
-    known = (
+    conditioning = (
         search.conditioning
         if resume is None or not resume.conditioning
         else min(search.conditioning, resume.conditioning)
     )
-    domain, parts = chart.problem.domain, search.subdivision()
+    domain, parts = chart.problem.domain, search.build_subdivision()
     return Certificate(
         fingerprint(chart.problem, chart.coordinates),
         method,
         bound,
         parts,
-        known * (1 - 1e-9) if bound > 0 and np.isfinite(known) else 0.0,
+        conditioning * (1 - 1e-9) if bound > 0 and np.isfinite(conditioning) else 0.0,
         injective,
         fold,
-        before[0] + search.judged,
+        before[0] + search.evaluated,
         before[1] + seconds,
         getattr(domain, "least_singular_value", 0.0),
         getattr(domain, "least_volume", 0.0),
-        _clear_share(domain, parts),
-    ).sealed()
+        _estimate_proved_fraction(domain, parts),
+    ).seal()
 
 
-def _clear_share(domain: Domain, parts: Subdivision) -> float:
+def _estimate_proved_fraction(domain: Domain, parts: Subdivision) -> float:
     """Of the clear positions of the box of a domain that keeps folds out, the share in proved parts; 0 for others.
 
     From samples of the box, and of the parts that are not proved.
@@ -356,15 +429,16 @@ def _clear_share(domain: Domain, parts: Subdivision) -> float:
     rng, volumes = np.random.default_rng(0), (high - low).prod(axis=1)
 
     def clear(low: Array, high: Array) -> float:
-        values = bound.singular_values(rng.uniform(low, high, (_SAMPLES, parts.n)))
+        values = bound.singular_values(rng.uniform(low, high, (RULES.samples, parts.n)))
         return float(np.mean(values > bound.least_singular_value))
 
-    chosen = rng.choice(len(low), _SAMPLES, p=volumes / volumes.sum())
+    chosen = rng.choice(len(low), RULES.samples, p=volumes / volumes.sum())
     left = float(volumes.sum() / (parts.high - parts.low).prod()) * clear(low[chosen], high[chosen])
-    return float(np.clip(1 - left / clear(parts.low, parts.high), 0.0, 1 - 2**-53))  # not all, whatever samples say
+    # Not all is proved, whatever samples say.
+    return float(np.clip(1 - left / clear(parts.low, parts.high), 0.0, 1 - 2**-53))
 
 
-def _shown(monitor: Monitor, stage: str, *, guarded: bool = False) -> Look:
+def _report_search(monitor: Monitor, stage: str, *, guarded: bool = False) -> Look:
     """Reports what a search has spent of its boxes and its time or, if that is more, the volume that is proved.
 
     Near the boundary of a domain that is `guarded` from folds, hardly any volume and most of the boxes are left. So the
@@ -376,105 +450,44 @@ def _shown(monitor: Monitor, stage: str, *, guarded: bool = False) -> Look:
         limits, share = search.limits, search.proved_volume
         if search.open_count:
             share = min(share, 1 - 2**-53)
-        spent = max(search.judged / limits.boxes, (time.monotonic() - start) / max(limits.seconds, _MOMENT))
+        spent = max(search.evaluated / limits.boxes, (time.monotonic() - start) / max(limits.seconds, 1e-9))
         done = 1.0 if not search.open_count else min(1.0, spent if guarded else max(share, spent))
-        detail = f"{search.judged:,} boxes, {search.open_count:,} open, {percent(share, 2)} proved"
+        detail = f"{search.evaluated:,} boxes, {search.open_count:,} open, {percent(share, 2)} proved"
         monitor(Progress(stage, done, detail))
 
     return show
 
 
-_AT_ONCE = 512
-_SAME_SHARE = 1e-4  # of the same samples, on machines that round otherwise
-_OFF_CENTRE = 1e-6  # of the width of a box
-Mapped = Callable[..., Iterable[Verdicts]]
-
-
-def check_certificate(
-    chart: Chart,
-    certificate: Certificate | None = None,
-    *,
-    executor: Executor | None = None,
-    monitor: Monitor = silent,
-) -> bool:
-    """Whether a certificate holds: all that it says of the chart is computed once more.
-
-    That is each part of the domain, the bound of the conditioning, the two signs of a fold, and the one-to-one box. The
-    number of boxes that were judged and the seconds are history, which only the digest of the certificate covers.
-
-    Args:
-        chart: the chart.
-        certificate: its certificate. Default: the one in the chart's file.
-        executor: shares the work, see `certify`.
-        monitor: called with progress.
-
-    Raises:
-        CertifyError: if there is no certificate, if it belongs to another chart or method or has been changed, or if
-            `certify` would refuse the chart.
-
-    Example:
-        >>> import orthocas as oc
-        >>> from orthocas import problems
-        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
-        >>> oc.check_certificate(chart, oc.certify(chart))
-        True
-    """
-    checked_options(chart, None, executor)
-    certificate = chart.certificate if certificate is None else certificate
-    if certificate is None:
-        raise CertifyError("the chart has no certificate, expected one made by `certify`")
-    require_same(chart, certificate)
-    bound, rows = checked_bound(chart, certificate.bound), chart_rows(chart)
-    judge = judge_of(chart, rows, bound, certificate.method)
-    mapped: Mapped = map if executor is None else partial(in_order, executor)
-    if certificate.fold and not _folds(chart, judge, np.array(certificate.fold)):
-        return False
-    if not _regular(certificate, _judged(judge, certificate.regular, mapped, monitor)):
-        return False
-    if abs(_clear_share(chart.problem.domain, certificate.regular) - certificate.clear_share) > _SAME_SHARE:
-        return False
-    box = certificate.injective
-    if box is None:
-        return True
-    one_to_one = one_to_one_judge(chart, rows, box)
-    if one_to_one is None or not box.complete or not _around_the_centre(certificate, box):
-        return False
-    return all(verdicts.proved.all() for verdicts in _judged(one_to_one, box, mapped, monitor))
-
-
-def _regular(certificate: Certificate, found: list[Verdicts]) -> bool:
+def _check_regular(certificate: Certificate, parts: list[BoxResults]) -> bool:
     """Whether the parts are proved, with one sign unless the chart folds, and the conditioning is what it says."""
-    signs = {int(sign) for verdicts in found for sign in np.unique(verdicts.sign) if sign}
-    least = min((float(verdicts.conditioning.min()) for verdicts in found), default=0.0)
-    proved = all(verdicts.proved.all() for verdicts in found)
+    signs = {int(sign) for results in parts for sign in np.unique(results.sign) if sign}
+    least = min((float(results.conditioning.min()) for results in parts), default=0.0)
+    proved = all(results.proved.all() for results in parts)
     return proved and (len(signs) < 2 or bool(certificate.fold)) and least >= certificate.conditioning
 
 
-def _folds(chart: Chart, judge: Judge, points: Array) -> bool:
+def _check_fold(chart: Chart, check: BoxCheck, points: Array) -> bool:
     """Whether det J is proved to have opposite signs at two points (2, n) of the domain."""
-    found = judge(points, points)
-    return bool(contains(chart.problem.domain, points).all() and found.regular.all() and found.sign.prod() < 0)
+    results = check(points, points)
+    return bool(chart.problem.domain.contains(points).all() and results.regular.all() and results.sign.prod() < 0)
 
 
-def _around_the_centre(certificate: Certificate, box: Subdivision) -> bool:
+def _is_around_centre(certificate: Certificate, box: Subdivision) -> bool:
     """Whether a box lies in the domain, around its centre."""
     domain = certificate.regular
     off = (box.low + box.high - domain.low - domain.high) / (box.high - box.low)
     inside = (box.low >= domain.low).all() and (box.high <= domain.high).all()
-    return bool(inside and np.abs(off).max() < _OFF_CENTRE)
+    return bool(inside and np.abs(off).max() < RULES.off_centre)
 
 
-def _judged(judge: Judge, parts: Subdivision, mapped: Mapped, monitor: Monitor) -> list[Verdicts]:
+def _check_parts(check: BoxCheck, parts: Subdivision, mapped: Mapped, monitor: Monitor) -> list[BoxResults]:
     low, high = parts.leaves(PROVED)
-    found = []
+    pieces = [slice(k, k + RULES.at_once) for k in range(0, len(low), RULES.at_once)]
+    results = []
     try:
-        for verdicts in mapped(judge, _cut(low), _cut(high)):
-            found.append(verdicts)
-            monitor(Progress("check", min(len(found) * _AT_ONCE / len(low), 1.0), f"{len(low)} boxes"))
+        for part in mapped(check, [low[piece] for piece in pieces], [high[piece] for piece in pieces]):
+            results.append(part)
+            monitor(Progress("check", min(len(results) * RULES.at_once / len(low), 1.0), f"{len(low)} boxes"))
     except BrokenExecutor:
         raise CertifyError("the executor cannot be used any more: one of its processes died") from None
-    return found
-
-
-def _cut(corners: Array) -> list[Array]:
-    return [corners[k : k + _AT_ONCE] for k in range(0, len(corners), _AT_ONCE)]
+    return results

@@ -20,7 +20,7 @@ from orthocas.certificates.taylor import (
     square,
 )
 from orthocas.errors import CertifyError
-from orthocas.tools.expressions import Tape, read, to_tape
+from orthocas.tools.expressions import Tape, evaluate_tape, write_tape
 
 _LARGEST_POWER = 64
 _LINEAR = ("assign", "neg", "twice")
@@ -30,18 +30,18 @@ _SUMS = ("add", "sub")
 Slopes = dict[int, TaylorModel]  #: derivatives by the inputs; an input that is missing has the derivative 0
 #: f' for f(a) with the value v; functions that are not among UNARY have a derivative with bounds, but no value
 _DERIVATIVES: dict[str, Callable[[TaylorModel, Any], TaylorModel]] = {
-    "sq": lambda a, v: a.times(2.0),
-    "sqrt": lambda a, v: reciprocal_square_root(a).times(0.5),
+    "sq": lambda a, v: a.multiply_by(2.0),
+    "sqrt": lambda a, v: reciprocal_square_root(a).multiply_by(0.5),
     "inv": lambda a, v: -square(v),
     "sin": lambda a, v: cosine(a),
     "cos": lambda a, v: -sine(a),
     "tan": lambda a, v: square(reciprocal(cosine(a))),
     "exp": lambda a, v: v,
-    "tanh": lambda a, v: _one() - square(v),
+    "tanh": lambda a, v: _build_one() - square(v),
     "log": lambda a, v: reciprocal(a),
-    "atan": lambda a, v: reciprocal(square(a) + _one()),
-    "asin": lambda a, v: reciprocal_square_root(_one() - square(a)),
-    "acos": lambda a, v: -reciprocal_square_root(_one() - square(a)),
+    "atan": lambda a, v: reciprocal(square(a) + _build_one()),
+    "asin": lambda a, v: reciprocal_square_root(_build_one() - square(a)),
+    "acos": lambda a, v: -reciprocal_square_root(_build_one() - square(a)),
 }
 _KNOWN = {*_LINEAR, *_SUMS, *_DERIVATIVES, *POWERS, "mul", "div", "atan2"}
 
@@ -53,7 +53,7 @@ class _Jet(NamedTuple):
     slopes: Slopes
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TaylorGraph:
     """An SX function h of q (n, 1), dense, or its derivatives by some joints, in Taylor arithmetic.
 
@@ -65,9 +65,9 @@ class TaylorGraph:
     joints: tuple[int, ...] | None  #: dh/dq by these, column by column; None: h itself
 
     @classmethod
-    def of(cls, function: ca.Function, what: str, joints: Sequence[int] | None = None) -> "TaylorGraph":
+    def build(cls, function: ca.Function, what: str, joints: Sequence[int] | None = None) -> "TaylorGraph":
         """The steps of a function, checked; `what` names it in errors."""
-        tape = to_tape(function)
+        tape = write_tape(function)
         _require_bounds(tape, what, joints is None)
         return cls(tape, None if joints is None else tuple(joints))
 
@@ -78,13 +78,13 @@ class TaylorGraph:
         def leaf(name: str, of: Any) -> _Jet:
             if name == "const":
                 return _Jet(TaylorModel.constant(np.array([float(of)])), {})
-            return _Jet(inputs[of], {of: _one()} if of in moving else {})
+            return _Jet(inputs[of], {of: _build_one()} if of in moving else {})
 
-        found = read(self.tape, leaf, _jet)
+        jets = evaluate_tape(self.tape, leaf, _apply_step)
         if self.joints is None:
-            return [_known(jet) for jet in found]
+            return [_get_value(jet) for jet in jets]
         none = TaylorModel.constant(np.zeros(1))
-        return [jet.slopes.get(joint, none) for joint in self.joints for jet in found]
+        return [jet.slopes.get(joint, none) for joint in self.joints for jet in jets]
 
 
 def is_whole(value: float | None) -> bool:
@@ -92,78 +92,83 @@ def is_whole(value: float | None) -> bool:
     return value is not None and abs(value) <= _LARGEST_POWER and value == round(value)
 
 
-def _one() -> TaylorModel:
+def _build_one() -> TaylorModel:
     return TaylorModel.constant(np.ones(1))
 
 
-def _jet(name: str, of: Sequence[_Jet]) -> _Jet:
+def _apply_step(name: str, of: Sequence[_Jet]) -> _Jet:
     """A step of any kind."""
     if name in POWERS:
         assert of[1].value is not None
-        return _power(of[0], int(of[1].value.centre.flat[0]))
+        return _apply_power(of[0], int(of[1].value.centre.flat[0]))
     if len(of) == 1:
-        return _unary(name, *of)
-    return {"add": _sum, "sub": _difference, "mul": _product, "div": _quotient, "atan2": _angle}[name](*of)
+        return _apply_unary(name, *of)
+    return {"add": _add, "sub": _subtract, "mul": _multiply, "div": _divide, "atan2": _apply_angle}[name](*of)
 
 
-def _unary(name: str, a: _Jet) -> _Jet:
+def _apply_unary(name: str, a: _Jet) -> _Jet:
     value = UNARY[name](a.value) if name in UNARY and a.value is not None else None
     if name in _LINEAR:
         return _Jet(value, {j: UNARY[name](slope) for j, slope in a.slopes.items()})
-    return _Jet(value, _scaled(_DERIVATIVES[name](_known(a), value), a.slopes) if a.slopes else {})
+    return _Jet(value, _scale_slopes(_DERIVATIVES[name](_get_value(a), value), a.slopes) if a.slopes else {})
 
 
-def _power(a: _Jet, exponent: int) -> _Jet:
-    value = _known(a)
-    slopes = _scaled(power(value, exponent - 1).times(float(exponent)), a.slopes) if exponent and a.slopes else {}
+def _apply_power(a: _Jet, exponent: int) -> _Jet:
+    value = _get_value(a)
+    slopes = (
+        _scale_slopes(power(value, exponent - 1).multiply_by(float(exponent)), a.slopes)
+        if exponent and a.slopes
+        else {}
+    )
     return _Jet(power(value, exponent), slopes)
 
 
-def _sum(a: _Jet, b: _Jet) -> _Jet:
-    return _Jet(_both("add", a, b), _added(a.slopes, b.slopes))
+def _add(a: _Jet, b: _Jet) -> _Jet:
+    return _Jet(_combine_values("add", a, b), _add_slopes(a.slopes, b.slopes))
 
 
-def _difference(a: _Jet, b: _Jet) -> _Jet:
-    return _Jet(_both("sub", a, b), _added(a.slopes, {j: -slope for j, slope in b.slopes.items()}))
+def _subtract(a: _Jet, b: _Jet) -> _Jet:
+    return _Jet(_combine_values("sub", a, b), _add_slopes(a.slopes, {j: -slope for j, slope in b.slopes.items()}))
 
 
-def _product(a: _Jet, b: _Jet) -> _Jet:
-    parts = [_scaled(_known(other), part.slopes) for part, other in ((a, b), (b, a)) if part.slopes]
-    return _Jet(_both("mul", a, b), _added(*parts))
+def _multiply(a: _Jet, b: _Jet) -> _Jet:
+    parts = [_scale_slopes(_get_value(other), part.slopes) for part, other in ((a, b), (b, a)) if part.slopes]
+    return _Jet(_combine_values("mul", a, b), _add_slopes(*parts))
 
 
-def _quotient(a: _Jet, b: _Jet) -> _Jet:
+def _divide(a: _Jet, b: _Jet) -> _Jet:
     """a / b with the derivative (a' - (a / b) b') / b."""
-    inverse = reciprocal(_known(b))
+    inverse = reciprocal(_get_value(b))
     value = None if a.value is None else a.value * inverse
-    slopes = _scaled(inverse, a.slopes)
+    slopes = _scale_slopes(inverse, a.slopes)
     if b.slopes:
         assert value is not None
-        slopes = _added(slopes, _scaled(-(value * inverse), b.slopes))
+        slopes = _add_slopes(slopes, _scale_slopes(-(value * inverse), b.slopes))
     return _Jet(value, slopes)
 
 
-def _angle(y: _Jet, x: _Jet) -> _Jet:
+def _apply_angle(y: _Jet, x: _Jet) -> _Jet:
     """atan2(y, x), without a value, with the derivative (x y' - y x') / (x^2 + y^2)."""
-    a, b = _known(y), _known(x)
+    a, b = _get_value(y), _get_value(x)
     inverse = reciprocal(square(b) + square(a))
-    return _Jet(None, _added(_scaled(b * inverse, y.slopes), _scaled(-(a * inverse), x.slopes)))
+    return _Jet(None, _add_slopes(_scale_slopes(b * inverse, y.slopes), _scale_slopes(-(a * inverse), x.slopes)))
 
 
-def _known(jet: _Jet) -> TaylorModel:
-    assert jet.value is not None  # `_require_bounds` has refused others
+def _get_value(jet: _Jet) -> TaylorModel:
+    # `_require_bounds` has refused others.
+    assert jet.value is not None
     return jet.value
 
 
-def _both(name: str, a: _Jet, b: _Jet) -> TaylorModel | None:
+def _combine_values(name: str, a: _Jet, b: _Jet) -> TaylorModel | None:
     return None if a.value is None or b.value is None else BINARY[name](a.value, b.value)
 
 
-def _scaled(factor: TaylorModel, slopes: Slopes) -> Slopes:
+def _scale_slopes(factor: TaylorModel, slopes: Slopes) -> Slopes:
     return {j: factor * slope for j, slope in slopes.items()}
 
 
-def _added(*parts: Slopes) -> Slopes:
+def _add_slopes(*parts: Slopes) -> Slopes:
     total: Slopes = {}
     for part in parts:
         for j, slope in part.items():
@@ -183,22 +188,23 @@ def _require_bounds(tape: Tape, what: str, values: bool) -> None:
     """Refuse operations whose derivative has no bounds, or needs a value that has none; and outputs without bounds."""
     unknown = f"{what} uses the value of log, atan, asin, acos or atan2, which cannot be certified"
 
+    # Follow the tape with what is known of each place.
     def step(name: str, of: Sequence[_Step]) -> _Step:
         if name not in _KNOWN:
             raise CertifyError(f"{what} uses the operation {name}, which cannot be certified")
         if name in POWERS and not is_whole(of[1].constant):
             raise CertifyError(f"{what} has a power that is no whole number, so it cannot be certified")
-        if not all(operand.known for operand in _needed(name, of)):
+        if not all(operand.known for operand in _find_needed(name, of)):
             raise CertifyError(unknown)
         bounded = name in UNARY or name in BINARY or name in POWERS
         return _Step(bounded and all(operand.known for operand in of), any(operand.moving for operand in of))
 
-    found = read(tape, lambda name, of: _Step(True, name == "input", of if name == "const" else None), step)
-    if values and not all(output.known for output in found):
+    outputs = evaluate_tape(tape, lambda name, of: _Step(True, name == "input", of if name == "const" else None), step)
+    if values and not all(output.known for output in outputs):
         raise CertifyError(unknown)
 
 
-def _needed(name: str, of: Sequence[_Step]) -> Sequence[_Step]:
+def _find_needed(name: str, of: Sequence[_Step]) -> Sequence[_Step]:
     """The operands whose values a derivative needs."""
     if name in _LINEAR or name in _SUMS:
         return ()

@@ -11,50 +11,69 @@ the middle of that joint does not matter, and the coordinates bound how far two 
 
 from dataclasses import dataclass, replace
 from itertools import takewhile
+from math import comb, factorial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.bases.products import ProductFamily
-from orthocas.certificates.chart_rows import ChartRows, CoordinateRows, GraphRows, ProductRows, true_gradients
-from orthocas.certificates.jets import ORDERS, Around, Jets, TipJets
-from orthocas.certificates.judges import (
-    Verdicts,
-    all_positive,
-    between,
-    chosen,
-    influences,
+from orthocas.certificates.box_checks import (
+    BoxResults,
+    compute_influences,
+    compute_pivots,
+    find_most_influential,
+    find_singular_vectors,
+    have_positive_pivots,
     is_orthogonal,
-    most_influential,
-    pivots,
-    singular_vectors,
+    multiply_between,
+    select_boxes,
 )
-from orthocas.certificates.task_rows import TipRows
-from orthocas.certificates.taylor import TINY, UNIT, UP, TaylorModel, above, sum_error
+from orthocas.certificates.jets import ORDERS, Around, Jets, find_neighbours, list_multi_indices
+from orthocas.certificates.rows import (
+    ChartRows,
+    CoordinateRows,
+    GraphRows,
+    ProductRows,
+    TipRows,
+    bound_reach,
+    bound_rotation_error,
+    build_true_gradients,
+)
+from orthocas.certificates.taylor import TINY, UNIT, UP, TaylorModel, compute_margin, evaluate_sine_cosine, sum_error
 from orthocas.charts.certificate import Subdivision
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
+from orthocas.robots.tree import KinematicTree
+from orthocas.tasks.domains import Domain
 from orthocas.tools.batch import one_blas_thread
 from orthocas.tools.checks import Array
 
-_AT_ONCE = 48  #: boxes, whose terms fit into the cache of a processor
-_ROUNDS = 2  # of bounds of the differences by the coordinates
+
+@dataclass(frozen=True, slots=True)
+class OneToOneRules:
+    """Numbers of the one-to-one proof."""
+
+    at_once: int = 48  #: boxes, whose terms fit into the cache of a processor
+    rounds: int = 2  #: of bounds of the differences by the coordinates
 
 
-@dataclass(frozen=True, eq=False)
-class OneToOneJudge:
-    """Proves that Jm(c, d) is nonsingular, for middles c in a box and all d that two points of the whole can have."""
+RULES = OneToOneRules()
 
-    task: TipJets
+
+@dataclass(frozen=True, eq=False, repr=False)
+class OneToOneCheck:
+    """Proves that Jm(c, d) is nonsingular, for centres c in a box and all d that two points of the whole can have."""
+
+    task: "TipJets"
     coordinates: ProductRows | None
     active: tuple[int, ...]
-    still: tuple[int, ...]  #: columns of joints that Jm does not depend on in the middle; they may have wide ranges
+    still: tuple[int, ...]  #: columns of joints on whose centre Jm does not depend; they may have wide ranges
     low: Array  #: of the whole, (n,)
     high: Array
 
     @property
     def joints(self) -> tuple[int, ...]:
-        """The joints whose middles matter."""
+        """The joints whose centres matter."""
         return tuple(joint for k, joint in enumerate(self.active) if k not in self.still)
 
     @property
@@ -62,49 +81,51 @@ class OneToOneJudge:
         """The joints of the columns `still`."""
         return tuple(self.active[k] for k in self.still)
 
-    def __call__(self, low: Array, high: Array) -> Verdicts:
-        """Judge boxes between corners (boxes, n)."""
-        found = []
+    def __call__(self, low: Array, high: Array) -> BoxResults:
+        """Evaluate boxes between corners (boxes, n)."""
+        parts = []
         with one_blas_thread(), np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            for k in range(0, len(low), _AT_ONCE):
-                found.append(self._few(low[k : k + _AT_ONCE], high[k : k + _AT_ONCE]))
-        return _verdicts(found)
+            for k in range(0, len(low), RULES.at_once):
+                parts.append(self._check_few(low[k : k + RULES.at_once], high[k : k + RULES.at_once]))
+        return _join_results(parts)
 
-    def _few(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array]:
-        q, around = (low + high).T / 2, self._around(low, high)
+    def _check_few(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array]:
+        q, around = (low + high).T / 2, self._build_around(low, high)
         if self.still and self.coordinates is not None:
-            for _ in range(_ROUNDS):
-                around = self._bounded(around, self.coordinates.jets(around))
-        proved, widest, promising = self._judged(q, around)
+            for _ in range(RULES.rounds):
+                around = self._narrow_differences(around, self.coordinates.build_jets(around))
+        proved, widest, promising = self._check_at_order(q, around)
         for order in ORDERS[1:]:
             again = np.flatnonzero(promising)
             if again.size:
-                proved[again], widest[again], promising[again] = self._judged(
+                proved[again], widest[again], promising[again] = self._check_at_order(
                     q[:, again], replace(around[again], order=order)
                 )
         return proved, widest
 
-    def _judged(self, q: Array, around: Around) -> tuple[NDArray[np.bool_], Array, NDArray[np.bool_]]:
+    def _check_at_order(self, q: Array, around: Around) -> tuple[NDArray[np.bool_], Array, NDArray[np.bool_]]:
         """Whether boxes are proved, the joint to halve, and whether they might be proved with higher derivatives."""
-        own = () if self.coordinates is None else (self.coordinates.jets(around),)
-        jets = Jets.joined([self.task(q, around), *own])
+        own = () if self.coordinates is None else (self.coordinates.build_jets(around),)
+        jets = Jets.join([self.task(q, around), *own])
+        # J averaged over the segments, in the singular basis of its centre.
         model, terms = jets.average(around, self.active)
-        left, right = singular_vectors(model)
-        turned = between(left, model, right)
-        known = replace(turned, remainder=(turned.remainder + _spread(left, terms, right)) * UP)
+        left, right = find_singular_vectors(model)
+        turned = multiply_between(left, model, right)
+        narrow = replace(turned, remainder=(turned.remainder + _spread(left, terms, right)) * UP)
         rest = (np.abs(left) @ jets.rest.transpose(2, 0, 1) @ np.abs(right)).transpose(1, 2, 0) * UP
-        all_ = replace(known, remainder=(known.remainder + rest) * UP)
+        all_ = replace(narrow, remainder=(narrow.remainder + rest) * UP)
         sound = is_orthogonal(left) & is_orthogonal(right)
-        gains = influences(all_)
+        # Halving joints that stand still is of no use.
+        gains = compute_influences(all_)
         gains[:, self.still] = 0
-        proved = all_positive(pivots(all_)) & sound
+        proved = have_positive_pivots(compute_pivots(all_)) & sound
         promising = ~proved & sound
         if around.order < ORDERS[-1] and promising.any():
-            promising[promising] = all_positive(pivots(chosen(known, promising)))
-        return proved, most_influential(gains, self.active), promising
+            promising[promising] = have_positive_pivots(compute_pivots(select_boxes(narrow, promising)))
+        return proved, find_most_influential(gains, self.active), promising
 
-    def _around(self, low: Array, high: Array) -> Around:
-        """Middles of the boxes, and the largest differences that two points of the whole with such middles have."""
+    def _build_around(self, low: Array, high: Array) -> Around:
+        """Centres of the boxes, and the largest differences that two points of the whole with such centres have."""
         rounding = 8 * UNIT * (np.abs(self.low) + np.abs(self.high))
         centre, outer = (self.low + self.high) / 2, (self.high - self.low) / 2
         nearest = np.maximum(np.maximum(low - centre, centre - high), 0)
@@ -115,16 +136,19 @@ class OneToOneJudge:
         middles[list(self.still)] = 0
         return Around((low + high).T[columns] / 2, middles, np.ascontiguousarray(room.T[columns]))
 
-    def _bounded(self, around: Around, own: Jets) -> Around:
+    def _narrow_differences(self, around: Around, own: Jets) -> Around:
         """Smaller differences: for xi(q) = xi(p), each row w of a combination of coordinates has w Jm d = 0."""
         model, terms = own.average(around, self.active)
         centre = model.centre.transpose(2, 0, 1)
-        doubt = (model.deviation() + (np.abs(terms).sum(axis=2) + own.rest) * UP).transpose(2, 0, 1)
+        doubt = (model.bound_deviation() + (np.abs(terms).sum(axis=2) + own.rest) * UP).transpose(2, 0, 1)
         r = centre.shape[1]
         projected = np.linalg.pinv(np.nan_to_num(centre))[:, list(self.still)]
         D = around.differences.copy()
         for rows in (projected, np.broadcast_to(np.eye(r), (len(centre), r, r))):
-            sizes, least = _combined(rows, centre, doubt)
+            # Upper and lower bounds of the sizes of rows @ J for |J - centre| <= doubt, (boxes, rows, columns).
+            middle = np.abs(rows @ centre)
+            error = (np.abs(rows) @ (doubt + sum_error(rows.shape[2]) * np.abs(centre))) * UP
+            sizes, least = (middle + error) * UP, (middle - error) / UP
             for row in range(sizes.shape[1]):
                 for k in self.still:
                     others = (sizes[:, row] * D.T).sum(axis=1) - sizes[:, row, k] * D[k]
@@ -133,8 +157,8 @@ class OneToOneJudge:
         return replace(around, differences=D)
 
 
-@dataclass(frozen=True, eq=False)
-class ConvexJudge:
+@dataclass(frozen=True, eq=False, repr=False)
+class ConvexCheck:
     """Proves that the symmetric part of P J is positive definite, for one P on all boxes and the true rows of J.
 
     (q - p)^T P (phi(q) - phi(p)) is the integral of (q - p)^T P J (q - p) over the segment between points of a convex
@@ -152,64 +176,66 @@ class ConvexJudge:
         """The joints that J depends on."""
         return self.rows.variables
 
-    def __call__(self, low: Array, high: Array) -> Verdicts:
-        """Judge boxes between corners (boxes, n)."""
-        found = []
+    def __call__(self, low: Array, high: Array) -> BoxResults:
+        """Evaluate boxes between corners (boxes, n)."""
+        parts = []
         with one_blas_thread(), np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            for k in range(0, len(low), _AT_ONCE):
-                found.append(self._few(self.rows(low[k : k + _AT_ONCE], high[k : k + _AT_ONCE])))
-        return _verdicts(found)
+            for k in range(0, len(low), RULES.at_once):
+                parts.append(self._check_few(self.rows(low[k : k + RULES.at_once], high[k : k + RULES.at_once])))
+        return _join_results(parts)
 
-    def _few(self, J: TaylorModel) -> tuple[NDArray[np.bool_], Array]:
+    def _check_few(self, J: TaylorModel) -> tuple[NDArray[np.bool_], Array]:
         boxes = J.remainder.shape[-1]
         unit = np.broadcast_to(np.eye(len(self.inverse)), (boxes, *self.inverse.shape))
-        product = between(np.broadcast_to(self.inverse, unit.shape), J, unit)
+        product = multiply_between(np.broadcast_to(self.inverse, unit.shape), J, unit)
         transposed = replace(
             product, coefficients=product.coefficients.swapaxes(1, 2), remainder=product.remainder.swapaxes(0, 1)
         )
         symmetric = product + transposed
         vectors = np.linalg.eigh(np.nan_to_num(np.moveaxis(symmetric.centre, -1, 0)))[1][:, :, ::-1]
-        turned = between(vectors.transpose(0, 2, 1), symmetric, vectors)
-        proved = all_positive(pivots(turned)) & is_orthogonal(vectors) & self._within_a_turn(J)
-        return proved, most_influential(influences(turned), J.variables)
+        turned = multiply_between(vectors.transpose(0, 2, 1), symmetric, vectors)
+        proved = have_positive_pivots(compute_pivots(turned)) & is_orthogonal(vectors) & self._is_within_turn(J)
+        return proved, find_most_influential(compute_influences(turned), J.variables)
 
-    def _within_a_turn(self, J: TaylorModel) -> NDArray[np.bool_]:
+    def _is_within_turn(self, J: TaylorModel) -> NDArray[np.bool_]:
         """Whether rows with a period change by less than it, over the widths at their largest slopes, (boxes,)."""
         circles = np.flatnonzero(self.rows.turns)
         widths = (self.high - self.low)[list(self.rows.active), None] * UP
-        change = (J.magnitude()[circles] * widths).sum(axis=1)
+        change = (J.bound_magnitude()[circles] * widths).sum(axis=1)
         return np.asarray((change * UP < self.rows.turns[circles, None]).all(axis=0))
 
 
-def one_to_one_judge(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToOneJudge | ConvexJudge | None:
-    """The judge for a box in the domain of a chart, with rows whose vanishing differences are those of phi.
+def choose_one_to_one_check(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToOneCheck | ConvexCheck | None:
+    """The check for a box in the domain of a chart, with rows whose vanishing differences are those of phi.
 
     None if the other rows depend on an idle joint, which then is none, or jump where an arc tangent begins a new turn,
     or stand for those at another heading of a moving base.
     """
-    tip, tree, active = TipRows.of(chart.problem.task), chart.problem.robot.tree, rows.active
-    coordinates, known = chart.coordinates, isinstance(rows.coordinates, ProductRows | None)
-    if rows.base or {*rows.variables} - {*active} or _jumps(chart, rows):
+    tip, tree, active = TipRows.build(chart.problem.task), chart.problem.robot.tree, rows.active
+    coordinates, closed_form = chart.coordinates, isinstance(rows.coordinates, ProductRows | None)
+    if rows.base or {*rows.variables} - {*active} or _has_jumps(chart, rows):
         return None
-    if tip is None or not known:
-        true = replace(rows, task=true_gradients(chart.problem.task, active)[0])
+    # Rows without derivatives in closed form have the convex check.
+    if tip is None or not closed_form:
+        true = replace(rows, task=build_true_gradients(chart.problem.task, active)[0])
         centre = chart.problem.domain.centre[None]
         inverse = np.asarray(np.linalg.pinv(true(centre, centre).centre[:, :, 0]), dtype=float)
-        return ConvexJudge(true, inverse, base.low, base.high)
+        return ConvexCheck(true, inverse, base.low, base.high)
     own: ProductRows | None = None
     if rows.coordinates is not None:
         assert isinstance(coordinates, Coordinates)
         assert isinstance(coordinates.family, ProductFamily)
-        own = ProductRows.of(coordinates.family, coordinates.theta, ORDERS[-1] + 2)
+        own = ProductRows.build(coordinates.family, coordinates.theta, ORDERS[-1] + 2)
+    # Leading joints on which J does not depend keep a free range.
     leading = takewhile(lambda i: i not in rows.variables, tree.carriers(tree.tip_parent))
     still = tuple(active.index(i) for i in leading if i in active)
-    task = TipJets.of(tip, tree, active, chart.problem.domain)
-    return OneToOneJudge(task, own, active, still, base.low, base.high)
+    task = TipJets.build(tip, tree, active, chart.problem.domain)
+    return OneToOneCheck(task, own, active, still, base.low, base.high)
 
 
-def _jumps(chart: Chart, rows: ChartRows) -> bool:
+def _has_jumps(chart: Chart, rows: ChartRows) -> bool:
     """Whether task or coordinates have steps with jumps, other than those of a coordinate's own period."""
-    task = TipRows.of(chart.problem.task) is None and _has_angle(rows.task)
+    task = TipRows.build(chart.problem.task) is None and _has_angle(rows.task)
     return task or (_has_angle(rows.coordinates) and not rows.turns[rows.m :].all())
 
 
@@ -217,10 +243,10 @@ def _has_angle(rows: CoordinateRows | None) -> bool:
     return isinstance(rows, GraphRows) and any(step[0] == "atan2" for step in rows.graph.tape["steps"])
 
 
-def _verdicts(found: list[tuple[NDArray[np.bool_], Array]]) -> Verdicts:
-    proved, widest = (np.concatenate(each) for each in zip(*found, strict=True))
+def _join_results(parts: list[tuple[NDArray[np.bool_], Array]]) -> BoxResults:
+    proved, widest = (np.concatenate(each) for each in zip(*parts, strict=True))
     nothing = np.zeros(len(proved))
-    return Verdicts(proved, proved, nothing, nothing, widest)
+    return BoxResults(proved, proved, nothing, nothing, widest)
 
 
 def _spread(left: Array, terms: Array, right: Array) -> Array:
@@ -231,12 +257,148 @@ def _spread(left: Array, terms: Array, right: Array) -> Array:
     products = right.transpose(0, 2, 1)[:, None] @ products
     sums = np.abs(products, out=products).sum(axis=3)
     sizes = np.abs(left) @ np.abs(parts, out=parts).sum(axis=3) @ np.abs(right)
-    spread: Array = ((sums + sum_error(2 * (rows + columns)) * sizes) * above(count)).transpose(1, 2, 0)
+    spread: Array = ((sums + sum_error(2 * (rows + columns)) * sizes) * compute_margin(count)).transpose(1, 2, 0)
     return spread
 
 
-def _combined(rows: Array, centre: Array, doubt: Array) -> tuple[Array, Array]:
-    """Upper and lower bounds of the sizes of rows @ J for |J - centre| <= doubt, (boxes, rows, columns)."""
-    middle = np.abs(rows @ centre)
-    error = (np.abs(rows) @ (doubt + sum_error(rows.shape[2]) * np.abs(centre))) * UP
-    return (middle + error) * UP, (middle - error) / UP
+@dataclass(frozen=True, eq=False, repr=False)
+class TipJets:
+    """The rows of a tip task in the axes of the world, for columns of some joints in increasing order."""
+
+    rows: TipRows
+    tree: KinematicTree
+    columns: tuple[int, ...]
+    lengths: Array  #: bounds of the distance from each joint's origin to the tip, 1 for prismatic joints, (columns,)
+    doubt: float  #: bound of the error of an entry, from rounding and rotations that are none
+
+    @classmethod
+    def build(cls, rows: TipRows, tree: KinematicTree, columns: tuple[int, ...], domain: Domain) -> "TipJets":
+        """For boxes within a domain."""
+        doubt = 64 * (tree.n + 8) * bound_rotation_error(tree) * bound_reach(tree, domain)
+        chain = tree.carriers(tree.tip_parent)
+        slides = np.where(tree.prismatic, np.abs(domain.centre) + domain.half_width, 0.0)
+        steps = np.linalg.norm(tree.translations, axis=1) + slides
+        beyond = float(np.linalg.norm(tree.tip_translation))
+        longer = 1 + 16 * tree.n * bound_rotation_error(tree)
+        lengths = dict.fromkeys(columns, 0.0)
+        for i in reversed(chain):
+            lengths[i] = 1.0 if tree.prismatic[i] else beyond
+            beyond += float(steps[i])
+        return cls(rows, tree, columns, np.array([lengths[i] for i in columns]) * longer, doubt)
+
+    def __call__(self, q: Array, around: Around) -> Jets:
+        """Jets at joint positions q (all joints, boxes), the columns of which are the centres of the boxes."""
+        # Each part has nested cross products of joint axes: of arms, of rotations, of one axis.
+        axes, arms, R = self._compute_geometry(q)
+        turning = np.array([not self.tree.prismatic[i] for i in self.columns])
+        carried = np.array([i in self.tree.carriers(self.tree.tip_parent) for i in self.columns])
+        outer = axes * (turning & carried)[:, None, None]
+        parts, rests = [], []
+        if self.rows.position:
+            first = np.where(turning[:, None, None], np.cross(axes, arms, axis=1), axes) * carried[:, None, None]
+            along = list(self.rows.position)
+            parts.append([each[:, along] for each in _nest_products(outer, first, around.order)])
+            rests.append(np.repeat(_bound_rest(around, self.lengths)[None], len(along), axis=0))
+        if self.rows.rotation:
+            parts.append(_nest_rotations(outer, around.order))
+            rests.append(np.repeat(self._bound_rest_of_turns(around, turning & carried)[None], 3, axis=0))
+        if self.rows.axis is not None:
+            u = R[:, :, self.rows.axis]
+            across = R[:, :, [k for k in range(3) if k != self.rows.axis]]
+            first = np.cross(outer, np.broadcast_to(u.T[None], outer.shape), axis=1)
+            nested = _nest_products(outer, first, around.order)
+            parts.append([np.einsum("bxk,mxb->mkb", across, each) for each in nested])
+            rests.append(np.repeat(self._bound_rest_of_turns(around, turning & carried)[None], 2, axis=0))
+        n = len(self.columns)
+        derivatives = tuple(
+            np.concatenate([part[order][find_neighbours(n, order + 1)] for part in parts], axis=2).transpose(2, 0, 1, 3)
+            for order in range(around.order + 1)
+        )
+        doubt = np.full((1, 1, 1, 1), self.doubt)
+        return Jets(derivatives, (doubt,) * (around.order + 1), np.concatenate(rests) * UP)
+
+    def _bound_rest_of_turns(self, around: Around, turning: Array) -> Array:
+        """The rest for vectors of length 1 that prismatic joints leave alone."""
+        still = np.logical_not(turning)[:, None]
+        part = Around(around.centre, np.where(still, 0, around.middles), np.where(still, 0, around.differences))
+        return _bound_rest(part, np.asarray(turning, dtype=float))
+
+    def _compute_geometry(self, q: Array) -> tuple[Array, Array, Array]:
+        """Axes of the columns' joints and arms from their origins to the tip, (columns, 3, boxes); R, (boxes, 3, 3)."""
+        boxes = q.shape[1]
+        # Forward kinematics of the chain, for all boxes at once.
+        R, p = np.broadcast_to(np.eye(3), (boxes, 3, 3)), np.zeros((boxes, 3))
+        axes, origins = {}, {}
+        for i in self.tree.carriers(self.tree.tip_parent):
+            p = p + R @ self.tree.translations[i]
+            R = R @ self.tree.rotations[i]
+            if self.tree.prismatic[i]:
+                p = p + R[:, :, 2] * q[i][:, None]
+            else:
+                R = R @ _rotate_about_z(q[i])
+            axes[i], origins[i] = R[:, :, 2], p
+        tip = p + R @ self.tree.tip_translation
+        nothing = np.zeros((boxes, 3))
+        own = np.stack([axes.get(i, nothing).T for i in self.columns])
+        arms = np.stack([(tip - origins.get(i, tip)).T for i in self.columns])
+        return own, arms, R @ self.tree.tip_rotation
+
+
+def _rotate_about_z(angles: Array) -> Array:
+    """Rz, (boxes, 3, 3)."""
+    (s, _), (c, _) = evaluate_sine_cosine(angles)
+    zero, one = np.zeros_like(s), np.ones_like(s)
+    return np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(-1, 3, 3)
+
+
+def _nest_products(axes: Array, first: Array, highest: int) -> list[Array]:
+    """a_i x (a_j x ... first_l) for multi-indices i <= j <= ... <= l from order 1 on, (multi-indices, 3, boxes)."""
+    nested = [first]
+    for order in range(2, highest + 2):
+        outer, inner = _split(len(axes), order)
+        nested.append(np.cross(axes[outer], nested[-1][inner], axis=1))
+    return nested
+
+
+def _nest_rotations(axes: Array, highest: int) -> list[Array]:
+    """The skew part of [a_i]x [a_j]x ... [a_l]x as a vector, for multi-indices from order 1 on."""
+    n, _, boxes = axes.shape
+    crosses = np.zeros((n, 3, 3, boxes))
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        crosses[:, j, i], crosses[:, i, j] = axes[:, k], -axes[:, k]
+    nested, product = [], crosses
+    for order in range(1, highest + 2):
+        if order > 1:
+            outer, inner = _split(n, order)
+            product = np.einsum("mijb,mjkb->mikb", crosses[outer], product[inner])
+        skew = [(product[:, (k + 2) % 3, (k + 1) % 3] - product[:, (k + 1) % 3, (k + 2) % 3]) / 2 for k in range(3)]
+        nested.append(np.stack(skew, axis=1))
+    return nested
+
+
+def _split(n: int, order: int) -> tuple[Array, Array]:
+    """The first joint of each multi-index of an order, and the place of the others among those of one order less."""
+    index = {m: k for k, m in enumerate(list_multi_indices(n, order - 1))}
+    indices = list_multi_indices(n, order)
+    return np.array([m[0] for m in indices]), np.array([index[m[1:]] for m in indices])
+
+
+def _bound_rest(around: Around, lengths: Array) -> Array:
+    """What the derivatives of J that are used leave out of the average, (columns, boxes).
+
+    Of the next order at the centre, the terms that are odd in d cancel; the one after it is bounded everywhere between
+    the points. The length of a derivative depends on the last of its joints: sums over joints up to each, weighted by
+    their steps.
+    """
+    next_ = around.order + 1
+    c, s = np.cumsum(around.middles, axis=0), np.cumsum(around.differences, axis=0)
+    odd = sum(comb(next_, k) * c ** (next_ - k) * s**k / (k + 1) for k in range(0, next_, 2))
+    even = sum(comb(next_ + 1, k) * c ** (next_ + 1 - k) * s**k / (k + 1) for k in range(next_ + 2))
+    upto = (odd / factorial(next_) + even / factorial(next_ + 1)) * UP
+    steps = np.diff(upto, axis=0, prepend=0.0) * lengths[:, None]
+    # Of the joint itself and those after it, then of those before.
+    later = np.cumsum(steps[::-1], axis=0)[::-1]
+    before = upto - np.diff(upto, axis=0, prepend=0.0)
+    rest: Array = (later + before * lengths[:, None]) * UP
+    return rest

@@ -1,51 +1,59 @@
 """What a proof must know beyond the box: parts of a domain, endless joints."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from orthocas.bases.family import Family, LinearFamily
 from orthocas.bases.mlp import MLPFamily
-from orthocas.certificates.chart_rows import (
+from orthocas.certificates.box_checks import (
+    NEVER,
+    BoxResults,
+    EliminationCheck,
+    RegularCheck,
+    find_most_influential,
+    find_singular_vectors,
+    is_orthogonal,
+    multiply_between,
+)
+from orthocas.certificates.determinant import CofactorCheck, Determinant
+from orthocas.certificates.rows import (
     ChartRows,
     GraphRows,
-    closed_form_rows,
-    joint_models,
-    task_gradients,
-    true_gradients,
+    TipRows,
+    build_closed_form,
+    build_joint_models,
+    build_task_rows,
+    build_true_gradients,
 )
-from orthocas.certificates.determinant import CofactorJudge, Determinant
-from orthocas.certificates.judges import (
-    NEVER,
-    RegularityJudge,
-    RegularJudge,
-    Verdicts,
-    between,
-    is_orthogonal,
-    most_influential,
-    singular_vectors,
-)
-from orthocas.certificates.task_rows import TipRows
 from orthocas.certificates.taylor import UP, TaylorModel, Variables
 from orthocas.charts.certificate import COFACTORS, ELIMINATION
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import CertifyError
-from orthocas.tasks.domains import PathBound, SingularBound, bounds_of
-from orthocas.tasks.task import Task
+from orthocas.tasks.domains import PathBound, SingularBound
 from orthocas.tools.batch import dense_function, one_blas_thread
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import Tape, gradient_dependences, periodic_joints, to_tape
+from orthocas.tools.expressions import Tape, evaluate_tape, find_gradient_dependences, write_tape
 
-_ROUNDING = 1e-6  # of distances, far above that of floating-point numbers
-_LENGTHS = 1e-7  # of squares: far above what singular vectors miss that are orthogonal up to 1e-9, and roundings of D
-_STEEP = 0.08  # how much a singular value changes over a box, at least in most cases: by so much of its half-widths
-_THIN = 0.25  # narrower than so much of the widest joint
-_GUARDS = 1e-12  # of |J|^2: elimination in floating-point numbers is exact to less, so guards agree
+
+@dataclass(frozen=True, slots=True)
+class OutsideRules:
+    """Margins of proofs that boxes lie outside a domain, and when they are tried."""
+
+    rounding: float = 1e-6  #: of distances, far above that of floating-point numbers
+    #: of squares: far above what singular vectors miss that are orthogonal up to 1e-9, and roundings of D
+    lengths: float = 1e-7
+    #: how much a singular value changes over a box, at least in most cases: by so much of its half-widths
+    steep: float = 0.08
+    thin: float = 0.25  #: of the widest joint: narrower boxes are thin
+    guards: float = 1e-12  #: of |J|^2: elimination in floating-point numbers is exact to less, so guards agree
+
+
+RULES = OutsideRules()
 
 
 def require_all_positions(chart: Chart, variables: Collection[int]) -> None:
@@ -56,12 +64,13 @@ def require_all_positions(chart: Chart, variables: Collection[int]) -> None:
     and of xi are read. The joints of a torus are unbounded.
     """
     problem = chart.problem
-    endless = np.flatnonzero(np.isinf(bounds_of(problem.domain)[1])).tolist()
-    asked = [joint for joint in endless if joint in variables]
-    if not asked:
+    # Joints without bounds on which the proof depends must repeat after a turn.
+    endless = np.flatnonzero(np.isinf(problem.domain.bounds[1])).tolist()
+    endless_variables = [joint for joint in endless if joint in variables]
+    if not endless_variables:
         return
-    alike = _same_after_turns(chart)
-    for joint in asked:
+    alike = _find_periodic_joints(chart)
+    for joint in endless_variables:
         name = problem.robot.joint_names[joint]
         if problem.robot.tree.prismatic[joint] or problem.domain.half_width[joint] < np.pi:
             raise CertifyError(f"joint '{name}' is unbounded and J depends on it, expected bounds, or a full turn")
@@ -72,18 +81,19 @@ def require_all_positions(chart: Chart, variables: Collection[int]) -> None:
             )
 
 
-def _same_after_turns(chart: Chart) -> set[int]:
+def _find_periodic_joints(chart: Chart) -> set[int]:
     """The joints whose full turns change neither J_x nor J_xi."""
     coordinates = chart.coordinates
-    assert isinstance(coordinates, Coordinates)  # `chart_rows` has refused others
-    task = _alike(to_tape(chart.problem.task.smooth_function), chart.n)
+    # `build_chart_rows` has refused others.
+    assert isinstance(coordinates, Coordinates)
+    task = _find_unchanged(write_tape(chart.problem.task.smooth_function), chart.n)
     if not len(coordinates.offset):
         return task
-    own = _family_alike(coordinates.family, len(coordinates.active), coordinates)
+    own = _find_periodic_inputs(coordinates.family, len(coordinates.active), coordinates)
     return task & {*coordinates.idle, *(coordinates.active[i] for i in own)}
 
 
-def _family_alike(family: Family, n: int, coordinates: Coordinates) -> set[int]:
+def _find_periodic_inputs(family: Family, n: int, coordinates: Coordinates) -> set[int]:
     """The same for the coordinates of a family of n joints."""
     if isinstance(family, MLPFamily):
         return {i for i, direct in enumerate(family.direct) if not direct}
@@ -92,29 +102,75 @@ def _family_alike(family: Family, n: int, coordinates: Coordinates) -> set[int]:
         values = family.basis(q)
     else:
         values = family.expression(q, ca.SX(ca.DM(coordinates.theta)))
-    return _alike(to_tape(dense_function("values", [q], [values])), n)
+    return _find_unchanged(write_tape(dense_function("values", [q], [values])), n)
 
 
-def _alike(tape: Tape, n: int) -> set[int]:
+def _find_unchanged(tape: Tape, n: int) -> set[int]:
     """The joints whose full turns do not change a gradient."""
-    needed = {k for row in gradient_dependences(tape) for joints in row.values() for k in joints}
-    return {k for k in range(n) if k not in needed} | periodic_joints(tape, n)
+    needed = {k for row in find_gradient_dependences(tape) for joints in row.values() for k in joints}
+    return {k for k in range(n) if k not in needed} | find_periodic_joints(tape, n)
 
 
-@dataclass(frozen=True, eq=False)
-class OutsideJudge:
+def find_periodic_joints(tape: Tape, n: int) -> frozenset[int]:
+    """The joints k of n for which h(q + 2 pi e_k) - h(q) is the same constant at every q, for all outputs h."""
+    nothing, unit = np.zeros(n), np.eye(n)
+
+    def leaf(name: str, of: Any) -> _Shift:
+        return _Shift(nothing, float(of)) if name == "const" else _Shift(unit[of])
+
+    shifts = evaluate_tape(tape, leaf, lambda name, of: _Shift(_compute_shift(name, of)))
+    alike = np.all([~np.isnan(each.turn) for each in shifts], axis=0)
+    return frozenset(np.flatnonzero(alike).tolist())
+
+
+class _Shift(NamedTuple):
+    """What a full turn does to a value."""
+
+    turn: Any  #: change by a turn of each joint / 2 pi; NaN where it is no constant
+    constant: float | None = None  #: the value itself, if it is a number
+
+
+def _compute_shift(name: str, of: Sequence[_Shift]) -> Any:
+    """The change of a step. Only whole numbers of moderate size are added and multiplied, which is exact."""
+    shifts = [each.turn for each in of]
+    if name in _EXACT:
+        return _keep_whole(_EXACT[name](*shifts))
+    for one, other in ((of[0], of[-1]), (of[-1], of[0])):
+        if name == "mul" and one.constant is not None:
+            return _keep_whole(np.where(other.turn == 0, 0.0, other.turn * one.constant))
+    still = np.all([shift == 0 for shift in shifts], axis=0)
+    if name in ("sin", "cos", "tan"):
+        still = ~np.isnan(shifts[0])
+    return np.where(still, 0.0, np.nan)
+
+
+_EXACT: Mapping[str, Callable[..., Any]] = {
+    "assign": lambda a: a,
+    "neg": lambda a: -a,
+    "twice": lambda a: 2 * a,
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+}
+
+
+def _keep_whole(shift: Any) -> Any:
+    return np.where((shift == np.round(shift)) & (np.abs(shift) < 2.0**40), shift, np.nan)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class OutsideCheck:
     """Counts boxes as proved, without a sign, that lie outside a ClearBox: s(q) <= bound all over the box.
 
     s(q) <= |v^T D^-1 J(q)| for all |v| >= 1, with the rows J that count in that ClearBox. Here v(q) is the singular
-    vector of the smallest singular value at the middle of the box, plus as much of the others, linear in q, as cancels
-    the change of v^T D^-1 J along them to first order. Another judge judges the other boxes, and their det J must have
-    the sign of the middle of the domain: a box with the other sign is halved until its parts lie outside, or a fold
-    shows. Where the domain itself keeps folds out, a box with the other sign is left to it: it is not proved, halving
-    it is of no use, and its sign is no fold of the chart.
+    vector of the smallest singular value at the centre of the box, plus as much of the others, linear in q, as cancels
+    the change of v^T D^-1 J along them to first order. Another check evaluates the other boxes, and their det J must
+    have the sign of the centre of the domain: a box with the other sign is halved until its parts lie outside, or a
+    fold shows. Where the domain itself keeps folds out, a box with the other sign is left to it: it is not proved,
+    halving it is of no use, and its sign is no fold of the chart.
     """
 
-    inside: RegularJudge
-    rows: GraphRows  #: J, the rows that judge, or C(q) J with orthogonal C if all entries of D are the same
+    inside: RegularCheck
+    rows: GraphRows  #: J, the rows that check, or C(q) J with orthogonal C if all entries of D are the same
     domain: SingularBound
     sign: float  #: of det J at the centre of the domain
     variables: Variables
@@ -130,62 +186,62 @@ class OutsideJudge:
         """The joints that J or the bound depends on."""
         return tuple(sorted({*self.inside.joints, *self.variables}))
 
-    def __call__(self, low: Array, high: Array) -> Verdicts:
-        """Judge boxes between corners (boxes, n)."""
-        found = self.inside(low, high)
-        own = found.proved & (found.sign == self.sign)
-        values = np.full(len(low), np.inf)  # at the middles of boxes that are not proved
-        values[~own] = self._singular_values((low + high)[~own] / 2)
-        near, widest = self._worth_a_try(values, low, high), self._no_slivers(values, low, high, found.widest)
+    def __call__(self, low: Array, high: Array) -> BoxResults:
+        """Evaluate boxes between corners (boxes, n)."""
+        inside = self.inside(low, high)
+        own = inside.proved & (inside.sign == self.sign)
+        # Singular values are needed at the centres of boxes that are not proved.
+        values = np.full(len(low), np.inf)
+        if not own.all():
+            values[~own] = self.domain.singular_values((low + high)[~own] / 2)
+        # Boxes that may lie outside: others, too large for the value at their centre, are rarely proved to.
+        half = (high - low)[:, list(self.variables)] / 2
+        near = np.asarray(self.domain.least_singular_value - values > RULES.steep * half.sum(axis=1))
+        widest = self._avoid_slivers(values, low, high, inside.widest)
         outside = np.zeros(len(low), dtype=bool)
         if near.any():
             with one_blas_thread():
-                outside[near], widest[near] = self.lie_outside(low[near], high[near])
-        regular, sign = found.regular & ~outside, np.where(outside, 0, found.sign)
+                outside[near], widest[near] = self.check_outside(low[near], high[near])
+        regular, sign = inside.regular & ~outside, np.where(outside, 0, inside.sign)
         if self.guarded:
             widest[regular & ~own & (values > self.domain.least_singular_value)] = NEVER
             regular, sign = regular & (sign == self.sign), np.where(sign == self.sign, sign, 0)
-        return Verdicts(
+        return BoxResults(
             proved=own | outside,
             regular=regular,
             sign=sign,
-            conditioning=np.where(outside, np.inf, found.conditioning),
+            conditioning=np.where(outside, np.inf, inside.conditioning),
             widest=widest,
         )
 
-    def _singular_values(self, points: Array) -> Array:
-        return np.asarray(self.domain.singular_values(points)) if len(points) else np.zeros(0)
-
-    def _worth_a_try(self, values: Array, low: Array, high: Array) -> NDArray[np.bool_]:
-        """Boxes that may lie outside: others, too large for the value at their middle, are rarely proved to."""
-        half = (high - low)[:, list(self.variables)] / 2
-        return np.asarray(self.domain.least_singular_value - values > _STEEP * half.sum(axis=1))
-
-    def _no_slivers(self, values: Array, low: Array, high: Array, widest: Array) -> Array:
-        """The joint to halve: of thin boxes with a middle outside the widest one, so that they become worth a try."""
+    def _avoid_slivers(self, values: Array, low: Array, high: Array, widest: Array) -> Array:
+        """The joint to halve: of thin boxes with a centre outside the widest one, so that they become worth a try."""
         joints = np.array(self.joints)
         half = (high - low)[:, joints] / 2
-        known = np.maximum(widest, 0)
-        thin = (high - low)[np.arange(len(low)), known] / 2 < _THIN * half.max(axis=1)
+        joint = np.maximum(widest, 0)
+        thin = (high - low)[np.arange(len(low)), joint] / 2 < RULES.thin * half.max(axis=1)
         thin &= (values < self.domain.least_singular_value) & (widest >= 0)
         return np.where(thin, joints[half.argmax(axis=1)], widest)
 
-    def lie_outside(self, low: Array, high: Array) -> tuple[Array, Array]:
+    def check_outside(self, low: Array, high: Array) -> tuple[Array, Array]:
         """Whether boxes lie outside, and the joint to halve to find out."""
-        J = self.rows(joint_models(low, high, self.variables)[0]).times(1 / self.domain.scale[:, None, None])
-        left, right = singular_vectors(J)
+        joints = build_joint_models(low, high, self.variables)[0]
+        J = self.rows(joints).multiply_by(1 / self.domain.scale[:, None, None])
+        # The row v^T J with the change along the other singular vectors taken out.
+        left, right = find_singular_vectors(J)
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            least = _least_row(between(left, J, right))
-            sizes = least.magnitude()
+            least = _build_least_row(multiply_between(left, J, right))
+            sizes = least.bound_magnitude()
             squared = (sizes**2).sum(axis=0) * UP
-            squared += _GUARDS * (J.magnitude() ** 2).sum(axis=(0, 1))
-            influences = (least.gains() * sizes).sum(axis=1)
-        small = squared <= self.domain.least_singular_value**2 * (1 - _LENGTHS)
+            squared += RULES.guards * (J.bound_magnitude() ** 2).sum(axis=(0, 1))
+            influences = (least.compute_gains() * sizes).sum(axis=1)
+        # Its length bounds the smallest singular value from above.
+        small = squared <= self.domain.least_singular_value**2 * (1 - RULES.lengths)
         outside: Array = small & is_orthogonal(left) & is_orthogonal(right)
-        return outside, most_influential(influences.T, least.variables)
+        return outside, find_most_influential(influences.T, least.variables)
 
 
-def _least_row(turned: TaylorModel) -> TaylorModel:
+def _build_least_row(turned: TaylorModel) -> TaylorModel:
     """v^T times a matrix in its singular basis, for v = (a_1, ..., a_m-1, 1) with a_j = -(linear part) / s_j."""
     row = turned[-1]
     linear = slice(1, 1 + len(turned.variables))
@@ -196,16 +252,16 @@ def _least_row(turned: TaylorModel) -> TaylorModel:
     return row
 
 
-@dataclass(frozen=True, eq=False)
-class CorridorJudge:
+@dataclass(frozen=True, eq=False, repr=False)
+class CorridorCheck:
     """Counts boxes as proved, without a sign, that are farther from the path than the radius.
 
-    A box is, if the distance of its middle is larger than the radius by more than half of its diagonal.
+    A box is, if the distance of its centre is larger than the radius by more than half of its diagonal.
 
-    Another judge judges the other boxes, and their det J must have the sign of the first posture of the path.
+    Another check evaluates the other boxes, and their det J must have the sign of the first posture of the path.
     """
 
-    inside: RegularJudge
+    inside: RegularCheck
     domain: PathBound
     sign: float
 
@@ -219,23 +275,24 @@ class CorridorJudge:
         """All joints: parts may lie outside in each of them."""
         return tuple(range(len(self.domain.centre)))
 
-    def __call__(self, low: Array, high: Array) -> Verdicts:
-        """Judge boxes between corners (boxes, n)."""
+    def __call__(self, low: Array, high: Array) -> BoxResults:
+        """Evaluate boxes between corners (boxes, n)."""
         middle, half = (low + high) / 2, (high - low) / 2
         distance: Any = np.sqrt(self.domain.squared_distance(middle))
-        outside = distance > 1 + _ROUNDING + self.domain.lengths(half)
-        found = self.inside(low, high)
-        return Verdicts(
-            proved=(found.proved & (found.sign == self.sign)) | outside,
-            regular=found.regular & (distance <= 1),  # only these signs tell about the corridor
-            sign=np.where(outside, 0, found.sign),
-            conditioning=np.where(outside, np.inf, found.conditioning),
-            widest=found.widest,
+        outside = distance > 1 + RULES.rounding + self.domain.lengths(half)
+        inside = self.inside(low, high)
+        return BoxResults(
+            proved=(inside.proved & (inside.sign == self.sign)) | outside,
+            # Only these signs are of the corridor.
+            regular=inside.regular & (distance <= 1),
+            sign=np.where(outside, 0, inside.sign),
+            conditioning=np.where(outside, np.inf, inside.conditioning),
+            widest=inside.widest,
         )
 
 
-def judge_of(chart: Chart, rows: ChartRows, bound: float, method: str | None = None) -> RegularJudge:
-    """The judge of a chart: of its whole box or, of a part of it, of what is not proved to lie outside.
+def choose_check(chart: Chart, rows: ChartRows, bound: float, method: str | None = None) -> RegularCheck:
+    """The check of a chart: of its whole box or, of a part of it, of what is not proved to lie outside.
 
     Args:
         chart: the chart.
@@ -251,54 +308,45 @@ def judge_of(chart: Chart, rows: ChartRows, bound: float, method: str | None = N
     domain = chart.problem.domain
     domain.require_bounds("proof")
     require_all_positions(chart, rows.variables)
-    judge, near, clear = inside_judge(chart, rows, bound, method), domain.path_bound, domain.singular_bound
+    check, near, clear = choose_inside_check(chart, rows, bound, method), domain.path_bound, domain.singular_bound
     if near is not None:
-        _require_uncounted(near, chart.problem.robot.joint_names)
+        # After a turn of an unbounded joint that counts, what is far from the path may be near it.
+        for joint in {*near.unbounded} & {*near.counted.tolist()}:
+            name = chart.problem.robot.joint_names[joint]
+            raise CertifyError(f"joint '{name}' is unbounded and counts in the corridor, expected an infinite radius")
         start = near.postures[near.contains(near.postures)][:1]
-        return CorridorJudge(judge, near, float(judge(start, start).sign[0]))
+        return CorridorCheck(check, near, float(check(start, start).sign[0]))
     if clear is None:
-        return judge
-    own, variables = _judging_rows(chart, clear)
+        return check
+    own, variables = _choose_rows(chart, clear)
     require_all_positions(chart, variables)
-    sign = float(judge(domain.centre[None], domain.centre[None]).sign[0])  # rows have other scales than the chart's
-    return OutsideJudge(judge, own, clear, sign, tuple(sorted(variables)), domain.room_to_fold is not None)
+    # The sign is that of these rows, which have other scales than the chart's.
+    sign = float(check(domain.centre[None], domain.centre[None]).sign[0])
+    return OutsideCheck(check, own, clear, sign, tuple(sorted(variables)), domain.room_to_fold is not None)
 
 
-def inside_judge(chart: Chart, rows: ChartRows, bound: float, method: str | None = None) -> RegularJudge:
-    """The judge of boxes that lie in the domain; see `judge_of`."""
-    determinant = Determinant.of(chart) if bound == 0 and method != ELIMINATION else None
+def choose_inside_check(chart: Chart, rows: ChartRows, bound: float, method: str | None = None) -> RegularCheck:
+    """The check of boxes that lie in the domain; see `choose_check`."""
+    determinant = Determinant.build(chart) if bound == 0 and method != ELIMINATION else None
     if determinant is not None:
-        return CofactorJudge(determinant)
+        return CofactorCheck(determinant)
     if method == COFACTORS:
         raise CertifyError("the chart's determinant has no expansion, so it has no certificate of this method")
-    return RegularityJudge(rows, bound)
+    return EliminationCheck(rows, bound)
 
 
-def _judging_rows(chart: Chart, domain: SingularBound) -> tuple[GraphRows, set[int]]:
-    """The rows that judge positions, as `domain.is_clear` takes them, and the joints that they depend on.
+def _choose_rows(chart: Chart, domain: SingularBound) -> tuple[GraphRows, set[int]]:
+    """The rows that check positions, as `domain.is_clear` takes them, and the joints that they depend on.
 
     Rows of a whole position or a whole orientation may be rotated if they have the same scale: then the rotation
     changes no singular value, and rows in the axes of a body of the arm depend on fewer joints.
     """
     task, joints = chart.problem.task, range(chart.n)
-    if _turns_freely(chart.problem.task, domain):
-        return task_gradients(task, chart.problem.domain, joints)
+    tip = TipRows.build(task)
+    if tip is not None and tip.axis is None and len(domain.scale) % 3 == 0:
+        own_axes = domain.jacobian_function is task.frame_jacobian_function or not tip.rotation
+        if own_axes and (domain.scale[::3] == domain.scale.reshape(-1, 3).T).all():
+            return build_task_rows(task, chart.problem.domain, joints)
     if domain.jacobian_function is not task.jacobian_function:
-        return closed_form_rows(domain.jacobian_function, joints)
-    return true_gradients(task, joints)
-
-
-def _turns_freely(task: Task, domain: SingularBound) -> bool:
-    """Whether no singular value depends on the axes in which position and orientation are taken."""
-    tip = TipRows.of(task)
-    if tip is None or tip.axis is not None or len(domain.scale) % 3:
-        return False
-    own_axes = domain.jacobian_function is task.frame_jacobian_function or not tip.rotation
-    return own_axes and bool((domain.scale[::3] == domain.scale.reshape(-1, 3).T).all())
-
-
-def _require_uncounted(domain: PathBound, joint_names: Sequence[str]) -> None:
-    """Raise CertifyError if an unbounded joint counts: after a turn, what is far from the path may be near it."""
-    for joint in {*domain.unbounded} & {*domain.counted.tolist()}:
-        name = joint_names[joint]
-        raise CertifyError(f"joint '{name}' is unbounded and counts in the corridor, expected an infinite radius")
+        return build_closed_form(domain.jacobian_function, joints)
+    return build_true_gradients(task, joints)

@@ -1,4 +1,4 @@
-"""Branch and bound: judge boxes, and halve those on which nothing is proved, the largest first."""
+"""Branch and bound: check boxes, and halve those on which nothing is proved, the largest first."""
 
 import heapq
 import logging
@@ -10,17 +10,26 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from orthocas.certificates.judges import NEVER, UNKNOWN, Judge, Verdicts
-from orthocas.charts.certificate import MOST_BOXES, OPEN, PROVED, Subdivision, halfway
+from orthocas.certificates.box_checks import NEVER, UNKNOWN, BoxCheck, BoxResults
+from orthocas.charts.certificate import MOST_BOXES, OPEN, PROVED, Subdivision, halve_interval
 from orthocas.errors import CertifyError
 from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import check_remembered
 from orthocas.tools.processes import ATTEMPTS, worker_died
 
-BATCH = 512  #: most boxes of one task
-_SMALL = 128  # boxes; smaller tasks take longer for each
-_TASKS = 8  # that the waiting boxes are cut into if they are few
-_IN_FLIGHT = 64  # most tasks of an executor at a time
+
+@dataclass(frozen=True, slots=True)
+class SearchRules:
+    """How boxes are shared between workers."""
+
+    batch: int = 512  #: most boxes of one task
+    small: int = 128  #: boxes; smaller tasks take longer for each
+    tasks: int = 8  #: that the waiting boxes are cut into if they are few
+    in_flight: int = 64  #: most tasks of an executor at a time
+
+
+RULES = SearchRules()
+
 _log = logging.getLogger(__name__)
 Priority = Callable[[Array, Array], Array]  #: corners (boxes, n) -> numbers, smallest first
 Look = Callable[["Search"], None]  #: called after each batch
@@ -32,7 +41,7 @@ class Limits:
 
     seconds: float = np.inf
     boxes: int = MOST_BOXES // 4
-    smallest: float = 2.0**-12  #: share of the width of the whole below which a joint's interval is not halved
+    smallest: float = 2.0**-12  #: fraction of the width of the whole below which a joint's interval is not halved
     first_failure: bool = False  #: whether boxes that rank behind one that is too small to halve do not matter
     folds: bool = True  #: whether a fold ends the search
     hopeless: int = MOST_BOXES  #: boxes after which the search ends if the rest would take more than `boxes`
@@ -40,15 +49,15 @@ class Limits:
 
 @dataclass(eq=False)
 class Search:
-    """A search in progress: the tree of boxes, and those still to judge."""
+    """A search in progress: the tree of boxes, and those still to check."""
 
-    judge: Judge
+    check: BoxCheck
     base: Subdivision  #: its open parts are searched
     limits: Limits
     priority: Priority
     executor: Executor | None = None
-    judged: int = 0
-    proved_volume: float = 0.0  #: share of the whole
+    evaluated: int = 0
+    proved_volume: float = 0.0  #: fraction of the whole
     open_count: int = 0  #: number of boxes where nothing is proved so far
     dead: int = 0  #: number of boxes too small to halve, or of no use to halve
     failed: float = np.inf  #: least rank of these boxes
@@ -77,10 +86,10 @@ class Search:
     def run(self, look: Look) -> None:
         """Search until all is proved, a fold is found, or a limit is reached. An interrupted search keeps its state."""
         end = time.monotonic() + self.limits.seconds
-        pending: dict[Future[Verdicts], list[tuple[float, int, Array, Array]]] = {}
+        pending: dict[Future[BoxResults], list[tuple[float, int, Array, Array]]] = {}
         try:
             while self._waiting or pending:
-                if self._decided or time.monotonic() > end or self.judged >= self.limits.boxes or self._hopeless:
+                if self._decided or time.monotonic() > end or self.evaluated >= self.limits.boxes or self._hopeless:
                     break
                 self._step(pending)
                 look(self)
@@ -92,8 +101,8 @@ class Search:
     @property
     def _hopeless(self) -> bool:
         """Whether all would take too many boxes, if it goes on as slowly as so far."""
-        late = self.judged > self.limits.hopeless
-        return late and self.judged > self.proved_volume * self.limits.boxes
+        late = self.evaluated > self.limits.hopeless
+        return late and self.evaluated > self.proved_volume * self.limits.boxes
 
     @property
     def _decided(self) -> bool:
@@ -103,50 +112,51 @@ class Search:
 
     def visit(self, points: Array) -> None:
         """Note the signs of det J at points (k, n), where they are proved."""
-        found = self.judge(points, points)
-        for point, regular, sign in zip(points, found.regular, found.sign.tolist(), strict=True):
+        results = self.check(points, points)
+        for point, regular, sign in zip(points, results.regular, results.sign.tolist(), strict=True):
             if regular and sign:
                 self.signs.setdefault(int(sign), point)
 
-    def subdivision(self) -> Subdivision:
+    def build_subdivision(self) -> Subdivision:
         """The tree so far."""
         codes: list[int] = []
         root = 0
         for code in self.base.codes.tolist():
             if code == OPEN:
-                codes += self._preorder(root)
+                codes += self._list_preorder(root)
                 root += 1
             else:
                 codes.append(code)
         return Subdivision(self.base.low, self.base.high, np.array(codes, dtype=np.uint8))
 
-    def _step(self, pending: dict[Future[Verdicts], list[tuple[float, int, Array, Array]]]) -> None:
-        """Judge one batch here, or give batches to the executor and take back those that are done."""
+    def _step(self, pending: dict[Future[BoxResults], list[tuple[float, int, Array, Array]]]) -> None:
+        """Evaluate one batch here, or give batches to the executor and take back those that are done."""
         check_remembered()
         if self.executor is None:
             batch = self._take()
             try:
-                verdicts = self.judge(*_corners(batch))
+                results = self.check(*_stack_corners(batch))
             except KeyboardInterrupt:
                 self._return(batch)
                 raise
-            self._apply(batch, verdicts)
+            self._apply(batch, results)
             return
-        while self._waiting and len(pending) < _IN_FLIGHT:
+        # Keep the executor busy, and take back what is done.
+        while self._waiting and len(pending) < RULES.in_flight:
             batch = self._take()
             try:
-                pending[self.executor.submit(self.judge, *_corners(batch))] = batch
+                pending[self.executor.submit(self.check, *_stack_corners(batch))] = batch
             except BrokenExecutor:
                 raise CertifyError("the executor cannot be used any more: one of its processes died") from None
         done = wait(pending, return_when=FIRST_COMPLETED).done
         for future in done:
             batch = pending.pop(future)
             if worker_died(future):
-                self._again(batch)
+                self._retry(batch)
             else:
                 self._apply(batch, future.result())
 
-    def _again(self, batch: list[tuple[float, int, Array, Array]]) -> None:
+    def _retry(self, batch: list[tuple[float, int, Array, Array]]) -> None:
         """Return boxes whose process died; those for which that was the last attempt stay open."""
         self._deaths.update(place for _, place, _, _ in batch)
         given_up = [box for box in batch if self._deaths[box[1]] >= ATTEMPTS]
@@ -156,43 +166,47 @@ class Search:
             _log.warning("%d boxes are left unproved: worker processes died over them", len(given_up))
 
     def _take(self) -> list[tuple[float, int, Array, Array]]:
-        return [heapq.heappop(self._waiting) for _ in range(self._batch_size())]
-
-    def _batch_size(self) -> int:
-        """As many boxes as there are, but enough tasks for all workers of an executor."""
+        # As many boxes as there are, but enough tasks for all workers of an executor.
         waiting = len(self._waiting)
-        return min(BATCH, waiting if self.executor is None else max(waiting // _TASKS, min(_SMALL, waiting)))
+        if self.executor is not None:
+            waiting = max(waiting // RULES.tasks, min(RULES.small, waiting))
+        return [heapq.heappop(self._waiting) for _ in range(min(RULES.batch, waiting))]
 
     def _return(self, batch: list[tuple[float, int, Array, Array]]) -> None:
         for box in batch:
             heapq.heappush(self._waiting, box)
 
-    def _apply(self, batch: list[tuple[float, int, Array, Array]], verdicts: Verdicts) -> None:
+    def _apply(self, batch: list[tuple[float, int, Array, Array]], results: BoxResults) -> None:
         """Close the boxes that are proved, and halve the others."""
-        low, high = _corners(batch)
-        self.judged += len(batch)
-        self._look_for_folds((low + high) / 2, verdicts.sign)
-        proved = verdicts.proved
+        low, high = _stack_corners(batch)
+        self.evaluated += len(batch)
+        # A point for each sign that is new is visited: signs at the centres of boxes without a proof are hints.
+        for sign in {-1, 1} - set(self.signs):
+            there = np.flatnonzero(results.sign == sign)
+            if there.size:
+                self.visit((low + high)[there[:1]] / 2)
+        proved = results.proved
         if proved.any():
-            self.conditioning = min(self.conditioning, float(verdicts.conditioning[proved].min()))
-            self.proved_volume += float(_shares(self.base, low[proved], high[proved]).sum())
+            self.conditioning = min(self.conditioning, float(results.conditioning[proved].min()))
+            self.proved_volume += float(_measure_volumes(self.base, low[proved], high[proved]).sum())
         for k, (rank, place, a, b) in enumerate(batch):
             if proved[k]:
                 self._codes[place] = PROVED
                 self.open_count -= 1
                 continue
             shares = (b - a) / (self.base.high - self.base.low)
-            joint = int(verdicts.widest[k])
-            if joint == UNKNOWN:  # the relatively widest one: any choice that stays the same may never help
-                joint = max(self.judge.joints, key=lambda i: float(shares[i]))
+            joint = int(results.widest[k])
+            # The relatively widest joint: any choice that stays the same may never help.
+            if joint == UNKNOWN:
+                joint = max(self.check.joints, key=lambda i: float(shares[i]))
             if joint != NEVER and shares[joint] > self.limits.smallest:
-                self._halve(place, a, b, joint)
+                self._split_box(place, a, b, joint)
             else:
                 self.dead += 1
                 self.failed = min(self.failed, rank)
 
-    def _halve(self, place: int, low: Array, high: Array, joint: int) -> None:
-        middle = halfway(low[joint], high[joint])
+    def _split_box(self, place: int, low: Array, high: Array, joint: int) -> None:
+        middle = halve_interval(low[joint], high[joint])
         top, bottom = high.copy(), low.copy()
         top[joint] = bottom[joint] = middle
         self._codes[place], self._children[place] = joint, len(self._codes)
@@ -206,14 +220,7 @@ class Search:
             self._codes.append(OPEN)
             self._children.append(0)
 
-    def _look_for_folds(self, points: Array, signs: Array) -> None:
-        """Visit a point for each sign that is new: signs at the middle of boxes without a proof are hints."""
-        for sign in {-1, 1} - set(self.signs):
-            there = np.flatnonzero(signs == sign)
-            if there.size:
-                self.visit(points[there[:1]])
-
-    def _preorder(self, root: int) -> list[int]:
+    def _list_preorder(self, root: int) -> list[int]:
         codes, waiting = [], [root]
         while waiting:
             place = waiting.pop()
@@ -223,27 +230,27 @@ class Search:
         return codes
 
 
-def largest_first(base: Subdivision) -> Priority:
+def rank_by_volume(base: Subdivision) -> Priority:
     """Boxes of the largest volume first."""
-    return lambda low, high: -_shares(base, low, high)
+    return lambda low, high: -_measure_volumes(base, low, high)
 
 
-def nearest_first(base: Subdivision) -> Priority:
+def rank_by_distance(base: Subdivision) -> Priority:
     """Boxes that the smallest scaled copy of the whole touches first."""
-    return lambda low, high: distances(base, low, high)
+    return lambda low, high: measure_distances(base, low, high)
 
 
-def distances(base: Subdivision, low: Array, high: Array) -> Array:
+def measure_distances(base: Subdivision, low: Array, high: Array) -> Array:
     """The scale s at which a copy of the whole about its centre first touches each box, (boxes,)."""
     middle, half = (base.low + base.high) / 2, (base.high - base.low) / 2
     gaps: Array = np.maximum(np.maximum(low - middle, middle - high), 0) / half
     return np.asarray(gaps.max(axis=1))
 
 
-def _shares(base: Subdivision, low: Array, high: Array) -> Array:
+def _measure_volumes(base: Subdivision, low: Array, high: Array) -> Array:
     shares: Array = ((high - low) / (base.high - base.low)).prod(axis=1)
     return shares
 
 
-def _corners(batch: list[tuple[float, int, Array, Array]]) -> tuple[Array, Array]:
+def _stack_corners(batch: list[tuple[float, int, Array, Array]]) -> tuple[Array, Array]:
     return np.array([box[2] for box in batch]), np.array([box[3] for box in batch])

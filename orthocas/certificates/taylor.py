@@ -1,4 +1,11 @@
-"""Taylor models: polynomials with a remainder that covers truncation and rounding; and functions of them."""
+"""Taylor models: polynomials with a remainder that covers truncation and rounding; and functions of them.
+
+A model of f on a box has f(c + h t) = sum_a c_a t^a + e for t in [-1, 1]^n, |a| <= 3, and |e| <= the remainder. Sums
+and products carry the remainders of their operands, the terms that they cut off, and all roundings.
+
+Source:
+    ours, docs/explanation/certificates.md.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,33 +23,34 @@ UNIT = 2.0**-53  #: u: relative error of one operation
 UP = 1.0 + 2.0**-40  #: factor on bounds, for up to 4,000 roundings of non-negative numbers
 TINY = 1e-290  #: larger than all underflow of one operation on arrays of numbers up to 1e10
 DEGREE = 3
-_PRODUCTS = 8  # that add up to a coefficient of a product: a_S b_rest over the subsets S of three variables
+_PRODUCTS = 8  #: that add up to a coefficient of a product: a_S b_rest over the subsets S of three variables
 Variables = tuple[int, ...]  #: increasing numbers of variables
 Monomial = tuple[int, ...]  #: its variables in increasing order, repeated for powers
 Places = slice | NDArray[np.intp]  #: where coefficients go
-# pi / 2 and ln 2 in pieces: the first ones are so short that products with whole numbers up to 2^20 are exact
+#: pi / 2 and ln 2 in pieces: the first ones are so short that products with whole numbers up to 2^20 are exact
 _HALF_PI = tuple(map(float.fromhex, ("0x1.921fb54000000p+0", "0x1.10b4611800000p-30", "0x1.313198a2e0370p-61")))
 _LN2 = tuple(map(float.fromhex, ("0x1.62e42fefa0000p-1", "0x1.cf79abc9e3b39p-40")))
 _WIDEST_ANGLE, _WIDEST_EXPONENT = 1e6, 700.0
-_ERROR = 32 * UNIT  # reduction 3 u, Horner's rule below 8 u, the rest of the series below 1e-4 u
-_ROUNDINGS = 16 * UNIT  # relative error of a few operations in a row
-_TANH = 6.2 / 24  # |tanh''''| = 8 |t| (1 - t^2) |2 - 3 t^2| < 8 * 0.385 * 2 for t = tanh x in [-1, 1]
+_ERROR = 32 * UNIT  #: reduction 3 u, Horner's rule below 8 u, the rest of the series below 1e-4 u
+_ROUNDINGS = 16 * UNIT  #: relative error of a few operations in a row
+_TANH = 6.2 / 24  #: |tanh''''| = 8 |t| (1 - t^2) |2 - 3 t^2| < 8 * 0.385 * 2 for t = tanh x in [-1, 1]
 POWERS = ("pow", "constpow")  #: with a whole constant exponent
 Enclosed = tuple[Array, Array]  #: values, and bounds of their absolute errors
 
 
 def sum_error(products: int) -> float:
     """Error of a sum of so many products, relative to the sum of their absolute values; 8 roundings are to spare."""
-    return 1.01 * (products + 8) * UNIT  # k u / (1 - k u) < 1.01 k u for k below 10^13
+    # k u / (1 - k u) < 1.01 k u for k below 10^13.
+    return 1.01 * (products + 8) * UNIT
 
 
-def above(products: int) -> float:
+def compute_margin(products: int) -> float:
     """The factor on bounds that are sums of so many products of non-negative numbers."""
     return UP * (1 + sum_error(products))
 
 
 @cache
-def monomials(variables: Variables, degree: int = DEGREE) -> tuple[Monomial, ...]:
+def list_monomials(variables: Variables, degree: int = DEGREE) -> tuple[Monomial, ...]:
     """All monomials up to the degree, in order of their degrees."""
     degrees = range(degree + 1)
     return tuple(m for d in degrees for m in combinations_with_replacement(variables, d))
@@ -56,10 +64,10 @@ def order_starts(count: int) -> tuple[int, ...]:
 
 
 @cache
-def places(part: Variables, whole: Variables) -> Places:
+def find_places(part: Variables, whole: Variables) -> Places:
     """Where the monomials of some of the variables stand among those of all."""
-    index = {monomial: k for k, monomial in enumerate(monomials(whole))}
-    return _compact([index[monomial] for monomial in monomials(part)])
+    index = {monomial: k for k, monomial in enumerate(list_monomials(whole))}
+    return _merge_places([index[monomial] for monomial in list_monomials(part)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,28 +83,28 @@ class Product:
 
 
 @cache
-def product(left: Variables, right: Variables) -> Product:
+def plan_product(left: Variables, right: Variables) -> Product:
     """The table for polynomials in the given variables."""
     both = tuple(sorted({*left, *right}))
-    index = {monomial: k for k, monomial in enumerate(monomials(both))}
+    index = {monomial: k for k, monomial in enumerate(list_monomials(both))}
 
     def of(one: Monomial, others: tuple[Monomial, ...]) -> Places:
-        return _compact([index[tuple(sorted(one + other))] for other in others])
+        return _merge_places([index[tuple(sorted(one + other))] for other in others])
 
-    a, b = monomials(left), monomials(right)
+    a, b = list_monomials(left), list_monomials(right)
     starts = order_starts(len(left))
     middle = b[1 : order_starts(len(right))[3]]
     return Product(
         both,
         len(index),
-        places(left, both),
-        places(right, both),
+        find_places(left, both),
+        find_places(right, both),
         tuple(of((i,), middle) for i in left),
         tuple(of((j,), a[starts[2] : starts[3]]) for j in right),
     )
 
 
-def _compact(indices: list[int]) -> Places:
+def _merge_places(indices: list[int]) -> Places:
     """A slice where the indices follow each other."""
     if indices and indices == list(range(indices[0], indices[-1] + 1)):
         return slice(indices[0], indices[-1] + 1)
@@ -108,7 +116,7 @@ class TaylorModel:
     """Models of functions on boxes: any shape of functions first, boxes last."""
 
     variables: Variables  #: the variables it depends on
-    coefficients: Array  #: (monomials, ..., boxes), in the order of `monomials`
+    coefficients: Array  #: (monomials, ..., boxes), in the order of `list_monomials`
     remainder: Array  #: (..., boxes), >= 0
 
     @classmethod
@@ -122,7 +130,7 @@ class TaylorModel:
         value: Array = self.coefficients[0]
         return value
 
-    def sizes(self) -> Array:
+    def sum_sizes(self) -> Array:
         """Sums of the absolute coefficients of each degree, (4, ..., boxes)."""
         starts = order_starts(len(self.variables))[:4]
         size = np.abs(self.coefficients)
@@ -131,7 +139,7 @@ class TaylorModel:
         sums: Array = np.add.reduceat(size, starts, axis=0)
         return sums
 
-    def magnitude(self) -> Array:
+    def bound_magnitude(self) -> Array:
         """A bound of the absolute values, (..., boxes)."""
         bound: Array = (np.abs(self.coefficients).sum(axis=0) + self.remainder) * UP
         return bound
@@ -140,15 +148,15 @@ class TaylorModel:
         index = part if isinstance(part, tuple) else (part,)
         return replace(self, coefficients=self.coefficients[(slice(None), *index)], remainder=self.remainder[index])
 
-    def over(self, variables: Variables) -> "TaylorModel":
+    def extend(self, variables: Variables) -> "TaylorModel":
         """The same model with more variables."""
         if variables == self.variables:
             return self
         wide = np.zeros((order_starts(len(variables))[4], *self.coefficients.shape[1:]))
-        wide[places(self.variables, variables)] = self.coefficients
+        wide[find_places(self.variables, variables)] = self.coefficients
         return TaylorModel(variables, wide, self.remainder)
 
-    def on(self, shape: tuple[int, ...]) -> "TaylorModel":
+    def broadcast_to(self, shape: tuple[int, ...]) -> "TaylorModel":
         """The same model for functions and boxes of another shape, to which its own is broadcast."""
         wide = np.broadcast_to(self.coefficients, (len(self.coefficients), *shape))
         return TaylorModel(self.variables, wide, np.broadcast_to(self.remainder, shape))
@@ -158,14 +166,14 @@ class TaylorModel:
 
     def __add__(self, other: "TaylorModel") -> "TaylorModel":
         variables = tuple(sorted({*self.variables, *other.variables}))
-        total = self.over(variables).coefficients + other.over(variables).coefficients
+        total = self.extend(variables).coefficients + other.extend(variables).coefficients
         rounding = UNIT * np.abs(total).sum(axis=0)
         return TaylorModel(variables, total, (self.remainder + other.remainder + rounding) * UP + TINY)
 
     def __sub__(self, other: "TaylorModel") -> "TaylorModel":
         return self + (-other)
 
-    def times(self, factor: Array | float) -> "TaylorModel":
+    def multiply_by(self, factor: Array | float) -> "TaylorModel":
         """The product with exact numbers, (..., boxes)."""
         scaled = self.coefficients * factor
         rounding = UNIT * np.abs(scaled).sum(axis=0)
@@ -173,10 +181,11 @@ class TaylorModel:
 
     def __mul__(self, other: "TaylorModel") -> "TaylorModel":
         if not self.variables:
-            return other._by_constant(self)
+            return other._multiply_constant(self)
         if not other.variables:
-            return self._by_constant(other)
-        table = product(self.variables, other.variables)
+            return self._multiply_constant(other)
+        # Constant times all, linear times linear and quadratic, quadratic times linear.
+        table = plan_product(self.variables, other.variables)
         a, b = self.coefficients, other.coefficients
         out = np.zeros((table.size, *np.broadcast_shapes(a.shape[1:], b.shape[1:])))
         out[table.right] = a[0] * b
@@ -187,24 +196,24 @@ class TaylorModel:
             out[where] += a[i] * b[1:end]
         for j, where in enumerate(table.quadratic_by, 1):
             out[where] += b[j] * a[starts[2] : starts[3]]
-        return TaylorModel(table.variables, out, self._left_out(other))
+        return TaylorModel(table.variables, out, self._bound_remainder(other))
 
-    def _by_constant(self, factor: "TaylorModel") -> "TaylorModel":
+    def _multiply_constant(self, factor: "TaylorModel") -> "TaylorModel":
         """The product with a model without variables."""
-        exact = self.times(factor.centre)
+        exact = self.multiply_by(factor.centre)
         doubt = factor.remainder * (np.abs(self.coefficients).sum(axis=0) + self.remainder)
-        return _more_uncertain(exact, doubt)
+        return _widen(exact, doubt)
 
-    def _left_out(self, other: "TaylorModel") -> Array:
+    def _bound_remainder(self, other: "TaylorModel") -> Array:
         """The remainder of a product: degrees above 3, the remainders of the factors, and rounding."""
-        a, b = self.sizes(), other.sizes()
+        a, b = self.sum_sizes(), other.sum_sizes()
         all_a, all_b = a.sum(axis=0), b.sum(axis=0)
         high = a[3] * (b[1] + b[2] + b[3]) + a[2] * (b[2] + b[3]) + a[1] * b[3]
         carried = self.remainder * (all_b + other.remainder) + other.remainder * all_a
         bound: Array = (high + carried + sum_error(_PRODUCTS) * (all_a * all_b)) * UP + TINY
         return bound
 
-    def composed(self, series: "Series") -> "TaylorModel":
+    def compose(self, series: "Series") -> "TaylorModel":
         """The model of f(self), for the series of f about the centre."""
         if not self.variables:
             first = np.abs(series.values[1:]) + series.errors[1:]
@@ -214,32 +223,33 @@ class TaylorModel:
         away = TaylorModel(self.variables, self.coefficients.copy(), self.remainder)
         away.coefficients[0] = 0
         values = [TaylorModel.constant(series.values[k], series.errors[k]) for k in range(4)]
-        return _more_uncertain(((values[3] * away + values[2]) * away + values[1]) * away + values[0], series.tail)
+        return _widen(((values[3] * away + values[2]) * away + values[1]) * away + values[0], series.tail)
 
-    def deviation(self) -> Array:
+    def bound_deviation(self) -> Array:
         """A bound of the distance from the centre, (..., boxes)."""
         bound: Array = (np.abs(self.coefficients[1:]).sum(axis=0) + self.remainder) * UP
         return bound
 
-    def gains(self) -> Array:
+    def compute_gains(self) -> Array:
         """How much halving the interval of each variable takes from the bound of the values, (variables, ..., boxes).
 
         A coefficient shrinks by 2^-power; the remainder is shared out like the cubic terms, which it is most like.
         """
-        taken, size = _taken(self.variables).T, np.abs(self.coefficients)
+        taken, size = _weigh_halving(self.variables).T, np.abs(self.coefficients)
         cubic = order_starts(len(self.variables))[3]
         flat, shape = size.reshape(len(size), -1), (len(taken), *size.shape[1:])
         last = (taken[:, cubic:] @ flat[cubic:]).reshape(shape)
         known = (taken[:, :cubic] @ flat[:cubic]).reshape(shape) + last
-        with np.errstate(invalid="ignore"):  # infinite remainders
+        # Remainders may be infinite.
+        with np.errstate(invalid="ignore"):
             gains: Array = known + last / (last.sum(axis=0) + TINY) * self.remainder
         return gains
 
 
 @cache
-def _taken(variables: Variables) -> Array:
+def _weigh_halving(variables: Variables) -> Array:
     """1 - 2^-power of each variable in each monomial, (monomials, variables)."""
-    return np.array([[1 - 0.5 ** powers.count(v) for v in variables] for powers in monomials(variables)])
+    return np.array([[1 - 0.5 ** powers.count(v) for v in variables] for powers in list_monomials(variables)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -251,28 +261,29 @@ class Series:
     tail: Array  #: (..., boxes)
 
 
-def stacked(models: list[TaylorModel]) -> TaylorModel:
+def stack(models: list[TaylorModel]) -> TaylorModel:
     """Models of the same shape as one, with a new first axis."""
     variables = tuple(sorted({v for model in models for v in model.variables}))
     shape = np.broadcast_shapes(*(model.remainder.shape for model in models))
-    parts = [model.on(shape).over(variables) for model in models]
+    parts = [model.broadcast_to(shape).extend(variables) for model in models]
     coefficients = np.stack([part.coefficients for part in parts], axis=1)
     return TaylorModel(variables, coefficients, np.stack([part.remainder for part in parts]))
 
 
-def _more_uncertain(model: TaylorModel, error: Array) -> TaylorModel:
+def _widen(model: TaylorModel, error: Array) -> TaylorModel:
     return replace(model, remainder=(model.remainder + error) * UP)
 
 
-def sine_and_cosine(x: Array) -> tuple[Enclosed, Enclosed]:
+def evaluate_sine_cosine(x: Array) -> tuple[Enclosed, Enclosed]:
     """Sine and cosine of numbers up to 1e6 in size."""
     known = np.abs(x) <= _WIDEST_ANGLE
     x = np.where(known, x, 0.0)
     turns = np.rint(x * (2 / np.pi))
-    r = ((x - turns * _HALF_PI[0]) - turns * _HALF_PI[1]) - turns * _HALF_PI[2]  # |r| < 0.79
+    # |r| < 0.79.
+    r = ((x - turns * _HALF_PI[0]) - turns * _HALF_PI[1]) - turns * _HALF_PI[2]
     square = r * r
-    s = r * _horner(square, [(-1.0) ** k / factorial(2 * k + 1) for k in range(10)])
-    c = _horner(square, [(-1.0) ** k / factorial(2 * k) for k in range(11)])
+    s = r * _evaluate_horner(square, [(-1.0) ** k / factorial(2 * k + 1) for k in range(10)])
+    c = _evaluate_horner(square, [(-1.0) ** k / factorial(2 * k) for k in range(11)])
     quarter = turns % 4
     sine = np.choose(quarter.astype(int), [s, c, -s, -c])
     cosine = np.choose(quarter.astype(int), [c, -s, -c, s])
@@ -280,23 +291,25 @@ def sine_and_cosine(x: Array) -> tuple[Enclosed, Enclosed]:
     return (sine, error), (cosine, error)
 
 
-def exponential(x: Array) -> Enclosed:
+def evaluate_exponential(x: Array) -> Enclosed:
     """e^x of numbers up to 700 in size."""
     known = np.abs(x) <= _WIDEST_EXPONENT
     x = np.where(known, x, 0.0)
     whole = np.rint(x * (1 / np.log(2.0)))
-    r = (x - whole * _LN2[0]) - whole * _LN2[1]  # |r| < 0.35
-    value = np.ldexp(_horner(r, [1 / factorial(k) for k in range(16)]), whole.astype(int))
+    # |r| < 0.35.
+    r = (x - whole * _LN2[0]) - whole * _LN2[1]
+    value = np.ldexp(_evaluate_horner(r, [1 / factorial(k) for k in range(16)]), whole.astype(int))
     return value, np.where(known, _ERROR * value, np.inf)
 
 
-def hyperbolic_tangent(x: Array) -> Enclosed:
+def evaluate_tanh(x: Array) -> Enclosed:
     """tanh x, from e^(-2 |x|)."""
-    decay, error = exponential(np.maximum(-2 * np.abs(x), -_WIDEST_EXPONENT))  # beyond, tanh is 1 up to 1e-300
+    # Beyond the widest exponent, tanh is 1 up to 1e-300.
+    decay, error = evaluate_exponential(np.maximum(-2 * np.abs(x), -_WIDEST_EXPONENT))
     return np.sign(x) * (1 - decay) / (1 + decay), 4 * error + 16 * UNIT + 0 * x
 
 
-def _horner(x: Array, coefficients: list[float]) -> Array:
+def _evaluate_horner(x: Array, coefficients: list[float]) -> Array:
     """Sum of coefficients[k] x^k."""
     value = np.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
@@ -306,47 +319,48 @@ def _horner(x: Array, coefficients: list[float]) -> Array:
 
 def sine(model: TaylorModel) -> TaylorModel:
     """The model of sin f."""
-    s, c = sine_and_cosine(model.centre)
-    return model.composed(_harmonic(s[0], c[0], s[1], model.deviation()))
+    s, c = evaluate_sine_cosine(model.centre)
+    return model.compose(_expand_harmonic(s[0], c[0], s[1], model.bound_deviation()))
 
 
 def cosine(model: TaylorModel) -> TaylorModel:
     """The model of cos f."""
-    s, c = sine_and_cosine(model.centre)
-    return model.composed(_harmonic(c[0], -s[0], s[1], model.deviation()))
+    s, c = evaluate_sine_cosine(model.centre)
+    return model.compose(_expand_harmonic(c[0], -s[0], s[1], model.bound_deviation()))
 
 
 def reciprocal(model: TaylorModel) -> TaylorModel:
     """The model of 1 / f. Nothing is known where f may vanish."""
-    x, e = model.centre, model.deviation()
+    x, e = model.centre, model.bound_deviation()
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         values = np.stack([1 / x, -1 / (x * x), 1 / (x * x * x), -1 / (x * x * x * x)])
         ratio = np.abs(e / x) * UP
-        tail = np.where(ratio < 1, ratio**4 / (np.abs(x) * (1 - ratio)), np.inf)  # geometric series
-        return model.composed(Series(values, _ROUNDINGS * np.abs(values), tail * UP))
+        # The tail of a geometric series.
+        tail = np.where(ratio < 1, ratio**4 / (np.abs(x) * (1 - ratio)), np.inf)
+        return model.compose(Series(values, _ROUNDINGS * np.abs(values), tail * UP))
 
 
 def square_root(model: TaylorModel) -> TaylorModel:
     """The model of sqrt f. Nothing is known where f may be zero or negative."""
-    x, e = model.centre, model.deviation()
+    x, e = model.centre, model.bound_deviation()
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         root = np.sqrt(x)
         values = np.stack([root, 1 / (2 * root), -1 / (8 * x * root), 1 / (16 * x * x * root)])
-        tail = root * _decreasing(5 / 128, e / x)
-        return model.composed(Series(values, _ROUNDINGS * np.abs(values), tail * UP))
+        tail = root * _bound_decreasing(5 / 128, e / x)
+        return model.compose(Series(values, _ROUNDINGS * np.abs(values), tail * UP))
 
 
 def reciprocal_square_root(model: TaylorModel) -> TaylorModel:
     """The model of 1 / sqrt f. Nothing is known where f may be zero or negative."""
-    x, e = model.centre, model.deviation()
+    x, e = model.centre, model.bound_deviation()
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         root = 1 / np.sqrt(x)
         values = np.stack([root, -root / (2 * x), 3 * root / (8 * x * x), -5 * root / (16 * x * x * x)])
-        tail = root * _decreasing(35 / 128, e / x)
-        return model.composed(Series(values, _ROUNDINGS * np.abs(values), tail * UP))
+        tail = root * _bound_decreasing(35 / 128, e / x)
+        return model.compose(Series(values, _ROUNDINGS * np.abs(values), tail * UP))
 
 
-def _decreasing(first: float, ratio: Array) -> Array:
+def _bound_decreasing(first: float, ratio: Array) -> Array:
     """The rest of a power series from degree 4 on, if its coefficients decrease from `first` on in size."""
     rest: Array = np.where((ratio >= 0) & (ratio < 1 - 1e-9), first * ratio**4 / (1 - ratio * UP), np.inf)
     return rest
@@ -354,22 +368,23 @@ def _decreasing(first: float, ratio: Array) -> Array:
 
 def exponent(model: TaylorModel) -> TaylorModel:
     """The model of e^f."""
-    value, error = exponential(model.centre)
-    e = model.deviation()
-    highest, beyond = exponential(np.minimum(e * UP, 600.0))
+    value, error = evaluate_exponential(model.centre)
+    e = model.bound_deviation()
+    highest, beyond = evaluate_exponential(np.minimum(e * UP, 600.0))
     tail = np.where(e < 500, (np.abs(value) + error) * (highest + beyond) * e**4 / 24, np.inf)
     factors = [1.0, 1.0, 1 / 2, 1 / 6]
     values, errors = (np.stack([x * factor for factor in factors]) for x in (value, error + _ROUNDINGS * value))
-    return model.composed(Series(values, errors, tail * UP))
+    return model.compose(Series(values, errors, tail * UP))
 
 
 def tanh(model: TaylorModel) -> TaylorModel:
     """The model of tanh f."""
-    t, error = hyperbolic_tangent(model.centre)
+    t, error = evaluate_tanh(model.centre)
     slope = 1 - t * t
     values = np.stack([t, slope, -t * slope, slope * (3 * t * t - 1) / 3])
-    errors = np.stack([error, *[8 * error + _ROUNDINGS] * 3])  # the derivatives change by less than 8 with t
-    return model.composed(Series(values, errors, _TANH * model.deviation() ** 4 * UP))
+    # The derivatives change by less than 8 with t.
+    errors = np.stack([error, *[8 * error + _ROUNDINGS] * 3])
+    return model.compose(Series(values, errors, _TANH * model.bound_deviation() ** 4 * UP))
 
 
 def square(model: TaylorModel) -> TaylorModel:
@@ -388,7 +403,7 @@ def power(model: TaylorModel, exponent_: int) -> TaylorModel:
     return result
 
 
-def _harmonic(value: Array, slope: Array, error: Array, away: Array) -> Series:
+def _expand_harmonic(value: Array, slope: Array, error: Array, away: Array) -> Series:
     """The series of sine and cosine, whose derivatives repeat: value, slope, -value, -slope."""
     values = np.stack([value, slope, -value / 2, -slope / 6])
     errors = np.stack([error, error, error, error]) + _ROUNDINGS
@@ -398,7 +413,7 @@ def _harmonic(value: Array, slope: Array, error: Array, away: Array) -> Series:
 UNARY: dict[str, Callable[[TaylorModel], TaylorModel]] = {
     "assign": lambda a: a,
     "neg": lambda a: -a,
-    "twice": lambda a: a.times(2.0),
+    "twice": lambda a: a.multiply_by(2.0),
     "sq": square,
     "sqrt": square_root,
     "inv": reciprocal,

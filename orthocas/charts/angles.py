@@ -145,12 +145,12 @@ def judge_by_columns(samples: Samples, J: Array) -> dict[str, Array]:
 def _evaluated(function: ColumnFunction, size: int, data: list[Array]) -> Array:
     """Results (N, size) for data (N, ...)."""
 
-    def on_one_block() -> BlockFunction:
-        run = function.on_one_block()
+    def build_block_function() -> BlockFunction:
+        run = function.build_block_function()
         return lambda *columns: run(*columns)[0]
 
     results = np.empty((len(data[0]), size))
-    fill(results, data[0], on_one_block, *data[1:])
+    fill(results, data[0], build_block_function, *data[1:])
     return results
 
 
@@ -211,7 +211,7 @@ def _lengths(rows: ca.SX) -> ca.SX:
 
 def judge_by_lapack(samples: Samples, J: Array) -> dict[str, Array]:
     """Like `judge`."""
-    gradients, covectors, unit = samples.raised(J), J.transpose(0, 2, 1), _unit(J)
+    gradients, covectors, unit = samples.compute_metric_gradients(J), J.transpose(0, 2, 1), _unit(J)
     own = np.sqrt(np.einsum("sij,sij->si", gradients, J))
     first, second = (np.array([pair[k] for pair in pairs(J.shape[1])], dtype=int) for k in (0, 1))
     in_metric = gradients @ covectors / own[:, :, None] / own[:, None, :]

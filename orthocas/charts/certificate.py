@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.errors import CertifyError, InvalidValueError
-from orthocas.tools.checks import Array, frozen_array, require_kind, require_shape, require_text
+from orthocas.tools.checks import Array, freeze_array, require_kind, require_shape, require_text
 from orthocas.tools.display import Shown, number_list, percent
-from orthocas.tools.json import attributes
+from orthocas.tools.json import collect_attributes
 
 OPEN, PROVED = 255, 254  #: codes of boxes that are not halved; others are the joint that is
-MOST_BOXES = 20_000_000
-_DEEPEST = 1000
+MOST_BOXES = 20_000_000  #: of a subdivision
+_DEEPEST = 1000  #: open halves at once, of a tree in a file
 ELIMINATION = "taylor-3/2"  #: J by Taylor models and elimination. The one-to-one part of taylor-3/1 was unsound.
 COFACTORS = "cofactors-5/1"  #: det J of charts with one coordinate, by its expansion along the row of that coordinate
 METHODS = (ELIMINATION, COFACTORS)  #: of this version; certificates of other methods cannot be checked
@@ -34,14 +34,14 @@ class Subdivision:
     codes: Array  #: uint8, in preorder: the joint whose interval is halved (lower half first), PROVED or OPEN
 
     def __post_init__(self) -> None:
-        low = frozen_array("low", self.low, (None,))
-        high = frozen_array("high", self.high, low.shape)
+        low = freeze_array("low", self.low, (None,))
+        high = freeze_array("high", self.high, low.shape)
         codes = np.array(self.codes)
         if codes.dtype != np.uint8 or codes.ndim != 1 or not 0 < codes.size <= MOST_BOXES:
             raise InvalidValueError("codes", f"{codes.dtype} of shape {codes.shape}", "bytes of a tree of boxes")
         if not (low < high).all():
             raise InvalidValueError("low", low.tolist(), "a corner below the opposite one")
-        _require_tree(codes, len(low))
+        _check_tree(codes, len(low))
         codes.setflags(write=False)
         for name, value in (("low", low), ("high", high), ("codes", codes)):
             object.__setattr__(self, name, value)
@@ -76,39 +76,40 @@ class Subdivision:
         """Share of the volume that is proved: 1 only if all of it is."""
         if self.complete:
             return 1.0
-        depths = self._depths()[self.codes == PROVED]
+        depths = self._compute_depths()[self.codes == PROVED]
         return min(float((0.5**depths).sum()), 1 - 2**-53)
 
     def leaves(self, code: int) -> tuple[Array, Array]:
         """Corners (boxes, n) of the parts with a code, in preorder."""
-        upper, found = self._upper_halves(), []
+        upper, parts = self._find_upper_halves(), []
         place, low, high = np.zeros(1, dtype=int), self.low[None], self.high[None]
-        while place.size:  # one level of the tree at a time
+        # One level of the tree at a time.
+        while place.size:
             codes = self.codes[place]
-            found.append((place[codes == code], low[codes == code], high[codes == code]))
+            parts.append((place[codes == code], low[codes == code], high[codes == code]))
             inner = codes < PROVED
             place, joint, low, high = place[inner], codes[inner], low[inner], high[inner]
             row = np.arange(len(place))
             top, bottom = high.copy(), low.copy()
-            top[row, joint] = bottom[row, joint] = halfway(low[row, joint], high[row, joint])
+            top[row, joint] = bottom[row, joint] = halve_interval(low[row, joint], high[row, joint])
             place = np.concatenate([place + 1, upper[place]])
             low, high = np.concatenate([low, bottom]), np.concatenate([top, high])
-        places, lows, highs = (np.concatenate(each) for each in zip(*found, strict=True))
+        places, lows, highs = (np.concatenate(each) for each in zip(*parts, strict=True))
         order = np.argsort(places)
         return lows[order], highs[order]
 
-    def _upper_halves(self) -> NDArray[np.intp]:
+    def _find_upper_halves(self) -> NDArray[np.intp]:
         """Where the upper half of each part that is halved stands; the lower half follows it."""
-        found = np.zeros(self.codes.size, dtype=np.intp)
+        places = np.zeros(self.codes.size, dtype=np.intp)
         waiting: list[int] = []
         for k, code in enumerate(self.codes.tolist()):
             if code < PROVED:
                 waiting.append(k)
             elif waiting:
-                found[waiting.pop()] = k + 1
-        return found
+                places[waiting.pop()] = k + 1
+        return places
 
-    def _depths(self) -> Array:
+    def _compute_depths(self) -> Array:
         depths = np.zeros(self.codes.size)
         waiting = [0]
         for k, code in enumerate(self.codes.tolist()):
@@ -118,12 +119,12 @@ class Subdivision:
         return depths
 
 
-def halfway(low: Any, high: Any) -> Any:
+def halve_interval(low: Any, high: Any) -> Any:
     """The numbers between two corners where boxes are halved."""
     return (low + high) / 2
 
 
-def _require_tree(codes: Array, n: int) -> None:
+def _check_tree(codes: Array, n: int) -> None:
     require_shape("codes", codes.shape, (None,))
     inner = codes < PROVED
     if (codes[inner] >= n).any():
@@ -151,12 +152,12 @@ class Certificate(Shown):
     conditioning: float  #: proven lower bound of the conditioning on the proved share; 0 if none was asked for
     injective: Subdivision | None = None  #: a box on which phi is one-to-one, and its parts
     fold: tuple[tuple[float, ...], ...] = ()  #: two joint positions where det J differs in sign, the second in the fold
-    boxes: int = 0  #: judged to find the proof
+    boxes: int = 0  #: evaluated to find the proof
     seconds: float = field(default=0.0)
     least_singular_value: float = 0.0  #: of a ClearBox; parts proved to lie outside it count as proved. 0: no ClearBox
     least_volume: float = 0.0  #: of a RegularPart, which keeps folds out of what is not proved. 0: another domain
     clear_share: float = 0.0  #: of the clear positions of a RegularPart's box, the share in proved parts, from samples
-    digest: str = ""  #: of all of the above, see `sealed`
+    digest: str = ""  #: of all of the above, see `seal`
 
     def __post_init__(self) -> None:
         for name in ("fingerprint", "method"):
@@ -167,18 +168,19 @@ class Certificate(Shown):
         if self.method not in METHODS:
             object.__setattr__(self, "injective", None)
 
-    def sealed(self) -> Self:
+    def seal(self) -> Self:
         """The same certificate with the digest of its content, which shows accidental changes. It is no signature."""
-        return replace(self, digest=self._content_digest())
+        return replace(self, digest=self._compute_digest())
 
-    def without_given_up(self, count: int) -> Self:
+    def remove_given_up(self, count: int) -> Self:
         """The same without a number of parts that were given up, which older files have and no check covers."""
-        return self.sealed() if self.digest == self._content_digest(count) else self
+        return self.seal() if self.digest == self._compute_digest(count) else self
 
-    def _content_digest(self, given_up: int = 0) -> str:
+    def _compute_digest(self, given_up: int = 0) -> str:
         """SHA-256 of all numbers and texts but the digest; older certificates also count parts that were given up."""
         numbers = [self.bound, self.conditioning, self.boxes, self.seconds, self.least_singular_value, given_up]
-        numbers += [self.least_volume, self.clear_share] if self.least_volume else []  # older ones have no such numbers
+        # Older certificates have no such numbers.
+        numbers += [self.least_volume, self.clear_share] if self.least_volume else []
         points = [[float(value) for value in point] for point in self.fold]
         content = [self.fingerprint, self.method, [float(number) for number in numbers], points]
         digest = hashlib.sha256(json.dumps(content).encode())
@@ -189,7 +191,7 @@ class Certificate(Shown):
 
     def require_for(self, fingerprint: str) -> None:
         """Raise CertifyError if the certificate is not that of the chart with this fingerprint, or has been changed."""
-        if self.digest and self.digest != self._content_digest():
+        if self.digest and self.digest != self._compute_digest():
             raise CertifyError("the certificate is void: it has been changed since `certify` made it")
         if self.fingerprint != fingerprint:
             raise CertifyError("the certificate is void: it was made for another chart, or the chart has changed")
@@ -211,7 +213,7 @@ class Certificate(Shown):
 
     def facts(self) -> dict[str, str]:
         """What is proved, of how many boxes, and what is not."""
-        facts = {"certificate": self._verdict()}
+        facts = {"certificate": self._describe()}
         if self.conditioning > 0:
             facts["conditioning"] = f"at least {self.conditioning:.3g} there"
         if self.injective is not None:
@@ -235,16 +237,16 @@ class Certificate(Shown):
         """Plain data for JSON."""
         one = self.injective
         return {
-            **attributes(self, "proved", "share", "bound", "conditioning", "boxes"),
+            **collect_attributes(self, "proved", "share", "bound", "conditioning", "boxes"),
             "parts": self.regular.proved_count,
             "unproved": self.regular.open_count,
             "seconds": self.seconds,
             "one_to_one_half_width": None if one is None else ((one.high - one.low) / 2).tolist(),
-            **attributes(self, "fold", *(("least_volume", "clear_share") if self.least_volume else ())),
-            **attributes(self, "method", "fingerprint"),
+            **collect_attributes(self, "fold", *(("least_volume", "clear_share") if self.least_volume else ())),
+            **collect_attributes(self, "method", "fingerprint"),
         }
 
-    def _verdict(self) -> str:
+    def _describe(self) -> str:
         if self.fold:
             at = ", ".join(f"{value:.3f}" for value in self.fold[-1])
             return f"refuted, the chart folds at q = ({at})"

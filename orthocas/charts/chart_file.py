@@ -18,12 +18,12 @@ from orthocas.charts.coordinates import CoordinateMap, Coordinates
 from orthocas.charts.regular_part import RegularPart
 from orthocas.errors import CertifyError, ChartFileError, InvalidValueError, OrthocasError
 from orthocas.exact.flow import GrownCoordinates
-from orthocas.exact.leaves import leaf_from_arrays
-from orthocas.tasks.domains import sample_uniform
-from orthocas.tasks.problem import FOREIGN, Problem, problem_from_data, problem_to_data
-from orthocas.tools.archive import Kind, Stored, read_archive, to_npy, write_archive
+from orthocas.exact.leaves import read_leaf
+from orthocas.tasks.problem import FOREIGN, Problem, read_problem, write_problem
+from orthocas.tasks.samples import sample_uniform
+from orthocas.tools.archive import Kind, Stored, read_archive, write_archive, write_npy
 from orthocas.tools.checks import require_count, require_text
-from orthocas.tools.json import part
+from orthocas.tools.json import get_part
 
 _TREES = ("regular", "injective")
 _CORNERS = ("low", "high", "codes")
@@ -66,12 +66,12 @@ def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored],
     """
     regular = _tree(arrays, "regular", n)
     injective = _tree(arrays, "injective", n) if "certificate_injective_codes" in arrays else None
-    fold = part(data, "fold", list)
+    fold = get_part(data, "fold", list)
     if len(fold) not in (0, 2) or any(not isinstance(point, list) or len(point) != n for point in fold):
         raise InvalidValueError("fold of a certificate", repr(fold)[:80], f"no or two joint positions of {n} numbers")
     known = Certificate(
-        part(data, "fingerprint", str),
-        part(data, "method", str),
+        get_part(data, "fingerprint", str),
+        get_part(data, "method", str),
         _number(data, "bound"),
         regular,
         _number(data, "conditioning"),
@@ -82,15 +82,15 @@ def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored],
         _number(data, "least_singular_value") if "least_singular_value" in data else 0.0,
         _number(data, "least_volume") if "least_volume" in data else 0.0,
         _number(data, "clear_share") if "clear_share" in data else 0.0,
-        part(data, "digest", str) if "digest" in data else "",  # missing in older files
+        get_part(data, "digest", str) if "digest" in data else "",  # missing in older files
     )
     if "dead" not in data:
         return known
-    return known.without_given_up(require_count("dead boxes of a certificate", int(_number(data, "dead")), least=0))
+    return known.remove_given_up(require_count("dead boxes of a certificate", int(_number(data, "dead")), least=0))
 
 
 def _tree(arrays: Mapping[str, Stored], name: str, n: int) -> Subdivision:
-    low, high, codes = (part(arrays, f"certificate_{name}_{corner}", np.ndarray) for corner in _CORNERS)
+    low, high, codes = (get_part(arrays, f"certificate_{name}_{corner}", np.ndarray) for corner in _CORNERS)
     tree = Subdivision(low, high, codes)
     if tree.n != n:
         raise InvalidValueError(f"box of '{name}' in a certificate", f"one of {tree.n} joints", f"{n} joints")
@@ -133,13 +133,13 @@ def fingerprint(problem: Problem, coordinates: CoordinateMap) -> str:
     header, arrays = _content(problem, coordinates)
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(arrays):
-        digest.update(name.encode() + hashlib.sha256(to_npy(arrays[name])).digest())
+        digest.update(name.encode() + hashlib.sha256(write_npy(arrays[name])).digest())
     return digest.hexdigest()
 
 
 def _content(problem: Problem, coordinates: CoordinateMap) -> tuple[dict[str, Any], dict[str, Stored]]:
     """Header and arrays of a chart, without notes."""
-    header, arrays = problem_to_data(problem)
+    header, arrays = write_problem(problem)
     description, numbers = _coordinates_to_data(coordinates)
     return {**header, "coordinates": description}, {**arrays, **numbers}
 
@@ -152,13 +152,13 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes, Certifi
     """
     header, arrays = read_archive(path, CHART)
     try:
-        problem = problem_from_data(header, arrays)
-        coordinates = _coordinates(problem, part(header, "coordinates", dict), arrays)
+        problem = read_problem(header, arrays)
+        coordinates = _coordinates(problem, get_part(header, "coordinates", dict), arrays)
         if coordinates.r != problem.r:
             raise ChartFileError(f"{path} has {coordinates.r} coordinates, expected r = {problem.r}")
         _require_finite(problem, coordinates)
         certificate = _certificate(problem, coordinates, header, arrays)
-        return problem, coordinates, _checked_notes(part(header, "notes", dict)), certificate
+        return problem, coordinates, _checked_notes(get_part(header, "notes", dict)), certificate
     except ChartFileError:
         raise
     except OrthocasError as error:
@@ -173,7 +173,7 @@ def _certificate(
     """The certificate of the file, if it has one, and only if it belongs to the chart."""
     if "certificate" not in header:
         return None
-    data = part(header, "certificate", dict)
+    data = get_part(header, "certificate", dict)
     certificate = certificate_from_data(data, arrays, problem.n)
     certificate.require_for(fingerprint(problem, coordinates))
     if "notes" in data and data["notes"] != _digest_of(header["notes"]):  # missing in older files
@@ -237,13 +237,13 @@ def _coordinates_to_data(coordinates: CoordinateMap) -> tuple[dict[str, Any], di
 def _coordinates(problem: Problem, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> CoordinateMap:
     if "leaf" in data:
         own = {name.removeprefix(_LEAF): array for name, array in arrays.items() if name.startswith(_LEAF)}
-        return GrownCoordinates(problem, leaf_from_arrays(problem, part(data, "leaf", str), own))
+        return GrownCoordinates(problem, read_leaf(problem, get_part(data, "leaf", str), own))
     parametrisation = parametrisation_from_data(data)
     found = Coordinates(
         parametrisation,
         JointSpace.of(problem),
-        _idle(part(data, "idle", list), problem.n),
-        *(part(arrays, name, np.ndarray) for name in ("theta", "offset", "scale")),
+        _idle(get_part(data, "idle", list), problem.n),
+        *(get_part(arrays, name, np.ndarray) for name in ("theta", "offset", "scale")),
     )
     if isinstance(parametrisation, CyclicParametrisation):
         require_cyclic(problem, parametrisation.cyclic)

@@ -20,9 +20,9 @@ from orthocas.bases.family import (
 from orthocas.tools.batch import Batched, dense_function, one_blas_thread
 from orthocas.tools.blas_graph import NumpyGraph
 from orthocas.tools.cached import BuiltOnUse, cached_property
-from orthocas.tools.checks import Array, frozen_array, require_shape
+from orthocas.tools.checks import Array, freeze_array, require_shape
 from orthocas.tools.columns import COLUMNS, MANY, BlockedFunction, BlockFunction, ColumnFunction, fill
-from orthocas.tools.expressions import scalar_code
+from orthocas.tools.expressions import expand_scalars
 
 _FEW = 8  # joint positions below which networks are evaluated one by one
 
@@ -163,15 +163,15 @@ def _values(coordinates: "Coordinates", family: SelfDerivativeFamily) -> Maker:
     basis = ColumnFunction(ca.Function("basis", [q], [ca.densify(family.basis(q))]))
 
     def make() -> BlockFunction:
-        psi, xi = basis.on_one_block(), np.empty((coordinates.r, COLUMNS))
+        psi, xi = basis.build_block_function(), np.empty((coordinates.r, COLUMNS))
 
-        def on_one_block(columns: Array) -> Array:
+        def build_block_function(columns: Array) -> Array:
             np.matmul(C, psi(columns[active])[0], out=xi[:r])
             xi[:r] -= shift
             xi[r:] = columns[idle] - centre
             return xi
 
-        return on_one_block
+        return build_block_function
 
     return make
 
@@ -190,14 +190,14 @@ def _slopes(coordinates: "Coordinates", family: SelfDerivativeFamily) -> Maker:
     basis = ColumnFunction(ca.Function("smaller_basis", [q], [ca.densify(smaller)]))
 
     def make() -> BlockFunction:
-        psi, J = basis.on_one_block(), np.empty((coordinates.r * n, COLUMNS))
+        psi, J = basis.build_block_function(), np.empty((coordinates.r * n, COLUMNS))
         J[r * n :] = of_idle
 
-        def on_one_block(columns: Array) -> Array:
+        def build_block_function(columns: Array) -> Array:
             np.matmul(flat, psi(columns[active])[0], out=J[: r * n])
             return J
 
-        return on_one_block
+        return build_block_function
 
     return make
 
@@ -223,9 +223,9 @@ class Coordinates:
             terms = self.parametrisation.term_count(len(self.active)) if fitted else 0
             require_shape("theta", np.shape(self.theta), (fitted * terms,))
         size = self.family.size if fitted else 0
-        object.__setattr__(self, "theta", frozen_array("theta", self.theta, (size,)))
-        object.__setattr__(self, "offset", frozen_array("offset", self.offset, (fitted,)))
-        object.__setattr__(self, "scale", frozen_array("scale", self.scale, (fitted,)))
+        object.__setattr__(self, "theta", freeze_array("theta", self.theta, (size,)))
+        object.__setattr__(self, "offset", freeze_array("offset", self.offset, (fitted,)))
+        object.__setattr__(self, "scale", freeze_array("scale", self.scale, (fitted,)))
 
     @property
     def r(self) -> int:
@@ -331,7 +331,7 @@ class Coordinates:
 
     @cached_property
     def _point_by_point(self) -> BuiltOnUse[str, BlockedFunction]:
-        fast = (lambda graph: graph) if self.as_matrices else scalar_code
+        fast = (lambda graph: graph) if self.as_matrices else expand_scalars
         return BuiltOnUse(lambda name: BlockedFunction(fast(self.functions[name])))
 
     @cached_property
@@ -343,7 +343,7 @@ class Coordinates:
     def _on_blocks(self) -> BuiltOnUse[str, Maker]:
         """What makes functions of many joint positions side by side."""
         if self.as_matrices:
-            return BuiltOnUse(lambda name: self._column_graphs[name].on_one_block)
+            return BuiltOnUse(lambda name: self._column_graphs[name].build_block_function)
         return BuiltOnUse(lambda name: block_function(self, name))
 
     @cached_property

@@ -8,13 +8,12 @@ from numpy.typing import NDArray
 
 from orthocas.charts.in_domain import BoxedPhi
 from orthocas.charts.newton import inverses
-from orthocas.tasks.domains import bounds_of
 from orthocas.tasks.relative import Relative
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.columns import BlockedFunction
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +162,7 @@ class CurveTracer:
         """Whether sliding joints are in their ranges, or not far outside."""
         if self.turning.all():
             return np.ones(len(q), dtype=bool)
-        low, high = bounds_of(self.boxed.domain)
+        low, high = self.boxed.domain.bounds
         room = RULES.prismatic * self.boxed.domain.half_width
         return np.asarray((((q >= low - room) & (q <= high + room)) | self.turning).all(axis=1))
 
@@ -242,7 +241,7 @@ class CurveTracer:
 
 def without_turns(difference: Array, turning: NDArray[np.bool_]) -> Array:
     """Differences of joint positions (..., n) without full turns of revolute joints."""
-    return np.asarray(shortest(difference, np.where(turning, 2 * np.pi, 0.0)))
+    return np.asarray(wrap_shortest(difference, np.where(turning, 2 * np.pi, 0.0)))
 
 
 def solutions_of(A: Array, right: Array) -> Array:

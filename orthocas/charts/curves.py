@@ -12,10 +12,10 @@ from orthocas.charts.curve_tracer import RULES, CurveTracer, Traces, solutions_o
 from orthocas.charts.in_domain import BoxedPhi
 from orthocas.charts.newton import Starts
 from orthocas.charts.phi import largest
-from orthocas.tasks.domains import bounds_of, sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 
 _AT_ONCE = 2048  # rows whose curves are held in memory
 _PROBES, _SAME = 32, 1e-9  # positions at which turns are tried, and change of xi that is rounding
@@ -96,8 +96,10 @@ class SelfMotionCurves:
         q = sample_uniform(self.boxed.domain, _PROBES, 0)
         turned = q + 2 * np.pi * np.eye(q.shape[1])[:, None]
         here, there = self.xi(q), self.xi(turned.reshape(-1, q.shape[1])).reshape(-1, len(q), 1)
-        moved = np.abs(shortest(there - here, self.boxed.phi_map.difference.turns[self.boxed.m :])).max(axis=(1, 2))
-        free = self.tracer.turning & ~np.isfinite(bounds_of(self.boxed.domain)[0])
+        moved = np.abs(wrap_shortest(there - here, self.boxed.phi_map.difference.turns[self.boxed.m :])).max(
+            axis=(1, 2)
+        )
+        free = self.tracer.turning & ~np.isfinite(self.boxed.domain.bounds[0])
         return np.asarray(free & (moved > _SAME))
 
     def stages(self, targets: Array, own: Array) -> tuple[Array, Array]:
@@ -156,7 +158,7 @@ class SelfMotionCurves:
 
     def _away(self, q: Array) -> Array:
         """Largest distances of joints (N, S, n) from their ranges, up to full turns, (N, S)."""
-        low, high = bounds_of(self.boxed.domain)
+        low, high = self.boxed.domain.bounds
         bounded = np.isfinite(low)
         centre, half = np.where(bounded, (low + high) / 2, 0.0), np.where(bounded, (high - low) / 2, np.inf)
         return np.asarray((np.abs(without_turns(q - centre, self.tracer.turning)) - half).max(axis=2).clip(0.0))
@@ -164,7 +166,7 @@ class SelfMotionCurves:
     def _steps(self, traces: Traces, own: Array) -> "Steps":
         """The steps of curves in and around the box of the domain, after all full turns that bring them there."""
         curve, shift = self._sheets(traces, own)
-        low, high = bounds_of(self.boxed.domain)
+        low, high = self.boxed.domain.bounds
         moved = traces.q[curve] + shift[:, None]
         near = np.asarray(((moved >= low - RULES.step) & (moved <= high + RULES.step)).all(axis=2))
         at, place = np.nonzero((near[:, :-1] | near[:, 1:]) & (np.arange(1, near.shape[1]) < traces.count[curve, None]))
@@ -187,7 +189,7 @@ class SelfMotionCurves:
 
     def _xi_left_of(self, targets: Array, steps: "Steps") -> Array:
         """xi - xi(q) at both ends of steps, (S, 2); NaN far from the box."""
-        left, low, high = np.full(steps.q.shape[:2], np.nan), *bounds_of(self.boxed.domain)
+        left, low, high = np.full(steps.q.shape[:2], np.nan), *self.boxed.domain.bounds
         slack = RULES.step / RULES.parts
         near = np.asarray(((steps.q >= low - slack) & (steps.q <= high + slack)).all(axis=2))
         begins = near.copy()
@@ -208,7 +210,7 @@ class SelfMotionCurves:
     def _arcs(self, targets: Array, steps: "Steps", left: Array) -> "Arcs":
         """Points on the steps that may hold a root, an end of an arc, or a place where xi turns back."""
         steps = steps.part(self._matters(steps, left))
-        low, high = bounds_of(self.boxed.domain)
+        low, high = self.boxed.domain.bounds
         q, along = steps.divided()
         slack = RULES.step / RULES.parts
         close = np.asarray(((q >= low - slack) & (q <= high + slack)).all(axis=2))
@@ -243,7 +245,9 @@ class SelfMotionCurves:
         first, last = self._shares_inside(steps.q[:, 0], steps.q[:, 1], RULES.missed)
         changes = np.where(none, first < last, ~both)
         changes[self._crossed(left)[0]] = True
-        ahead = shortest((left[:, 1] - left[:, 0])[:, None], self.boxed.phi_map.difference.turns[self.boxed.m :])[:, 0]
+        ahead = wrap_shortest((left[:, 1] - left[:, 0])[:, None], self.boxed.phi_map.difference.turns[self.boxed.m :])[
+            :, 0
+        ]
         bends = steps.follows.copy()
         bends[1:] &= ~(ahead[1:] * ahead[:-1] > 0) & both[1:] & both[:-1]
         changes |= bends
@@ -259,7 +263,7 @@ class SelfMotionCurves:
         Joints without boundaries turn to within half a turn of the caller's starts (K, n), or one and a half where
         turns change xi.
         """
-        low, high = bounds_of(self.boxed.domain)
+        low, high = self.boxed.domain.bounds
         turn, room, bounded = 2 * np.pi, RULES.step, np.isfinite(low)
         low = np.where(bounded, low - room, own - np.where(self.winding, 3 * np.pi, np.pi))[:, None]
         high = np.where(bounded, high + room, np.inf)
@@ -351,7 +355,7 @@ class SelfMotionCurves:
 
     def _shares_inside(self, a: Array, b: Array, slack: float) -> tuple[Array, Array]:
         """Where the chords from a to b (K, n) are in the box, or so near: between shares low and high (K,) if <."""
-        low, high = bounds_of(self.boxed.domain)
+        low, high = self.boxed.domain.bounds
         step = np.where(np.abs(b - a) > 1e-300, b - a, 1e-300)
         one, other = (low - slack - a) / step, (high + slack - a) / step
         first, last = np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
@@ -365,7 +369,7 @@ class SelfMotionCurves:
 
     def _in_box(self, q: Array) -> NDArray[np.bool_]:
         """Which points (N, n) lie in the box of the domain."""
-        low, high = bounds_of(self.boxed.domain)
+        low, high = self.boxed.domain.bounds
         return np.asarray(((q >= low) & (q <= high)).all(axis=1))
 
     def _take_ends(self, targets: Array, ends: "Ends", best: Nearest) -> None:
@@ -392,14 +396,14 @@ class SelfMotionCurves:
 
     def _snapped(self, q: Array) -> Array:
         """Points that miss the boundary by rounding, on it."""
-        moved = np.clip(q, *bounds_of(self.boxed.domain))
+        moved = np.clip(q, *self.boxed.domain.bounds)
         near = np.abs(moved - q) <= 1e-9 * self.boxed.domain.half_width
         return np.where(near.all(axis=1, keepdims=True), moved, q)
 
     def _xi_left(self, targets: Array, q: Array) -> Array:
         """xi - xi(q), (N,)."""
         left = targets[:, self.boxed.m :] - self.xi(q)
-        return np.asarray(shortest(left, self.boxed.phi_map.difference.turns[self.boxed.m :])[:, 0])
+        return np.asarray(wrap_shortest(left, self.boxed.phi_map.difference.turns[self.boxed.m :])[:, 0])
 
     @cached_property
     def _period(self) -> float:

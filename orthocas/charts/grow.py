@@ -13,19 +13,20 @@ from orthocas.exact.leaves import (
     CircleLeaf,
     Leaf,
     LeafChart,
-    circle_leaf,
-    disk_leaf,
-    linear_leaf,
-    turning_joints,
+    build_disk_leaf,
+    build_linear_leaf,
+    find_turning_joints,
+    trace_circle_leaf,
 )
 from orthocas.robots.tree import require_driven
-from orthocas.tasks.domains import Box, sample_evenly
+from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem, check
+from orthocas.tasks.samples import sample_evenly
 from orthocas.tools.checks import (
     Array,
     as_float_array,
     as_point,
-    frozen_array,
+    freeze_array,
     require_count,
     require_kind,
     require_known,
@@ -141,15 +142,15 @@ def _leaf_chart(
     problem: Problem, leaf: str, x0: Array, origin: Array | None, region: Box | None, cells: int
 ) -> LeafChart:
     if leaf == "disk":
-        return disk_leaf(problem, x0, _region(problem, x0) if region is None else region, cells)
+        return build_disk_leaf(problem, x0, _region(problem, x0) if region is None else region, cells)
     start = _start(problem, x0, origin)
     if leaf == "linear":
         if problem.domain.full_turns:
             raise GrowError("a linear leaf is not periodic and the domain is a torus: use a Box domain or another leaf")
-        return linear_leaf(problem, start)
+        return build_linear_leaf(problem, start)
     if problem.r != 1:
         raise GrowError(f"the problem has r = {problem.r} extra coordinates, expected r = 1 for a circle leaf")
-    return circle_leaf(problem, x0, start)
+    return trace_circle_leaf(problem, x0, start)
 
 
 def _level(problem: Problem, level: ArrayLike | None, origin: Array | None) -> Array:
@@ -158,7 +159,7 @@ def _level(problem: Problem, level: ArrayLike | None, origin: Array | None) -> A
         return np.asarray(problem.task.batched(q[None])[0][0])
     values = np.atleast_1d(as_float_array("level", level))
     require_shape("level", values.shape, (problem.m,))
-    return frozen_array("level", values, (problem.m,))
+    return freeze_array("level", values, (problem.m,))
 
 
 def _start(problem: Problem, x0: Array, origin: Array | None) -> Array:
@@ -178,7 +179,7 @@ def _start(problem: Problem, x0: Array, origin: Array | None) -> Array:
 def _region(problem: Problem, x0: Array) -> Box:
     """A box around the part of the leaf that the domain is pulled to."""
     domain = problem.domain
-    whole = (domain.half_width >= np.pi - 1e-9) & turning_joints(problem)
+    whole = (domain.half_width >= np.pi - 1e-9) & find_turning_joints(problem)
     if whole.sum() > 1:  # cut the domain open, as in [AS2023] Sec. 5.2
         return Box(domain.centre, domain.half_width)
     pulled = TaskFlow(problem).pull(sample_evenly(domain, _PROBES, 0), x0)

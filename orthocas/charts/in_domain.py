@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from orthocas.charts.newton import inverses
 from orthocas.charts.phi import ROUNDING, PhiMap, largest
-from orthocas.tasks.domains import Domain, bounds_of
+from orthocas.tasks.domains import Domain
 from orthocas.tasks.relative import Relative
 from orthocas.tasks.task import Task
 from orthocas.tools.cached import cached_property
@@ -63,17 +63,17 @@ class BoxedPhi:
     @cached_property
     def low(self) -> Array:
         """Lowest u, (n,): -1, or -inf for joints without boundaries."""
-        return (bounds_of(self.domain)[0] - self.domain.centre) / self.domain.half_width
+        return (self.domain.bounds[0] - self.domain.centre) / self.domain.half_width
 
     @cached_property
     def high(self) -> Array:
         """Highest u, (n,)."""
-        return (bounds_of(self.domain)[1] - self.domain.centre) / self.domain.half_width
+        return (self.domain.bounds[1] - self.domain.centre) / self.domain.half_width
 
     def points(self, u: Array) -> Array:
         """q at u (N, n), within the boundaries, (N, n)."""
         domain = self.domain
-        return np.clip(domain.centre + domain.half_width * u, *bounds_of(domain))
+        return np.clip(domain.centre + domain.half_width * u, *domain.bounds)
 
     def of_points(self, q: Array) -> Array:
         """u of the points of the box nearest to q (N, n), (N, n)."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from orthocas.charts.in_domain import KEPT, BoxedPhi, solve_in_box
 from orthocas.charts.newton import Starts
 from orthocas.charts.phi import PhiMap, largest
-from orthocas.tasks.domains import Domain, bounds_of
+from orthocas.tasks.domains import Domain
 from orthocas.tools.batch import evaluate_columns
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
@@ -217,7 +217,7 @@ class Nearest:
 
     def search(self, targets: Array, starts: Array) -> Array:
         """Where the search from starts (N, n) ends, (N, n); see `keeps_task`."""
-        low, high = bounds_of(self.domain)
+        low, high = self.domain.bounds
         with _one_at_a_time:
             q = evaluate_columns(self._search, 1, np.clip(starts, low, high), targets)[0]
         q = np.clip(q, low, high)  # NaN stays
@@ -256,7 +256,7 @@ class Nearest:
             "g": ca.vertcat(*constraints),
         }
         solver = ca.nlpsol("nearest", "ipopt", equations, _OPTIONS)
-        low, high = (ca.DM(bound) for bound in bounds_of(domain))
+        low, high = (ca.DM(bound) for bound in domain.bounds)
         start = ca.MX.sym("start", n)
         found = solver(x0=start, p=target, lbx=low, ubx=high, lbg=ca.DM(lower), ubg=ca.DM(upper))
         return ca.Function("nearest", [start, target], [found["x"]])

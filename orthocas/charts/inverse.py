@@ -14,7 +14,6 @@ from orthocas.charts.newton import Attempt, LocalSolver, Starts
 from orthocas.charts.phi import PhiMap, largest
 from orthocas.charts.solutions import InverseStatus, Solutions
 from orthocas.robots.tree import KinematicTree
-from orthocas.tasks.domains import bounds_of
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, Indices
@@ -255,7 +254,7 @@ class Inverse:
 
     def _snapped(self, targets: Array, attempt: Attempt, tolerance: float) -> Attempt:
         """The same points, but on the boundary where they are solutions that miss it by rounding."""
-        low, high = bounds_of(self.problem.domain)
+        low, high = self.problem.domain.bounds
         moved = np.clip(attempt.q, low, high)
         off = np.abs(moved - attempt.q)
         rows = np.flatnonzero((off > 0).any(axis=1) & (off <= _SNAP * self.problem.domain.half_width).all(axis=1))

@@ -27,8 +27,8 @@ from orthocas.charts.phi import Differences, PhiFunctions, PhiMap
 from orthocas.charts.reaching import ReachingTracker, near_function
 from orthocas.charts.solutions import Solutions, Tracker
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, units_hint
-from orthocas.tasks.domains import bounds_of, sample_uniform
-from orthocas.tasks.problem import task_sizes
+from orthocas.tasks.problem import measure_task_sizes
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
     Array,
@@ -188,7 +188,7 @@ class InverseMethods(PhiFunctions):
 
     def wished(self, q_wish: ArrayLike, x: ArrayLike | None) -> tuple[Array, Array]:
         """Targets of phi for `nearest_xi`, and the wishes moved into the box of the domain, (N, n) each."""
-        wishes = np.clip(self._rows("q_wish", q_wish), *bounds_of(self.problem.domain))
+        wishes = np.clip(self._rows("q_wish", q_wish), *self.problem.domain.bounds)
         phi = np.array(self.phi(wishes))
         if x is not None:
             values = as_float_array("x", x)
@@ -300,7 +300,7 @@ class InverseMethods(PhiFunctions):
     @cached_property
     def phi_sizes(self) -> Array:
         """Sizes of the components of phi, (n,): how far task components move over the domain, and 1 for xi."""
-        return np.concatenate([task_sizes(self.problem), np.ones(self.r)])
+        return np.concatenate([measure_task_sizes(self.problem), np.ones(self.r)])
 
     @property
     def turns(self) -> Array:
@@ -353,13 +353,13 @@ class InverseMethods(PhiFunctions):
             inside = self.solve(targets[beyond], starts, tolerance=found.tolerance, inside=True)
             nearest[beyond] = inside.q
         q, domain = found.q[beyond[0]], self.problem.domain
-        low, high = bounds_of(domain)
+        low, high = domain.bounds
         j = int(np.argmax(np.maximum(low - q, q - high) / domain.half_width))
         reason = (
             f"joint '{self.problem.robot.joint_names[j]}' at {q[j]:.4g}, expected within [{low[j]:.4g}, {high[j]:.4g}]"
         )
         if not domain.is_box and low[j] <= q[j] <= high[j]:
-            reason = domain.explained(q)
+            reason = domain.explain(q)
         return InverseError(
             f"q with phi(q) = phi lies outside the domain for {found.named(beyond)}: {reason}. "
             "`error.nearest` has joint positions inside; outside=True accepts those outside",

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from orthocas.charts.coordinates import InvertibleMap
 from orthocas.charts.phi import ROUNDING, Differences, PhiMap, largest
 from orthocas.errors import SingularTaskError
-from orthocas.tasks.domains import Domain, sample_heavily
-from orthocas.tools.batch import dense_function, in_threads
+from orthocas.tasks.domains import Domain
+from orthocas.tasks.samples import sample_boundary_weighted
+from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.cached import BuiltOnUse, cached_property
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.interrupts import deferred
@@ -177,7 +178,7 @@ def inverses(matrices: Array) -> tuple[Array, NDArray[np.bool_]]:
         found = np.empty_like(matrices)
         pieces = [slice(first, first + _PIECE) for first in range(0, len(matrices), _PIECE)]
         for piece, inverse in zip(
-            pieces, in_threads(lambda piece: np.linalg.inv(matrices[piece]), pieces), strict=True
+            pieces, run_in_threads(lambda piece: np.linalg.inv(matrices[piece]), pieces), strict=True
         ):
             found[piece] = inverse
     except np.linalg.LinAlgError:  # it does not say which
@@ -403,13 +404,13 @@ class Starts:
         if relative is None or not relative.turned:
             return normalised
         first, last = relative.first, relative.task.m
-        orientations = relative.embedded(phi[:, :last]) / self._range[1][first:last].mean()
+        orientations = relative.embed(phi[:, :last]) / self._range[1][first:last].mean()
         return np.concatenate([normalised[:, :first], orientations, normalised[:, last:]], axis=1)
 
     @cached_property
     def _table(self) -> tuple[Array, Array]:
         """Points of the domain where phi is defined, and phi, (K, n) each."""
-        return where_known(self._map, sample_heavily(self._domain, _POINTS, _SEED))
+        return where_known(self._map, sample_boundary_weighted(self._domain, _POINTS, _SEED))
 
     @cached_property
     def _range(self) -> tuple[Array, Array]:

@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocas.charts.coordinates import CoordinateMap, Coordinates
 from orthocas.errors import InvalidValueError
-from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.tasks.problem import Problem
 from orthocas.tasks.relative import Relative
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_point_set, require_shape
-from orthocas.tools.expressions import fast_form, shortest
+from orthocas.tools.expressions import choose_form, wrap_shortest
 
 ROUNDING = 1e-5  #: of phi: 1e-9 of it are 45 units in the last place
 _SINGULAR = 1e-8  # ratio of singular values of J below which the inverse map fails
@@ -24,7 +24,7 @@ def counted_on(rows: Array, turns: Array) -> Array:
     """Rows (N, k) of values along a curve; periodic ones go on by the shorter way from row to row."""
     if not turns.any():
         return rows
-    steps = shortest(np.diff(rows, axis=0), turns)
+    steps = wrap_shortest(np.diff(rows, axis=0), turns)
     return np.asarray(rows[0] + np.concatenate([np.zeros((1, rows.shape[1])), np.cumsum(steps, axis=0)]))
 
 
@@ -47,13 +47,13 @@ class Differences:
     def __call__(self, targets: Any, values: Any) -> Any:
         """Targets - values, as NumPy rows (..., n) or CasADi columns (n, 1)."""
         if self.task is None or not self.task.turned:
-            return shortest(targets - values, self.turns)
+            return wrap_shortest(targets - values, self.turns)
         m, symbolic = self.task.task.m, isinstance(values, ca.SX | ca.MX)
         pair = (targets[:m], values[:m]) if symbolic else (targets[..., :m], values[..., :m])
         first = self.task.difference(*pair)
         if symbolic:
-            return ca.vertcat(first, shortest(targets[m:] - values[m:], self.turns[m:]))
-        rest = shortest(targets[..., m:] - values[..., m:], self.turns[m:])
+            return ca.vertcat(first, wrap_shortest(targets[m:] - values[m:], self.turns[m:]))
+        rest = wrap_shortest(targets[..., m:] - values[..., m:], self.turns[m:])
         return np.concatenate([first, rest], axis=-1)
 
 
@@ -126,7 +126,7 @@ class PhiFunctions:
         It is also the graph itself for robots with more than 10 joints.
         """
         matrices = isinstance(self.coordinates, Coordinates) and self.coordinates.as_matrices
-        return graph if matrices else fast_form(graph, self.n)
+        return graph if matrices else choose_form(graph, self.n)
 
     @overload
     def xi(self, q: Symbolic) -> Symbolic: ...
@@ -176,7 +176,7 @@ class PhiFunctions:
             return self._expression("jacobian", q)
         points, single = as_point_set("q", q, self.n)
         J = np.empty((len(points), self.n, self.n))
-        task_jacobians(self.problem, points, J[:, : self.m])
+        self.problem.task.evaluate_jacobian(points, J[:, : self.m])
         self._coordinates_into("jacobian", J[:, self.m :], points)
         return J[0] if single else J
 

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from orthocas.charts.angles import MOST_JOINTS, judge_by_columns, judge_by_lapack
 from orthocas.charts.coordinates import CoordinateMap
 from orthocas.errors import SingularTaskError
-from orthocas.tasks.domains import Domain, bounds_of, contains, sample_heavily
-from orthocas.tasks.problem import Problem, distance_from_half_a_turn, task_jacobians
-from orthocas.tasks.samples import Samples, samples_at
-from orthocas.tools.batch import in_threads
+from orthocas.tasks.domains import Domain
+from orthocas.tasks.problem import Problem, measure_half_turn_distance
+from orthocas.tasks.samples import Samples, evaluate_samples, sample_boundary_weighted
+from orthocas.tools.batch import run_in_threads
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import MANY
 from orthocas.tools.display import Shown, number_list
-from orthocas.tools.json import attributes
+from orthocas.tools.json import collect_attributes
 
 _CHUNK = 40_000  # joint positions evaluated at once
 _NEAR_THE_END = 0.1  # cos(angle / 2) of turns beyond which rounding of J_x shows
@@ -51,17 +51,17 @@ class Judged:
         parts = [_judged(problem, coordinates, points[start : start + _CHUNK]) for start in starts]
         found: dict[str, Any] = parts[0]
         if len(parts) > 1:
-            together = in_threads(lambda name: np.concatenate([part[name] for part in parts]), list(found))
+            together = run_in_threads(lambda name: np.concatenate([part[name] for part in parts]), list(found))
             found = dict(zip(found, together, strict=True))
         return cls(**{"metric_mutual_cosines": found["mutual_cosines"], **found})
 
 
 def _judged(problem: Problem, coordinates: CoordinateMap, points: Array) -> dict[str, Array]:
     """The fields of `Judged` by name, for so few joint positions that all intermediate values have room in memory."""
-    samples = samples_at(problem, points)
+    samples = evaluate_samples(problem, points)
     kept = np.ones(len(points), dtype=bool)
     if len(samples) < len(points):
-        kept = np.asarray((task_jacobians(problem, points) != 0).any(axis=2).all(axis=1))
+        kept = np.asarray((problem.task.evaluate_jacobian(points) != 0).any(axis=2).all(axis=1))
     J = coordinates.jacobian(samples.points)
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         squares = np.einsum("sij,sij->si", J, J)
@@ -70,7 +70,7 @@ def _judged(problem: Problem, coordinates: CoordinateMap, points: Array) -> dict
     if not alive.all():
         samples, J = samples[alive], J[alive]
     found = judge(samples, J)
-    ends = distance_from_half_a_turn(problem, samples.points) < _NEAR_THE_END
+    ends = measure_half_turn_distance(problem, samples.points) < _NEAR_THE_END
     if ends.any():
         for name, values in zip(
             ("leak_sines", "conditioning", "signs"), _by_frame(problem, samples[ends], J[ends]), strict=True
@@ -129,7 +129,7 @@ class PointQuality(Shown):
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
-        return attributes(self, "leak_deg", "conditioning", "boundary_distance")
+        return collect_attributes(self, "leak_deg", "conditioning", "boundary_distance")
 
 
 def point_quality(problem: Problem, coordinates: CoordinateMap, points: Array) -> PointQuality:
@@ -138,9 +138,9 @@ def point_quality(problem: Problem, coordinates: CoordinateMap, points: Array) -
     leak, conditioning = np.full((len(points), coordinates.r), np.nan), np.full(len(points), np.nan)
     leak[judged.kept] = np.degrees(np.arcsin(np.clip(judged.leak_sines, 0.0, 1.0)))
     conditioning[judged.kept] = judged.conditioning
-    lower, upper = bounds_of(problem.domain)
+    lower, upper = problem.domain.bounds
     distance = np.minimum(points - lower, upper - points).min(axis=1)
-    distance = np.where(contains(problem.domain, points), distance, np.minimum(distance, 0.0))  # too near a singularity
+    distance = np.where(problem.domain.contains(points), distance, np.minimum(distance, 0.0))  # too near a singularity
     return PointQuality(leak, conditioning, distance)
 
 
@@ -179,7 +179,7 @@ def worst_points(problem: Problem, coordinates: CoordinateMap, seed: int = 0, *,
         seed: seed of candidates and steps.
         thorough: follow the worst descents to their ends, for a least value that is printed; fits need bad points only.
     """
-    points = sample_heavily(problem.domain, CANDIDATES, (seed, CANDIDATES, 1))
+    points = sample_boundary_weighted(problem.domain, CANDIDATES, (seed, CANDIDATES, 1))
     u = (points - problem.domain.centre) / problem.domain.half_width
     found = _signed_conditioning(problem, coordinates, u)
     orientation = 1.0 if np.sum(found >= 0) >= np.isfinite(found).sum() / 2 else -1.0
@@ -202,11 +202,11 @@ def least_in_domain(value: Value, domain: Domain, seed: int = 0) -> Array:
     Source:
         ours.
     """
-    points = sample_heavily(domain, CANDIDATES, (seed, CANDIDATES, 1))
+    points = sample_boundary_weighted(domain, CANDIDATES, (seed, CANDIDATES, 1))
 
     def inside(u: Array) -> Array:
         q = domain.centre + domain.half_width * u
-        return np.where(contains(domain, q), value(q), np.nan)
+        return np.where(domain.contains(q), value(q), np.nan)
 
     u, _ = descended(inside, (points - domain.centre) / domain.half_width, value(points), seed, thorough=True)
     best: Array = domain.centre + domain.half_width * u[0]
@@ -252,7 +252,7 @@ def _step(value: Value, u: Array, found: Array, step: Array, rng: np.random.Gene
 def _signed_conditioning(problem: Problem, coordinates: CoordinateMap, u: Array) -> Array:
     """Conditioning times the sign of det J at points of the cube, (N,); NaN outside the domain."""
     points, values = _joint_positions(problem, u), np.full(len(u), np.nan)
-    inside = np.flatnonzero(contains(problem.domain, points))
+    inside = np.flatnonzero(problem.domain.contains(points))
     try:
         judged = Judged.at(problem, coordinates, points[inside])
     except SingularTaskError:  # for example at half a turn

@@ -12,12 +12,11 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import Judged, WorstPoints, worst_points
 from orthocas.errors import InvalidValueError, SingularTaskError
-from orthocas.tasks.domains import sample_uniform
-from orthocas.tasks.samples import idle_joints, samples_at
-from orthocas.tools.batch import in_threads
+from orthocas.tasks.samples import evaluate_samples, find_idle_joints, sample_uniform
+from orthocas.tools.batch import run_in_threads
 from orthocas.tools.checks import Array, Indices, as_point_set, require_count, require_kind, require_memory
 from orthocas.tools.display import Shown, listed, percent
-from orthocas.tools.json import attributes, plain
+from orthocas.tools.json import clean, collect_attributes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -56,7 +55,7 @@ class _Sums:
             return angles.sum(axis=1), (angles * angles).sum(axis=1), np.abs(angles).max(axis=1), counts
 
         first, second, largest, counts = np.zeros(k), np.zeros(k), np.zeros(k), np.zeros((k, bins))
-        for part in in_threads(one_piece, range(0, N, _PIECE) if k else ()):
+        for part in run_in_threads(one_piece, range(0, N, _PIECE) if k else ()):
             first, second, counts = first + part[0], second + part[1], counts + part[3]
             largest = np.maximum(largest, part[2])
         return cls(N, middle, first, second, largest, counts)
@@ -113,7 +112,7 @@ class AngleStatistics:
 
     def as_dict(self) -> dict[str, float]:
         """Mean, standard deviation and largest deviation [deg]."""
-        return attributes(self, "mean", "std", "max")
+        return collect_attributes(self, "mean", "std", "max")
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +144,7 @@ class LeakStatistics:
 
     def as_dict(self) -> dict[str, object]:
         """Mean, root mean square and largest leak, and the root mean square of each coordinate [deg]."""
-        return attributes(self, "mean", "rms", "max", "rms_of_each")
+        return collect_attributes(self, "mean", "rms", "max", "rms_of_each")
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +181,7 @@ class Angles:
     def as_dict(self) -> dict[str, dict[str, object]]:
         """Plain data: the four angles in degrees."""
         names = ("task_angle", "mutual_angle", "leak", "metric_mutual_angle")
-        return {f"{name}_deg": angles for name, angles in attributes(self, *names).items()}
+        return {f"{name}_deg": angles for name, angles in collect_attributes(self, *names).items()}
 
 
 @dataclass(frozen=True)
@@ -294,13 +293,13 @@ class Report(Shown):
         """Plain data for JSON. NaN becomes None."""
         angles = Angles(self.task_angle, self.mutual_angle, self.leak, self.metric_mutual_angle)
         data = {
-            **attributes(self, "n", "m", "r", "samples", "seed", "metric"),
+            **collect_attributes(self, "n", "m", "r", "samples", "seed", "metric"),
             **angles.as_dict(),
-            **attributes(self, "idle_joints", "without_idle", "conditioning", "worst_point"),
+            **collect_attributes(self, "idle_joints", "without_idle", "conditioning", "worst_point"),
             "least_conditioning_searched": None if self.worst is None else self.worst.least,
-            **attributes(self, "singular_samples", "folded_samples", "length_ratio", "degenerate"),
+            **collect_attributes(self, "singular_samples", "folded_samples", "length_ratio", "degenerate"),
         }
-        return dict(plain(data))
+        return dict(clean(data))
 
 
 def evaluate(
@@ -399,9 +398,9 @@ def _worst_point(judged: Judged, worst: WorstPoints | None) -> Array:
 
 def _idle_coordinates(chart: Chart, judged: Judged) -> dict[int, str]:
     """Coordinates that are functions of one idle joint alone, with the names of these joints."""
-    first = samples_at(chart.problem, sample_uniform(chart.problem.domain, _TELLING, 0))
+    first = evaluate_samples(chart.problem, sample_uniform(chart.problem.domain, _TELLING, 0))
     found: dict[int, str] = {}
-    for joint in idle_joints(chart.problem, first):
+    for joint in find_idle_joints(chart.problem, first):
         likely = _functions_of(joint, judged.jacobian[:_TELLING])
         sure = likely[_functions_of(joint, judged.jacobian[:, likely])]
         found |= {int(j): chart.problem.robot.joint_names[joint] for j in sure}

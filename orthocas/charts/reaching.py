@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from orthocas.charts.newton import Bound, PointFunctions
 from orthocas.charts.phi import PhiMap
 from orthocas.charts.solutions import Tracker, TrackerStatus
-from orthocas.tasks.domains import Domain, reach
+from orthocas.tasks.domains import Domain
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
 
@@ -73,7 +73,7 @@ class ReachingTracker(Tracker):
         self._at, self._to, self._e, self._rooms = np.empty(n), np.empty(n), np.empty(n), np.empty(rooms)
         self._J, self._slopes = np.empty((n, n)), np.empty((n, rooms))
         self._near = Bound(near, [self._at, self._to], [self._e, self._J, self._rooms, self._slopes])
-        self._width, ends = domain.half_width, reach(domain) - RULES.joint_room * domain.half_width
+        self._width, ends = domain.half_width, domain.reach - RULES.joint_room * domain.half_width
         self._low, self._high = domain.centre - ends, domain.centre + ends
 
     def __getstate__(self) -> dict[str, Any]:

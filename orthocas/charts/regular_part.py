@@ -18,8 +18,8 @@ from orthocas.tasks.domains import Box, Domain, StopKind, Wall, register_domain
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_number, as_point_set, frozen_array, require_kind
-from orthocas.tools.json import part
+from orthocas.tools.checks import Array, as_number, as_point_set, freeze_array, require_kind
+from orthocas.tools.json import get_part
 
 REGULAR_PART = "regular part"  #: name of the kind
 _ARRAYS = ("theta", "space_centre", "space_half_width")
@@ -75,9 +75,9 @@ class RegularPart(ClearBox):
         """Both conditions in one line."""
         return f"{super().heading}, and volume of the coordinates above {self.least_volume:g}"
 
-    def numbers_of_condition(self) -> dict[str, Any]:
+    def report_condition(self) -> dict[str, Any]:
         """Those of the clear box, and the bound."""
-        return {**super().numbers_of_condition(), "least_volume": self.least_volume}
+        return {**super().report_condition(), "least_volume": self.least_volume}
 
     def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
         """Those of the clear box, bound and coordinates."""
@@ -91,31 +91,31 @@ class RegularPart(ClearBox):
     def from_data(cls, task: Task, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
         """The domain of a file."""
         box = ClearBox.from_data(task, data, arrays)
-        kind, robot = part(data, "regular", dict), task.robot
-        theta, centre, half_width = (part(arrays, name, np.ndarray) for name in _ARRAYS)
+        kind, robot = get_part(data, "regular", dict), task.robot
+        theta, centre, half_width = (get_part(arrays, name, np.ndarray) for name in _ARRAYS)
         n = robot.n
         centre, half_width = (
-            frozen_array("space_centre", centre, (n,)),
-            frozen_array("space_half_width", half_width, (n,)),
+            freeze_array("space_centre", centre, (n,)),
+            freeze_array("space_half_width", half_width, (n,)),
         )
         space = JointSpace(centre, half_width, robot.tree.prismatic, robot.joint_names)
         if not space.half_width.min() > 0:
             raise InvalidValueError("space_half_width", space.half_width.min(), "positive numbers")
-        idle = tuple(part(kind, "idle", list))
+        idle = tuple(get_part(kind, "idle", list))
         fitted = n - task.m - len(idle)
         own = Coordinates(parametrisation_from_data(kind), space, idle, theta, np.zeros(fitted), np.ones(fitted))
-        return cls(box, own, part(data, "least_volume", float))
+        return cls(box, own, get_part(data, "least_volume", float))
 
-    def explained(self, q: Array) -> str:
+    def explain(self, q: Array) -> str:
         """What is wrong with a position (n,) of the box."""
         if self.singular_values(q) <= self.least_singular_value:
-            return super().explained(q)
+            return super().explain(q)
         bound = f"expected one above least_volume = {self.least_volume:g}"
         return f"the coordinates have a volume of {self.volumes(q):.3g}, {bound}"
 
-    def within(self, box: Box) -> "RegularPart":
+    def apply_to(self, box: Box) -> "RegularPart":
         """The same conditions on another box."""
-        return RegularPart(super().within(box), self.coordinates, self.least_volume)
+        return RegularPart(super().apply_to(box), self.coordinates, self.least_volume)
 
     def volumes(self, q: ArrayLike) -> Any:
         """v(q), positive as at the centre, at points (n,) or (N, n): a number, or (N,)."""

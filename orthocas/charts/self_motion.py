@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 from orthocas.charts.newton import Newton
 from orthocas.charts.phi import counted_on, largest, require_no_turns
 from orthocas.errors import InvalidValueError, degrees_hint
-from orthocas.tasks.domains import StopKind, bounds_of, contains
+from orthocas.tasks.domains import StopKind
 from orthocas.tasks.problem import Problem
-from orthocas.tools.checks import Array, Indices, as_number, as_point, frozen_array, require_count
+from orthocas.tools.checks import Array, Indices, as_number, as_point, freeze_array, require_count
 from orthocas.tools.display import Shown, listed, number_list
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
@@ -68,7 +68,7 @@ class Walls:
     def __init__(self, problem: Problem) -> None:
         domain = problem.domain
         self._domain, self._robot = domain, problem.robot
-        self._low, self._high = bounds_of(domain)
+        self._low, self._high = domain.bounds
         self._curved = domain.walls
         endless = np.isinf(self._low) & ~np.array(problem.robot.tree.prismatic)
         self.turning = endless  #: unbounded revolute joints, (n,): they are at the same place after a full turn
@@ -98,7 +98,7 @@ class Walls:
 
     def gap(self, q: Array, start: Array) -> Array:
         """q - start (n,), up to full turns of unbounded revolute joints."""
-        return np.asarray(shortest(q - start, 2 * np.pi * self.turning))
+        return np.asarray(wrap_shortest(q - start, 2 * np.pi * self.turning))
 
 
 Signs = Callable[[Array, Array], float]  #: q and tangent -> a number that turns negative at a fold
@@ -358,7 +358,7 @@ def start_inside(chart: "Chart", q: ArrayLike) -> Array:
     """
     point = as_point("q", q, chart.n)
     given = point.round(4).tolist()
-    if not contains(chart.problem.domain, point):
+    if not chart.problem.domain.contains(point):
         stop = Walls(chart.problem).worst(point)
         hint = degrees_hint(*point[~np.array(chart.problem.robot.tree.prismatic)])
         raise InvalidValueError("q", given, f"a point of the domain, which ends at {stop}{hint}")
@@ -498,7 +498,7 @@ class SelfMotion(Shown):
 
     def __post_init__(self) -> None:
         for name in ("x", "q", "xi"):
-            object.__setattr__(self, name, frozen_array(name, getattr(self, name), getattr(self, name).shape))
+            object.__setattr__(self, name, freeze_array(name, getattr(self, name), getattr(self, name).shape))
 
     def facts(self) -> dict[str, str]:
         """Number of points, and the extent of each coordinate."""
@@ -515,7 +515,7 @@ class SelfMotionCurve(SelfMotion):
 
     def __post_init__(self) -> None:
         SelfMotion.__post_init__(self)
-        object.__setattr__(self, "arc_length", frozen_array("arc_length", self.arc_length, (len(self.q),)))
+        object.__setattr__(self, "arc_length", freeze_array("arc_length", self.arc_length, (len(self.q),)))
 
     def facts(self) -> dict[str, str]:
         """Length, folds, and what stops the curve."""

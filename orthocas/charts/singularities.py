@@ -9,10 +9,9 @@ import scipy
 from orthocas.charts.chart import Chart
 from orthocas.errors import GrowError
 from orthocas.exact.flow import GrownCoordinates
-from orthocas.exact.leaves import turning_joints
-from orthocas.tasks.domains import contains, sample_evenly
-from orthocas.tasks.metric import metric_matrices
-from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.exact.leaves import find_turning_joints
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import sample_evenly
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array, require_at_least, require_kind
 
@@ -59,15 +58,15 @@ def singular_points(problem: Problem, seed: int = 0) -> tuple[SingularPoint, ...
         raise GrowError(f"the task has m = {problem.m} components, expected m = 1 to find singular points")
     hessian = _hessian(problem)
     q = sample_evenly(problem.domain, _STARTS, seed)
-    size = np.sqrt((task_jacobians(problem, q) ** 2).sum(axis=(1, 2)).mean())
+    size = np.sqrt((problem.task.evaluate_jacobian(q) ** 2).sum(axis=(1, 2)).mean())
     for _ in range(_NEWTON_STEPS):
-        J = task_jacobians(problem, q)
+        J = problem.task.evaluate_jacobian(q)
         step = np.linalg.pinv(hessian(q)[0].reshape(-1, problem.n, problem.n)) @ J.transpose(0, 2, 1)
         q = q - step[:, :, 0]
     turns = np.floor((q - problem.domain.centre) / (2 * np.pi) + 0.5 - _SAME)  # an angle of half a turn becomes +pi
-    q = q - 2 * np.pi * turns * turning_joints(problem)
-    flat = np.abs(task_jacobians(problem, q)).max(axis=(1, 2)) < _FLAT * size
-    found = _distinct(q[flat & contains(problem.domain, q)])
+    q = q - 2 * np.pi * turns * find_turning_joints(problem)
+    flat = np.abs(problem.task.evaluate_jacobian(q)).max(axis=(1, 2)) < _FLAT * size
+    found = _distinct(q[flat & problem.domain.contains(q)])
     return tuple(_classified(problem, point, hessian) for point in found)
 
 
@@ -112,7 +111,7 @@ def _hessian(problem: Problem) -> Batched:
 
 def _classified(problem: Problem, point: Array, hessian: Batched) -> SingularPoint:
     H = hessian(point[None])[0].reshape(problem.n, problem.n)
-    factor = np.linalg.inv(np.linalg.cholesky(metric_matrices(problem.metric, point[None])[0]))
+    factor = np.linalg.inv(np.linalg.cholesky(problem.metric.evaluate(point[None])[0]))
     curvatures, vectors = np.linalg.eigh(factor @ H @ factor.T)
     kind = "minimum" if curvatures[0] > 0 else "maximum" if curvatures[-1] < 0 else "saddle"
     value = float(problem.task.batched(point[None])[0][0, 0])

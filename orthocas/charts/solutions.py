@@ -10,12 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocas.charts.newton import GOAL, REFRESHES, Bound, PointFunctions, PointSolver
 from orthocas.errors import InvalidValueError, InverseError, degrees_hint
-from orthocas.tasks.domains import Domain, bounds_of, contains, reach
+from orthocas.tasks.domains import Domain
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, Indices, as_float_array, as_point, require_shape
 from orthocas.tools.display import Shown, listed, number_list
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 from orthocas.tools.interrupts import deferred
 
 _FEW = 5  # rows that a message names
@@ -200,7 +200,7 @@ class Tracker(Shown):
             return None
         turns = np.zeros(len(q))
         turns[list(self._functions.turning)] = 2 * np.pi
-        return np.asarray(shortest(self._solver.q - q, turns))
+        return np.asarray(wrap_shortest(self._solver.q - q, turns))
 
     @property
     def largest_step(self) -> Array:
@@ -225,8 +225,8 @@ class Tracker(Shown):
             InvalidValueError: if q lies outside the domain, or J is singular there.
         """
         point = as_point("q", q, len(self._limit))
-        if not contains(self._domain, point):
-            hint = degrees_hint(*point[np.isfinite(bounds_of(self._domain)[0])])
+        if not self._domain.contains(point):
+            hint = degrees_hint(*point[np.isfinite(self._domain.bounds[0])])
             raise InvalidValueError("q", point.tolist(), f"a point of the domain{hint}")
         self._solver.q[:] = point
         if not self._solver.refresh():
@@ -287,7 +287,7 @@ class Tracker(Shown):
 def _guard(domain: Domain, limit: Array) -> ca.Function:
     """q before, q -> the largest change relative to its limit, and a number > 0 outside the domain."""
     before, q = (ca.MX.sym(name, len(limit)) for name in ("before", "q"))
-    outside = ca.mmax(ca.fabs(q - ca.DM(domain.centre)) - ca.DM(reach(domain)))
+    outside = ca.mmax(ca.fabs(q - ca.DM(domain.centre)) - ca.DM(domain.reach))
     if domain.condition is not None:
         outside = ca.fmax(outside, ca.if_else(ca.mmin(domain.condition.pivots(q)) > 0, -1, 1))
     return dense_function("guard", [before, q], [ca.vertcat(ca.norm_inf((q - before) / ca.DM(limit)), outside)])

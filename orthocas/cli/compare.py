@@ -31,7 +31,7 @@ from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
 from orthocas.solvers import get as get_solver
 from orthocas.solvers.protocol import Solver
-from orthocas.tools.files import output_folder, published, require_replaceable_files
+from orthocas.tools.files import open_output_folder, publish, require_replaceable_files
 from orthocas.tools.interrupts import INTERRUPTED
 
 _FILES = ("comparison.csv", "comparison.json", "front.png", "convergence.png")
@@ -73,7 +73,7 @@ def compare(
     parametrisations = [parse_parametrisation(name) for name in param or _PARAMETRISATIONS]
     minimisers: list[Solver] | None = [get_solver(name) for name in solver] if solver else None
     loss = parse_weights(weights, None)
-    with output_folder("--out", out) as folder, output_folder("--out", folder / "charts") as charts:
+    with open_output_folder("--out", out) as folder, open_output_folder("--out", folder / "charts") as charts:
         require_replaceable_files(folder, _FILES, force)
         try:
             with terminal_monitor() as monitor:
@@ -112,7 +112,7 @@ def write_comparison(comparison: Comparison, folder: Path, force: bool) -> None:
     comparison.write(folder, force)
     if all(result.failed for result in comparison.results):
         return
-    with published(folder, listed=True, force=force) as drafts:
+    with publish(folder, listed=True, force=force) as drafts:
         front_figure(comparison).savefig(drafts / "front.png", dpi=150)
         convergence_figure(comparison).savefig(drafts / "convergence.png", dpi=150)
 
@@ -153,7 +153,7 @@ def fit_demo(out: Path, quick: bool = False, force: bool = False) -> tuple[Fit, 
     with terminal_monitor() as monitor:
         fit = fit_chart(problems.get("iiwa"), Polynomial(degree=3 if quick else 5), monitor=monitor)
     report = evaluate(fit.chart, samples=5_000 if quick else 100_000)
-    with output_folder("--out", out) as folder, published(folder, listed=True, force=force) as drafts:
+    with open_output_folder("--out", out) as folder, publish(folder, listed=True, force=force) as drafts:
         fit.chart.save(drafts / "iiwa.orthocas")
         quality_figure(report).savefig(drafts / "iiwa_quality.png", dpi=150)
         self_motion_figure(fit.chart, reach=None).savefig(drafts / "iiwa_self_motion.png", dpi=150)

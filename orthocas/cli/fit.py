@@ -46,17 +46,17 @@ from orthocas.fitting.suggest_domain import CONDITIONING, LEAK_DEG, DomainSugges
 from orthocas.fitting.terms import Weights
 from orthocas.fitting.wide import CLEARANCE, WideFit, fit_wide
 from orthocas.paths.chart_along import RADIUS, corridor_problem
-from orthocas.robots.homes import read_postures
 from orthocas.robots.robot import Robot
 from orthocas.solvers import get as get_solver
 from orthocas.solvers.protocol import Status
+from orthocas.tasks.corridor import read_postures
 from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.task import Task
 from orthocas.tools.archive import require_free
 from orthocas.tools.display import listed, number_list, percent
 from orthocas.tools.interrupts import INTERRUPTED
-from orthocas.tools.json import attributes
+from orthocas.tools.json import collect_attributes
 from orthocas.tools.progress import Monitor
 
 _AUTO, _BRANCH = "auto", "branch"  # words of --domain
@@ -380,7 +380,7 @@ def _describe_wide(result: Fit) -> dict[str, Any]:
     meaning = None if result.meaning is None else {"like": result.chart.notes["meaning"], **asdict(result.meaning)}
     return {
         "branch": result.branch.name,
-        **attributes(result, "regular_share", "left_out"),
+        **collect_attributes(result, "regular_share", "left_out"),
         "meaning": meaning,
     }
 
@@ -406,10 +406,10 @@ def _describe_fit(result: Fit, report: Report, target: Path, suggestion: DomainS
         "stages": [
             {
                 "parametrisation": stage.label,
-                **attributes(stage, "parameters", "samples"),
+                **collect_attributes(stage, "parameters", "samples"),
                 "loss": stage.result.value,
                 "status": stage.result.status.value,
-                **attributes(stage.result, "iterations", "seconds"),
+                **collect_attributes(stage.result, "iterations", "seconds"),
             }
             for stage in result.stages
         ],

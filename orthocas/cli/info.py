@@ -13,13 +13,13 @@ from orthocas.cli.output import build_reach_data, print_json, print_rows
 from orthocas.errors import OptionError, RobotError, SingularTaskError
 from orthocas.exact.involutivity import involutivity
 from orthocas.robots.robot import Robot
-from orthocas.tasks.branches import CLEAR
+from orthocas.tasks.branches import RULES as BRANCH_RULES
 from orthocas.tasks.branches import branches as find_branches
 from orthocas.tasks.problem import Problem, check
 from orthocas.tasks.samples import NEGLIGIBLE
 from orthocas.tasks.task import Task
 from orthocas.tools.display import percent
-from orthocas.tools.json import plain
+from orthocas.tools.json import clean
 
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
@@ -80,15 +80,15 @@ def _describe_robot(robot: Robot) -> dict[str, Any]:
     return {
         "joints": list(robot.joint_names),
         "kinds": list(robot.tree.joint_kinds),
-        "lower": plain(robot.lower),
-        "upper": plain(robot.upper),
-        "effort_limits": plain(robot.effort_limits),
-        "velocity_limits": plain(robot.velocity_limits),
+        "lower": clean(robot.lower),
+        "upper": clean(robot.upper),
+        "effort_limits": clean(robot.effort_limits),
+        "velocity_limits": clean(robot.velocity_limits),
         "homes": list(robot.homes),
         "tip": robot.tree.tip_name,
         **({"tips": list(robot.tips)} if robot.tree.tips else {}),
         "mass_kg": float(robot.tree.masses.sum()),
-        "gravity": plain(robot.tree.gravity),
+        "gravity": clean(robot.tree.gravity),
     }
 
 
@@ -96,7 +96,7 @@ def _describe_redundancy(robot: Robot) -> dict[str, Any]:
     """The number r = n - m of extra coordinates of each task that has some, and the joints that do not move it."""
     kinds = ("position", "pose", *(("relative_position", "relative_pose") if len(robot.tips) == 2 else ()))
     # No posture in which joints happen to be parallel.
-    q = robot.tree.middle + 0.1 * np.arange(1, robot.n + 1)
+    q = robot.tree.centre_posture + 0.1 * np.arange(1, robot.n + 1)
     coordinates, floating = {}, robot.tree.floating
     for kind in kinds:
         task = Task.named(robot, kind, q)
@@ -117,12 +117,12 @@ def _describe_branches(robot: Robot, task: Task | None) -> dict[str, Any]:
     Branches that are too near to singular positions for the default clearance of wide charts have the one they allow.
     """
     branching = find_branches(robot, task)
-    lower = {item.name: item.clearance for item in branching if item.clearance < CLEAR}
+    lower = {item.name: item.clearance for item in branching if item.clearance < BRANCH_RULES.nonsingular}
     return {
         "cuts": [cut.explained for cut in branching.cuts],
         "branches": {item.name: item.share for item in branching},
         **({"clearance_at_most": lower} if lower else {}),
-        "postures": {item.name: plain(item.posture) for item in branching},
+        "postures": {item.name: clean(item.posture) for item in branching},
     }
 
 
@@ -139,7 +139,7 @@ def _describe_problem(problem: Problem) -> dict[str, Any]:
         "centre": problem.domain.centre.tolist(),
         "half_width": problem.domain.half_width.tolist(),
         "unbounded_joints": [problem.robot.joint_names[k] for k in problem.domain.unbounded],
-        **problem.domain.numbers_of_condition(),
+        **problem.domain.report_condition(),
         "cyclic_joints": list(cyclic_joints(problem)),
         "near_singular_share": checked.singular_share,
         "half_turn_share": checked.half_turn_share,

@@ -16,7 +16,7 @@ from orthocas.robots.robot import Robot
 from orthocas.tasks.domains import default_box
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.regular_box import regular_box
-from orthocas.tasks.task import Task, task_kinds
+from orthocas.tasks.task import Task, list_task_kinds
 from orthocas.tools.checks import Array
 
 
@@ -91,7 +91,7 @@ _PROBLEM_OPTIONS: dict[str, Any] = {
     ],
     "task": Annotated[
         str | None,
-        typer.Option("--task", help=f"Task: {', '.join(task_kinds())}; AXES such as xy, AXIS x, y or z."),
+        typer.Option("--task", help=f"Task: {', '.join(list_task_kinds())}; AXES such as xy, AXIS x, y or z."),
     ],
     "metric": Annotated[str | None, typer.Option("--metric", help="Metric: euclidean or inertia.")],
     "centre": Annotated[str | None, typer.Option("--centre", help='Centre of the domain, "0,0.5,..." [rad or m].')],

@@ -11,7 +11,7 @@ import typer
 
 from orthocas.errors import InvalidValueError, one_line, printable
 from orthocas.tools.display import percent
-from orthocas.tools.json import plain, to_json
+from orthocas.tools.json import clean, write_json
 from orthocas.tools.progress import Monitor, Progress, TerminalBars
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ _UNEVEN = 30.0  # ratio of gradient lengths above which the same gain means too 
 
 def print_json(data: Mapping[str, Any]) -> None:
     """Print one JSON object."""
-    typer.echo(to_json(data))
+    typer.echo(write_json(data))
 
 
 def print_rows(rows: Mapping[str, str]) -> None:
@@ -70,7 +70,7 @@ def build_reach_data(chart: "Chart") -> dict[str, Any]:
     if (reach := _find_reach(chart)) is None:
         return {}
     return {
-        "xi_range": {part.label: [plain(part.low), plain(part.high)] for part in reach},
+        "xi_range": {part.label: [clean(part.low), clean(part.high)] for part in reach},
         "xi_stops": {part.label: [str(part.low_stop), str(part.high_stop)] for part in reach},
     }
 

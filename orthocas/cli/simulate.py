@@ -33,13 +33,12 @@ from orthocas.simulation.figure import FORMATS, require_format, save_animation, 
 from orthocas.simulation.mujoco_plant import MUJOCO, MuJoCo
 from orthocas.simulation.run import simulate as run_closed_loop
 from orthocas.simulation.trajectory import Outcome, Trajectory, coupling_index
-from orthocas.tasks.domains import contains
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import require_known
 from orthocas.tools.display import percent
-from orthocas.tools.files import is_listed, output_folder, published, require_replaceable_files, require_writable
+from orthocas.tools.files import is_listed, open_output_folder, publish, require_replaceable_files, require_writable
 from orthocas.tools.interrupts import INTERRUPTED, deferred
-from orthocas.tools.json import plain, to_json
+from orthocas.tools.json import clean, write_json
 from orthocas.tools.progress import Monitor
 
 _FILES = ("trajectory.npz", "coordinates.png", "report.json")
@@ -199,10 +198,10 @@ def _finish(
 ) -> dict[str, Any]:
     """Write the run, its picture and its report, which is returned, and remove the animation of an earlier run."""
     report = build_report(law, chart, plan, run, seconds)
-    with output_folder("--out", out) as folder, published(folder, listed=True, force=force) as drafts:
+    with open_output_folder("--out", out) as folder, publish(folder, listed=True, force=force) as drafts:
         run.save(drafts / "trajectory.npz")
         trajectory_figure(run, units_of(chart.problem)).savefig(drafts / "coordinates.png", dpi=130)
-        (drafts / "report.json").write_text(to_json(report, indent=1) + "\n")
+        (drafts / "report.json").write_text(write_json(report, indent=1) + "\n")
     for old in (out / f"animation.{kind}" for kind in FORMATS):
         if is_listed(old):
             old.unlink()
@@ -248,7 +247,7 @@ def build_report(controller: Controller, chart: Chart, plan: Plan, seen: Traject
     bad = np.flatnonzero(seen.fell_back)
     first = int(bad[0]) if bad.size else None
     status, cause = (ControlStatus(int(column[first or 0])) for column in (seen.status, seen.cause))
-    inside = np.asarray(contains(chart.problem.domain, seen.q))
+    inside = np.asarray(chart.problem.domain.contains(seen.q))
     evaluated = (
         plan.has_steps and not plan.pushes and seen.outcome is Outcome.COMPLETE and inside.all() and not bad.size
     )
@@ -278,7 +277,7 @@ def build_report(controller: Controller, chart: Chart, plan: Plan, seen: Traject
         "energy": _evaluate_energy(seen) if seen.kind == "torque" and not bad.size else None,
         "seconds": seconds,
     }
-    return dict(plain(report))
+    return dict(clean(report))
 
 
 def format_report(report: dict[str, Any], problem: Problem) -> dict[str, str]:

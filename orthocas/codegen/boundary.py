@@ -11,10 +11,11 @@ from orthocas.charts.chart import Chart
 from orthocas.codegen.description import chart_values, filled, flags, numbers, words
 from orthocas.codegen.precision import Precision, bounds_inside
 from orthocas.control.controller import Controller
-from orthocas.tasks.domains import Domain, PathBound, SingularBound, bounds_of, contains, reach, sample_uniform
+from orthocas.tasks.domains import Domain, PathBound, SingularBound
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import scalar_code
+from orthocas.tools.expressions import expand_scalars
 
 _USUAL = 256  # positions of a domain whose median room to a fold is the usual one
 
@@ -47,7 +48,7 @@ def position_within(domain: Domain) -> Array:
     if near is not None:
         inside = near.postures[near.contains(near.postures)]
         return np.asarray(inside[len(inside) // 2])
-    shares = [0.5**k for k in range(1, 20) if contains(domain, domain.centre + 0.5**k * domain.half_width)]
+    shares = [0.5**k for k in range(1, 20) if domain.contains(domain.centre + 0.5**k * domain.half_width)]
     return np.round(domain.centre + (shares[0] if shares else 0.0) * domain.half_width, 3)
 
 
@@ -66,7 +67,7 @@ def domain_values(chart: Chart, known: Mapping[str, str], precision: Precision) 
         "domain_lower": numbers(lowest),
         "domain_upper": numbers(highest),
         "domain_centre": numbers(domain.centre),
-        "domain_reach": numbers(reach(domain)),
+        "domain_reach": numbers(domain.reach),
         "is_clear": "1" if condition is None else "is_clear(q)",
         "clear_c": "" if condition is None else _condition_code(condition, known),
     }
@@ -88,7 +89,7 @@ def _condition_code(domain: Domain, values: Mapping[str, str]) -> str:
 def bound_values(controller: Controller) -> dict[str, str]:
     """The boundary of the box, which is none for laws without a chart."""
     domain = controller.problem.domain
-    lower, upper = bounds_of(domain)
+    lower, upper = domain.bounds
     bounded = np.isfinite(lower) & np.isfinite(upper) & (controller.chart is not None)
     return {
         "domain_half_width": numbers(domain.half_width),
@@ -124,7 +125,7 @@ def _clear(domain: Domain, clear: SingularBound) -> BoundaryCondition:
     )
     words = {"clear_bound": repr(clear.least_singular_value), "clear_span": repr(span)}
     q = ca.MX.sym("q", len(clear.centre))
-    kernels = (scalar_code(ca.Function("gram", [q], [clear.gram(q)])),)
+    kernels = (expand_scalars(ca.Function("gram", [q], [clear.gram(q)])),)
     room = domain.room_to_fold
     if room is None:
         words |= dict.fromkeys(("least_of", "end_of_least", "or_volume"), "")
@@ -137,7 +138,7 @@ def _clear(domain: Domain, clear: SingularBound) -> BoundaryCondition:
         "fold_span": repr(usual),
     }
     meaning += " So is\n * the bound on the volume of the coordinates, in shares of the median."
-    folds = scalar_code(ca.Function("room", [q], [room(q)]))
+    folds = expand_scalars(ca.Function("room", [q], [room(q)]))
     return BoundaryCondition(("fold_boundary.c", "clear_boundary.c"), meaning, words, (*kernels, folds))
 
 

@@ -20,7 +20,7 @@ from orthocas.codegen.library import compilers
 from orthocas.errors import CompileError, SimulationError
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_path
-from orthocas.tools.files import digest, draft_folder, made_folder, published
+from orthocas.tools.files import compute_digest, make_folder, open_draft_folder, publish
 from orthocas.tools.interrupts import deferred
 from orthocas.tools.processes import run_program
 
@@ -49,15 +49,15 @@ def kept_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], fo
     content = [*(text.encode() for text in sources.values()), repr((compiler, options)).encode()]
     name = f"{kind}-{hashlib.sha256(b'/'.join(content)).hexdigest()[:32]}.so"
     place = _cache() if folder is None else as_path("folder", folder)
-    library = made_folder("folder", place, mode=0o700).resolve() / name
+    library = make_folder("folder", place, mode=0o700).resolve() / name
     _require_own(library.parent)
     if not _is_whole(library):
-        with draft_folder() as place, published(library.parent) as drafts:
+        with open_draft_folder() as place, publish(library.parent) as drafts:
             for file, text in sources.items():
                 (place / file).write_text(text, encoding="utf-8")
             code = [str(place / file) for file in sources if file.endswith(".c")]
             run_program([compiler, *options, "-o", str(drafts / name), *code, "-lm"])
-            (drafts / f"{name}.sha256").write_text(digest(drafts / name))
+            (drafts / f"{name}.sha256").write_text(compute_digest(drafts / name))
     return library
 
 
@@ -98,7 +98,7 @@ def _require_own(place: Path) -> None:
 def _is_whole(library: Path) -> bool:
     """Whether a library is there as it was compiled: the system ends processes that load half of one."""
     try:
-        return library.with_name(f"{library.name}.sha256").read_text() == digest(library)
+        return library.with_name(f"{library.name}.sha256").read_text() == compute_digest(library)
     except (OSError, ValueError):
         return False
 

@@ -14,8 +14,7 @@ from orthocas.charts.curves import Nearest, SelfMotionCurves
 from orthocas.codegen.compiled import template
 from orthocas.codegen.description import flags, numbers
 from orthocas.codegen.kernels import generate_kernels
-from orthocas.tasks.domains import bounds_of
-from orthocas.tools.batch import dense_function, in_threads
+from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.checks import Array
 
 _PIECE = 64  # rows that a thread takes at once
@@ -46,7 +45,7 @@ class CompiledCurves:
             counts = ctypes.c_long(len(stages[0])), ctypes.c_long(starts.shape[1])
             library.curve_rows(ctypes.c_long(len(starts)), phi, q_start, *counts, ctypes.c_double(tolerance), *others)
 
-        in_threads(search_piece, range(0, len(own), _PIECE))
+        run_in_threads(search_piece, range(0, len(own), _PIECE))
         best.between[:] = between
         return best
 
@@ -74,7 +73,7 @@ def curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
     sizes |= {**kernels.sizes(), **{name.upper(): repr(value) for name, value in asdict(RULES).items()}}
     sizes["XI_SIZE"] = repr(float(chart.phi_sizes[chart.m]))
     sizes["PERIOD"] = repr(turn) if turn > 0 else "INFINITY"
-    low, high = bounds_of(domain)
+    low, high = domain.bounds
     arrays = {"low": low, "high": high, "centre": domain.centre, "half_width": domain.half_width}
     lines = [f"#define {name} {value}" for name, value in sizes.items()]
     lines += [f"static const double {name}[N] = {{{numbers(values)}}};" for name, values in arrays.items()]

@@ -16,11 +16,11 @@ from orthocas.charts.solutions import Solutions
 from orthocas.codegen.compiled import kept_library, loaded, template
 from orthocas.codegen.compiled_curves import CompiledCurves, curve_source
 from orthocas.codegen.generate import generate_c
-from orthocas.tools.batch import in_threads
+from orthocas.tools.batch import run_in_threads
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices, require_kind
 from orthocas.tools.display import Shown
-from orthocas.tools.files import draft_folder
+from orthocas.tools.files import open_draft_folder
 
 _FLAGS = ("-O3",)  # no warnings as errors: compilers doubt pointers of CasADi that pass the end of an array
 _ROWS = "inverse_rows.c"
@@ -89,7 +89,7 @@ class CompiledInverse(Shown):
                 *(ctypes.c_void_p(array.ctypes.data) for array in arrays),
             )
 
-        in_threads(solve_piece, range(0, len(targets), _PIECE))
+        run_in_threads(solve_piece, range(0, len(targets), _PIECE))
         phi_map = self.chart.phi_map
         attempt.residual[:] = phi_map.difference(targets, attempt.residual) / phi_map.scale(targets)
         attempt.iterations[:], attempt.suspicious[:] = 1, ~(condition < SUSPICIOUS)
@@ -128,7 +128,7 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
         [True, True]
     """
     require_kind("chart", chart, Chart)
-    with draft_folder() as drafts:
+    with open_draft_folder() as drafts:
         generate_c(chart, drafts, name="arm")
         sources = {name: (drafts / name).read_text(encoding="utf-8") for name in ("arm.h", "arm.c")}
     sources[_ROWS] = template(_ROWS)

@@ -12,7 +12,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
 from orthocas.control.controller import Controller
 from orthocas.robots.kinematics import TipTurn
-from orthocas.tasks.domains import Domain, bounds_of
+from orthocas.tasks.domains import Domain
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array
 
@@ -93,7 +93,7 @@ def chart_values(chart: Chart) -> dict[str, str]:
 
 def domain_lines(domain: Domain, names: list[str]) -> str:
     """The boundaries of a domain, joint by joint, and its condition on singular values."""
-    return _boundary_lines(names, *bounds_of(domain)) + clear_line(domain)
+    return _boundary_lines(names, *domain.bounds) + clear_line(domain)
 
 
 def _angles(chart: Chart) -> str:
@@ -109,7 +109,7 @@ def _with_units(task: Task) -> list[str]:
 
 def _orientation(task: Task) -> str:
     """The convention of orientation components, and their reference rotation."""
-    turn = TipTurn.of_kind(task.recipe["kind"])
+    turn = TipTurn.from_kind(task.recipe["kind"])
     if turn is None or "reference" not in task.recipe:
         return ""
     first = turn.labels[3 if turn.with_position else 0]

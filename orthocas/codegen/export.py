@@ -18,7 +18,7 @@ from orthocas.codegen.export_law import TORQUE_LAWS, law_form
 from orthocas.control.operational_space import Impedance, PDPlus
 from orthocas.errors import ArchiveError, InvalidValueError
 from orthocas.tools.checks import Array, as_path, require_kind, require_known
-from orthocas.tools.files import published, require_replaceable, require_writable
+from orthocas.tools.files import publish, require_replaceable, require_writable
 from orthocas.version import VERSION
 
 _COMMON = ("from base64 import b64decode", "from functools import cache")
@@ -138,7 +138,7 @@ def export(chart: Chart | Impedance | PDPlus, to: str, path: str | Path, force: 
     require_replaceable(target, _is_ours(target), force)
     text = module_text(chart, to)
     try:
-        with published(target.parent) as drafts:
+        with publish(target.parent) as drafts:
             (drafts / target.name).write_text(text, encoding="utf-8")
     except OSError as error:
         raise ArchiveError(f"cannot write {target}: {error.strerror}") from None

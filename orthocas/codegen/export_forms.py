@@ -14,7 +14,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import ARITHMETIC, Tape, to_tape
+from orthocas.tools.expressions import ARITHMETIC, Tape, write_tape
 
 _OPERATORS = {
     **ARITHMETIC,
@@ -53,7 +53,7 @@ def function_code(name: str, summary: str, *functions: ca.Function) -> str:
     """A Python function of columns q (n, N) with the entries of dense SX functions' outputs, row by row, (k, N)."""
     q = ca.SX.sym("q", functions[0].size_in(0)[0])
     rows = ca.vertcat(*(ca.vec(ca.densify(function(q)).T) for function in functions))
-    lines = tape_lines(to_tape(ca.Function("rows", [q], [ca.cse(rows)])))
+    lines = tape_lines(write_tape(ca.Function("rows", [q], [ca.cse(rows)])))
     body = "\n".join(f"    {line}" for line in lines)
     return f'def {name}(q):\n    """{summary}"""\n{body}\n'
 

@@ -6,7 +6,8 @@ import numpy as np
 from orthocas.charts.chart import Chart
 from orthocas.charts.solutions import InverseStatus
 from orthocas.codegen.export_forms import Form, function_code
-from orthocas.tasks.domains import Domain, FoldBound, PathBound, SingularBound, bounds_of, sample_uniform
+from orthocas.tasks.domains import Domain, FoldBound, PathBound, SingularBound
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
 
@@ -40,7 +41,7 @@ def _newton(chart: Chart) -> Form:
     problem, n = chart.problem, chart.n
     domain, robot = problem.domain, problem.robot
     slack = _SLACK * domain.half_width
-    low, high = bounds_of(domain)
+    low, high = domain.bounds
     bounds = np.array([low - slack, high + slack, robot.lower - slack, robot.upper + slack])
     target, value = ca.SX.sym("target", n), ca.SX.sym("value", n)
     difference = chart.phi_map.difference(target, value)
@@ -64,7 +65,7 @@ def _nearest(chart: Chart) -> Form:
     """Steps to the nearest xi, with the box of the domain."""
     domain = chart.problem.domain
     tables = {
-        "range": np.array(bounds_of(domain))[:, :, None],
+        "range": np.array(domain.bounds)[:, :, None],
         "half_width": domain.half_width[:, None],
         "identity": np.eye(chart.n + _rooms(domain)),
     }

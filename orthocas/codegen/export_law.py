@@ -8,9 +8,8 @@ from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, ControlStatus
 from orthocas.control.linear_algebra import ROUNDS, SOFTEST
 from orthocas.control.operational_space import Impedance, PDPlus
 from orthocas.errors import InvalidValueError
-from orthocas.tasks.domains import reach
 from orthocas.tools.batch import dense_function
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 
 TORQUE_LAWS = (Impedance, PDPlus)  #: that can be exported
 _STATUSES = ("OK", "OUTSIDE_DOMAIN", "SINGULAR", "NOT_FINITE", "SATURATED")
@@ -47,7 +46,7 @@ def law_form(law: Impedance | PDPlus) -> Form:
     model = law.model
     if model.gains(law.problem, law.feed_forward):
         raise InvalidValueError("model of the law", ", ".join(model.gains(law.problem, law.feed_forward)), "its own")
-    bound, domain = reach(law.problem.domain), law.problem.domain
+    bound, domain = law.problem.domain.reach, law.problem.domain
     stiffness = law.stiffness if law.damping_stiffness is None else law.damping_stiffness
     turn = np.zeros(law.problem.n)
     turn[list(law.problem.turning)] = 2 * np.pi
@@ -88,7 +87,7 @@ def _functions(law: Impedance | PDPlus) -> list[str]:
         function_code(
             "_shortest",
             "Errors by the shorter way around for coordinates that are angles, (n, N).",
-            dense_function("f", [e], [shortest(e, chart.turns)]),
+            dense_function("f", [e], [wrap_shortest(e, chart.turns)]),
         ),
         _code(
             "_mass_matrix", "Entries of M row by row, (n n, N).", [q], [ca.vec(law.model.mass_matrix(robot, inputs))]
@@ -96,8 +95,8 @@ def _functions(law: Impedance | PDPlus) -> list[str]:
         _code("_gravity", "Gravity torque, (n, N).", [q], [law.model.gravity_torque(robot, inputs)]),
     ]
     if law.feed_forward:
-        drift = chart.relative.drift(q, x_d, dx_d)
-        bend = chart.relative.bend(q, dq, w, (x_d, dx_d, ddx_d))
+        drift = chart.relative.compute_drift(q, x_d, dx_d)
+        bend = chart.relative.compute_bias(q, dq, w, (x_d, dx_d, ddx_d))
         coriolis = law.model.coriolis_torque(robot, inputs, w)
         states = [q, dq, w, x_d, dx_d, ddx_d]
         found += [

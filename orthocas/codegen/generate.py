@@ -20,8 +20,8 @@ from orthocas.control.controller import Controller, require_controller
 from orthocas.control.safety import Safety
 from orthocas.errors import ArchiveError, InvalidValueError
 from orthocas.tools.checks import as_path, require_kind, require_shape
-from orthocas.tools.expressions import fast_form, scalar_code
-from orthocas.tools.files import output_folder, published, require_writable
+from orthocas.tools.expressions import choose_form, expand_scalars
+from orthocas.tools.files import open_output_folder, publish, require_writable
 
 _LOCALS = 5 * 1024  # bytes; 1 to 4.5 KiB with gcc and clang for up to seven joints (tests/codegen/test_c_safety.py)
 _TAKEN = (  # names of C headers and libraries
@@ -118,7 +118,7 @@ def _functions(chart: Chart, controller: Controller | None, precision: Precision
     found = [
         ca.Function("chart", [q], [chart.function("phi")(q), chart.function("jacobian")(q).T]),
         ca.Function("curvature", [q, dq, v], [chart.function("second_derivative")(q, dq, v)]),
-        fast_form(ca.Function("dynamics", [q, dq], [robot.mass_matrix(q), robot.bias(q, dq), robot.gravity(q)]), n),
+        choose_form(ca.Function("dynamics", [q, dq], [robot.mass_matrix(q), robot.bias(q, dq), robot.gravity(q)]), n),
     ]
     if chart.relative.turned:
         x, wanted = ca.MX.sym("x", chart.m), ca.MX.sym("wanted", chart.m)
@@ -130,7 +130,7 @@ def _functions(chart: Chart, controller: Controller | None, precision: Precision
     if domain is not None and domain.condition is not None:
         # a graph where the condition asks for coordinates of a network
         pivots = ca.Function("pivots", [q], [domain.condition.pivots(q)])
-        found.append(pivots if domain.condition.pivots.is_a("MXFunction") else scalar_code(pivots))
+        found.append(pivots if domain.condition.pivots.is_a("MXFunction") else expand_scalars(pivots))
     if controller is not None:
         graph = precision.graph(controller)
         inputs = graph.mx_in()
@@ -222,7 +222,7 @@ def _is_ours(path: Path) -> bool:
 def _write(out: Path, contents: Mapping[str, str]) -> None:
     """Write all files or, if one fails, none."""
     try:
-        with output_folder("out", out) as folder, published(folder) as drafts:
+        with open_output_folder("out", out) as folder, publish(folder) as drafts:
             for name, text in contents.items():
                 (drafts / name).write_text(text, encoding="utf-8")
     except OSError as error:

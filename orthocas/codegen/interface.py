@@ -21,7 +21,7 @@ from orthocas.control.controller import Controller
 from orthocas.control.memory import memory_of
 from orthocas.control.safety import SIGNED, UNBOUNDED, Safety
 from orthocas.tasks.relative import Relative
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 from orthocas.version import VERSION
 
 _TORQUE = """It compensates gravity and the load that it has felt, damps
@@ -85,7 +85,7 @@ def supervision_kernels(controller: Controller, condition: BoundaryCondition | N
     measured, relative = controller.measured(q), Relative(controller.problem.task)
     start, velocity, acceleration, end = (ca.MX.sym(name, k) for name in ("start", "velocity", "acceleration", "end"))
     m, gap = controller.problem.m, _apart(controller, relative, end, start)
-    turned = relative.rates_of(start[:m], velocity[:m], acceleration[:m])
+    turned = relative.convert_rates(start[:m], velocity[:m], acceleration[:m])
     rates = [ca.vertcat(*parts) for parts in zip(turned, (velocity[m:], acceleration[m:]), strict=True)]
     found = [
         ca.Function("fallback", inputs, fallback.call(inputs)),
@@ -111,7 +111,7 @@ def _apart(controller: Controller, relative: Relative, end: ca.MX, start: ca.MX)
         unit = ca.sumsqr(relative.task.quaternion_function(end[:m])) < _UNIT
         difference = ca.if_else(unit, difference, ca.MX.nan(len(controller.labels)))
     if controller.chart is not None and controller.labels == controller.chart.labels:
-        difference = shortest(difference, controller.chart.turns)
+        difference = wrap_shortest(difference, controller.chart.turns)
     return ca.densify(difference)
 
 
@@ -131,7 +131,7 @@ def _implied(controller: Controller, relative: Relative) -> ca.Function:
         J_2 = ca.jacobian(controller.measured(q)[m:], q)
         J, bend = ca.vertcat(slope, J_2), ca.jtimes(J_2 @ dq, q, dq)
     bend = ca.vertcat(controller.problem.task.rates_derivative_function(q, dq, dq), bend)
-    turned = relative.rates_of(value[:m], rates[0][:m], rates[1][:m])
+    turned = relative.convert_rates(value[:m], rates[0][:m], rates[1][:m])
     velocity, acceleration = (ca.vertcat(a, b[m:]) for a, b in zip(turned, rates, strict=True))
     B = ca.horzcat(change, velocity, acceleration - bend)
     if k != n:

@@ -12,7 +12,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.reaching import RULES, ReachingRules
 from orthocas.codegen.description import numbers
 from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, Controller, with_smallest_volume
-from orthocas.tasks.domains import Domain, bounds_of, reach
+from orthocas.tasks.domains import Domain
 from orthocas.tools.checks import Array
 
 _EXPONENT = re.compile(r"e\+?(-?)0*")  # 1e+06 becomes 1e6, and 1e-05 1e-5
@@ -134,7 +134,7 @@ def _in_single_precision(token: re.Match[str]) -> str:
 def bounds_inside(domain: Domain, precision: Precision) -> tuple[Array, Array]:
     """Lower and upper bounds in a precision, (n,) each, that belong to the domain in Python and in C."""
     centre, found = precision.rounded(domain.centre), []
-    for boundary in bounds_of(domain):
+    for boundary in domain.bounds:
         bound = precision.rounded(boundary)
         while (beyond := _is_beyond(domain, bound, precision)).any():
             inwards = np.nextafter(bound.astype(precision.scalar), centre.astype(precision.scalar))
@@ -145,7 +145,7 @@ def bounds_inside(domain: Domain, precision: Precision) -> tuple[Array, Array]:
 
 def _is_beyond(domain: Domain, q: Array, precision: Precision) -> Any:
     """Whether Python or C finds the joints of q outside, (n,)."""
-    distance, largest = abs(q - domain.centre), reach(domain)
+    distance, largest = abs(q - domain.centre), domain.reach
     in_c = precision.rounded(abs(q - precision.rounded(domain.centre)))
     return (distance > largest) | (in_c > precision.rounded(largest))
 

@@ -18,11 +18,11 @@ from orthocas.control.controller import (
     squared_volume,
 )
 from orthocas.errors import ProofError
-from orthocas.tasks.domains import Domain, contains
+from orthocas.tasks.domains import Domain
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array, require_kind
-from orthocas.tools.expressions import shortest
-from orthocas.tools.files import draft_folder
+from orthocas.tools.expressions import wrap_shortest
+from orthocas.tools.files import open_draft_folder
 
 _BAD = (np.nan, np.inf, -np.inf, 1e200)
 _REACH = 1.2  # random states lie in the domain enlarged by this factor
@@ -126,7 +126,7 @@ def check_c(
     q = _positions(chart.problem.domain, np.random.default_rng(seed).uniform(-1, 1, (states, n)), precision)
     differences: dict[str, float] = {}
     for compiler in compilers():
-        with draft_folder() as folder:
+        with open_draft_folder() as folder:
             path = compile_shared(generated, folder, compiler=compiler)
             library = CompiledLibrary(path, generated.name, n, generated.single_precision)
             found = _compared(library, chart, controller, q, seed)
@@ -170,7 +170,7 @@ def _chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array, dq: Ar
     largest = library.precision.largest
     known, moving = _are_numbers(largest, q), _are_numbers(largest, q, dq)
     somewhere, speed = np.where(known[:, None], q, domain.centre), np.where(moving[:, None], dq, 0)
-    inside = np.where(contains(domain, somewhere), ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN)
+    inside = np.where(domain.contains(somewhere), ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN)
     wanted = {"phi": chart.phi(somewhere), "jacobian": chart.jacobian(somewhere)}
     has_value = known & np.isfinite(wanted["phi"]).all(axis=1) & np.isfinite(wanted["jacobian"]).all(axis=(1, 2))
     status = np.select([~known, ~has_value], [ControlStatus.NOT_FINITE, ControlStatus.SINGULAR], inside)
@@ -178,7 +178,7 @@ def _chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array, dq: Ar
     _require_status("chart", [row[-1] for row in found], status, q)
     phi, J = (np.array([row[k] for row in found]) for k in range(2))
     wanted = {name: _zero_unless(has_value, value) for name, value in wanted.items()}
-    phi = wanted["phi"] + shortest(phi - wanted["phi"], chart.turns)  # pi and -pi are one angle
+    phi = wanted["phi"] + wrap_shortest(phi - wanted["phi"], chart.turns)  # pi and -pi are one angle
     differences = {"phi": _difference(phi, wanted["phi"]), "jacobian": _difference(J, wanted["jacobian"])}
     wanted = {
         "mass_matrix": robot.mass_matrix(somewhere),
@@ -229,9 +229,9 @@ def _inverse_error(library: CompiledLibrary, chart: Chart, target: Array, start:
     """Largest remaining error in phi. Infinite without a solution; status and output must then be as documented."""
     solution, status = library.inverse(target, start)
     if status in (ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN):
-        if (status == ControlStatus.OK) != contains(chart.problem.domain, solution.astype(float)):
+        if (status == ControlStatus.OK) != chart.problem.domain.contains(solution.astype(float)):
             raise ProofError(f"the status of inverse is {status} at q = {solution.tolist()}")
-        return float(np.abs(shortest(chart.phi(solution.astype(float)) - target, chart.turns)).max())
+        return float(np.abs(wrap_shortest(chart.phi(solution.astype(float)) - target, chart.turns)).max())
     if status == ControlStatus.STOPPED_EARLY:
         after, before = (_remaining(library, chart, target, q) for q in (solution, start))
         if not after <= before * (1 + 1e-5):

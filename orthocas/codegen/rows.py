@@ -14,7 +14,7 @@ from orthocas.codegen.kernels import POWER
 from orthocas.codegen.precision import DOUBLE, Precision
 from orthocas.errors import InvalidValueError
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import ARITHMETIC, scalar_code, to_tape
+from orthocas.tools.expressions import ARITHMETIC, expand_scalars, write_tape
 
 _LANES = 8  # rows side by side: a line of the cache for each number
 _LOCALS = 4096  # bytes of stack for other variables
@@ -93,7 +93,7 @@ def _parts(chart: Chart) -> tuple[ca.Function, list[int], ca.Function, Array, Ar
         C = coordinates.scale[:, None] * coordinates.theta.reshape(r, -1)
         basis = ca.Function("basis", [q], [ca.densify(family.basis(q[coordinates.active]))])
         return ca.Function("direct", [q], [direct]), places, basis, C, coordinates.scale * coordinates.offset
-    phi = scalar_code(chart.function("phi"))
+    phi = expand_scalars(chart.function("phi"))
     empty = ca.Function("basis", [q], [ca.SX(0, 1)])
     return ca.Function("direct", [q], [phi(q)]), list(range(chart.n)), empty, np.zeros((0, 0)), np.zeros(0)
 
@@ -106,7 +106,7 @@ def _family(coordinates: Coordinates) -> Any:
 def _written(function: ca.Function) -> tuple[list[str], int]:
     """The operations of a function as C, and how many variables they need."""
     lines, slots = [], 0
-    for name, into, *of in to_tape(function)["steps"]:
+    for name, into, *of in write_tape(function)["steps"]:
         if name == "output":
             lines.append(f"    out[{into} * LANES + l] = w{of[0]};")
             continue

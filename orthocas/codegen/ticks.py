@@ -11,9 +11,8 @@ from orthocas.codegen.generate import generate_c
 from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
 from orthocas.control.controller import Controller
 from orthocas.control.operational_space import PDPlus
-from orthocas.tasks.domains import contains
 from orthocas.tools.checks import Array
-from orthocas.tools.files import draft_folder
+from orthocas.tools.files import open_draft_folder
 from orthocas.tools.interrupts import deferred
 from orthocas.tools.processes import run_program
 
@@ -37,7 +36,7 @@ def control_tick(chart: Chart) -> float:
     Raises:
         CompileError: if there is no C compiler.
     """
-    with draft_folder() as folder:
+    with open_draft_folder() as folder:
         with deferred():  # CasADi may lose Ctrl-C while it builds functions
             law = PDPlus(chart, 50.0, coupling="decoupled")
             generated = generate_c(chart, folder, law, "tick")
@@ -54,7 +53,7 @@ def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int =
         CompileError: if there is no C compiler, or the timing program cannot be built or run.
     """
     first = cases[0][1]
-    with draft_folder() as folder:
+    with open_draft_folder() as folder:
         data, program = folder / "states", folder / "ticks"
         numbers = np.concatenate([part.ravel() for law, _ in cases for part in (_states(law), gain_numbers(law))])
         first.numbers(numbers).tofile(data)
@@ -74,6 +73,6 @@ def _states(law: Controller) -> Array:
     """States inside the domain with references nearby, (64, 2 n + 3 k)."""
     rng, domain, n, k = np.random.default_rng(0), law.problem.domain, law.problem.n, len(law.labels)
     q = domain.centre + 0.4 * domain.half_width * rng.uniform(-1, 1, (_STATES, n))
-    q[~contains(domain, q)] = domain.centre
+    q[~domain.contains(q)] = domain.centre
     reference = np.array([law.measured(point).full().ravel() for point in q]) + 0.01 * rng.normal(size=(_STATES, k))
     return np.hstack([q, rng.normal(size=(_STATES, n)), reference, rng.normal(size=(_STATES, 2 * k))])

@@ -10,7 +10,7 @@ import numpy as np
 from orthocas.control.gains import Setting
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError
-from orthocas.tasks.domains import Domain, reach
+from orthocas.tasks.domains import Domain
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array
 from orthocas.tools.display import listed, number_list
@@ -112,7 +112,7 @@ def _is_inside(domain: Domain | None, q: ca.SX) -> ca.SX:
 
 def _is_between_boundaries(domain: Domain | None, q: ca.SX) -> ca.SX:
     """Whether q (n, 1) lies in the box; always true for joints without boundaries, such as the angles of a torus."""
-    widths = np.full(q.shape[0], np.inf) if domain is None else reach(domain)
+    widths = np.full(q.shape[0], np.inf) if domain is None else domain.reach
     bounded = np.flatnonzero(np.isfinite(widths)).tolist()
     if domain is None or not bounded:
         return ca.SX(1)

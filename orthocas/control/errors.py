@@ -3,7 +3,7 @@
 import casadi as ca
 
 from orthocas.charts.chart import Chart
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 
 
 def errors(chart: Chart, q: ca.MX, reference: ca.MX) -> tuple[ca.MX, ca.MX]:
@@ -15,14 +15,14 @@ def errors(chart: Chart, q: ca.MX, reference: ca.MX) -> tuple[ca.MX, ca.MX]:
     """
     m, own = chart.m, chart.coordinates.functions
     e, slope = chart.relative.error(q, reference[:m])
-    rest = shortest(own["xi"](q) - reference[m:], chart.turns[m:])
+    rest = wrap_shortest(own["xi"](q) - reference[m:], chart.turns[m:])
     return ca.vertcat(e, rest), ca.vertcat(slope, own["jacobian"](q))
 
 
 def drift(chart: Chart, q: ca.MX, reference: ca.MX, velocity: ca.MX) -> ca.MX:
     """The rate de/dq dq at which q stays with a reference that moves, (n, 1): d_phi_d for most tasks."""
     m = chart.m
-    return ca.vertcat(chart.relative.drift(q, reference[:m], velocity[:m]), velocity[m:])
+    return ca.vertcat(chart.relative.compute_drift(q, reference[:m], velocity[:m]), velocity[m:])
 
 
 def bend(chart: Chart, q: ca.MX, dq: ca.MX, w: ca.MX, wanted: tuple[ca.MX, ca.MX, ca.MX]) -> ca.MX:
@@ -30,4 +30,4 @@ def bend(chart: Chart, q: ca.MX, dq: ca.MX, w: ca.MX, wanted: tuple[ca.MX, ca.MX
     m = chart.m
     x, dx, ddx = (part[:m] for part in wanted)
     rest = chart.coordinates.functions["second_derivative"](q, dq, w) - wanted[2][m:]
-    return ca.vertcat(chart.relative.bend(q, dq, w, (x, dx, ddx)), rest)
+    return ca.vertcat(chart.relative.compute_bias(q, dq, w, (x, dx, ddx)), rest)

@@ -10,14 +10,14 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.point_quality import least_in_domain
 from orthocas.errors import InvalidValueError
 from orthocas.robots.robot import Robot
-from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.metric import require_mass
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import (
     Array,
     as_float_array,
     as_number,
     as_point_set,
-    frozen_array,
+    freeze_array,
     require_kind,
     require_shape,
 )
@@ -82,7 +82,7 @@ def command_limit(name: str, value: ArrayLike | None, default: Array) -> Array:
 
 
 def _spread(name: str, value: ArrayLike, length: int) -> Array:
-    return frozen_array(name, np.broadcast_to(_one_or(name, value, length), (length,)), (length,))
+    return freeze_array(name, np.broadcast_to(_one_or(name, value, length), (length,)), (length,))
 
 
 def _one_or(name: str, value: ArrayLike, length: int) -> Array:

@@ -3,7 +3,8 @@
 import numpy as np
 
 from orthocas.robots.robot import Robot
-from orthocas.tasks.domains import Domain, sample_uniform
+from orthocas.tasks.domains import Domain
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 from orthocas.tools.display import percent
 

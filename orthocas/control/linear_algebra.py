@@ -7,9 +7,9 @@ import casadi as ca
 import numpy as np
 
 from orthocas.bases.family import Expression
-from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.expressions import WRITTEN_OUT
 

@@ -372,21 +372,21 @@ def _momentum(tree: KinematicTree, with_payload: bool, with_gravity: bool) -> ca
     """
     q, dq, rest = ca.SX.sym("q", tree.n), ca.SX.sym("dq", tree.n), ca.SX(tree.n, 1)
     payload = [ca.SX.sym("payload", dynamics.PAYLOAD)] if with_payload else []
-    p = dynamics.inverse_dynamics(tree, q, rest, dq, np.zeros(3), *payload)
+    p = dynamics.build_inverse_dynamics(tree, q, rest, dq, np.zeros(3), *payload)
     rate = ca.gradient(ca.dot(dq, p) / 2, q)
     if with_gravity:
-        rate -= dynamics.bias(tree, q, rest, tree.gravity, *payload)
+        rate -= dynamics.build_bias(tree, q, rest, tree.gravity, *payload)
     return ca.Function("momentum", [q, dq, *payload], [ca.densify(p), ca.densify(rate)])
 
 
 def _regressor(tree: KinematicTree) -> tuple[ca.Function, tuple[int, ...]]:
     """q, dq, w, a -> Y (n, k) of M a + C(q, dq) w + g in the first moments, and the joint whose link has each."""
     q, dq, w, a = (ca.SX.sym(name, tree.n) for name in ("q", "dq", "w", "a"))
-    numbers = ca.SX.sym("numbers", len(dynamics.inertial_numbers(tree)))
+    numbers = ca.SX.sym("numbers", len(dynamics.collect_inertials(tree)))
     rest, weightless = ca.SX(tree.n, 1), np.zeros(3)
-    force = dynamics.inverse_dynamics(tree, q, rest, a, tree.gravity, inertials=numbers)
-    for sign in (1, -1):  # C(q, dq) w by polarisation, as in `dynamics.coriolis_product`
-        force += sign / 4 * dynamics.bias(tree, q, dq + sign * w, weightless, inertials=numbers)
-    places, joints = dynamics.first_moments(tree)
+    force = dynamics.build_inverse_dynamics(tree, q, rest, a, tree.gravity, inertials=numbers)
+    for sign in (1, -1):  # C(q, dq) w by polarisation, as in `dynamics.build_coriolis_product`
+        force += sign / 4 * dynamics.build_bias(tree, q, dq + sign * w, weightless, inertials=numbers)
+    places, joints = dynamics.find_first_moments(tree)
     Y = ca.jacobian(force, numbers)[:, places]  # linear, but for the rotors' inertias, which do not depend on them
     return ca.Function("regressor", [q, dq, w, a], [ca.densify(Y)]), joints

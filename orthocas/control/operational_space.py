@@ -44,8 +44,8 @@ from orthocas.control.reference import Reference
 from orthocas.control.run_time_model import Gravity, RunTimeModel, Source
 from orthocas.errors import InvalidValueError, LawWarning
 from orthocas.robots.tree import require_driven
-from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_point_set, require_kind, require_known

@@ -8,7 +8,6 @@ from orthocas.charts.self_motion import too_far
 from orthocas.charts.solutions import Tracker, TrackerStatus
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError, InverseError, OrthocasError, UnreachableReferenceError, degrees_hint
-from orthocas.tasks.domains import bounds_of, contains
 from orthocas.tools.checks import Array, as_point, require_kind
 
 _VALUES = "; targets of a Reference are values of phi, not changes of it ('move' in a steps file is a change)"
@@ -26,7 +25,7 @@ def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
     q_start = as_point("q_start", q_start, chart.n)
     if reference.labels != chart.labels:
         raise InvalidValueError("labels of the reference", reference.labels, f"those of the chart {chart.labels}")
-    if not contains(chart.problem.domain, q_start):
+    if not chart.problem.domain.contains(q_start):
         hint = degrees_hint(*q_start[~np.array(chart.problem.robot.tree.prismatic)])
         raise UnreachableReferenceError(f"the start lies outside the domain: {_outside(chart, q_start)}{hint}")
     times = reference.grid()
@@ -43,7 +42,7 @@ def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
                 f"the reference cannot be reached {where}: {error}{too_far(chart, q, targets[k, chart.m :])}{_VALUES}"
             )
             raise UnreachableReferenceError(text) from None
-        if not contains(chart.problem.domain, new):
+        if not chart.problem.domain.contains(new):
             reason = f"{_outside(chart, new)}{too_far(chart, q, targets[k, chart.m :])}"
             raise UnreachableReferenceError(f"the reference leaves the domain {where}: {reason}{_VALUES}")
         path[k] = q = new
@@ -81,8 +80,8 @@ class _Follower:
 def _outside(chart: Chart, q: Array) -> str:
     domain = chart.problem.domain
     if domain.condition is not None and not np.all(np.asarray(domain.condition.pivots(q)) > 0):
-        return domain.explained(q)
-    low, high = bounds_of(domain)
+        return domain.explain(q)
+    low, high = domain.bounds
     i = int(np.argmax(np.abs(q - domain.centre) / (high - low)))
     low, high = low[i], high[i]
     return f"joint '{chart.problem.robot.joint_names[i]}' at {q[i]:.4g}, expected within [{low:.4g}, {high:.4g}]"

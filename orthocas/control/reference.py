@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from orthocas.errors import InvalidValueError
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, frozen_array, require_kind, require_known, require_shape
+from orthocas.tools.checks import Array, as_float_array, freeze_array, require_kind, require_known, require_shape
 from orthocas.tools.display import Shown, listed, number_list
 
 NATURAL_FREQUENCY = 2 * np.pi  #: omega0 [rad/s] of [AS2023] Sec. 8
@@ -107,7 +107,7 @@ class Reference(Shown):
             [[1.0, 0.0], [1.2, 0.0]]
         """
         names = _names(labels)
-        value = frozen_array("start", start, (len(labels),))
+        value = freeze_array("start", start, (len(labels),))
         omega0 = _require_number("natural_frequency", natural_frequency, above=0.0)
         _require_number("duration", duration, above=0.0)
         zeta = _require_number("damping_ratio", damping_ratio, above=-np.finfo(float).tiny)
@@ -133,8 +133,8 @@ class Reference(Shown):
             InvalidValueError, ShapeError: for arguments of the wrong value or shape.
         """
         names = _names(labels)
-        t = frozen_array("times", times, (None,))
-        values = frozen_array("points", points, (len(t), len(names)))
+        t = freeze_array("times", times, (None,))
+        values = freeze_array("points", points, (len(t), len(names)))
         if len(t) < 2 or t[0] != 0 or np.diff(t).min() <= 0:
             raise InvalidValueError("times", t.tolist(), "at least two increasing times that begin with 0")
         rest = [(order, np.zeros(len(names))) for order in (1, 2)]
@@ -169,7 +169,7 @@ class Reference(Shown):
         Raises:
             InvalidValueError: for a time before the start or after the end.
         """
-        t = frozen_array("times", times, (None,))
+        t = freeze_array("times", times, (None,))
         if len(t) and not (t.min() >= 0 and t.max() <= self.duration * (1 + 1e-9)):
             bad = t.min() if t.min() < 0 else t.max()
             raise InvalidValueError("time of a reference", bad, f"from 0 to {self.duration:g} s")

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError
-from orthocas.robots.dynamics import payload_numbers
+from orthocas.robots.dynamics import check_payload
 from orthocas.robots.robot import Robot
 from orthocas.tasks.problem import Problem
-from orthocas.tools.checks import Array, as_float_array, frozen_array, require_finite, require_known, require_shape
+from orthocas.tools.checks import Array, as_float_array, freeze_array, require_finite, require_known, require_shape
 
 Source = Literal["own", "given"]
 Gravity = Literal["law", "robot"]
@@ -66,9 +66,9 @@ class RunTimeModel:
         if self.payload is not None:
             if self.source == "given":
                 raise InvalidValueError("payload", self.payload, "none, because the given model includes the load")
-            object.__setattr__(self, "payload", payload_numbers("payload", self.payload))
+            object.__setattr__(self, "payload", check_payload("payload", self.payload))
         if self.wrench is not None:
-            object.__setattr__(self, "wrench", frozen_array("wrench", self.wrench, (6,)))
+            object.__setattr__(self, "wrench", freeze_array("wrench", self.wrench, (6,)))
 
     @classmethod
     def with_inputs(cls, source: Source, gravity: Gravity, inputs: Iterable[str]) -> "RunTimeModel":
@@ -104,11 +104,11 @@ class RunTimeModel:
             found["extra_torque"] = _per_joint(self.extra_torque, problem.n)
         if self.source == "given":
             robot, q = problem.robot, problem.domain.centre
-            found["mass_matrix"] = frozen_array("mass_matrix", robot.mass_matrix(q).ravel(), (problem.n**2,))
+            found["mass_matrix"] = freeze_array("mass_matrix", robot.mass_matrix(q).ravel(), (problem.n**2,))
             if coriolis:
                 found["coriolis_torque"] = np.zeros(problem.n)
             if self.gravity == "law":
-                found["gravity_torque"] = frozen_array("gravity_torque", robot.gravity(q), (problem.n,))
+                found["gravity_torque"] = freeze_array("gravity_torque", robot.gravity(q), (problem.n,))
         return found
 
     def remarks(self) -> list[str]:
@@ -169,4 +169,4 @@ def _per_joint(value: ArrayLike, n: int) -> Array:
     require_finite("extra_torque", given)
     if given.ndim:
         require_shape("extra_torque", given.shape, (n,))
-    return frozen_array("extra_torque", np.broadcast_to(given, (n,)), (n,))
+    return freeze_array("extra_torque", np.broadcast_to(given, (n,)), (n,))

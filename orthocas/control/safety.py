@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from orthocas.control.controller import Command, Controller, require_controller
 from orthocas.errors import InvalidValueError
-from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.relative import Relative
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, as_float_array, as_number, require_count, require_shape

@@ -11,7 +11,7 @@ from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.robots.tree import require_driven
 from orthocas.tools.checks import Array, as_float_array, require_at_least, require_kind
 from orthocas.tools.display import Shown, listed, number_list
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 
 
 class XiTask(Shown):
@@ -91,7 +91,7 @@ class XiTask(Shown):
         if self.target_xi is None:
             raise InvalidValueError("target of the task", "none", "one from `set_target`")
         error = self.chart.xi(self._position(configuration)) - self.target_xi
-        return np.asarray(shortest(error, self.chart.turns[self.chart.m :]))
+        return np.asarray(wrap_shortest(error, self.chart.turns[self.chart.m :]))
 
     def compute_jacobian(self, configuration: Any) -> Array:
         """de/dq, (r, nv), with zeros for joints that the chart does not have."""

@@ -10,23 +10,33 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from orthocas.errors import NoExpressionError
-from orthocas.exact.leaves import LeafChart, LeafValues, without_turns
-from orthocas.tasks.metric import metric_matrices
-from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.exact.leaves import LeafChart, LeafValues, remove_turns
+from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import Samples
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_point_set
-from orthocas.tools.columns import ColumnFunction, blocked, by_sample
+from orthocas.tools.columns import ColumnFunction, arrange_blocks, split_by_sample
 
-_STAGES = 12
-_FEW = 64  # up to this many trajectories, a block of columns does not pay off
-_FIRST = 0.25  # first step
-_SMALLEST = 1e-9  # smaller steps mean that the field is singular, so the trajectory stops
-_SHRINK, _GROW, _SAFETY = 0.2, 10.0, 0.9
+
+@dataclass(frozen=True, slots=True)
+class FlowRules:
+    """Numbers of the integration of many trajectories."""
+
+    stages: int = 12  #: of the method of Dormand and Prince
+    few: int = 64  #: trajectories up to which a block of columns does not pay off
+    first: float = 0.25  #: first step
+    smallest: float = 1e-9  #: step; where smaller ones are needed, the field is singular and the trajectory stops
+    shrink: float = 0.2  #: smallest factor from one step to the next
+    grow: float = 10.0  #: largest factor
+    safety: float = 0.9  #: factor on the step that the error estimate allows
+    looser: float = 100.0  #: factor on the tolerance of tangent vectors, which need fewer digits than points
+    inverse: float = 1e-12  #: tolerance of the flow back from the leaf
+
+
+RULES = FlowRules()
+
 TOLERANCE = 1e-10  #: default local error of a step [rad] or [m]; end points are then accurate to about 1e-8
-_LOOSER = 100.0  # factor on the tolerance of tangent vectors, which need fewer digits than points
-_INVERSE_TOLERANCE = 1e-12  # tolerance of the flow back from the leaf
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +53,7 @@ class BatchedFlow:
     field: ca.Function
     scale: Array
 
-    def end_points(self, starts: Array, parameters: Array, tolerance: float) -> tuple[Array, NDArray[np.bool_]]:
+    def find_end_points(self, starts: Array, parameters: Array, tolerance: float) -> tuple[Array, NDArray[np.bool_]]:
         """States at s = 1, (N, k), and which trajectories reached s = 1, (N,).
 
         The other trajectories stopped where the step size fell below 1e-9 or the field was not finite. Their rows hold
@@ -54,26 +64,28 @@ class BatchedFlow:
             parameters: (N, l).
             tolerance: tolerance of the local error of a step.
         """
-        y, s, step = starts.copy(), np.zeros(len(starts)), np.full(len(starts), _FIRST)
+        y, s, step = starts.copy(), np.zeros(len(starts)), np.full(len(starts), RULES.first)
         running = np.arange(len(starts))
         while running.size:
+            # Try a step of each running trajectory, keep good ones, and adapt all step sizes.
             tried = np.minimum(step[running], 1 - s[running])
-            moved, error = self._moved(y[running], tried[:, None], parameters[running])
+            moved, error = self._take_steps(y[running], tried[:, None], parameters[running])
             ratio = np.nan_to_num(error[:, 0] / tolerance, nan=np.inf)
             good = ratio <= 1
             y[running[good]] = moved[good]
             s[running[good]] += tried[good]
-            step[running] = tried * np.clip(_SAFETY * np.maximum(ratio, 1e-16) ** (-1 / 8), _SHRINK, _GROW)
-            running = running[(s[running] < 1) & (step[running] > _SMALLEST)]
+            growth = RULES.safety * np.maximum(ratio, 1e-16) ** (-1 / 8)
+            step[running] = tried * np.clip(growth, RULES.shrink, RULES.grow)
+            running = running[(s[running] < 1) & (step[running] > RULES.smallest)]
         return y, s >= 1
 
-    def _moved(self, *arguments: Array) -> list[Array]:
+    def _take_steps(self, *arguments: Array) -> list[Array]:
         """One step of some trajectories: y (N, k), step sizes (N, 1), p (N, l) -> y (N, k), errors (N, 1)."""
         N = len(arguments[0])
-        if N <= _FEW:
+        if RULES.few >= N:
             return self._few(*arguments)
-        outputs = self._many(*map(blocked, arguments))
-        return [by_sample(out[:, None], N)[:, :, 0] for out in outputs]
+        outputs = self._many(*map(arrange_blocks, arguments))
+        return [split_by_sample(out[:, None], N)[:, :, 0] for out in outputs]
 
     @cached_property
     def _few(self) -> Batched:
@@ -89,17 +101,17 @@ class BatchedFlow:
         k = self.field.size1_in(0)
         y, step, p = ca.SX.sym("y", k), ca.SX.sym("step"), ca.SX.sym("p", self.field.size1_in(1))
         method, slopes = scipy.integrate.DOP853, list[Any]()
-        for i in range(_STAGES):
-            slopes.append(self.field(y + step * _combined(method.A[i, :i], slopes), p) if i else self.field(y, p))
-        moved = y + step * _combined(method.B, slopes)
+        for i in range(RULES.stages):
+            slopes.append(self.field(y + step * _sum_weighted(method.A[i, :i], slopes), p) if i else self.field(y, p))
+        moved = y + step * _sum_weighted(method.B, slopes)
         scale = ca.DM(self.scale)
-        fifth = ca.sumsqr(_combined(method.E5[:_STAGES], slopes) / scale)
-        third = ca.sumsqr(_combined(method.E3[:_STAGES], slopes) / scale)
+        fifth = ca.sumsqr(_sum_weighted(method.E5[: RULES.stages], slopes) / scale)
+        third = ca.sumsqr(_sum_weighted(method.E3[: RULES.stages], slopes) / scale)
         error = step * fifth / ca.sqrt(fifth + 0.01 * third + 1e-300)
         return dense_function("step", [y, step, p], [moved, error])
 
 
-def _combined(weights: Array, slopes: list[Any]) -> Any:
+def _sum_weighted(weights: Array, slopes: list[Any]) -> Any:
     """Weighted sum, without the terms whose weight is zero."""
     return sum(float(w) * slope for w, slope in zip(weights, slopes, strict=True) if w != 0)
 
@@ -145,7 +157,7 @@ class TaskFlow:
             dx: desired changes of the task values.
             tolerance: local error of a step [rad] or [m].
         """
-        ends, arrived = self._positions.end_points(points, dx, tolerance)
+        ends, arrived = self._positions.find_end_points(points, dx, tolerance)
         return Moved(ends, np.where(arrived, Arrival.REACHED, Arrival.SINGULAR))
 
     def pull(self, points: Array, level: Array, tolerance: float = TOLERANCE) -> Moved:
@@ -162,15 +174,17 @@ class TaskFlow:
         ker J_x(q).
         """
         n, r = self.problem.n, self.problem.r
-        A = metric_matrices(self.problem.metric, points)
+        A = self.problem.metric.evaluate(points)
         inverse = np.asarray(np.linalg.inv(A), dtype=float)
-        samples = Samples(points, task_jacobians(self.problem, points), inverse)
+        # Tangent vectors start as an A-orthonormal basis of ker J_x.
+        samples = Samples(points, self.problem.task.evaluate_jacobian(points), inverse)
         Z = samples.null_basis
         lengths = np.linalg.norm(Z, axis=1)
         directions = (Z / lengths[:, None, :]).transpose(0, 2, 1).reshape(-1, r * n)
         starts = np.concatenate([points, directions, np.log(lengths)], axis=1)
         dx = level - self.problem.task.batched(points)[0]
-        ends, arrived = self._with_tangents.end_points(starts, dx, tolerance)
+        ends, arrived = self._with_tangents.find_end_points(starts, dx, tolerance)
+        # Directions and logarithms of lengths make the vectors again.
         tangents = ends[:, n : n + r * n].reshape(-1, r, n) * np.exp(ends[:, n + r * n :])[:, :, None]
         moved = Moved(ends[:, :n], np.where(arrived, Arrival.REACHED, Arrival.SINGULAR))
         return moved, tangents.transpose(0, 2, 1) @ Z.transpose(0, 2, 1) @ A
@@ -179,14 +193,14 @@ class TaskFlow:
     def field(self) -> ca.Function:
         """q (n, 1), dx (m, 1) -> J_x^#A dx (n, 1)."""
         q, dx = ca.SX.sym("q", self.problem.n), ca.SX.sym("dx", self.problem.m)
-        gradients = self.gradients(q)
+        gradients = self.build_gradients(q)
         J = self.problem.task.jacobian_function(q)
-        return dense_function("field", [q, dx], [gradients @ _spd_solve(J @ gradients, dx)])
+        return dense_function("field", [q, dx], [gradients @ _solve_spd(J @ gradients, dx)])
 
-    def gradients(self, q: ca.SX) -> ca.SX:
+    def build_gradients(self, q: ca.SX) -> ca.SX:
         """Gradients of the task in the metric, A^-1 J_x^T (n, m), for a symbol q ([AS2023] eq. (16))."""
         J = self.problem.task.jacobian_function(q)
-        return J.T if self.problem.metric.is_identity else _spd_solve(self.problem.metric.function(q), J.T)
+        return J.T if self.problem.metric.is_identity else _solve_spd(self.problem.metric.function(q), J.T)
 
     @cached_property
     def _positions(self) -> BatchedFlow:
@@ -203,10 +217,10 @@ class TaskFlow:
         stretching = ca.sum1(directions * turning) / ca.sum1(directions**2)
         rates = turning - directions * ca.repmat(stretching, n, 1)
         field = dense_function("field_with_tangents", [y, dx], [ca.vertcat(dq, ca.vec(rates), stretching.T)])
-        return BatchedFlow(field, np.r_[np.ones(n), np.full(r * (n + 1), _LOOSER)])
+        return BatchedFlow(field, np.r_[np.ones(n), np.full(r * (n + 1), RULES.looser)])
 
 
-def _spd_solve(A: ca.SX, B: ca.SX) -> ca.SX:
+def _solve_spd(A: ca.SX, B: ca.SX) -> ca.SX:
     """A^-1 B for symmetric positive definite A, with half the operations of `ca.solve`."""
     return ca.ldl_solve(B, *ca.ldl(A))
 
@@ -252,19 +266,19 @@ class GrownCoordinates:
         """
         points = as_point_set("points", points, self.problem.n)[0]
         moved = self.flow.pull(points, self.leaf.level, tolerance)
-        return Moved(moved.points, self._status(moved, self._on_leaf(moved)))
+        return Moved(moved.points, self._find_status(moved, self._evaluate_leaf(moved)))
 
     def xi(self, points: Array) -> Array:
         """Coordinates (N, r) at points (N, n)."""
         moved = self.flow.pull(points, self.leaf.level)
-        values = self._on_leaf(moved)
-        return self._where_known(moved, values, values.xi)
+        values = self._evaluate_leaf(moved)
+        return self._mask_unknown(moved, values, values.xi)
 
     def jacobian(self, points: Array) -> Array:
         """J_xi (N, r, n) at points (N, n)."""
         moved, derivative = self.flow.pull_with_derivative(points, self.leaf.level)
-        values = self._on_leaf(moved)
-        return self._where_known(moved, values, values.gradients @ derivative)
+        values = self._evaluate_leaf(moved)
+        return self._mask_unknown(moved, values, values.gradients @ derivative)
 
     def inverse(self, phi: Array, q_start: Array) -> Array:
         """Joint positions with given task values and coordinates, (N, n), by the flow back from the leaf.
@@ -275,19 +289,19 @@ class GrownCoordinates:
         m, n = self.problem.m, self.problem.n
         start = self.flow.pull(q_start, self.leaf.level)
         on_leaf = self.leaf.points(phi[:, m:], np.where(start.reached[:, None], start.points, np.nan))
-        found = np.isfinite(on_leaf).all(axis=1)
+        known = np.isfinite(on_leaf).all(axis=1)
         solutions = np.full((len(phi), n), np.nan)
-        moved = self.flow.move(on_leaf[found], phi[found, :m] - self.leaf.level, _INVERSE_TOLERANCE)
-        solutions[found] = np.where(moved.reached[:, None], self._onto_task(moved.points, phi[found, :m]), np.nan)
-        return q_start + without_turns(self.problem, solutions - q_start) if self.leaf.periodic else solutions
+        moved = self.flow.move(on_leaf[known], phi[known, :m] - self.leaf.level, RULES.inverse)
+        solutions[known] = np.where(moved.reached[:, None], self._correct_task(moved.points, phi[known, :m]), np.nan)
+        return q_start + remove_turns(self.problem, solutions - q_start) if self.leaf.periodic else solutions
 
-    def _onto_task(self, points: Array, x: Array) -> Array:
+    def _correct_task(self, points: Array, x: Array) -> Array:
         """Points (N, n) after a Newton step along the task gradients to the task values x (N, m).
 
         The step removes the integration error, which matters if task values are large numbers.
         """
         dx = x - self.problem.task.batched(points)[0]
-        return self.flow.move(points, dx, _INVERSE_TOLERANCE).points
+        return self.flow.move(points, dx, RULES.inverse).points
 
     @property
     def functions(self) -> dict[str, ca.Function]:
@@ -306,14 +320,14 @@ class GrownCoordinates:
         """The flow along the task gradients."""
         return TaskFlow(self.problem)
 
-    def _on_leaf(self, moved: Moved) -> LeafValues:
+    def _evaluate_leaf(self, moved: Moved) -> LeafValues:
         """The leaf's chart at end points; an arbitrary point replaces those of trajectories that did not arrive."""
         return self.leaf.values(np.where(moved.reached[:, None], moved.points, self.problem.domain.centre))
 
     @staticmethod
-    def _status(moved: Moved, values: LeafValues) -> NDArray[np.int_]:
+    def _find_status(moved: Moved, values: LeafValues) -> NDArray[np.int_]:
         return np.where(moved.reached & ~values.inside, Arrival.OUTSIDE, moved.status)
 
-    def _where_known(self, moved: Moved, values: LeafValues, results: Array) -> Array:
-        known = self._status(moved, values) == Arrival.REACHED
+    def _mask_unknown(self, moved: Moved, values: LeafValues, results: Array) -> Array:
+        known = self._find_status(moved, values) == Arrival.REACHED
         return np.where(known.reshape(-1, *[1] * (results.ndim - 1)), results, np.nan)

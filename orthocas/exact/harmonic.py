@@ -8,25 +8,41 @@ import skimage
 from numpy.typing import ArrayLike, NDArray
 
 from orthocas.errors import FoldedMapError, InvalidValueError
-from orthocas.exact import libigl as igl
-from orthocas.exact.mesh import TriangleMesh, cotangents, flip_to_delaunay, require_disk, steps_to_neighbours
-from orthocas.tools.checks import Array, Indices, frozen_array, require_count, require_finite, require_shape
+from orthocas.exact.mesh import (
+    TriangleMesh,
+    compute_cotangents,
+    compute_smoothing_steps,
+    flip_to_delaunay,
+    igl,
+    require_disk,
+)
+from orthocas.tools.checks import Array, Indices, freeze_array, require_count, require_finite, require_shape
 
-_ON_LEVEL = 2e-13  # |h - level| of a vertex, relative to the larger of 1 and the largest |h|
-_ROUNDS = 4  # rounds of flips and smoothing
-_NEWTON_STEPS = 20
-_BISECTIONS = 60
-_CLEARANCE = 0.1  # smallest distance of marching cubes vertices from grid points, as a share of a cell's edge
-_TINY = 1e-300
-_CHUNK = 500_000  # grid points per call of h
 
-__all__ = ["TriangleMesh", "level_surface", "require_disk"]
+@dataclass(frozen=True, slots=True)
+class SurfaceRules:
+    """Numbers of marching cubes and of the vertices on a surface."""
+
+    on_level: float = 2e-13  #: |h - level| of a vertex, relative to the larger of 1 and the largest |h|
+    rounds: int = 4  #: of flips and smoothing
+    newton_steps: int = 20  #: of a vertex to the surface
+    bisections: int = 60  #: of a grid edge, where Newton steps fail
+    #: smallest distance of marching cubes vertices from grid points, as a fraction of a cell's edge
+    clearance: float = 0.1
+    tiny: float = 1e-300  #: to divide by
+    chunk: int = 500_000  #: grid points per call of h
+
+
+RULES = SurfaceRules()
+
+
+__all__ = ["TriangleMesh", "build_level_surface", "require_disk"]
 
 Mask = NDArray[np.bool_]
-Function = Callable[[Array], Array]  # (N, 3) -> (N,), or (N, 3) for a gradient
+Function = Callable[[Array], Array]  #: (N, 3) -> (N,), or (N, 3) for a gradient
 
 
-def level_surface(
+def build_level_surface(
     h: Function, gradient: Function, level: float, low: ArrayLike, high: ArrayLike, cells: int
 ) -> TriangleMesh:
     """The surface {q : low <= q <= high, h(q) = level}.
@@ -54,18 +70,20 @@ def level_surface(
         Marching cubes: [AS2023] Sec. 5.2. Exact vertices and the improvement of the triangles are ours:
         docs/explanation/derivations_exact.md#disk-chart.
     """
-    frozen_array("level", level, ())
-    corners = np.stack([frozen_array("low", low, (3,)), frozen_array("high", high, (3,))])
+    freeze_array("level", level, ())
+    corners = np.stack([freeze_array("low", low, (3,)), freeze_array("high", high, (3,))])
     if not np.all(corners[0] < corners[1]):
         raise InvalidValueError("low", corners[0].tolist(), f"less than high = {corners[1].tolist()}")
-    axes = _grid_axes(corners, require_count("cells", cells, least=2))
-    gap, largest = _sampled_gap(h, level, axes)
-    points, faces, free, ends = _march(gap, axes)
-    sheet = _Sheet(h, gradient, level, corners, free, _ON_LEVEL * max(1.0, largest), float(axes[0][1] - axes[0][0]))
+    axes = _build_grid_axes(corners, require_count("cells", cells, least=2))
+    # Marching cubes, then Newton steps onto the surface, then flips and smoothing in turns.
+    gap, largest = _sample_gap(h, level, axes)
+    points, faces, free, ends = _march_cubes(gap, axes)
+    tolerance, cell = RULES.on_level * max(1.0, largest), float(axes[0][1] - axes[0][0])
+    sheet = _Sheet(h, gradient, level, corners, free, tolerance, cell)
     points = sheet.start(points, ends)
-    for _ in range(_ROUNDS):
+    for _ in range(RULES.rounds):
         faces = flip_to_delaunay(points, faces)
-        points = sheet.slide(points, steps_to_neighbours(points, faces))
+        points = sheet.slide(points, compute_smoothing_steps(points, faces))
     return TriangleMesh(points, flip_to_delaunay(points, faces))
 
 
@@ -76,37 +94,38 @@ class _Sheet:
     h: Function
     gradient: Function
     level: float
-    corners: Array  # (2, 3)
-    free: Mask  # (V, 3): whether a vertex may move along an axis; false across the faces of the box that it lies on
-    tolerance: float  # of h
-    cell: float  # edge length of a grid cell
+    corners: Array  #: (2, 3)
+    free: Mask  #: (V, 3): whether a vertex may move along an axis; false across the faces of the box that it lies on
+    tolerance: float  #: of h
+    cell: float  #: edge length of a grid cell
 
     def start(self, points: Array, ends: Array) -> Array:
         """Move marching cubes vertices onto the surface, by bisection between ends (2, V, 3) where Newton fails."""
-        moved, failed = self._newton(points)
+        moved, failed = self._take_newton_steps(points)
         if failed.any():
             moved[failed] = self._bisect(ends[:, failed])
         return moved
 
     def slide(self, points: Array, steps: Array) -> Array:
         """Move vertices by the part of their steps along surface and box; a vertex stays in place if Newton fails."""
-        normal = _values(self.gradient, points, "gradient", (3,)) * self.free
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), _TINY)
+        normal = _evaluate_checked(self.gradient, points, "gradient", (3,)) * self.free
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), RULES.tiny)
         along = steps * self.free
-        moved, failed = self._newton(points + along - normal * np.sum(normal * along, axis=1, keepdims=True))
+        moved, failed = self._take_newton_steps(points + along - normal * np.sum(normal * along, axis=1, keepdims=True))
         moved[failed] = points[failed]
         return moved
 
-    def _newton(self, start: Array) -> tuple[Array, Mask]:
+    def _take_newton_steps(self, start: Array) -> tuple[Array, Mask]:
         """Take Newton steps along the free part of the gradient; return vertices that fail or move more than a cell."""
         points, moving = start.copy(), np.arange(len(start))
-        for _ in range(_NEWTON_STEPS):
-            gap = self._gap(points[moving])
+        for _ in range(RULES.newton_steps):
+            gap = self._evaluate_gap(points[moving])
             moving, gap = moving[np.abs(gap) > self.tolerance], gap[np.abs(gap) > self.tolerance]
             if not len(moving):
                 break
-            slope = _values(self.gradient, points[moving], "gradient", (3,)) * self.free[moving]
-            step = slope * (gap / np.maximum(np.sum(slope**2, axis=1), _TINY))[:, None]
+            # A Newton step along the free part of the gradient, at most a cell long.
+            slope = _evaluate_checked(self.gradient, points[moving], "gradient", (3,)) * self.free[moving]
+            step = slope * (gap / np.maximum(np.sum(slope**2, axis=1), RULES.tiny))[:, None]
             length = np.linalg.norm(step, axis=1, keepdims=True)
             step *= self.cell / np.maximum(length, self.cell)
             points[moving] = np.clip(points[moving] - step, *self.corners)
@@ -117,39 +136,39 @@ class _Sheet:
     def _bisect(self, ends: Array) -> Array:
         """A point of the surface between each pair of ends (2, K, 3)."""
         a, b = ends
-        below = self._gap(a) < 0
-        for _ in range(_BISECTIONS):
+        below = self._evaluate_gap(a) < 0
+        for _ in range(RULES.bisections):
             middle = (a + b) / 2
-            same = ((self._gap(middle) < 0) == below)[:, None]
+            same = ((self._evaluate_gap(middle) < 0) == below)[:, None]
             a, b = np.where(same, middle, a), np.where(same, b, middle)
-        points: Array = np.where((np.abs(self._gap(a)) < np.abs(self._gap(b)))[:, None], a, b)
-        off = np.flatnonzero(np.abs(self._gap(points)) > self.tolerance)
+        points: Array = np.where((np.abs(self._evaluate_gap(a)) < np.abs(self._evaluate_gap(b)))[:, None], a, b)
+        off = np.flatnonzero(np.abs(self._evaluate_gap(points)) > self.tolerance)
         if len(off):
             place = np.round(points[off[0]], 4).tolist()
             raise InvalidValueError("level", self.level, f"a value that h does not jump across, as near {place}")
         return points
 
-    def _gap(self, points: Array) -> Array:
+    def _evaluate_gap(self, points: Array) -> Array:
         """Checked values of h - level."""
-        return _values(self.h, points, "h", ()) - self.level
+        return _evaluate_checked(self.h, points, "h", ()) - self.level
 
 
-def _grid_axes(corners: Array, cells: int) -> list[Array]:
+def _build_grid_axes(corners: Array, cells: int) -> list[Array]:
     """Grid coordinates along each axis: nearly cubic cells, `cells` of them along the longest edge."""
     width = corners[1] - corners[0]
     counts = np.maximum(1, np.ceil(cells * width / width.max() - 1e-9)).astype(int) + 1
     return [np.linspace(corners[0, i], corners[1, i], counts[i]) for i in range(3)]
 
 
-def _sampled_gap(h: Function, level: float, axes: list[Array]) -> tuple[NDArray[np.float32], float]:
+def _sample_gap(h: Function, level: float, axes: list[Array]) -> tuple[NDArray[np.float32], float]:
     """h - level on the grid in single precision with the signs preserved, and the largest |h|."""
     shape = tuple(len(axis) for axis in axes)
     gap = np.empty(shape, dtype=np.float32)
-    slab = max(1, _CHUNK // (shape[1] * shape[2]))
+    slab = max(1, RULES.chunk // (shape[1] * shape[2]))
     lowest, highest = np.inf, -np.inf
     for start in range(0, shape[0], slab):
         grid = np.stack(np.meshgrid(axes[0][start : start + slab], *axes[1:], indexing="ij"), axis=-1)
-        values = _values(h, grid.reshape(-1, 3), "h", ())
+        values = _evaluate_checked(h, grid.reshape(-1, 3), "h", ())
         lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
         gap[start : start + slab] = (values - level).reshape(grid.shape[:3])
     if not lowest < level < highest:
@@ -157,7 +176,7 @@ def _sampled_gap(h: Function, level: float, axes: list[Array]) -> tuple[NDArray[
     return gap, max(abs(lowest), abs(highest))
 
 
-def _march(gap: NDArray[np.float32], axes: list[Array]) -> tuple[Array, Indices, Mask, Array]:
+def _march_cubes(gap: NDArray[np.float32], axes: list[Array]) -> tuple[Array, Indices, Mask, Array]:
     """Marching cubes: vertices (V, 3), faces (F, 3), free axes (V, 3), and the ends of their grid edges (2, V, 3)."""
     _push_from_zero(gap)
     index, faces, _, _ = skimage.measure.marching_cubes(gap, 0.0, gradient_direction="descent")
@@ -178,11 +197,11 @@ def _push_from_zero(gap: NDArray[np.float32]) -> None:
         for side in (slice(None, -1), slice(1, None)):
             part = change[tuple(side if i == axis else slice(None) for i in range(3))]
             np.maximum(part, step, out=part)
-    change *= _CLEARANCE
+    change *= RULES.clearance
     np.copyto(gap, np.where(gap < 0, -change, change), where=np.abs(gap) < change)
 
 
-def _values(function: Function, points: Array, name: str, shape: tuple[int, ...]) -> Array:
+def _evaluate_checked(function: Function, points: Array, name: str, shape: tuple[int, ...]) -> Array:
     """Checked values of h or its gradient."""
     values = np.asarray(function(points), dtype=float)
     require_shape(f"{name}(q)", values.shape, (len(points), *shape))
@@ -190,7 +209,7 @@ def _values(function: Function, points: Array, name: str, shape: tuple[int, ...]
     return values
 
 
-def harmonic_disk(mesh: TriangleMesh) -> Array:
+def map_to_disk(mesh: TriangleMesh) -> Array:
     """One-to-one harmonic map of a mesh onto the unit disk.
 
     Boundary vertices lie on the unit circle, spaced by arc length; the one with the lowest index has angle 0. Every
@@ -213,7 +232,7 @@ def harmonic_disk(mesh: TriangleMesh) -> Array:
     """
     loop = require_disk(mesh)
     disk = solve_dirichlet(mesh, loop, igl.map_vertices_to_circle(mesh.vertices, loop))
-    areas = signed_areas(disk, mesh.faces)
+    areas = compute_signed_areas(disk, mesh.faces)
     folded = int(np.sum(~(areas > 0)))
     if folded:
         raise FoldedMapError(folded, len(areas))
@@ -241,16 +260,16 @@ def solve_dirichlet(mesh: TriangleMesh, fixed: Indices, values: Array) -> Array:
         [AS2023] eqs. (40), (41), (43), by libigl.
     """
     require_shape("values", values.shape, (len(fixed), None))
-    require_finite("cotangent", cotangents(mesh.vertices, mesh.faces))
+    require_finite("cotangent", compute_cotangents(mesh.vertices, mesh.faces))
     try:
         result: Array = igl.harmonic(mesh.vertices, mesh.faces, fixed, values, 1)
     except RuntimeError:
-        wanted = "at least one in each component of a mesh without nearly flat triangles"
-        raise InvalidValueError("fixed", f"{len(fixed)} vertices", wanted) from None
+        expected = "at least one in each component of a mesh without nearly flat triangles"
+        raise InvalidValueError("fixed", f"{len(fixed)} vertices", expected) from None
     return result
 
 
-def signed_areas(points: Array, faces: Indices) -> Array:
+def compute_signed_areas(points: Array, faces: Indices) -> Array:
     """Signed areas of triangles in the plane, (F,), positive if counterclockwise."""
     a, b = points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]]
     areas: Array = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2

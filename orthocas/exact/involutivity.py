@@ -8,16 +8,24 @@ import numpy as np
 
 from orthocas.errors import InvalidValueError, SingularTaskError
 from orthocas.robots.tree import require_driven
-from orthocas.tasks.domains import sample_uniform
 from orthocas.tasks.problem import Problem, check, is_regular
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array, require_count, require_kind, require_memory, require_shape
 from orthocas.tools.display import Shown, number_list
-from orthocas.tools.json import attributes
+from orthocas.tools.json import collect_attributes
 
-_ROUNDING = 1e-7  # a defect below this share of the terms that cancel in it counts as zero
-_STRAIGHT = 1e-12  # [rad]; task gradients that turn by less over the domain count as constant
-_LARGE = 20.0  # [deg]; larger expected leaks are beyond the first-order estimate
+
+@dataclass(frozen=True, slots=True)
+class InvolutivityRules:
+    """When a defect counts as zero, and when its estimate says nothing."""
+
+    rounding: float = 1e-7  #: defect, relative to the terms that cancel in it, that counts as zero
+    straight: float = 1e-12  #: [rad] turn of the task gradients over the domain that counts as none
+    large: float = 20.0  #: [deg] expected leak beyond the first-order estimate
+
+
+RULES = InvolutivityRules()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -42,7 +50,11 @@ class Involutivity(Shown):
         """The result in one sentence."""
         if self.exact:
             return "exact orthogonal coordinates exist locally: the task gradients span an involutive distribution"
-        leak = f"about {self.expected_leak_deg:.2g}" if self.expected_leak_deg < _LARGE else f"more than {_LARGE:g}"
+        leak = (
+            f"about {self.expected_leak_deg:.2g}"
+            if self.expected_leak_deg < RULES.large
+            else f"more than {RULES.large:g}"
+        )
         return (
             f"no exact orthogonal coordinates exist: the mean involutivity defect is {self.mean:.3g}, "
             f"expect coordinates with a leak of {leak} degrees on this domain (rms, in the metric)"
@@ -61,7 +73,7 @@ class Involutivity(Shown):
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON, without the function."""
-        return attributes(self, *(part.name for part in fields(self) if part.name != "function"), "verdict")
+        return collect_attributes(self, *(part.name for part in fields(self) if part.name != "function"), "verdict")
 
 
 def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involutivity:
@@ -101,19 +113,21 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
     require_kind("problem", problem, Problem)
     require_driven("involutivity", problem.robot.tree)
     require_memory(f"{samples} samples of the defect", 32.0 * samples * problem.n * problem.m**2)
-    points = _regular_points(problem, samples, seed)
-    brackets = TaskBrackets.of(problem)
-    across, size, basis = Batched(brackets.tensor_function())(points)
+    # Brackets across the span at all samples, and the scale of what cancels in them.
+    points = _sample_regular(problem, samples, seed)
+    brackets = TaskBrackets.build(problem)
+    across, size, basis = Batched(brackets.build_tensor_function())(points)
     T = across.reshape(-1, problem.n, problem.m, problem.m)
     d = np.sqrt((T**2).sum(axis=(1, 2, 3)) / 2)
     if not np.isfinite(d).all():
         at = np.round(points[np.flatnonzero(~np.isfinite(d))[0]], 4).tolist()
         raise SingularTaskError(f"the second derivative of task '{problem.task.name}' is not finite at q = {at}")
-    turns = _squared_turns(T, basis.reshape(-1, problem.n, problem.m), problem.domain.half_width)
+    # What the defect makes of the domain, as an angle.
+    turns = _compute_squared_turns(T, basis.reshape(-1, problem.n, problem.m), problem.domain.half_width)
     leak = float(np.degrees(np.sqrt(turns.mean() / problem.r)))
     worst = int(np.argmax(d))
     return Involutivity(
-        function=brackets.defect_function(),
+        function=brackets.build_defect_function(),
         mean=float(d.mean()),
         std=float(d.std()),
         p99=float(np.quantile(d, 0.99)),
@@ -121,14 +135,14 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
         worst_point=tuple(points[worst].tolist()),
         expected_leak_deg=leak,
         expected_angle_deg=leak / problem.m**0.5,
-        exact=bool(np.all((d <= _ROUNDING * size[:, 0]) | (turns <= _STRAIGHT**2))),
+        exact=bool(np.all((d <= RULES.rounding * size[:, 0]) | (turns <= RULES.straight**2))),
         samples=samples,
         seed=seed,
         singular_samples=samples - len(points),
     )
 
 
-def _regular_points(problem: Problem, samples: int, seed: int) -> Array:
+def _sample_regular(problem: Problem, samples: int, seed: int) -> Array:
     """Uniform samples of the domain, without the near-singular ones."""
     check(problem, samples, seed)
     points = sample_uniform(problem.domain, samples, seed)
@@ -138,7 +152,7 @@ def _regular_points(problem: Problem, samples: int, seed: int) -> Array:
     return points[regular]
 
 
-def _squared_turns(T: Array, basis: Array, half_width: Array) -> Array:
+def _compute_squared_turns(T: Array, basis: Array, half_width: Array) -> Array:
     """Sum over pairs of |T(e_a, e_b)|_A^2 / (k_a + k_b) [rad^2], (N,).
 
     The basis is rotated within the span so that it also diagonalises C^-1, where C = diag(half_width^2 / 3) is the
@@ -205,7 +219,7 @@ class TaskBrackets:
     size: ca.SX  #: root sum of squares of the terms that cancel in the brackets: the scale of rounding in d
 
     @classmethod
-    def of(cls, problem: Problem) -> "TaskBrackets":
+    def build(cls, problem: Problem) -> "TaskBrackets":
         """Build the expressions. They are NaN where J_x loses rank.
 
         With A = U^T U and the QR factors U^-T J_x^T = O R, the basis is E = U^-1 O = G R^-1, G = A^-1 J_x^T. Brackets
@@ -225,10 +239,10 @@ class TaskBrackets:
         terms = [ca.sumsqr(along[a][:, b]) for a in range(m) for b in range(m) if a != b]
         return cls(q, basis, across, ca.sqrt(ca.sumsqr(across) / 2), ca.sqrt(sum(terms, ca.SX(0))))
 
-    def defect_function(self) -> ca.Function:
+    def build_defect_function(self) -> ca.Function:
         """q (n, 1) -> d (1, 1)."""
         return dense_function("involutivity_defect", [self.q], [self.defect])
 
-    def tensor_function(self) -> ca.Function:
+    def build_tensor_function(self) -> ca.Function:
         """q (n, 1) -> across (n, m m), size (1, 1), basis (n, m)."""
         return dense_function("task_brackets", [self.q], [self.across, self.size, self.basis])

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NoReturn
 
 import casadi as ca
 import numpy as np
@@ -10,34 +10,43 @@ import scipy
 from numpy.typing import NDArray
 
 from orthocas.errors import GrowError, InvalidValueError
-from orthocas.exact.harmonic import TriangleMesh, harmonic_disk, level_surface
+from orthocas.exact.harmonic import TriangleMesh, build_level_surface, map_to_disk
 from orthocas.exact.mesh import TriangleLocator
-from orthocas.tasks.domains import Box, sample_uniform
-from orthocas.tasks.metric import metric_matrices
-from orthocas.tasks.problem import Problem, task_jacobians
-from orthocas.tasks.samples import samples_at
+from orthocas.tasks.domains import Box
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import evaluate_samples, sample_uniform
 from orthocas.tools.cached import building, cached_property
-from orthocas.tools.checks import Array, Indices, frozen_array, frozen_indices, require_known, require_memory
-from orthocas.tools.expressions import determinant, shortest
+from orthocas.tools.checks import Array, Indices, freeze_array, freeze_indices, require_known, require_memory
+from orthocas.tools.expressions import compute_determinant, wrap_shortest
 from orthocas.tools.interrupts import deferred
 
-_ON_LEAF = 1e-6  # [rad] or [m]
+
+@dataclass(frozen=True, slots=True)
+class LeafRules:
+    """Numbers of the charts of leaves."""
+
+    on_leaf: float = 1e-6  #: [rad] or [m] from the leaf, for points that lie on it
+    disk_steps: int = 30  #: Newton steps from a triangle to the leaf above it
+    on_disk: float = 1e-12  #: [rad] or [m] accepted distance from the leaf
+    fewest_across: int = 5  #: cells along the shortest edge of a region
+    scale_samples: int = 1000  #: to measure the size of the gradient
+    stages: int = 8  #: intermediate points on the way to the coordinates of a linear leaf
+    iterations: int = 10  #: Newton steps at each of these points
+    solved: float = 1e-12  #: residual of a solution, scaled
+    on_curve: float = 1e-5  #: [rad] distance beyond which a point belongs to another component of the leaf
+    piece: float = 1.0  #: arc length per call of the integrator
+    steps: int = 100  #: number of outputs per call
+    longest: float = 200.0  #: [rad] longest curve
+    singular: float = 0.01  #: smallest singular value of J_x on the curve, relative to the largest
+    fewest: int = 20  #: samples of a curve
+    closings: int = 3  #: corrections of the length of a curve
+    projections: int = 4  #: Gauss-Newton steps from the nearest sample to the nearest point of the curve
+
+
+RULES = LeafRules()
+
 CELLS = 60  #: default number of marching cubes cells along the longest edge of the region
-_ROUNDS = 30  # Newton steps from a triangle to the leaf above it
-_ON_DISK = 1e-12  # accepted distance from the leaf [rad] or [m]
-_FEWEST_ACROSS = 5  # smallest number of cells along the shortest edge of a region
-_SCALE_SAMPLES = 1000  # samples to measure the size of the gradient
-_STAGES = 8  # intermediate points on the way to the desired coordinates
-_ITERATIONS = 10  # Newton steps at each point
-_SOLVED = 1e-12
 SAMPLES = 2000  #: points on the curve; the spline through them is accurate to about 1e-12
-_ON_CURVE = 1e-5  # distance [rad] beyond which a point belongs to another component of the leaf
-_PIECE, _STEPS = 1.0, 100  # arc length and number of outputs per call of the integrator
-_LONGEST = 200.0  # longest curve [rad]
-_SINGULAR = 0.01  # smallest singular value of J_x on the curve, relative to the largest
-_FEWEST = 20  # smallest number of samples of a curve
-_CLOSINGS = 3  # number of corrections of the length
-_PROJECTIONS = 4  # Gauss-Newton steps from the nearest sample to the nearest point of the curve
 Leaf = Literal["linear", "circle", "disk"]  #: kinds of base leaves
 
 
@@ -50,70 +59,29 @@ class LeafValues:
     inside: NDArray[np.bool_]  #: which points the chart covers, (N,); the other rows are meaningless
 
 
-class LeafChart(Protocol):
-    """A chart xi0 of the base leaf."""
-
-    @property
-    def kind(self) -> str:
-        """Short name: 'linear', 'circle' or 'disk'."""
-        ...
-
-    @property
-    def level(self) -> Array:
-        """Task value x0 of the leaf, (m,)."""
-        ...
-
-    def values(self, points: Array) -> LeafValues:
-        """Coordinates of points on the leaf, (N, n)."""
-        ...
-
-    @property
-    def turn(self) -> float:
-        """Period of the coordinates: 2 pi on a circle, otherwise 0 (none)."""
-        ...
-
-    @property
-    def periodic(self) -> bool:
-        """Whether the coordinates stay the same under whole turns of the joints."""
-        ...
-
-    def points(self, xi: Array, near: Array | None = None) -> Array:
-        """Points of the leaf (N, n) with coordinates xi (N, r); NaN where no such point exists.
-
-        Args:
-            xi: coordinates.
-            near: points of the leaf, (N, n), NaN if unknown; they select one of several solutions.
-        """
-        ...
-
-    def to_arrays(self) -> Mapping[str, Array | Indices]:
-        """All arrays, for chart files."""
-        ...
-
-
-def turning_joints(problem: Problem) -> NDArray[np.bool_]:
+def find_turning_joints(problem: Problem) -> NDArray[np.bool_]:
     """Which joint positions are angles, (n,)."""
     return ~np.array(problem.robot.tree.prismatic, dtype=np.bool_)
 
 
-def without_turns(problem: Problem, differences: Array) -> Array:
+def remove_turns(problem: Problem, differences: Array) -> Array:
     """Differences of joint positions, (..., n), with angles within half a turn of 0."""
-    return np.asarray(shortest(differences, np.where(turning_joints(problem), 2 * np.pi, 0.0)))
+    return np.asarray(wrap_shortest(differences, np.where(find_turning_joints(problem), 2 * np.pi, 0.0)))
 
 
-def covers(region: Box, points: Array) -> NDArray[np.bool_]:
+def is_covered(region: Box, points: Array) -> NDArray[np.bool_]:
     """Which points lie in the region, up to rounding, (N,)."""
     return np.asarray((np.abs(points - region.centre) <= region.half_width + 1e-9).all(axis=1))
 
 
 def require_on_leaf(problem: Problem, level: Array, points: Array) -> None:
     """Raise InvalidValueError unless points (N, n) lie on the leaf h(q) = level (m,), relative to the size of J_x."""
-    J = task_jacobians(problem, points)
+    J = problem.task.evaluate_jacobian(points)
     off = np.abs(problem.task.batched(points)[0] - level).max(axis=1)
     size = np.sqrt((J**2).sum(axis=(1, 2)).mean())
-    if not off.max() <= _ON_LEAF * size:
+    if not off.max() <= RULES.on_leaf * size:
         what = f"error of the task on the base leaf h(q) = {level.tolist()}"
-        raise InvalidValueError(what, f"{off.max():.3g}", f"at most {_ON_LEAF * size:.3g}")
+        raise InvalidValueError(what, f"{off.max():.3g}", f"at most {RULES.on_leaf * size:.3g}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,8 +113,8 @@ class DiskLeaf:
             "disk": (count, 2),
         }
         for name, shape in shapes.items():
-            object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
-        object.__setattr__(self, "faces", frozen_indices("faces", self.faces, (None, 3), count))
+            object.__setattr__(self, name, freeze_array(name, getattr(self, name), shape))
+        object.__setattr__(self, "faces", freeze_indices("faces", self.faces, (None, 3), count))
         if not len(self.faces):
             raise InvalidValueError("faces", "empty", "at least one triangle")
         if np.linalg.norm(self.disk, axis=1).max() > 1 + 1e-9:
@@ -165,11 +133,11 @@ class DiskLeaf:
 
     def values(self, points: Array) -> LeafValues:
         """Coordinates of points on the leaf, (N, 3)."""
-        points = self.region_centre + without_turns(self.problem, points - self.region_centre)
-        found = self._in_space.locate(points)
-        corners = self.disk[self.faces[found.face]]
-        xi = np.einsum("sk,skr->sr", found.barycentric, corners)
-        return LeafValues(xi, self._gradients[found.face], covers(self.region, points))
+        points = self.region_centre + remove_turns(self.problem, points - self.region_centre)
+        located = self._in_space.locate(points)
+        corners = self.disk[self.faces[located.face]]
+        xi = np.einsum("sk,skr->sr", located.barycentric, corners)
+        return LeafValues(xi, self._gradients[located.face], is_covered(self.region, points))
 
     def points(self, xi: Array, near: Array | None = None) -> Array:
         """Points of the leaf with coordinates xi (N, 2) in the disk; NaN for other xi.
@@ -177,19 +145,20 @@ class DiskLeaf:
         Each point moves from its triangle along the triangle's normal onto the leaf, so that `values` returns xi.
         """
         inside = np.hypot(xi[:, 0], xi[:, 1]) <= 1
-        found = self._in_disk.locate(np.where(inside[:, None], xi, 0.0))
-        corners = self.faces[found.face]
-        feet = np.einsum("sk,skn->sn", found.barycentric, self.vertices[corners])
-        normals = self._normals[found.face]
+        located = self._in_disk.locate(np.where(inside[:, None], xi, 0.0))
+        corners = self.faces[located.face]
+        feet = np.einsum("sk,skn->sn", located.barycentric, self.vertices[corners])
+        normals = self._normals[located.face]
+        # Newton along the normal of the triangle, for all points at once.
         height = np.zeros((len(xi), 1))
-        for _ in range(_ROUNDS):
+        for _ in range(RULES.disk_steps):
             q = feet + height * normals
             residual = self.problem.task.batched(q)[0] - self.level
             slope = (self.problem.task.batched_jacobian(q)[0].reshape(-1, 3) * normals).sum(axis=1, keepdims=True)
             height = height - residual / slope
-            if np.abs(residual / slope).max(initial=0.0) < _ON_DISK:
+            if np.abs(residual / slope).max(initial=0.0) < RULES.on_disk:
                 break
-        known = inside & (found.distance < _ON_DISK)
+        known = inside & (located.distance < RULES.on_disk)
         return np.where(known[:, None], feet + height * normals, np.nan)
 
     def to_arrays(self) -> Mapping[str, Array | Indices]:
@@ -225,7 +194,7 @@ class DiskLeaf:
         return np.asarray((np.linalg.pinv(in_space) @ in_disk).transpose(0, 2, 1))
 
 
-def disk_leaf(problem: Problem, level: Array, region: Box, cells: int = CELLS) -> DiskLeaf:
+def build_disk_leaf(problem: Problem, level: Array, region: Box, cells: int = CELLS) -> DiskLeaf:
     """Triangulate the part of a leaf inside a region, and map it onto the unit disk.
 
     Args:
@@ -243,18 +212,19 @@ def disk_leaf(problem: Problem, level: Array, region: Box, cells: int = CELLS) -
             f"the problem has n = {problem.n} and m = {problem.m}, expected n = 3 and m = 1 for a disk leaf"
         )
     low, high = region.centre - region.half_width, region.centre + region.half_width
-    shortest = cells * float(region.half_width.min() / region.half_width.max())
-    if shortest < _FEWEST_ACROSS:
+    across = cells * float(region.half_width.min() / region.half_width.max())
+    if across < RULES.fewest_across:
         widths = (2 * region.half_width).round(4).tolist()
         raise GrowError(
-            f"the region has edges {widths}, so {cells} cells along the longest give {shortest:.1f} along "
-            f"the shortest, expected at least {_FEWEST_ACROSS}"
+            f"the region has edges {widths}, so {cells} cells along the longest give {across:.1f} along "
+            f"the shortest, expected at least {RULES.fewest_across}"
         )
     require_memory(f"a mesh with {cells} cells", 40.0 * cells**3)
     task = problem.task
-    points = sample_uniform(region, _SCALE_SAMPLES, 0)
-    scale = float(np.sqrt((task.batched_jacobian(points)[0] ** 2).sum(axis=(1, 2)).mean()))  # makes units irrelevant
-    mesh = level_surface(
+    points = sample_uniform(region, RULES.scale_samples, 0)
+    # The scale makes units irrelevant.
+    scale = float(np.sqrt((task.batched_jacobian(points)[0] ** 2).sum(axis=(1, 2)).mean()))
+    mesh = build_level_surface(
         lambda q: task.batched(q)[0][:, 0] / scale,
         lambda q: task.batched_jacobian(q)[0].reshape(-1, 3) / scale,
         float(level[0]) / scale,
@@ -262,7 +232,7 @@ def disk_leaf(problem: Problem, level: Array, region: Box, cells: int = CELLS) -
         high,
         cells,
     )
-    disk = harmonic_disk(mesh)
+    disk = map_to_disk(mesh)
     return DiskLeaf(problem, level, region.centre, region.half_width, mesh.vertices, mesh.faces, disk)
 
 
@@ -285,7 +255,7 @@ class LinearLeaf:
     def __post_init__(self) -> None:
         n, m, r = self.problem.n, self.problem.m, self.problem.r
         for name, shape in (("level", (m,)), ("centre", (n,)), ("normals", (n, r))):
-            object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
+            object.__setattr__(self, name, freeze_array(name, getattr(self, name), shape))
         require_on_leaf(self.problem, self.level, self.centre[None])
         if np.abs(np.linalg.norm(self.normals, axis=0) - 1).max() > 1e-9:
             raise InvalidValueError("normals", self.normals.tolist(), "columns of length 1")
@@ -303,36 +273,37 @@ class LinearLeaf:
         """
         q = np.broadcast_to(self.centre, (len(xi), len(self.centre)))
         q = q if near is None else np.where(np.isfinite(near), near, q)
+        # Follow the straight line to xi in steps, so that Newton stays on the sheet.
         start = (q - self.centre) @ self.normals
         N = np.broadcast_to(self.normals.T, (len(xi), *self.normals.T.shape))
-        for share in np.linspace(0.0, 1.0, _STAGES + 1)[1:]:
-            for _ in range(_ITERATIONS):
-                residual = self._residual(q, start + share * (xi - start))
-                if np.abs(residual).max(initial=0.0) < _SOLVED:
+        for share in np.linspace(0.0, 1.0, RULES.stages + 1)[1:]:
+            for _ in range(RULES.iterations):
+                residual = self._compute_residual(q, start + share * (xi - start))
+                if np.abs(residual).max(initial=0.0) < RULES.solved:
                     break
-                J = np.concatenate([task_jacobians(self.problem, q) / self._scale, N], axis=1)
+                J = np.concatenate([self.problem.task.evaluate_jacobian(q) / self._scale, N], axis=1)
                 q = q - (np.linalg.pinv(J) @ residual[:, :, None])[:, :, 0]
-        solved = np.abs(self._residual(q, xi)).max(axis=1) < 1e3 * _SOLVED
+        solved = np.abs(self._compute_residual(q, xi)).max(axis=1) < 1e3 * RULES.solved
         return np.where(solved[:, None], q, np.nan)
 
     def to_arrays(self) -> Mapping[str, Array]:
         """All arrays, for chart files."""
         return {"level": self.level, "centre": self.centre, "normals": self.normals}
 
-    def _residual(self, q: Array, xi: Array) -> Array:
+    def _compute_residual(self, q: Array, xi: Array) -> Array:
         x = self.problem.task.batched(q)[0]
         return np.concatenate([(x - self.level) / self._scale, (q - self.centre) @ self.normals - xi], axis=1)
 
     @cached_property
     def _scale(self) -> float:
         """Size of J_x at q0, which makes the units of the task irrelevant."""
-        return float(np.linalg.norm(task_jacobians(self.problem, self.centre[None])))
+        return float(np.linalg.norm(self.problem.task.evaluate_jacobian(self.centre[None])))
 
 
-def linear_leaf(problem: Problem, centre: Array) -> LinearLeaf:
+def build_linear_leaf(problem: Problem, centre: Array) -> LinearLeaf:
     """The leaf through a joint position (n,), with coordinates along its tangent space there."""
     points = centre[None]
-    normals = (metric_matrices(problem.metric, points) @ samples_at(problem, points).null_basis)[0]
+    normals = (problem.metric.evaluate(points) @ evaluate_samples(problem, points).null_basis)[0]
     level = problem.task.batched(points)[0][0]
     return LinearLeaf(problem, level, centre, normals / np.linalg.norm(normals, axis=0))
 
@@ -354,8 +325,8 @@ class CircleLeaf:
 
     def __post_init__(self) -> None:
         for name, shape in (("level", (self.problem.m,)), ("curve", (None, self.problem.n)), ("length", (1,))):
-            object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
-        if len(self.curve) < _FEWEST or not self.length[0] > 0:
+            object.__setattr__(self, name, freeze_array(name, getattr(self, name), shape))
+        if len(self.curve) < RULES.fewest or not self.length[0] > 0:
             raise InvalidValueError("curve", f"{len(self.curve)} samples of length {self.length[0]}", "a closed curve")
         require_on_leaf(self.problem, self.level, self.curve)
 
@@ -366,17 +337,18 @@ class CircleLeaf:
 
     def values(self, points: Array) -> LeafValues:
         """Coordinates of points on the leaf, (N, n)."""
-        nearest = self._tree.query(self._embedded(points))[1]
+        nearest = self._tree.query(self._embed(points))[1]
         L = self.length[0]
+        # From the nearest sample to the nearest point, by Gauss-Newton steps along the curve.
         samples = self.curve[nearest]
-        near = samples + without_turns(self.problem, points - samples)
+        near = samples + remove_turns(self.problem, points - samples)
         along = nearest * L / (len(self.curve) - 1)
-        for _ in range(_PROJECTIONS):
+        for _ in range(RULES.projections):
             tangent = self._spline(along, 1) + self._drift / L
-            away = near - self._at(along)
+            away = near - self._evaluate(along)
             along = along + (tangent * away).sum(axis=1) / (tangent**2).sum(axis=1)
         tangent = self._spline(along, 1) + self._drift / L
-        inside = np.linalg.norm(near - self._at(along), axis=1) < _ON_CURVE
+        inside = np.linalg.norm(near - self._evaluate(along), axis=1) < RULES.on_curve
         xi = np.pi - (np.pi - 2 * np.pi * along / L) % (2 * np.pi)
         gradients = 2 * np.pi / L * tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
         return LeafValues(xi[:, None], gradients[:, None, :], inside)
@@ -384,7 +356,7 @@ class CircleLeaf:
     def points(self, xi: Array, near: Array | None = None) -> Array:
         """Points of the leaf with coordinates xi (N, 1) in [-pi, pi]; both ends are at the cut. NaN for other xi."""
         along = xi[:, 0] * self.length[0] / (2 * np.pi)
-        return np.where(np.abs(xi) <= np.pi + 1e-9, self._at(along), np.nan)
+        return np.where(np.abs(xi) <= np.pi + 1e-9, self._evaluate(along), np.nan)
 
     def to_arrays(self) -> Mapping[str, Array]:
         """All arrays, for chart files."""
@@ -403,21 +375,21 @@ class CircleLeaf:
         periodic[-1] = periodic[0]
         return scipy.interpolate.CubicSpline(share[:, 0] * self.length[0], periodic, bc_type="periodic")
 
-    def _at(self, along: Array) -> Array:
+    def _evaluate(self, along: Array) -> Array:
         return np.asarray(self._spline(along) + along[:, None] / self.length[0] * self._drift)
 
     @cached_property
     def _tree(self) -> Any:
-        return scipy.spatial.cKDTree(self._embedded(self.curve[:-1]))
+        return scipy.spatial.cKDTree(self._embed(self.curve[:-1]))
 
-    def _embedded(self, points: Array) -> Array:
+    def _embed(self, points: Array) -> Array:
         """Angles as points on circles, so that whole turns do not matter."""
-        turning = turning_joints(self.problem)
+        turning = find_turning_joints(self.problem)
         angles = points[:, turning]
         return np.concatenate([np.cos(angles), np.sin(angles), points[:, ~turning]], axis=1)
 
 
-def circle_leaf(problem: Problem, level: Array, start: Array, samples: int = SAMPLES) -> CircleLeaf:
+def trace_circle_leaf(problem: Problem, level: Array, start: Array, samples: int = SAMPLES) -> CircleLeaf:
     """Trace the leaf from one of its points until it closes.
 
     Args:
@@ -429,47 +401,50 @@ def circle_leaf(problem: Problem, level: Array, start: Array, samples: int = SAM
     Raises:
         GrowError: if the leaf does not close within 200 rad, or runs into a singularity.
     """
-    trace = _tracer(problem, level, _STEPS)
-    q, travelled, step = start, 0.0, _PIECE / _STEPS
-    while travelled < _LONGEST:
-        piece = trace(q, _PIECE)
-        away = without_turns(problem, piece[1:] - start)
-        left = -(np.diff(piece, axis=0) * away).sum(axis=1) / step  # arc length to the start, along the curve
+    trace = _build_tracer(problem, level, RULES.steps)
+    q, travelled, step = start, 0.0, RULES.piece / RULES.steps
+    while travelled < RULES.longest:
+        piece = trace(q, RULES.piece)
+        away = remove_turns(problem, piece[1:] - start)
+        # Arc length to the start, along the curve.
+        left = -(np.diff(piece, axis=0) * away).sum(axis=1) / step
         back = np.flatnonzero((np.linalg.norm(away, axis=1) < 2 * step) & (left >= 0))
         if back.size:
             k = int(back[-1])
-            return _closed(problem, level, start, travelled + (k + 1) * step + left[k], samples)
-        q, travelled = piece[-1], travelled + _PIECE
-    raise GrowError(f"the base leaf h(q) = {level.tolist()} does not close within {_LONGEST:g} rad of arc length")
+            return _close_circle(problem, level, start, travelled + (k + 1) * step + left[k], samples)
+        q, travelled = piece[-1], travelled + RULES.piece
+    raise GrowError(f"the base leaf h(q) = {level.tolist()} does not close within {RULES.longest:g} rad of arc length")
 
 
-def _closed(problem: Problem, level: Array, start: Array, length: float, samples: int) -> CircleLeaf:
+def _close_circle(problem: Problem, level: Array, start: Array, length: float, samples: int) -> CircleLeaf:
     """Trace the leaf once around, with corrections of its length."""
-    trace = _tracer(problem, level, samples)
-    for _ in range(_CLOSINGS):
+    trace = _build_tracer(problem, level, samples)
+    for _ in range(RULES.closings):
         curve = trace(start, length)
         last = curve[-1] - curve[-2]
-        length -= float(last @ without_turns(problem, curve[-1] - start)) / float(np.linalg.norm(last))
+        length -= float(last @ remove_turns(problem, curve[-1] - start)) / float(np.linalg.norm(last))
     curve = trace(start, length)
-    sizes = np.linalg.svd(task_jacobians(problem, curve), compute_uv=False)
-    if sizes[:, -1].min() < _SINGULAR * sizes[:, 0].max():  # the integrator may step across a singular point
-        raise _singular(level)
+    sizes = np.linalg.svd(problem.task.evaluate_jacobian(curve), compute_uv=False)
+    # The integrator may step across a singular point.
+    if sizes[:, -1].min() < RULES.singular * sizes[:, 0].max():
+        _raise_singular(level)
     return CircleLeaf(problem, level, curve, np.array([length]))
 
 
-def _singular(level: Array) -> GrowError:
-    return GrowError(f"the base leaf h(q) = {level.tolist()} runs into a singularity of the task")
+def _raise_singular(level: Array) -> NoReturn:
+    raise GrowError(f"the base leaf h(q) = {level.tolist()} runs into a singularity of the task")
 
 
-def _tracer(problem: Problem, level: Array, steps: int) -> Callable[[Array, float], Array]:
+def _build_tracer(problem: Problem, level: Array, steps: int) -> Callable[[Array, float], Array]:
     """A map (point, length) -> points at equal arc lengths (steps + 1, n) along the leaf, integrated by SUNDIALS.
 
     The curve follows the unit vector orthogonal to all task gradients; the term -J_x^# (h - x0) keeps it on the leaf.
     """
     q, length = ca.SX.sym("q", problem.n), ca.SX.sym("length")
+    # The unit vector across all gradients, by cofactors, and a pull back to the leaf.
     J = problem.task.jacobian_function(q)
     others = [[k for k in range(problem.n) if k != i] for i in range(problem.n)]
-    across = ca.vertcat(*((-1) ** (i + 1) * determinant(J[:, columns]) for i, columns in enumerate(others)))
+    across = ca.vertcat(*((-1) ** (i + 1) * compute_determinant(J[:, columns]) for i, columns in enumerate(others)))
     home = J.T @ ca.solve(J @ J.T, problem.task.function(q) - level)
     rate = length * (across / ca.norm_2(across) - home)
     grid = np.linspace(0.0, 1.0, steps + 1)
@@ -486,18 +461,19 @@ def _tracer(problem: Problem, level: Array, steps: int) -> Callable[[Array, floa
         except RuntimeError:
             points = np.full((steps, problem.n), np.nan)
         if not np.isfinite(points).all():
-            raise _singular(level)
+            _raise_singular(level)
         return np.vstack([start, points])
 
     return trace
 
 
+LeafChart = LinearLeaf | CircleLeaf | DiskLeaf  #: a chart xi0 of the base leaf
 LEAVES: dict[str, type[LinearLeaf] | type[CircleLeaf] | type[DiskLeaf]] = {
     kind.kind: kind for kind in (LinearLeaf, CircleLeaf, DiskLeaf)
 }
 
 
-def leaf_from_arrays(problem: Problem, kind: str, arrays: Mapping[str, NDArray[Any]]) -> LeafChart:
+def read_leaf(problem: Problem, kind: str, arrays: Mapping[str, NDArray[Any]]) -> LeafChart:
     """Build the chart of a leaf from its arrays.
 
     Raises:

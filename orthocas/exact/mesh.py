@@ -1,20 +1,38 @@
 """Triangle meshes of leaves: points on them, and meshes that are improved."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from importlib import import_module
+from typing import Any, NamedTuple
 from weakref import finalize
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocas.errors import InvalidValueError, NotADiskError
-from orthocas.exact import libigl as igl
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, Indices, frozen_array, frozen_indices, require_finite, require_shape
+from orthocas.tools.checks import Array, Indices, freeze_array, freeze_indices, require_finite, require_shape
 
-_CHUNK = 10_000  # points per call of libigl, which Ctrl-C cannot interrupt; 0.1 s on 200,000 triangles
-_MOST_ROUNDS = 200  # rounds of flips; a few dozen suffice, but there is no proof that they end on a curved surface
-_FLAT = -1e-9  # an edge is flipped if the sum of the cotangents of its opposite angles is below this
+
+@dataclass(frozen=True, slots=True)
+class MeshRules:
+    """Numbers of meshes."""
+
+    chunk: int = 10_000  #: points per call of libigl, which Ctrl-C cannot interrupt; 0.1 s on 200,000 triangles
+    rounds: int = 200  #: of flips; a few dozen suffice, but there is no proof that they end on a curved surface
+    flat: float = -1e-9  #: sum of the cotangents of the opposite angles below which an edge is flipped
+
+
+RULES = MeshRules()
+
+
+class _Libigl:
+    """libigl, which is imported on first use: only meshes need it, and it brings half of SciPy."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(import_module("igl"), name)
+
+
+igl = _Libigl()
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,14 +52,15 @@ class TriangleMesh:
     faces: Indices
 
     def __post_init__(self) -> None:
-        vertices = frozen_array("vertices", self.vertices, (None, 3))
+        vertices = freeze_array("vertices", self.vertices, (None, 3))
         object.__setattr__(self, "vertices", vertices)
-        object.__setattr__(self, "faces", frozen_indices("faces", self.faces, (None, 3), len(vertices)))
+        object.__setattr__(self, "faces", freeze_indices("faces", self.faces, (None, 3), len(vertices)))
 
     @cached_property
     def edges(self) -> Indices:
         """Every edge once, (E, 2), the smaller index first."""
-        if not len(self.faces):  # libigl would run out of memory
+        # Without triangles, libigl would run out of memory.
+        if not len(self.faces):
             return np.empty((0, 2), dtype=np.int64)
         edges: Indices = igl.edges(self.faces)
         return edges
@@ -58,7 +77,7 @@ class TriangleMesh:
 
         Ours, because `igl.is_edge_manifold` misses the second case.
         """
-        start, end = half_edges(self.faces)
+        start, end = list_half_edges(self.faces)
         keys, count = np.unique(start * len(self.vertices) + end, return_counts=True)
         again = np.stack(np.divmod(keys[count > 1], len(self.vertices)), axis=1)
         return len(np.unique(np.sort(again, axis=1), axis=0))
@@ -97,19 +116,19 @@ def require_disk(mesh: TriangleMesh) -> Indices:
     Source:
         Ours: docs/explanation/derivations_exact.md#disk-chart.
     """
-    found = (mesh.components, mesh.boundary_loops, mesh.euler_characteristic)
-    if found != (1, 1, 1) or mesh.clashing_edges:
-        raise NotADiskError(*found, mesh.clashing_edges)
+    kind = (mesh.components, mesh.boundary_loops, mesh.euler_characteristic)
+    if kind != (1, 1, 1) or mesh.clashing_edges:
+        raise NotADiskError(*kind, mesh.clashing_edges)
     loop: Indices = igl.boundary_loop(mesh.faces)
     return np.roll(loop, -int(loop.argmin()))
 
 
-def half_edges(faces: Indices) -> tuple[Indices, Indices]:
+def list_half_edges(faces: Indices) -> tuple[Indices, Indices]:
     """Start and end of the edges of all faces, (3 F,) each; edges opposite corner 0 first, then 1, then 2."""
     return faces[:, [1, 2, 0]].T.ravel(), faces[:, [2, 0, 1]].T.ravel()
 
 
-def edge_keys(start: Indices, end: Indices, count: int) -> Indices:
+def number_edges(start: Indices, end: Indices, count: int) -> Indices:
     """One number per edge, the same for both directions, in a mesh with `count` vertices."""
     return np.minimum(start, end) * count + np.maximum(start, end)
 
@@ -142,19 +161,20 @@ class TriangleLocator:
     """
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
-        self._vertices = frozen_array("vertices", vertices, (None, None))
+        self._vertices = freeze_array("vertices", vertices, (None, None))
         if self._vertices.shape[1] not in (2, 3):
             require_shape("vertices", self._vertices.shape, (None, 3))
-        self._faces = frozen_indices("faces", faces, (None, 3), len(self._vertices))
+        self._faces = freeze_indices("faces", faces, (None, 3), len(self._vertices))
         if not len(self._faces):
             raise InvalidValueError("faces", "empty", "at least one triangle")
-        self._points = _in_space(self._vertices)
-        areas = np.linalg.norm(_normals(self._points[self._faces]), axis=1) / 2
+        self._points = _pad_to_space(self._vertices)
+        areas = np.linalg.norm(_compute_normals(self._points[self._faces]), axis=1) / 2
         if not areas.min() > 0:
             raise InvalidValueError(f"area of triangle {areas.argmin()}", areas.min(), "a positive number")
         self._trees = [igl.AABB()]
         self._trees[0].init(self._points, self._faces)
-        finalize(self, self._trees.clear)  # also at exit, where libigl would call a tree in use a leak
+        # Also at exit, where libigl would call a tree in use a leak.
+        finalize(self, self._trees.clear)
 
     def __reduce__(self) -> tuple[type["TriangleLocator"], tuple[Array, Indices]]:
         """Pickle and copy only the mesh; the tree is rebuilt."""
@@ -169,43 +189,44 @@ class TriangleLocator:
         """
         require_finite("points", points)
         require_shape("points", points.shape, (None, self._vertices.shape[1]))
-        starts = range(0, max(len(points), 1), _CHUNK)
-        parts = [self._locate(_in_space(points[start : start + _CHUNK])) for start in starts]
+        starts = range(0, max(len(points), 1), RULES.chunk)
+        parts = []
+        for start in starts:
+            part = _pad_to_space(points[start : start + RULES.chunk])
+            squares, face, closest = self._trees[0].squared_distance(self._points, self._faces, part)
+            # Where a distance is not finite, libigl has found no face.
+            require_finite("squared distance", squares)
+            weights = _compute_barycentric(closest, self._points[self._faces[face]])
+            parts.append(Located(face, weights, np.sqrt(squares)))
         return Located(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
-    def _locate(self, points: Array) -> Located:
-        squares, face, closest = self._trees[0].squared_distance(self._points, self._faces, points)
-        require_finite("squared distance", squares)  # if not finite, libigl has found no face
-        return Located(face, _barycentric(closest, self._points[self._faces[face]]), np.sqrt(squares))
 
-
-def _in_space(points: Array) -> Array:
+def _pad_to_space(points: Array) -> Array:
     """Points (N, 2) in the plane z = 0, because libigl's tree reads beyond the end of arrays with two columns."""
     return np.ascontiguousarray(np.pad(points, ((0, 0), (0, 3 - points.shape[1]))))
 
 
-def _barycentric(points: Array, triangles: Array) -> Array:
+def _compute_barycentric(points: Array, triangles: Array) -> Array:
     """Barycentric coordinates (N, 3) of points (N, 3) on triangles (N, 3, 3).
 
     Ours, because those of libigl lose digits in flat triangles. For height 1e-4 and length 1, they reproduce the point
     to 1e-8, and ours to 1e-13.
     """
-    normals = _normals(triangles)
+    normals = _compute_normals(triangles)
     to_corners = triangles - points[:, None]
-    parts = np.cross(
-        np.roll(to_corners, -1, axis=1), np.roll(to_corners, -2, axis=1)
-    )  # of the triangles opposite corners 0, 1, 2
+    # Of the triangles opposite corners 0, 1, 2.
+    parts = np.cross(np.roll(to_corners, -1, axis=1), np.roll(to_corners, -2, axis=1))
     weights = np.maximum(np.einsum("ncd,nd->nc", parts, normals), 0.0)
     result: Array = weights / weights.sum(axis=1, keepdims=True)
     return result
 
 
-def _normals(triangles: Array) -> Array:
+def _compute_normals(triangles: Array) -> Array:
     """Normal vectors of triangles (N, 3, 3), with twice the area as length, (N, 3)."""
     return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
 
 
-def cotangents(vertices: Array, faces: Indices) -> Array:
+def compute_cotangents(vertices: Array, faces: Indices) -> Array:
     """Cotangents of the corner angles, (F, 3); not finite for triangles without area."""
     cot: Array = 2 * igl.cotmatrix_entries(vertices, faces)
     return cot
@@ -228,18 +249,18 @@ def flip_to_delaunay(vertices: Array, faces: Indices) -> Indices:
         Ours, after [BS2007]: docs/explanation/derivations_exact.md#disk-chart.
     """
     faces = faces.copy()
-    for _ in range(_MOST_ROUNDS):
-        keys, first, second = _inner_edges(faces, len(vertices))
-        cot = np.nan_to_num(cotangents(vertices, faces), nan=0.0, posinf=1e12, neginf=-1e12).T.ravel()
+    for _ in range(RULES.rounds):
+        keys, first, second = _find_inner_edges(faces, len(vertices))
+        cot = np.nan_to_num(compute_cotangents(vertices, faces), nan=0.0, posinf=1e12, neginf=-1e12).T.ravel()
         weight = cot[first] + cot[second]
-        wanted = np.flatnonzero(weight < _FLAT)
-        wanted = wanted[np.argsort(weight[wanted], kind="stable")]
-        if not _flip(vertices, faces, keys, first[wanted], second[wanted]):
+        flat = np.flatnonzero(weight < RULES.flat)
+        flat = flat[np.argsort(weight[flat], kind="stable")]
+        if not _flip(vertices, faces, keys, first[flat], second[flat]):
             break
     return faces
 
 
-def steps_to_neighbours(points: Array, faces: Indices) -> Array:
+def compute_smoothing_steps(points: Array, faces: Indices) -> Array:
     """Smoothing steps (V, 3) from each vertex to the mean of its neighbours; every vertex must be in a triangle."""
     neighbours = igl.adjacency_matrix(faces)
     mean = (neighbours @ points) / np.diff(neighbours.indptr)[:, None]
@@ -247,9 +268,9 @@ def steps_to_neighbours(points: Array, faces: Indices) -> Array:
     return steps
 
 
-def _inner_edges(faces: Indices, count: int) -> tuple[Indices, Indices, Indices]:
+def _find_inner_edges(faces: Indices, count: int) -> tuple[Indices, Indices, Indices]:
     """Sorted keys of all edges, and the two half-edges of each inner edge. Four times as fast as `igl.edge_flaps`."""
-    keys = edge_keys(*half_edges(faces), count)
+    keys = number_edges(*list_half_edges(faces), count)
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
     twin = np.flatnonzero(keys[1:] == keys[:-1])
@@ -258,40 +279,36 @@ def _inner_edges(faces: Indices, count: int) -> tuple[Indices, Indices, Indices]
 
 def _flip(vertices: Array, faces: Indices, keys: Indices, first: Indices, second: Indices) -> bool:
     """Flip edges that do not share a triangle, in place, and return whether any was flipped."""
-    quads = _quads(faces, first, second)
-    allowed = _allowed(vertices, quads, keys)
+    # Edges i -> j, with the opposite corners k in the first triangle and n in the second, as rows (N, 4).
+    face, corner = first % len(faces), first // len(faces)
+    i, j, k = (faces[face, (corner + shift) % 3] for shift in (1, 2, 0))
+    quads = np.stack([i, j, k, faces[second % len(faces), second // len(faces)]], axis=1)
+    allowed = _is_allowed(vertices, quads, keys)
     quads, face, other = quads[allowed], first[allowed] % len(faces), second[allowed] % len(faces)
-    chosen = _independent(quads, face, other, len(vertices))
+    chosen = _select_independent(quads, face, other, len(vertices))
     i, j, k, n = quads[chosen].T
     faces[face[chosen]] = np.stack([i, n, k], axis=1)
     faces[other[chosen]] = np.stack([n, j, k], axis=1)
     return bool(chosen.any())
 
 
-def _quads(faces: Indices, first: Indices, second: Indices) -> Indices:
-    """Edges i -> j, with the opposite corners k in the first triangle and n in the second, as rows (N, 4)."""
-    face, corner = first % len(faces), first // len(faces)
-    i, j, k = (faces[face, (corner + shift) % 3] for shift in (1, 2, 0))
-    return np.stack([i, j, k, faces[second % len(faces), second // len(faces)]], axis=1)
-
-
-def _allowed(vertices: Array, quads: Indices, keys: Indices) -> NDArray[np.bool_]:
+def _is_allowed(vertices: Array, quads: Indices, keys: Indices) -> NDArray[np.bool_]:
     """Whether the edge k - n is new and the triangles i n k and n j k face the same way as the old ones."""
-    wanted = edge_keys(quads[:, 2], quads[:, 3], len(vertices))
-    place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    new = number_edges(quads[:, 2], quads[:, 3], len(vertices))
+    place = np.minimum(np.searchsorted(keys, new), len(keys) - 1)
     p, q, r, s = (vertices[quads[:, c]] for c in range(4))
     one, other = np.cross(s - p, r - p), np.cross(q - s, r - s)
     normal = np.cross(q - p, r - p) + np.cross(p - q, s - q)
     ahead = (np.einsum("nd,nd->n", one, normal) > 0) & (np.einsum("nd,nd->n", other, normal) > 0)
-    result: NDArray[np.bool_] = (keys[place] != wanted) & ahead
+    result: NDArray[np.bool_] = (keys[place] != new) & ahead
     return result
 
 
-def _independent(quads: Indices, face: Indices, other: Indices, count: int) -> NDArray[np.bool_]:
+def _select_independent(quads: Indices, face: Indices, other: Indices, count: int) -> NDArray[np.bool_]:
     """Which flips, given best first, are the first at both of their triangles and at their new edge."""
     number = np.arange(len(face))
     _, at_face = np.unique(np.stack([face, other], axis=1), return_index=True)
     wins = np.bincount(at_face // 2, minlength=len(face)) == 2
-    new_edge = np.unique(edge_keys(quads[:, 2], quads[:, 3], count), return_index=True)[1]
+    new_edge = np.unique(number_edges(quads[:, 2], quads[:, 3], count), return_index=True)[1]
     result: NDArray[np.bool_] = wins & np.isin(number, new_edge)
     return result

@@ -12,7 +12,7 @@ from orthocas.bases.family import LinearFamily
 from orthocas.bases.products import ProductFamily
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
-from orthocas.tools.columns import ColumnFunction, blocked
+from orthocas.tools.columns import ColumnFunction, arrange_blocks
 
 _PART = 16  # blocks
 
@@ -35,7 +35,7 @@ class BasisGradients(ABC):
 
     def at(self, points: Array) -> Array:
         """The numbers X at points (N, n), (B, g, S, c)."""
-        blocks = blocked(points)
+        blocks = arrange_blocks(points)
         if self.dtype == np.float64:
             found = self._columns(blocks)[0]
         else:  # some blocks at a time, so that the memory never holds all of them in double precision

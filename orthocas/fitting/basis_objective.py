@@ -13,10 +13,10 @@ from orthocas.bases.family import LinearFamily
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
 from orthocas.fitting.residuals import Loss, Pairs, curvature_columns, loss_columns, residual_columns, value_columns
 from orthocas.fitting.terms import Sizes, Weights
-from orthocas.tasks.samples import Draw, Samples, even_parts
-from orthocas.tools.batch import in_threads, in_threads_with, thread_count
+from orthocas.tasks.samples import Draw, Samples, split_samples
+from orthocas.tools.batch import count_threads, run_in_threads, run_in_threads_with
 from orthocas.tools.checks import Array
-from orthocas.tools.columns import COLUMNS, Run, blocked, by_sample, shares
+from orthocas.tools.columns import COLUMNS, Run, arrange_blocks, build_weights, split_by_sample
 
 _ROWS_IN_CACHE = 512  # samples in a product: the rows stay in the cache
 _CHUNK = 512  # samples per product of the Hessian, so that the rows stay in the cache
@@ -43,7 +43,7 @@ def normal_matrix(derivatives: Sequence[Array], gradients: Sequence[Array], shar
     places = [slice(end - G.shape[2], end) for G, end in zip(gradients, ends, strict=True)]
     H = np.zeros((ends[-1], ends[-1]))
     chunks = range(0, len(gradients[0]), _ROWS_IN_CACHE)
-    together = ceil(thread_count() / r)  # chunks, so that there is work for all threads
+    together = ceil(count_threads() / r)  # chunks, so that there is work for all threads
     for k in range(0, len(chunks), together):
         _add(H, places, chunks[k : k + together], derivatives, gradients, shared)
     for i, j, *_ in shared:
@@ -83,10 +83,10 @@ def _add(
     for i, j, row, other in shared:
         rows_of.setdefault((i, j), []).append((row, other))
     pieces = [(start, j) for start in starts for j in range(r)]
-    X = dict(zip(pieces, in_threads(rows, pieces), strict=True))
+    X = dict(zip(pieces, run_in_threads(rows, pieces), strict=True))
     work: list[Callable[[], None]] = [partial(square, j) for j in range(r)]
     work += [partial(mixed, pair) for pair in rows_of]
-    in_threads(lambda block: block(), work)
+    run_in_threads(lambda block: block(), work)
 
 
 class BasisObjective:
@@ -139,12 +139,12 @@ class BasisObjective:
 
     def _put(self, samples: Samples) -> None:
         self.N, self.X = len(samples), self._gradients.at(samples.points)
-        self._share = shares(self.N)
+        self._share = build_weights(self.N)
         self._expanded: dict[str, Array] = {}
 
     def _describe(self, samples: Samples) -> None:
-        found = samples.described(self._loss.data, self._orientation)
-        self._described = dict(zip(self._loss.data, map(blocked, found), strict=True))
+        found = samples.collect_data(self._loss.data, self._orientation)
+        self._described = dict(zip(self._loss.data, map(arrange_blocks, found), strict=True))
 
     @property
     def _data(self) -> list[Array]:
@@ -153,7 +153,7 @@ class BasisObjective:
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
         """The same loss on `count` fresh sample sets of `size` each."""
-        for part in even_parts(self._draw(size * count, seed), count):
+        for part in split_samples(self._draw(size * count, seed), count):
             other = copy(self)
             other._put(part)
             other._describe(part)
@@ -161,7 +161,7 @@ class BasisObjective:
 
     def coordinate_jacobians(self, theta: Array) -> Array:
         """J_xi at every sample, (N, r, n)."""
-        return by_sample(self._jacobian_entries(theta).reshape(-1, self.n, self.r, COLUMNS), self.N)
+        return split_by_sample(self._jacobian_entries(theta).reshape(-1, self.n, self.r, COLUMNS), self.N)
 
     def value(self, theta: Array) -> float:
         """L(theta)."""
@@ -171,8 +171,8 @@ class BasisObjective:
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """L(theta) and dL/dtheta."""
         T, columns, parts = self._table(theta), loss_columns(self._loss), self._parts
-        with columns.borrowed(min(thread_count(), len(parts))) as runs:
-            sums = in_threads_with(runs, lambda run, part: self._sums(T, run, part), parts)
+        with columns.borrow(min(count_threads(), len(parts))) as runs:
+            sums = run_in_threads_with(runs, lambda run, part: self._sums(T, run, part), parts)
         slopes = self._gradients.collected(np.sum([gradient for _, gradient in sums], axis=0))
         return sum(value for value, _ in sums), slopes[self.kept]
 
@@ -193,7 +193,7 @@ class BasisObjective:
         """d^2L/dtheta^2, exact, (size, size)."""
         r, n, K = self.r, self.n, self.K
         (curvature,) = curvature_columns(self._loss)(self._jacobian_entries(theta), *self._data)
-        W = by_sample(curvature.reshape(-1, n * r, n * r, curvature.shape[2]), self.N).reshape(-1, n, r, n, r)
+        W = split_by_sample(curvature.reshape(-1, n * r, n * r, curvature.shape[2]), self.N).reshape(-1, n, r, n, r)
         G, H = self._dense, np.zeros((r, K, r, K))
 
         def fill(pair: tuple[int, int]) -> None:
@@ -204,7 +204,7 @@ class BasisObjective:
                 H[i, :, j] += G[part].reshape(-1, K).T @ raised.reshape(-1, K) / self.N
             H[j, :, i] = H[i, :, j].T
 
-        in_threads(fill, [(i, j) for i in range(r) for j in range(i + 1)])
+        run_in_threads(fill, [(i, j) for i in range(r) for j in range(i + 1)])
         free = self.kept.ravel()
         block: Array = H.reshape(r * K, r * K)[np.ix_(free, free)]
         return block
@@ -287,7 +287,7 @@ class BasisObjective:
     def _jacobian_entries(self, theta: Array) -> Array:
         """J_xi, (B, n r, c)."""
         T = self._table(theta)
-        J = _double(np.concatenate(in_threads(lambda part: T @ self.X[part], self._parts)))
+        J = _double(np.concatenate(run_in_threads(lambda part: T @ self.X[part], self._parts)))
         return J.reshape(len(J), self.n * self.r, -1)
 
     def _matrix(self, theta: Array, stride: int) -> Array:
@@ -312,7 +312,7 @@ class BasisObjective:
     def _rows(self, derivative: Array, stride: int) -> Array:
         """Derivatives of residuals (B, n rows, c) at some samples, (N / stride, rows, n), in single precision."""
         blocks = derivative.reshape(len(derivative), self.n, -1, derivative.shape[2])
-        return by_sample(blocks, self.N, stride).astype(np.float32)
+        return split_by_sample(blocks, self.N, stride).astype(np.float32)
 
     def _hinge_matrix(self, residual: Array, derivative: Array) -> Array:
         """Gauss-Newton matrix of a hinge residual. It couples all coordinates, but acts at few samples."""

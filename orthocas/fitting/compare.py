@@ -32,9 +32,9 @@ from orthocas.tools.archive import require_free
 from orthocas.tools.batch import THREADS
 from orthocas.tools.checks import as_path, require_count, require_kind
 from orthocas.tools.display import Shown
-from orthocas.tools.files import draft_folder, published, require_writable, write_temporary
+from orthocas.tools.files import open_draft_folder, publish, require_writable, write_temporary
 from orthocas.tools.interrupts import deferred
-from orthocas.tools.json import plain, to_json
+from orthocas.tools.json import clean, write_json
 from orthocas.tools.processes import Processes, begin_worker
 from orthocas.tools.progress import Monitor, Progress, silent
 
@@ -305,7 +305,7 @@ def _run_in_processes(cells: Sequence[Cell], size: int) -> Iterator[CellResult]:
 
     Cells are passed in files: a pool whose process dies while it receives a large argument hangs in Python 3.11.2.
     """
-    with draft_folder() as folder, Processes(size, begin_worker, os.getpid()) as processes:
+    with open_draft_folder() as folder, Processes(size, begin_worker, os.getpid()) as processes:
         queue, running = iter(enumerate(cells)), dict[Future[CellResult], Cell]()
         while True:
             # No process has more than one cell, so one that dies loses no other.
@@ -415,15 +415,15 @@ class Comparison(Shown):
         writer.writeheader()
         for result in self.results:
             writer.writerow({name: getattr(result, name) for name in names})
-        with published(folder, listed=True, force=force) as drafts:
+        with publish(folder, listed=True, force=force) as drafts:
             (drafts / "comparison.csv").write_text(text.getvalue(), newline="")
-            (drafts / "comparison.json").write_text(to_json(self.as_dict(), indent=1))
+            (drafts / "comparison.json").write_text(write_json(self.as_dict(), indent=1))
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON. NaN becomes None."""
         return {
-            "summaries": plain(self.summaries()),
-            "fits": plain(self.results),
+            "summaries": clean(self.summaries()),
+            "fits": clean(self.results),
         }
 
     def facts(self) -> dict[str, str]:

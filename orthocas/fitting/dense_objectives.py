@@ -12,12 +12,12 @@ import numpy as np
 from orthocas.bases.family import ArrayFamily, ArrayMemory, Family, Memories
 from orthocas.fitting.residuals import Loss, loss_columns, loss_with_slopes, value_columns
 from orthocas.fitting.terms import Sizes, Weights
-from orthocas.tasks.samples import Draw, Samples, even_parts
-from orthocas.tools.batch import in_threads, in_threads_with, thread_count
+from orthocas.tasks.samples import Draw, Samples, split_samples
+from orthocas.tools.batch import count_threads, run_in_threads, run_in_threads_with
 from orthocas.tools.blas_graph import NumpyGraph
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
-from orthocas.tools.columns import Run, blocked, by_sample, shares
+from orthocas.tools.columns import Run, arrange_blocks, build_weights, split_by_sample
 from orthocas.tools.expressions import replay
 
 _ORIENTING = 200  # samples that determine the orientation of the start
@@ -73,7 +73,7 @@ class ArrayObjective:
     def value(self, theta: Array) -> float:
         """L(theta)."""
         small = self._rounded(theta)
-        J = in_threads(lambda piece: blocked(self._family.pullback(piece.points, small)[0]), self._pieces)
+        J = run_in_threads(lambda piece: arrange_blocks(self._family.pullback(piece.points, small)[0]), self._pieces)
         columns = value_columns(self._loss)
         parts = zip(J, self._pieces, strict=True)
         return sum(float(np.vdot(columns(own, *piece.data)[0][:, 0], piece.shares)) for own, piece in parts)
@@ -85,20 +85,20 @@ class ArrayObjective:
         def part(tools: tuple[Run, ArrayMemory], work: tuple[_Piece, Array]) -> float:
             (run, memory), (piece, result) = tools, work
             J, back = self._family.pullback(piece.points, small, memory)
-            entries = blocked(J)
+            entries = arrange_blocks(J)
             losses, slopes = np.empty(piece.shares.shape), np.empty_like(entries)
             for b, block in enumerate(entries):
                 run([block, *(array[b] for array in piece.data)], [losses[b], slopes[b]])
             slopes *= piece.shares[:, None]
             by_entry = slopes.reshape(-1, self.n, self.r, slopes.shape[2])
-            back(by_sample(by_entry, len(J)), result)
+            back(split_by_sample(by_entry, len(J)), result)
             return float(np.vdot(losses, piece.shares))
 
-        threads = min(thread_count(), len(self._pieces))
-        with columns.borrowed(threads) as runs, self._memories.borrowed(threads + 1) as (results, *memories):
+        threads = min(count_threads(), len(self._pieces))
+        with columns.borrow(threads) as runs, self._memories.borrow(threads + 1) as (results, *memories):
             gradients = [results.array(f"piece {k}", small.shape, small.dtype) for k in range(len(self._pieces))]
             tools, work = list(zip(runs, memories, strict=True)), list(zip(self._pieces, gradients, strict=True))
-            value = sum(in_threads_with(tools, part, work))
+            value = sum(run_in_threads_with(tools, part, work))
             gradient = gradients[0].astype(np.float64)
             for slopes in gradients[1:]:
                 gradient += slopes
@@ -106,7 +106,7 @@ class ArrayObjective:
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
         """The same loss on `count` fresh sample sets of `size` each."""
-        for part in even_parts(self._draw(size * count, seed), count):
+        for part in split_samples(self._draw(size * count, seed), count):
             other = copy(self)
             other._put(part)
             yield other
@@ -131,12 +131,12 @@ class ArrayObjective:
         """Use these samples, in pieces of nearly equal size."""
         N, most = len(samples), max(_LEAST, _ENTRIES // (self.r * self._family.width))
         size = ceil(N / ceil(N / most))
-        data = samples.described(self._loss.data, self._orientation)
+        data = samples.collect_data(self._loss.data, self._orientation)
         self._pieces = []
         for k in range(0, N, size):
             points = samples.points[k : k + size]
-            blocks = [blocked(array[k : k + size]) for array in data]
-            self._pieces.append(_Piece(points, blocks, shares(len(points)) * (len(points) / N)))
+            blocks = [arrange_blocks(array[k : k + size]) for array in data]
+            self._pieces.append(_Piece(points, blocks, build_weights(len(points)) * (len(points) / N)))
 
 
 class GraphObjective:
@@ -169,7 +169,7 @@ class GraphObjective:
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
         """The same loss on `count` fresh sample sets of `size` each. They share their graphs."""
-        for part in even_parts(self._draw(size * count, seed), count):
+        for part in split_samples(self._draw(size * count, seed), count):
             other = copy(self)
             other._put(part, size)
             yield other
@@ -188,7 +188,7 @@ class GraphObjective:
 
     def _put(self, samples: Samples, room: int) -> None:
         """Use these samples. Graphs are built for `room` samples, so that smaller sets share them."""
-        entries = _entries(samples.described(self._graphs.loss.data, self._orientation), len(samples))
+        entries = _entries(samples.collect_data(self._graphs.loss.data, self._orientation), len(samples))
         graph = self._graphs.of_size(room)
         self._blocks = [
             _Block.filled(graph, samples.points[k : k + graph.columns], entries[k : k + graph.columns], len(samples))

@@ -17,12 +17,12 @@ from orthocas.errors import GrowError, InvalidValueError
 from orthocas.exact.flow import GrownCoordinates
 from orthocas.solvers.lbfgs import LBFGS
 from orthocas.solvers.protocol import Solver
-from orthocas.tasks.domains import sample_evenly, sample_uniform
+from orthocas.tasks.samples import sample_evenly, sample_uniform
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.blas_graph import NumpyGraph
 from orthocas.tools.checks import Array, require_count, require_kind, require_memory
 from orthocas.tools.display import Shown, number_list, percent
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 from orthocas.tools.progress import Monitor, Progress, Watch, silent
 
 _PER_PARAMETER = 4  # samples per parameter of a coordinate
@@ -166,7 +166,7 @@ def _targets(chart: Chart, points: Array) -> _Targets:
 def _judged(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> Distilled:
     held_out = sample_uniform(chart.problem.domain, min(count, 5000), _HELD_OUT_SEED)
     known = _targets(chart, held_out)
-    errors = shortest(distilled.coordinates.xi(known.points) - known.xi, distilled.turns[chart.m :])
+    errors = wrap_shortest(distilled.coordinates.xi(known.points) - known.xi, distilled.turns[chart.m :])
     gradients = known.gradients / known.weight
     turned = np.linalg.norm(distilled.coordinates.jacobian(known.points) - gradients, axis=2)
     relative = turned / np.linalg.norm(gradients, axis=2)

@@ -25,8 +25,8 @@ from orthocas.solvers.protocol import Solver, Status
 from orthocas.tasks.clear_box import ClearBox
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem, ProblemCheck, check
-from orthocas.tasks.samples import Samples, idle_joints, sample_problem
-from orthocas.tools.batch import using_threads
+from orthocas.tasks.samples import Samples, find_idle_joints, sample_problem
+from orthocas.tools.batch import use_threads
 from orthocas.tools.checks import Array, require_count
 from orthocas.tools.display import Shown, listed, percent
 from orthocas.tools.interrupts import remembered
@@ -127,7 +127,7 @@ def fit(
     )
     if like is not None and align_to is not None:
         raise InvalidValueError("like", "given with align_to", "one of them: both define order and signs")
-    with using_threads(None if threads is None else require_count("threads", threads)):
+    with use_threads(None if threads is None else require_count("threads", threads)):
         return _fit(problem, settings, monitor, align_to)
 
 
@@ -214,7 +214,7 @@ def _solve(
     begin: Begin | None,
 ) -> tuple[Solution, Coordinates]:
     """Run the stages, and choose scale, order and signs. Joints that the task does not feel become coordinates."""
-    idle = tuple(idle_joints(problem, samples)[-problem.r :]) if settings.split_idle else ()
+    idle = tuple(find_idle_joints(problem, samples)[-problem.r :]) if settings.split_idle else ()
     space, r = JointSpace.of(problem), problem.r - len(idle)
     if r == 0:
         none = np.zeros(0)

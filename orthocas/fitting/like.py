@@ -22,7 +22,7 @@ from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_known, require_shape
 from orthocas.tools.columns import BlockedFunction
-from orthocas.tools.expressions import expression_of, to_tape
+from orthocas.tools.expressions import build_expression, write_tape
 
 Quantity = Callable[[ca.SX], ca.SX]  #: a function of an SX column q
 Likeness = Task | Quantity | str | Sequence[Quantity | str]  #: what coordinates may be like
@@ -41,7 +41,7 @@ def quantity_of(robot: Robot, like: Quantity | str) -> tuple[str, ca.Function]:
             return f"{SWIVEL} [rad]", sew_angle(robot, "conventional")
         k = robot.joint_names.index(like)
         return f"{like} [{'m' if robot.tree.prismatic[k] else 'rad'}]", dense_function("like", [q], [q[k]])
-    found = expression_of("like", like, q)
+    found = build_expression("like", like, q)
     require_shape("like", found.shape, (1, 1))
     name = str(getattr(like, "__name__", ""))
     return name if name.isidentifier() else "a function of q", dense_function("like", [q], [found])
@@ -63,7 +63,7 @@ def _finite(slopes: Array) -> Array:
 
 
 def _digest(function: ca.Function) -> str:
-    return hashlib.sha256(json.dumps(to_tape(function)).encode()).hexdigest()[:12]
+    return hashlib.sha256(json.dumps(write_tape(function)).encode()).hexdigest()[:12]
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +148,9 @@ class Like:
         samples, k = sample_problem(problem, _HELD_OUT, (seed, _HELD_OUT)), len(self.names)
         J, Z = coordinates.jacobian(samples.points)[:, :k], samples.null_basis
         left = self.slopes(samples.points) @ Z
-        lengths = np.sqrt(np.einsum("skn,skn->sk", J, samples.raised(J))) * np.linalg.norm(left, axis=2)
+        lengths = np.sqrt(np.einsum("skn,skn->sk", J, samples.compute_metric_gradients(J))) * np.linalg.norm(
+            left, axis=2
+        )
         cosines = np.einsum("skz,skz->sk", J @ Z, left) / np.maximum(lengths, _STILL)
         angles = np.degrees(np.sqrt((np.arccos(np.clip(cosines, -1, 1)) ** 2).mean(axis=0)))
         return dict(zip(self.names, angles.tolist(), strict=True))

@@ -12,7 +12,6 @@ from orthocas.bases.family import LinearFamily
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError, RobotError
 from orthocas.fitting.like import SWIVEL, Like, Likeness, like_label, quantity_of
-from orthocas.tasks.metric import metric_matrices
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import sample_problem
 from orthocas.tasks.task import Task
@@ -182,5 +181,5 @@ def unit_self_motion(problem: Problem, q: Array) -> Array:
     J = problem.task.batched_frame_jacobian(q[None])[0].reshape(problem.m, problem.n)
     z = np.linalg.svd(J)[2][-1]
     z = z * np.sign(np.linalg.det(np.vstack([J, z])))
-    square = 1.0 if problem.metric.is_identity else z @ metric_matrices(problem.metric, q[None])[0] @ z
+    square = 1.0 if problem.metric.is_identity else z @ problem.metric.evaluate(q[None])[0] @ z
     return np.asarray(z / np.sqrt(square))

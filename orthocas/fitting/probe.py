@@ -18,15 +18,15 @@ from orthocas.fitting.terms import DEFAULT_WEIGHTS, Weights
 from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.lbfgs import QuasiNewton
 from orthocas.solvers.protocol import SolveResult, Status
-from orthocas.tasks.domains import Box, sample_evenly, sample_heavily
+from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import (
     NEAR_HALF_A_TURN,
     NEAR_SINGULAR,
     Problem,
-    distance_from_half_a_turn,
+    measure_half_turn_distance,
     relative_singular_values,
 )
-from orthocas.tasks.samples import Samples, samples_at
+from orthocas.tasks.samples import Samples, evaluate_samples, sample_boundary_weighted, sample_evenly
 from orthocas.tools.batch import one_blas_thread
 from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import deferred
@@ -206,7 +206,7 @@ class Prober:
         return worst_points(problem, found, seed, thorough=True).least
 
     def _judged(self, problem: Problem, jacobian: Callable[[Array], Array]) -> Verdict:
-        return judged(problem, sample_heavily(problem.domain, _JUDGES, _SEED), jacobian, self.active)
+        return judged(problem, sample_boundary_weighted(problem.domain, _JUDGES, _SEED), jacobian, self.active)
 
     def _gradients(self, family: ProductFamily, theta: Array) -> Callable[[Array], Array]:
         """Points (N, n) -> gradients in the active joints, (N, r, active)."""
@@ -223,8 +223,8 @@ class Prober:
     def _fitted(self, problem: Problem, family: ProductFamily) -> Array:
         """Parameters, (size,)."""
         even = sample_evenly(problem.domain, _TRAINING, _SEED)
-        heavy = sample_heavily(problem.domain, _HEAVY, _SEED + 1)
-        samples = samples_at(problem, np.vstack([even, heavy])).restricted_to(self.active)
+        heavy = sample_boundary_weighted(problem.domain, _HEAVY, _SEED + 1)
+        samples = evaluate_samples(problem, np.vstack([even, heavy])).restricted_to(self.active)
         with deferred():
             fresh = self._start is None
             start = spectral_start(family, samples[: len(even)]) if self._start is None else self._start.on(family)
@@ -269,11 +269,11 @@ def judged_chart(chart: Chart, samples: int, seed: int) -> Verdict:
         J: Array = coordinates.jacobian(points)[:, :fitted, active]
         return J
 
-    return judged(chart.problem, sample_heavily(chart.problem.domain, samples, seed), jacobian, active)
+    return judged(chart.problem, sample_boundary_weighted(chart.problem.domain, samples, seed), jacobian, active)
 
 
 def judged(problem: Problem, points: Array, jacobian: Callable[[Array], Array], active: list[int]) -> Verdict:
-    """Quality at the result of `sample_heavily`.
+    """Quality at the result of `sample_boundary_weighted`.
 
     Without fitted coordinates, such as where all are idle joints, nothing leaks, and det J has another sign where a
     singular posture of the task lies between.
@@ -284,13 +284,13 @@ def judged(problem: Problem, points: Array, jacobian: Callable[[Array], Array], 
         jacobian: gradients of the fitted coordinates in the active joints, (N, r, n), at points of all joints.
         active: the active joints.
     """
-    samples = samples_at(problem, points)
+    samples = evaluate_samples(problem, points)
     J, own = jacobian(samples.points), samples.restricted_to(active)
     uniform = len(samples) - 2 * (len(samples) // 3)
     leaks, conditioning = leak_and_conditioning(own, J)
     worst = int(np.argmin(conditioning))
     task_value = float(relative_singular_values(problem, points).min())
-    turn_value = float(distance_from_half_a_turn(problem, points).min())
+    turn_value = float(measure_half_turn_distance(problem, points).min())
     if J.shape[1] == 0:
         return Verdict(0.0, 1.0, samples.points[worst], task_value if conditioning[worst] > 0 else 0.0, turn_value)
     leak = float(np.degrees(np.sqrt(np.mean(leaks[:uniform] ** 2))))

@@ -18,9 +18,9 @@ from orthocas.fitting.volume_loss import LEAST_VOLUME, BasisField, BasisShortfal
 from orthocas.solvers.adam import Adam
 from orthocas.solvers.lbfgs import LBFGS
 from orthocas.solvers.protocol import SolveResult
-from orthocas.tasks.domains import Box, sample_heavily, sample_uniform
+from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.samples import NEGLIGIBLE
+from orthocas.tasks.samples import NEGLIGIBLE, sample_boundary_weighted, sample_uniform
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 from orthocas.tools.progress import Monitor, Watch
@@ -112,7 +112,7 @@ class Search(ABC):
         """Samples, half of them uniform like positions that count for the share, the others heavy near limits."""
         domain, even = self.problem.domain, int(_EVEN * count)
         uniform = sample_uniform(domain, even, (self.seed, tag, _UNIFORM_TAG))
-        points = np.vstack([uniform, sample_heavily(domain, count - even, (self.seed, tag))])
+        points = np.vstack([uniform, sample_boundary_weighted(domain, count - even, (self.seed, tag))])
         points = points[beside_the_middle(self.problem, points)]
         if not len(points):
             wanted = "more: none lies on the middle's side of singular positions"

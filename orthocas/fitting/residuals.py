@@ -221,18 +221,18 @@ class LossWithVolumes:
         """Outputs (B, entries, c) for contiguous inputs (B, entries, c)."""
         shapes = [(len(J), 1, COLUMNS), *([J.shape] if self._slopes else [])]
         results = [np.empty(shape) for shape in shapes]
-        with self.borrowed(1) as (run,):
+        with self.borrow(1) as (run,):
             for b in range(len(J)):
                 run([J[b], *(array[b] for array in data)], [result[b] for result in results])
         return results
 
     @contextmanager
-    def borrowed(self, count: int) -> Iterator[list[Run]]:
-        """Functions of blocks for so many threads; see `ColumnFunction.borrowed`."""
+    def borrow(self, count: int) -> Iterator[list[Run]]:
+        """Functions of blocks for so many threads; see `ColumnFunction.borrow`."""
         with ExitStack() as stack:
             written: Sequence[Run | None] = [None] * count
             if self._written is not None:
-                written = stack.enter_context(self._written.borrowed(count))
+                written = stack.enter_context(self._written.borrow(count))
             yield [self._run(own) for own in written]
 
     def residuals(self, J: Array, *data: Array) -> list[Array]:

@@ -40,9 +40,8 @@ from orthocas.solvers.protocol import (
     SolveResult,
     Status,
 )
-from orthocas.tasks.domains import sample_evenly
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.samples import Samples, sample_problem, samples_at
+from orthocas.tasks.samples import Samples, evaluate_samples, sample_evenly, sample_problem
 from orthocas.tools.batch import one_blas_thread
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_memory
@@ -208,7 +207,7 @@ class FoldSearch:
         """The objective plus the fold term at all points collected."""
         if not len(self._points):
             return objective
-        samples = samples_at(self._problem, self._points).restricted_to(self._active)
+        samples = evaluate_samples(self._problem, self._points).restricted_to(self._active)
         penalty = objective.elsewhere(samples, {FOLD_TERM.name: self._weight})
         return _LinearSum(objective, penalty) if isinstance(objective, BasisObjective) else _Sum(objective, penalty)
 
@@ -432,7 +431,7 @@ class StageRunner:
         key = family, count, kept is not None
         if key not in self._starts:
             points = sample_evenly(self.problem.domain, count, _START_SEED)
-            samples = samples_at(self.problem, points).restricted_to(self.active)
+            samples = evaluate_samples(self.problem, points).restricted_to(self.active)
             start = spectral_start(family, samples, kept, self._gradients(family))
             if self.like is not None:
                 start = self.like.turned(family, start, samples, self._gradients(family))
@@ -441,7 +440,7 @@ class StageRunner:
 
     def _samples(self, count: int, tag: int) -> Samples:
         points = sample_evenly(self.problem.domain, count, (self.settings.seed, tag))
-        return samples_at(self.problem, points).restricted_to(self.active)
+        return evaluate_samples(self.problem, points).restricted_to(self.active)
 
     def _draw(self, count: int, seed: tuple[int, ...]) -> Samples:
         return sample_problem(self.problem, count, (self.settings.seed, _FRESH, *seed)).restricted_to(self.active)

@@ -12,7 +12,7 @@ from orthocas.bases.family import JointSpace, LinearFamily
 from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
 from orthocas.fitting.residuals import Pairs, coordinates_of
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.samples import Samples, directions
+from orthocas.tasks.samples import Samples, compute_directions
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 
@@ -190,9 +190,9 @@ def _symmetric(problem: Problem, active: list[int], u: Array, choices: Sequence[
 
 
 def _tensors(problem: Problem, active: list[int], u: Array) -> Array:
-    """The `directions` at points of the cube (N, n)."""
+    """The `compute_directions` at points of the cube (N, n)."""
     domain = problem.domain
-    return directions(problem, active, domain.centre[active] + domain.half_width[active] * u)
+    return compute_directions(problem, active, domain.centre[active] + domain.half_width[active] * u)
 
 
 def _parities(problem: Problem, active: list[int], signs: Array, u: Array) -> Array | None:

@@ -21,12 +21,12 @@ from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM, require_driven
 from orthocas.tasks.domains import Box, Domain
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.problem import Problem, check
-from orthocas.tasks.regular_box import home_posture
-from orthocas.tasks.samples import idle_joints, sample_problem
+from orthocas.tasks.regular_box import find_home
+from orthocas.tasks.samples import find_idle_joints, sample_problem
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, as_number, require_count, require_kind
 from orthocas.tools.display import Shown, listed, number_list
-from orthocas.tools.json import attributes
+from orthocas.tools.json import collect_attributes
 from orthocas.tools.progress import Monitor, Progress, silent
 
 JUDGES = 30_000  #: samples that judge the fit
@@ -126,7 +126,7 @@ class DomainSuggestion(Shown):
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
         quality = ("leak_deg", "conditioning", "worst_point", "asked", "seconds")
-        return attributes(self, "home", "home_source", "joints", *quality)
+        return collect_attributes(self, "home", "home_source", "joints", *quality)
 
 
 @dataclass(eq=False)
@@ -326,7 +326,7 @@ def suggest_domain(
     bounds, loss = _checked(robot, task, leak_deg, conditioning, seed), Weights.of(weights)
     if parametrisation is not None:
         require_parametrisation(parametrisation)
-    posture = home_posture(robot, task, home)
+    posture = find_home(robot, task, home)
     room = np.minimum(_room(robot, posture.q), _farthest(robot))
     problem = Problem(robot, task, metric, Box(posture.q, np.minimum(_unit(robot), room)))
     check(problem, _CHECKED)
@@ -359,7 +359,7 @@ class _Joints:
 
     @classmethod
     def of(cls, problem: Problem) -> "_Joints":
-        idle = idle_joints(problem, sample_problem(problem, _CHECKED, 0))[-problem.r :]
+        idle = find_idle_joints(problem, sample_problem(problem, _CHECKED, 0))[-problem.r :]
         return cls(problem.robot.joint_names, tuple(idle), cyclic_joints(problem))
 
     @property

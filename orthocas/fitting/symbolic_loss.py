@@ -11,10 +11,9 @@ from orthocas.fitting.residuals import Loss, sample_loss
 from orthocas.fitting.settings import require_parametrisation
 from orthocas.fitting.starts import spectral_start
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Sizes, WeightNumbers, Weights
-from orthocas.tasks.domains import sample_evenly
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.samples import Samples, samples_at
-from orthocas.tools.checks import Array, as_point_set, frozen_array, require_count, require_kind
+from orthocas.tasks.samples import Samples, evaluate_samples, sample_evenly
+from orthocas.tools.checks import Array, as_point_set, freeze_array, require_count, require_kind
 
 
 def loss(
@@ -60,14 +59,14 @@ def loss(
     require_parametrisation(parametrisation)
     family = parametrisation.for_problem(problem).family(JointSpace.of(problem), problem.r)
     drawn = _drawn(problem, samples, seed)
-    theta0 = _start(family, drawn, seed) if start is None else frozen_array("start", start, (family.size,))
+    theta0 = _start(family, drawn, seed) if start is None else freeze_array("start", start, (family.size,))
     theta = ca.MX.sym("theta", family.size)
     J = _jacobians(family, drawn.points, theta)  # (r n, N), each J_xi column by column
     identity = drawn.metric_inverse is None
     known = Weights.of(weights).for_problem(problem)
     of_sample = Loss.of(Sizes(problem.n, problem.m, problem.r, identity), known.by_name)
     orientation = _orientation(drawn, ca.Function("J", [theta], [J])(theta0).full(), problem.r)
-    data = [_columns(part) for part in drawn.described(of_sample.data, orientation)]
+    data = [_columns(part) for part in drawn.collect_data(of_sample.data, orientation)]
     mean = ca.sum2(_mapped(of_sample, len(drawn))(J, *data)) / len(drawn)
     return ca.Function("loss", [theta], [mean], ["theta"], ["loss"])
 
@@ -75,8 +74,8 @@ def loss(
 def _drawn(problem: Problem, samples: int | ArrayLike, seed: int) -> Samples:
     if isinstance(samples, int | np.integer):
         count = require_count("samples", int(samples))
-        return samples_at(problem, sample_evenly(problem.domain, count, require_count("seed", seed, least=0)))
-    return samples_at(problem, as_point_set("samples", samples, problem.n)[0])
+        return evaluate_samples(problem, sample_evenly(problem.domain, count, require_count("seed", seed, least=0)))
+    return evaluate_samples(problem, as_point_set("samples", samples, problem.n)[0])
 
 
 def _start(family: Family, samples: Samples, seed: int) -> Array:

@@ -11,7 +11,7 @@ from orthocas.charts.angles import pairs
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, as_float_array, as_number, require_kind, require_known, require_shape
-from orthocas.tools.expressions import MOST_ROWS, determinant
+from orthocas.tools.expressions import MOST_ROWS, compute_determinant
 
 REGULAR_VOLUME = 0.9  #: volume of the gradients below which the regularity term acts
 LEAST_CONDITIONING = 0.2  #: that fits aim at on the whole domain
@@ -273,7 +273,7 @@ def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_invers
     J = coordinate_jacobian
     raised = J if metric_inverse is None else J @ metric_inverse
     lengths = ca.sqrt(ca.sum2(raised * J))
-    return determinant((J @ null_basis) / ca.repmat(lengths, 1, J.shape[0]))
+    return compute_determinant((J @ null_basis) / ca.repmat(lengths, 1, J.shape[0]))
 
 
 def volume_hinges(J: Array, null_basis: Array, metric_inverse: Array | None, bound: float) -> tuple[Array, Array]:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from orthocas.bases.family import ArrayFamily, ArrayMemory
 from orthocas.fitting.basis_gradients import BasisGradients
 from orthocas.fitting.meaning import Wish
-from orthocas.tasks.metric import metric_matrices
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array
 
@@ -33,7 +32,7 @@ class Field(ABC):
         task, metric = problem.task, problem.metric
         J = task.batched_frame_jacobian(points)[0].reshape(len(points), task.m, problem.n)
         #: R with A^-1 = R R^T, (N, n, n); None for the identity
-        self.root = None if metric.is_identity else np.linalg.cholesky(np.linalg.inv(metric_matrices(metric, points)))
+        self.root = None if metric.is_identity else np.linalg.cholesky(np.linalg.inv(metric.evaluate(points)))
         self.judged = _across(J)  #: orthonormal basis across the task's rows, (N, n, r)
         self.own = self.judged if self.root is None else _across(self._in_metric(J))  #: the same in the metric
 

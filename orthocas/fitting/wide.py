@@ -34,12 +34,13 @@ from orthocas.fitting.volume_loss import LEAST_VOLUME
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import require_driven
 from orthocas.solvers.protocol import Status
-from orthocas.tasks.branches import CLEARER, Branch, Branches, branches, clear_positions, middles
+from orthocas.tasks.branches import RULES as BRANCH_RULES
+from orthocas.tasks.branches import Branch, Branches, branches, sample_centres, sample_nonsingular
 from orthocas.tasks.domains import Box
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.problem import Problem, check
-from orthocas.tasks.regular_box import home_posture
-from orthocas.tasks.samples import idle_joints, sample_problem
+from orthocas.tasks.regular_box import find_home
+from orthocas.tasks.samples import find_idle_joints, sample_problem
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, as_number, require_count, require_kind
 from orthocas.tools.display import number_list, percent
@@ -196,14 +197,14 @@ def fit_wide(
     cases = [_case(problem, family, meant) for family in wanted]
     problem, _ = cases[0]
     count = None if samples is None else require_count("samples", samples, least=2)
-    posture = chosen.posture if home is None else home_posture(robot, task, home).q
+    posture = chosen.posture if home is None else find_home(robot, task, home).q
     meaning, quantities = None, None
     if problem.r == 1:
         meaning = Meaning.by_default(problem, posture) if like is None else Meaning.of(problem, like, posture)
     elif like is not None:
         quantities = Like.of(problem, like)
         quantities.require_at_most(problem.r)
-    idle = idle_joints(problem, sample_problem(problem, _FIRST, (seed, _FIRST_TAG)))[-problem.r :]
+    idle = find_idle_joints(problem, sample_problem(problem, _FIRST, (seed, _FIRST_TAG)))[-problem.r :]
     if len(idle) == problem.r and parametrisation is None and not meant:
         meaning = None
         searches: list[Search] = [IdleSearch(problem, cases[0][1], tuple(idle), seed, monitor)]
@@ -305,7 +306,7 @@ def _finished(
         coordinates = fix_gauge(normalise(raw, centre, first), centre) if len(raw.offset) else raw
     domain = RegularPart(clear.domain, coordinates, LEAST_VOLUME / clear.r)
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
-    counted = clear_positions(clear.robot, clear.task, branch.box, JUDGED, (seed, _COUNTED_TAG))
+    counted = sample_nonsingular(clear.robot, clear.task, branch.box, JUDGED, (seed, _COUNTED_TAG))
     share = float(domain.contains(counted).mean()) if len(counted) else float("nan")
     error = None if meaning is None else meaning.error(problem, coordinates, seed)
     worst = worst_points(problem, coordinates, seed, thorough=True)
@@ -344,7 +345,7 @@ def _chosen(robot: Robot, task: Task, branch: Branch | Box | str | None, home: A
     found: Branches = branches(robot, task)
     if branch is not None:
         return found[branch]
-    return found.of(home_posture(robot, task, home).q) or found[0]
+    return found.of(find_home(robot, task, home).q) or found[0]
 
 
 def _families(problem: Problem, meant: bool) -> tuple[Polynomial | MLP, ...]:
@@ -372,12 +373,12 @@ def _problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Bran
     try:
         return Problem(robot, task, metric, box, branch.name, clearance)
     except DomainError:
-        points, values = middles(robot, task, box)
-    clear = points[values > CLEARER * clearance]
+        points, values = sample_centres(robot, task, box)
+    clear = points[values > BRANCH_RULES.of_centre * clearance]
     room = box.half_width - np.abs(clear - box.centre)
     if not len(clear):
-        missing = f"no position clear by {CLEARER * clearance:g}"
-        most = f"at most {math.floor(1e3 * float(values.max()) / CLEARER) / 1e3:g} can serve it"
+        missing = f"no position clear by {BRANCH_RULES.of_centre * clearance:g}"
+        most = f"at most {math.floor(1e3 * float(values.max()) / BRANCH_RULES.of_centre) / 1e3:g} can serve it"
         raise DomainError(f"branch '{branch.name}' has {missing}, expected one for clearance = {clearance:g}: {most}")
     best = int(np.argmax(np.log(room).sum(axis=1)))
     domain = Box(clear[best], room[best], box.unbounded)

@@ -9,13 +9,12 @@ from numpy.typing import ArrayLike
 from orthocas.charts.chart import Chart
 from orthocas.charts.solutions import Tracker, TrackerStatus
 from orthocas.errors import DomainError, InvalidValueError, InverseError, MissingExtraError
-from orthocas.tasks.domains import bounds_of
 from orthocas.tools.checks import (
     Array,
     as_float_array,
     as_point,
     as_point_set,
-    frozen_indices,
+    freeze_indices,
     require_kind,
     require_shape,
 )
@@ -73,7 +72,7 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
             raise InvalidValueError("positions", repr(positions)[:80], "a function of an environment")
         self.chart, self._positions = chart, positions
         places = range(chart.n) if joints is None else joints
-        self._joints = frozen_indices("joints", places, (chart.n,), 2**31)
+        self._joints = freeze_indices("joints", places, (chart.n,), 2**31)
         sizes = as_float_array("step", step)
         if sizes.shape not in ((), (chart.n,)) or not ((sizes > 0) & np.isfinite(sizes)).all():
             raise InvalidValueError("step", sizes.tolist(), f"one finite number or {chart.n}, > 0")
@@ -127,7 +126,7 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
     def _extend(self, observation: Array) -> Array:
         """An observation with xi and the distance to the boundary."""
         q = self._read_joints()
-        low, high = bounds_of(self.chart.problem.domain)
+        low, high = self.chart.problem.domain.bounds
         distance = np.minimum(q - low, high - q).min()
         return np.asarray(np.concatenate([observation, self.chart.xi(q), [distance]]))
 

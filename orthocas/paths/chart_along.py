@@ -13,8 +13,8 @@ from orthocas.fitting.fit import fit
 from orthocas.tasks.corridor import Corridor
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.regular_box import joint_range
-from orthocas.tasks.samples import idle_joints, sample_problem
+from orthocas.tasks.regular_box import find_joint_range
+from orthocas.tasks.samples import find_idle_joints, sample_problem
 from orthocas.tools.checks import Array, as_number, as_point_set, require_kind
 
 RADIUS = 0.2  #: [rad]
@@ -98,14 +98,14 @@ def corridor_problem(problem: Problem, postures: ArrayLike, radius: float = RADI
         raise InvalidValueError("radius", radius, "a positive number below pi")
     prismatic = np.array(problem.robot.tree.prismatic)
     sizes = np.where(prismatic, RULES.prismatic * size, size)
-    whole = joint_range(problem.robot, margin_deg)
+    whole = find_joint_range(problem.robot, margin_deg)
     path = path[_thin_out(path / sizes)]
 
     # Which joints only turn the whole task, or do not move it, is asked in the narrow corridor.
     narrow = Problem(problem.robot, problem.task, problem.metric, _build_corridor(whole, path, sizes), problem.name)
     names = problem.robot.joint_names
     cyclic = cyclic_joints(narrow)
-    idle = idle_joints(narrow, sample_problem(narrow, RULES.samples, 0))
+    idle = find_idle_joints(narrow, sample_problem(narrow, RULES.samples, 0))
     # These may take their whole range.
     for k in {*idle, *map(names.index, cyclic)}:
         sizes[k] = np.inf

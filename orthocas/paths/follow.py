@@ -18,8 +18,8 @@ from orthocas.paths.joint_motion import JointMotion, Margins
 from orthocas.paths.tool_path import RULES, ToolPath
 from orthocas.robots.obstacles import LinkDistances, Obstacle
 from orthocas.robots.tree import require_driven
-from orthocas.tasks.clear_box import row_scale
-from orthocas.tasks.domains import bounds_of, contains, sample_uniform
+from orthocas.tasks.clear_box import compute_row_scale
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind
@@ -228,7 +228,7 @@ class MotionLimits:
         if domain.singular_bound is not None:
             return domain.singular_bound.scale
         J = self._compute_jacobian(sample_uniform(domain, RULES.scale_samples, 0))
-        return row_scale(J[np.isfinite(J).all(axis=(1, 2))], self.chart.problem.task.units)
+        return compute_row_scale(J[np.isfinite(J).all(axis=(1, 2))], self.chart.problem.task.units)
 
     def compute_scaled_jacobian(self, q: Array) -> Array:
         """D^-1 J at joint positions (P, n), (P, m, n)."""
@@ -247,7 +247,7 @@ class MotionLimits:
         """Raise PathError at the first place (P,) whose joint position (P, n) is lost, outside, or at an obstacle."""
         finite = np.flatnonzero(np.isfinite(q).all(axis=1))
         free = (self.distances(q[finite]) >= self.clearance).all(axis=1)
-        kept = finite[contains(self.chart.problem.domain, q[finite]) & free]
+        kept = finite[self.chart.problem.domain.contains(q[finite]) & free]
         if len(kept) < len(q):
             raise self._build_error(path, s, q, int(np.setdiff1d(np.arange(len(q)), kept)[0]))
 
@@ -257,7 +257,7 @@ class MotionLimits:
         if not np.isfinite(q[k]).all():
             return self.build_lost_error(path, LostCurve(s[:k], q[:k], float(s[k])))
         where = path.describe_place(float(s[k]), self.chart.labels)
-        if not contains(self.chart.problem.domain, q[k]):
+        if not self.chart.problem.domain.contains(q[k]):
             reason = f"it leaves the domain, stopped by {Walls(self.chart.problem).worst(q[k])}"
             return PathError(f"the path cannot be followed {where}: {reason}{self._describe_reach(q[last])}")
         # Neither lost nor outside: an obstacle.
@@ -289,7 +289,7 @@ class MotionLimits:
 
     def measure_margins(self, q: Array, dq: Array, ddq: Array) -> Margins:
         """What a motion leaves, at its time stamps."""
-        low, high = bounds_of(self.chart.problem.domain)
+        low, high = self.chart.problem.domain.bounds
         room = np.minimum(q - low, high - q) / self.chart.problem.domain.half_width
         worst = int(np.argmin(room.min(axis=0)))
         bounded = bool(np.isfinite(room).any())
@@ -317,14 +317,14 @@ class Costs:
         """Residuals (P, k) and gradients (P, k, n) at joint positions (P, n)."""
         parts = [self._evaluate_boundaries(q), self._evaluate_task(q)]
         if self.limits.distances.obstacles:
-            values, gradients = self.limits.distances.with_gradients(q)
+            values, gradients = self.limits.distances.evaluate_gradients(q)
             residuals, slopes = _evaluate_inverse(values - self.limits.clearance, RULES.away, RULES.too_near)
             parts.append((residuals, slopes[..., None] * gradients))
         return np.concatenate([part[0] for part in parts], axis=1), np.concatenate([part[1] for part in parts], axis=1)
 
     def _evaluate_boundaries(self, q: Array) -> tuple[Array, Array]:
         domain = self.limits.chart.problem.domain
-        bounded = np.flatnonzero(np.isfinite(bounds_of(domain)[0]))
+        bounded = np.flatnonzero(np.isfinite(domain.bounds[0]))
         u = ((q - domain.centre) / domain.half_width)[:, bounded]
         # u / sqrt(1 - u^2) in half-widths, and a straight line where that grows too steep.
         near = np.clip(u, -RULES.inside, RULES.inside)

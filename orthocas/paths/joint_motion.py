@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthocas.errors import PathFileError
-from orthocas.tools.checks import Array, as_path, frozen_array
+from orthocas.tools.checks import Array, as_path, freeze_array
 from orthocas.tools.display import Shown, listed
-from orthocas.tools.files import published, require_replaceable, require_writable
+from orthocas.tools.files import publish, require_replaceable, require_writable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,9 +54,9 @@ class JointMotion(Shown):
         N, n, m = len(self.times), len(self.joint_names), self.x.shape[1]
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("q", "dq", "ddq"), (N, n))
         for name, shape in {**shapes, "times": (N,), "s": (N,), "x": (N, m), "xi": (N, n - m)}.items():
-            object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
+            object.__setattr__(self, name, freeze_array(name, getattr(self, name), shape))
         if self.left_over is not None:
-            object.__setattr__(self, "left_over", frozen_array("left_over", self.left_over, (n,)))
+            object.__setattr__(self, "left_over", freeze_array("left_over", self.left_over, (n,)))
 
     @property
     def closed(self) -> bool:
@@ -112,7 +112,7 @@ class JointMotion(Shown):
         """
         target = as_path("path", path)
         require_place(target, force)
-        with published(target.parent) as drafts:
+        with publish(target.parent) as drafts:
             (drafts / target.name).write_text(self._format_text(), encoding="utf-8", newline="")
 
     def _format_text(self) -> str:

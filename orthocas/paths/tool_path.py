@@ -12,11 +12,12 @@ from scipy.interpolate import CubicSpline
 from orthocas.charts.chart import Chart
 from orthocas.charts.phi import counted_on
 from orthocas.errors import InvalidValueError, ShapeError
-from orthocas.robots.spatial import rotations_of
+from orthocas.robots.spatial import build_rotations
 from orthocas.tasks.relative import Relative
 from orthocas.tools.batch import Batched
-from orthocas.tools.checks import Array, as_float_array, frozen_array
-from orthocas.tools.files import LONGEST, column_places, read_table
+from orthocas.tools.checks import Array, as_float_array, freeze_array
+from orthocas.tools.files import RULES as FILE_RULES
+from orthocas.tools.files import find_columns, read_table
 
 MOST_WAYPOINTS = 100_000
 
@@ -131,7 +132,7 @@ class TaskSpline:
         if not self._relative.turned:
             return rows
         first, p = np.split(rows.reshape(-1, rows.shape[-1]), [self._relative.first], axis=1)
-        R = rotations_of(p / np.linalg.norm(p, axis=1, keepdims=True))
+        R = build_rotations(p / np.linalg.norm(p, axis=1, keepdims=True))
         x = np.hstack([first, Batched(self._relative.task.components_function)(R)[0]])
         return np.asarray(x.reshape(*rows.shape[:-1], -1))
 
@@ -192,7 +193,7 @@ def _evaluate_function(name: str, function: Callable[[float], Any], s: float, si
         value = function(float(s))
     except Exception as error:
         raise InvalidValueError(f"{name}({s:g})", f"{type(error).__name__}: {error}", "a value") from None
-    return frozen_array(f"{name}({s:g})", value, (size,))
+    return freeze_array(f"{name}({s:g})", value, (size,))
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,5 +279,5 @@ def _find_columns(names: Sequence[str], chart: Chart) -> list[int]:
     for name in names:
         if name not in chart.labels:
             expected = f"{', '.join(task)}, and if the path has a schedule {', '.join(extra)}"
-            raise ValueError(f"line 1: unknown column {name[:LONGEST]!r}, expected {expected}")
-    return column_places(names, columns)
+            raise ValueError(f"line 1: unknown column {name[: FILE_RULES.cell]!r}, expected {expected}")
+    return find_columns(names, columns)

@@ -1,10 +1,11 @@
 """Robots: the numbers of a `pin.Model`, turned into CasADi kinematics and dynamics.
 
 - `robot` has `Robot`, and `tree` the plain numbers behind it (`KinematicTree`).
-- `kinematics`, `dynamics` and `spatial` build the CasADi expressions.
-- `files`, `homes`, `urdf_checks` and `mjcf` (with `mjcf_*` and `xml_*`) read URDF, SRDF and MJCF files.
-  `pinocchio_model` converts a `pin.Model` to a tree. `planar` builds planar arms.
-- `tool` moves the tip, and `tip_turn` compares its orientation with a reference.
+- `kinematics`, `dynamics` and `spatial` build the CasADi expressions; `kinematics` also moves the tip by a tool, and
+  compares its orientation with a reference.
+- `urdf` and `mjcf` read URDF, SRDF and MJCF files; `pinocchio_model` locks joints of a `pin.Model`, converts it to a
+  tree, and builds planar arms.
+- `obstacles` has solids and their distances to the links.
 """
 
 from orthocas.robots.robot import Robot

@@ -1,6 +1,7 @@
 """Mass matrix (composite rigid bodies), inverse dynamics (recursive Newton-Euler), and payloads."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -12,55 +13,53 @@ from orthocas.robots.tree import KinematicTree
 from orthocas.tools.checks import Array, as_float_array, require_finite
 
 _Z = ca.SX([0, 0, 1])
-_OF_BODY = {  # which of mass, mass times centre, and inertia xx, xy, xz, yy, yz, zz are not 0 after `_regroup`
+#: which of mass, mass times centre, and inertia xx, xy, xz, yy, yz, zz are not 0 after `_regroup`
+_OF_BODY = {
     "revolute": [1, 2, 4, 5, 6, 8, 9],
     "prismatic": list(range(10)),
 }
 PAYLOAD = 10  #: numbers of a payload
 _FORMS = "a mass, (4,) mass and centre, or (10,) mass, centre and inertia Ixx, Ixy, Ixz, Iyy, Iyz, Izz"
-_MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]  # places of Ixx, Ixy, Ixz, Iyy, Iyz, Izz in the matrix
-_INDEFINITE = 1e-6  # of the largest entry, as rounded inertias of data sheets have
-
-
-@dataclass
-class _Inertials:
-    """Inertial parameters of a body as expressions, about the body frame's origin."""
-
-    mass: ca.SX
-    moment: ca.SX  # m c, (3, 1)
-    inertia: ca.SX  # (3, 3)
+_MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]  #: places of Ixx, Ixy, Ixz, Iyy, Iyz, Izz in the matrix
+_INDEFINITE = 1e-6  #: of the largest entry of a payload's inertia, as rounded ones of data sheets have
 
 
 @dataclass
 class _Body:
-    """Inertial parameters about the body frame's origin."""
+    """Inertial parameters about the body frame's origin, as numbers or SX expressions."""
 
-    mass: float
-    moment: Array  # m c, (3,)
-    inertia: Array  # about the origin, (3, 3)
+    mass: Any
+    moment: Any  #: m c, (3,) or (3, 1)
+    inertia: Any  #: (3, 3)
 
 
-def mass_matrix(tree: KinematicTree, q: ca.SX, payload: ca.SX | None = None, inertials: ca.SX | None = None) -> ca.SX:
+def build_mass_matrix(
+    tree: KinematicTree, q: ca.SX, payload: ca.SX | None = None, inertials: ca.SX | None = None
+) -> ca.SX:
     """M(q), (n, n), symmetric positive definite, [kg m^2] for revolute joints. The diagonal includes rotor inertias.
 
     A payload (10, 1) is mass, centre in the tip frame, and inertia about it: Ixx, Ixy, Ixz, Iyy, Iyz, Izz. Inertials
-    are the numbers of `inertial_numbers`, if they are not those of the tree.
+    are the numbers of `collect_inertials`, if they are not those of the tree.
     """
-    joints = _joint_transforms(tree, q)
-    bodies = _bodies(tree, payload, inertials)
+    joints = _build_transforms(tree, q)
+    bodies = _build_bodies(tree, payload, inertials)
     mass, moment, inertia = ([getattr(body, name) for body in bodies] for name in ("mass", "moment", "inertia"))
     M = ca.SX.zeros(tree.n, tree.n)
     for i in reversed(range(tree.n)):
-        force, torque = _unit_acceleration_wrench(tree, i, mass[i], moment[i], inertia[i])
-        M[i, i] = _along_joint(tree, i, force, torque) + tree.armatures[i]
+        # Force, and torque about the origin, that give the body unit acceleration along its joint.
+        if tree.joint_kinds[i] == "prismatic":
+            force, torque = mass[i] * _Z, ca.cross(moment[i], _Z)
+        else:
+            force, torque = ca.cross(_Z, moment[i]), inertia[i][:, 2]
+        M[i, i] = _project_on_joint(tree, i, force, torque) + tree.armatures[i]
         j = i
         while tree.parents[j] >= 0:
-            force, torque = joints[j].wrench_to_parent(force, torque)
+            force, torque = joints[j].move_wrench(force, torque)
             j = tree.parents[j]
-            M[i, j] = M[j, i] = _along_joint(tree, j, force, torque)
+            M[i, j] = M[j, i] = _project_on_joint(tree, j, force, torque)
         parent = tree.parents[i]
         if parent >= 0:
-            m, mc, inert = joints[i].inertia_to_parent(mass[i], moment[i], inertia[i])
+            m, mc, inert = joints[i].move_inertia(mass[i], moment[i], inertia[i])
             mass[parent], moment[parent], inertia[parent] = (
                 mass[parent] + m,
                 moment[parent] + mc,
@@ -69,7 +68,7 @@ def mass_matrix(tree: KinematicTree, q: ca.SX, payload: ca.SX | None = None, ine
     return M
 
 
-def inverse_dynamics(
+def build_inverse_dynamics(
     tree: KinematicTree,
     q: ca.SX,
     dq: ca.SX,
@@ -79,12 +78,14 @@ def inverse_dynamics(
     inertials: ca.SX | None = None,
 ) -> ca.SX:
     """tau = M ddq + C dq + g, (n, 1) [N m] or [N], for a gravity acceleration (3,) in the world."""
-    joints = _joint_transforms(tree, q)
-    bodies = _bodies(tree, payload, inertials)
-    states: list[tuple[ca.SX, ca.SX, ca.SX]] = []  # angular velocity, angular acceleration matrix, linear acceleration
+    joints = _build_transforms(tree, q)
+    bodies = _build_bodies(tree, payload, inertials)
+    #: angular velocity, angular acceleration matrix, linear acceleration
+    states: list[tuple[ca.SX, ca.SX, ca.SX]] = []
     accelerations: list[ca.SX] = []
     at_rest = (ca.SX(3, 1), ca.SX(3, 3), constant(-gravity))
     for i, parent in enumerate(tree.parents):
+        # The parent's motion in the axes of the body, then what the joint adds.
         omega_p, U_p, a_p = states[parent] if parent >= 0 else at_rest
         alpha_p = accelerations[parent] if parent >= 0 else ca.SX(3, 1)
         to_child = joints[i].to_child
@@ -94,14 +95,14 @@ def inverse_dynamics(
         else:
             alpha += ca.cross(omega, _Z) * dq[i] + _Z * ddq[i]
             omega += _Z * dq[i]
-        # U v = alpha x v + omega x (omega x v): one matrix for all vectors fixed in the body
+        # U v = alpha x v + omega x (omega x v): one matrix for all vectors fixed in the body.
         U = skew(alpha) + omega @ omega.T - ca.SX.eye(3) * ca.dot(omega, omega)
         states.append((omega, U, a))
         accelerations.append(alpha)
-    return _joint_forces(tree, joints, bodies, states, accelerations) + ca.SX(ca.DM(tree.armatures)) * ddq
+    return _sum_wrenches(tree, joints, bodies, states, accelerations) + ca.SX(ca.DM(tree.armatures)) * ddq
 
 
-def forward_dynamics(
+def build_forward_dynamics(
     tree: KinematicTree, q: ca.SX, dq: ca.SX, tau: ca.SX, gravity: Array, inertials: ca.SX | None = None
 ) -> ca.SX:
     """ddq = M^-1 (tau - C dq - g), (n, 1), with M = L^T D L, from the tips to the base.
@@ -109,13 +110,13 @@ def forward_dynamics(
     In this order L keeps the zeros of M between joints of different branches ([F2008] Sec. 6.5).
     """
     tips_first = list(reversed(range(tree.n)))
-    M = mass_matrix(tree, q, inertials=inertials)[tips_first, tips_first]
+    M = build_mass_matrix(tree, q, inertials=inertials)[tips_first, tips_first]
     D, LT, order = ca.ldl(M, False)
-    force = (tau - bias(tree, q, dq, gravity, inertials=inertials))[tips_first]
+    force = (tau - build_bias(tree, q, dq, gravity, inertials=inertials))[tips_first]
     return ca.ldl_solve(force, D, LT, order)[tips_first]
 
 
-def bias(
+def build_bias(
     tree: KinematicTree,
     q: ca.SX,
     dq: ca.SX,
@@ -124,35 +125,36 @@ def bias(
     inertials: ca.SX | None = None,
 ) -> ca.SX:
     """C(q, dq) dq + g(q), (n, 1)."""
-    return inverse_dynamics(tree, q, dq, ca.SX(tree.n, 1), gravity, payload, inertials)
+    return build_inverse_dynamics(tree, q, dq, ca.SX(tree.n, 1), gravity, payload, inertials)
 
 
-def zero_momentum(tree: KinematicTree, q: ca.SX) -> ca.SX:
+def build_zero_momentum(tree: KinematicTree, q: ca.SX) -> ca.SX:
     """H(q) = [-M_bb^-1 M_ba; I], (n, a), for a base b that floats and a joints of the arms."""
     k = len(tree.floating)
-    M = mass_matrix(tree, q)
-    base_first = list(reversed(range(k)))  # L of L^T D L in the order of `forward_dynamics`
+    M = build_mass_matrix(tree, q)
+    # L of L^T D L is in the order of `build_forward_dynamics`.
+    base_first = list(reversed(range(k)))
     D, LT, order = ca.ldl(M[base_first, base_first], False)
     follows = ca.ldl_solve(M[base_first, k:], D, LT, order)[base_first, :]
     return ca.vertcat(-follows, ca.SX.eye(tree.n - k))
 
 
-def coriolis_product(tree: KinematicTree, q: ca.SX, v: ca.SX, w: ca.SX, payload: ca.SX | None = None) -> ca.SX:
+def build_coriolis_product(tree: KinematicTree, q: ca.SX, v: ca.SX, w: ca.SX, payload: ca.SX | None = None) -> ca.SX:
     """C(q, v) w with the Christoffel form of C, (n, 1), by polarisation of the quadratic form C(q, v) v.
 
     C(q, v) w = (c(v + w) - c(v - w)) / 4 with c(v) = C(q, v) v. It is bilinear and symmetric in (v, w).
     """
     weightless = np.zeros(3)
-    return (bias(tree, q, v + w, weightless, payload) - bias(tree, q, v - w, weightless, payload)) / 4
+    return (build_bias(tree, q, v + w, weightless, payload) - build_bias(tree, q, v - w, weightless, payload)) / 4
 
 
 @dataclass
 class _JointTransform:
     """Body i in its parent's frame: a constant rotation and a turn about z, which are cheaper than their product."""
 
-    rotation: ca.SX  # constant, (3, 3)
-    turn: ca.SX  # Rz(q) or the identity
-    offset: ca.SX  # origin of the body in the parent's frame
+    rotation: ca.SX  #: constant, (3, 3)
+    turn: ca.SX  #: Rz(q) or the identity
+    offset: ca.SX  #: origin of the body in the parent's frame
 
     def to_child(self, v: ca.SX) -> ca.SX:
         return self.turn.T @ (self.rotation.T @ v)
@@ -160,11 +162,11 @@ class _JointTransform:
     def to_parent(self, v: ca.SX) -> ca.SX:
         return self.rotation @ (self.turn @ v)
 
-    def wrench_to_parent(self, force: ca.SX, torque: ca.SX) -> tuple[ca.SX, ca.SX]:
+    def move_wrench(self, force: ca.SX, torque: ca.SX) -> tuple[ca.SX, ca.SX]:
         f = self.to_parent(force)
         return f, self.to_parent(torque) + ca.cross(self.offset, f)
 
-    def inertia_to_parent(self, mass: ca.SX, moment: ca.SX, inertia: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+    def move_inertia(self, mass: ca.SX, moment: ca.SX, inertia: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
         turned = self.rotation @ (self.turn @ inertia @ self.turn.T) @ self.rotation.T
         mc, r = self.to_parent(moment), self.offset
         shift = 2 * ca.dot(r, mc) * ca.SX.eye(3) - r @ mc.T - mc @ r.T
@@ -172,7 +174,7 @@ class _JointTransform:
         return mass, mc + mass * r, ca.triu2symm(ca.triu(turned + shift + steiner))
 
 
-def _joint_transforms(tree: KinematicTree, q: ca.SX) -> list[_JointTransform]:
+def _build_transforms(tree: KinematicTree, q: ca.SX) -> list[_JointTransform]:
     transforms = []
     for i in range(tree.n):
         rotation, offset = constant(tree.rotations[i]), constant(tree.translations[i])
@@ -183,10 +185,10 @@ def _joint_transforms(tree: KinematicTree, q: ca.SX) -> list[_JointTransform]:
     return transforms
 
 
-def _joint_forces(
+def _sum_wrenches(
     tree: KinematicTree,
     joints: list[_JointTransform],
-    bodies: list[_Inertials],
+    bodies: list[_Body],
     states: list[tuple[ca.SX, ca.SX, ca.SX]],
     accelerations: list[ca.SX],
 ) -> ca.SX:
@@ -195,32 +197,24 @@ def _joint_forces(
     torques = [ca.SX(3, 1)] * tree.n
     tau = ca.SX.zeros(tree.n)
     for i in reversed(range(tree.n)):
+        # The wrench of the body itself, and those of the bodies that it carries.
         omega, U, a = states[i]
         moment, inertia = bodies[i].moment, bodies[i].inertia
         force = forces[i] + bodies[i].mass * a + U @ moment
         torque = torques[i] + inertia @ accelerations[i] + ca.cross(omega, inertia @ omega) + ca.cross(moment, a)
-        tau[i] = _along_joint(tree, i, force, torque)
+        tau[i] = _project_on_joint(tree, i, force, torque)
         parent = tree.parents[i]
         if parent >= 0:
-            f, n = joints[i].wrench_to_parent(force, torque)
+            f, n = joints[i].move_wrench(force, torque)
             forces[parent], torques[parent] = forces[parent] + f, torques[parent] + n
     return tau
 
 
-def _along_joint(tree: KinematicTree, i: int, force: ca.SX, torque: ca.SX) -> ca.SX:
+def _project_on_joint(tree: KinematicTree, i: int, force: ca.SX, torque: ca.SX) -> ca.SX:
     return force[2] if tree.joint_kinds[i] == "prismatic" else torque[2]
 
 
-def _unit_acceleration_wrench(
-    tree: KinematicTree, i: int, mass: ca.SX, moment: ca.SX, inertia: ca.SX
-) -> tuple[ca.SX, ca.SX]:
-    """Force, and torque about the origin, that give body i unit acceleration along its joint."""
-    if tree.joint_kinds[i] == "prismatic":
-        return mass * _Z, ca.cross(moment, _Z)
-    return ca.cross(_Z, moment), inertia[:, 2]
-
-
-def inertial_numbers(tree: KinematicTree) -> Array:
+def collect_inertials(tree: KinematicTree) -> Array:
     """The inertial parameters on which the dynamics depend, (k,): 7 of each revolute joint's body, 10 of others."""
     numbers = []
     for kind, body in zip(tree.joint_kinds, _regroup(tree), strict=True):
@@ -229,50 +223,51 @@ def inertial_numbers(tree: KinematicTree) -> Array:
     return np.concatenate(numbers)
 
 
-def first_moments(tree: KinematicTree) -> tuple[list[int], tuple[int, ...]]:
-    """Places among `inertial_numbers` of what gravity acts on, and the joint that carries each.
+def find_first_moments(tree: KinematicTree) -> tuple[list[int], tuple[int, ...]]:
+    """Places among `collect_inertials` of what gravity acts on, and the joint that carries each.
 
     These are mass times centre across the axis for revolute joints, and the mass for prismatic ones.
     """
-    found: list[tuple[int, int]] = []
+    places: list[int] = []
+    joints: list[int] = []
     start = 0
     for joint, kind in enumerate(tree.joint_kinds):
-        wanted = (0,) if kind == "prismatic" else (1, 2)
-        found += [(start + i, joint) for i, place in enumerate(_OF_BODY[kind]) if place in wanted]
-        start += len(_OF_BODY[kind])
-    return [place for place, _ in found], tuple(joint for _, joint in found)
+        moments = (0,) if kind == "prismatic" else (1, 2)
+        new = [start + i for i, place in enumerate(_OF_BODY[kind]) if place in moments]
+        places, joints, start = places + new, joints + [joint] * len(new), start + len(_OF_BODY[kind])
+    return places, tuple(joints)
 
 
-def _given_bodies(tree: KinematicTree, inertials: ca.SX) -> list[_Inertials]:
-    """Bodies with the numbers of `inertial_numbers`."""
+def _unpack_inertials(tree: KinematicTree, inertials: ca.SX) -> list[_Body]:
+    """Bodies with the numbers of `collect_inertials`."""
     bodies, start = [], 0
     for kind in tree.joint_kinds:
         ten = ca.SX(10, 1)
         for place in _OF_BODY[kind]:
             ten[place], start = inertials[start], start + 1
-        bodies.append(_Inertials(ten[0], ten[1:4], ca.reshape(ten[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3)))
+        bodies.append(_Body(ten[0], ten[1:4], ca.reshape(ten[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3)))
     return bodies
 
 
-def _bodies(tree: KinematicTree, payload: ca.SX | None, inertials: ca.SX | None) -> list[_Inertials]:
+def _build_bodies(tree: KinematicTree, payload: ca.SX | None, inertials: ca.SX | None) -> list[_Body]:
     """The regrouped bodies, with the payload on the one that carries the tip."""
     if inertials is None:
-        bodies = [_Inertials(ca.SX(b.mass), constant(b.moment), constant(b.inertia)) for b in _regroup(tree)]
+        bodies = [_Body(ca.SX(b.mass), constant(b.moment), constant(b.inertia)) for b in _regroup(tree)]
     else:
-        bodies = _given_bodies(tree, inertials)
+        bodies = _unpack_inertials(tree, inertials)
     if payload is not None and tree.tip_parent >= 0:
-        body = bodies[tree.tip_parent]
-        mass, moment, inertia = _payload(tree, payload)
-        bodies[tree.tip_parent] = _Inertials(body.mass + mass, body.moment + moment, body.inertia + inertia)
+        # Mass, mass times centre, and inertia about the body's origin, in the frame of the tip's body.
+        body, R, p, mass = (
+            bodies[tree.tip_parent],
+            constant(tree.tip_rotation),
+            constant(tree.tip_translation),
+            payload[0],
+        )
+        centre = p + R @ payload[1:4]
+        turned = R @ ca.reshape(payload[4:][_MATRIX], 3, 3) @ R.T
+        inertia = turned + mass * (ca.dot(centre, centre) * ca.SX.eye(3) - centre @ centre.T)
+        bodies[tree.tip_parent] = _Body(body.mass + mass, body.moment + mass * centre, body.inertia + inertia)
     return bodies
-
-
-def _payload(tree: KinematicTree, payload: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Mass, mass times centre (3, 1), and inertia (3, 3) about the body's origin, in the frame of the tip's body."""
-    R, p, mass = constant(tree.tip_rotation), constant(tree.tip_translation), payload[0]
-    centre = p + R @ payload[1:4]
-    turned = R @ ca.reshape(payload[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3) @ R.T
-    return mass, mass * centre, turned + mass * (ca.dot(centre, centre) * ca.SX.eye(3) - centre @ centre.T)
 
 
 def _regroup(tree: KinematicTree) -> list[_Body]:
@@ -307,7 +302,7 @@ def _attach(parent: _Body, child: _Body, R: Array, p: Array) -> None:
     parent.mass += child.mass
 
 
-def payload_numbers(name: str, value: ArrayLike) -> Array:
+def check_payload(name: str, value: ArrayLike) -> Array:
     """The ten numbers of a payload, read-only.
 
     Args:
@@ -318,12 +313,13 @@ def payload_numbers(name: str, value: ArrayLike) -> Array:
     Raises:
         InvalidValueError: for another form, a negative mass, or an inertia that no body has.
     """
-    given = np.atleast_1d(as_float_array(name, value))
-    if given.shape not in ((1,), (4,), (PAYLOAD,)):
-        raise InvalidValueError(f"shape of {name}", given.shape, _FORMS)
-    require_finite(name, given)
+    values = np.atleast_1d(as_float_array(name, value))
+    if values.shape not in ((1,), (4,), (PAYLOAD,)):
+        raise InvalidValueError(f"shape of {name}", values.shape, _FORMS)
+    require_finite(name, values)
+    # Missing numbers are 0: a point mass at the tip, or one elsewhere.
     numbers = np.zeros(PAYLOAD)
-    numbers[: len(given)] = given
+    numbers[: len(values)] = values
     if numbers[0] < 0:
         raise InvalidValueError(f"mass of {name}", numbers[0], "a mass >= 0")
     inertia = numbers[4:][_MATRIX].reshape(3, 3)
@@ -334,23 +330,24 @@ def payload_numbers(name: str, value: ArrayLike) -> Array:
     return numbers
 
 
-def with_payload(tree: KinematicTree, payload: ArrayLike) -> KinematicTree:
+def add_payload(tree: KinematicTree, payload: ArrayLike) -> KinematicTree:
     """The tree with a payload merged into the body that carries the tip; unchanged if that is the base."""
-    numbers, i = payload_numbers("payload", payload), tree.tip_parent
+    numbers, i = check_payload("payload", payload), tree.tip_parent
     mass, centre, inertia = tree.masses[i], tree.centres[i], tree.inertias[i]
     total = mass + numbers[0]
     if i < 0 or total == 0:
         return tree
     R = tree.tip_rotation
     added = tree.tip_translation + R @ numbers[1:4]
+    # The joint centre of mass, and both inertias about it (Steiner).
     together = (mass * centre + numbers[0] * added) / total
     turned = R @ numbers[4:][_MATRIX].reshape(3, 3) @ R.T
     inertia = inertia + turned + _steiner(mass, centre - together) + _steiner(numbers[0], added - together)
     return replace(
         tree,
-        masses=_replaced(tree.masses, i, total),
-        centres=_replaced(tree.centres, i, together),
-        inertias=_replaced(tree.inertias, i, inertia),
+        masses=_replace(tree.masses, i, total),
+        centres=_replace(tree.centres, i, together),
+        inertias=_replace(tree.inertias, i, inertia),
     )
 
 
@@ -358,7 +355,7 @@ def _steiner(mass: float, offset: Array) -> Array:
     return np.asarray(mass * (offset @ offset * np.eye(3) - np.outer(offset, offset)))
 
 
-def _replaced(values: Array, i: int, value: ArrayLike) -> Array:
+def _replace(values: Array, i: int, value: ArrayLike) -> Array:
     changed = values.copy()
     changed[i] = value
     return changed

@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike
 from orthocas.errors import InvalidValueError, units_hint
 from orthocas.robots.spatial import (
     constant,
+    find_quaternion,
     half_angle_vector,
-    quaternion_of,
-    quaternion_product,
+    multiply_quaternions,
+    rotate_z_to,
     rotation_matrix,
-    rotation_z_to,
     skew,
     snap,
     tilt,
@@ -22,11 +22,12 @@ from orthocas.robots.spatial import (
     turn_about,
 )
 from orthocas.robots.tree import Frame, KinematicTree
-from orthocas.tools.checks import Array, as_float_array, frozen_array, require_finite, require_known
+from orthocas.tools.checks import Array, as_float_array, freeze_array, require_finite, require_known
 
 _AXES = ("x", "y", "z")
-_LEAST_SQUARE = 1e-24  # of a cosine
-_KINDS = {  # whether the position comes first, and whether the whole orientation counts
+_LEAST_SQUARE = 1e-24  #: of a cosine
+#: whether the position comes first, and whether the whole orientation counts
+_KINDS = {
     "orientation": (False, True),
     "pose": (True, True),
     "axis": (False, False),
@@ -36,15 +37,15 @@ _KINDS = {  # whether the position comes first, and whether the whole orientatio
 Pose = tuple[ca.SX, ca.SX]  #: rotation (3, 3) and position (3, 1) [m] in the world
 
 
-def body_poses(tree: KinematicTree, q: ca.SX) -> list[Pose]:
+def build_body_poses(tree: KinematicTree, q: ca.SX) -> list[Pose]:
     """Rotation and position of every body frame in the world, for q (n, 1)."""
     poses: list[Pose] = []
     for i, parent in enumerate(tree.parents):
-        poses.append(_next(tree, q, i, poses[parent] if parent >= 0 else (ca.SX.eye(3), ca.SX.zeros(3))))
+        poses.append(_move_to_child(tree, q, i, poses[parent] if parent >= 0 else (ca.SX.eye(3), ca.SX.zeros(3))))
     return poses
 
 
-def _next(tree: KinematicTree, q: ca.SX, i: int, pose: Pose) -> Pose:
+def _move_to_child(tree: KinematicTree, q: ca.SX, i: int, pose: Pose) -> Pose:
     """Pose of body i, from that of its parent."""
     R, p = pose
     R_joint, p_joint = R @ constant(tree.rotations[i]), p + R @ constant(tree.translations[i])
@@ -53,60 +54,60 @@ def _next(tree: KinematicTree, q: ca.SX, i: int, pose: Pose) -> Pose:
     return R_joint @ turn(q[i]), p_joint
 
 
-def frame_pose(tree: KinematicTree, q: ca.SX, frame: Frame, base: Frame | None = None) -> Pose:
+def build_frame_pose(tree: KinematicTree, q: ca.SX, frame: Frame, base: Frame | None = None) -> Pose:
     """Rotation and position of a frame in the world, or in another frame, for q (n, 1).
 
     Joints that carry both frames take no part.
     """
-    shared = _shared(tree, frame, base)
-    R, p = _placed(tree, q, frame, shared)
+    shared = _find_shared(tree, frame, base)
+    R, p = _place_frame(tree, q, frame, shared)
     if base is None:
         return R, p
-    across, origin = _placed(tree, q, base, shared)
+    across, origin = _place_frame(tree, q, base, shared)
     return across.T @ R, across.T @ (p - origin)
 
 
-def frame_jacobian(tree: KinematicTree, q: ca.SX, frame: Frame, base: Frame | None = None) -> ca.SX:
+def build_frame_jacobian(tree: KinematicTree, q: ca.SX, frame: Frame, base: Frame | None = None) -> ca.SX:
     """Geometric Jacobian of a frame, (6, n), in axes of the world, or of another frame and as seen from it.
 
     d(position)/dt = J[:3] dq, angular velocity = J[3:] dq.
     """
-    shared = _shared(tree, frame, base)
-    point = _placed(tree, q, frame, shared)[1]
-    J = _moving(tree, q, frame.parent, point, shared)
+    shared = _find_shared(tree, frame, base)
+    point = _place_frame(tree, q, frame, shared)[1]
+    J = _build_jacobian(tree, q, frame.parent, point, shared)
     if base is None:
         return J
-    across = _placed(tree, q, base, shared)[0]
-    J -= _moving(tree, q, base.parent, point, shared)
+    across = _place_frame(tree, q, base, shared)[0]
+    J -= _build_jacobian(tree, q, base.parent, point, shared)
     return ca.vertcat(across.T @ J[:3, :], across.T @ J[3:, :])
 
 
-def centre_of_mass(tree: KinematicTree, q: ca.SX) -> ca.SX:
+def build_centre_of_mass(tree: KinematicTree, q: ca.SX) -> ca.SX:
     """Centre of mass of all bodies that joints move, in the world, (3, 1)."""
-    places = [p + R @ constant(centre) for (R, p), centre in zip(body_poses(tree, q), tree.centres, strict=True)]
+    places = [p + R @ constant(centre) for (R, p), centre in zip(build_body_poses(tree, q), tree.centres, strict=True)]
     total: ca.SX = sum(mass * place for mass, place in zip(tree.masses, places, strict=True)) / tree.masses.sum()
     return total
 
 
-def _shared(tree: KinematicTree, frame: Frame, base: Frame | None) -> list[int]:
+def _find_shared(tree: KinematicTree, frame: Frame, base: Frame | None) -> list[int]:
     """The bodies that carry two frames, from the base on; none if the second is the world."""
     pairs = zip(tree.carriers(frame.parent), tree.carriers(-1 if base is None else base.parent), strict=False)
     return [body for body, other in pairs if body == other]
 
 
-def _placed(tree: KinematicTree, q: ca.SX, frame: Frame, shared: list[int]) -> Pose:
+def _place_frame(tree: KinematicTree, q: ca.SX, frame: Frame, shared: list[int]) -> Pose:
     """Pose of a frame in the last of the shared bodies that carry it, or in the world."""
     R, p = ca.SX.eye(3), ca.SX.zeros(3)
     for body in tree.carriers(frame.parent)[len(shared) :]:
-        R, p = _next(tree, q, body, (R, p))
+        R, p = _move_to_child(tree, q, body, (R, p))
     return R @ constant(frame.rotation), p + R @ constant(frame.translation)
 
 
-def _moving(tree: KinematicTree, q: ca.SX, carrier: int, point: ca.SX, shared: list[int]) -> ca.SX:
+def _build_jacobian(tree: KinematicTree, q: ca.SX, carrier: int, point: ca.SX, shared: list[int]) -> ca.SX:
     """Jacobian (6, n) of a point and of the frames of a body, by the joints between it and the shared bodies."""
     J, pose = ca.SX(6, tree.n), (ca.SX.eye(3), ca.SX.zeros(3))
     for i in tree.carriers(carrier)[len(shared) :]:
-        pose = _next(tree, q, i, pose)
+        pose = _move_to_child(tree, q, i, pose)
         axis = pose[0][:, 2]
         if tree.joint_kinds[i] == "prismatic":
             J[:3, i] = axis
@@ -115,27 +116,27 @@ def _moving(tree: KinematicTree, q: ca.SX, carrier: int, point: ca.SX, shared: l
     return J
 
 
-def tip_pose(tree: KinematicTree, q: ca.SX) -> Pose:
+def build_tip_pose(tree: KinematicTree, q: ca.SX) -> Pose:
     """Rotation and position of the tip frame in the world, for q (n, 1)."""
-    return frame_pose(tree, q, tree.tip)
+    return build_frame_pose(tree, q, tree.tip)
 
 
-def tip_jacobian(tree: KinematicTree, q: ca.SX) -> ca.SX:
+def build_tip_jacobian(tree: KinematicTree, q: ca.SX) -> ca.SX:
     """Geometric Jacobian of the tip in world axes, (6, n): d(position)/dt = J[:3] dq, angular velocity = J[3:] dq."""
-    return frame_jacobian(tree, q, tree.tip)
+    return build_frame_jacobian(tree, q, tree.tip)
 
 
-def point_jacobian(tree: KinematicTree, q: ca.SX, body: int, point: Array) -> ca.SX:
+def build_point_jacobian(tree: KinematicTree, q: ca.SX, body: int, point: Array) -> ca.SX:
     """Jacobian (3, n) of a point (3,) [m] that is fixed in a body's frame: d(position in the world)/dt = J dq."""
-    return frame_jacobian(tree, q, Frame("point", body, np.eye(3), point))[:3, :]
+    return build_frame_jacobian(tree, q, Frame("point", body, np.eye(3), point))[:3, :]
 
 
-def joint_points(tree: KinematicTree, q: ca.SX) -> ca.SX:
+def build_joint_points(tree: KinematicTree, q: ca.SX) -> ca.SX:
     """Base, origins of the joints that move the tip, and the tip, (3, points), in the world: a line to draw.
 
     With further tips, the line goes to these first, and back along their joints.
     """
-    poses, points = body_poses(tree, q), [ca.SX.zeros(3)]
+    poses, points = build_body_poses(tree, q), [ca.SX.zeros(3)]
     here: list[int] = []
     for name in (*reversed(tree.tips), tree.tip_name):
         frame = tree.frame(name)
@@ -144,7 +145,7 @@ def joint_points(tree: KinematicTree, q: ca.SX) -> ca.SX:
         shared = len(here) - len(back)
         points += [poses[body][1] for body in [*reversed(back), *here[shared - 1 : shared]]]
         points += [poses[body][1] for body in chain[shared:]]
-        points.append(frame_pose(tree, q, frame)[1])
+        points.append(build_frame_pose(tree, q, frame)[1])
         here = chain
     return ca.horzcat(*points)
 
@@ -162,7 +163,7 @@ class TipTurn:
             require_known("axis of the tip", self.axis, _AXES)
 
     @classmethod
-    def of_kind(cls, kind: str) -> Self | None:
+    def from_kind(cls, kind: str) -> Self | None:
         """Build from a task's kind: orientation, pose:z, axis, axis:x, position+axis, .... None for other kinds."""
         what, _, axis = kind.partition(":")
         if what not in _KINDS:
@@ -198,29 +199,30 @@ class TipTurn:
             to_differentiate: use the formula without cases, which loses digits next to half a turn.
         """
         if self.axis is None:
-            turns = half_angle_vector(turned) if to_differentiate else 2 * quaternion_of(turned)[1:]
+            turns = half_angle_vector(turned) if to_differentiate else 2 * find_quaternion(turned)[1:]
         else:
-            turns = self._about_axis(turned, None if to_differentiate else quaternion_of(turned))
+            turns = self._split_about_axis(turned, None if to_differentiate else find_quaternion(turned))
         return ca.vertcat(position, turns) if self.with_position else turns
 
     def quaternion(self, turns: ca.SX) -> ca.SX:
         """The rotation (w, x, y, z) that the components of a whole orientation (3, 1) describe, w >= 0 without axis."""
         half = turns / 2
         if self.axis is None:
-            return ca.vertcat(_cosine(half), half)
+            return ca.vertcat(_compute_cosine(half), half)
         axis = _AXES.index(self.axis)
         i, j = _others(axis)
         tilted, along, spun = ca.SX(3, 1), ca.SX(3, 1), ca.SX(3, 1)
         tilted[i], tilted[j], along[axis], spun[axis] = half[0], half[1], 1, ca.sin(half[2])
         tilting = ca.cross(along, tilted)
-        return quaternion_product(ca.vertcat(_cosine(tilting), tilting), ca.vertcat(ca.cos(half[2]), spun))
+        return multiply_quaternions(ca.vertcat(_compute_cosine(tilting), tilting), ca.vertcat(ca.cos(half[2]), spun))
 
     def of_quaternion(self, p: ca.SX) -> ca.SX:
         """The components of a whole orientation (3, 1) that a unit quaternion (w, x, y, z) describes."""
         if self.axis is None:
             return 2 * p[1:] * ca.if_else(p[0] < 0, -1, 1)
         cross = skew(p[1:])
-        return self._about_axis(ca.SX.eye(3) + 2 * (p[0] * cross + cross @ cross), p * ca.if_else(p[0] < 0, -1, 1))
+        turned = ca.SX.eye(3) + 2 * (p[0] * cross + cross @ cross)
+        return self._split_about_axis(turned, p * ca.if_else(p[0] < 0, -1, 1))
 
     @property
     def order(self) -> Array:
@@ -232,7 +234,7 @@ class TipTurn:
         tilting = -np.array(ca.DM(skew(ca.SX(along))))
         return np.vstack([tilting[_others(axis)], along])
 
-    def _about_axis(self, turned: ca.SX, p: ca.SX | None) -> ca.SX:
+    def _split_about_axis(self, turned: ca.SX, p: ca.SX | None) -> ca.SX:
         """Tilt and turn of a rotation matrix, with its quaternion (w >= 0) unless they are to be differentiated."""
         assert self.axis is not None
         axis = _AXES.index(self.axis)
@@ -251,11 +253,12 @@ class TipTurn:
         rows = turning
         if self.axis is not None:
             axis = _AXES.index(self.axis)
-            tilting = -skew(ca.SX(np.eye(3)[axis])) @ turning  # how fast the axis itself moves
+            # How fast the axis itself moves.
+            tilting = -skew(ca.SX(np.eye(3)[axis])) @ turning
             rows = ca.vertcat(tilting[_others(axis), :], *([turning[axis, :]] if self.whole else []))
         return ca.vertcat(moving, rows) if self.with_position else rows
 
-    def distance_from_half_a_turn(self, x: Array) -> Array:
+    def measure_half_turn_distance(self, x: Array) -> Array:
         """cos(angle / 2) of the larger of tilt and turn, at task values (N, m), (N,): 0 where the components end."""
         turns = x[:, 3:] if self.with_position else x
         angles = 2 * np.arcsin(np.minimum(np.linalg.norm(turns[:, : 3 if self.axis is None else 2], axis=1) / 2, 1.0))
@@ -265,7 +268,7 @@ class TipTurn:
         return margin
 
 
-def _cosine(sines: ca.SX) -> ca.SX:
+def _compute_cosine(sines: ca.SX) -> ca.SX:
     """The positive cosine of half an angle, from sines (3, 1) times an axis; its derivative is finite."""
     return ca.sqrt(ca.fmax(1 - ca.sumsqr(sines), _LEAST_SQUARE))
 
@@ -274,19 +277,19 @@ def _others(axis: int) -> list[int]:
     return [k for k in range(3) if k != axis]
 
 
-def frame_along(direction: ArrayLike, axis: str) -> Array:
+def align_frame(direction: ArrayLike, axis: str) -> Array:
     """A rotation (3, 3) that takes a coordinate axis to a direction (3,).
 
     Raises:
         ShapeError, InvalidValueError: if the direction is zero or not (3,).
     """
-    wanted = frozen_array("reference", direction, (3,))
-    if not wanted.any():
-        raise InvalidValueError("reference", wanted.tolist(), "a direction other than zero")
-    return np.roll(rotation_z_to(wanted), _AXES.index(axis) - 2, axis=1)
+    target = freeze_array("reference", direction, (3,))
+    if not target.any():
+        raise InvalidValueError("reference", target.tolist(), "a direction other than zero")
+    return np.roll(rotate_z_to(target), _AXES.index(axis) - 2, axis=1)
 
 
-def with_tool(tree: KinematicTree, tool: ArrayLike) -> KinematicTree:
+def add_tool(tree: KinematicTree, tool: ArrayLike) -> KinematicTree:
     """The tree with its tip moved: tip pose = old tip pose times the tool's transform. The tool has no mass.
 
     Args:
@@ -296,7 +299,7 @@ def with_tool(tree: KinematicTree, tool: ArrayLike) -> KinematicTree:
     Raises:
         InvalidValueError: if the tool has another form, or numbers that look like millimetres or degrees.
     """
-    R, p = _transform(tool)
+    R, p = _read_tool(tool)
     return replace(
         tree,
         tip_name=f"{tree.tip_name} + tool",
@@ -305,7 +308,7 @@ def with_tool(tree: KinematicTree, tool: ArrayLike) -> KinematicTree:
     )
 
 
-def _transform(tool: ArrayLike) -> tuple[Array, Array]:
+def _read_tool(tool: ArrayLike) -> tuple[Array, Array]:
     """Rotation (3, 3) and position (3,) of a tool."""
     values = as_float_array("tool", tool)
     require_finite("tool", values)
@@ -317,19 +320,14 @@ def _transform(tool: ArrayLike) -> tuple[Array, Array]:
             raise InvalidValueError("last row of tool", values[3].tolist(), "[0, 0, 0, 1]")
         return rotation_matrix("rotation of tool", values[:3, :3]), values[:3, 3]
     if values.shape == (6,):
-        return _from_angles(*values[3:]), values[:3]
-    if values.shape == (3,):
-        return np.eye(3), values
-    raise InvalidValueError("shape of tool", values.shape, "(3,), (6,) or (4, 4)")
-
-
-def _from_angles(roll: float, pitch: float, yaw: float) -> Array:
-    """Rz(yaw) Ry(pitch) Rx(roll), fixed axes as in URDF."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
-    return np.array(
-        [
+        # Rz(yaw) Ry(pitch) Rx(roll), about fixed axes as in URDF.
+        (cr, cp, cy), (sr, sp, sy) = np.cos(values[3:]), np.sin(values[3:])
+        turned = [
             [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
             [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
             [-sp, cp * sr, cp * cr],
         ]
-    )
+        return np.array(turned), values[:3]
+    if values.shape == (3,):
+        return np.eye(3), values
+    raise InvalidValueError("shape of tool", values.shape, "(3,), (6,) or (4, 4)")

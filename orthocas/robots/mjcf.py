@@ -9,17 +9,18 @@ import numpy as np
 import pinocchio as pin
 
 from orthocas.errors import RobotError, one_line
-from orthocas.robots.xml import MOST_LINKS, read_xml
-from orthocas.tools.checks import Array, as_path, of_extra
+from orthocas.robots.urdf import RULES, read_xml
+from orthocas.tools.checks import Array, as_path, import_extra
 
-_WORDS = ("name", "class", "childclass", "joint", "body", "file", "mesh", "material")  # attributes that hold names
+#: attributes that hold names
+_WORDS = ("name", "class", "childclass", "joint", "body", "file", "mesh", "material")
 
 
-def model_from_mjcf(source: Any) -> pin.Model:
+def read_mjcf(source: Any) -> pin.Model:
     """The kinematics, masses, armatures, limits of position and effort, and gravity of an MJCF file.
 
     MuJoCo's own compiler reads the file, with meshes, includes, default classes, attached and replicated bodies. The
-    model has a frame for every body, named site and joint. If they share a name, `frame_index` prefers the body to the
+    model has a frame for every body, named site and joint. If they share a name, `find_frame` prefers the body to the
     site, and the site to the joint. Bodies and joints without a name are called body<i> and joint<i>, with MuJoCo's
     indices i. Named keyframes become reference configurations.
 
@@ -37,22 +38,23 @@ def model_from_mjcf(source: Any) -> pin.Model:
         RobotError: if MuJoCo refuses the file, or the model has no joint, armatures of tendons or actuators, or
             flexible bodies.
     """
-    mujoco = of_extra("mujoco", "reading MJCF files", "mujoco")
+    mujoco = import_extra("mujoco", "reading MJCF files", "mujoco")
     if isinstance(source, mujoco.MjModel):
-        return _converted(mujoco, source, "the model")
+        return _convert(mujoco, source, "the model")
     source = as_path("path", source)
-    root = read_xml(source, "MJCF", "mujoco")  # bounds its size and depth, and refuses document types
-    if sum(1 for _ in root.iter("body")) > MOST_LINKS:
-        raise RobotError(f"{source} has more than {MOST_LINKS} bodies")
-    _require_numbers(root, source)
+    # The bounds of size and depth, and no document types, protect MuJoCo's parser.
+    root = read_xml(source, "MJCF", "mujoco")
+    if sum(1 for _ in root.iter("body")) > RULES.links:
+        raise RobotError(f"{source} has more than {RULES.links} bodies")
+    _check_numbers(root, source)
     try:
         compiled = mujoco.MjModel.from_xml_path(str(source))
     except ValueError as error:
         raise RobotError(f"MuJoCo refuses {source}: {one_line(str(error))}") from None
-    return _converted(mujoco, compiled, str(source))
+    return _convert(mujoco, compiled, str(source))
 
 
-def _require_numbers(root: Element, source: str | Path) -> None:
+def _check_numbers(root: Element, source: str | Path) -> None:
     """Refuse NaN, of which MuJoCo only prints a warning."""
     for element in root.iter():
         for attribute, value in element.attrib.items():
@@ -60,18 +62,19 @@ def _require_numbers(root: Element, source: str | Path) -> None:
                 raise RobotError(f"{source}: {attribute} of <{element.tag}> is '{value}', expected finite numbers")
 
 
-def _converted(mujoco: Any, compiled: Any, name: str) -> pin.Model:
+def _convert(mujoco: Any, compiled: Any, name: str) -> pin.Model:
     _refuse_unread(compiled, name)
     model = pin.Model()
     off = bool(compiled.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     model.gravity.linear = np.zeros(3) if off else compiled.opt.gravity
-    carriers = [(0, pin.SE3.Identity())]  # of each body: the joint that moves it, and its pose in the joint's frame
+    # Of each body: the joint that moves it, and its pose in the joint's frame.
+    carriers = [(0, pin.SE3.Identity())]
     for i in range(1, compiled.nbody):
         carriers.append(_add_body(mujoco, model, compiled, i, *carriers[compiled.body_parentid[i]]))
     for i in range(compiled.nsite):
         if compiled.site(i).name:
             joint, placement = carriers[compiled.site_bodyid[i]]
-            there = placement * _pose(compiled.site_pos[i], compiled.site_quat[i])
+            there = placement * _build_pose(compiled.site_pos[i], compiled.site_quat[i])
             model.addFrame(pin.Frame(compiled.site(i).name, joint, there, pin.FrameType.OP_FRAME))
     for i in range(compiled.nkey):
         if compiled.key(i).name:
@@ -83,8 +86,9 @@ def _refuse_unread(compiled: Any, name: str) -> None:
     """Refuse what changes the mass matrix and is not read."""
     if not compiled.njnt:
         raise RobotError(f"{name} has no joint, expected at least one")
-    if compiled.nbody - 1 > MOST_LINKS:
-        raise RobotError(f"{name} has more than {MOST_LINKS} bodies")
+    if compiled.nbody - 1 > RULES.links:
+        raise RobotError(f"{name} has more than {RULES.links} bodies")
+    # Numbers and names must be finite and readable.
     placed = (
         "body_pos",
         "body_quat",
@@ -102,6 +106,7 @@ def _refuse_unread(compiled: Any, name: str) -> None:
         raise RobotError(f"{name} has names that are not UTF-8, expected a file in UTF-8") from None
     if not all(np.isfinite(getattr(compiled, part)).all() for part in placed):
         raise RobotError(f"{name} holds numbers that are not finite")
+    # Flexible bodies and armatures of tendons and actuators change the mass matrix.
     if compiled.nflex:
         raise RobotError(f"{name} has a flexible body, which orthocas does not support")
     for kind in ("tendon", "actuator"):
@@ -113,11 +118,12 @@ def _refuse_unread(compiled: Any, name: str) -> None:
 
 def _add_body(mujoco: Any, model: pin.Model, compiled: Any, i: int, joint: int, placement: pin.SE3) -> Any:
     """Add a body to the joint that moves its parent. Returns the joint that moves it, and its pose in that frame."""
-    placement = placement * _pose(compiled.body_pos[i], compiled.body_quat[i])
+    placement = placement * _build_pose(compiled.body_pos[i], compiled.body_quat[i])
     for k in range(compiled.body_jntadr[i], compiled.body_jntadr[i] + compiled.body_jntnum[i]):
         joint, placement = _add_joint(mujoco, model, compiled, k, joint, placement)
     model.addFrame(pin.Frame(compiled.body(i).name or f"body{i}", joint, placement, pin.FrameType.BODY))
-    if joint:  # bodies fixed to the world load no joint
+    # Bodies fixed to the world load no joint.
+    if joint:
         turn = pin.Quaternion(*compiled.body_iquat[i]).matrix()
         inertia = turn @ np.diag(compiled.body_inertia[i]) @ turn.T
         model.appendBodyToJoint(
@@ -137,11 +143,12 @@ def _add_joint(mujoco: Any, model: pin.Model, compiled: Any, k: int, parent: int
         index = model.addJoint(parent, pin.JointModelSpherical(), placement * anchor, name)
     else:
         slides, axis = kind == mujoco.mjtJoint.mjJNT_SLIDE, compiled.jnt_axis[k].copy()
-        back = -axis * compiled.qpos0[compiled.jnt_qposadr[k]]  # in the pose of the file its position is `ref`
+        # In the pose of the file, the position of the joint is `ref`.
+        back = -axis * compiled.qpos0[compiled.jnt_qposadr[k]]
         shift = pin.SE3(np.eye(3), back) if slides else pin.SE3(pin.exp3(back), np.zeros(3))
         moved = (pin.JointModelPrismaticUnaligned if slides else pin.JointModelRevoluteUnaligned)(axis)
         lower, upper = compiled.jnt_range[k] if compiled.jnt_limited[k] else (-np.inf, np.inf)
-        limits = (np.array([value]) for value in (_effort(mujoco, compiled, k), np.inf, lower, upper))
+        limits = (np.array([value]) for value in (_find_effort(mujoco, compiled, k), np.inf, lower, upper))
         index = model.addJoint(parent, moved, placement * anchor * shift, name, *limits)
     model.addJointFrame(index)
     first, count = model.joints[index].idx_v, model.joints[index].nv
@@ -149,7 +156,7 @@ def _add_joint(mujoco: Any, model: pin.Model, compiled: Any, k: int, parent: int
     return index, anchor.inverse()
 
 
-def _effort(mujoco: Any, compiled: Any, k: int) -> float:
+def _find_effort(mujoco: Any, compiled: Any, k: int) -> float:
     """The largest force [N] or torque [N m] of both signs at joint k; inf if an actuator has no limit, or none acts."""
     limit = _reach(compiled.jnt_actfrcrange[k]) if compiled.jnt_actfrclimited[k] else np.inf
     at_joint = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
@@ -157,20 +164,23 @@ def _effort(mujoco: Any, compiled: Any, k: int) -> float:
         i for i in range(compiled.nu) if compiled.actuator_trntype[i] in at_joint and compiled.actuator_trnid[i, 0] == k
     ]
     forces = [
-        abs(compiled.actuator_gear[i, 0]) * _force(mujoco, compiled, i) for i in acting if compiled.actuator_gear[i, 0]
+        abs(compiled.actuator_gear[i, 0]) * _find_force(mujoco, compiled, i)
+        for i in acting
+        if compiled.actuator_gear[i, 0]
     ]
     return min(limit, sum(forces)) if forces and sum(forces) > 0 else limit
 
 
-def _force(mujoco: Any, compiled: Any, i: int) -> float:
+def _find_force(mujoco: Any, compiled: Any, i: int) -> float:
     """The largest force of actuator i, before its gear; inf without a limit."""
     force = _reach(compiled.actuator_forcerange[i]) if compiled.actuator_forcelimited[i] else np.inf
-    plain = (
+    # Of a motor, the force is the gain times the control.
+    motor = (
         compiled.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
         and compiled.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
         and compiled.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_NONE
-    )  # a motor: the force is the gain times the control
-    if plain and compiled.actuator_ctrllimited[i]:
+    )
+    if motor and compiled.actuator_ctrllimited[i]:
         force = min(force, abs(compiled.actuator_gainprm[i, 0]) * _reach(compiled.actuator_ctrlrange[i]))
     return float(force)
 
@@ -181,6 +191,6 @@ def _reach(ends: Array) -> float:
     return float(min(-lower, upper)) if lower < 0 < upper else np.inf
 
 
-def _pose(position: Array, quaternion: Array) -> pin.SE3:
+def _build_pose(position: Array, quaternion: Array) -> pin.SE3:
     """A pose; MuJoCo's quaternions begin with their real part, as the arguments of Pinocchio's do."""
     return pin.SE3(pin.Quaternion(*quaternion).normalized().matrix(), position.copy())

@@ -10,18 +10,27 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError
-from orthocas.robots.kinematics import body_poses, frame_pose
+from orthocas.robots.kinematics import build_body_poses, build_frame_pose
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import BASE_JOINTS
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, as_number, as_point_set, frozen_array, require_kind
+from orthocas.tools.checks import Array, as_float_array, as_number, as_point_set, freeze_array, require_kind
 
 __all__ = ["Capsule", "LinkDistances", "Obstacle", "Plane", "Sphere"]
 
-_TINY = 1e-18  # [m^2], keeps square roots differentiable
-_FARTHEST = 1e6  # [m]
-_POSTURES, _MOVES = 20, 1e-9  # postures by which moving links are found, and the least move [m]
+
+@dataclass(frozen=True, slots=True)
+class ObstacleRules:
+    """Numbers of obstacles and links."""
+
+    least_square: float = 1e-18  #: [m^2], keeps square roots differentiable
+    farthest: float = 1e6  #: [m] largest length
+    postures: int = 20  #: by which moving links are found
+    move: float = 1e-9  #: [m] of a link that moves
+
+
+RULES = ObstacleRules()
 
 
 @runtime_checkable
@@ -56,17 +65,17 @@ class Sphere:
     radius: float
 
     def __init__(self, centre: ArrayLike, radius: float) -> None:
-        object.__setattr__(self, "centre", frozen_array("centre", centre, (3,)))
-        object.__setattr__(self, "radius", _size("radius", radius))
+        object.__setattr__(self, "centre", freeze_array("centre", centre, (3,)))
+        object.__setattr__(self, "radius", _check_size("radius", radius))
 
     @property
     def heading(self) -> str:
         """One line: radius [m] and centre [m] in the base frame."""
-        return f"sphere of radius {self.radius:.4g} at {_point(self.centre)}"
+        return f"sphere of radius {self.radius:.4g} at {_print_point(self.centre)}"
 
     def distance(self, start: ca.SX, end: ca.SX) -> ca.SX:
         """Distance of a segment from the ball."""
-        return ca.sqrt(_square_to_segment(ca.SX(ca.DM(self.centre)), start, end) + _TINY) - self.radius
+        return ca.sqrt(_measure_point(ca.SX(ca.DM(self.centre)), start, end) + RULES.least_square) - self.radius
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,19 +93,19 @@ class Capsule:
     radius: float
 
     def __init__(self, start: ArrayLike, end: ArrayLike, radius: float) -> None:
-        object.__setattr__(self, "start", frozen_array("start", start, (3,)))
-        object.__setattr__(self, "end", frozen_array("end", end, (3,)))
-        object.__setattr__(self, "radius", _size("radius", radius))
+        object.__setattr__(self, "start", freeze_array("start", start, (3,)))
+        object.__setattr__(self, "end", freeze_array("end", end, (3,)))
+        object.__setattr__(self, "radius", _check_size("radius", radius))
 
     @property
     def heading(self) -> str:
         """One line: radius [m] and the ends of the axis [m] in the base frame."""
-        return f"capsule of radius {self.radius:.4g} from {_point(self.start)} to {_point(self.end)}"
+        return f"capsule of radius {self.radius:.4g} from {_print_point(self.start)} to {_print_point(self.end)}"
 
     def distance(self, start: ca.SX, end: ca.SX) -> ca.SX:
         """Distance of a segment from the capsule."""
         a, b = ca.SX(ca.DM(self.start)), ca.SX(ca.DM(self.end))
-        return ca.sqrt(_square_of_segments(start, end, a, b) + _TINY) - self.radius
+        return ca.sqrt(_measure_segment(start, end, a, b) + RULES.least_square) - self.radius
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,17 +121,17 @@ class Plane:
     point: Array
 
     def __init__(self, normal: ArrayLike, point: ArrayLike) -> None:
-        given = frozen_array("normal", normal, (3,))
-        length = float(np.linalg.norm(given))
+        direction = freeze_array("normal", normal, (3,))
+        length = float(np.linalg.norm(direction))
         if not 1e-9 < length < np.inf:
-            raise InvalidValueError("normal", given.tolist(), "a direction, of a length above 1e-9")
-        object.__setattr__(self, "normal", frozen_array("normal", given / length, (3,)))
-        object.__setattr__(self, "point", frozen_array("point", point, (3,)))
+            raise InvalidValueError("normal", direction.tolist(), "a direction, of a length above 1e-9")
+        object.__setattr__(self, "normal", freeze_array("normal", direction / length, (3,)))
+        object.__setattr__(self, "point", freeze_array("point", point, (3,)))
 
     @property
     def heading(self) -> str:
         """One line: a point [m] and the unit normal in the base frame."""
-        return f"plane through {_point(self.point)} with normal {_point(self.normal)}"
+        return f"plane through {_print_point(self.point)} with normal {_print_point(self.normal)}"
 
     def distance(self, start: ca.SX, end: ca.SX) -> ca.SX:
         """Distance of a segment from the half-space: that of its nearer end."""
@@ -130,40 +139,40 @@ class Plane:
         return ca.fmin(ca.dot(normal, start), ca.dot(normal, end)) - offset
 
 
-def _square_to_segment(point: ca.SX, start: ca.SX, end: ca.SX) -> ca.SX:
+def _measure_point(point: ca.SX, start: ca.SX, end: ca.SX) -> ca.SX:
     """Squared distance of a point from a segment, which may have no length."""
     along = end - start
-    share = _within(ca.dot(point - start, along) / (ca.dot(along, along) + _TINY))
-    gap = point - start - share * along
+    fraction = _clip(ca.dot(point - start, along) / (ca.dot(along, along) + RULES.least_square))
+    gap = point - start - fraction * along
     return ca.dot(gap, gap)
 
 
-def _square_of_segments(a0: ca.SX, a1: ca.SX, b0: ca.SX, b1: ca.SX) -> ca.SX:
+def _measure_segment(a0: ca.SX, a1: ca.SX, b0: ca.SX, b1: ca.SX) -> ca.SX:
     """Squared distance of two segments: the least of five candidates, of which one has an end or none at its place."""
     a, b, between = a1 - a0, b1 - b0, a0 - b0
     aa, ab, bb = ca.dot(a, a), ca.dot(a, b), ca.dot(b, b)
-    share = _within((ab * ca.dot(b, between) - bb * ca.dot(a, between)) / (aa * bb - ab**2 + _TINY))
-    squares = [_square_to_segment(a0 + share * a, b0, b1)]
-    squares += [_square_to_segment(point, b0, b1) for point in (a0, a1)]
-    squares += [_square_to_segment(point, a0, a1) for point in (b0, b1)]
+    fraction = _clip((ab * ca.dot(b, between) - bb * ca.dot(a, between)) / (aa * bb - ab**2 + RULES.least_square))
+    squares = [_measure_point(a0 + fraction * a, b0, b1)]
+    squares += [_measure_point(point, b0, b1) for point in (a0, a1)]
+    squares += [_measure_point(point, a0, a1) for point in (b0, b1)]
     least = squares[0]
     for square in squares[1:]:
         least = ca.fmin(least, square)
     return least
 
 
-def _within(share: ca.SX) -> ca.SX:
-    return ca.fmin(ca.fmax(share, 0), 1)
+def _clip(fraction: ca.SX) -> ca.SX:
+    return ca.fmin(ca.fmax(fraction, 0), 1)
 
 
-def _size(name: str, value: float) -> float:
+def _check_size(name: str, value: float) -> float:
     size = as_number(name, value)
-    if not 0 < size < 1e6:
+    if not 0 < size < RULES.farthest:
         raise InvalidValueError(name, value, "a length above 0 [m], at most 1e6")
     return size
 
 
-def _point(point: Array) -> str:
+def _print_point(point: Array) -> str:
     return f"({', '.join(f'{value:.4g}' for value in point)})"
 
 
@@ -200,12 +209,13 @@ class LinkDistances:
         for k, obstacle in enumerate(obstacles):
             if isinstance(obstacle, type) or not isinstance(obstacle, Obstacle):
                 raise InvalidValueError(f"obstacles[{k}]", f"a {type(obstacle).__name__}", "a Sphere, Capsule or Plane")
-        given = as_float_array("radius", radius)
-        if given.shape not in ((), (robot.n,)):
-            raise InvalidValueError("radius", f"an array of shape {given.shape}", f"one number, or {robot.n}")
-        radii = np.broadcast_to(given, (robot.n,))
-        if not ((radii >= 0) & (radii < _FARTHEST)).all():
-            raise InvalidValueError("radius", given.tolist(), "lengths >= 0 [m]")
+        # One radius for all links, or one for each.
+        sizes = as_float_array("radius", radius)
+        if sizes.shape not in ((), (robot.n,)):
+            raise InvalidValueError("radius", f"an array of shape {sizes.shape}", f"one number, or {robot.n}")
+        radii = np.broadcast_to(sizes, (robot.n,))
+        if not ((radii >= 0) & (radii < RULES.farthest)).all():
+            raise InvalidValueError("radius", sizes.tolist(), "lengths >= 0 [m]")
         object.__setattr__(self, "robot", robot)
         object.__setattr__(self, "obstacles", tuple(obstacles))
         object.__setattr__(self, "radii", tuple(radii.tolist()))
@@ -216,7 +226,7 @@ class LinkDistances:
         values: Array = self._batched(points)[0]
         return values[0] if single else values
 
-    def with_gradients(self, points: Array) -> tuple[Array, Array]:
+    def evaluate_gradients(self, points: Array) -> tuple[Array, Array]:
         """Distances (N, K) and their gradients (N, K, n) at points (N, n)."""
         values, gradients = self._batched_gradients(points)
         return values, gradients.reshape(len(points), -1, self.robot.n)
@@ -244,18 +254,24 @@ class LinkDistances:
         """Joint, and both ends of its link, for links that move: those on the ways to all tips, each once."""
         tree = self.robot.tree
         ends: dict[tuple[int, int | str], tuple[int, ca.SX, ca.SX]] = {}
-        origins = {-1: ca.SX.zeros(3), **{body: pose[1] for body, pose in enumerate(body_poses(tree, self._q))}}
+        origins = {-1: ca.SX.zeros(3), **{body: pose[1] for body, pose in enumerate(build_body_poses(tree, self._q))}}
         for frame in (tree.tip, *map(tree.frame, tree.tips)):
             way = tree.carriers(frame.parent)
             for start, end in pairwise([-1, *way]):
-                # nothing solid joins the world and a base that moves
+                # Nothing solid joins the world and a base that moves.
                 if tree.joint_names[end] not in BASE_JOINTS:
                     ends[start, end] = max(start, way[0]), origins[start], origins[end]
-            ends[frame.parent, frame.name] = frame.parent, origins[frame.parent], frame_pose(tree, self._q, frame)[1]
+            ends[frame.parent, frame.name] = (
+                frame.parent,
+                origins[frame.parent],
+                build_frame_pose(tree, self._q, frame)[1],
+            )
         links = list(ends.values())
         points = Batched(dense_function("ends", [self._q], [ca.vertcat(*(ca.vertcat(*link[1:]) for link in links))]))
-        seen = points(np.random.default_rng(0).uniform(-1, 1, (_POSTURES, tree.n)))[0].reshape(_POSTURES, -1, 6)
-        moves = np.ptp(seen, axis=0).max(axis=1) > _MOVES
+        # Links that do not move between seeded postures stand still.
+        postures = np.random.default_rng(0).uniform(-1, 1, (RULES.postures, tree.n))
+        places = points(postures)[0].reshape(RULES.postures, -1, 6)
+        moves = np.ptp(places, axis=0).max(axis=1) > RULES.move
         return [link for link, moving in zip(links, moves, strict=True) if moving]
 
     @cached_property

@@ -1,34 +1,41 @@
-"""`pin.Model`: planar arms with uniform links as one, and any one as the numbers of a `KinematicTree`."""
+"""`pin.Model`: its joints and frames as a `KinematicTree`, locked joints, default tips, postures, and planar arms."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pinocchio as pin
 
-from orthocas.errors import InvalidValueError, RobotError
-from orthocas.robots.spatial import rotation_z_to, snap
-from orthocas.robots.tree import JointKind, KinematicTree, on_moving_base
-from orthocas.tools.checks import Array, frozen_array, require_known
+from orthocas.errors import InvalidValueError, RobotError, degrees_hint
+from orthocas.robots.spatial import rotate_z_to, snap
+from orthocas.robots.tree import BASE_JOINTS, JointKind, KinematicTree, place_on_base
+from orthocas.tools.checks import Array, freeze_array, require_known
 
 LINKS = (pin.FrameType.BODY, pin.FrameType.OP_FRAME)  #: links of URDF, bodies and sites of MJCF
-_UNLIMITED = 1e10  # Pinocchio uses the largest double for "no limit"
+_UNLIMITED = 1e10  #: numbers above it are no limits: Pinocchio uses the largest double
+_GRIPPER = re.compile("gripper|finger|jaw", re.IGNORECASE)
+_FINGER = re.compile("finger|jaw", re.IGNORECASE)
+_SHAPE = re.compile("_sc$|collision", re.IGNORECASE)  #: frames of shapes that stand for links in collision checks
+_TOOL = re.compile("tool|tcp|end_?effector|eef|(^|_)ee(_|$)", re.IGNORECASE)
+WORLD = "universe"  #: Pinocchio's name for what does not move
 TIP = "tip"
 GRAVITY = 9.81  #: [m/s^2]
 
 
-def tree_from_model(model: pin.Model, *tips: str, base: str | None = None) -> KinematicTree:
-    """Read joints, bodies, limits, tips and links from a Pinocchio model, whose base may move; see `on_moving_base`.
+def build_tree(model: pin.Model, *tips: str, base: str | None = None) -> KinematicTree:
+    """Read joints, bodies, limits, tips and links from a Pinocchio model, whose base may move; see `place_on_base`.
 
     Raises:
         UnknownNameError: if there is no frame with the name of a tip.
         RobotError: if a joint is not revolute, continuous or prismatic. The message names it.
     """
-    tip = model.frames[frame_index(model, tips[0])]
+    tip = model.frames[find_frame(model, tips[0])]
     links = (frame.name for frame in model.frames if frame.type in LINKS and frame.name.isprintable())
     names = dict.fromkeys(name for name in (*tips, *links) if name != tips[0])
-    further = [model.frames[frame_index(model, name)] for name in names]
-    axes = [joint_axis(model, i) for i in range(1, model.njoints)]
-    turns = [np.eye(3)] + [rotation_z_to(axis) for _, axis in axes]  # body frame -> frame with the axis along z
+    further = [model.frames[find_frame(model, name)] for name in names]
+    axes = [find_axis(model, i) for i in range(1, model.njoints)]
+    # Each body frame is turned so that the joint's axis is its z axis.
+    turns = [np.eye(3)] + [rotate_z_to(axis) for _, axis in axes]
     bodies = range(1, model.njoints)
     placed = [(turns[frame.parentJoint].T, frame.placement) for frame in (tip, *further)]
     rotations = [snap(across @ place.rotation) for across, place in placed]
@@ -46,10 +53,10 @@ def tree_from_model(model: pin.Model, *tips: str, base: str | None = None) -> Ki
         centres=np.array([turns[i].T @ model.inertias[i].lever for i in bodies]),
         inertias=np.array([turns[i].T @ model.inertias[i].inertia @ turns[i] for i in bodies]),
         armatures=np.array([model.armature[model.joints[i].idx_v] for i in bodies]),
-        lower=_limits(model, model.lowerPositionLimit, continuous, -np.inf),
-        upper=_limits(model, model.upperPositionLimit, continuous, np.inf),
-        effort_limits=_largest(model, "effort", model.effortLimit),
-        velocity_limits=_largest(model, "velocity", model.velocityLimit),
+        lower=_read_limits(model, model.lowerPositionLimit, continuous, -np.inf),
+        upper=_read_limits(model, model.upperPositionLimit, continuous, np.inf),
+        effort_limits=_read_largest(model, "effort", model.effortLimit),
+        velocity_limits=_read_largest(model, "velocity", model.velocityLimit),
         tip_name=tip.name,
         tip_parent=tip.parentJoint - 1,
         tip_rotation=rotations[0],
@@ -61,23 +68,24 @@ def tree_from_model(model: pin.Model, *tips: str, base: str | None = None) -> Ki
         frame_rotations=np.array(rotations[1:]).reshape(-1, 3, 3),
         frame_translations=np.array(translations[1:]).reshape(-1, 3),
     )
-    own = model.inertias[0]  # links that no joint of the file moves
-    return tree if base is None else on_moving_base(tree, base, own.mass, own.lever, own.inertia)
+    # What a moving base carries are the links that no joint of the file moves.
+    own = model.inertias[0]
+    return tree if base is None else place_on_base(tree, base, own.mass, own.lever, own.inertia)
 
 
-def frame_index(model: pin.Model, name: str) -> int:
+def find_frame(model: pin.Model, name: str) -> int:
     """Index of a frame. If they share a name, a link is preferred to a site, and a site to a joint.
 
     Raises:
         UnknownNameError: if there is no such frame.
     """
     require_known("frame", name, [frame.name for frame in model.frames])
-    found = [i for i, frame in enumerate(model.frames) if frame.name == name]
-    kinds = {i: model.frames[i].type for i in found}
-    return min(found, key=lambda i: (kinds[i] != pin.FrameType.BODY, kinds[i] == pin.FrameType.JOINT))
+    candidates = [i for i, frame in enumerate(model.frames) if frame.name == name]
+    kinds = {i: model.frames[i].type for i in candidates}
+    return min(candidates, key=lambda i: (kinds[i] != pin.FrameType.BODY, kinds[i] == pin.FrameType.JOINT))
 
 
-def joint_axis(model: pin.Model, i: int) -> tuple[JointKind, Array]:
+def find_axis(model: pin.Model, i: int) -> tuple[JointKind, Array]:
     """Kind and axis of joint i, from its motion subspace.
 
     Raises:
@@ -85,13 +93,14 @@ def joint_axis(model: pin.Model, i: int) -> tuple[JointKind, Array]:
     """
     joint, name = model.joints[i], model.names[i]
     if i in set(model.mimicking_joints):
-        leader = model.names[leader_of(model, i)]
-        raise RobotError(f"joint '{name}' is a mimic joint, expected independent joints: {remedy(leader)}")
+        leader = model.names[find_leader(model, i)]
+        raise RobotError(f"joint '{name}' is a mimic joint, expected independent joints: {suggest_lock(leader)}")
     if joint.nv != 1:
         raise RobotError(
             f"joint '{name}' is of type {joint.shortname()} with {joint.nv} degrees of freedom, "
-            f"expected revolute, continuous or prismatic joints: {remedy(name)}"
+            f"expected revolute, continuous or prismatic joints: {suggest_lock(name)}"
         )
+    # The motion subspace of a joint with one degree of freedom is a unit twist.
     data = joint.createData()
     joint.calc(data, pin.neutral(model))
     subspace = np.asarray(data.S).ravel()
@@ -100,26 +109,28 @@ def joint_axis(model: pin.Model, i: int) -> tuple[JointKind, Array]:
         return "revolute", angular
     if not angular.any():
         return "prismatic", linear
-    raise RobotError(f"joint '{name}' is helical, expected revolute, continuous or prismatic joints: {remedy(name)}")
+    raise RobotError(
+        f"joint '{name}' is helical, expected revolute, continuous or prismatic joints: {suggest_lock(name)}"
+    )
 
 
-def leader_of(model: pin.Model, mimic: int) -> int:
+def find_leader(model: pin.Model, mimic: int) -> int:
     """The joint that a mimic joint follows."""
     return int(model.mimicked_joints[list(model.mimicking_joints).index(mimic)])
 
 
-def remedy(joint: str) -> str:
+def suggest_lock(joint: str) -> str:
     """Instructions for locking a joint, in Python and on the command line."""
     return f"lock it with locked={{'{joint}': 0.0}} or --lock {joint}=0"
 
 
-def _limits(model: pin.Model, limits: Array, continuous: list[bool], unlimited: float) -> Array:
+def _read_limits(model: pin.Model, limits: Array, continuous: list[bool], unlimited: float) -> Array:
     """Position limits, one per joint. A continuous joint has none."""
     values = [unlimited if free else limits[model.joints[i + 1].idx_q] for i, free in enumerate(continuous)]
     return np.array([unlimited if abs(value) > _UNLIMITED else value for value in values])
 
 
-def _largest(model: pin.Model, what: str, limits: Array) -> Array:
+def _read_largest(model: pin.Model, what: str, limits: Array) -> Array:
     """Limits of effort or velocity, one per joint. 0 means no limit: many files use it as a placeholder.
 
     Raises:
@@ -132,7 +143,164 @@ def _largest(model: pin.Model, what: str, limits: Array) -> Array:
     return np.where((values > 0) & (values < _UNLIMITED), values, np.inf)
 
 
-def planar_model(lengths: Sequence[float], masses: Sequence[float]) -> pin.Model:
+def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
+    """Lock joints at the given positions [rad] or [m]. Joints that mimic a locked joint follow it.
+
+    A joint with several degrees of freedom (floating, spherical, planar) is locked at its neutral position, given as 0.
+
+    Raises:
+        UnknownNameError: if there is no such joint.
+        InvalidValueError: if a position is not finite, or an angle looks like degrees.
+        RobotError: if the joint mimics another one, or has several degrees of freedom and a position other than 0.
+    """
+    if not isinstance(locked, Mapping):
+        raise InvalidValueError("locked", locked, "a mapping from joint names to positions")
+    # Each joint gets its position; those that mimic one of them follow.
+    names = list(model.names)[1:]
+    position = pin.neutral(model)
+    ids = []
+    for name, value in locked.items():
+        require_known("joint", name, names)
+        if not isinstance(value, int | float | np.number) or not np.isfinite(value):
+            raise InvalidValueError(f"locked position of joint '{name}'", repr(value), "a finite number")
+        ids.append(model.getJointId(name))
+        set_position(model, ids[-1], float(value), position)
+    ids += [i for i in model.mimicking_joints if find_leader(model, i) in ids]
+    return fix_joints(model, ids, position) if ids else model
+
+
+def lock_off_chain(model: pin.Model, *tips: str) -> pin.Model:
+    """Lock every joint that moves no tip, of any type, at neutral or at the limit closest to zero.
+
+    Raises:
+        UnknownNameError: if there is no frame with the name of a tip.
+        RobotError: if a joint that moves a tip is not revolute, continuous or prismatic. The message names it.
+    """
+    chains = [model.supports[model.frames[find_frame(model, tip)].parentJoint] for tip in tips]
+    chain = sorted({i for supports in chains for i in supports if i > 0})
+    for i in chain:
+        find_axis(model, i)
+    ids = [i for i in range(1, model.njoints) if i not in chain]
+    position, mimics = pin.neutral(model), set(model.mimicking_joints)
+    for i in ids:
+        joint = model.joints[i]
+        if joint.nq == joint.nv == 1 and i not in mimics:
+            limits = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+            position[joint.idx_q] = np.clip(0.0, *limits)
+    return fix_joints(model, ids, position) if ids else model
+
+
+def fix_joints(model: pin.Model, ids: list[int], position: Array) -> pin.Model:
+    """The model with joints fixed at a position.
+
+    Pinocchio finds joints by name among all frames, so others get names of their own meanwhile: bodies, sites and
+    joints may share one.
+
+    Raises:
+        RobotError: if a joint has the name of Pinocchio's world.
+    """
+    if WORLD in list(model.names)[1:]:
+        raise RobotError(
+            f"a joint is called '{WORLD}', which no joint can be called while joints are locked: rename it"
+        )
+    # Frames other than joints get unique names meanwhile.
+    renamed, names = model.copy(), {}
+    for i, frame in enumerate(renamed.frames):
+        if i > 0 and frame.type != pin.FrameType.JOINT:
+            unique = f"{i}\n{frame.name}"
+            names[unique], frame.name = frame.name, unique
+    reduced = pin.buildReducedModel(renamed, ids, position)
+    for frame in reduced.frames:
+        frame.name = names.get(frame.name, frame.name)
+    return reduced
+
+
+def set_position(model: pin.Model, i: int, value: float, position: Array) -> None:
+    """Write a joint position into a configuration. Pinocchio stores cos and sin of a continuous joint."""
+    joint, name = model.joints[i], model.names[i]
+    if i in set(model.mimicking_joints):
+        leader = model.names[find_leader(model, i)]
+        raise RobotError(
+            f"joint '{name}' mimics joint '{leader}', expected an independent joint: {suggest_lock(leader)}"
+        )
+    if joint.nv != 1:
+        if value != 0:
+            raise RobotError(
+                f"locked position of joint '{name}' is {value:g}, expected 0: "
+                f"a joint with {joint.nv} degrees of freedom can only be locked at its neutral position"
+            )
+        return
+    # Angles that look like degrees are mistakes.
+    turns = joint.shortname().startswith("JointModelR")
+    if turns and (hint := degrees_hint(value)):
+        raise InvalidValueError(f"locked position of joint '{name}'", f"{value:g}", f"an angle in radians{hint}")
+    position[joint.idx_q : joint.idx_q + joint.nq] = (np.cos(value), np.sin(value)) if joint.nq == 2 else value
+
+
+def find_default_tip(model: pin.Model) -> str:
+    """The end of the arm of a robot with a single chain, apart from joints of a gripper, which is not moved.
+
+    Of the frames there it is the last one that is called a tool or an end effector; otherwise the last one that is no
+    part of a finger and no shape for collision checks.
+
+    Raises:
+        RobotError: if the robot branches. The message lists the frames to choose from, chain by chain.
+    """
+    ids = [i for i in range(1, model.njoints) if not _is_of_gripper(model, i)] or list(range(1, model.njoints))
+    carriers = {model.parents[i] for i in ids}
+    ends = [_list_ends(model, i) for i in ids if i not in carriers]
+    if not ends:
+        raise RobotError("the robot has no movable joint, expected at least one")
+    if len(ends) > 1:
+        listing = "; ".join(", ".join(names) for names in ends)
+        raise RobotError(f"the robot has {len(ends)} chains, name the tip frame: {listing}")
+    return ends[0][0]
+
+
+def _is_of_gripper(model: pin.Model, i: int) -> bool:
+    """Whether a joint is called after a gripper, or its link after a finger, as are all that it carries."""
+    link = next((frame.name for frame in model.frames if frame.parentJoint == i and frame.type in LINKS), "")
+    own = _GRIPPER.search(model.names[i]) or _FINGER.search(link)
+    return bool(own) and all(_is_of_gripper(model, k) for k in range(i + 1, model.njoints) if model.parents[k] == i)
+
+
+def _list_ends(model: pin.Model, i: int) -> list[str]:
+    """The frames of a body that stand for its end: the best one, then the others that carry no further frame."""
+    frames = {k: frame for k, frame in enumerate(model.frames) if frame.parentJoint == i}
+    links = [k for k in frames if frames[k].type in LINKS] or list(frames)
+    plain = [k for k in links if not (_FINGER.search(frames[k].name) or _SHAPE.search(frames[k].name))]
+    best = [*links, *plain, *(k for k in plain if _TOOL.search(frames[k].name))][-1]
+    # The parent of a link is a fixed joint, whose parent is a link.
+    inner = {model.frames[frames[k].parentFrame].parentFrame for k in plain}
+    return [frames[best].name, *(frames[k].name for k in plain if k != best and k not in inner)]
+
+
+def read_model_postures(model: pin.Model, joint_names: Sequence[str]) -> dict[str, Array]:
+    """Named postures (n,): reference configurations of a Pinocchio model, which are the keyframes of an MJCF file."""
+    states: dict[str, dict[str, float]] = {}
+    for entry in model.referenceConfigurations:
+        position, joints = entry.data(), states.setdefault(entry.key(), {})
+        for name, joint in zip(list(model.names)[1:], list(model.joints)[1:], strict=True):
+            # Pinocchio stores cos and sin of a continuous joint.
+            if joint.nv == 1:
+                part = position[joint.idx_q : joint.idx_q + joint.nq]
+                joints[name] = float(part[0]) if len(part) == 1 else float(np.arctan2(part[1], part[0]))
+    # Pinocchio's name for the zero posture of an MJCF file, which is not in the file.
+    states.pop("qpos0", None)
+    return collect_postures(states, joint_names)
+
+
+def collect_postures(states: Mapping[str, Mapping[str, float]], joint_names: Sequence[str]) -> dict[str, Array]:
+    """States as joint positions (n,), with a moving base at 0. States that lack another joint are skipped."""
+    placed = {name: {**dict.fromkeys(BASE_JOINTS, 0.0), **joints} for name, joints in states.items()}
+    return {
+        name: np.array([joints[joint] for joint in joint_names])
+        for name, joints in placed.items()
+        if all(joint in joints for joint in joint_names)
+    }
+
+
+def build_planar(lengths: Sequence[float], masses: Sequence[float]) -> pin.Model:
     """A chain in the x-y plane with joints about z. At q = 0 it lies along x; gravity points along -y.
 
     Each link is a thin rod with uniform mass: I = m l^2 / 12 about its centre.
@@ -148,11 +316,12 @@ def planar_model(lengths: Sequence[float], masses: Sequence[float]) -> pin.Model
     Source:
         [AS2023] Fig. 5 and Sec. 8.
     """
-    lengths = frozen_array("lengths", lengths, (None,)).tolist()
-    masses = frozen_array("masses", masses, (len(lengths),)).tolist()
+    lengths = freeze_array("lengths", lengths, (None,)).tolist()
+    masses = freeze_array("masses", masses, (len(lengths),)).tolist()
     for name, values in (("lengths", lengths), ("masses", masses)):
         if not values or min(values) <= 0:
             raise InvalidValueError(name, values, "positive numbers, one per link")
+    # The model: one revolute joint and one uniform rod a link.
     model = pin.Model()
     model.name = f"planar_{len(lengths)}r"
     model.gravity.linear = np.array([0.0, -GRAVITY, 0.0])

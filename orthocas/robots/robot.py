@@ -11,13 +11,22 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, RobotError, ShapeError
-from orthocas.robots import dynamics, kinematics, urdf
-from orthocas.robots.dynamics import PAYLOAD, with_payload
-from orthocas.robots.homes import model_states, postures, srdf_states
-from orthocas.robots.kinematics import with_tool
-from orthocas.robots.mjcf import model_from_mjcf
-from orthocas.robots.pinocchio_model import TIP, frame_index, planar_model, tree_from_model
+from orthocas.robots import dynamics, kinematics
+from orthocas.robots.dynamics import PAYLOAD, add_payload
+from orthocas.robots.kinematics import add_tool
+from orthocas.robots.mjcf import read_mjcf
+from orthocas.robots.pinocchio_model import (
+    TIP,
+    build_planar,
+    build_tree,
+    find_default_tip,
+    find_frame,
+    lock_joints,
+    lock_off_chain,
+    read_model_postures,
+)
 from orthocas.robots.tree import KinematicTree
+from orthocas.robots.urdf import read_srdf_postures, read_urdf
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import BuiltOnUse, cached_property
 from orthocas.tools.checks import (
@@ -25,7 +34,7 @@ from orthocas.tools.checks import (
     as_float_array,
     as_path,
     as_point_set,
-    frozen_array,
+    freeze_array,
     require_kind,
     require_known,
 )
@@ -35,7 +44,7 @@ from orthocas.tools.expressions import WRITTEN_OUT
 Locked = Mapping[str, float] | None  #: joint -> position at which it is locked [rad] or [m]
 Tool = ArrayLike | None
 Gravity = ArrayLike | None
-_Key = tuple[str | None, ...]  # name of a function, then frames
+_Key = tuple[str | None, ...]  #: name of a function, then frames
 FrameQuantity = Literal["position", "rotation", "jacobian"]
 
 
@@ -64,40 +73,7 @@ class Robot(Shown):
         require_kind("homes", homes, Mapping)
         self.tree = tree
         #: named postures (n,) of the robot's files: SRDF group states, MJCF keyframes. Chart files do not store them.
-        self.homes = {name: frozen_array(f"home '{name}'", q, (tree.n,)) for name, q in homes.items()}
-
-    @classmethod
-    def from_model(
-        cls,
-        model: pin.Model,
-        tip: str | None = None,
-        locked: Locked = None,
-        *,
-        tips: Sequence[str] = (),
-        base: str | None = None,
-        gravity: Gravity = None,
-    ) -> Self:
-        """Build from a Pinocchio model, with all its joints.
-
-        Args:
-            model: the model. Joints that are not locked must be revolute, continuous or prismatic.
-            tip: name of any frame of the model. Default: the last frame of a robot with a single chain.
-            tips: names of several frames, such as two hands, in place of `tip`.
-            locked: joints to lock, with their positions [rad] or [m].
-            base: as in `from_file`.
-            gravity: as in `from_file`; default: that of the model.
-
-        Raises:
-            UnknownNameError: if the frame or a locked joint does not exist.
-            RobotError: if a joint that is not locked is of another type (floating base, spherical, mimic, ...).
-        """
-        require_kind("model", model, pin.Model)
-        names = _names(tip, tips) or (urdf.default_tip(model),)
-        for name in names:
-            frame_index(model, name)
-        tree = tree_from_model(urdf.lock_joints(model, locked or {}), *names, base=base)
-        robot = cls(tree, postures(model_states(model), tree.joint_names))
-        return robot if gravity is None else robot.with_gravity(gravity)
+        self.homes = {name: freeze_array(f"home '{name}'", q, (tree.n,)) for name, q in homes.items()}
 
     @classmethod
     def from_file(
@@ -152,10 +128,10 @@ class Robot(Shown):
         gravity: Gravity = None,
     ) -> Self:
         """Build the joints that move the tips from a URDF file; see `from_file`."""
-        file = as_path("path", path)
-        names = _names(tip, tips)
-        robot = cls._chain(urdf.read_urdf(file, names, locked), names, locked, tool, base, gravity)
-        return cls(robot.tree, postures(srdf_states(file), robot.joint_names))
+        file, names = as_path("path", path), _check_tips(tip, tips)
+        model = read_urdf(file, names, locked)
+        robot = cls._from_chain(model, names, locked, tool, base, gravity)
+        return cls(robot.tree, read_srdf_postures(file, robot.joint_names))
 
     @classmethod
     def from_mjcf(
@@ -173,12 +149,61 @@ class Robot(Shown):
 
         Needs the extra `orthocas[mujoco]`, because MuJoCo's compiler reads the file.
         """
-        return cls._chain(model_from_mjcf(path), _names(tip, tips), locked, tool, base, gravity)
+        return cls._from_chain(read_mjcf(path), _check_tips(tip, tips), locked, tool, base, gravity)
+
+    @classmethod
+    def _from_chain(
+        cls,
+        model: pin.Model,
+        tips: tuple[str, ...],
+        locked: Locked,
+        tool: Tool,
+        base: str | None,
+        gravity: Gravity,
+    ) -> Self:
+        """The robot of the joints that move the tips, without those that the user locks."""
+        tips = tips or (find_default_tip(model),)
+        chain = lock_off_chain(lock_joints(model, locked or {}), *tips)
+        robot = cls.from_model(chain, tips=tips, base=base, gravity=gravity)
+        return robot if tool is None else robot.with_tool(tool)
+
+    @classmethod
+    def from_model(
+        cls,
+        model: pin.Model,
+        tip: str | None = None,
+        locked: Locked = None,
+        *,
+        tips: Sequence[str] = (),
+        base: str | None = None,
+        gravity: Gravity = None,
+    ) -> Self:
+        """Build from a Pinocchio model, with all its joints.
+
+        Args:
+            model: the model. Joints that are not locked must be revolute, continuous or prismatic.
+            tip: name of any frame of the model. Default: the last frame of a robot with a single chain.
+            tips: names of several frames, such as two hands, in place of `tip`.
+            locked: joints to lock, with their positions [rad] or [m].
+            base: as in `from_file`.
+            gravity: as in `from_file`; default: that of the model.
+
+        Raises:
+            UnknownNameError: if the frame or a locked joint does not exist.
+            RobotError: if a joint that is not locked is of another type (floating base, spherical, mimic, ...).
+        """
+        require_kind("model", model, pin.Model)
+        names = _check_tips(tip, tips) or (find_default_tip(model),)
+        for name in names:
+            find_frame(model, name)
+        tree = build_tree(lock_joints(model, locked or {}), *names, base=base)
+        robot = cls(tree, read_model_postures(model, tree.joint_names))
+        return robot if gravity is None else robot.with_gravity(gravity)
 
     @classmethod
     def planar(cls, lengths: Sequence[float], masses: Sequence[float]) -> Self:
         """A planar arm with uniform links of given lengths [m] and masses [kg]. Gravity points along -y."""
-        return cls(tree_from_model(planar_model(lengths, masses), TIP))
+        return cls(build_tree(build_planar(lengths, masses), TIP))
 
     def with_scaled_masses(self, factor: ArrayLike) -> Self:
         """The same robot with scaled masses: mass and inertia of each body times a factor, (n,) or one number > 0.
@@ -186,8 +211,8 @@ class Robot(Shown):
         Raises:
             ShapeError, InvalidValueError: if the factors are invalid.
         """
-        given = as_float_array("factor", factor)
-        factors = frozen_array("factor", np.full(self.n, given) if given.ndim == 0 else given, (self.n,))
+        values = as_float_array("factor", factor)
+        factors = freeze_array("factor", np.full(self.n, values) if values.ndim == 0 else values, (self.n,))
         if factors.min() <= 0:
             raise InvalidValueError("factor", factors.min(), "numbers > 0")
         masses, inertias = self.tree.masses * factors, self.tree.inertias * factors[:, None, None]
@@ -203,7 +228,7 @@ class Robot(Shown):
         Raises:
             InvalidValueError: if the tool has another form.
         """
-        return type(self)(with_tool(self.tree, tool), self.homes)
+        return type(self)(add_tool(self.tree, tool), self.homes)
 
     def with_payload(self, payload: ArrayLike) -> Self:
         """The same robot carrying a load that is fixed to the tip.
@@ -215,7 +240,7 @@ class Robot(Shown):
         Raises:
             InvalidValueError: if the payload has another form, a negative mass, or an indefinite inertia.
         """
-        return type(self)(with_payload(self.tree, payload), self.homes)
+        return type(self)(add_payload(self.tree, payload), self.homes)
 
     def with_gravity(self, gravity: ArrayLike) -> Self:
         """The same robot under another gravity, such as on a wall, a ceiling or the moon.
@@ -233,10 +258,10 @@ class Robot(Shown):
             >>> robot.with_gravity([0.0, -1.62, 0.0]).gravity([0.0]).round(9).tolist()
             [4.86]
         """
-        given = frozen_array("gravity", gravity, (3,))
-        if self.tree.floating and given.any():
-            raise RobotError(f"gravity is {given.tolist()}, expected none: a base that nothing holds has no gravity")
-        return type(self)(replace(self.tree, gravity=given), self.homes)
+        vector = freeze_array("gravity", gravity, (3,))
+        if self.tree.floating and vector.any():
+            raise RobotError(f"gravity is {vector.tolist()}, expected none: a base that nothing holds has no gravity")
+        return type(self)(replace(self.tree, gravity=vector), self.homes)
 
     def home(self, name: str) -> Array:
         """A named posture (n,) of the robot's files.
@@ -246,22 +271,6 @@ class Robot(Shown):
         """
         require_known("home", name, self.homes or {"none, the robot's files name no posture": None})
         return self.homes[name]
-
-    @classmethod
-    def _chain(
-        cls,
-        model: pin.Model,
-        tips: tuple[str, ...],
-        locked: Locked,
-        tool: Tool,
-        base: str | None,
-        gravity: Gravity,
-    ) -> Self:
-        """The robot of the joints that move the tips, without those that the user locks."""
-        tips = tips or (urdf.default_tip(model),)
-        chain = urdf.lock_off_chain(urdf.lock_joints(model, locked or {}), *tips)
-        robot = cls.from_model(chain, tips=tips, base=base, gravity=gravity)
-        return robot if tool is None else robot.with_tool(tool)
 
     @property
     def n(self) -> int:
@@ -383,18 +392,18 @@ class Robot(Shown):
             >>> robot.frame_position([0.0, 0.0], "tip").tolist()
             [2.0, 0.0, 0.0]
         """
-        return self._call(self._frame_key("position", frame, relative_to), q)
+        return self._call(self._find_key("position", frame, relative_to), q)
 
     def frame_rotation(self, q: Any, frame: str, relative_to: str | None = None) -> Any:
         """Rotation of a frame in the world, or in another frame, (3, 3)."""
-        return self._call(self._frame_key("rotation", frame, relative_to), q)
+        return self._call(self._find_key("rotation", frame, relative_to), q)
 
     def frame_jacobian(self, q: Any, frame: str, relative_to: str | None = None) -> Any:
         """Geometric Jacobian of a frame, (6, n): linear rows, then angular rows.
 
         They are in axes of the world, or in those of another frame and as seen from it.
         """
-        return self._call(self._frame_key("jacobian", frame, relative_to), q)
+        return self._call(self._find_key("jacobian", frame, relative_to), q)
 
     def centre_of_mass(self, q: Any) -> Any:
         """Centre of mass of all that the joints move, in the world, (3,) [m]."""
@@ -414,7 +423,7 @@ class Robot(Shown):
             UnknownNameError: if there is no such quantity or frame.
         """
         require_known("quantity of a frame", quantity, ("position", "rotation", "jacobian"))
-        return self._functions[self._frame_key(quantity, frame, relative_to)]
+        return self._functions[self._find_key(quantity, frame, relative_to)]
 
     def joint_points(self, q: Any) -> Array:
         """A line to draw, along base, joint origins and tip: q (N, n) -> (N, points, 3) [m].
@@ -443,26 +452,24 @@ class Robot(Shown):
 
     @cached_property
     def _functions(self) -> BuiltOnUse[_Key, ca.Function]:
-        return BuiltOnUse(self._built_function)
+        return BuiltOnUse(self._build_function)
 
-    def _built_function(self, key: _Key) -> ca.Function:
+    def _build_function(self, key: _Key) -> ca.Function:
         name, frames = str(key[0]), key[1:]
         names, expression = _FUNCTIONS[name]
         by_bias = name.startswith("coriolis_product") and self.n > WRITTEN_OUT
         kind = ca.MX if by_bias else ca.SX
-        arguments = [kind.sym(argument, PAYLOAD if argument == "payload" else self.n) for argument in names]
+        arguments: list[Any] = [kind.sym(argument, PAYLOAD if argument == "payload" else self.n) for argument in names]
         if by_bias:
-            result = self._coriolis_product(*arguments)
+            # Two calls of the bias, in which gravity cancels: no further code in generated C.
+            q, v, w, *payload = arguments
+            bias = self.function("bias_with_payload" if payload else "bias")
+            result = (bias(q, v + w, *payload) - bias(q, v - w, *payload)) / 4
         else:
             result = expression(self.tree, *arguments, *(frame and self.tree.frame(frame) for frame in frames))
         return dense_function(name, arguments, [result], names)
 
-    def _coriolis_product(self, q: Any, v: Any, w: Any, *payload: Any) -> Any:
-        """C(q, v) w by two calls of the bias, in which gravity cancels: no further code in generated C."""
-        bias = self.function("bias_with_payload" if payload else "bias")
-        return (bias(q, v + w, *payload) - bias(q, v - w, *payload)) / 4
-
-    def _frame_key(self, quantity: str, frame: str | None, relative_to: str | None) -> _Key:
+    def _find_key(self, quantity: str, frame: str | None, relative_to: str | None) -> _Key:
         """Key of a frame's function; that of the tip in the world has a name of its own."""
         for name in (frame, relative_to):
             if name is not None:
@@ -474,12 +481,14 @@ class Robot(Shown):
         """Call a function with CasADi or NumPy arguments, and return the same kind."""
         key = (name,) if isinstance(name, str) else name
         function = self._functions[key]
+        # CasADi arguments give an expression, which needs columns of the right size.
         if any(isinstance(a, ca.SX | ca.MX) for a in arguments):
             for a in arguments:
                 shape = tuple(a.shape) if hasattr(a, "shape") else np.shape(as_float_array("a joint vector", a))
                 if shape != (self.n, 1):
                     raise ShapeError("a CasADi joint vector", shape, (self.n, 1))
             return function(*arguments)
+        # NumPy arguments give arrays, of one state or of a set.
         sets = [as_point_set(name, a, self.n) for name, a in zip(function.name_in(), arguments, strict=True)]
         points = [p for p, _ in sets]
         if len({len(p) for p in points}) > 1:
@@ -489,7 +498,7 @@ class Robot(Shown):
         return result[0] if all(single for _, single in sets) else result
 
 
-def _names(tip: str | None, tips: Sequence[str]) -> tuple[str, ...]:
+def _check_tips(tip: str | None, tips: Sequence[str]) -> tuple[str, ...]:
     """The names of the tips; none where the default is wanted.
 
     Raises:
@@ -497,44 +506,45 @@ def _names(tip: str | None, tips: Sequence[str]) -> tuple[str, ...]:
     """
     if tip is not None and tips:
         raise InvalidValueError("tips", repr(tips)[:80], "none beside tip: name all tips in tips")
-    known = not isinstance(tips, str) and isinstance(tips, Sequence) and all(isinstance(name, str) for name in tips)
-    if not known or len(set(tips)) < len(tips):
+    valid = not isinstance(tips, str) and isinstance(tips, Sequence) and all(isinstance(name, str) for name in tips)
+    if not valid or len(set(tips)) < len(tips):
         raise InvalidValueError("tips", repr(tips)[:80], "different names of frames")
     return tuple(tips) if tip is None else (tip,)
 
 
-_FUNCTIONS: dict[str, tuple[tuple[str, ...], Callable[..., ca.SX]]] = {  # arguments and expressions
-    "mass_matrix": (("q",), dynamics.mass_matrix),
-    "gravity": (("q",), lambda tree, q: dynamics.bias(tree, q, ca.SX(tree.n, 1), tree.gravity)),
-    "frame_position": (("q",), lambda tree, q, *frames: kinematics.frame_pose(tree, q, *frames)[1]),
-    "frame_rotation": (("q",), lambda tree, q, *frames: kinematics.frame_pose(tree, q, *frames)[0]),
-    "frame_jacobian": (("q",), kinematics.frame_jacobian),
-    "centre_of_mass": (("q",), kinematics.centre_of_mass),
-    "tip_position": (("q",), lambda tree, q: kinematics.tip_pose(tree, q)[1]),
-    "tip_rotation": (("q",), lambda tree, q: kinematics.tip_pose(tree, q)[0]),
-    "tip_jacobian": (("q",), kinematics.tip_jacobian),
-    "joint_points": (("q",), kinematics.joint_points),
-    "bias": (("q", "dq"), lambda tree, q, dq: dynamics.bias(tree, q, dq, tree.gravity)),
+#: arguments and expressions
+_FUNCTIONS: dict[str, tuple[tuple[str, ...], Callable[..., ca.SX]]] = {
+    "mass_matrix": (("q",), dynamics.build_mass_matrix),
+    "gravity": (("q",), lambda tree, q: dynamics.build_bias(tree, q, ca.SX(tree.n, 1), tree.gravity)),
+    "frame_position": (("q",), lambda tree, q, *frames: kinematics.build_frame_pose(tree, q, *frames)[1]),
+    "frame_rotation": (("q",), lambda tree, q, *frames: kinematics.build_frame_pose(tree, q, *frames)[0]),
+    "frame_jacobian": (("q",), kinematics.build_frame_jacobian),
+    "centre_of_mass": (("q",), kinematics.build_centre_of_mass),
+    "tip_position": (("q",), lambda tree, q: kinematics.build_tip_pose(tree, q)[1]),
+    "tip_rotation": (("q",), lambda tree, q: kinematics.build_tip_pose(tree, q)[0]),
+    "tip_jacobian": (("q",), kinematics.build_tip_jacobian),
+    "joint_points": (("q",), kinematics.build_joint_points),
+    "bias": (("q", "dq"), lambda tree, q, dq: dynamics.build_bias(tree, q, dq, tree.gravity)),
     "inverse_dynamics": (
         ("q", "dq", "ddq"),
-        lambda tree, q, dq, ddq: dynamics.inverse_dynamics(tree, q, dq, ddq, tree.gravity),
+        lambda tree, q, dq, ddq: dynamics.build_inverse_dynamics(tree, q, dq, ddq, tree.gravity),
     ),
     "forward_dynamics": (
         ("q", "dq", "tau"),
-        lambda tree, q, dq, tau: dynamics.forward_dynamics(tree, q, dq, tau, tree.gravity),
+        lambda tree, q, dq, tau: dynamics.build_forward_dynamics(tree, q, dq, tau, tree.gravity),
     ),
-    "coriolis_product": (("q", "v", "w"), dynamics.coriolis_product),
-    "zero_momentum": (("q",), dynamics.zero_momentum),
-    "mass_matrix_with_payload": (("q", "payload"), dynamics.mass_matrix),
+    "coriolis_product": (("q", "v", "w"), dynamics.build_coriolis_product),
+    "zero_momentum": (("q",), dynamics.build_zero_momentum),
+    "mass_matrix_with_payload": (("q", "payload"), dynamics.build_mass_matrix),
     "gravity_with_payload": (
         ("q", "payload"),
-        lambda tree, q, payload: dynamics.bias(tree, q, ca.SX(tree.n, 1), tree.gravity, payload),
+        lambda tree, q, payload: dynamics.build_bias(tree, q, ca.SX(tree.n, 1), tree.gravity, payload),
     ),
     "bias_with_payload": (
         ("q", "dq", "payload"),
-        lambda tree, q, dq, payload: dynamics.bias(tree, q, dq, tree.gravity, payload),
+        lambda tree, q, dq, payload: dynamics.build_bias(tree, q, dq, tree.gravity, payload),
     ),
-    "coriolis_product_with_payload": (("q", "v", "w", "payload"), dynamics.coriolis_product),
+    "coriolis_product_with_payload": (("q", "v", "w", "payload"), dynamics.build_coriolis_product),
 }
 _MATRICES = (
     "mass_matrix",

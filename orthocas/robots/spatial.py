@@ -5,10 +5,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError
-from orthocas.tools.checks import Array, frozen_array
+from orthocas.tools.checks import Array, freeze_array
 
-_TINY = 1e-24  # under square roots, so that their derivatives are finite
-_ROUNDING = 1e-14  # entries of rotations this close to 0 or +-1 are rounding of rpy -> matrix
+_TINY = 1e-24  #: under square roots, so that their derivatives are finite
+_ROUNDING = 1e-14  #: entries of rotations this close to 0 or +-1 are rounding of rpy -> matrix
 
 
 def skew(v: ca.SX) -> ca.SX:
@@ -29,13 +29,14 @@ def half_angle_vector(R: ca.SX) -> ca.SX:
     return vee / ca.sqrt(1 + ca.trace(R))
 
 
-def quaternion_of(R: ca.SX) -> ca.SX:
+def find_quaternion(R: ca.SX) -> ca.SX:
     """The unit quaternion (w, x, y, z) of a rotation matrix with w >= 0, without loss of digits, (4, 1).
 
     Beyond 120 degrees it is taken from the column of v v^T with the largest diagonal entry, v = (x, y, z).
     """
     trace, far = ca.trace(R), ca.SX(4, 1)
-    squares = [ca.fmax(1 + 2 * R[k, k] - trace, _TINY) for k in range(3)]  # 4 v_k^2
+    # 4 v_k^2
+    squares = [ca.fmax(1 + 2 * R[k, k] - trace, _TINY) for k in range(3)]
     for k in (2, 1, 0):
         i, j = (k + 1) % 3, (k + 2) % 3
         size, turned = ca.sqrt(squares[k]), R[j, i] - R[i, j]
@@ -50,7 +51,7 @@ def quaternion_of(R: ca.SX) -> ca.SX:
     return ca.if_else(trace > 0, ca.vertcat(cosine, vee / cosine) / 2, far)
 
 
-def quaternion_product(a: ca.SX, b: ca.SX) -> ca.SX:
+def multiply_quaternions(a: ca.SX, b: ca.SX) -> ca.SX:
     """a b of quaternions (w, x, y, z), (4, 1)."""
     v, u = a[1:], b[1:]
     return ca.vertcat(a[0] * b[0] - ca.dot(v, u), a[0] * u + b[0] * v + ca.cross(v, u))
@@ -61,7 +62,7 @@ def conjugate(a: ca.SX) -> ca.SX:
     return ca.vertcat(a[0], -a[1:])
 
 
-def rotations_of(quaternions: Array) -> Array:
+def build_rotations(quaternions: Array) -> Array:
     """Rotation matrices (N, 3, 3) of unit quaternions (w, x, y, z), (N, 4)."""
     w, x, y, z = quaternions.T
     o = np.zeros_like(w)
@@ -85,7 +86,8 @@ def tilt(R: ca.SX, axis: int, to_differentiate: bool = False) -> ca.SX:
     factor = ca.sqrt(2 / (1 + d[axis]))
     if to_differentiate:
         return across * factor
-    beyond = ca.sqrt(2 * (1 - d[axis]) / ca.fmax(ca.sumsqr(across), _TINY))  # more than a quarter of a turn
+    # Beyond a quarter of a turn.
+    beyond = ca.sqrt(2 * (1 - d[axis]) / ca.fmax(ca.sumsqr(across), _TINY))
     return across * ca.if_else(d[axis] < 0, beyond, factor)
 
 
@@ -111,14 +113,15 @@ def rotation_matrix(name: str, value: ArrayLike) -> Array:
     Raises:
         ShapeError, InvalidValueError: if it is not a rotation matrix.
     """
-    rotation = frozen_array(name, value, (3, 3))
-    bounded = np.abs(rotation).max() < 2  # products of larger numbers may overflow
+    rotation = freeze_array(name, value, (3, 3))
+    # Products of larger numbers may overflow.
+    bounded = np.abs(rotation).max() < 2
     if not bounded or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0:
         raise InvalidValueError(name, rotation.tolist(), "a rotation matrix")
     return rotation
 
 
-def rotation_z_to(axis: Array) -> Array:
+def rotate_z_to(axis: Array) -> Array:
     """A rotation T with T z = axis. For a coordinate axis it is a signed permutation, so that zeros stay zeros."""
     z = snap(axis / np.linalg.norm(axis))
     helper = np.roll(np.eye(3)[int(np.argmax(np.abs(z)))], 1)

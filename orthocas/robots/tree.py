@@ -7,79 +7,27 @@ from typing import Literal
 import numpy as np
 
 from orthocas.errors import InvalidValueError, RobotError
-from orthocas.tools.checks import Array, as_float_array, frozen_array, require_known, require_shape, require_text
+from orthocas.tools.checks import Array, as_float_array, freeze_array, require_known, require_shape, require_text
 from orthocas.tools.display import listed
 
-MOST_JOINTS = 150  #: the work for a mass matrix grows with their square
-MOST_FRAMES = 1000  #: of a robot that anybody has
-_LARGEST = 1e30  # larger numbers overflow in products
-_NOT_TURNED = 1e-6  # |R R^T - 1| of a rotation in single precision
-_SYMMETRIC = 1e-6  # of the largest entry
-_INDEFINITE = 0.1  # of the largest entry: identified inertias in published robot files have -0.07
+
+@dataclass(frozen=True, slots=True)
+class TreeRules:
+    """Bounds and tolerances of the numbers of a robot."""
+
+    joints: int = 150  #: the work for a mass matrix grows with their square
+    frames: int = 1000  #: of a robot that anybody has
+    largest: float = 1e30  #: larger numbers overflow in products
+    not_turned: float = 1e-6  #: |R R^T - 1| of a rotation in single precision
+    symmetric: float = 1e-6  #: of the largest entry of an inertia
+    indefinite: float = 0.1  #: of the largest entry: identified inertias in published robot files have -0.07
+    no_inertia: float = 1e-9  #: [kg m^2]
+
+
+RULES = TreeRules()
 _OF_JOINTS = ("rotations", "translations", "masses", "centres", "inertias", "armatures")
-_NO_INERTIA = 1e-9  # [kg m^2]
 REVOLUTE_ROOM = np.pi / 4  #: [rad] on either side of a default posture, as the hypercube of [AS2023] Sec. 9
 PRISMATIC_ROOM = 0.25  #: [m]
-
-
-def require_joint_names(names: Sequence[str]) -> None:
-    """Raise an error unless all names are printable text, each of them once."""
-    for i, name in enumerate(names):
-        require_text(f"joint_names[{i}]", name)
-    if len(set(names)) < len(names):
-        twice = next(name for i, name in enumerate(names) if name in names[:i])
-        raise RobotError(f"two joints are called '{twice}', expected different names")
-
-
-def require_bounded(name: str, array: Array, joints: Sequence[str] = ()) -> None:
-    """Raise InvalidValueError if an entry is so large that products overflow; names the joint of its row."""
-    largest = float(np.abs(array).max())
-    if largest > _LARGEST:
-        row = int(np.unravel_index(np.abs(array).argmax(), array.shape)[0])
-        place = f" at joint '{joints[row]}'" if joints else ""
-        raise InvalidValueError(f"largest entry of {name}{place}", f"{largest:g}", f"at most {_LARGEST:g}")
-
-
-def require_index(name: str, value: int, largest: int) -> None:
-    """Raise InvalidValueError unless the value is the index of a body, or -1 for the base."""
-    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not whole or not -1 <= value <= largest:
-        raise InvalidValueError(name, repr(value)[:80], f"an index from -1 to {largest}")
-
-
-def require_limits(joint: str, lower: float, upper: float, effort: float, velocity: float) -> None:
-    """Raise RobotError unless a joint can be somewhere, and move."""
-    if not lower <= upper or lower == np.inf or upper == -np.inf:
-        raise RobotError(f"joint '{joint}' has limits [{lower:g}, {upper:g}], expected lower <= upper")
-    for what, limit in (("effort", effort), ("velocity", velocity)):
-        if not limit > 0:
-            raise RobotError(f"joint '{joint}' has the {what} limit {limit:g}, expected a number > 0")
-
-
-def require_body(joint: str, mass: float, inertia: Array, armature: float, links: Sequence[str] = ()) -> None:
-    """Raise RobotError unless mass, armature and inertia (3, 3) about the centre of mass are not negative.
-
-    Identified inertias in published robot files are often slightly indefinite and violate the triangle inequality.
-    Whether the mass matrix is positive definite is for the metric to check.
-    """
-    body = f"the body moved by joint '{joint}'{f' ({listed(links)})' if links else ''}"
-    if mass < 0:
-        raise RobotError(f"{body} has mass {mass:g} kg, expected >= 0")
-    if armature < 0:
-        raise RobotError(f"joint '{joint}' has armature {armature:g}, expected >= 0")
-    size = float(np.abs(inertia).max())
-    if np.abs(inertia - inertia.T).max() > _SYMMETRIC * size:
-        raise RobotError(f"{body} has an inertia matrix that is not symmetric")
-    smallest = float(np.linalg.eigvalsh((inertia + inertia.T) / 2)[0])
-    if smallest < -_INDEFINITE * size - _NO_INERTIA:
-        raise RobotError(f"{body} has the principal moment of inertia {smallest:.3g} kg m^2, expected >= 0")
-
-
-def require_rotation(name: str, matrix: Array) -> None:
-    """Raise InvalidValueError unless the matrix (3, 3) is a rotation, to single precision."""
-    bounded = np.abs(matrix).max() < 2
-    if not bounded or np.abs(matrix @ matrix.T - np.eye(3)).max() > _NOT_TURNED or np.linalg.det(matrix) < 0:
-        raise InvalidValueError(name, matrix.round(6).tolist(), "a rotation matrix")
 
 
 JointKind = Literal["revolute", "prismatic"]
@@ -136,8 +84,8 @@ class KinematicTree:
         n = self.n
         if n == 0:
             raise RobotError("the robot has no movable joint, expected at least one")
-        if n > MOST_JOINTS:
-            raise RobotError(f"the robot has {n} movable joints, expected at most {MOST_JOINTS}")
+        if n > RULES.joints:
+            raise RobotError(f"the robot has {n} movable joints, expected at most {RULES.joints}")
         shapes: dict[str, tuple[int, ...]] = {
             "rotations": (n, 3, 3),
             "translations": (n, 3),
@@ -152,45 +100,63 @@ class KinematicTree:
             "frame_translations": (len(self.frame_names), 3),
         }
         for name, shape in shapes.items():
-            object.__setattr__(self, name, frozen_array(name, getattr(self, name), shape))
-            if getattr(self, name).size:
-                require_bounded(name, getattr(self, name), self.joint_names if name in _OF_JOINTS else ())
-        for name in ("lower", "upper", "effort_limits", "velocity_limits"):  # these may be infinite
+            array = freeze_array(name, getattr(self, name), shape)
+            object.__setattr__(self, name, array)
+            # Products of larger numbers would overflow.
+            if array.size and np.abs(array).max() > RULES.largest:
+                row = int(np.unravel_index(np.abs(array).argmax(), array.shape)[0])
+                place = f" at joint '{self.joint_names[row]}'" if name in _OF_JOINTS else ""
+                largest = f"{float(np.abs(array).max()):g}"
+                raise InvalidValueError(f"largest entry of {name}{place}", largest, f"at most {RULES.largest:g}")
+        # Limits may be infinite.
+        for name in ("lower", "upper", "effort_limits", "velocity_limits"):
             limits = as_float_array(name, getattr(self, name)).copy()
             require_shape(name, limits.shape, (n,))
             limits.setflags(write=False)
             object.__setattr__(self, name, limits)
-        self._require_sense()
+        self._check_joints()
+        self._check_frames()
 
-    def _require_sense(self) -> None:
+    def _check_joints(self) -> None:
         """Check names, kinds, limits, the order of bodies, rotations and inertias."""
         require_shape("joint_kinds", (len(self.joint_kinds),), (self.n,))
         require_shape("parents", (len(self.parents),), (self.n,))
-        require_joint_names(self.joint_names)
+        for i, name in enumerate(self.joint_names):
+            require_text(f"joint_names[{i}]", name)
+        if len(set(self.joint_names)) < self.n:
+            twice = next(name for i, name in enumerate(self.joint_names) if name in self.joint_names[:i])
+            raise RobotError(f"two joints are called '{twice}', expected different names")
         require_text("tip_name", self.tip_name)
         for i, name in enumerate(self.joint_names):
             require_known("joint kind", self.joint_kinds[i], JOINT_KINDS)
-            require_index(f"parents[{i}]", self.parents[i], i - 1)
-            require_limits(name, self.lower[i], self.upper[i], self.effort_limits[i], self.velocity_limits[i])
-            require_rotation(f"rotations[{i}]", self.rotations[i])
-        require_index("tip_parent", self.tip_parent, self.n - 1)
-        require_rotation("tip_rotation", self.tip_rotation)
+            _require_index(f"parents[{i}]", self.parents[i], i - 1)
+            # A joint can be somewhere, and move.
+            lower, upper = self.lower[i], self.upper[i]
+            if not lower <= upper or lower == np.inf or upper == -np.inf:
+                raise RobotError(f"joint '{name}' has limits [{lower:g}, {upper:g}], expected lower <= upper")
+            for what, limit in (("effort", self.effort_limits[i]), ("velocity", self.velocity_limits[i])):
+                if not limit > 0:
+                    raise RobotError(f"joint '{name}' has the {what} limit {limit:g}, expected a number > 0")
+            _require_rotation(f"rotations[{i}]", self.rotations[i])
+
+    def _check_frames(self) -> None:
+        """Check the tip, further frames, and the bodies that carry them."""
+        _require_index("tip_parent", self.tip_parent, self.n - 1)
+        _require_rotation("tip_rotation", self.tip_rotation)
         require_shape("frame_parents", (len(self.frame_parents),), (len(self.frame_names),))
-        if len(self.frame_names) > MOST_FRAMES:
-            raise RobotError(f"the robot has {len(self.frame_names)} frames, expected at most {MOST_FRAMES}")
+        if len(self.frame_names) > RULES.frames:
+            raise RobotError(f"the robot has {len(self.frame_names)} frames, expected at most {RULES.frames}")
         for k, name in enumerate(self.frame_names):
             require_text(f"frame_names[{k}]", name)
-            require_index(f"frame_parents[{k}]", self.frame_parents[k], self.n - 1)
-            require_rotation(f"frame_rotations[{k}]", self.frame_rotations[k])
+            _require_index(f"frame_parents[{k}]", self.frame_parents[k], self.n - 1)
+            _require_rotation(f"frame_rotations[{k}]", self.frame_rotations[k])
         for tip in self.tips:
             require_known("tip", tip, self.frame_names)
+        # The links of each body name it in errors.
+        frames = list(zip((self.tip_name, *self.frame_names), (self.tip_parent, *self.frame_parents), strict=True))
         for i, name in enumerate(self.joint_names):
-            require_body(name, self.masses[i], self.inertias[i], self.armatures[i], self._links(i))
-
-    def _links(self, body: int) -> list[str]:
-        """Names of the frames that a body carries."""
-        named = zip((self.tip_name, *self.frame_names), (self.tip_parent, *self.frame_parents), strict=True)
-        return [name for name, parent in named if parent == body]
+            links = [frame for frame, parent in frames if parent == i]
+            require_body(name, self.masses[i], self.inertias[i], self.armatures[i], links)
 
     @property
     def tip(self) -> Frame:
@@ -211,11 +177,11 @@ class KinematicTree:
 
     def carriers(self, body: int) -> list[int]:
         """A body and those that carry it, from the base on; none for -1."""
-        found = []
+        chain = []
         while body >= 0:
-            found.append(body)
+            chain.append(body)
             body = self.parents[body]
-        return found[::-1]
+        return chain[::-1]
 
     @property
     def n(self) -> int:
@@ -223,10 +189,10 @@ class KinematicTree:
         return len(self.joint_names)
 
     @property
-    def middle(self) -> Array:
+    def centre_posture(self) -> Array:
         """A posture away from the joint limits, (n,) [rad] or [m].
 
-        It is the middle of the limits. A joint without both limits has the value closest to 0 that is pi/4 rad (0.25 m)
+        It is the centre of the limits. A joint without both limits has the value closest to 0 that is pi/4 rad (0.25 m)
         away from its limit.
         """
         room = np.where(self.prismatic, PRISMATIC_ROOM, REVOLUTE_ROOM)
@@ -249,6 +215,41 @@ class KinematicTree:
         return ()
 
 
+def _require_index(name: str, value: int, largest: int) -> None:
+    """Raise InvalidValueError unless the value is the index of a body, or -1 for the base."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not whole or not -1 <= value <= largest:
+        raise InvalidValueError(name, repr(value)[:80], f"an index from -1 to {largest}")
+
+
+def _require_rotation(name: str, matrix: Array) -> None:
+    """Raise InvalidValueError unless the matrix (3, 3) is a rotation, to single precision."""
+    bounded = np.abs(matrix).max() < 2
+    if not bounded or np.abs(matrix @ matrix.T - np.eye(3)).max() > RULES.not_turned or np.linalg.det(matrix) < 0:
+        raise InvalidValueError(name, matrix.round(6).tolist(), "a rotation matrix")
+
+
+def require_body(joint: str, mass: float, inertia: Array, armature: float, links: Sequence[str] = ()) -> None:
+    """Raise RobotError unless mass, armature and inertia (3, 3) about the centre of mass are not negative.
+
+    Identified inertias in published robot files are often slightly indefinite and violate the triangle inequality.
+    Whether the mass matrix is positive definite is for the metric to check.
+    """
+    size = float(np.abs(inertia).max())
+    smallest = float(np.linalg.eigvalsh((inertia + inertia.T) / 2)[0])
+    symmetric = np.abs(inertia - inertia.T).max() <= RULES.symmetric * size
+    if mass >= 0 and armature >= 0 and symmetric and smallest >= -RULES.indefinite * size - RULES.no_inertia:
+        return
+    body = f"the body moved by joint '{joint}'{f' ({listed(links)})' if links else ''}"
+    if mass < 0:
+        raise RobotError(f"{body} has mass {mass:g} kg, expected >= 0")
+    if armature < 0:
+        raise RobotError(f"joint '{joint}' has armature {armature:g}, expected >= 0")
+    if not symmetric:
+        raise RobotError(f"{body} has an inertia matrix that is not symmetric")
+    raise RobotError(f"{body} has the principal moment of inertia {smallest:.3g} kg m^2, expected >= 0")
+
+
 def require_driven(what: str, tree: KinematicTree) -> None:
     """Raise RobotError for a robot with a floating base, whose first joints no motor drives."""
     if tree.floating:
@@ -268,11 +269,11 @@ _BASES: dict[str, tuple[str, ...]] = {
     "floating": _FLOATING,
     "floating:xy": _AFLOAT,
 }
-_AXES = {"heading": "z", "yaw": "z", "pitch": "y", "roll": "x"}  # of joints that turn
+_AXES = {"heading": "z", "yaw": "z", "pitch": "y", "roll": "x"}  #: of joints that turn
 BASE_JOINTS = tuple({joint for joints in _BASES.values() for joint in joints})  #: that a moving base may have
 
 
-def on_moving_base(tree: KinematicTree, base: str, mass: float, centre: Array, inertia: Array) -> KinematicTree:
+def place_on_base(tree: KinematicTree, base: str, mass: float, centre: Array, inertia: Array) -> KinematicTree:
     """A tree whose base slides along the world's x and y and turns about z, slides along one axis, or floats.
 
     The joints of the base come first, without limits: base_x, base_y, base_heading; base_x, base_y or base_z; float_x,
@@ -291,29 +292,28 @@ def on_moving_base(tree: KinematicTree, base: str, mass: float, centre: Array, i
         RobotError: if the robot has joints of these names.
     """
     if not isinstance(base, str) or base not in _BASES:
-        wanted = (
-            f"one of {', '.join(_BASES)}. The place of wheels that cannot slide sideways is no function of joints: "
-        )
-        raise InvalidValueError("base", repr(base)[:80], wanted + "use planar, and let the base follow the motion")
+        kinds = f"one of {', '.join(_BASES)}. The place of wheels that cannot slide sideways is no function of joints: "
+        raise InvalidValueError("base", repr(base)[:80], kinds + "use planar, and let the base follow the motion")
     names = _BASES[base]
     moves = [name.rpartition("_")[2] for name in names]
-    kinds: list[JointKind] = ["revolute" if move in _AXES else "prismatic" for move in moves]
-    along = [np.roll(np.eye(3), 2 - "xyz".index(_AXES.get(move, move)), axis=1) for move in moves]  # z becomes the axis
-    k, back = len(names), along[-1].T  # from the world's axes to those of the last body
+    joint_kinds: list[JointKind] = ["revolute" if move in _AXES else "prismatic" for move in moves]
+    # Rotations by which z becomes the axis of each joint, and back from the world's axes to those of the last body.
+    along = [np.roll(np.eye(3), 2 - "xyz".index(_AXES.get(move, move)), axis=1) for move in moves]
+    k, back = len(names), along[-1].T
     free, first = np.full(k, np.inf), np.zeros((k, 3))
 
-    def carried(body: int) -> int:
+    def shift(body: int) -> int:
         return body + k
 
-    def seen(rotations: Array, translations: Array, parents: tuple[int, ...]) -> tuple[Array, Array]:
+    def turn_base(rotations: Array, translations: Array, parents: tuple[int, ...]) -> tuple[Array, Array]:
         """Frames of the base in axes of the last body that moves it."""
         on_base = np.array([parent < 0 for parent in parents], dtype=bool)
         turned = np.where(on_base[:, None, None], back @ rotations, rotations)
         return turned, np.where(on_base[:, None], translations @ back.T, translations)
 
-    rotations, translations = seen(tree.rotations, tree.translations, tree.parents)
-    frames, places = seen(tree.frame_rotations, tree.frame_translations, tree.frame_parents)
-    (tip,), (place,) = seen(tree.tip_rotation[None], tree.tip_translation[None], (tree.tip_parent,))
+    rotations, translations = turn_base(tree.rotations, tree.translations, tree.parents)
+    frames, places = turn_base(tree.frame_rotations, tree.frame_translations, tree.frame_parents)
+    (tip,), (place,) = turn_base(tree.tip_rotation[None], tree.tip_translation[None], (tree.tip_parent,))
     steps = [along[i - 1].T @ along[i] if i else along[i] for i in range(k)]
     bodies = np.zeros((k, 3, 3))
     bodies[-1] = back @ inertia @ back.T
@@ -322,8 +322,8 @@ def on_moving_base(tree: KinematicTree, base: str, mass: float, centre: Array, i
     return replace(
         tree,
         joint_names=(*names, *tree.joint_names),
-        joint_kinds=(*kinds, *tree.joint_kinds),
-        parents=(*range(-1, k - 1), *map(carried, tree.parents)),
+        joint_kinds=(*joint_kinds, *tree.joint_kinds),
+        parents=(*range(-1, k - 1), *map(shift, tree.parents)),
         rotations=np.concatenate([steps, rotations]),
         translations=np.concatenate([first, translations]),
         masses=np.concatenate([np.zeros(k - 1), [mass], tree.masses]),
@@ -335,10 +335,10 @@ def on_moving_base(tree: KinematicTree, base: str, mass: float, centre: Array, i
         effort_limits=np.concatenate([free, tree.effort_limits]),
         velocity_limits=np.concatenate([free, tree.velocity_limits]),
         gravity=np.zeros(3) if names in (_FLOATING, _AFLOAT) else tree.gravity,
-        tip_parent=carried(tree.tip_parent),
+        tip_parent=shift(tree.tip_parent),
         tip_rotation=tip,
         tip_translation=place,
-        frame_parents=tuple(map(carried, tree.frame_parents)),
+        frame_parents=tuple(map(shift, tree.frame_parents)),
         frame_rotations=frames,
         frame_translations=places,
     )

@@ -13,10 +13,10 @@ from orthocas.charts.chart import Chart
 from orthocas.control.gains import non_negative_gains, positive_gains
 from orthocas.control.reference import DAMPING_RATIO, NATURAL_FREQUENCY, Reference
 from orthocas.errors import InvalidValueError, OrthocasError, StepsFileError
-from orthocas.robots.kinematics import point_jacobian
+from orthocas.robots.kinematics import build_point_jacobian
 from orthocas.robots.tree import KinematicTree
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, frozen_array, require_count, require_known, require_shape
+from orthocas.tools.checks import Array, as_float_array, freeze_array, require_count, require_known, require_shape
 from orthocas.tools.json import Reader
 
 Link = str | int | None  #: a link, by the joint that moves it (name or index), or a frame by its name; None: the tip
@@ -119,11 +119,11 @@ class Push:
                 raise InvalidValueError(f"{name} of a push", value, f"a finite number {want}")
         object.__setattr__(self, "start", float(start))
         object.__setattr__(self, "duration", float(duration))
-        object.__setattr__(self, "force", frozen_array("force", force, (3,)))
-        object.__setattr__(self, "torque", None if torque is None else frozen_array("torque", torque, (None,)))
+        object.__setattr__(self, "force", freeze_array("force", force, (3,)))
+        object.__setattr__(self, "torque", None if torque is None else freeze_array("torque", torque, (None,)))
         require_link(link)
         object.__setattr__(self, "link", link)
-        object.__setattr__(self, "point", frozen_array("point", point, (3,)))
+        object.__setattr__(self, "point", freeze_array("point", point, (3,)))
 
     @property
     def end(self) -> float:
@@ -259,7 +259,7 @@ class Loads:
         """J^T f at every place, plus the torque of the joints, (n, 1), for a row (3 P + n, 1)."""
         torque = row[3 * len(self.places) :]
         for k, place in enumerate(self.places):
-            torque += point_jacobian(self._tree, q, place.body, np.array(place.point)).T @ row[3 * k : 3 * k + 3]
+            torque += build_point_jacobian(self._tree, q, place.body, np.array(place.point)).T @ row[3 * k : 3 * k + 3]
         return torque
 
     @cached_property

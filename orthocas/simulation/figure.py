@@ -21,7 +21,7 @@ from orthocas.control.controller import FROM_THE_LAW, ControlStatus
 from orthocas.errors import ArchiveError, InvalidValueError
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, require_known
-from orthocas.tools.files import published, require_replaceable_files, require_writable
+from orthocas.tools.files import publish, require_replaceable_files, require_writable
 from orthocas.tools.picture import Picture
 from orthocas.tools.progress import Monitor, Progress, silent
 
@@ -348,7 +348,7 @@ def save_animation(
             yield picture
             monitor(Progress("draw animation", k / len(instants), f"frame {k} of {len(instants)}"))
 
-    with published(target.parent, listed=True, force=force) as folder:
+    with publish(target.parent, listed=True, force=force) as folder:
         draft = folder / target.name
         if target.suffix == ".gif":
             _write_gif(draft, draw(), samples)

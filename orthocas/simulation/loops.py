@@ -17,7 +17,7 @@ from orthocas.robots.robot import Robot
 from orthocas.simulation.disturbances import RULES, Friction, Loads, Noise, Push, Stops
 from orthocas.tools.cached import building, cached_property
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import scalar_code
+from orthocas.tools.expressions import expand_scalars
 from orthocas.tools.interrupts import deferred
 
 KEPT = 32  #: functions of each kind that a process remembers
@@ -83,7 +83,7 @@ class ClosedLoop:
             torque -= self.friction.torque(dq, numbers[: 2 * n])
         inertials = numbers[2 * n :] if self.rubs else numbers
         tree = self.plant.tree
-        ddq = dynamics.forward_dynamics(tree, q, dq, torque, tree.gravity, inertials)
+        ddq = dynamics.build_forward_dynamics(tree, q, dq, torque, tree.gravity, inertials)
         return ca.Function("plant", [ca.vertcat(q, dq), command, load, numbers], [ca.vertcat(dq, ddq)])
 
     @property
@@ -91,7 +91,7 @@ class ClosedLoop:
         """Amounts of friction, if there is any, then the inertial parameters of the robot."""
         if not self.torque:
             return np.zeros(0)
-        inertials = dynamics.inertial_numbers(self.plant.tree)
+        inertials = dynamics.collect_inertials(self.plant.tree)
         return np.concatenate([self.friction.numbers(self.n), inertials]) if self.rubs else inertials
 
     @property
@@ -149,7 +149,7 @@ def _build_rate(keyed: Keyed, profile: ca.Function) -> ca.Function:
     load = ca.MX.sym("load", loop.loads.size)
     command, _ = loop.commanded(state, profile.call([t, parameters]))
     rate = ca.Function("rate", [state, t, parameters, load], [loop.plant_rate(state, command, load)])
-    return scalar_code(rate) if loop.controller.function.is_a("SXFunction") else rate
+    return expand_scalars(rate) if loop.controller.function.is_a("SXFunction") else rate
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,7 +252,7 @@ def _compile_law(graph: ca.Function, measured: ca.Function, energy: ca.Function 
 @lru_cache(KEPT)
 def _compile_plant(keyed: Keyed) -> Any:
     function = keyed.loop.plant_of_numbers
-    return _compile([scalar_code(_rename(function.name(), function))])
+    return _compile([expand_scalars(_rename(function.name(), function))])
 
 
 @lru_cache(KEPT)

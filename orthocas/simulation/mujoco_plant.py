@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from orthocas.control.gains import non_negative_gains, positive_gains
 from orthocas.errors import InvalidValueError, RobotError, SimulationError
 from orthocas.robots.robot import Robot
-from orthocas.robots.spatial import rotation_z_to
+from orthocas.robots.spatial import rotate_z_to
 from orthocas.robots.tree import KinematicTree, require_body
 from orthocas.simulation.disturbances import Friction, Link, place_of
-from orthocas.tools.checks import Array, as_number, as_point, frozen_array, of_extra, require_at_least, require_kind
+from orthocas.tools.checks import Array, as_number, as_point, freeze_array, import_extra, require_at_least, require_kind
 from orthocas.tools.display import Shown
 
 MUJOCO = "mujoco"  #: name of this plant
@@ -66,8 +66,8 @@ class Payload:
     ) -> None:
         require_at_least("mass of a payload", mass, 0.0)
         object.__setattr__(self, "mass", as_number("mass of a payload", mass))
-        object.__setattr__(self, "centre", frozen_array("centre of a payload", centre, (3,)))
-        object.__setattr__(self, "inertia", frozen_array("inertia of a payload", inertia, (3, 3)))
+        object.__setattr__(self, "centre", freeze_array("centre of a payload", centre, (3,)))
+        object.__setattr__(self, "inertia", freeze_array("inertia of a payload", inertia, (3, 3)))
         require_body("tip", self.mass, self.inertia, 0.0)
 
 
@@ -92,11 +92,11 @@ class Wall:
     time_constant: float = 0.01
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "point", frozen_array("point of a wall", self.point, (3,)))
-        normal = frozen_array("normal of a wall", self.normal, (3,))
+        object.__setattr__(self, "point", freeze_array("point of a wall", self.point, (3,)))
+        normal = freeze_array("normal of a wall", self.normal, (3,))
         if not 0 < np.linalg.norm(normal) < np.inf:
             raise InvalidValueError("normal of a wall", normal.tolist(), "a direction other than zero")
-        object.__setattr__(self, "normal", frozen_array("normal", normal / np.linalg.norm(normal), (3,)))
+        object.__setattr__(self, "normal", freeze_array("normal", normal / np.linalg.norm(normal), (3,)))
         for name in ("tip_radius", "size", "thickness", "time_constant"):
             if not 0 < as_number(f"{name} of a wall", getattr(self, name)) < np.inf:
                 raise InvalidValueError(f"{name} of a wall", getattr(self, name), "a finite number > 0")
@@ -172,7 +172,7 @@ def mujoco() -> ModuleType:
     Raises:
         MissingExtraError: if it is not installed.
     """
-    return of_extra("mujoco", "MuJoCo as plant", "mujoco")
+    return import_extra("mujoco", "MuJoCo as plant", "mujoco")
 
 
 def body_name(i: int) -> str:
@@ -288,7 +288,7 @@ def _add_wall(mj: ModuleType, spec: Any, tip: Any, wall: Wall) -> None:
     centre = wall.point - wall.normal * half[2]
     solref = (wall.time_constant, 1.0)
     box = spec.worldbody.add_geom(type=mj.mjtGeom.mjGEOM_BOX, size=half, pos=centre, name="wall", solref=solref)
-    box.quat = _compute_quaternion(mj, rotation_z_to(wall.normal))
+    box.quat = _compute_quaternion(mj, rotate_z_to(wall.normal))
     size = (wall.tip_radius, 0, 0)
     tip.add_geom(type=mj.mjtGeom.mjGEOM_SPHERE, size=size, mass=0, name=HAND, solref=solref)
 
@@ -502,8 +502,8 @@ class MuJoCoPlant(Shown):
         Raises:
             ShapeError, InvalidValueError, UnknownNameError: for other forces and places.
         """
-        force = frozen_array("force", force, (3,))
-        body, at = place_of(self.robot.tree, link, frozen_array("point", point, (3,)))
+        force = freeze_array("force", force, (3,))
+        body, at = place_of(self.robot.tree, link, freeze_array("point", point, (3,)))
         if body < 0:
             # What carries the tip does not move.
             return

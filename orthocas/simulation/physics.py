@@ -16,7 +16,7 @@ from orthocas.simulation.loops import ClosedLoop, Piece, build_held_plant, run_c
 from orthocas.simulation.mujoco_plant import MuJoCo, MuJoCoPlant
 from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, as_number, require_kind
-from orthocas.tools.files import draft_folder
+from orthocas.tools.files import open_draft_folder
 from orthocas.tools.interrupts import deferred
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def _compile(controller: Controller, safety: Safety) -> "Supervisor":
 
     # Laws without one have no supervised form, and were refused before.
     chart: Any = controller.chart
-    with draft_folder() as folder:
+    with open_draft_folder() as folder:
         generated = codegen.generate_c(chart, folder / "law", controller, "law", safety=safety)
         library = codegen.compile_shared(generated, generated.folder)
         supervisor: Supervisor = codegen.Supervisor(

@@ -23,7 +23,7 @@ from orthocas.simulation.physics import LawWithMemory, SupervisedLaw, run_physic
 from orthocas.simulation.trajectory import Outcome, Trajectory, find_loss
 from orthocas.tools.batch import THREADS, Batched
 from orthocas.tools.checks import Array, as_number, as_point, require_executor, require_kind, require_known
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 from orthocas.tools.progress import Monitor, Progress, silent
 
 Plant = Robot | MuJoCo | Literal["mujoco"] | None  #: the true robot, or MuJoCo with it; None: the controller's model
@@ -338,7 +338,7 @@ class Prepared:
         value, chart = self._evaluate("measured", q)[0], controller.chart
         if chart is not None and controller.labels == chart.labels and chart.turns.any():
             # Circle-valued quantities with the whole turns that bring them nearest to the reference.
-            value = np.asarray(target[0] + shortest(value - target[0], chart.turns))
+            value = np.asarray(target[0] + wrap_shortest(value - target[0], chart.turns))
         run = Trajectory(
             controller=controller.name,
             kind=controller.command,

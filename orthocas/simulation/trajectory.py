@@ -18,24 +18,24 @@ from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError, OrthocasError, TrajectoryFileError
 from orthocas.simulation.disturbances import RULES, Push
 from orthocas.tasks.domains import contains
-from orthocas.tools.archive import Stored, from_npy, unpacking
+from orthocas.tools.archive import Stored, open_archive, read_npy
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import building
 from orthocas.tools.checks import (
     Array,
     as_float_array,
     as_path,
-    frozen_indices,
+    freeze_indices,
     require_kind,
     require_known,
     require_shape,
     require_text,
 )
 from orthocas.tools.display import Shown, listed, number_list
-from orthocas.tools.expressions import shortest
-from orthocas.tools.files import is_numpy_archive, published, require_replaceable, require_writable
+from orthocas.tools.expressions import wrap_shortest
+from orthocas.tools.files import is_numpy_archive, publish, require_replaceable, require_writable
 from orthocas.tools.interrupts import deferred
-from orthocas.tools.json import from_strict_json, part
+from orthocas.tools.json import get_part, read_strict_json
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,12 +69,12 @@ def read_run_file(
     Raises:
         TrajectoryFileError: if the file is missing, damaged, foreign or from a newer version.
     """
-    with unpacking(path, "trajectory", TrajectoryFileError) as zipped:
+    with open_archive(path, "trajectory", TrajectoryFileError) as zipped:
         entries = ["header", *names, *(name for name in later if f"{name}.npy" in zipped.sizes)]
         zipped.require_room([f"{name}.npy" for name in entries])
         try:
-            stored = {name: from_npy(zipped.read(f"{name}.npy")) for name in entries}
-            header = from_strict_json(str(stored.pop("header")))
+            stored = {name: read_npy(zipped.read(f"{name}.npy")) for name in entries}
+            header = read_strict_json(str(stored.pop("header")))
         except ValueError as error:
             if isinstance(error, TrajectoryFileError):
                 raise
@@ -213,7 +213,7 @@ class Trajectory(Shown):
             "units": _ARRAYS,
         }
         arrays = {name: getattr(self, name) for name in _ARRAYS}
-        with published(target.parent) as drafts, (drafts / target.name).open("wb") as draft:
+        with publish(target.parent) as drafts, (drafts / target.name).open("wb") as draft:
             np.savez_compressed(draft, header=json.dumps(header), **arrays)
 
     @classmethod
@@ -226,11 +226,11 @@ class Trajectory(Shown):
         path = as_path("path", path)
         header, arrays = read_run_file(path, _VERSION, _REQUIRED, _LATER)
         try:
-            names: dict[str, Any] = {name: tuple(part(header, name, list)) for name in ("labels", "joint_names")}
+            names: dict[str, Any] = {name: tuple(get_part(header, name, list)) for name in ("labels", "joint_names")}
             _check_names(names)
-            require_known("kind of command", part(header, "kind", str), ("torque", "velocity"))
-            require_known("outcome", part(header, "outcome", str), [outcome.value for outcome in Outcome])
-            controller = require_text("controller", part(header, "controller", str))
+            require_known("kind of command", get_part(header, "kind", str), ("torque", "velocity"))
+            require_known("outcome", get_part(header, "outcome", str), [outcome.value for outcome in Outcome])
+            controller = require_text("controller", get_part(header, "controller", str))
             checked = _check_arrays(arrays, len(names["joint_names"]), len(names["labels"]))
             own: dict[str, Any] = {
                 "controller": controller,
@@ -262,7 +262,7 @@ def _check_arrays(arrays: Mapping[str, Any], n: int, k: int) -> dict[str, Any]:
         require_shape(name, checked[name].shape, (N, *width))
     checked.setdefault("cause", np.zeros(N))
     for name in ("status", "cause"):
-        checked[name] = frozen_indices(name, checked[name], (N,), len(ControlStatus))
+        checked[name] = freeze_indices(name, checked[name], (N,), len(ControlStatus))
     if N == 0 or not np.isfinite(checked["times"]).all() or (np.diff(checked["times"]) <= 0).any():
         raise InvalidValueError("times", "empty or not increasing", "increasing instants, at least one")
     return checked
@@ -367,7 +367,7 @@ def coupling_index(chart: Chart, reference: Reference, trajectory: Trajectory) -
     if reference.labels != chart.labels:
         raise InvalidValueError("labels of the reference", reference.labels, f"those of the chart {chart.labels}")
     wanted = reference.sample(np.minimum(trajectory.times, reference.duration))[0]
-    away = np.abs(shortest(chart.phi(trajectory.q) - wanted, chart.turns))
+    away = np.abs(wrap_shortest(chart.phi(trajectory.q) - wanted, chart.turns))
     # Between two steps of the reference, only the commanded coordinates should move.
     steps = np.diff(np.vstack([reference.start, reference.targets]), axis=0)
     index = np.full((chart.n, chart.n), np.nan)

@@ -12,10 +12,11 @@ from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, SingularTaskError, UnknownNameError
 from orthocas.robots.robot import Robot
-from orthocas.tasks.clear_box import row_scale
-from orthocas.tasks.domains import Box, sample_evenly
+from orthocas.tasks.clear_box import compute_row_scale
+from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem, relative_singular_values
-from orthocas.tasks.regular_box import joint_range
+from orthocas.tasks.regular_box import find_joint_range
+from orthocas.tasks.samples import sample_evenly
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, as_point, require_kind
 from orthocas.tools.display import Shown, listed, percent
@@ -23,25 +24,39 @@ from orthocas.tools.display import Shown, listed, percent
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-CLEAR = 0.1  #: relative singular value above which positions are clear: those of shares, and of self-motions at cuts
-CLEARER = 1.5  #: times the clearance of a wide chart: that of its middle, if the middle of the branch is not clear
-_SLICES, _ON_SLICE, _FINER, _SEED = 61, 200, 400, 0  # slices q_k = v, and positions on each
-_FEW = 8  # positions on a slice; fewer say nothing about it
-_QUANTILE = 0.9  # of the positions of a slice that must be singular, or that self-motions must not leave
-_LOW = 0.12  # of that quantile, relative to the largest one of the joint's slices
-_STILL = 0.02  # joints that self-motions move less are not cut where they move least
-_EXACT = 1e-4  # the quantile where a cut is one of geometry, not of offsets between axes
-_APART = 0.45  # [rad or m] cuts of one joint that are nearer are one
-_MOST_CUTS = 2  # of a joint
-_WELL_CLEAR, _WELL = (
-    0.15,
-    0.6,
-)  # that quantile on the clearest slice of a part that counts, or over that of the joint
-_NEIGHBOURS, _SAME = 5, 1e-8  # of a minimum; difference of poses that are equal [m and rad]
-_SAMPLES, _DRAWN = 20_000, 25  # positions; times those that are wanted, the most that are drawn for clear ones
-_MIDDLES, _SURELY = 20_000, 3.0  # positions that may be a middle; times CLEAR, a value on any box that has one for sure
-_PANELS, _COLOUR = 4, "#1f5fa8"  # of pictures: side by side, of the arm
-_ARM = 7  #: joints of an arm, counted from its tip, whose self-motions are looked at
+
+@dataclass(frozen=True, slots=True)
+class BranchRules:
+    """Numbers of the search for branches, chosen on eight arms."""
+
+    #: relative singular value above which positions count: those of fractions, and of self-motions at cuts
+    nonsingular: float = 0.1
+    #: times the clearance of a wide chart: that of its centre, if the centre of the branch is too singular
+    of_centre: float = 1.5
+    slices: int = 61  #: slices q_k = v of a joint
+    on_slice: int = 200  #: positions on a slice
+    on_fine_slice: int = 400  #: positions on a slice while a cut is refined
+    seed: int = 0  #: of all positions
+    few: int = 8  #: positions on a slice; fewer say nothing about it
+    quantile: float = 0.9  #: of the positions of a slice that must be singular, or that self-motions must not leave
+    low: float = 0.12  #: that quantile at a cut, relative to the largest one of the slices of the joint
+    still: float = 0.02  #: joints that self-motions move less are not cut where they move least
+    exact: float = 1e-4  #: the quantile at which a cut is one of geometry, not of offsets between axes
+    apart: float = 0.45  #: [rad or m] cuts of one joint that are nearer are one
+    most_cuts: int = 2  #: of a joint
+    well: float = 0.15  #: the quantile on the best slice of a part that counts
+    well_of_joint: float = 0.6  #: or that quantile relative to the best slice of the joint, if that is less
+    neighbours: int = 5  #: slices on each side of a minimum
+    same_pose: float = 1e-8  #: [m and rad] difference of poses that are equal
+    samples: int = 20_000  #: positions of the joint range
+    drawn: int = 25  #: most positions that are drawn, in those that are asked for
+    centres: int = 20_000  #: positions that may be the centre of a chart
+    surely: float = 3.0  #: times `nonsingular`: a value in the range that makes sure of such a centre on any box
+    arm: int = 7  #: joints of an arm, counted from its tip, whose self-motions are examined
+
+
+RULES = BranchRules()
+
 _PARTS = {6: {1: "shoulder", 2: "elbow", 4: "wrist"}, 7: {1: "shoulder", 3: "elbow", 5: "wrist"}}
 
 
@@ -70,9 +85,10 @@ class Branch:
     name: str  #: such as "shoulder+ elbow- wrist+"; "whole" without cuts
     box: Box  #: up to the joint limits
     posture: Array  #: its clear position farthest from limits and cuts, (n,)
-    clear_share: float  #: share of its positions with a relative singular value above 0.1
-    share: float  #: its share of all such positions of the joint range
-    clearance: float = CLEAR  #: the largest up to 0.1 for which some position is clear enough to be a chart's middle
+    clear_share: float  #: fraction of its positions with a relative singular value above 0.1
+    share: float  #: its fraction of all such positions of the joint range
+    #: the largest up to 0.1 for which some position is nonsingular enough to be the centre of a chart
+    clearance: float = RULES.nonsingular
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -109,26 +125,26 @@ class Branches(Shown, Sequence[Branch]):
     def mirrored(self, q: ArrayLike, cut: int) -> Array:
         """The joint position (n,) beyond a cut with the same pose of the tip, for cuts among `mirrors`.
 
-        q_k - value changes its sign, and its neighbours turn by half a turn, towards the middle of their range.
+        q_k - value changes its sign, and its neighbours turn by half a turn, towards the centre of their range.
         """
         q = as_point("q", q, self.robot.n)
-        found: Array = _reflected(self.robot, self.cuts[cut], q[None])[0]
-        return found
+        image: Array = _reflect(self.robot, self.cuts[cut], q[None])[0]
+        return image
 
     def plot(self) -> "Figure":
-        """The posture of each branch, in a panel with its name and its share of the clear positions."""
+        """The posture of each branch, in a panel with its name and its fraction of the clear positions."""
         from matplotlib.layout_engine import ConstrainedLayoutEngine  # takes long, and searches need no pictures
 
         from orthocas.tools.picture import Picture, equal_axes
 
-        columns = min(len(self), _PANELS)
+        columns = min(len(self), 4)
         rows = -(-len(self) // columns)
         layout = ConstrainedLayoutEngine(h_pad=0.15, w_pad=0.1)
         figure = Picture(figsize=(3.4 * columns, 3.4 * rows), layout=layout)
         postures = self.robot.joint_points(np.array([item.posture for item in self]))
         for k, (item, points) in enumerate(zip(self, postures, strict=True)):
             panel = figure.add_subplot(rows, columns, k + 1, projection="3d")
-            panel.plot(*points.T, "-o", color=_COLOUR, markersize=4, linewidth=2.2)
+            panel.plot(*points.T, "-o", color="#1f5fa8", markersize=4, linewidth=2.2)
             panel.set_title(f"{item.name}\n{percent(item.share)} of the clear positions", fontsize=9)
             equal_axes(panel, postures.reshape(-1, 3))
         return figure
@@ -136,25 +152,28 @@ class Branches(Shown, Sequence[Branch]):
     def facts(self) -> dict[str, str]:
         """Cuts and branches, and those that a wide chart of the usual clearance cannot serve."""
         shares = [f"{item.name} ({percent(item.share)})" for item in self.items]
-        lower = [f"{item.name} ({item.clearance:.2g} or less)" for item in self.items if item.clearance < CLEAR]
-        return {
+        facts = {
             "branches": f"{len(self)} of {self.robot.heading}",
             "cuts": "; ".join(cut.explained for cut in self.cuts) or "none",
             "clear positions": listed(shares),
-            **({"too singular": f"for wide charts of clearance {CLEAR:g}: {listed(lower)}"} if lower else {}),
         }
+        below = [item for item in self.items if item.clearance < RULES.nonsingular]
+        if below:
+            lower = listed([f"{item.name} ({item.clearance:.2g} or less)" for item in below])
+            facts["too singular"] = f"for wide charts of clearance {RULES.nonsingular:g}: {lower}"
+        return facts
 
 
 def branches(robot: Robot, task: Task | None = None) -> Branches:
     """Find the parts of the joint range between which self-motions and ways around singular positions do not lead.
 
-    Cuts are hypersurfaces q_k = v of two kinds. On singular ones, no position is clear, such as those of a stretched
-    elbow. Others are not crossed by self-motions: joint k stands still on them while the arm moves without its tip,
-    as the second joint of a shoulder with three intersecting axes at q2 = 0. A coordinate keeps its sense along
-    self-motions on each side of a cut, and not across it. Each is looked for on 61 slices of every joint but the first
-    and the last of the arm, then refined; nearly so counts too, because offsets between axes move such places a little.
-    A cut of the second kind does not count if hardly any position between it and the next cut is clear. Cuts are found
-    from samples, not proved.
+    Cuts are hypersurfaces q_k = v of two kinds. On singular ones, every position is singular, such as those of a
+    stretched elbow. Others are not crossed by self-motions: joint k stands still on them while the arm moves without
+    its tip, as the second joint of a shoulder with three intersecting axes at q2 = 0. A coordinate keeps its sign along
+    self-motions on each side of a cut, and not across it. The search takes slices of every joint but the first and the
+    last of the arm, and refines what it finds; nearly so counts too, because offsets between axes move such places a
+    little. A cut of the second kind does not count if hardly any position between it and the next cut is nonsingular.
+    Cuts are found from samples, not proved.
 
     Self-motions are those of the tip's pose, by the last seven joints: charts of its position keep to the same cuts.
     With several tips, they are those of each tip by the last seven joints that carry it, if these move the task.
@@ -183,20 +202,22 @@ def branches(robot: Robot, task: Task | None = None) -> Branches:
     require_kind("robot", robot, Robot)
     if task is not None:
         require_kind("task", task, Task)
-    whole = joint_range(robot, 0)
-    arms = _Arm.all_of(robot, task, whole)
-    cuts = tuple(cut for arm in arms for k in arm.inner for cut in arm.cuts(k))
-    points = sample_evenly(Box(whole.centre, whole.half_width), _SAMPLES, _SEED)
+    whole = find_joint_range(robot, 0)
+    arms = _Arm.build_all(robot, task, whole)
+    cuts = tuple(cut for arm in arms for k in arm.inner for cut in arm.find_cuts(k))
+    points = sample_evenly(Box(whole.centre, whole.half_width), RULES.samples, RULES.seed)
     if task is not None:
-        values = _values_in_range(robot, task)(points)
+        values = _scale_to_range(robot, task)(points)
     else:
-        values = np.min([arm.judged(points)[0] for arm in arms], axis=0)
-    if not (values > CLEAR).any():
+        values = np.min([arm.measure_self_motions(points)[0] for arm in arms], axis=0)
+    if not (values > RULES.nonsingular).any():
         raise SingularTaskError("no position of the joint range is clear of singular ones")
-    found = [_branch(whole, cuts, sides, points, values) for sides in product(*_sides(cuts))]
-    items = [item for item in found if item]
+    # A joint with k cuts has k + 1 parts, and a branch takes one part of each joint.
+    parts = [range(1 + sum(cut.joint == k for cut in cuts)) for k in sorted({cut.joint for cut in cuts})]
+    candidates = [_build_branch(whole, cuts, sides, points, values) for sides in product(*parts)]
+    items = [item for item in candidates if item]
     if task is not None or len(arms) == 1:
-        items = [_with_clearance(item, robot, task or arms[0].task, points, values) for item in items]
+        items = [_add_clearance(item, robot, task or arms[0].task, points, values) for item in items]
     items.sort(key=lambda item: -item.share)
     mirrors = tuple(i for i, cut in enumerate(cuts) if _is_mirror(robot, cut, points[:50]))
     return Branches(robot, cuts, tuple(items), mirrors)
@@ -213,36 +234,37 @@ class _Arm:
     scale: Array
 
     @classmethod
-    def all_of(cls, robot: Robot, task: Task | None, whole: Box) -> list["_Arm"]:
+    def build_all(cls, robot: Robot, task: Task | None, whole: Box) -> list["_Arm"]:
         """The arm of a robot with one tip; of others, those of all tips whose joints move the task."""
-        points = sample_evenly(Box(whole.centre, whole.half_width), 2000, _SEED)
+        points = sample_evenly(Box(whole.centre, whole.half_width), 2000, RULES.seed)
         if len(robot.tips) == 1:
-            joints = list(range(max(0, robot.n - _ARM), robot.n))
-            return [cls._of(robot, Task.pose(robot) if robot.n >= 6 or task is None else task, whole, joints, points)]
+            joints = list(range(max(0, robot.n - RULES.arm), robot.n))
+            one = Task.pose(robot) if robot.n >= 6 or task is None else task
+            return [cls._build(robot, one, whole, joints, points)]
         moved = np.ones(robot.n, dtype=bool)
         if task is not None:
-            moved = np.asarray(_jacobians(task.with_reference_at(whole.centre), points[:20]).any(axis=(0, 1)))
-        found = []
+            moved = np.asarray(_evaluate_jacobians(task.with_reference_at(whole.centre), points[:20]).any(axis=(0, 1)))
+        arms = []
         for tip in robot.tips:
-            joints = robot.tree.carriers(robot.tree.frame(tip).parent)[-_ARM:]
+            joints = robot.tree.carriers(robot.tree.frame(tip).parent)[-RULES.arm :]
             if joints and moved[joints].any():
-                found.append(cls._of(robot, Task.pose(robot, frame=tip), whole, joints, points))
-        return found
+                arms.append(cls._build(robot, Task.pose(robot, frame=tip), whole, joints, points))
+        return arms
 
     @classmethod
-    def _of(cls, robot: Robot, task: Task, whole: Box, joints: list[int], points: Array) -> "_Arm":
-        judged = task.with_reference_at(whole.centre)
-        J = _jacobians(judged, points)
-        return cls(robot, judged, whole, joints, row_scale(J[:, :, joints], judged.units))
+    def _build(cls, robot: Robot, task: Task, whole: Box, joints: list[int], points: Array) -> "_Arm":
+        centred = task.with_reference_at(whole.centre)
+        J = _evaluate_jacobians(centred, points)
+        return cls(robot, centred, whole, joints, compute_row_scale(J[:, :, joints], centred.units))
 
     @property
     def inner(self) -> list[int]:
         """The joints that may be cut: turning the base or the tool changes nothing."""
         return self.joints[1:-1]
 
-    def judged(self, points: Array) -> tuple[Array, Array]:
+    def measure_self_motions(self, points: Array) -> tuple[Array, Array]:
         """Relative singular values (N,), and how far unit self-motions move each joint, (N, n); NaN without any."""
-        J = _jacobians(self.task, points)[:, :, self.joints] / self.scale[:, None]
+        J = _evaluate_jacobians(self.task, points)[:, :, self.joints] / self.scale[:, None]
         m = J.shape[1]
         moved = np.full(points.shape, np.nan)
         if m >= len(self.joints):
@@ -251,64 +273,68 @@ class _Arm:
         moved[:, self.joints] = np.sqrt((V[:, m:] ** 2).sum(axis=1))
         return np.asarray(s[:, -1]), moved
 
-    def cuts(self, k: int) -> list[Cut]:
+    def find_cuts(self, k: int) -> list[Cut]:
         """The cuts of joint k."""
         low, high = (self.whole.centre[k] + side * self.whole.half_width[k] for side in (-1, 1))
-        values = np.linspace(low, high, _SLICES)
-        found: list[tuple[Cut, float]] = []
-        of_slices = np.array([self._sizes(k, v, _ON_SLICE) for v in values])
+        values = np.linspace(low, high, RULES.slices)
+        cuts: list[tuple[Cut, float]] = []
+        of_slices = np.array([self._measure_slice(k, v, RULES.on_slice) for v in values])
+        # Minima over the slices are refined, singular ones first, and those near another cut are dropped.
         for singular, sizes in zip((True, False), of_slices.T, strict=True):
-            if not np.isfinite(sizes).any() or (not singular and np.nanmax(sizes) < _STILL):
+            if not np.isfinite(sizes).any() or (not singular and np.nanmax(sizes) < RULES.still):
                 continue
-            for i in _minima(sizes, _LOW * float(np.nanmax(sizes))):
-                cut, size = self._refined(k, values, i, singular)
-                if all(abs(cut.value - other.value) > _APART for other, _ in found):
-                    found.append((cut, size))
-        strongest = sorted(found, key=lambda pair: pair[1])[:_MOST_CUTS]
-        while weakest := _beside_a_sliver(strongest, low, high, values, of_slices[:, 0]):
+            for i in _find_minima(sizes, RULES.low * float(np.nanmax(sizes))):
+                cut, size = self._refine_cut(k, values, i, singular)
+                if all(abs(cut.value - other.value) > RULES.apart for other, _ in cuts):
+                    cuts.append((cut, size))
+        # Few cuts are kept, and none that is not singular beside a part with hardly any nonsingular slice.
+        strongest = sorted(cuts, key=lambda pair: pair[1])[: RULES.most_cuts]
+        while weakest := _find_sliver_cut(strongest, low, high, values, of_slices[:, 0]):
             strongest.remove(weakest)
         return sorted((cut for cut, _ in strongest), key=lambda cut: cut.value)
 
-    def _sizes(self, k: int, value: float, count: int) -> tuple[float, float]:
+    def _measure_slice(self, k: int, value: float, count: int) -> tuple[float, float]:
         """The 90 % quantiles, over a slice, of the singular value, and of how far self-motions move the joint."""
-        points = sample_evenly(Box(self.whole.centre, self.whole.half_width), count, (_SEED, k))
+        points = sample_evenly(Box(self.whole.centre, self.whole.half_width), count, (RULES.seed, k))
         points[:, k] = value
-        s, moved = self.judged(points)
-        clear = moved[s > CLEAR, k]
-        moves = float(np.quantile(clear, _QUANTILE)) if len(clear) >= _FEW else np.nan
-        return float(np.quantile(s, _QUANTILE)), moves
+        s, moved = self.measure_self_motions(points)
+        clear = moved[s > RULES.nonsingular, k]
+        moves = float(np.quantile(clear, RULES.quantile)) if len(clear) >= RULES.few else np.nan
+        return float(np.quantile(s, RULES.quantile)), moves
 
-    def _refined(self, k: int, values: Array, i: int, singular: bool) -> tuple[Cut, float]:
+    def _refine_cut(self, k: int, values: Array, i: int, singular: bool) -> tuple[Cut, float]:
         """The cut near slice i, and its quantile."""
 
         def size(value: float) -> float:
-            found = self._sizes(k, value, _FINER)[0 if singular else 1]
-            return found if np.isfinite(found) else 1.0
+            quantile = self._measure_slice(k, value, RULES.on_fine_slice)[0 if singular else 1]
+            return quantile if np.isfinite(quantile) else 1.0
 
-        found = scipy.optimize.minimize_scalar(
+        # Cuts of geometry lie at zero for most robots, which is more exact than what the search ends with.
+        minimum = scipy.optimize.minimize_scalar(
             size, bounds=(values[i - 1], values[i + 1]), method="bounded", options={"xatol": 1e-6}
         )
-        value = 0.0 if size(0.0) <= found.fun + _EXACT and values[i - 1] < 0 < values[i + 1] else float(found.x)
+        at_zero = size(0.0) <= minimum.fun + RULES.exact and values[i - 1] < 0 < values[i + 1]
+        value = 0.0 if at_zero else float(minimum.x)
         name = self.robot.joint_names[k]
         parts = _PARTS.get(len(self.joints), {}) if len(self.robot.tips) == 1 else {}
         part = parts.get(k - self.joints[0], name)
         least = size(value)
-        return Cut(k, name, part, value, singular, least < _EXACT), least
+        return Cut(k, name, part, value, singular, least < RULES.exact), least
 
 
-def _beside_a_sliver(
+def _find_sliver_cut(
     cuts: list[tuple[Cut, float]], low: float, high: float, values: Array, sizes: Array
 ) -> tuple[Cut, float] | None:
     """The weakest cut, of those that self-motions do not cross, that bounds a part with hardly any clear slice."""
     placed = sorted(cuts, key=lambda pair: pair[0].value)
     ends = [low, *(cut.value for cut, _ in placed), high]
-    enough = min(_WELL_CLEAR, _WELL * float(sizes.max()))
+    enough = min(RULES.well, RULES.well_of_joint * float(sizes.max()))
     slivers = [sizes[(values > start) & (values < end)].max(initial=0.0) <= enough for start, end in pairwise(ends)]
-    found = [pair for i, pair in enumerate(placed) if not pair[0].singular and (slivers[i] or slivers[i + 1])]
-    return max(found, key=lambda pair: pair[1], default=None)
+    candidates = [pair for i, pair in enumerate(placed) if not pair[0].singular and (slivers[i] or slivers[i + 1])]
+    return max(candidates, key=lambda pair: pair[1], default=None)
 
 
-def clear_positions(robot: Robot, task: Task, box: Box, samples: int, seed: int | tuple[int, ...]) -> Array:
+def sample_nonsingular(robot: Robot, task: Task, box: Box, samples: int, seed: int | tuple[int, ...]) -> Array:
     """Uniform positions of a box at which a task is clear, as `branches` counts them, (N, n).
 
     Args:
@@ -318,71 +344,67 @@ def clear_positions(robot: Robot, task: Task, box: Box, samples: int, seed: int 
         samples: N, or less if fewer than one in 25 is clear.
         seed: of the positions.
     """
-    values, rng = _values_in_range(robot, task), np.random.default_rng(seed)
-    found, count = [np.empty((0, robot.n))], 0
-    for _ in range(_DRAWN):
+    values, rng = _scale_to_range(robot, task), np.random.default_rng(seed)
+    kept, count = [np.empty((0, robot.n))], 0
+    for _ in range(RULES.drawn):
         points = rng.uniform(box.centre - box.half_width, box.centre + box.half_width, (samples, robot.n))
-        found.append(points[values(points) > CLEAR])
-        count += len(found[-1])
+        kept.append(points[values(points) > RULES.nonsingular])
+        count += len(kept[-1])
         if count >= samples:
             break
-    return np.concatenate(found)[:samples]
+    return np.concatenate(kept)[:samples]
 
 
-def middles(robot: Robot, task: Task, box: Box) -> tuple[Array, Array]:
+def sample_centres(robot: Robot, task: Task, box: Box) -> tuple[Array, Array]:
     """Positions of a box (N, n), and their relative singular values with rows scaled over the box, (N,)."""
-    points = sample_evenly(Box(box.centre, box.half_width), _MIDDLES, _SEED)
+    points = sample_evenly(Box(box.centre, box.half_width), RULES.centres, RULES.seed)
     return points, relative_singular_values(Problem(robot, task, domain=box), points)
 
 
-def _values_in_range(robot: Robot, task: Task) -> Callable[[Array], Array]:
+def _scale_to_range(robot: Robot, task: Task) -> Callable[[Array], Array]:
     """Relative singular values of a task at points (N, n), (N,); rows are scaled over the joint range."""
-    whole = joint_range(robot, 0)
-    judged = task.with_reference_at(whole.centre)
-    scale = row_scale(
-        _jacobians(judged, sample_evenly(Box(whole.centre, whole.half_width), _SAMPLES, _SEED)), judged.units
-    )
+    whole = find_joint_range(robot, 0)
+    centred = task.with_reference_at(whole.centre)
+    samples = sample_evenly(Box(whole.centre, whole.half_width), RULES.samples, RULES.seed)
+    scale = compute_row_scale(_evaluate_jacobians(centred, samples), centred.units)
 
     def values(points: Array) -> Array:
-        return np.asarray(np.linalg.svd(_jacobians(judged, points) / scale[:, None], compute_uv=False)[:, -1])
+        return np.asarray(np.linalg.svd(_evaluate_jacobians(centred, points) / scale[:, None], compute_uv=False)[:, -1])
 
     return values
 
 
-def _with_clearance(branch: Branch, robot: Robot, task: Task, points: Array, values: Array) -> Branch:
+def _add_clearance(branch: Branch, robot: Robot, task: Task, points: Array, values: Array) -> Branch:
     """The branch with the clearance that it allows; the values at points are those in the joint range."""
-    if task.m >= robot.n or values[branch.box.contains(points)].max() > _SURELY * CLEAR:
+    if task.m >= robot.n or values[branch.box.contains(points)].max() > RULES.surely * RULES.nonsingular:
         return branch
-    largest = float(middles(robot, task, branch.box)[1].max()) / CLEARER
-    return replace(branch, clearance=min(CLEAR, math.floor(1e3 * largest) / 1e3))
+    largest = float(sample_centres(robot, task, branch.box)[1].max()) / RULES.of_centre
+    return replace(branch, clearance=min(RULES.nonsingular, math.floor(1e3 * largest) / 1e3))
 
 
-def _jacobians(task: Task, points: Array) -> Array:
+def _evaluate_jacobians(task: Task, points: Array) -> Array:
     """Frame Jacobians, zero where they are not finite, (N, m, n)."""
     J: Array = task.batched_frame_jacobian(points)[0].reshape(len(points), task.m, points.shape[1])
     return np.where(np.isfinite(J), J, 0.0)
 
 
-def _minima(sizes: Array, limit: float) -> list[int]:
+def _find_minima(sizes: Array, limit: float) -> list[int]:
     """Inner slices that are the lowest of their neighbours and below a limit, the lowest first."""
-    found = []
+    minima = []
     for i in range(1, len(sizes) - 1):
-        near = sizes[max(0, i - _NEIGHBOURS) : i + _NEIGHBOURS + 1]
+        near = sizes[max(0, i - RULES.neighbours) : i + RULES.neighbours + 1]
         if sizes[i] <= limit and sizes[i] == np.nanmin(near):
-            found.append(i)
-    return sorted(found, key=lambda i: float(sizes[i]))
+            minima.append(i)
+    return sorted(minima, key=lambda i: float(sizes[i]))
 
 
-def _sides(cuts: tuple[Cut, ...]) -> list[range]:
-    """For each joint that is cut, the numbers of its parts."""
-    joints = sorted({cut.joint for cut in cuts})
-    return [range(1 + sum(cut.joint == k for cut in cuts)) for k in joints]
-
-
-def _branch(whole: Box, cuts: tuple[Cut, ...], sides: tuple[int, ...], points: Array, values: Array) -> Branch | None:
+def _build_branch(
+    whole: Box, cuts: tuple[Cut, ...], sides: tuple[int, ...], points: Array, values: Array
+) -> Branch | None:
     """The branch on some sides of the cuts; None if it has no clear sample."""
+    # Each side is the part of a joint between two of its cuts, or between a cut and a limit.
     low, high = whole.centre - whole.half_width, whole.centre + whole.half_width
-    clear, words = points[values > CLEAR], []
+    clear, words = points[values > RULES.nonsingular], []
     for k, side in zip(sorted({cut.joint for cut in cuts}), sides, strict=True):
         own = [cut for cut in cuts if cut.joint == k]
         if side:
@@ -390,6 +412,7 @@ def _branch(whole: Box, cuts: tuple[Cut, ...], sides: tuple[int, ...], points: A
         if side < len(own):
             high[k] = own[side].value
         words.append(own[0].part + ("-", "+")[side] if len(own) == 1 else own[0].part + ("-", "0", "+")[side])
+    # The box, its fractions, and the nonsingular position farthest from all its boundaries.
     inside = clear[((clear > low) & (clear < high)).all(axis=1)]
     if not len(inside):
         return None
@@ -400,12 +423,12 @@ def _branch(whole: Box, cuts: tuple[Cut, ...], sides: tuple[int, ...], points: A
     return Branch(" ".join(words) or "whole", box, posture, len(inside) / drawn, len(inside) / len(clear))
 
 
-def _reflected(robot: Robot, cut: Cut, points: Array) -> Array:
+def _reflect(robot: Robot, cut: Cut, points: Array) -> Array:
     """Points (N, n) on the other side of a cut, the neighbours of its joint turned by half a turn."""
     k = cut.joint
     moved = points.copy()
     moved[:, k] = 2 * cut.value - points[:, k]
-    middle = np.where(np.isfinite(robot.tree.middle), robot.tree.middle, 0.0)
+    middle = np.where(np.isfinite(robot.tree.centre_posture), robot.tree.centre_posture, 0.0)
     for j in (k - 1, k + 1):
         if 0 <= j < robot.n:
             moved[:, j] += np.where(points[:, j] > middle[j], -np.pi, np.pi)
@@ -418,9 +441,9 @@ def _is_mirror(robot: Robot, cut: Cut, points: Array) -> bool:
     near = [j for j in (cut.joint - 1, cut.joint, cut.joint + 1) if 0 <= j < robot.n]
     if not cut.exact or any(prismatic[j] for j in near):
         return False
-    moved = _reflected(robot, cut, points)
+    moved = _reflect(robot, cut, points)
     same = [
-        np.abs(of(points, tip) - of(moved, tip)).max() < _SAME
+        np.abs(of(points, tip) - of(moved, tip)).max() < RULES.same_pose
         for of in (robot.frame_position, robot.frame_rotation)
         for tip in robot.tips
     ]

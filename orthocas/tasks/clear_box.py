@@ -1,4 +1,4 @@
-"""The part of a box that stays clear of near-singular positions of a task."""
+"""The part of a box that stays away from near-singular positions of a task."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,43 +9,29 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocas.errors import DomainError, InvalidValueError, SingularTaskError
-from orthocas.tasks.domains import (
-    Box,
-    Domain,
-    StopKind,
-    Wall,
-    register_domain,
-    require_within_limits,
-    sample_evenly,
-    sample_uniform,
-)
+from orthocas.tasks.domains import Box, Domain, StopKind, Wall, register_domain, require_within_limits
+from orthocas.tasks.samples import sample_evenly, sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_number, as_point_set, frozen_array, require_kind, require_known
+from orthocas.tools.checks import Array, as_number, as_point_set, freeze_array, require_kind, require_known
 from orthocas.tools.columns import BlockedFunction
-from orthocas.tools.json import part
+from orthocas.tools.json import get_part
 
 CLEAR_BOX = "clear box"  #: name of the kind
-ROWS = ("frame", "x")  #: Jacobians by which a position is judged
-_SAMPLES, _SEED = 256, 0  # of the box, for the scale of the rows
-_SHARE_SAMPLES = 20_000
+ROWS = ("frame", "x")  #: Jacobians by which a position is evaluated
 
 
-def row_scale(J: Array, units: tuple[str, ...]) -> Array:
-    """Root mean square length of the rows of each unit, (m,). It does not depend on how axes are turned; 1 if zero.
+@dataclass(frozen=True, slots=True)
+class ClearBoxRules:
+    """Sample sizes of a `ClearBox`."""
 
-    Args:
-        J: task Jacobians at samples, (N, m, n).
-        units: units of the task components; rows with the same unit share one scale, rows of unknown unit have their
-            own.
-    """
-    squares = (J**2).sum(axis=2).mean(axis=0)
-    groups = [unit or f"own {i}" for i, unit in enumerate(units)]
-    means = [
-        np.mean([square for square, other in zip(squares, groups, strict=True) if other == mine]) for mine in groups
-    ]
-    return np.sqrt([mean if mean > 0 else 1.0 for mean in means])
+    samples: int = 256  #: of the box, for the scale of the rows
+    fraction_samples: int = 20_000  #: of the box, for the fraction of it that is nonsingular
+    seed: int = 0
+
+
+RULES = ClearBoxRules()
 
 
 @register_domain
@@ -103,11 +89,12 @@ class ClearBox(Box):
         require_kind("box", box, Box)
         require_kind("task", task, Task)
         require_known("rows", rows, ROWS)
+        # The frame Jacobian decides unless `rows` says otherwise; sizes are those of its rows on the box.
         super().__init__(box.centre, box.half_width, box.unbounded)
         task = task.with_reference_at(box.centre)
         object.__setattr__(self, "task", task)
         object.__setattr__(self, "rows", rows)
-        sizes = self._row_sizes() if scale is None else frozen_array("scale", scale, (task.m,))
+        sizes = self._measure_rows() if scale is None else freeze_array("scale", scale, (task.m,))
         bound = as_number("least_singular_value", least_singular_value)
         for name, value in (("least_singular_value", bound), ("scale", sizes.min())):
             if not 0 < value < np.inf:
@@ -115,13 +102,13 @@ class ClearBox(Box):
         for field, value in (("least_singular_value", bound), ("scale", sizes)):
             object.__setattr__(self, field, value)
         if not self.is_clear(self.centre[None])[0]:
-            raise DomainError(f"the centre of the domain {self._value_told(self.centre)}")
+            raise DomainError(f"the centre of the domain {self._describe_value(self.centre)}")
 
     @property
     def heading(self) -> str:
         """The condition in one line, with the lengths by which rows are divided."""
         rows = "J_x" if self.jacobian_function is self.task.jacobian_function else "the frame Jacobian"
-        sizes = f"(rows of {rows} over {_lengths(self.scale, self.task.units)})"
+        sizes = f"(rows of {rows} over {_list_sizes(self.scale, self.task.units)})"
         return f"relative singular value of the task above {self.least_singular_value:g} {sizes}"
 
     @property
@@ -140,11 +127,11 @@ class ClearBox(Box):
         room = lambda q: float(self.singular_values(q)) - self.least_singular_value  # noqa: E731
         return (Wall(StopKind.NEAR_SINGULAR, room, self.singular_values, self.heading),)
 
-    def facts_of_condition(self) -> dict[str, str]:
+    def describe_condition(self) -> dict[str, str]:
         """The condition in one line."""
         return {"clear": self.heading}
 
-    def numbers_of_condition(self) -> dict[str, Any]:
+    def report_condition(self) -> dict[str, Any]:
         """Bound, rows and their sizes, and how much of the box is left."""
         return {
             "least_singular_value": self.least_singular_value,
@@ -167,24 +154,24 @@ class ClearBox(Box):
         box = Box.from_data(task, data, arrays)
         require_kind("box", box, Box)
         require_within_limits(task.robot, box)
-        rows = part(data, "judged_rows", str) if "judged_rows" in data else "frame" if task.turn is None else "x"
-        bound = part(data, "least_singular_value", float)
-        return cls(cast("Box", box), task, bound, part(arrays, "row_scale", np.ndarray), rows)
+        rows = get_part(data, "judged_rows", str) if "judged_rows" in data else "frame" if task.turn is None else "x"
+        bound = get_part(data, "least_singular_value", float)
+        return cls(cast("Box", box), task, bound, get_part(arrays, "row_scale", np.ndarray), rows)
 
     @property
     def jacobian_function(self) -> ca.Function:
         """q (n, 1) -> J (m, n), the rows that count."""
         return self.task.jacobian_function if self.rows == "x" else self.task.frame_jacobian_function
 
-    def explained(self, q: Array) -> str:
+    def explain(self, q: Array) -> str:
         """What is wrong with a position (n,) that is not clear."""
-        return f"the task {self._value_told(q)}"
+        return f"the task {self._describe_value(q)}"
 
-    def _value_told(self, q: Array) -> str:
+    def _describe_value(self, q: Array) -> str:
         bound = f"expected one above least_singular_value = {self.least_singular_value:g}"
         return f"has a relative singular value of {self.singular_values(q):.3g}, {bound}"
 
-    def within(self, box: Box) -> "ClearBox":
+    def apply_to(self, box: Box) -> "ClearBox":
         """The same condition on another box."""
         return ClearBox(box, self.task, self.least_singular_value, self.scale, self.rows)
 
@@ -202,16 +189,17 @@ class ClearBox(Box):
     def singular_values(self, q: ArrayLike) -> Any:
         """s(q) at points (n,) or (N, n): a number, or (N,); NaN where the task has no finite Jacobian."""
         points, single = as_point_set("q", q, len(self.centre))
-        J = self._jacobians(points) / self.scale[:, None]
-        known = np.isfinite(J).all(axis=(1, 2))
+        J = self._evaluate_jacobians(points) / self.scale[:, None]
+        finite = np.isfinite(J).all(axis=(1, 2))
         values = np.full(len(points), np.nan)
-        values[known] = np.linalg.svd(J[known], compute_uv=False)[:, -1]
+        values[finite] = np.linalg.svd(J[finite], compute_uv=False)[:, -1]
         return values[0] if single else values
 
     @cached_property
     def share(self) -> float:
-        """Share of the box that is clear, from 20,000 samples."""
-        return float(self.is_clear(sample_evenly(_boundaries(self), _SHARE_SAMPLES, _SEED)).mean())
+        """Fraction of the box that is clear, from 20,000 samples."""
+        points = sample_evenly(Box(self.centre, self.half_width), RULES.fraction_samples, RULES.seed)
+        return float(self.is_clear(points).mean())
 
     @cached_property
     def gram(self) -> ca.Function:
@@ -228,36 +216,54 @@ class ClearBox(Box):
     @cached_property
     def _clear_pivots(self) -> ca.Function:
         q = ca.SX.sym("q", len(self.centre))
-        square = self.least_singular_value * self.least_singular_value  # ** raises OverflowError for bounds of a file
+        # A product, because ** raises OverflowError for the bounds of some files.
+        square = self.least_singular_value * self.least_singular_value
         left = self.gram(q) - square * ca.SX.eye(self.task.m)
-        found = []
+        # Pivots of Gaussian elimination without exchanges.
+        pivots = []
         for _ in range(self.task.m):
-            found.append(left[0, 0])
+            pivots.append(left[0, 0])
             left = left[1:, 1:] - left[1:, 0] @ left[0, 1:] / left[0, 0]
-        return dense_function("pivots", [q], [ca.vertcat(*found)])
+        return dense_function("pivots", [q], [ca.vertcat(*pivots)])
 
     @cached_property
     def _batched_pivots(self) -> BlockedFunction:
         return BlockedFunction(self.pivots)
 
-    def _jacobians(self, points: Array) -> Array:
+    def _evaluate_jacobians(self, points: Array) -> Array:
         """J at points (N, n), (N, m, n)."""
         batched = self.task.batched_jacobian if self.rows == "x" else self.task.batched_frame_jacobian
         J: Array = batched(points)[0].reshape(len(points), self.task.m, len(self.centre))
         return J
 
-    def _row_sizes(self) -> Array:
+    def _measure_rows(self) -> Array:
         """The scale of the rows at samples of the box, without those where they are not finite, (m,)."""
-        J = self._jacobians(sample_uniform(_boundaries(self), _SAMPLES, _SEED))
-        known = np.isfinite(J).all(axis=(1, 2))
-        if not known.any():
+        J = self._evaluate_jacobians(sample_uniform(Box(self.centre, self.half_width), RULES.samples, RULES.seed))
+        finite = np.isfinite(J).all(axis=(1, 2))
+        if not finite.any():
             raise SingularTaskError(
-                f"the Jacobian of task '{self.task.name}' is not finite at any of {_SAMPLES} samples"
+                f"the Jacobian of task '{self.task.name}' is not finite at any of {RULES.samples} samples"
             )
-        return row_scale(J[known], self.task.units)
+        return compute_row_scale(J[finite], self.task.units)
 
 
-def clear_domain(domain: Domain, task: Task, least_singular_value: float | None) -> Domain:
+def compute_row_scale(J: Array, units: tuple[str, ...]) -> Array:
+    """Root mean square length of the rows of each unit, (m,). It does not depend on how axes are turned; 1 if zero.
+
+    Args:
+        J: task Jacobians at samples, (N, m, n).
+        units: units of the task components; rows with the same unit share one scale, rows of unknown unit have their
+            own.
+    """
+    squares = (J**2).sum(axis=2).mean(axis=0)
+    groups = [unit or f"own {i}" for i, unit in enumerate(units)]
+    means = [
+        np.mean([square for square, other in zip(squares, groups, strict=True) if other == mine]) for mine in groups
+    ]
+    return np.sqrt([mean if mean > 0 else 1.0 for mean in means])
+
+
+def exclude_singular(domain: Domain, task: Task, least_singular_value: float | None) -> Domain:
     """The part of a domain where a task is clear of singular positions: a ClearBox of this task, if a bound is given.
 
     Raises:
@@ -273,12 +279,7 @@ def clear_domain(domain: Domain, task: Task, least_singular_value: float | None)
     return domain
 
 
-def _boundaries(box: Box) -> Box:
-    """The whole box, also of a ClearBox."""
-    return Box(box.centre, box.half_width)
-
-
-def _lengths(scale: Array, units: tuple[str, ...]) -> str:
+def _list_sizes(scale: Array, units: tuple[str, ...]) -> str:
     """For example '0.41 m, 1.53 rad'; one number for each row if units are unknown or their numbers differ."""
-    told = [f"{size:.3g} {unit}".strip() for size, unit in zip(scale, units, strict=True)]
-    return ", ".join(dict.fromkeys(told) if all(units) else told)
+    sizes = [f"{size:.3g} {unit}".strip() for size, unit in zip(scale, units, strict=True)]
+    return ", ".join(dict.fromkeys(sizes) if all(units) else sizes)

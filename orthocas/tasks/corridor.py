@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Self, cast
 
 import casadi as ca
@@ -9,15 +10,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, ShapeError
+from orthocas.robots.robot import Robot
 from orthocas.tasks.domains import NARROWEST, WIDEST, Box, Domain, register_domain
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, as_point_set, frozen_array, require_kind
+from orthocas.tools.checks import Array, as_float_array, as_point_set, freeze_array, require_kind
 from orthocas.tools.display import number_list
-from orthocas.tools.json import part
+from orthocas.tools.files import find_columns, read_table
+from orthocas.tools.json import get_part
 
 CORRIDOR = "corridor"  #: name of the kind
-_MOST_POSTURES = 2000
+_MOST_POSTURES = 2000  #: of a path
+_MOST_IN_FILE = 1_000_000  #: postures of a CSV file
 
 
 @register_domain
@@ -56,7 +60,8 @@ class Corridor(Box):
         require_kind("box", box, Box)
         super().__init__(box.centre, box.half_width, box.unbounded)
         n = len(box.centre)
-        path = frozen_array("postures", postures, (None, n))
+        # Check the path, then the radius of each joint; infinite ones do not count.
+        path = freeze_array("postures", postures, (None, n))
         if (widest := np.abs(path).max(initial=0.0)) > WIDEST:
             raise InvalidValueError("postures", f"up to {widest:.3g}", f"numbers up to {WIDEST:g}")
         if not 1 <= len(path) <= _MOST_POSTURES:
@@ -66,8 +71,8 @@ class Corridor(Box):
             raise ShapeError("radius", sizes.shape, (n,))
         finite = np.isfinite(sizes)
         if not ((sizes > NARROWEST) & (~finite | (sizes <= WIDEST))).all() or not finite.any():
-            wanted = f"numbers above {NARROWEST:g} up to {WIDEST:g}, or infinite ones for some of the joints"
-            raise InvalidValueError("radius", sizes.tolist(), wanted)
+            expected = f"numbers above {NARROWEST:g} up to {WIDEST:g}, or infinite ones for some of the joints"
+            raise InvalidValueError("radius", sizes.tolist(), expected)
         sizes = np.array(np.broadcast_to(sizes, (n,)))
         sizes.setflags(write=False)
         for field, value in (("postures", path), ("radius", sizes)):
@@ -91,7 +96,7 @@ class Corridor(Box):
         """Itself."""
         return self
 
-    def facts_of_condition(self) -> dict[str, str]:
+    def describe_condition(self) -> dict[str, str]:
         """The condition in one line."""
         return {"corridor": self.heading}
 
@@ -103,14 +108,14 @@ class Corridor(Box):
     def from_data(cls, task: Any, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
         """The corridor of a file."""
         box = cast("Box", Box.from_data(task, data, arrays))
-        return cls(box, *(part(arrays, name, np.ndarray) for name in ("postures", "radius")))
+        return cls(box, *(get_part(arrays, name, np.ndarray) for name in ("postures", "radius")))
 
-    def within(self, box: Box) -> Self:
+    def apply_to(self, box: Box) -> Self:
         """The same condition on another box. Joints that have more room there do not count."""
         wider = box.half_width > self.half_width * (1 + 1e-9)
         return type(self)(box, self.postures, np.where(wider, np.inf, self.radius))
 
-    def explained(self, q: Array) -> str:
+    def explain(self, q: Array) -> str:
         """What is wrong with a position (n,) that is too far from the path."""
         distance = float(np.sqrt(1 - float(self.pivots(q))))
         return f"the position is {distance:.3g} radii away from the path of the corridor, expected at most 1"
@@ -191,3 +196,21 @@ class Corridor(Box):
         starts, steps = (z[:-1], np.diff(z, axis=0)) if len(z) > 1 else (z, np.zeros_like(z))
         squares = np.maximum((steps**2).sum(axis=1), 1e-24)
         return starts, steps / np.sqrt(squares)[:, None], squares
+
+
+def read_postures(path: Path, robot: Robot) -> Array:
+    """Postures (N, n) of a CSV file: a header with the names of joints in any order, and one posture a line.
+
+    Columns of other names, such as those of time and velocities, are left alone.
+
+    Raises:
+        PathFileError: names the file, the line, and what is wrong there.
+    """
+    return read_table(
+        path,
+        "postures file",
+        "postures",
+        _MOST_IN_FILE,
+        lambda names: find_columns(names, robot.joint_names),
+        least=1,
+    )

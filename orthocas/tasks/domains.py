@@ -1,15 +1,14 @@
-"""Domains: the regions of joint space on which charts are fitted and evaluated, with seeded sampling."""
+"""Domains: the regions of joint space on which charts are fitted and evaluated."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, Self, TypeAlias, TypeVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from orthocas.errors import DomainError, InvalidValueError, ShapeError, degrees_hint
 from orthocas.robots.robot import Robot
@@ -19,21 +18,18 @@ from orthocas.tools.checks import (
     Array,
     as_float_array,
     as_point_set,
-    frozen_array,
+    freeze_array,
     require_count,
     require_kind,
     require_known,
-    require_memory,
 )
 
 if TYPE_CHECKING:
+    from orthocas.tasks.clear_box import ClearBox
+    from orthocas.tasks.corridor import Corridor
     from orthocas.tasks.task import Task
 
 _MOST_JOINTS = 1000
-_MOST_SAMPLES = 10**12
-_POWERS = (1.0, 0.5, 0.25)  # of the distance from the middle: uniform, near faces, near corners
-_LEAST_SHARE, _TRIED = 1e-3, 10_000  # of the points of a box, at least so many, that have to lie in the domain
-_BLOCK = 1000  # fewest points to draw at once, after the first ones
 NARROWEST = 1e-9  #: [rad] or [m]; boxes of this half-width and less drown in rounding
 WIDEST = 1e6  #: [rad] or [m]; wider boxes are mistakes, and overflow later
 
@@ -68,7 +64,7 @@ class Domain(ABC):
     """
 
     name: str  #: of the kind, as files and messages have it
-    centre: Array  #: middle of the box around it, (n,)
+    centre: Array  #: centre of the box around it, (n,)
     half_width: Array  #: half of the edge lengths of that box, (n,), > 0
     unbounded: tuple[int, ...] = ()  #: joints whose every position lies inside
     full_turns: bool = False  #: whether all joints turn without end and positions repeat after a turn
@@ -78,6 +74,24 @@ class Domain(ABC):
     @abstractmethod
     def contains(self, q: ArrayLike) -> Any:
         """Whether points (n,) or (N, n) lie in the domain: a bool, or (N,)."""
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest joint positions, (n,) each. They are infinite for unbounded joints, and for a torus."""
+        half_width = self.half_width.copy()
+        half_width[slice(None) if self.full_turns else list(self.unbounded)] = np.inf
+        return self.centre - half_width, self.centre + half_width
+
+    @property
+    def slack(self) -> Array:
+        """What the boundaries give for rounding, (n,)."""
+        return np.asarray(1e-12 * self.half_width + 4 * np.finfo(float).eps * np.abs(self.centre))
+
+    @property
+    def reach(self) -> Array:
+        """Largest distance from the centre that counts as inside, (n,), with slack for rounding at the boundaries."""
+        lower, upper = self.bounds
+        return np.asarray((upper - lower) / 2 + self.slack)
 
     @property
     def condition(self) -> "Condition | None":
@@ -149,21 +163,22 @@ class Domain(ABC):
         With power 1 they are uniform, with smaller ones nearer to the boundaries.
         """
         u = rng.uniform(-1.0, 1.0, (count, len(self.centre)))
-        return _scaled(self, u if power == 1 else np.sign(u) * np.abs(u) ** power)
+        points: Array = self.centre + self.half_width * (u if power == 1 else np.sign(u) * np.abs(u) ** power)
+        return points
 
-    def within(self, box: "Box") -> "Domain":
+    def apply_to(self, box: "Box") -> "Domain":
         """The same condition on another box."""
         raise DomainError(f"a domain of kind '{self.name}' has no other size, expected a box")
 
-    def explained(self, q: Array) -> str:
+    def explain(self, q: Array) -> str:
         """What is wrong with a position (n,) of the box that lies outside the domain."""
         return f"the position {np.round(q, 4).tolist()} lies outside the {self.name}"
 
-    def facts_of_condition(self) -> dict[str, str]:
+    def describe_condition(self) -> dict[str, str]:
         """The condition in one line, by its name."""
         return {}
 
-    def numbers_of_condition(self) -> dict[str, Any]:
+    def report_condition(self) -> dict[str, Any]:
         """What `orthocas info --json` has of the condition."""
         return {}
 
@@ -193,46 +208,8 @@ class Condition(Protocol):
         ...
 
 
-class SingularBound(Condition, Protocol):
-    """A condition s(q) > bound on the relative singular value of a task; see `orthocas.ClearBox`."""
-
-    @property
-    def centre(self) -> Array:
-        """Middle of the box, (n,)."""
-        ...
-
-    @property
-    def least_singular_value(self) -> float:
-        """The bound, > 0."""
-        ...
-
-    @property
-    def scale(self) -> Array:
-        """Sizes of the rows, (m,) > 0."""
-        ...
-
-    @property
-    def rows(self) -> str:
-        """Which rows count: "frame" or "x"."""
-        ...
-
-    @property
-    def jacobian_function(self) -> ca.Function:
-        """q (n, 1) -> J (m, n), the rows that count."""
-        ...
-
-    @property
-    def gram(self) -> ca.Function:
-        """q (n, 1) -> D^-1 J J^T D^-1, (m, m)."""
-        ...
-
-    def is_clear(self, points: Array) -> NDArray[np.bool_]:
-        """Whether s(q) > bound at points (N, n), (N,)."""
-        ...
-
-    def singular_values(self, q: ArrayLike) -> Any:
-        """s(q) at points (n,) or (N, n)."""
-        ...
+SingularBound: TypeAlias = "ClearBox"  #: a condition s(q) > bound on the relative singular value of a task
+PathBound: TypeAlias = "Corridor"  #: a condition on the distance to a path of postures, in radii
 
 
 class FoldBound(Protocol):
@@ -251,52 +228,6 @@ class FoldBound(Protocol):
     @property
     def orientation(self) -> float:
         """The sign of the volume at the centre."""
-        ...
-
-
-class PathBound(Condition, Protocol):
-    """A condition on the distance to a path of postures, in radii; see `orthocas.Corridor`."""
-
-    @property
-    def centre(self) -> Array:
-        """Middle of the box, (n,)."""
-        ...
-
-    @property
-    def unbounded(self) -> tuple[int, ...]:
-        """Joints whose every position lies inside."""
-        ...
-
-    @property
-    def postures(self) -> Array:
-        """The path, (N, n)."""
-        ...
-
-    @property
-    def radius(self) -> Array:
-        """The largest distances (n,), infinite for joints that do not count."""
-        ...
-
-    @property
-    def counted(self) -> Any:
-        """The joints that count."""
-        ...
-
-    @property
-    def lines(self) -> tuple[Array, Array, Array]:
-        """Start, unit direction and squared length of every line, in joints that count and units of the radius."""
-        ...
-
-    def contains(self, q: ArrayLike) -> Any:
-        """Whether points lie in the domain."""
-        ...
-
-    def squared_distance(self, points: Array) -> Array:
-        """Squared distance of points (N, n) from the path in radii, (N,)."""
-        ...
-
-    def lengths(self, steps: Array) -> Array:
-        """Lengths of steps (N, n) in radii, (N,)."""
         ...
 
 
@@ -357,11 +288,12 @@ class Box(Domain):
     is_box = True
 
     def __init__(self, centre: ArrayLike, half_width: ArrayLike, unbounded: Sequence[int] = ()) -> None:
-        middle = frozen_array("centre", centre, (None,))
+        middle = freeze_array("centre", centre, (None,))
         widths = as_float_array("half_width", half_width)
+        # Check both, with one half-width for all joints spread out.
         if widths.ndim > 0 and widths.shape != middle.shape:
             raise ShapeError("half_width", widths.shape, middle.shape)
-        widths = frozen_array("half_width", np.broadcast_to(widths, middle.shape), middle.shape)
+        widths = freeze_array("half_width", np.broadcast_to(widths, middle.shape), middle.shape)
         if widths.size == 0:
             raise InvalidValueError("centre", "empty", "at least one joint")
         if widths.min() <= NARROWEST or widths.max() > WIDEST:
@@ -369,7 +301,10 @@ class Box(Domain):
             raise InvalidValueError("half_width", f"{bad:g}", f"numbers above {NARROWEST:g}, up to {WIDEST:g}")
         object.__setattr__(self, "centre", middle)
         object.__setattr__(self, "half_width", widths)
-        object.__setattr__(self, "unbounded", _joint_indices("unbounded", unbounded, len(middle)))
+        if not isinstance(unbounded, list | tuple | range):
+            raise InvalidValueError("unbounded", repr(unbounded)[:80], "a list of joint indices")
+        joints = {require_count("entry of unbounded", k, least=0, most=len(middle) - 1) for k in unbounded}
+        object.__setattr__(self, "unbounded", tuple(sorted(joints)))
 
     @classmethod
     def from_limits(cls, lower: ArrayLike, upper: ArrayLike) -> Self:
@@ -383,8 +318,8 @@ class Box(Domain):
             ShapeError: if the two differ in length.
             InvalidValueError: if a number is not finite, or lower_i >= upper_i.
         """
-        low = frozen_array("lower", lower, (None,))
-        high = frozen_array("upper", upper, low.shape)
+        low = freeze_array("lower", lower, (None,))
+        high = freeze_array("upper", upper, low.shape)
         wrong = np.flatnonzero(low >= high)
         if wrong.size:
             i = int(wrong[0])
@@ -395,7 +330,7 @@ class Box(Domain):
         """Whether points (n,) or (N, n) lie in the box: a bool, or (N,)."""
         return _between_boundaries(self, q)
 
-    def within(self, box: "Box") -> "Box":
+    def apply_to(self, box: "Box") -> "Box":
         """The other box."""
         return box
 
@@ -406,8 +341,10 @@ class Box(Domain):
     @classmethod
     def from_data(cls, task: "Task", data: Mapping[str, Any], arrays: Mapping[str, Any]) -> "Domain":
         """The box of a file."""
-        unbounded = json.part(data, "unbounded", list) if "unbounded" in data else ()  # missing in older files
-        return Box(json.part(arrays, "centre", np.ndarray), json.part(arrays, "half_width", np.ndarray), unbounded)
+        # Older files have no unbounded joints.
+        unbounded = json.get_part(data, "unbounded", list) if "unbounded" in data else ()
+        centre, half_width = (json.get_part(arrays, name, np.ndarray) for name in ("centre", "half_width"))
+        return Box(centre, half_width, unbounded)
 
 
 @register_domain
@@ -431,8 +368,8 @@ class Torus(Domain):
     def __init__(self, n: int) -> None:
         require_count("n", n, most=_MOST_JOINTS)
         object.__setattr__(self, "n", n)
-        object.__setattr__(self, "centre", frozen_array("centre", np.zeros(n), (n,)))
-        object.__setattr__(self, "half_width", frozen_array("half_width", np.full(n, np.pi), (n,)))
+        object.__setattr__(self, "centre", freeze_array("centre", np.zeros(n), (n,)))
+        object.__setattr__(self, "half_width", freeze_array("half_width", np.full(n, np.pi), (n,)))
 
     def contains(self, q: ArrayLike) -> Any:
         """Whether points (n,) or (N, n) lie on the torus: a bool, or (N,). All finite angles do."""
@@ -448,93 +385,17 @@ class Torus(Domain):
         return cls(task.robot.n)
 
 
-def sample_uniform(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
-    """Draw points uniformly from the domain, (samples, n)."""
-    rng = _generator(domain, samples, seed)
-    return _inside(domain, samples, lambda count: domain.draw(rng, count, 1.0))
-
-
-def sample_heavily(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
-    """Draw points of which a third is uniform, a third near faces and a third near corners, (samples, n).
-
-    Charts fail there first. The distances from the centre are |u|^p half-widths, with uniform u and p = 1, 1/2 and 1/4.
-
-    Source:
-        ours.
-    """
-    rng, third = _generator(domain, samples, seed), samples // 3
-
-    sizes = (samples - 2 * third, third, third)
-    parts = [
-        _inside(domain, size, partial(domain.draw, rng, power=power))
-        for size, power in zip(sizes, _POWERS, strict=True)
-    ]
-    return np.vstack(parts)
-
-
-def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
-    """Draw points that fill the domain more evenly than random points, (samples, n).
-
-    They follow the additive recurrence frac(shift + k alpha), alpha_j = g^-j, with g the root of g^(n+1) = g + 1 and a
-    random shift. Each point is uniformly distributed, and every part of the sequence is even. Means over the domain
-    converge faster than with independent points. Domains that draw points themselves get independent ones.
-
-    Source:
-        M. Roberts, docs/reference/references.md [R2018]. The use for training is ours.
-    """
-    if domain.draws_itself:
-        return sample_uniform(domain, samples, seed)
-    rng, n = _generator(domain, samples, seed), len(domain.centre)
-    g = 1.5
-    for _ in range(64):
-        g = (1 + g) ** (1 / (n + 1))
-    shift, done = rng.uniform(size=n), 0
-
-    def draw(count: int) -> Array:
-        nonlocal done
-        k = np.arange(done + 1, done + count + 1)[:, None]
-        done += count
-        return _scaled(domain, 2 * ((shift + k * g ** -np.arange(1.0, n + 1)) % 1.0) - 1)
-
-    return _inside(domain, samples, draw)
-
-
 def contains(domain: Domain, q: ArrayLike) -> Any:
     """Whether points (n,) or (N, n) lie in the domain: a bool, or (N,). Finite angles always lie on a torus."""
-    require_domain(domain)
-    return domain.contains(q)
-
-
-def require_domain(domain: Domain) -> None:
-    """Raise InvalidValueError unless the object is a domain."""
     if not isinstance(domain, Domain):
         raise InvalidValueError("domain", f"a {type(domain).__name__}", "a Box, a Torus or another Domain")
-
-
-def bounds_of(domain: Domain) -> tuple[Array, Array]:
-    """Lowest and highest joint positions, (n,) each. They are infinite for unbounded joints, and for a torus."""
-    half_width = domain.half_width.copy()
-    half_width[slice(None) if domain.full_turns else list(domain.unbounded)] = np.inf
-    return domain.centre - half_width, domain.centre + half_width
-
-
-def reach(domain: Domain) -> Array:
-    """Largest distance from the centre that counts as inside, (n,), with slack for rounding at the boundaries."""
-    lower, upper = bounds_of(domain)
-    values: Array = (upper - lower) / 2 + slack(domain)
-    return values
-
-
-def slack(domain: Domain) -> Array:
-    """What the boundaries of a domain give for rounding, (n,)."""
-    values: Array = 1e-12 * domain.half_width + 4 * np.finfo(float).eps * np.abs(domain.centre)
-    return values
+    return domain.contains(q)
 
 
 def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: ArrayLike | None = None) -> Box:
     """A box inside the joint limits.
 
-    The centre is the middle of the limits. For a joint without both limits it is 0, or the allowed value nearest to 0.
+    The centre is that of the limits. For a joint without both limits it is 0, or the allowed value nearest to 0.
     Half-widths are pi/4 for revolute and 0.25 m for prismatic joints, or less where the limits are closer.
 
     Args:
@@ -544,7 +405,7 @@ def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: Array
             leaves the limits.
     """
     require_kind("robot", robot, Robot)
-    middle = robot.tree.middle if centre is None else frozen_array("centre", centre, (robot.n,))
+    middle = robot.tree.centre_posture if centre is None else freeze_array("centre", centre, (robot.n,))
     if half_width is not None:
         return Box(middle, half_width)
     widths = default_half_width(robot, middle)
@@ -556,7 +417,8 @@ def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: Array
 def default_half_width(robot: Robot, centre: Array) -> Array:
     """Half-widths of default boxes around centres (n,) or (N, n), same shape; <= 0 at or beyond a joint limit."""
     room = np.minimum(centre - robot.lower, robot.upper - centre)
-    widths: Array = np.minimum(_wanted_half_width(robot), room)
+    largest = np.where(robot.tree.prismatic, PRISMATIC_ROOM, REVOLUTE_ROOM)
+    widths: Array = np.minimum(largest, room)
     return widths
 
 
@@ -575,8 +437,9 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
         raise DomainError(f"joint '{name}' is prismatic, expected a Box domain instead of a Torus")
     low, high = domain.centre - domain.half_width, domain.centre + domain.half_width
     if not domain.full_turns:
-        low, high = bounds_of(domain)
-    slack = 1e-9 * domain.half_width  # limits in a URDF are decimal, so sums are not exact
+        low, high = domain.bounds
+    # Limits in a URDF are decimal, so sums are not exact.
+    slack = 1e-9 * domain.half_width
     outside = np.flatnonzero((low < robot.lower - slack) | (high > robot.upper + slack))
     if outside.size:
         _raise_outside(robot, int(outside[0]), low, high)
@@ -585,56 +448,8 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
 def _between_boundaries(domain: Domain, q: ArrayLike) -> Any:
     """Whether points (n,) or (N, n) lie between the boundaries of a domain: a bool, or (N,)."""
     points, single = as_point_set("q", q, len(domain.centre))
-    inside = np.all(np.abs(points - domain.centre) <= reach(domain), axis=1)
+    inside = np.all(np.abs(points - domain.centre) <= domain.reach, axis=1)
     return inside[0] if single else inside
-
-
-def _generator(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> np.random.Generator:
-    """The generator of a seed, after checks of what is asked for."""
-    require_count("samples", samples, most=_MOST_SAMPLES)
-    for part in seed if isinstance(seed, tuple) else (seed,):
-        require_count("seed", part, least=0)
-    require_memory(f"{samples} samples", 32.0 * samples * len(domain.centre))
-    return np.random.default_rng(seed)
-
-
-def _scaled(domain: Domain, u: Array) -> Array:
-    """Points of the cube [-1, 1]^n in the box around the domain."""
-    points: Array = domain.centre + domain.half_width * u
-    return points
-
-
-def _inside(domain: Domain, samples: int, draw: Callable[[int], Array]) -> Array:
-    """The first points of a sequence that lie in the domain, (samples, n); `draw` returns the next so many points.
-
-    Raises:
-        DomainError: if next to none of them does.
-    """
-    found = [np.empty((0, len(domain.centre)))]
-    drawn = kept = 0
-    size = samples
-    while kept < samples:
-        if drawn >= _TRIED and kept < _LEAST_SHARE * drawn:
-            share = f"{kept} of {drawn} points of its box lie in the domain"
-            wanted = "lower least_singular_value, or raise the radius of the corridor"
-            raise DomainError(f"{share}, expected at least {_LEAST_SHARE:.1%}: {wanted}")
-        points = draw(size)
-        found.append(points[domain.contains(points)])
-        drawn, kept = drawn + size, kept + len(found[-1])
-        size = max(samples - kept, _BLOCK)
-    return np.concatenate(found)[:samples]
-
-
-def _joint_indices(name: str, values: Any, n: int) -> tuple[int, ...]:
-    """Different indices of joints, sorted."""
-    if not isinstance(values, list | tuple | range):
-        raise InvalidValueError(name, repr(values)[:80], "a list of joint indices")
-    found = sorted({require_count(f"entry of {name}", value, least=0, most=n - 1) for value in values})
-    return tuple(found)
-
-
-def _wanted_half_width(robot: Robot) -> Array:
-    return np.where(robot.tree.prismatic, PRISMATIC_ROOM, REVOLUTE_ROOM)
 
 
 def _raise_outside(robot: Robot, i: int, low: Array, high: Array) -> None:

@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, MetricError, ShapeError
-from orthocas.robots.pinocchio_model import remedy
+from orthocas.robots.pinocchio_model import suggest_lock
 from orthocas.robots.robot import Robot
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, frozen_array, require_kind, require_known, require_text
-from orthocas.tools.expressions import HoldsFunctions, called, expression_of
+from orthocas.tools.checks import Array, freeze_array, require_kind, require_known, require_text
+from orthocas.tools.expressions import HoldsFunctions, build_expression, call_user
 
 METRIC_KINDS = ("euclidean", "inertia")
 MetricSpec = str | ArrayLike | Callable[[ca.SX], ca.SX]  #: what `Metric.from_spec` accepts
-_SINGULAR = 1e-12  # eigenvalue, relative to the largest entry, that counts as zero
+_SINGULAR = 1e-12  #: eigenvalue, relative to the largest entry, that counts as zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +44,9 @@ class Metric(HoldsFunctions):
         """
         require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
+        # By the name of a registered builder, or of a kind of its own.
         if isinstance(spec, str) and spec in _REGISTERED:
-            built = called(f"metric '{spec}'", "a builder that takes this robot", _REGISTERED[spec], robot)
+            built = call_user(f"metric '{spec}'", "a builder that takes this robot", _REGISTERED[spec], robot)
             return cls.custom(robot, spec, built)
         if isinstance(spec, str):
             require_known("metric", spec, (*METRIC_KINDS, *_REGISTERED))
@@ -53,9 +54,10 @@ class Metric(HoldsFunctions):
                 require_mass(robot, "the inertia metric")
             A = robot.function("mass_matrix")(q) if spec == "inertia" else ca.SX.eye(robot.n)
             return cls(spec, dense_function("metric", [q], [A]), {"kind": spec})
+        # By a map of q, or by a constant matrix.
         if callable(spec):
             return cls.custom(robot, "custom", spec)
-        matrix = frozen_array("metric", spec, (robot.n, robot.n))
+        matrix = freeze_array("metric", spec, (robot.n, robot.n))
         require_spd(matrix[None], np.zeros((1, robot.n)))
         return cls(
             "constant",
@@ -86,7 +88,7 @@ class Metric(HoldsFunctions):
         require_text("name of a metric", str(name))
         require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
-        A = expression_of("metric", function, q)
+        A = build_expression("metric", function, q)
         if A.shape != (robot.n, robot.n):
             raise ShapeError("metric", A.shape, (robot.n, robot.n))
         return cls(str(name), dense_function("metric", [q], [A]), {"kind": "custom", "name": str(name)})
@@ -95,6 +97,19 @@ class Metric(HoldsFunctions):
     def batched(self) -> Batched:
         """Evaluates A at many points."""
         return Batched(self.function)
+
+    def evaluate(self, points: Array) -> Array:
+        """A at points (N, n), as an array (N, n, n).
+
+        Raises:
+            MetricError: if a matrix is not symmetric positive definite.
+        """
+        n = points.shape[1]
+        if self.is_identity:
+            return np.broadcast_to(np.eye(n), (len(points), n, n))
+        A = self.batched(points)[0].reshape(-1, n, n)
+        require_spd(A, points)
+        return A
 
     @property
     def is_identity(self) -> bool:
@@ -136,16 +151,6 @@ def register_metric(name: str, build: Callable[[Robot], Callable[[ca.SX], ca.SX]
     _REGISTERED[name] = build
 
 
-def metric_matrices(metric: Metric, points: Array) -> Array:
-    """A at points (N, n), as an array (N, n, n). Each matrix is checked to be symmetric positive definite."""
-    n = points.shape[1]
-    if metric.is_identity:
-        return np.broadcast_to(np.eye(n), (len(points), n, n))
-    A = metric.batched(points)[0].reshape(-1, n, n)
-    require_spd(A, points)
-    return A
-
-
 def require_spd(matrices: Array, points: Array) -> None:
     """Raise MetricError, with the worst point, unless all matrices (N, n, n) are symmetric positive definite."""
     if not len(matrices):
@@ -163,7 +168,8 @@ def require_spd(matrices: Array, points: Array) -> None:
             f"metric is not symmetric at q = {np.round(points[worst], 4).tolist()} "
             f"(difference {asymmetry[worst]:.3g}), expected symmetric positive definite"
         )
-    with suppress(np.linalg.LinAlgError):  # faster than eigenvalues
+    # A Cholesky factorisation is faster than eigenvalues, and enough where it succeeds.
+    with suppress(np.linalg.LinAlgError):
         np.linalg.cholesky(matrices - _SINGULAR * size[:, None, None] * np.eye(matrices.shape[1]))
         return
     smallest = np.linalg.eigvalsh(matrices)[:, 0]
@@ -183,5 +189,5 @@ def require_mass(robot: Robot, use: str) -> None:
         joint = robot.joint_names[int(np.argmax(np.abs(vectors[0, :, 0])))]
         raise MetricError(
             f"joint '{joint}' moves no mass, so M(q) is singular, expected mass or armature for {use}: "
-            f"give the joint's link a mass in the robot file, or {remedy(joint)}"
+            f"give the joint's link a mass in the robot file, or {suggest_lock(joint)}"
         )

@@ -11,16 +11,17 @@ from numpy.typing import NDArray
 from orthocas.errors import InvalidValueError, MetricError, NotRedundantError, SingularTaskError
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import KinematicTree
-from orthocas.tasks.clear_box import clear_domain, row_scale
-from orthocas.tasks.domains import Domain, domain_from_data, require_within_limits, sample_uniform
-from orthocas.tasks.metric import Metric, MetricSpec, metric_matrices
+from orthocas.tasks.clear_box import compute_row_scale, exclude_singular
+from orthocas.tasks.domains import Domain, domain_from_data, require_within_limits
+from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.regular_box import regular_box
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.archive import Stored
 from orthocas.tools.checks import Array, require_kind, require_shape, require_text
 from orthocas.tools.display import Shown, listed, number_list
-from orthocas.tools.expressions import from_tape, require_tape, shortest, to_tape
-from orthocas.tools.json import part
+from orthocas.tools.expressions import read_tape, require_tape, wrap_shortest, write_tape
+from orthocas.tools.json import get_part
 
 NEAR_SINGULAR = 0.01  #: smallest relative singular value of the task below which a sample counts as singular
 NEAR_HALF_A_TURN = 0.01  #: cos(angle / 2) of turns that count as half a turn: those above 178.9 deg
@@ -74,6 +75,7 @@ class Problem(Shown):
         name: str = "custom",
         least_singular_value: float | None = None,
     ) -> None:
+        # Robot and task belong together, and the task leaves some freedom.
         if not isinstance(task, Task) or not isinstance(robot, Robot):
             raise InvalidValueError(
                 "robot and task", f"{type(robot).__name__} and {type(task).__name__}", "Robot and Task"
@@ -82,12 +84,14 @@ class Problem(Shown):
             raise InvalidValueError("task", f"a task of another robot ({task.name})", "a task built on the same robot")
         if task.m >= robot.n - len(robot.tree.floating):
             raise NotRedundantError(task.m, robot.n - len(robot.tree.floating))
+        # The domain lies within the limits; its centre gives a missing reference.
         domain = regular_box(robot, task) if domain is None else domain
         if not isinstance(domain, Domain):
             raise InvalidValueError("domain", repr(domain), "a Box, a Torus or another Domain")
         require_within_limits(robot, domain)
         task = task.with_reference_at(domain.centre)
-        domain = clear_domain(domain, task, least_singular_value)
+        domain = exclude_singular(domain, task, least_singular_value)
+        # The metric is one of the same robot; what moves a floating base is its inertia.
         metric = metric if isinstance(metric, Metric) else Metric.from_spec(robot, metric)
         require_shape("metric", metric.function.size_out(0), (robot.n, robot.n))
         if robot.tree.floating and not metric.is_inertia:
@@ -142,26 +146,22 @@ class Problem(Shown):
             return q
         period = np.zeros(self.n)
         period[list(self.turning)] = 2 * np.pi
-        return near + shortest(q - near, period)
+        return near + wrap_shortest(q - near, period)
 
     def facts(self) -> dict[str, str]:
         """Sizes, task, metric, domain and robot."""
         domain = self.domain
+        joints = [self.robot.joint_names[k] for k in domain.unbounded]
+        unbounded = f", unbounded in {listed(joints)}" if joints else ""
         return {
             "problem": f"{self.name}, n = {self.n} joints, m = {self.m} task, r = {self.r} extra",
             "task": self.task.heading,
             "metric": self.metric.name,
-            "domain": f"{domain.name}, half-width {number_list(domain.half_width)}{self._endless}",
-            **domain.facts_of_condition(),
+            "domain": f"{domain.name}, half-width {number_list(domain.half_width)}{unbounded}",
+            **domain.describe_condition(),
             "centre": number_list(domain.centre),
             "robot": self.robot.heading,
         }
-
-    @property
-    def _endless(self) -> str:
-        """The unbounded joints of the domain, in words."""
-        joints = [self.robot.joint_names[k] for k in self.domain.unbounded]
-        return f", unbounded in {listed(joints)}" if joints else ""
 
 
 @dataclass(frozen=True)
@@ -176,12 +176,12 @@ class ProblemCheck:
 
     @property
     def half_turn_share(self) -> float:
-        """Share of samples about half a turn from the reference."""
+        """Fraction of samples about half a turn from the reference."""
         return self.half_turn_samples / self.samples
 
     @property
     def singular_share(self) -> float:
-        """Share of near-singular samples."""
+        """Fraction of near-singular samples."""
         return self.singular_samples / self.samples
 
 
@@ -202,8 +202,9 @@ def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
         0.0
     """
     require_kind("problem", problem, Problem)
+    # Each metric matrix is checked, then the rank of the task.
     points = sample_uniform(problem.domain, samples, seed)
-    metric_matrices(problem.metric, points)
+    problem.metric.evaluate(points)
     smallest = relative_singular_values(problem, points)
     if smallest.max() < _RANK_LOST:
         raise SingularTaskError(
@@ -216,7 +217,7 @@ def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
         singular_samples=int((smallest < NEAR_SINGULAR).sum()),
         smallest_singular_value=float(smallest[worst]),
         most_singular_point=tuple(points[worst].tolist()),
-        half_turn_samples=int((distance_from_half_a_turn(problem, points) < NEAR_HALF_A_TURN).sum()),
+        half_turn_samples=int((measure_half_turn_distance(problem, points) < NEAR_HALF_A_TURN).sum()),
     )
 
 
@@ -230,7 +231,7 @@ def relative_singular_values(problem: Problem, points: Array) -> Array:
         SingularTaskError: if a task component does not depend on any joint, or J_x is not finite at a point.
     """
     task, domain = problem.task, problem.domain
-    J = task_jacobians(problem, points)
+    J = problem.task.evaluate_jacobian(points)
     idle = np.flatnonzero((J == 0).all(axis=(0, 2)))
     if idle.size:
         raise SingularTaskError(f"task component '{task.labels[idle[0]]}' does not depend on any joint")
@@ -238,26 +239,26 @@ def relative_singular_values(problem: Problem, points: Array) -> Array:
         return np.asarray(domain.singular_bound.singular_values(points))
     if task.turn is not None or task.parts:
         J = task.batched_frame_jacobian(points)[0].reshape(J.shape)
-    return np.asarray(np.linalg.svd(J / row_scale(J, task.units)[:, None], compute_uv=False)[:, -1])
+    return np.asarray(np.linalg.svd(J / compute_row_scale(J, task.units)[:, None], compute_uv=False)[:, -1])
 
 
 def is_regular(problem: Problem, points: Array) -> NDArray[np.bool_]:
     """Whether J_x is far from losing rank at points (N, n), (N,): the robot is, and the tool far from half a turn."""
-    clear = relative_singular_values(problem, points) >= NEAR_SINGULAR
-    return clear & (distance_from_half_a_turn(problem, points) >= NEAR_HALF_A_TURN)
+    nonsingular = relative_singular_values(problem, points) >= NEAR_SINGULAR
+    return nonsingular & (measure_half_turn_distance(problem, points) >= NEAR_HALF_A_TURN)
 
 
-def distance_from_half_a_turn(problem: Problem, points: Array) -> Array:
+def measure_half_turn_distance(problem: Problem, points: Array) -> Array:
     """cos(angle / 2) of the tool's turn from the reference at points (N, n), (N,); 1 for tasks without a reference."""
-    found = np.ones(len(points))
+    distances = np.ones(len(points))
     for task in problem.task.parts or (problem.task,):
         if task.turn is not None:
             x = task.batched(points)[0].reshape(-1, task.m)
-            found = np.minimum(found, task.turn.distance_from_half_a_turn(x))
-    return found
+            distances = np.minimum(distances, task.turn.measure_half_turn_distance(x))
+    return distances
 
 
-def task_sizes(problem: Problem) -> Array:
+def measure_task_sizes(problem: Problem) -> Array:
     """How far the task components move over the domain, (m,): the mean of sum_j |dh_i/dq_j| half_width_j at 32 samples.
 
     1 for a component that does not move, or whose gradient is not finite.
@@ -268,26 +269,12 @@ def task_sizes(problem: Problem) -> Array:
     return np.where(np.isfinite(sizes) & (sizes > 0), sizes, 1.0)
 
 
-def task_jacobians(problem: Problem, points: Array, results: Array | None = None) -> Array:
-    """J_x at points (N, n), as an array (N, m, n): a new one, or `results`.
-
-    Raises:
-        SingularTaskError: if J_x is not finite at a point (for example polar coordinates at the origin).
-    """
-    J = np.empty((len(points), problem.m, problem.n)) if results is None else results
-    problem.task.batched_jacobian.into(J, points)
-    if not np.isfinite(J).all():
-        bad = ~np.isfinite(J).all(axis=(1, 2))
-        at = np.round(points[np.flatnonzero(bad)[0]], 4).tolist()
-        raise SingularTaskError(f"the Jacobian of task '{problem.task.name}' is not finite at q = {at}")
-    return J
-
-
-def problem_to_data(problem: Problem) -> tuple[dict[str, Any], dict[str, Stored]]:
+def write_problem(problem: Problem) -> tuple[dict[str, Any], dict[str, Stored]]:
     """Parts 'robot' and 'problem' of a header, and arrays whose names begin with robot_ and domain_."""
     tree = problem.robot.tree
     numbers = {f.name: getattr(tree, f.name) for f in fields(tree)}
-    if not tree.frame_names:  # as in older files
+    # Without frames, files are as before there were any.
+    if not tree.frame_names:
         numbers = {name: value for name, value in numbers.items() if name not in _OF_FRAMES}
     arrays = {f"robot_{name}": value for name, value in numbers.items() if isinstance(value, np.ndarray)}
     domain = problem.domain
@@ -298,8 +285,8 @@ def problem_to_data(problem: Problem) -> tuple[dict[str, Any], dict[str, Stored]
         "robot": {name: value for name, value in numbers.items() if not isinstance(value, np.ndarray)},
         "problem": {
             "name": problem.name,
-            "task": _task_data(problem.task),
-            "metric": _with_tape(problem.metric.recipe, problem.metric.function),
+            "task": _write_task(problem.task),
+            "metric": _add_tape(problem.metric.recipe, problem.metric.function),
             "domain": domain.name,
             **data,
         },
@@ -307,67 +294,66 @@ def problem_to_data(problem: Problem) -> tuple[dict[str, Any], dict[str, Stored]
     return header, arrays
 
 
-def problem_from_data(header: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Problem:
+def read_problem(header: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Problem:
     """The problem of a header and arrays that may be anything.
 
     Raises:
         OrthocasError, and the errors that Python and NumPy have for damaged data: if they make no sense.
     """
-    robot = Robot(_tree(part(header, "robot", dict), arrays))
-    return _problem(robot, part(header, "problem", dict), arrays)
+    robot, data = Robot(_read_tree(get_part(header, "robot", dict), arrays)), get_part(header, "problem", dict)
+    kind = get_part(data, "domain", str)
+    task, metric = _read_task(robot, get_part(data, "task", dict)), _read_metric(robot, get_part(data, "metric", dict))
+    own = {name.removeprefix("domain_"): array for name, array in arrays.items() if name.startswith("domain_")}
+    return Problem(robot, task, metric, domain_from_data(kind, task, data, own), get_part(data, "name", str))
 
 
-def _task_data(task: Task) -> dict[str, Any]:
+def _write_task(task: Task) -> dict[str, Any]:
     """A task as plain data, with the expressions of custom ones."""
-    data = _with_tape(task.recipe, task.function)
-    return data | {"parts": [_task_data(part) for part in task.parts]} if task.parts else data
+    data = _add_tape(task.recipe, task.function)
+    return data | {"parts": [_write_task(get_part) for get_part in task.parts]} if task.parts else data
 
 
-def _with_tape(recipe: Mapping[str, Any], function: ca.Function) -> dict[str, Any]:
+def _add_tape(recipe: Mapping[str, Any], function: ca.Function) -> dict[str, Any]:
     """A task or metric as plain data. A custom one includes its expression."""
-    return {**recipe, "tape": to_tape(function)} if recipe["kind"] == "custom" else dict(recipe)
+    return {**recipe, "tape": write_tape(function)} if recipe["kind"] == "custom" else dict(recipe)
 
 
-def _tree(data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> KinematicTree:
-    names = part(data, "joint_names", list)
+def _read_tree(data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> KinematicTree:
+    names = get_part(data, "joint_names", list)
     numbers: dict[str, Any] = {
         name.removeprefix("robot_"): array for name, array in arrays.items() if name.startswith("robot_")
     }
-    for name in ("effort_limits", "velocity_limits"):  # missing in older files
+    # Older files have no such limits.
+    for name in ("effort_limits", "velocity_limits"):
         numbers.setdefault(name, np.full(len(names), np.inf))
     texts: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in data.items()}
-    wanted, found = {field.name for field in fields(KinematicTree)}, {*texts, *numbers}
-    if not found & _OF_FRAMES:
-        wanted -= _OF_FRAMES
-    if wanted != found:
-        odd = f"with {sorted(found - wanted)} and without {sorted(wanted - found)}"
+    expected, received = {field.name for field in fields(KinematicTree)}, {*texts, *numbers}
+    if not received & _OF_FRAMES:
+        expected -= _OF_FRAMES
+    if expected != received:
+        odd = f"with {sorted(received - expected)} and without {sorted(expected - received)}"
         raise InvalidValueError("robot", odd, "the fields of a KinematicTree")
     for name in ("joint_kinds", "parents", *sorted(_OF_FRAMES & {*data})):
-        part(data, name, list)
+        get_part(data, name, list)
     return KinematicTree(**texts | numbers)
 
 
-def _problem(robot: Robot, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Problem:
-    kind = part(data, "domain", str)
-    task, metric = _task(robot, part(data, "task", dict)), _metric(robot, part(data, "metric", dict))
-    own = {name.removeprefix("domain_"): array for name, array in arrays.items() if name.startswith("domain_")}
-    return Problem(robot, task, metric, domain_from_data(kind, task, data, own), part(data, "name", str))
-
-
-def _task(robot: Robot, recipe: Mapping[str, Any]) -> Task:
-    if part(recipe, "kind", str) == "custom":
-        labels = part(recipe, "labels", list)
-        units = part(recipe, "units", list) if "units" in recipe else ()  # older files have none
-        require_tape(part(recipe, "tape", dict), robot.n)
-        return Task.custom(robot, part(recipe, "name", str), lambda q: from_tape(recipe["tape"], q), labels, units)
+def _read_task(robot: Robot, recipe: Mapping[str, Any]) -> Task:
+    if get_part(recipe, "kind", str) == "custom":
+        labels = get_part(recipe, "labels", list)
+        # Older files have no units.
+        units = get_part(recipe, "units", list) if "units" in recipe else ()
+        require_tape(get_part(recipe, "tape", dict), robot.n)
+        return Task.custom(robot, get_part(recipe, "name", str), lambda q: read_tape(recipe["tape"], q), labels, units)
     if recipe["kind"] == "stack":
-        return Task.stack(*(_task(robot, each) for each in part(recipe, "parts", list)))
+        return Task.stack(*(_read_task(robot, each) for each in get_part(recipe, "parts", list)))
     return Task.from_recipe(robot, recipe)
 
 
-def _metric(robot: Robot, recipe: Mapping[str, Any]) -> Metric:
-    if part(recipe, "kind", str) == "custom":
-        require_tape(part(recipe, "tape", dict), robot.n)
-        name = recipe.get("name", "custom")  # older files have no name
-        return Metric.custom(robot, name, lambda q: from_tape(recipe["tape"], q))
+def _read_metric(robot: Robot, recipe: Mapping[str, Any]) -> Metric:
+    if get_part(recipe, "kind", str) == "custom":
+        require_tape(get_part(recipe, "tape", dict), robot.n)
+        # Older files have no name.
+        name = recipe.get("name", "custom")
+        return Metric.custom(robot, name, lambda q: read_tape(recipe["tape"], q))
     return Metric.from_spec(robot, recipe["matrix"] if recipe["kind"] == "constant" else recipe["kind"])

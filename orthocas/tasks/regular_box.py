@@ -9,59 +9,40 @@ from numpy.typing import ArrayLike
 from orthocas.errors import DomainError, InvalidValueError, NotRedundantError, degrees_hint
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM
-from orthocas.tasks.clear_box import row_scale
-from orthocas.tasks.domains import Box, default_box, default_half_width, sample_evenly
+from orthocas.tasks.clear_box import compute_row_scale
+from orthocas.tasks.domains import Box, default_box, default_half_width
+from orthocas.tasks.samples import sample_evenly
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array, as_number, as_point
 
-_PRISMATIC_MARGIN = 0.02  # of the range of a prismatic joint
-_REGULAR = 0.04  # regularity that keeps the middle of the limits; 5 % of the box may have less
-_SAMPLES, _WORST = 24, 6  # samples of a candidate; the mean of the worst 6 counts
-_JUDGES = 256  # samples of the middle
-_FARTHEST = np.pi / 2  # largest distance from the middle [rad]
-_FIRST_BEND = 0.75  # first bend, as a share of a joint's range
-_BENDS = np.linspace(-1, 1, 9)  # later bends, as shares of the range, one joint at a time
-_PENALTY = 0.015  # regularity that a bend of 1 rad must gain
-_ROUNDS = 10
-_REGULAR_HOME = 0.15  # a named posture needs at least this regularity, see `Judge`
-_ROOM = 0.5  # and this share of the default half-widths to its joint limits
+
+@dataclass(frozen=True, slots=True)
+class PostureRules:
+    """Numbers of the choice of postures and default boxes."""
+
+    prismatic_margin: float = 0.02  #: of the range of a prismatic joint
+    regular: float = 0.04  #: regularity that keeps the centre of the limits; 5 % of the box may have less
+    samples: int = 24  #: of the box around a candidate
+    worst: int = 6  #: samples that count: the mean of the least regular ones
+    centre_samples: int = 256  #: of the box around the centre of the limits
+    farthest: float = np.pi / 2  #: [rad] from the centre of the limits
+    first_bend: float = 0.75  #: as a fraction of the range of a joint
+    penalty: float = 0.015  #: regularity that a bend of 1 rad must gain
+    rounds: int = 10  #: of moves of one joint at a time
+    regular_home: float = 0.15  #: regularity that a named posture must have
+    room: float = 0.5  #: and the fraction of the default half-widths that it must have to its joint limits
 
 
-def joint_range(robot: Robot, margin_deg: float) -> Box:
-    """The box of all joint positions farther than a margin from the limits. Endless joints have a full turn.
-
-    Raises:
-        DomainError: if a joint has no range left.
-    """
-    margin = np.radians(as_number("margin_deg", margin_deg))
-    if not 0 <= margin < np.pi:
-        raise InvalidValueError("margin_deg", margin_deg, "an angle from 0 to below 180 degrees")
-    prismatic = np.array(robot.tree.prismatic)
-    missing = np.isinf(robot.lower) | np.isinf(robot.upper)
-    middle = robot.tree.middle
-    low = np.where(missing, middle - PRISMATIC_ROOM, robot.lower)
-    high = np.where(missing, middle + PRISMATIC_ROOM, robot.upper)
-    room = np.where(prismatic, _PRISMATIC_MARGIN * (high - low), margin) * ~missing
-    low, high = low + room, high - room
-    endless = ~prismatic & (missing | (robot.upper - robot.lower >= 2 * np.pi))
-    low[endless], high[endless] = -np.pi, np.pi
-    empty = np.flatnonzero(low >= high)
-    if empty.size:
-        name = robot.joint_names[int(empty[0])]
-        raise DomainError(
-            f"joint '{name}' has no range left with a margin of {margin_deg:g} deg, expected a smaller one"
-        )
-    free = endless & np.isinf(robot.lower) & np.isinf(robot.upper)
-    return Box((low + high) / 2, (high - low) / 2, np.flatnonzero(free).tolist())
+RULES = PostureRules()
 
 
 def regular_box(robot: Robot, task: Task) -> Box:
-    """The default box of a robot, moved to a bent posture if the task is singular in or near its middle.
+    """The default box of a robot, moved to a bent posture if the task is singular in or near its centre.
 
-    The score of a posture is the regularity of its box, less 0.015 for every radian from the middle of the limits.
+    The score of a posture is the regularity of its box, less a penalty for every radian from the centre of the limits.
     Candidates bend one or two joints. From the best candidate, joints move one at a time while the score improves.
-    Prismatic joints stay in the middle. The choice is deterministic.
+    Prismatic joints stay in the centre. The choice is deterministic.
 
     Args:
         robot: the robot.
@@ -76,91 +57,10 @@ def regular_box(robot: Robot, task: Task) -> Box:
     if task.m >= robot.n:
         raise NotRedundantError(task.m, robot.n)
     box = default_box(robot)
-    judge = Judge.of(robot, task, box)
-    if np.quantile(judge.regularity(box.centre[None], _JUDGES), 0.05) >= _REGULAR:
+    score = PostureScore.build(robot, task, box)
+    if np.quantile(score.evaluate_regularity(box.centre[None], RULES.centre_samples), 0.05) >= RULES.regular:
         return box
-    return default_box(robot, bent_posture(judge, robot, box))
-
-
-def bent_posture(judge: "Judge", robot: Robot, box: Box) -> Array:
-    """The posture with the best score, (n,), found from the middle of the default box."""
-    room = np.minimum(box.centre - robot.lower, robot.upper - box.centre) - box.half_width
-    way = np.where(robot.tree.prismatic, 0.0, np.clip(room, 0.0, _FARTHEST))
-    best, value = judge.best(_bent_postures(way))
-    for _ in range(_ROUNDS):
-        moved, improved = judge.best(_one_joint_moved(best, way))
-        if improved <= value:
-            break
-        best, value = moved, improved
-    return box.centre + best
-
-
-@dataclass(frozen=True)
-class Judge:
-    """Scores postures: how regular a task is on the default boxes around them."""
-
-    robot: Robot
-    m: int
-    jacobian: Batched
-    middle: Array
-    scale: Array  # scale of the rows of J_x, (m,)
-
-    @classmethod
-    def of(cls, robot: Robot, task: Task, box: Box) -> "Judge":
-        """Scale the rows of J_x by their size on a box."""
-        jacobian = Batched(task.centred_jacobian_function)
-        points = sample_evenly(box, _JUDGES, 0)
-        J = _finite(jacobian(points, np.broadcast_to(box.centre, points.shape))[0].reshape(-1, task.m, robot.n))
-        return cls(robot, task.m, jacobian, box.centre, row_scale(J, task.units))
-
-    def regularity(self, centres: Array, samples: int) -> Array:
-        """Smallest singular values of [J_x; N^T] on the boxes around centres (N, n), (N, samples + 1).
-
-        Rows of J_x are scaled to order one, and N is an orthonormal basis of the self-motions at the centre. The value
-        is zero where the task is singular, and where coordinates along the self-motions of the centre fold over.
-        """
-        n = self.robot.n
-        unit = np.vstack([np.zeros(n), sample_evenly(Box(np.zeros(n), 1.0), samples, 0)])
-        points = centres[:, None] + default_half_width(self.robot, centres)[:, None] * unit
-        at = np.broadcast_to(centres[:, None], points.shape)
-        J = _finite(self.jacobian(points.reshape(-1, n), at.reshape(-1, n))[0]).reshape(*points.shape[:2], self.m, n)
-        J = J / self.scale[:, None]
-        rest = np.linalg.svd(J[:, 0])[2][:, None, self.m :]
-        stacked = np.concatenate([J, np.broadcast_to(rest, (*points.shape[:2], n - self.m, n))], axis=2)
-        return np.asarray(np.linalg.svd(stacked, compute_uv=False)[..., -1])
-
-    def worst(self, centres: Array) -> Array:
-        """Mean of the smallest regularities on the boxes around centres (N, n), (N,)."""
-        values: Array = np.sort(self.regularity(centres, _SAMPLES - 1), axis=1)[:, :_WORST].mean(axis=1)
-        return values
-
-    def best(self, offsets: Array) -> tuple[Array, float]:
-        """The best of the offsets (N, n) from the middle, and its score."""
-        values = self.worst(self.middle + offsets) - _PENALTY * np.abs(offsets).sum(axis=1)
-        k = int(np.argmax(values))
-        return offsets[k], float(values[k])
-
-
-def _bent_postures(way: Array) -> Array:
-    """Offsets with no joint, one joint or two joints bent, in both directions."""
-    single = [sign * _FIRST_BEND * row for row in np.diag(way)[way > 0] for sign in (-1, 1)]
-    double = [a + b for a, b in combinations(single, 2) if not (a * b).any()]
-    return np.array([np.zeros(len(way)), *single, *double])
-
-
-def _one_joint_moved(posture: Array, way: Array) -> Array:
-    """The posture, and those with one joint moved within its range."""
-    moved = [posture]
-    for i in np.flatnonzero(way):
-        for bend in _BENDS:
-            moved.append(posture.copy())
-            moved[-1][i] = bend * way[i]
-    return np.array(moved)
-
-
-def _finite(J: Array) -> Array:
-    """J with zeros, that is singular, where it is not finite."""
-    return np.where(np.isfinite(J), J, 0.0)
+    return default_box(robot, find_bent_posture(score, robot, box))
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,8 +71,8 @@ class Home:
     source: str  #: in words
 
 
-def home_posture(robot: Robot, task: Task, home: ArrayLike | str | None = None) -> Home:
-    """The posture that is meant.
+def find_home(robot: Robot, task: Task, home: ArrayLike | str | None = None) -> Home:
+    """Find the posture that a user means.
 
     Without one, it is the first named posture of the robot's files around which the task is regular and joints have
     room to move. If there is none, it is the bent posture with the best score of `orthocas.tasks.regular_box`.
@@ -190,7 +90,14 @@ def home_posture(robot: Robot, task: Task, home: ArrayLike | str | None = None) 
     if task.m >= robot.n:
         raise NotRedundantError(task.m, robot.n)
     if home is None:
-        return _default_home(robot, task)
+        box = default_box(robot)
+        score, usual_room = PostureScore.build(robot, task, box), default_half_width(robot, robot.tree.centre_posture)
+        for name, q in robot.homes.items():
+            has_room = np.all(default_half_width(robot, q) >= RULES.room * usual_room)
+            if has_room and score.evaluate(q[None])[0] >= RULES.regular_home:
+                return Home(q, f"posture '{name}' of the robot's files")
+        return Home(find_bent_posture(score, robot, box), "bent posture where the task is most regular")
+    # A posture that is given must lie inside the limits.
     source = f"posture '{home}' of the robot's files" if isinstance(home, str) else "as given"
     q = robot.home(home) if isinstance(home, str) else as_point("home", home, robot.n)
     outside = np.flatnonzero((q <= robot.lower) | (q >= robot.upper))
@@ -203,11 +110,103 @@ def home_posture(robot: Robot, task: Task, home: ArrayLike | str | None = None) 
     return Home(q, source)
 
 
-def _default_home(robot: Robot, task: Task) -> Home:
-    box = default_box(robot)
-    judge = Judge.of(robot, task, box)
-    for name, q in robot.homes.items():
-        has_room = np.all(default_half_width(robot, q) >= _ROOM * default_half_width(robot, robot.tree.middle))
-        if has_room and judge.worst(q[None])[0] >= _REGULAR_HOME:
-            return Home(q, f"posture '{name}' of the robot's files")
-    return Home(bent_posture(judge, robot, box), "bent posture where the task is most regular")
+def find_joint_range(robot: Robot, margin_deg: float) -> Box:
+    """The box of all joint positions farther than a margin from the limits. Endless joints have a full turn.
+
+    Raises:
+        DomainError: if a joint has no range left.
+    """
+    margin = np.radians(as_number("margin_deg", margin_deg))
+    if not 0 <= margin < np.pi:
+        raise InvalidValueError("margin_deg", margin_deg, "an angle from 0 to below 180 degrees")
+    # Joints without limits take the room of a default box; endless ones a full turn.
+    prismatic = np.array(robot.tree.prismatic)
+    missing = np.isinf(robot.lower) | np.isinf(robot.upper)
+    middle = robot.tree.centre_posture
+    low = np.where(missing, middle - PRISMATIC_ROOM, robot.lower)
+    high = np.where(missing, middle + PRISMATIC_ROOM, robot.upper)
+    room = np.where(prismatic, RULES.prismatic_margin * (high - low), margin) * ~missing
+    low, high = low + room, high - room
+    endless = ~prismatic & (missing | (robot.upper - robot.lower >= 2 * np.pi))
+    low[endless], high[endless] = -np.pi, np.pi
+    empty = np.flatnonzero(low >= high)
+    if empty.size:
+        name = robot.joint_names[int(empty[0])]
+        raise DomainError(
+            f"joint '{name}' has no range left with a margin of {margin_deg:g} deg, expected a smaller one"
+        )
+    free = endless & np.isinf(robot.lower) & np.isinf(robot.upper)
+    return Box((low + high) / 2, (high - low) / 2, np.flatnonzero(free).tolist())
+
+
+def find_bent_posture(score: "PostureScore", robot: Robot, box: Box) -> Array:
+    """The posture with the best score, (n,), found from the centre of the default box."""
+    room = np.minimum(box.centre - robot.lower, robot.upper - box.centre) - box.half_width
+    way = np.where(robot.tree.prismatic, 0.0, np.clip(room, 0.0, RULES.farthest))
+    # Begin with no joint, one joint or two joints bent, in both directions.
+    single = [sign * RULES.first_bend * row for row in np.diag(way)[way > 0] for sign in (-1, 1)]
+    double = [a + b for a, b in combinations(single, 2) if not (a * b).any()]
+    best, value = score.find_best(np.array([np.zeros(len(way)), *single, *double]))
+    # Then move one joint at a time within its range while the score improves.
+    for _ in range(RULES.rounds):
+        candidates = [best]
+        for i in np.flatnonzero(way):
+            for bend in np.linspace(-1, 1, 9):
+                candidates.append(best.copy())
+                candidates[-1][i] = bend * way[i]
+        moved, improved = score.find_best(np.array(candidates))
+        if improved <= value:
+            break
+        best, value = moved, improved
+    return box.centre + best
+
+
+@dataclass(frozen=True)
+class PostureScore:
+    """Scores postures: how regular a task is on the default boxes around them."""
+
+    robot: Robot
+    m: int
+    jacobian: Batched
+    centre: Array  #: of the limits, (n,)
+    scale: Array  #: of the rows of J_x, (m,)
+
+    @classmethod
+    def build(cls, robot: Robot, task: Task, box: Box) -> "PostureScore":
+        """Scale the rows of J_x by their size on a box."""
+        jacobian = Batched(task.centred_jacobian_function)
+        points = sample_evenly(box, RULES.centre_samples, 0)
+        J = _fill_singular(jacobian(points, np.broadcast_to(box.centre, points.shape))[0].reshape(-1, task.m, robot.n))
+        return cls(robot, task.m, jacobian, box.centre, compute_row_scale(J, task.units))
+
+    def evaluate_regularity(self, centres: Array, samples: int) -> Array:
+        """Smallest singular values of [J_x; N^T] on the boxes around centres (N, n), (N, samples + 1).
+
+        Rows of J_x are scaled to order one, and N is an orthonormal basis of the self-motions at the centre. The value
+        is zero where the task is singular, and where coordinates along the self-motions of the centre fold over.
+        """
+        n = self.robot.n
+        unit = np.vstack([np.zeros(n), sample_evenly(Box(np.zeros(n), 1.0), samples, 0)])
+        points = centres[:, None] + default_half_width(self.robot, centres)[:, None] * unit
+        at = np.broadcast_to(centres[:, None], points.shape)
+        J = _fill_singular(self.jacobian(points.reshape(-1, n), at.reshape(-1, n))[0])
+        J = J.reshape(*points.shape[:2], self.m, n) / self.scale[:, None]
+        rest = np.linalg.svd(J[:, 0])[2][:, None, self.m :]
+        stacked = np.concatenate([J, np.broadcast_to(rest, (*points.shape[:2], n - self.m, n))], axis=2)
+        return np.asarray(np.linalg.svd(stacked, compute_uv=False)[..., -1])
+
+    def evaluate(self, centres: Array) -> Array:
+        """Mean of the smallest regularities on the boxes around centres (N, n), (N,)."""
+        values = np.sort(self.evaluate_regularity(centres, RULES.samples - 1), axis=1)
+        return np.asarray(values[:, : RULES.worst].mean(axis=1))
+
+    def find_best(self, offsets: Array) -> tuple[Array, float]:
+        """The best of the offsets (N, n) from the centre, and its score."""
+        values = self.evaluate(self.centre + offsets) - RULES.penalty * np.abs(offsets).sum(axis=1)
+        k = int(np.argmax(values))
+        return offsets[k], float(values[k])
+
+
+def _fill_singular(J: Array) -> Array:
+    """J with zeros, that is singular, where it is not finite."""
+    return np.where(np.isfinite(J), J, 0.0)

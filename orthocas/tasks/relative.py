@@ -1,11 +1,11 @@
-"""Task values relative to wanted ones: where x holds a whole orientation, nothing happens half a turn from anywhere."""
+"""Task values relative to target ones: where x holds a whole orientation, nothing happens half a turn from anywhere."""
 
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from orthocas.robots.spatial import conjugate, quaternion_product, skew
+from orthocas.robots.spatial import conjugate, multiply_quaternions, skew
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
@@ -14,9 +14,9 @@ from orthocas.tools.columns import BlockedFunction
 
 
 class Relative:
-    """A task value x relative to a wanted one x_d.
+    """A task value x relative to a target x_d.
 
-    For most tasks that is e = x - x_d. For orientation and pose tasks, with the tip's orientation R and the wanted one
+    For most tasks that is e = x - x_d. For orientation and pose tasks, with the tip's orientation R and its target
     R_d, the rows of the orientation are 2 sin(angle / 2) axis of R_d^T R, so they do not depend on the reference of the
     task; with an AXIS they are put into its order: tilt, tilt, turn. The error is continuous except where R is half a
     turn from R_d. The rates are J(q) dq with d(e)/dt = J dq at e = 0: those rows are the angular
@@ -38,9 +38,9 @@ class Relative:
             return x_d - x
         if isinstance(x, ca.SX | ca.MX | ca.DM) or isinstance(x_d, ca.SX | ca.MX | ca.DM):
             return -self._error(x, x_d)[0]
-        wanted, here = np.broadcast_arrays(x_d, x)
-        rows = self._batched_error(here.reshape(-1, self.task.m), wanted.reshape(-1, self.task.m))[0]
-        return -rows.reshape(wanted.shape)
+        target, here = np.broadcast_arrays(x_d, x)
+        rows = self._batched_error(here.reshape(-1, self.task.m), target.reshape(-1, self.task.m))[0]
+        return -rows.reshape(target.shape)
 
     @property
     def rates(self) -> ca.Function:
@@ -52,7 +52,7 @@ class Relative:
         """Evaluates J at many points."""
         return BlockedFunction(self.rates) if self.turned else self.task.batched_jacobian
 
-    def embedded(self, x: Array) -> Array:
+    def embed(self, x: Array) -> Array:
         """Orientations of x (N, m) as numbers (N, 16) whose distance is that of the error for near ones, and no seam.
 
         They are the products of the entries of the unit quaternion, which stands for a rotation with either sign, times
@@ -73,17 +73,17 @@ class Relative:
         e, slope = self._error(self.task.function(q), x_d)
         return e, slope @ J
 
-    def drift(self, q: ca.MX, x_d: ca.MX, dx_d: ca.MX) -> ca.MX:
-        """-de/dt of an arm at rest, (m, 1): the rate that de/dq dq must have to stay at the wanted value."""
+    def compute_drift(self, q: ca.MX, x_d: ca.MX, dx_d: ca.MX) -> ca.MX:
+        """-de/dt of an arm at rest, (m, 1): the rate that de/dq dq must have to stay at the target."""
         return -self._drift(self.task.function(q), x_d, dx_d) if self.turned else dx_d
 
-    def bend(self, q: ca.MX, dq: ca.MX, w: ca.MX, wanted: tuple[ca.MX, ca.MX, ca.MX]) -> ca.MX:
+    def compute_bias(self, q: ca.MX, dq: ca.MX, w: ca.MX, target: tuple[ca.MX, ca.MX, ca.MX]) -> ca.MX:
         """(d/dt) (de/dq w - drift) for a constant w (n, 1), (m, 1), with x_d and its two derivatives."""
         bend = self.task.rates_derivative_function(q, dq, w)
         if not self.turned:
-            return bend - wanted[2]
+            return bend - target[2]
         J = self.rates(q)
-        return self._bend(self.task.function(q), *wanted, J @ dq, J @ w, bend)
+        return self._bend(self.task.function(q), *target, J @ dq, J @ w, bend)
 
     @cached_property
     def moved(self) -> ca.Function:
@@ -92,7 +92,7 @@ class Relative:
         They are those of an orientation with the angular velocity and acceleration of x_d in its own axes. For tasks of
         a whole orientation only.
         """
-        x, e, x_d, dx_d, ddx_d = symbols = self._symbols("x", "e", "x_d", "dx_d", "ddx_d")
+        x, e, x_d, dx_d, ddx_d = symbols = self._make_symbols("x", "e", "x_d", "dx_d", "ddx_d")
         return dense_function("moved", symbols, list(self.turned_by(x, e, *self._turning(x_d, dx_d, ddx_d))))
 
     @cached_property
@@ -101,25 +101,27 @@ class Relative:
 
         For tasks of a whole orientation only.
         """
-        x, e, rates, changes = symbols = self._symbols("x", "e", "rates", "changes")
+        x, e, rates, changes = symbols = self._make_symbols("x", "e", "rates", "changes")
         turn, first = self.task.turn, self.first
         assert turn is not None
+        # The error as a quaternion step, and how the product turns.
         half, omega, alpha = (self._order.T @ part[first:] for part in (e / 2, rates, changes))
         step = ca.vertcat(ca.sqrt(ca.fmax(1 - ca.sumsqr(half), 0)), half)
-        p = quaternion_product(self._quaternion(x), step)
-        dp = quaternion_product(p, ca.vertcat(0, omega)) / 2
-        ddp = (quaternion_product(dp, ca.vertcat(0, omega)) + quaternion_product(p, ca.vertcat(0, alpha))) / 2
+        p = multiply_quaternions(self._compute_quaternion(x), step)
+        dp = multiply_quaternions(p, ca.vertcat(0, omega)) / 2
+        ddp = (multiply_quaternions(dp, ca.vertcat(0, omega)) + multiply_quaternions(p, ca.vertcat(0, alpha))) / 2
+        # The components of the product, and their derivatives along it.
         at = ca.SX.sym("p", 4)
         value = turn.of_quaternion(at)
         rate = ca.jtimes(value, at, dp)
-        found = [value, rate, ca.jtimes(rate, at, dp) + ca.jtimes(value, at, ddp)]
-        found = ca.substitute(found, [at], [p])
+        turned = [value, rate, ca.jtimes(rate, at, dp) + ca.jtimes(value, at, ddp)]
+        turned = ca.substitute(turned, [at], [p])
         straight = (x[:first] + e[:first], rates[:first], changes[:first])
-        whole = [ca.vertcat(a, b) for a, b in zip(straight, found, strict=True)]
+        whole = [ca.vertcat(a, b) for a, b in zip(straight, turned, strict=True)]
         return dense_function("turned_by", symbols, [ca.cse(part) for part in whole])
 
-    def rates_of(self, x_d: ca.MX, dx_d: ca.MX, ddx_d: ca.MX) -> tuple[ca.MX, ca.MX]:
-        """Rates of a wanted value as the error counts, (m, 1), about its own axes, and their derivatives."""
+    def convert_rates(self, x_d: ca.MX, dx_d: ca.MX, ddx_d: ca.MX) -> tuple[ca.MX, ca.MX]:
+        """Rates of a target value as the error counts, (m, 1), about its own axes, and their derivatives."""
         if not self.turned:
             return dx_d, ddx_d
         rate, change = self._turning(x_d, dx_d, ddx_d)
@@ -127,8 +129,8 @@ class Relative:
 
     @cached_property
     def _turning(self) -> ca.Function:
-        x_d, dx_d, ddx_d = symbols = self._symbols("x_d", "dx_d", "ddx_d")
-        _, omega, alpha = self._wanted(x_d, dx_d, ddx_d)
+        x_d, dx_d, ddx_d = symbols = self._make_symbols("x_d", "dx_d", "ddx_d")
+        _, omega, alpha = self._differentiate_target(x_d, dx_d, ddx_d)
         parts = ((dx_d, omega), (ddx_d, alpha))
         rates = [ca.vertcat(straight[: self.first], self._order @ turning) for straight, turning in parts]
         return dense_function("turning", symbols, rates)
@@ -140,19 +142,19 @@ class Relative:
     @cached_property
     def _error(self) -> ca.Function:
         """x, x_d -> e, and the slope E with de/dq = E J."""
-        x, x_d = self._symbols("x", "x_d")
-        w, v = self._relative(x, self._quaternion(x_d))
+        x, x_d = self._make_symbols("x", "x_d")
+        w, v = self._compute_turn(x, self._compute_quaternion(x_d))
         slope = ca.SX.eye(self.task.m)
-        slope[self.first :, self.first :] = self._ordered(w * ca.SX.eye(3) + skew(v))
+        slope[self.first :, self.first :] = self._reorder(w * ca.SX.eye(3) + skew(v))
         e = ca.vertcat(x[: self.first] - x_d[: self.first], self._order @ (2 * v))
         return dense_function("relative", [x, x_d], [e, slope], ["x", "x_d"])
 
     @cached_property
     def _drift(self) -> ca.Function:
         """x, x_d, dx_d -> de/dt of an arm at rest."""
-        x, x_d, dx_d = self._symbols("x", "x_d", "dx_d")
-        p, omega = self._wanted(x_d, dx_d, ca.SX.zeros(self.task.m))[:2]
-        w, v = self._relative(x, p)
+        x, x_d, dx_d = self._make_symbols("x", "x_d", "dx_d")
+        p, omega = self._differentiate_target(x_d, dx_d, ca.SX.zeros(self.task.m))[:2]
+        w, v = self._compute_turn(x, p)
         turning = self._order @ (w * omega - ca.cross(v, omega))
         return dense_function("drift", [x, x_d, dx_d], [-ca.vertcat(dx_d[: self.first], turning)], ["x", "x_d", "v"])
 
@@ -160,9 +162,9 @@ class Relative:
     def _bend(self) -> ca.Function:
         """x, x_d, dx_d, ddx_d, rates of dq, rates of w, dJ/dt w -> d/dt (E J w + de/dt of an arm at rest)."""
         names = ("x", "x_d", "dx_d", "ddx_d", "here", "there", "change")
-        x, x_d, dx_d, ddx_d, here, there, change = symbols = self._symbols(*names)
-        p, omega, alpha = self._wanted(x_d, dx_d, ddx_d)
-        w, v = self._relative(x, p)
+        x, x_d, dx_d, ddx_d, here, there, change = symbols = self._make_symbols(*names)
+        p, omega, alpha = self._differentiate_target(x_d, dx_d, ddx_d)
+        w, v = self._compute_turn(x, p)
         turning, along, changing = (self._order.T @ rate[self.first :] for rate in (here, there, change))
         dv = (w * (turning - omega) + ca.cross(v, turning + omega)) / 2
         dw = -ca.dot(v, turning - omega) / 2
@@ -171,7 +173,7 @@ class Relative:
         straight = change[: self.first] - ddx_d[: self.first]
         return dense_function("bend", symbols, [ca.cse(ca.vertcat(straight, self._order @ (moved - left)))], names)
 
-    def _symbols(self, *names: str) -> list[ca.SX]:
+    def _make_symbols(self, *names: str) -> list[ca.SX]:
         return [ca.SX.sym(name, self.task.m) for name in names]
 
     @property
@@ -179,23 +181,23 @@ class Relative:
         assert self.task.turn is not None
         return ca.SX(ca.sparsify(ca.DM(self.task.turn.order)))
 
-    def _ordered(self, matrix: ca.SX) -> ca.SX:
+    def _reorder(self, matrix: ca.SX) -> ca.SX:
         return self._order @ matrix @ self._order.T
 
-    def _quaternion(self, x: ca.SX) -> ca.SX:
+    def _compute_quaternion(self, x: ca.SX) -> ca.SX:
         quaternion: ca.SX = self.task.quaternion_function(x)
         return quaternion
 
-    def _relative(self, x: ca.SX, wanted: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """w >= 0 and v of the rotation from the wanted orientation to that of x."""
-        found = quaternion_product(conjugate(wanted), self._quaternion(x))
-        found = found * ca.if_else(found[0] < 0, -1, 1)
-        return found[0], found[1:]
+    def _compute_turn(self, x: ca.SX, target: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """w >= 0 and v of the rotation from the target orientation to that of x."""
+        turn = multiply_quaternions(conjugate(target), self._compute_quaternion(x))
+        turn = turn * ca.if_else(turn[0] < 0, -1, 1)
+        return turn[0], turn[1:]
 
-    def _wanted(self, x_d: ca.SX, dx_d: ca.SX, ddx_d: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """The wanted orientation, and its angular velocity and acceleration in its own axes."""
-        p = self._quaternion(x_d)
+    def _differentiate_target(self, x_d: ca.SX, dx_d: ca.SX, ddx_d: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """The target orientation, and its angular velocity and acceleration in its own axes."""
+        p = self._compute_quaternion(x_d)
         dp = ca.jtimes(p, x_d, dx_d)
         ddp = ca.jtimes(dp, x_d, dx_d) + ca.jtimes(p, x_d, ddx_d)
         back = conjugate(p)
-        return p, 2 * quaternion_product(back, dp)[1:], 2 * quaternion_product(back, ddp)[1:]
+        return p, 2 * multiply_quaternions(back, dp)[1:], 2 * multiply_quaternions(back, ddp)[1:]

@@ -1,21 +1,122 @@
-"""Sample sets of a problem: the data of the loss that do not depend on the coordinates; idle joints."""
+"""Samples: seeded points of a domain, and the data of the loss there that do not depend on the coordinates."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.tasks.domains import sample_uniform
-from orthocas.tasks.metric import metric_matrices
-from orthocas.tasks.problem import Problem, task_jacobians
+from orthocas.errors import DomainError
+from orthocas.tasks.domains import Domain
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array
+from orthocas.tools.checks import Array, require_count, require_memory
+
+if TYPE_CHECKING:
+    from orthocas.tasks.problem import Problem
 
 #: of the largest entry of J_x: columns below are of joints that do not move the task. Robot files round angles to nine
 #: decimals and more, and such a joint then tilts the axis that it turns about by so little
 NEGLIGIBLE = 1e-8
+
+
+@dataclass(frozen=True, slots=True)
+class SamplingRules:
+    """Numbers of the sampling of domains."""
+
+    most: int = 10**12  #: samples of one call
+    powers: tuple[float, ...] = (1.0, 0.5, 0.25)  #: of the distance from the centre: uniform, near faces, near corners
+    least_fraction: float = 1e-3  #: of the points of the box that must lie in the domain
+    tried: int = 10_000  #: points after which that counts
+    block: int = 1000  #: fewest points to draw at once, after the first ones
+
+
+RULES = SamplingRules()
+
+
+def sample_uniform(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
+    """Draw points uniformly from the domain, (samples, n)."""
+    rng = _make_generator(domain, samples, seed)
+    return _keep_inside(domain, samples, lambda count: domain.draw(rng, count, 1.0))
+
+
+def sample_boundary_weighted(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
+    """Draw points of which a third is uniform, a third near faces and a third near corners, (samples, n).
+
+    Charts fail there first. The distances from the centre are |u|^p half-widths, with uniform u and p = 1, 1/2 and 1/4.
+
+    Source:
+        ours.
+    """
+    rng, third = _make_generator(domain, samples, seed), samples // 3
+    sizes = (samples - 2 * third, third, third)
+    parts = [
+        _keep_inside(domain, size, partial(domain.draw, rng, power=power))
+        for size, power in zip(sizes, RULES.powers, strict=True)
+    ]
+    return np.vstack(parts)
+
+
+def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
+    """Draw points that fill the domain more evenly than random points, (samples, n).
+
+    They follow the additive recurrence frac(shift + k alpha), alpha_j = g^-j, with g the root of g^(n+1) = g + 1 and a
+    random shift. Each point is uniformly distributed, and every part of the sequence is even. Means over the domain
+    converge faster than with independent points. Domains that draw points themselves get independent ones.
+
+    Source:
+        M. Roberts, docs/reference/references.md [R2018]. The use for training is ours.
+    """
+    if domain.draws_itself:
+        return sample_uniform(domain, samples, seed)
+    rng, n = _make_generator(domain, samples, seed), len(domain.centre)
+    # The generalised golden ratio, by fixed-point iteration.
+    g = 1.5
+    for _ in range(64):
+        g = (1 + g) ** (1 / (n + 1))
+    shift, done = rng.uniform(size=n), 0
+
+    def draw(count: int) -> Array:
+        nonlocal done
+        k = np.arange(done + 1, done + count + 1)[:, None]
+        done += count
+        u = 2 * ((shift + k * g ** -np.arange(1.0, n + 1)) % 1.0) - 1
+        return np.asarray(domain.centre + domain.half_width * u)
+
+    return _keep_inside(domain, samples, draw)
+
+
+def _make_generator(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> np.random.Generator:
+    """The generator of a seed, after checks of what is asked for."""
+    require_count("samples", samples, most=RULES.most)
+    for part in seed if isinstance(seed, tuple) else (seed,):
+        require_count("seed", part, least=0)
+    require_memory(f"{samples} samples", 32.0 * samples * len(domain.centre))
+    return np.random.default_rng(seed)
+
+
+def _keep_inside(domain: Domain, samples: int, draw: Callable[[int], Array]) -> Array:
+    """The first points of a sequence that lie in the domain, (samples, n); `draw` returns the next so many points.
+
+    Raises:
+        DomainError: if next to none of them does.
+    """
+    kept = [np.empty((0, len(domain.centre)))]
+    drawn, count, size = 0, 0, samples
+    while count < samples:
+        # Give up where next to no point of the box lies in the domain.
+        if drawn >= RULES.tried and count < RULES.least_fraction * drawn:
+            raise DomainError(
+                f"{count} of {drawn} points of its box lie in the domain, expected at least "
+                f"{RULES.least_fraction:.1%}: lower least_singular_value, or raise the radius of the corridor"
+            )
+        points = draw(size)
+        kept.append(points[domain.contains(points)])
+        drawn, count = drawn + size, count + len(kept[-1])
+        size = max(samples - count, RULES.block)
+    return np.concatenate(kept)[:samples]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -42,7 +143,7 @@ class Samples:
         inverse = None if self.metric_inverse is None else self.metric_inverse[:, joints][:, :, joints]
         return Samples(self.points[:, joints], self.task_jacobian[:, :, joints], inverse)
 
-    def at_zero_momentum(self, base: Sequence[int]) -> "Samples":
+    def project_to_zero_momentum(self, base: Sequence[int]) -> "Samples":
         """The samples as velocities with zero momentum see them, on a base that floats.
 
         For A = M, with the joints a of the arms: J_x becomes the generalised Jacobian J_a - J_b M_bb^-1 M_ba, which is
@@ -56,12 +157,12 @@ class Samples:
         n, k = self.task_jacobian.shape[2], len(base)
         arms = self.metric_inverse[:, k:, k:]
         J, inverse = np.zeros_like(self.task_jacobian), np.repeat(np.eye(n)[None], len(self), axis=0)
-        gradients = self.raised(self.task_jacobian)[:, :, k:]
+        gradients = self.compute_metric_gradients(self.task_jacobian)[:, :, k:]
         J[:, :, k:] = np.linalg.solve(arms, gradients.transpose(0, 2, 1)).transpose(0, 2, 1)
         inverse[:, k:, k:] = arms
         return Samples(self.points, J, inverse)
 
-    def raised(self, covectors: Array) -> Array:
+    def compute_metric_gradients(self, covectors: Array) -> Array:
         """A^-1 v for covectors v (N, k, n): gradients in the metric ([AS2023] eq. (16))."""
         gradients: Array = covectors if self.metric_inverse is None else covectors @ self.metric_inverse
         return gradients
@@ -69,19 +170,21 @@ class Samples:
     @property
     def unit_task_gradients(self) -> Array:
         """A^-1 v_x,i / |A^-1 v_x,i| with Euclidean norms, as in [AS2023] eq. (24), (N, m, n)."""
-        gradients = self.raised(self.task_jacobian)
+        gradients = self.compute_metric_gradients(self.task_jacobian)
         unit: Array = gradients / np.linalg.norm(gradients, axis=2, keepdims=True)
         return unit
 
     @property
     def task_basis(self) -> Array:
         """An A-orthonormal basis e_1..e_m of span{grad_A h_i}, (N, m, n)."""
-        gradients = self.raised(self.task_jacobian)
+        gradients = self.compute_metric_gradients(self.task_jacobian)
         gram = gradients @ self.task_jacobian.transpose(0, 2, 1)
-        scale = np.sqrt(np.einsum("sii->si", gram))  # normalise rows first, so that units do not matter
+        # Rows are normalised first, so that units do not matter.
+        scale = np.sqrt(np.einsum("sii->si", gram))
         gram = gram / scale[:, :, None] / scale[:, None, :]
+        # The least eigenvalue keeps singular samples finite.
         values, vectors = np.linalg.eigh(gram)
-        values = np.maximum(values, 1e-14)  # keeps singular samples finite
+        values = np.maximum(values, 1e-14)
         whitening = (vectors / np.sqrt(values)[:, None, :]).transpose(0, 2, 1)
         basis: Array = whitening @ (gradients / scale[:, :, None])
         return basis
@@ -102,7 +205,7 @@ class Samples:
         """Sign (+1 or -1), at most of the samples, of the volume that J_xi (N, r, n) spans across the task."""
         return 1.0 if np.median(np.linalg.det(coordinate_jacobians @ self.null_basis)) >= 0 else -1.0
 
-    def described(self, names: Iterable[str], orientation: float | None) -> list[Array]:
+    def collect_data(self, names: Iterable[str], orientation: float | None) -> list[Array]:
         """The data of every sample that a loss needs, by name: arrays (N, rows, columns) or (N, rows).
 
         Args:
@@ -110,49 +213,49 @@ class Samples:
             orientation: result of `orientation` for the coordinates that a fit starts from. The null basis is oriented
                 like them, so that the volume of their gradients is positive.
         """
-        found: dict[str, Array] = {name: getattr(self, name) for name in names}
-        if "null_basis" in found:
-            turned = found["null_basis"].copy()
-            turned[:, :, -1] *= orientation or 1.0
-            found["null_basis"] = turned
-        return list(found.values())
+        data: dict[str, Array] = {name: getattr(self, name) for name in names}
+        if "null_basis" in data:
+            oriented = data["null_basis"].copy()
+            oriented[:, :, -1] *= orientation or 1.0
+            data["null_basis"] = oriented
+        return list(data.values())
 
 
 Draw = Callable[[int, tuple[int, ...]], Samples]  #: draws a number of fresh samples of a problem, with a seed
 
 
-def even_parts(samples: Samples, count: int) -> Iterator[Samples]:
+def split_samples(samples: Samples, count: int) -> Iterator[Samples]:
     """Split samples into `count` parts of nearly equal size. Sizes differ if samples were left out."""
     edges = np.linspace(0, len(samples), count + 1).astype(int)
     for start, stop in pairwise(edges):
         yield samples[int(start) : int(stop)]
 
 
-def sample_problem(problem: Problem, samples: int, seed: int | tuple[int, ...]) -> Samples:
+def sample_problem(problem: "Problem", samples: int, seed: int | tuple[int, ...]) -> Samples:
     """Draw samples uniformly from the problem's domain."""
-    return samples_at(problem, sample_uniform(problem.domain, samples, seed))
+    return evaluate_samples(problem, sample_uniform(problem.domain, samples, seed))
 
 
-def samples_at(problem: Problem, points: Array) -> Samples:
+def evaluate_samples(problem: "Problem", points: Array) -> Samples:
     """Samples at given joint positions (N, n)."""
-    J = task_jacobians(problem, points)
+    J = problem.task.evaluate_jacobian(points)
     kept = np.all(np.einsum("sij,sij->si", J, J) > 0, axis=1)
     if not kept.all():
         points, J = points[kept], J[kept]
     inverse: Array | None = None
     if not problem.metric.is_identity:
-        inverse = np.asarray(np.linalg.inv(metric_matrices(problem.metric, points)), dtype=float)
+        inverse = np.asarray(np.linalg.inv(problem.metric.evaluate(points)), dtype=float)
     samples = Samples(points, J, inverse)
-    return samples.at_zero_momentum(problem.robot.tree.floating) if problem.robot.tree.floating else samples
+    return samples.project_to_zero_momentum(problem.robot.tree.floating) if problem.robot.tree.floating else samples
 
 
-def idle_joints(problem: Problem, samples: Samples) -> list[int]:
+def find_idle_joints(problem: "Problem", samples: Samples) -> list[int]:
     """Joints k on which the task does not depend, and which the metric does not couple to the others.
 
     At every sample column k of J_x vanishes, up to `NEGLIGIBLE`, row k of A^-1 is zero off the diagonal, and A does not
     depend on q_k. Then J_x A^-1 e_k = 0, so xi = q_k is exact and orthogonal to every coordinate of the other joints.
     The rest of the problem does not depend on joint k. So are the joints of a floating base in
-    `Samples.at_zero_momentum`: the generalised inertia does not depend on where it is.
+    `Samples.project_to_zero_momentum`: the generalised inertia does not depend on where it is.
     """
     J = samples.task_jacobian
     size = np.abs(J).max(axis=(0, 1))
@@ -166,8 +269,10 @@ def idle_joints(problem: Problem, samples: Samples) -> list[int]:
     return [int(k) for k in np.flatnonzero(idle)]
 
 
-def directions(problem: Problem, joints: Sequence[int], points: Array) -> Array:
-    """What a symmetry of the joints keeps: A^-1, and the projector on the task gradients with its second index raised.
+def compute_directions(problem: "Problem", joints: Sequence[int], points: Array) -> Array:
+    """Compute what a symmetry of the joints keeps: A^-1, and the projector on the task gradients.
+
+    The second index of the projector is raised by the metric.
 
     Args:
         problem: robot, task, metric; the other joints stay at the centre of its domain.
@@ -179,7 +284,7 @@ def directions(problem: Problem, joints: Sequence[int], points: Array) -> Array:
     """
     q = np.repeat(problem.domain.centre[None], len(points), axis=0)
     q[:, list(joints)] = points
-    samples = samples_at(problem, q).restricted_to(list(joints))
+    samples = evaluate_samples(problem, q).restricted_to(list(joints))
     if len(samples) < len(points):
         return np.full((len(points), 2, len(joints), len(joints)), np.nan)
     basis = samples.task_basis

@@ -8,17 +8,17 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
-from orthocas.robots.kinematics import TipTurn, frame_along
+from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError, UnknownNameError
+from orthocas.robots.kinematics import TipTurn, align_frame
 from orthocas.robots.robot import FrameQuantity, Robot
-from orthocas.robots.spatial import quaternion_of, quaternion_product, rotation_matrix, rotations_of, skew
+from orthocas.robots.spatial import build_rotations, find_quaternion, multiply_quaternions, rotation_matrix, skew
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
     Array,
     as_float_array,
     as_point_set,
-    frozen_array,
+    freeze_array,
     require_finite,
     require_kind,
     require_known,
@@ -27,7 +27,7 @@ from orthocas.tools.checks import (
 )
 from orthocas.tools.columns import BlockedFunction
 from orthocas.tools.display import Shown, listed
-from orthocas.tools.expressions import HoldsFunctions, called, expression_of
+from orthocas.tools.expressions import HoldsFunctions, build_expression, call_user
 
 TASK_KINDS = (
     "position",
@@ -59,7 +59,7 @@ class Frames:
     relative_to: str | None = None  #: None: the world
 
     @classmethod
-    def of_recipe(cls, recipe: Mapping[str, Any]) -> Self:
+    def from_recipe(cls, recipe: Mapping[str, Any]) -> Self:
         """Those of a task's recipe."""
         return cls(recipe.get("frame"), recipe.get("relative_to"))
 
@@ -74,11 +74,11 @@ class Frames:
         frame = "" if self.frame is None else f" of {self.frame}"
         return frame if self.relative_to is None else f"{frame} in {self.relative_to}"
 
-    def function(self, robot: Robot, quantity: FrameQuantity) -> ca.Function:
+    def build_function(self, robot: Robot, quantity: FrameQuantity) -> ca.Function:
         """q (n, 1) -> position, rotation or geometric Jacobian of the frame."""
         return robot.frame_function(quantity, self.frame, self.relative_to)
 
-    def rotation(self, robot: Robot, q: ArrayLike) -> Array:
+    def evaluate_rotation(self, robot: Robot, q: ArrayLike) -> Array:
         """Rotation of the frame at q (n,), (3, 3)."""
         frame = robot.tree.tip_name if self.frame is None else self.frame
         return np.asarray(robot.frame_rotation(q, frame, self.relative_to))
@@ -92,7 +92,7 @@ class Task(Shown, HoldsFunctions):
     """The task map h of a robot. Use the class methods to build one.
 
     Orientation, pose and axis tasks compare the tip with a reference orientation. If none is given, `Problem` uses the
-    tip's orientation at the centre of its domain, and the task itself uses that in the middle of the joint limits.
+    tip's orientation at the centre of its domain, and the task itself uses that at the centre of the joint limits.
     """
 
     robot: Robot
@@ -122,15 +122,15 @@ class Task(Shown, HoldsFunctions):
             >>> task.m, task.labels, task.units
             (2, ('x', 'y'), ('m', 'm'))
         """
-        rows, frames = _rows_of(axes), Frames(frame, relative_to)
-        return cls._of_pose(
+        rows, frames = _find_rows(axes), Frames(frame, relative_to)
+        return cls._build_of_pose(
             robot, f"position:{axes}", tuple(axes), ("m",) * len(rows), lambda R, p: p[rows], frames=frames
         )
 
     @classmethod
     def polar(cls, robot: Robot) -> Self:
         """Radius [m] and angle [rad] of the tip in the x-y plane: axes="xy" in polar coordinates."""
-        return cls._of_pose(
+        return cls._build_of_pose(
             robot,
             "polar",
             ("radius", "angle"),
@@ -171,7 +171,7 @@ class Task(Shown, HoldsFunctions):
             >>> oc.Task.orientation(robot, axis="z").labels
             ('tilt_x', 'tilt_y', 'turn_z')
         """
-        return cls._turned(robot, TipTurn(False, True, axis), reference, Frames(frame, relative_to))
+        return cls._build_turned(robot, TipTurn(False, True, axis), reference, Frames(frame, relative_to))
 
     @classmethod
     def pose(
@@ -183,7 +183,7 @@ class Task(Shown, HoldsFunctions):
         relative_to: str | None = None,
     ) -> Self:
         """Position [m] and orientation of the tip, (6,); see `position` and `orientation`."""
-        return cls._turned(robot, TipTurn(True, True, axis), reference, Frames(frame, relative_to))
+        return cls._build_turned(robot, TipTurn(True, True, axis), reference, Frames(frame, relative_to))
 
     @classmethod
     def axis(
@@ -213,7 +213,7 @@ class Task(Shown, HoldsFunctions):
         """
         require_kind("axis", axis, str)
         turn, frames = TipTurn(False, False, axis), Frames(frame, relative_to)
-        return cls._turned(robot, turn, None if reference is None else frame_along(reference, axis), frames)
+        return cls._build_turned(robot, turn, None if reference is None else align_frame(reference, axis), frames)
 
     @classmethod
     def position_and_axis(
@@ -227,7 +227,7 @@ class Task(Shown, HoldsFunctions):
         """Position [m] and direction of one axis of the tip, (5,); see `position` and `axis`."""
         require_kind("axis", axis, str)
         turn, frames = TipTurn(True, False, axis), Frames(frame, relative_to)
-        return cls._turned(robot, turn, None if reference is None else frame_along(reference, axis), frames)
+        return cls._build_turned(robot, turn, None if reference is None else align_frame(reference, axis), frames)
 
     @classmethod
     def relative_position(cls, robot: Robot, base: str, frame: str, axes: str = "xyz") -> Self:
@@ -260,7 +260,7 @@ class Task(Shown, HoldsFunctions):
     def centre_of_mass(cls, robot: Robot, axes: str = "xyz") -> Self:
         """Centre of mass of all that the joints move, along the given world axes [m]."""
         require_kind("robot", robot, Robot)
-        rows = _rows_of(axes)
+        rows = _find_rows(axes)
         q, name = ca.SX.sym("q", robot.n), f"centre_of_mass:{axes}"
         h = dense_function("h", [q], [robot.centre_of_mass(q)[rows]])
         return cls(robot, name, tuple(f"com_{a}" for a in axes), ("m",) * len(rows), h, {"kind": name})
@@ -285,8 +285,9 @@ class Task(Shown, HoldsFunctions):
         require_kind("camera", camera, str)
         require_known("axis of the camera", axis, tuple("xyz"))
         q, k = ca.SX.sym("q", robot.n), "xyz".index(axis)
-        place = target if isinstance(target, str) else frozen_array("target", target, (3,)).tolist()
+        place = target if isinstance(target, str) else freeze_array("target", target, (3,)).tolist()
         to = robot.frame_position(q, place) if isinstance(place, str) else ca.SX(place)
+        # The unit vector to the target in the axes of the camera, flattened by Lambert's map.
         u = robot.frame_rotation(q, camera).T @ (to - robot.frame_position(q, camera))
         u /= ca.norm_2(u)
         others = [i for i in range(3) if i != k]
@@ -321,7 +322,8 @@ class Task(Shown, HoldsFunctions):
                 raise InvalidValueError("tasks", "of different robots", "tasks of one robot")
         if not tasks:
             raise InvalidValueError("tasks", "none", "at least one")
-        tasks = tuple(single for task in tasks for single in task.parts or (task,))  # a stack of stacks is one
+        # A stack of stacks is one stack.
+        tasks = tuple(single for task in tasks for single in task.parts or (task,))
         labels = [label for task in tasks for label in task.labels]
         numbered = (
             f"{label}_{labels[:i].count(label) + 1}" if labels.count(label) > 1 else label
@@ -330,7 +332,7 @@ class Task(Shown, HoldsFunctions):
         robot, units = tasks[0].robot, tuple(unit for task in tasks for unit in task.units)
         recipe = {"kind": "stack", "parts": [task.recipe for task in tasks]}
         name = " + ".join(task.name for task in tasks)
-        return cls(robot, name, tuple(numbered), units, _stacked(tasks, "function"), recipe, tasks)
+        return cls(robot, name, tuple(numbered), units, _stack_functions(tasks, "function"), recipe, tasks)
 
     @classmethod
     def custom(
@@ -365,11 +367,12 @@ class Task(Shown, HoldsFunctions):
         require_kind("robot", robot, Robot)
         require_text("name of a task", str(name))
         q = ca.SX.sym("q", robot.n)
-        x = expression_of(f"task '{name}'", function, q)
+        x = build_expression(f"task '{name}'", function, q)
         if x.shape[1] != 1 or x.shape[0] == 0:
             raise ShapeError(f"task '{name}'", x.shape, (None, 1))
         require_kind("labels", labels, Sequence)
         require_kind("units", units, Sequence)
+        # Names and units are free, but printable and one for each component.
         labels = tuple(str(label) for label in labels) or tuple(f"{name}[{i}]" for i in range(x.shape[0]))
         units = tuple(str(unit) for unit in units) or ("",) * x.shape[0]
         for argument, texts in (("labels", labels), ("units", units)):
@@ -393,32 +396,33 @@ class Task(Shown, HoldsFunctions):
             q_reference: posture (n,) that defines the reference of orientation, pose and axis tasks.
         """
         require_kind("kind", kind, str)
-        frames, asked = _OF_TIP, kind
+        frames, base_kind = _OF_TIP, kind
         if kind.startswith(_RELATIVE):
             if len(robot.tips) != 2:
                 raise InvalidValueError("task", kind, f"a robot with two tips; this one has {listed(robot.tips)}")
-            asked, frames = kind.removeprefix(_RELATIVE), Frames(robot.tips[1], robot.tips[0])
-        if (turn := TipTurn.of_kind(asked)) is not None:
-            reference = None if q_reference is None else frames.rotation(robot, q_reference)
-            return cls._turned(robot, turn, reference, frames)
-        if asked.partition(":")[0] == "position":
-            return cls.position(robot, asked.partition(":")[2] or "xyz", frames.frame, frames.relative_to)
+            base_kind, frames = kind.removeprefix(_RELATIVE), Frames(robot.tips[1], robot.tips[0])
+        if (turn := TipTurn.from_kind(base_kind)) is not None:
+            reference = None if q_reference is None else frames.evaluate_rotation(robot, q_reference)
+            return cls._build_turned(robot, turn, reference, frames)
+        if base_kind.partition(":")[0] == "position":
+            return cls.position(robot, base_kind.partition(":")[2] or "xyz", frames.frame, frames.relative_to)
+        # Kinds that users have registered.
         name, _, words = kind.partition(":")
         if name not in _REGISTERED or (name == "polar" and words):
-            raise UnknownNameError("task", kind, task_kinds())
-        wanted = f"'{name}' or '{name}:WORDS' with words that its builder takes"
-        task: Task = called(f"task '{kind}'", wanted, _REGISTERED[name], robot, words)
+            raise UnknownNameError("task", kind, list_task_kinds())
+        expected = f"'{name}' or '{name}:WORDS' with words that its builder takes"
+        task: Task = call_user(f"task '{kind}'", expected, _REGISTERED[name], robot, words)
         require_kind(f"what the builder of task '{name}' returns", task, Task)
         return task
 
     @classmethod
     def from_recipe(cls, robot: Robot, recipe: Mapping[str, Any]) -> "Task":
         """The task of a robot that `recipe` describes. Custom tasks and stacks have no such recipe."""
-        kind, frames = recipe["kind"], Frames.of_recipe(recipe)
+        kind, frames = recipe["kind"], Frames.from_recipe(recipe)
         if kind == "pointing":
             return cls.pointing(robot, recipe["camera"], recipe["target"], recipe["axis"])
-        if (turn := TipTurn.of_kind(kind)) is not None:
-            return cls._turned(robot, turn, recipe.get("reference"), frames)
+        if (turn := TipTurn.from_kind(kind)) is not None:
+            return cls._build_turned(robot, turn, recipe.get("reference"), frames)
         if kind.startswith("position:"):
             return cls.position(robot, kind.removeprefix("position:"), frames.frame, frames.relative_to)
         return cls.named(robot, kind)
@@ -427,8 +431,8 @@ class Task(Shown, HoldsFunctions):
     def of_tip(self) -> bool:
         """Whether the task is a function of the pose of the (first) tip in the world, of a kind that is known."""
         kind = self.recipe["kind"]
-        known = TipTurn.of_kind(kind) is not None or kind == "polar" or kind.startswith("position:")
-        return known and Frames.of_recipe(self.recipe) == _OF_TIP
+        of_pose = TipTurn.from_kind(kind) is not None or kind == "polar" or kind.startswith("position:")
+        return of_pose and Frames.from_recipe(self.recipe) == _OF_TIP
 
     @property
     def lacks_reference(self) -> bool:
@@ -439,7 +443,7 @@ class Task(Shown, HoldsFunctions):
     @property
     def turn(self) -> TipTurn | None:
         """How the task compares the tip's orientation with a reference; None if it does not."""
-        return TipTurn.of_kind(self.recipe["kind"])
+        return TipTurn.from_kind(self.recipe["kind"])
 
     def with_reference_at(self, q: ArrayLike) -> "Task":
         """The task with the tip's orientation at q (n,) as its reference, or the task itself if it has one already."""
@@ -448,7 +452,7 @@ class Task(Shown, HoldsFunctions):
         if self.parts:
             return self.stack(*(part.with_reference_at(q) for part in self.parts))
         assert self.turn is not None
-        return self._turned(self.robot, self.turn, self._frames.rotation(self.robot, q), self._frames)
+        return self._build_turned(self.robot, self.turn, self._frames.evaluate_rotation(self.robot, q), self._frames)
 
     @property
     def m(self) -> int:
@@ -467,11 +471,11 @@ class Task(Shown, HoldsFunctions):
         velocity omega in the tip's axes, which also holds next to half a turn.
         """
         if self.parts:
-            return _stacked(self.parts, "jacobian_function")
+            return _stack_functions(self.parts, "jacobian_function")
         q = ca.SX.sym("q", self.robot.n)
         if not self._has_rotation_vector:
             return dense_function("task_jacobian", [q], [ca.jacobian(self.smooth_function(q), q)])
-        J, p = self.rates_function(q), self._quaternion(q)
+        J, p = self.rates_function(q), self._build_quaternion(q)
         turns = (p[0] * ca.SX.eye(3) + skew(p[1:])) @ J[self.m - 3 :, :]
         return dense_function("task_jacobian", [q], [ca.cse(ca.vertcat(J[: self.m - 3, :], turns))])
 
@@ -486,7 +490,7 @@ class Task(Shown, HoldsFunctions):
         if turn is None or not turn.whole:
             return self.jacobian_function
         q = ca.SX.sym("q", self.robot.n)
-        J, R = self._frame("jacobian")(q), self._frame("rotation")(q)
+        J, R = self._build_frame("jacobian")(q), self._build_frame("rotation")(q)
         return dense_function("task_rates", [q], [ca.cse(turn.rates(R.T @ J[3:, :], J[:3, :]))])
 
     @cached_property
@@ -514,28 +518,30 @@ class Task(Shown, HoldsFunctions):
         if self.turn is None and not self.parts:
             return self.jacobian_function
         q = ca.SX.sym("q", self.robot.n)
-        rows = [part._frame_rows(q, frames) for part, frames in _independent_frames(self.parts or (self,))]
+        # Parts that repeat what another one says take the rows of their own frames.
+        rows = [part._build_frame_rows(q, frames) for part, frames in _find_independent_frames(self.parts or (self,))]
         return dense_function("frame_jacobian", [q], [ca.cse(ca.vertcat(*rows))])
 
-    def _frame_rows(self, q: ca.SX, frames: Frames) -> ca.SX:
+    def _build_frame_rows(self, q: ca.SX, frames: Frames) -> ca.SX:
         """The rows at q of a task with one part, if it looked at these frames; positions stay in their own axes."""
         turn = self.turn
         if turn is None and frames == self._frames:
             return self.jacobian_function(q)
-        J, R = (frames.function(self.robot, quantity)(q) for quantity in ("jacobian", "rotation"))
+        J, R = (frames.build_function(self.robot, quantity)(q) for quantity in ("jacobian", "rotation"))
         if turn is not None:
             return turn.rates(R.T @ J[3:, :], R.T @ J[:3, :])
-        axes = Frames(self._frames.relative_to).function(self.robot, "rotation")(q)
-        return (axes.T @ J[:3, :])[_rows_of(self.recipe["kind"].partition(":")[2]), :]
+        axes = Frames(self._frames.relative_to).build_function(self.robot, "rotation")(q)
+        return (axes.T @ J[:3, :])[_find_rows(self.recipe["kind"].partition(":")[2]), :]
 
     @cached_property
     def second_derivative_function(self) -> ca.Function:
         """q, v, w (n, 1) -> d^2 h(q)[v, w] = (d/ds) J_x(q + s v) w, (m, 1)."""
         q, v, w = (ca.SX.sym(name, self.robot.n) for name in ("q", "v", "w"))
         if self._has_rotation_vector:
-            J, p, change = self.rates_function(q), self._quaternion(q), self.rates_derivative_function(q, v, w)
+            # d^2 x = d(w omega + v x omega), with the change of the quaternion along v.
+            J, p, change = self.rates_function(q), self._build_quaternion(q), self.rates_derivative_function(q, v, w)
             along, there = (J[self.m - 3 :, :] @ rate for rate in (v, w))
-            dp = quaternion_product(p, ca.vertcat(0, along)) / 2
+            dp = multiply_quaternions(p, ca.vertcat(0, along)) / 2
             bend = dp[0] * there + ca.cross(dp[1:], there)
             bend += p[0] * change[self.m - 3 :] + ca.cross(p[1:], change[self.m - 3 :])
             second = ca.cse(ca.vertcat(change[: self.m - 3], bend))
@@ -549,7 +555,7 @@ class Task(Shown, HoldsFunctions):
         q, centre = (ca.SX.sym(name, self.robot.n) for name in ("q", "centre"))
         x, turn = self.smooth_function(q), self.turn
         if turn is not None and self.lacks_reference:
-            rotation, position = self._frame("rotation"), self._frame("position")
+            rotation, position = self._build_frame("rotation"), self._build_frame("position")
             x = turn.components(rotation(centre).T @ rotation(q), position(q), True)
         return dense_function("centred_jacobian", [q, centre], [ca.jacobian(x, q)], ["q", "centre"])
 
@@ -566,8 +572,22 @@ class Task(Shown, HoldsFunctions):
     @cached_property
     def batched_frame_jacobian(self) -> BlockedFunction:
         """Evaluates the rows of `frame_jacobian_function` at many points."""
-        known = self.turn is None and not self.parts
-        return self.batched_jacobian if known else BlockedFunction(self.frame_jacobian_function)
+        plain = self.turn is None and not self.parts
+        return self.batched_jacobian if plain else BlockedFunction(self.frame_jacobian_function)
+
+    def evaluate_jacobian(self, points: Array, results: Array | None = None) -> Array:
+        """J_x at points (N, n), as an array (N, m, n): a new one, or `results`.
+
+        Raises:
+            SingularTaskError: if J_x is not finite at a point (for example polar coordinates at the origin).
+        """
+        J = np.empty((len(points), self.m, self.robot.n)) if results is None else results
+        self.batched_jacobian.into(J, points)
+        if not np.isfinite(J).all():
+            bad = ~np.isfinite(J).all(axis=(1, 2))
+            at = np.round(points[np.flatnonzero(bad)[0]], 4).tolist()
+            raise SingularTaskError(f"the Jacobian of task '{self.name}' is not finite at q = {at}")
+        return J
 
     def value(self, position: ArrayLike | None, orientation: ArrayLike) -> Array:
         """The task value x, (m,) or (N, m), of a pose of the tip, for tasks of a whole orientation.
@@ -587,8 +607,8 @@ class Task(Shown, HoldsFunctions):
             >>> task.value([0.5, 0.0, 0.4], [0.0, 1.0, 0.0, 0.0]).round(3).tolist()  # half a turn about x
             [0.5, 0.0, 0.4, 2.0, 0.0, 0.0]
         """
-        turn = self._whole_turn()
-        R, single = _rotations("orientation", orientation)
+        turn = self._require_whole_turn()
+        R, single = _read_rotations("orientation", orientation)
         turned = Batched(self.components_function)(self.reference.T @ R)[0]
         if turn.with_position:
             p = as_float_array("position", np.nan if position is None else position)
@@ -601,40 +621,40 @@ class Task(Shown, HoldsFunctions):
 
     def orientation_of(self, x: ArrayLike) -> Array:
         """The tip's orientation in the world, (3, 3) or (N, 3, 3), at task values x (m,) or (N, m); see `value`."""
-        self._whole_turn()
+        self._require_whole_turn()
         values, single = as_point_set("x", x, self.m)
-        found = self.reference @ rotations_of(Batched(self.quaternion_function)(values)[0])
-        return np.asarray(found[0] if single else found)
+        R = self.reference @ build_rotations(Batched(self.quaternion_function)(values)[0])
+        return np.asarray(R[0] if single else R)
 
     @cached_property
     def quaternion_function(self) -> ca.Function:
         """x (m, 1) -> the rotation (w, x, y, z) from the reference to the tip, for tasks of a whole orientation."""
         x = ca.SX.sym("x", self.m)
-        return dense_function("quaternion", [x], [self._whole_turn().quaternion(x[self.m - 3 :])], ["x"])
+        return dense_function("quaternion", [x], [self._require_whole_turn().quaternion(x[self.m - 3 :])], ["x"])
 
     @cached_property
     def components_function(self) -> ca.Function:
         """The rotation from the reference to the tip (3, 3) -> the components of the orientation (3, 1)."""
         R = ca.SX.sym("R", 3, 3)
-        return dense_function("components", [R], [self._whole_turn().components(R, ca.SX.zeros(3))[-3:]], ["R"])
+        return dense_function("components", [R], [self._require_whole_turn().components(R, ca.SX.zeros(3))[-3:]], ["R"])
 
     @property
     def _has_rotation_vector(self) -> bool:
         return self.turn is not None and self.turn.whole and self.turn.axis is None
 
-    def _quaternion(self, q: ca.SX) -> ca.SX:
+    def _build_quaternion(self, q: ca.SX) -> ca.SX:
         """The rotation from the reference to the tip, (4, 1)."""
-        return quaternion_of(ca.SX(ca.DM(self.reference.T)) @ self._frame("rotation")(q))
+        return find_quaternion(ca.SX(ca.DM(self.reference.T)) @ self._build_frame("rotation")(q))
 
     @property
     def _frames(self) -> Frames:
-        return Frames.of_recipe(self.recipe)
+        return Frames.from_recipe(self.recipe)
 
-    def _frame(self, quantity: FrameQuantity) -> ca.Function:
+    def _build_frame(self, quantity: FrameQuantity) -> ca.Function:
         """q (n, 1) -> position, rotation or geometric Jacobian of the frame that the task looks at."""
-        return self._frames.function(self.robot, quantity)
+        return self._frames.build_function(self.robot, quantity)
 
-    def _whole_turn(self) -> TipTurn:
+    def _require_whole_turn(self) -> TipTurn:
         if self.turn is None or not self.turn.whole:
             raise InvalidValueError("task", self.name, "one with a whole orientation, such as pose")
         return self.turn
@@ -648,38 +668,39 @@ class Task(Shown, HoldsFunctions):
         """
         if self.turn is None:
             raise InvalidValueError("task", self.name, "one with an orientation")
-        given = self.recipe.get("reference")
-        return self._frames.rotation(self.robot, self.robot.tree.middle) if given is None else np.array(given)
+        if "reference" in self.recipe:
+            return np.array(self.recipe["reference"])
+        return self._frames.evaluate_rotation(self.robot, self.robot.tree.centre_posture)
 
     @cached_property
     def smooth_function(self) -> ca.Function:
         """q (n, 1) -> x (m, 1) in the form to differentiate: without cases, but with few digits next to half a turn."""
         turn = self.turn
         if self.parts:
-            return _stacked(self.parts, "smooth_function")
+            return _stack_functions(self.parts, "smooth_function")
         if turn is None:
             return self.function
         q = ca.SX.sym("q", self.robot.n)
-        rotation, position = self._frame("rotation")(q), self._frame("position")(q)
+        rotation, position = self._build_frame("rotation")(q), self._build_frame("position")(q)
         x = turn.components(ca.SX(ca.DM(self.reference.T)) @ rotation, position, True)
         return dense_function("h", [q], [x])
 
     @classmethod
-    def _turned(cls, robot: Robot, turn: TipTurn, reference: ArrayLike | None, frames: Frames = _OF_TIP) -> Self:
+    def _build_turned(cls, robot: Robot, turn: TipTurn, reference: ArrayLike | None, frames: Frames = _OF_TIP) -> Self:
         """A task of a frame's rotation from a reference (3, 3), or from the default if it is None."""
         require_kind("robot", robot, Robot)
         if reference is None:
-            base, extra = frames.rotation(robot, robot.tree.middle), {}
+            base, extra = frames.evaluate_rotation(robot, robot.tree.centre_posture), {}
         else:
             base = rotation_matrix("reference", reference)
             extra = {"reference": base.tolist()}
         across = ca.SX(ca.DM(base.T))
-        return cls._of_pose(
+        return cls._build_of_pose(
             robot, turn.kind, turn.labels, turn.units, lambda R, p: turn.components(across @ R, p), extra, frames
         )
 
     @classmethod
-    def _of_pose(
+    def _build_of_pose(
         cls,
         robot: Robot,
         kind: str,
@@ -692,12 +713,12 @@ class Task(Shown, HoldsFunctions):
         """A task that is a function of a frame's rotation and position."""
         require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
-        x = components(frames.function(robot, "rotation")(q), frames.function(robot, "position")(q))
+        x = components(frames.build_function(robot, "rotation")(q), frames.build_function(robot, "position")(q))
         recipe = {"kind": kind, **frames.recipe, **(extra or {})}
         return cls(robot, kind + frames.suffix, labels, units, dense_function("h", [q], [x]), recipe)
 
 
-def _rows_of(axes: str) -> list[int]:
+def _find_rows(axes: str) -> list[int]:
     """Places of different letters of "xyz".
 
     Raises:
@@ -709,45 +730,45 @@ def _rows_of(axes: str) -> list[int]:
     return ["xyz".index(a) for a in axes]
 
 
-def _stacked(tasks: Sequence[Task], name: str) -> ca.Function:
+def _stack_functions(tasks: Sequence[Task], name: str) -> ca.Function:
     """Functions of q (n, 1) that each task has, one below the other."""
     q = ca.SX.sym("q", tasks[0].robot.n)
     return dense_function("h", [q], [ca.vertcat(*(getattr(task, name)(q) for task in tasks))])
 
 
-def _independent_frames(tasks: Sequence[Task]) -> list[tuple[Task, Frames]]:
+def _find_independent_frames(tasks: Sequence[Task]) -> list[tuple[Task, Frames]]:
     """Each task with the frames whose rows stand for its own beside those of the others.
 
     A whole pose that leads from a frame with a known pose to another one is as good as the pose of the latter in the
     world. What is seen from a frame with a known pose is as good as what the world sees of it.
     """
     stands: dict[int, Frames] = {}
-    known: set[str | None] = {None}  # None: the world
+    settled: set[str | None] = {None}  #: frames with a known pose; None: the world
     poses = [task for task in tasks if task.turn is not None and task.turn.whole and task.turn.with_position]
     for _ in poses:
         for task in poses:
             ends = task._frames.relative_to, task._frames.frame or task.robot.tree.tip_name
-            new = [end for end in ends if end not in known]
+            new = [end for end in ends if end not in settled]
             if len(new) == 1:
                 stands[id(task)] = Frames(new[0])
-                known.add(new[0])
-    seen = {id(task): Frames(task._frames.frame) for task in tasks if task._frames.relative_to in known}
+                settled.add(new[0])
+    seen = {id(task): Frames(task._frames.frame) for task in tasks if task._frames.relative_to in settled}
     return [(task, stands.get(id(task), seen.get(id(task), task._frames))) for task in tasks]
 
 
-def _rotations(name: str, value: ArrayLike) -> tuple[Array, bool]:
+def _read_rotations(name: str, value: ArrayLike) -> tuple[Array, bool]:
     """Rotation matrices (N, 3, 3) from such, or from unit quaternions, and whether it was one."""
-    given = as_float_array(name, value)
-    require_finite(name, given)
-    single = given.shape in ((4,), (3, 3))
-    if not single and given.shape[1:] not in ((4,), (3, 3)):
-        raise InvalidValueError(f"shape of {name}", given.shape, "(3, 3), (N, 3, 3), (4,) or (N, 4)")
-    rows = given[None] if single else given
+    values = as_float_array(name, value)
+    require_finite(name, values)
+    single = values.shape in ((4,), (3, 3))
+    if not single and values.shape[1:] not in ((4,), (3, 3)):
+        raise InvalidValueError(f"shape of {name}", values.shape, "(3, 3), (N, 3, 3), (4,) or (N, 4)")
+    rows = values[None] if single else values
     if rows.ndim == 2:
         off = np.abs(np.linalg.norm(rows, axis=1) - 1)
         if len(rows) and off.max() > 1e-6:
             raise InvalidValueError(name, rows[off.argmax()].tolist(), "a quaternion (w, x, y, z) of length 1")
-        return rotations_of(rows / np.linalg.norm(rows, axis=1, keepdims=True)), single
+        return build_rotations(rows / np.linalg.norm(rows, axis=1, keepdims=True)), single
     return np.array([rotation_matrix(name, R) for R in rows]).reshape(-1, 3, 3), single
 
 
@@ -757,7 +778,7 @@ _REGISTERED: dict[str, Callable[[Robot, str], Task]] = {
 }
 
 
-def task_kinds() -> tuple[str, ...]:
+def list_task_kinds() -> tuple[str, ...]:
     """The short names of tasks, those of `register_task` too."""
     return tuple(dict.fromkeys((*TASK_KINDS, *_REGISTERED)))
 
@@ -781,7 +802,7 @@ def register_task(name: str, build: Callable[[Robot, str], Task]) -> None:
         ('height',)
     """
     require_text("name", name)
-    taken = name in TASK_KINDS or TipTurn.of_kind(name) is not None or _REGISTERED.get(name, build) is not build
+    taken = name in TASK_KINDS or TipTurn.from_kind(name) is not None or _REGISTERED.get(name, build) is not build
     if ":" in name or taken:
         raise InvalidValueError("name", repr(name), "a free name without a colon")
     if not callable(build):

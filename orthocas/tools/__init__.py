@@ -6,7 +6,7 @@ Which evaluator of CasADi functions to use:
 - `columns.BlockedFunction` does the same for an SX function of q that often meets thousands of joint positions, in
   threads. `columns.ColumnFunction` evaluates a large SX function on columns of 256 samples, for losses.
 - `blas_graph.NumpyGraph` evaluates an MX graph of dense products at BLAS speed, derivatives included, for networks.
-- `expressions.scalar_code` expands a small graph into scalar operations. Controllers run fastest in this form.
+- `expressions.expand_scalars` expands a small graph into scalar operations. Controllers run fastest in this form.
 
 `cached.cached_property` builds a value once for all threads, and never pickles or copies it. `interrupts.deferred`
 holds Ctrl-C back while compiled code runs. `files` has files that appear whole or not at all, and `archive` the

@@ -20,19 +20,19 @@ from orthocas.tools.cached import building
 from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import deferred
 
-_CHUNKS = (1, 8, 64)  # samples in one call: the smallest number that holds the set, or the largest
-_LARGE = 512  # samples in one call of sets of at least so many, where starting threads pays off
+_CHUNKS = (1, 8, 64)  #: samples in one call: the smallest number that holds the set, or the largest
+_LARGE = 512  #: samples in one call of sets of at least so many, where starting threads pays off
 
 
-def _threads() -> int:
+def _count_cores() -> int:
     """Number of cores this process may use, or OMP_NUM_THREADS if it is set, as in other libraries."""
-    wanted = os.environ.get("OMP_NUM_THREADS", "")
-    if wanted.isascii() and wanted.isdigit() and int(wanted) > 0:
-        return int(wanted)
+    number = os.environ.get("OMP_NUM_THREADS", "")
+    if number.isascii() and number.isdigit() and int(number) > 0:
+        return int(number)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-THREADS = _threads()  #: threads that mapped functions of this process use
+THREADS = _count_cores()  #: threads that mapped functions of this process use
 
 
 def dense_function(
@@ -57,7 +57,7 @@ class Batched:
 
     function: ca.Function
     _mapped: dict[int, ca.Function] = field(default_factory=dict, repr=False)
-    _mine: Any = field(default_factory=local, repr=False, compare=False)  # memory of each thread for few samples
+    _mine: Any = field(default_factory=local, repr=False, compare=False)  #: memory of each thread for few samples
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate N samples."""
@@ -67,6 +67,7 @@ class Batched:
             how = ("thread", THREADS) if chunk == _LARGE and THREADS > 1 else ()
             with building:
                 self._mapped[chunk] = self.function.map(chunk, *how)
+        # Large sets run in threads of CasADi; small ones in buffers that each thread keeps.
         if chunk == _LARGE:
             return evaluate_columns(self._mapped[chunk], chunk, *arguments)
         if not hasattr(self._mine, "columns"):
@@ -90,10 +91,11 @@ class _Columns:
 
     def __init__(self, function: ca.Function, chunk: int) -> None:
         self._chunk = chunk
+        # The stubs ask for sizes that the methods do not take.
         buffer: Any
-        buffer, self._run = function.buffer()  # Any: the stubs ask for sizes that the methods do not take
+        buffer, self._run = function.buffer()
         self._buffer = buffer
-        # CasADi stores matrices column by column
+        # CasADi stores matrices column by column.
         shapes = [function.size_in(i) for i in range(function.n_in())]
         self._inputs = [np.empty((chunk, columns // chunk, rows)) for rows, columns in shapes]
         shapes = [function.size_out(i) for i in range(function.n_out())]
@@ -106,71 +108,64 @@ class _Columns:
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate N samples."""
         N, chunk = len(arguments[0]), self._chunk
-        columns = [_column_major(a) for a in arguments]
+        # Each sample's column (rows,) or matrix (rows, columns) as CasADi stores it, (columns, rows).
+        columns = [a[:, None, :] if a.ndim == 2 else a.transpose(0, 2, 1) for a in arguments]
         results = [np.empty((N, *out.shape[1:])) for out in self._outputs]
         for start in range(0, N, chunk):
             count = min(chunk, N - start)
             for array, argument in zip(self._inputs, columns, strict=True):
                 array[:count] = argument[start : start + count]
+                # The last chunk is padded with a valid sample.
                 if count < chunk:
-                    array[count:] = argument[start]  # pad the last chunk with a valid sample
+                    array[count:] = argument[start]
             with deferred():
                 self._run()
             for result, out in zip(results, self._outputs, strict=True):
                 result[start : start + count] = out[:count]
-        return [_row_major(result) for result in results]
-
-
-def _column_major(array: Array) -> Array:
-    """Each sample's column (rows,) or matrix (rows, columns) as CasADi stores it, (columns, rows)."""
-    return array[:, None, :] if array.ndim == 2 else array.transpose(0, 2, 1)
-
-
-def _row_major(result: Array) -> Array:
-    """Undo the transposition. A single column becomes a vector."""
-    return result[:, 0, :] if result.shape[1] == 1 else result.transpose(0, 2, 1)
+        # A single column becomes a vector.
+        return [result[:, 0, :] if result.shape[1] == 1 else result.transpose(0, 2, 1) for result in results]
 
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 Tool = TypeVar("Tool")
 
-_wanted: ContextVar[int | None] = ContextVar("threads", default=None)
-_here = local()  # .works: whether this thread is one of a pool
+_chosen: ContextVar[int | None] = ContextVar("threads", default=None)
+_here = local()  #: .works: whether this thread is one of a pool
 
 
-def thread_count() -> int:
-    """Number of threads that share work: what `using_threads` says, or `THREADS`; 1 within such a thread."""
-    return 1 if hasattr(_here, "works") else _wanted.get() or THREADS
+def count_threads() -> int:
+    """Number of threads that share work: what `use_threads` says, or `THREADS`; 1 within such a thread."""
+    return 1 if hasattr(_here, "works") else _chosen.get() or THREADS
 
 
 @contextmanager
-def using_threads(count: int | None) -> Iterator[None]:
+def use_threads(count: int | None) -> Iterator[None]:
     """Let so many threads share the work of the block. None changes nothing."""
-    token = _wanted.set(count or _wanted.get())
+    token = _chosen.set(count or _chosen.get())
     try:
         yield
     finally:
-        _wanted.reset(token)
+        _chosen.reset(token)
 
 
-def in_threads(work: Callable[[Piece], Result], pieces: Sequence[Piece]) -> list[Result]:
-    """Results of all pieces in their order; `thread_count` threads share the pieces.
+def run_in_threads(work: Callable[[Piece], Result], pieces: Sequence[Piece]) -> list[Result]:
+    """Results of all pieces in their order; `count_threads` threads share the pieces.
 
     After an exception, and after Ctrl-C, no piece is still at work.
     """
-    count = thread_count()
+    count = count_threads()
     if min(count, len(pieces)) < 2:
         return [work(piece) for piece in pieces]
     futures: list[Future[Result]] = []
     try:
-        futures += (_pool(count).submit(work, piece) for piece in pieces)
+        futures += (_build_pool(count).submit(work, piece) for piece in pieces)
         return [future.result() for future in futures]
     finally:
         wait([future for future in futures if not future.cancel()])
 
 
-def in_threads_with(
+def run_in_threads_with(
     tools: Sequence[Tool], work: Callable[[Tool, Piece], Result], pieces: Sequence[Piece]
 ) -> list[Result]:
     """The same with tools that only one piece can use at a time; one for each thread, or for each piece, is enough."""
@@ -178,24 +173,25 @@ def in_threads_with(
     for tool in tools:
         ready.put(tool)
 
-    def with_a_tool(piece: Piece) -> Result:
+    def borrow_tool(piece: Piece) -> Result:
         tool = ready.get()
         try:
             return work(tool, piece)
         finally:
             ready.put(tool)
 
-    return in_threads(with_a_tool, pieces)
+    return run_in_threads(borrow_tool, pieces)
 
 
 @cache
-def _pool(count: int) -> ThreadPoolExecutor:
+def _build_pool(count: int) -> ThreadPoolExecutor:
     """Threads that sleep while there is nothing to do: to start them for every call costs more than the work."""
     return ThreadPoolExecutor(count, initializer=setattr, initargs=(_here, "works", True))
 
 
+# A child process has none of the threads.
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)  # a child has none of the threads
+    os.register_at_fork(after_in_child=_build_pool.cache_clear)
 
 
 class _BlasHold:
@@ -204,14 +200,16 @@ class _BlasHold:
     def __init__(self) -> None:
         self._lock, self._count = Lock(), 0
         self._libraries: ThreadpoolController | None = None
-        self._modules = 0  # when the libraries were searched, which takes 1 ms
+        #: modules when the libraries were searched, which takes 1 ms
+        self._modules = 0
         self._limits: Any = None
 
     def begin(self) -> None:
         """One more wants it."""
         with self._lock:
             if not self._count:
-                if self._libraries is None or self._modules != len(sys.modules):  # which may have brought some
+                # New modules may have brought libraries.
+                if self._libraries is None or self._modules != len(sys.modules):
                     self._libraries, self._modules = ThreadpoolController(), len(sys.modules)
                 self._limits = self._libraries.limit(limits=1, user_api="blas")
             self._count += 1

@@ -92,8 +92,9 @@ class NumpyGraph:
 
     def __init__(self, name: str, inputs: Sequence[ca.MX], outputs: Sequence[ca.MX]) -> None:
         self._nodes: list[NumpyNode] = []
-        with deferred():  # CasADi calls the nodes for their shapes, and would swallow Ctrl-C there
-            self.function = ca.Function(name, list(inputs), self._rewritten(inputs, ca.cse(list(outputs))))
+        # CasADi calls the nodes for their shapes, and would swallow Ctrl-C there.
+        with deferred():
+            self.function = ca.Function(name, list(inputs), self._rewrite(inputs, ca.cse(list(outputs))))
         self._memory = local()
 
     def __call__(self, *inputs: Array) -> list[Array]:
@@ -113,23 +114,25 @@ class NumpyGraph:
             evaluate()
         return results
 
-    def on_one_block(self) -> Callable[[Array], Array]:
+    def build_block_function(self) -> Callable[[Array], Array]:
         """A function of this graph's one input with its own memory. It returns the same array at every call."""
-        buffer: Any  # the stubs of set_arg and set_res ask for a size, the methods take none
+        # The stubs of set_arg and set_res ask for a size, the methods take none.
+        buffer: Any
         buffer, evaluate = self.function.buffer()
         values, result = (np.empty(size[::-1]) for size in (self.function.size_in(0), self.function.size_out(0)))
         buffer.set_arg(0, values.data)
 
         def run(block: Array) -> Array:
             values[...] = block.T
-            buffer.set_res(0, result.data)  # also keeps the buffer alive, which `evaluate` does not
+            # This also keeps the buffer alive, which `evaluate` does not.
+            buffer.set_res(0, result.data)
             with deferred():
                 evaluate()
             return result.T
 
         return run
 
-    def _rewritten(self, inputs: Sequence[ca.MX], outputs: list[ca.MX]) -> list[ca.MX]:
+    def _rewrite(self, inputs: Sequence[ca.MX], outputs: list[ca.MX]) -> list[ca.MX]:
         """Cut the graph at its expensive nodes, and join the pieces with NumPy's nodes in between."""
         plain = ca.Function("plain", list(inputs), outputs)
         heavy = [
@@ -140,16 +143,20 @@ class NumpyGraph:
         if not heavy:
             return outputs
         cuts = [ca.MX.sym("cut", *node.shape) for node in heavy]
-        operands = [[_untransposed(node.dep(i)) for i in range(node.n_dep())] for node in heavy]
+        # The operands of each node without a transposition, and whether they had one.
+        operands = []
+        for node in heavy:
+            deps = [node.dep(i) for i in range(node.n_dep())]
+            operands.append([(x.dep(0), True) if x.op() == ca.OP_TRANSPOSE else (x, False) for x in deps])
         pieces = iter(ca.graph_substitute([x for xs in operands for x, _ in xs] + outputs, heavy, cuts))
         definitions = []
         for node, xs in zip(heavy, operands, strict=True):
             flips = [flipped for _, flipped in xs]
-            definitions.append(self._replacement(node, [next(pieces) for _ in xs], flips))
+            definitions.append(self._replace(node, [next(pieces) for _ in xs], flips))
         _, rewritten = ca.substitute_inplace(cuts, definitions, list(pieces))
         return list(rewritten)
 
-    def _replacement(self, node: ca.MX, operands: list[ca.MX], flips: list[bool]) -> ca.MX:
+    def _replace(self, node: ca.MX, operands: list[ca.MX], flips: list[bool]) -> ca.MX:
         """The NumPy node for a product z + x y (operands z, x, y) or for tanh."""
         new: NumpyNode
         if node.op() == ca.OP_TANH:
@@ -163,10 +170,3 @@ class NumpyGraph:
         if node.op() == ca.OP_MTIMES and not operands[0].is_zero():
             result = (operands[0].T if flips[0] else operands[0]) + result
         return result
-
-
-def _untransposed(operand: ca.MX) -> tuple[ca.MX, bool]:
-    """The operand without a transposition, and whether it had one."""
-    if operand.op() == ca.OP_TRANSPOSE:
-        return operand.dep(0), True
-    return operand, False

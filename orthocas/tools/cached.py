@@ -46,23 +46,19 @@ class _CachedProperty(Generic[T]):
         if instance is None:
             return self
         store = instance.__dict__.get(_PLACE)
-        if store is not None and self._name in store:
-            value: T = store[self._name]
-            return value
-        return self._once(instance)
-
-    def _once(self, instance: object) -> T:
-        """The value. The first thread builds it while the others wait."""
-        with building:
-            store = instance.__dict__.setdefault(_PLACE, _Store())
-            if self._name not in store:
-                store[self._name] = self._build(instance)
-            value: T = store[self._name]
-            return value
+        if store is None or self._name not in store:
+            # The first thread builds the value while the others wait.
+            with building:
+                store = instance.__dict__.setdefault(_PLACE, _Store())
+                if self._name not in store:
+                    store[self._name] = self._build(instance)
+        value: T = store[self._name]
+        return value
 
 
 if TYPE_CHECKING:
-    from builtins import property as cached_property  # to type checkers it is one, also in protocols
+    # To type checkers it is a property, also in protocols.
+    from builtins import property as cached_property
 else:
     cached_property = _CachedProperty
 

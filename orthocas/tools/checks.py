@@ -17,12 +17,12 @@ from orthocas.errors import InvalidValueError, MemoryNeedError, MissingExtraErro
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-_LONGEST_TEXT = 500  # characters of a name
-_REAL = "biuf"  # NumPy's kinds of numbers: bool, int, unsigned, float
-_NO_NUMBER = (str, bytes, complex, type(None))  # rejected although NumPy converts them
+_LONGEST_TEXT = 500  #: characters of a name
+_REAL = "biuf"  #: NumPy's kinds of numbers: bool, int, unsigned, float
+_NO_NUMBER = (str, bytes, complex, type(None))  #: rejected although NumPy converts them
 
 
-def of_extra(package: str, feature: str, extra: str) -> ModuleType:
+def import_extra(package: str, feature: str, extra: str) -> ModuleType:
     """A package that only one feature needs; raise MissingExtraError if it is not installed."""
     try:
         return import_module(package)
@@ -65,7 +65,7 @@ def require_memory(what: str, needed: float) -> None:
         raise MemoryNeedError(what, needed, available)
 
 
-def frozen_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
+def freeze_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Array:
     """Copy to a read-only float array of the given shape, with finite entries.
 
     Raises:
@@ -80,7 +80,7 @@ def frozen_array(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> 
     return frozen
 
 
-def frozen_indices(name: str, value: ArrayLike, shape: tuple[int | None, ...], count: int) -> Indices:
+def freeze_indices(name: str, value: ArrayLike, shape: tuple[int | None, ...], count: int) -> Indices:
     """Copy to a read-only integer array of the given shape with entries from 0 to count - 1.
 
     Whole numbers stored as floats are accepted: chart files of early versions contain such indices.
@@ -89,7 +89,8 @@ def frozen_indices(name: str, value: ArrayLike, shape: tuple[int | None, ...], c
         ShapeError: if the shape differs.
         InvalidValueError: if an entry is not a whole number from 0 to count - 1.
     """
-    numbers = as_float_array(name, value)  # exact up to 2^53
+    # Floats hold whole numbers exactly up to 2^53.
+    numbers = as_float_array(name, value)
     require_shape(name, numbers.shape, shape)
     bad = ~((numbers >= 0) & (numbers < count) & (numbers == np.floor(numbers)))
     if bad.any():
@@ -113,7 +114,8 @@ def as_float_array(name: str, value: Any) -> Array:
         kind = array.dtype.kind
         if kind in _REAL or (kind == "O" and not any(isinstance(entry, _NO_NUMBER) for entry in array.flat)):
             return np.asarray(array, dtype=float)
-    except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: CasADi expressions inside lists
+    # RuntimeError stands for CasADi expressions inside lists.
+    except (TypeError, ValueError, OverflowError, RuntimeError):
         pass
     raise InvalidValueError(name, repr(value)[:80], "an array of numbers")
 
@@ -180,7 +182,7 @@ def as_point(name: str, value: ArrayLike, n: int) -> Array:
     points, single = as_point_set(name, value, n)
     if not single:
         raise ShapeError(name, points.shape, (n,))
-    return frozen_array(name, points[0], (n,))
+    return freeze_array(name, points[0], (n,))
 
 
 def require_executor(executor: object) -> None:
@@ -193,11 +195,11 @@ def require_kind(name: str, value: object, kind: type) -> None:
     """Raise InvalidValueError unless `value` is an instance of `kind`."""
     if not isinstance(value, kind):
         plain = isinstance(value, str | int | float | None)
-        given = repr(value)[:80] if plain else f"a {type(value).__name__}"
-        raise InvalidValueError(name, given, f"a {kind.__name__}{part_hint(value, kind)}")
+        received = repr(value)[:80] if plain else f"a {type(value).__name__}"
+        raise InvalidValueError(name, received, f"a {kind.__name__}{suggest_attribute(value, kind)}")
 
 
-def part_hint(value: object, kind: type) -> str:
+def suggest_attribute(value: object, kind: type) -> str:
     """The end of a message about a value that has an instance of `kind`, as a fit has a chart; "" for others."""
     name = kind.__name__.lower()
     return f": use its attribute '{name}'" if isinstance(getattr(value, name, None), kind) else ""

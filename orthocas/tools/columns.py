@@ -9,21 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.errors import OrthocasError
-from orthocas.tools.batch import Batched, in_threads_with, thread_count
+from orthocas.tools.batch import Batched, count_threads, run_in_threads_with
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import Tape, replay, to_tape
+from orthocas.tools.expressions import Tape, replay, write_tape
 
 COLUMNS = 256  #: samples in a block
 NARROW = 64  #: samples in a block of small sets
 MANY = 9  #: joint positions from which blocks pay off: `Batched` takes 1, 8 or 64 at once
-_PIECE = 8 * COLUMNS  # joint positions that a thread takes at once
+_PIECE = 8 * COLUMNS  #: joint positions that a thread takes at once
 
 #: Evaluates contiguous inputs (entries, c), and writes contiguous outputs (entries, c).
 Run = Callable[[Sequence[Array], Sequence[Array]], None]
 
 
-def blocked(stack: Array) -> Array:
+def arrange_blocks(stack: Array) -> Array:
     """Arrange samples (N, rows, columns) or (N, rows) in blocks (B, entries, c)."""
     flat = (stack.transpose(0, 2, 1) if stack.ndim == 3 else stack).reshape(len(stack), -1)
     blocks = -(-len(flat) // COLUMNS)
@@ -31,13 +31,13 @@ def blocked(stack: Array) -> Array:
     return np.ascontiguousarray(filled.reshape(blocks, COLUMNS, -1).transpose(0, 2, 1))
 
 
-def shares(samples: int) -> Array:
+def build_weights(samples: int) -> Array:
     """Weights of a mean over N samples in blocks, (B, c): 1 / N for samples, 0 for the padding."""
     blocks = -(-samples // COLUMNS)
     return np.where(np.arange(blocks * COLUMNS) < samples, 1 / samples, 0.0).reshape(blocks, COLUMNS)
 
 
-def by_sample(blocks: Array, samples: int, every: int = 1) -> Array:
+def split_by_sample(blocks: Array, samples: int, every: int = 1) -> Array:
     """Matrices (N, rows, columns) of the samples in blocks (B, columns, rows, c).
 
     Args:
@@ -62,19 +62,19 @@ class ColumnFunction:
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Outputs (B, entries, c) for contiguous inputs (B, entries, c). Threads share the blocks."""
-        blocks, count = len(arguments[0]), thread_count()
+        blocks, count = len(arguments[0]), count_threads()
         results = [np.empty((blocks, *shape)) for shape in self._shapes]
 
         def evaluate(run: Run, part: range) -> None:
             for b in part:
                 run([argument[b] for argument in arguments], [result[b] for result in results])
 
-        with self.borrowed(min(count, blocks)) as runs:
-            in_threads_with(runs, evaluate, [range(k, blocks, count) for k in range(len(runs))])
+        with self.borrow(min(count, blocks)) as runs:
+            run_in_threads_with(runs, evaluate, [range(k, blocks, count) for k in range(len(runs))])
         return results
 
     @contextmanager
-    def borrowed(self, count: int) -> Iterator[list[Run]]:
+    def borrow(self, count: int) -> Iterator[list[Run]]:
         """Functions of blocks for so many threads, with scratch memory that nobody else uses meanwhile.
 
         They are kept for the next time. CasADi lets go of Python's lock while it evaluates. It must not build in a
@@ -85,15 +85,15 @@ class ColumnFunction:
             try:
                 runs.append(self._spare.pop())
             except IndexError:
-                runs.append(self._new_run())
+                runs.append(self._build_run())
         try:
             yield runs
         finally:
             self._spare.extend(runs)
 
-    def on_one_block(self) -> Callable[..., list[Array]]:
+    def build_block_function(self) -> Callable[..., list[Array]]:
         """A function of contiguous inputs (entries, c) that returns the same arrays (entries, c) at every call."""
-        run, results = self._new_run(), [np.empty(shape) for shape in self._shapes]
+        run, results = self._build_run(), [np.empty(shape) for shape in self._shapes]
 
         def evaluate(*arguments: Array) -> list[Array]:
             run(arguments, results)
@@ -101,8 +101,9 @@ class ColumnFunction:
 
         return evaluate
 
-    def _new_run(self) -> Run:
-        buffer: Any  # the stubs of set_arg and set_res ask for a size, the methods take none
+    def _build_run(self) -> Run:
+        # The stubs of set_arg and set_res ask for a size, the methods take none.
+        buffer: Any
         buffer, evaluate = self._on_block.buffer()
 
         def run(arguments: Sequence[Array], results: Sequence[Array]) -> None:
@@ -155,7 +156,7 @@ class ColumnFunction:
             start += rows * columns
         outputs = self._function.call(parts)
         stacked = ca.densify(ca.vertcat(*(ca.vec(ca.densify(out)) for out in outputs)))
-        return to_tape(ca.Function("flat", [column], [ca.cse(stacked)]))
+        return write_tape(ca.Function("flat", [column], [ca.cse(stacked)]))
 
 
 #: A function of contiguous columns (n, c) with its own scratch memory; it may return the same array at every call.
@@ -172,30 +173,31 @@ def fill(results: NDArray[Any], points: Array, make: Callable[[], BlockFunction]
         others: further arguments of the function, (N, k) each.
     """
     starts = range(0, len(points), _PIECE)
-    functions = [make() for _ in range(min(thread_count(), len(starts)))]  # not in the threads, see ColumnFunction
+    # Functions are not built in the threads, see `ColumnFunction.borrow`.
+    functions = [make() for _ in range(min(count_threads(), len(starts)))]
 
-    def one_piece(function: BlockFunction, start: int) -> None:
+    def fill_piece(function: BlockFunction, start: int) -> None:
         piece = slice(start, start + _PIECE)
         fill_blocks(results[piece], function, COLUMNS, points[piece], *(array[piece] for array in others))
 
-    in_threads_with(functions, one_piece, starts)
+    run_in_threads_with(functions, fill_piece, starts)
 
 
 def fill_blocks(results: NDArray[Any], function: BlockFunction, columns: int, *arguments: Array) -> None:
     """The same by one function, of blocks of so many columns, in this thread."""
     for first in range(0, len(results), columns):
         count = min(columns, len(results) - first)
-        values = function(*(_columns(array[first : first + columns], columns) for array in arguments))
+        values = function(*(_fill_columns(array[first : first + columns], columns) for array in arguments))
         by_entry = values.reshape(*results.shape[1:], columns)[..., :count]
         results[first : first + columns] = np.moveaxis(by_entry, -1, 0)
 
 
-def _columns(points: Array, columns: int) -> Array:
+def _fill_columns(points: Array, columns: int) -> Array:
     """Joint positions (k, n) as columns (n, c). The last block is padded with its first position."""
-    found = np.empty((points.shape[1], columns))
-    found[:, : len(points)] = points.T
-    found[:, len(points) :] = points[:1].T
-    return found
+    filled = np.empty((points.shape[1], columns))
+    filled[:, : len(points)] = points.T
+    filled[:, len(points) :] = points[:1].T
+    return filled
 
 
 class BlockedFunction:
@@ -222,22 +224,18 @@ class BlockedFunction:
             try:
                 function = self._spare.pop()
             except IndexError:
-                function = self._on_narrow_block()
+                function = self._build_function(narrow=True)
             fill_blocks(results, function, NARROW, points, *others)
             self._spare.append(function)
         else:
-            fill(results, points, self._on_one_block, *others)
+            fill(results, points, self._build_function, *others)
         return results
 
-    def _on_one_block(self) -> BlockFunction:
-        """The function for `fill`."""
-        assert self._by_rows is not None
-        run = self._by_rows.on_one_block()
-        return lambda *columns: run(*columns)[0]
-
-    def _on_narrow_block(self) -> BlockFunction:
-        """The function of a narrow block."""
-        run = self._by_narrow_rows.on_one_block()
+    def _build_function(self, narrow: bool = False) -> BlockFunction:
+        """The function of a block."""
+        rows = self._by_narrow_rows if narrow else self._by_rows
+        assert rows is not None
+        run = rows.build_block_function()
         return lambda *columns: run(*columns)[0]
 
     @cached_property

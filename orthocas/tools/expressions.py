@@ -1,10 +1,10 @@
 """SX expressions as data: tapes for files, their structure, scalar code, and users' functions of q."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import inf
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -13,7 +13,8 @@ from orthocas.errors import InvalidValueError, OrthocasError
 from orthocas.tools.checks import Array, require_count
 from orthocas.tools.interrupts import deferred
 
-_LARGEST = 1e300  # of finite constants
+_LARGEST = 1e300  #: of finite constants
+#: operations that Python and C write alike
 ARITHMETIC = {
     "neg": "-{0}",
     "sq": "{0} * {0}",
@@ -24,17 +25,19 @@ ARITHMETIC = {
     "sub": "{0} - {1}",
     "mul": "{0} * {1}",
     "div": "{0} / {1}",
-}  #: operations that Python and C write alike
-UNARY = (  #: operations on one number, by their names in tapes
+}
+#: operations on one number, by their names in tapes
+UNARY = (
     *("neg", "exp", "log", "sqrt", "sq", "twice", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
     *("inv", "fabs", "sign", "not", "floor", "ceil", "erf", "log1p", "expm1", "asinh", "acosh", "atanh", "assign"),
 )
-BINARY = (  #: on two
+#: on two
+BINARY = (
     *("add", "sub", "mul", "div", "pow", "constpow", "atan2", "hypot", "fmod", "copysign", "fmin", "fmax"),
     *("lt", "le", "eq", "ne", "and", "or", "if_else_zero"),
 )
 MOST_ROWS = 12  #: of a determinant
-_BY_CASADI = 5  # rows of determinants that CasADi writes out well
+_BY_CASADI = 5  #: rows of determinants that CasADi writes out well
 _LINEAR = ("assign", "neg", "twice", "add", "sub")
 WRITTEN_OUT = 10  #: rows of the largest matrices whose products and inverses are written out
 Tape = dict[str, Any]
@@ -74,8 +77,8 @@ class _Written:
         try:
             return ca.Function.deserialize(self.text)
         except RuntimeError:
-            wanted = f"one of CasADi {ca.CasadiMeta.version()}; files of charts outlive versions"
-            raise InvalidValueError("pickle", f"of CasADi {self.version}", wanted) from None
+            expected = f"one of CasADi {ca.CasadiMeta.version()}; files of charts outlive versions"
+            raise InvalidValueError("pickle", f"of CasADi {self.version}", expected) from None
 
 
 #: CasADi's numbers of the operations
@@ -85,7 +88,7 @@ _NAMES: dict[int, str] = {code: name for name, code in CODES.items()} | {
 }
 
 
-def to_tape(function: ca.Function) -> Tape:
+def write_tape(function: ca.Function) -> Tape:
     """Write an SX function of one column and one output as a tape.
 
     Raises:
@@ -97,6 +100,7 @@ def to_tape(function: ca.Function) -> Tape:
         operation = function.instruction_id(k)
         if operation not in _NAMES:
             raise OrthocasError(f"custom expression uses CasADi operation {operation}, which chart files cannot store")
+        # A step is its operation, the place of its result, and a number or places of operands.
         name, into, of = _NAMES[operation], function.instruction_output(k), function.instruction_input(k)
         if name == "const":
             steps.append([name, into[0], function.instruction_constant(k)])
@@ -122,14 +126,14 @@ def require_tape(tape: Tape, inputs: int) -> None:
     written: set[int] = set()
     results: set[int] = set()
     for k, step in enumerate(tape["steps"]):
-        if not _makes_sense(step, inputs, written):
+        if not _is_step(step, inputs, written):
             raise InvalidValueError(f"step {k} of a tape", repr(step)[:80], "a known operation on earlier results")
         (results if step[0] == "output" else written).add(step[1])
     if len(results) != rows * columns or results != set(range(len(results))):
         raise InvalidValueError("number of outputs of a tape", len(results), f"{rows} rows times {columns} columns")
 
 
-def _makes_sense(step: Any, inputs: int, written: set[int]) -> bool:
+def _is_step(step: Any, inputs: int, written: set[int]) -> bool:
     """Whether a step is [operation, place of the result, what it needs ...]."""
     if not isinstance(step, list | tuple) or len(step) < 3 or not isinstance(step[0], str) or not _is_index(step[1]):
         return False
@@ -150,7 +154,7 @@ def _is_index(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
-def from_tape(tape: Tape, q: ca.SX) -> ca.SX:
+def read_tape(tape: Tape, q: ca.SX) -> ca.SX:
     """Rebuild the expression of a tape at q (n, 1).
 
     Raises:
@@ -161,7 +165,9 @@ def from_tape(tape: Tape, q: ca.SX) -> ca.SX:
     return ca.reshape(ca.vertcat(*entries), tape["rows"], tape["columns"])
 
 
-def read(tape: Tape, leaf: Callable[[str, Any], Value], step: Callable[[str, Sequence[Value]], Value]) -> list[Value]:
+def evaluate_tape(
+    tape: Tape, leaf: Callable[[str, Any], Value], step: Callable[[str, Sequence[Value]], Value]
+) -> list[Value]:
     """What a tape computes in any arithmetic: its outputs, column by column.
 
     Args:
@@ -183,13 +189,15 @@ def read(tape: Tape, leaf: Callable[[str, Any], Value], step: Callable[[str, Seq
 
 def replay(tape: Tape, inputs: Sequence[Entry]) -> list[Entry]:
     """The entries of a checked tape's output, column by column, for the entries of its input."""
-    kind: Any = type(inputs[0])  # its static methods take a tenth of the time of operators on Python's side
-    zero = 0 * inputs[0]  # gives constants the shape of the entries
+    # Static methods of the type take a tenth of the time of operators on Python's side.
+    kind: Any = type(inputs[0])
+    # It gives constants the shape of the entries.
+    zero = 0 * inputs[0]
 
     def step(name: str, of: Sequence[Any]) -> Any:
         return (kind.unary if len(of) == 1 else kind.binary)(CODES[name], *of)
 
-    return read(tape, lambda name, of: zero + float(of) if name == "const" else inputs[of], step)
+    return evaluate_tape(tape, lambda name, of: zero + float(of) if name == "const" else inputs[of], step)
 
 
 Joints = frozenset[int]
@@ -197,17 +205,17 @@ Gradient = dict[int, Joints]  #: the joints that each derivative depends on; mis
 _NOTHING: Joints = frozenset()
 
 
-def gradient_dependences(tape: Tape) -> list[Gradient]:
+def find_gradient_dependences(tape: Tape) -> list[Gradient]:
     """For each output, the joints that its derivatives depend on."""
 
     def leaf(name: str, of: Any) -> tuple[Joints, Gradient]:
         joints = frozenset([of]) if name == "input" else _NOTHING
         return joints, dict.fromkeys(joints, _NOTHING)
 
-    return [gradient for _, gradient in read(tape, leaf, _dependence)]
+    return [gradient for _, gradient in evaluate_tape(tape, leaf, _combine_dependences)]
 
 
-def _dependence(name: str, of: Sequence[tuple[Joints, Gradient]]) -> tuple[Joints, Gradient]:
+def _combine_dependences(name: str, of: Sequence[tuple[Joints, Gradient]]) -> tuple[Joints, Gradient]:
     """The joints that the result of a step and its derivatives depend on."""
     values = [joints for joints, _ in of]
     everything = frozenset().union(*values)
@@ -218,6 +226,7 @@ def _dependence(name: str, of: Sequence[tuple[Joints, Gradient]]) -> tuple[Joint
         partials = values[::-1]
     elif name == "div":
         partials[0] = values[1]
+    # By the chain rule: what a partial derivative and the operand's own depend on.
     total: Gradient = {}
     for partial, (_, part) in zip(partials, of, strict=True):
         for j, own in part.items():
@@ -225,60 +234,15 @@ def _dependence(name: str, of: Sequence[tuple[Joints, Gradient]]) -> tuple[Joint
     return everything, total
 
 
-def periodic_joints(tape: Tape, n: int) -> Joints:
-    """The joints k of n for which h(q + 2 pi e_k) - h(q) is the same constant at every q, for all outputs h."""
-    nothing, unit = np.zeros(n), np.eye(n)
-
-    def leaf(name: str, of: Any) -> _Shift:
-        return _Shift(nothing, float(of)) if name == "const" else _Shift(unit[of])
-
-    found = read(tape, leaf, lambda name, of: _Shift(_shift(name, of)))
-    alike = np.all([~np.isnan(each.turn) for each in found], axis=0)
-    return frozenset(np.flatnonzero(alike).tolist())
-
-
-class _Shift(NamedTuple):
-    """What a full turn does to a value."""
-
-    turn: Any  #: change by a turn of each joint / 2 pi; NaN where it is no constant
-    constant: float | None = None  #: the value itself, if it is a number
-
-
-def _shift(name: str, of: Sequence[_Shift]) -> Any:
-    """The change of a step. Only whole numbers of moderate size are added and multiplied, which is exact."""
-    shifts = [each.turn for each in of]
-    if name in _EXACT:
-        return _whole(_EXACT[name](*shifts))
-    for one, other in ((of[0], of[-1]), (of[-1], of[0])):
-        if name == "mul" and one.constant is not None:
-            return _whole(np.where(other.turn == 0, 0.0, other.turn * one.constant))
-    still = np.all([shift == 0 for shift in shifts], axis=0)
-    if name in ("sin", "cos", "tan"):
-        still = ~np.isnan(shifts[0])
-    return np.where(still, 0.0, np.nan)
-
-
-_EXACT: Mapping[str, Callable[..., Any]] = {
-    "assign": lambda a: a,
-    "neg": lambda a: -a,
-    "twice": lambda a: 2 * a,
-    "add": lambda a, b: a + b,
-    "sub": lambda a, b: a - b,
-}
-
-
-def _whole(shift: Any) -> Any:
-    return np.where((shift == np.round(shift)) & (np.abs(shift) < 2.0**40), shift, np.nan)
-
-
-def fast_form(graph: ca.Function, rows: int) -> ca.Function:
+def choose_form(graph: ca.Function, rows: int) -> ca.Function:
     """Scalar code of a graph with matrices of so many rows, or the graph itself where that would be too long."""
-    return scalar_code(graph) if rows <= WRITTEN_OUT else graph
+    return expand_scalars(graph) if rows <= WRITTEN_OUT else graph
 
 
-def scalar_code(function: ca.Function) -> ca.Function:
+def expand_scalars(function: ca.Function) -> ca.Function:
     """Expand a function into scalar operations. One that cannot be expanded (a network) is returned as it is."""
-    with deferred():  # `expand` turns Ctrl-C into a RuntimeError
+    # `expand` turns Ctrl-C into a RuntimeError.
+    with deferred():
         try:
             flat = function.expand()
         except RuntimeError:
@@ -288,7 +252,7 @@ def scalar_code(function: ca.Function) -> ca.Function:
         return ca.Function(function.name(), inputs, outputs, function.name_in(), function.name_out())
 
 
-def expression_of(what: str, function: Callable[[ca.SX], ca.SX] | ca.Function, q: ca.SX) -> ca.SX:
+def build_expression(what: str, function: Callable[[ca.SX], ca.SX] | ca.Function, q: ca.SX) -> ca.SX:
     """The SX expression that a user's function returns for q.
 
     Raises:
@@ -296,15 +260,15 @@ def expression_of(what: str, function: Callable[[ca.SX], ca.SX] | ca.Function, q
     """
     if not callable(function):
         raise InvalidValueError(what, repr(function), "a function of an SX column q")
-    value: ca.SX = called(what, f"a function of an SX column q {q.shape}", lambda: ca.SX(function(q)))
-    known = {str(symbol) for symbol in ca.vertsplit(q)}
-    free = [str(symbol) for symbol in ca.symvar(value) if str(symbol) not in known]
+    value: ca.SX = call_user(what, f"a function of an SX column q {q.shape}", lambda: ca.SX(function(q)))
+    symbols = {str(symbol) for symbol in ca.vertsplit(q)}
+    free = [str(symbol) for symbol in ca.symvar(value) if str(symbol) not in symbols]
     if free:
         raise InvalidValueError(what, f"using the free symbols {', '.join(free[:5])}", "an expression in q alone")
     return value
 
 
-def called(what: str, wanted: str, function: Callable[..., Any], *arguments: Any) -> Any:
+def call_user(what: str, expected: str, function: Callable[..., Any], *arguments: Any) -> Any:
     """What a user's function returns.
 
     Raises:
@@ -314,10 +278,10 @@ def called(what: str, wanted: str, function: Callable[..., Any], *arguments: Any
         return function(*arguments)
     except (RuntimeError, TypeError, ValueError, LookupError, ArithmeticError, AttributeError) as error:
         reason = " ".join(str(error).split())[:120]
-        raise InvalidValueError(what, f"failing ({reason})", wanted) from None
+        raise InvalidValueError(what, f"failing ({reason})", expected) from None
 
 
-def determinant(matrix: ca.SX) -> ca.SX:
+def compute_determinant(matrix: ca.SX) -> ca.SX:
     """det A of a symbolic matrix (r, r), by cofactors, with r 2^(r-1) products.
 
     Minors of the first k rows are made once for each choice of k columns. CasADi's own determinant makes them anew
@@ -329,6 +293,7 @@ def determinant(matrix: ca.SX) -> ca.SX:
     rows = require_count("rows of a determinant", matrix.shape[0], least=1, most=MOST_ROWS)
     if rows <= _BY_CASADI:
         return ca.det(matrix)
+    # From row to row, each minor is expanded along its last row.
     minors: dict[tuple[int, ...], ca.SX] = {(): ca.SX(1)}
     for k in range(rows):
         minors = {
@@ -341,7 +306,7 @@ def determinant(matrix: ca.SX) -> ca.SX:
     return minors[tuple(range(rows))]
 
 
-def shortest(difference: Any, turns: Array) -> Any:
+def wrap_shortest(difference: Any, turns: Array) -> Any:
     """Differences without whole periods of the components that have one, each by the shorter way around.
 
     Args:

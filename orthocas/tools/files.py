@@ -13,6 +13,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,13 +23,23 @@ from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import deferred
 
 LIST = ".orthocas.json"
-_LONGEST_HEADER = 2**26  # bytes; of charts with thousands of terms on tape
-_HOST = re.sub(r"[^A-Za-z0-9]", "", socket.gethostname())[:32] or "host"  # a process id means nothing elsewhere
+#: a process id means nothing on other hosts
+_HOST = re.sub(r"[^A-Za-z0-9]", "", socket.gethostname())[:32] or "host"
 _NAME = re.compile(r"\.?orthocas-(?P<host>[A-Za-z0-9]+)-(?P<process>\d+)-\w+")
 _FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
-_LARGEST_FILE = 2**25  # bytes
-_LARGEST = 1e6  # larger numbers are mistakes
-LONGEST = 60  #: characters of a cell in an error
+
+
+@dataclass(frozen=True, slots=True)
+class FileRules:
+    """Bounds of what is read."""
+
+    header: int = 2**26  #: bytes of the header of an archive; charts may have thousands of terms on tape
+    table: int = 2**25  #: bytes of a table
+    largest: float = 1e6  #: of the numbers of a table; larger ones are mistakes
+    cell: int = 60  #: characters of a cell in an error
+
+
+RULES = FileRules()
 
 
 def require_replaceable(path: Path, ours: bool, force: bool, error: type[ArchiveError] = ArchiveError) -> None:
@@ -56,8 +67,9 @@ def is_archive(path: Path, format_name: str) -> bool:
     """Whether a file is an archive of ours with a format, such as 'orthocas-chart', damaged or not."""
     try:
         with zipfile.ZipFile(path) as archive, archive.open("header.json") as header:
-            return bool(json.loads(header.read(_LONGEST_HEADER))["format"] == format_name)
-    except Exception:  # zipfile, its decompressors and json raise many kinds; a file that is not read is not ours
+            return bool(json.loads(header.read(RULES.header))["format"] == format_name)
+    # Zipfile, its decompressors and json raise many kinds; a file that is not read is not ours.
+    except Exception:
         return False
 
 
@@ -66,14 +78,14 @@ def is_numpy_archive(path: Path, names: Iterable[str]) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             return {f"{name}.npy" for name in names} <= set(archive.namelist())
-    except Exception:  # as above
+    except Exception:
         return False
 
 
 def is_listed(path: Path) -> bool:
     """Whether the list of its folder has a file, as it is now."""
     try:
-        return path.is_file() and digest(path) in read_list(path.parent).get(path.name, [])
+        return path.is_file() and compute_digest(path) in read_list(path.parent).get(path.name, [])
     except OSError:
         return False
 
@@ -81,19 +93,19 @@ def is_listed(path: Path) -> bool:
 def read_list(folder: Path) -> dict[str, list[str]]:
     """Names of files that were written to a folder, and the checksums that each may have."""
     try:
-        found = json.loads((folder / LIST).read_text(encoding="utf-8"))["files"]
-        return {str(name): [str(entry) for entry in entries] for name, entries in found.items()}
+        listed = json.loads((folder / LIST).read_text(encoding="utf-8"))["files"]
+        return {str(name): [str(entry) for entry in entries] for name, entries in listed.items()}
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return {}
 
 
-def list_text(folder: Path, drafts: Iterable[Path]) -> str:
+def write_list(folder: Path, drafts: Iterable[Path]) -> str:
     """The list of a folder once these drafts are there; what they replace stays known, should that never happen."""
-    known = read_list(folder)
+    files = read_list(folder)
     for draft in drafts:
         now = folder / draft.name
-        known[draft.name] = [digest(file) for file in (now, draft) if file.is_file()]
-    return json.dumps({"format": "orthocas-list", "files": known}, indent=1) + "\n"
+        files[draft.name] = [compute_digest(file) for file in (now, draft) if file.is_file()]
+    return json.dumps({"format": "orthocas-list", "files": files}, indent=1) + "\n"
 
 
 def refuse_xml(path: Path, what: str, error: type[ArchiveError]) -> None:
@@ -108,29 +120,30 @@ def refuse_xml(path: Path, what: str, error: type[ArchiveError]) -> None:
         raise error(f"{path} is an XML file, such as of a robot (Robot.from_file), not {what}")
 
 
-def digest(path: Path) -> str:
+def compute_digest(path: Path) -> str:
     """SHA-256 of a file."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 @contextmanager
-def draft_folder(parent: Path | None = None) -> Iterator[Path]:
+def open_draft_folder(parent: Path | None = None) -> Iterator[Path]:
     """A hidden folder in `parent`, or one where the system keeps temporary files, for the time of the block.
 
     Its name holds host and process id. Those that processes left which no longer run are removed first.
     """
     place = Path(tempfile.gettempdir()) if parent is None else parent
-    sweep(place)
+    remove_drafts(place)
     prefix = f"{'' if parent is None else '.'}orthocas-{_HOST}-{os.getpid()}-"
     folder: str | None = None
     try:
-        with deferred():  # Ctrl-C between the folder and its name would leave it
+        # Ctrl-C between the folder and its name would leave the folder, and during the removal half of it.
+        with deferred():
             folder = tempfile.mkdtemp(dir=place, prefix=prefix)
         yield Path(folder)
     finally:
         if folder is not None:
-            with deferred():  # and here half of it
+            with deferred():
                 shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -146,31 +159,32 @@ def write_temporary(file: Path, content: bytes) -> None:
         raise ArchiveError(f"cannot write the temporary file {file}: {error.strerror}") from None
 
 
-def sweep(folder: Path) -> None:
+def remove_drafts(folder: Path) -> None:
     """Remove the drafts of processes of this machine that no longer run."""
-    with suppress(OSError):  # a folder that cannot be listed or changed fails elsewhere, with a message
+    # A folder that cannot be listed or changed fails elsewhere, with a message.
+    with suppress(OSError):
         for entry in list(os.scandir(folder)):
-            if _is_left(entry.name) and entry.is_dir(follow_symlinks=False):
+            if _is_abandoned(entry.name) and entry.is_dir(follow_symlinks=False):
                 shutil.rmtree(entry.path, ignore_errors=True)
 
 
-def _is_left(name: str) -> bool:
+def _is_abandoned(name: str) -> bool:
+    """Whether a draft folder belongs to a process of this machine that no longer runs."""
     parts = _NAME.fullmatch(name)
-    return parts is not None and parts["host"] == _HOST and not _runs(int(parts["process"]))
-
-
-def _runs(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
+    if parts is None or parts["host"] != _HOST:
         return False
-    except OSError:  # it is another user's
+    try:
+        os.kill(int(parts["process"]), 0)
+    except (ProcessLookupError, OverflowError):
         return True
-    return True
+    # Other errors say that it is another user's.
+    except OSError:
+        return False
+    return False
 
 
 @contextmanager
-def published(folder: Path, listed: bool = False, force: bool = False) -> Iterator[Path]:
+def publish(folder: Path, listed: bool = False, force: bool = False) -> Iterator[Path]:
     """A draft folder. Its files move to `folder` when the block ends, and are deleted if the block raises.
 
     Each file appears whole or not at all: its content is on disk before its name is. Files of the same name are
@@ -185,14 +199,15 @@ def published(folder: Path, listed: bool = False, force: bool = False) -> Iterat
         ArchiveError: if files are listed and one in the way is not, or the disk is full; or if a symbolic link is in
             the way.
     """
-    with draft_folder(folder) as drafts, _full_disk_named(folder, drafts) if listed else nullcontext():
+    with open_draft_folder(folder) as drafts, _name_full_disk(folder, drafts) if listed else nullcontext():
         yield drafts
         files = sorted(drafts.iterdir())
         for file in files:
             require_replaceable(folder / file.name, not listed or is_listed(folder / file.name), force)
         if listed:
-            text = list_text(folder, files)
-            files.insert(0, drafts / LIST)  # first: what it announces may be missing, but nothing that is there unknown
+            text = write_list(folder, files)
+            # The list comes first: what it announces may be missing, but nothing that is there unknown.
+            files.insert(0, drafts / LIST)
             files[0].write_text(text, encoding="utf-8")
         for file in files:
             with file.open("rb") as stream:
@@ -202,7 +217,7 @@ def published(folder: Path, listed: bool = False, force: bool = False) -> Iterat
 
 
 @contextmanager
-def _full_disk_named(folder: Path, drafts: Path) -> Iterator[None]:
+def _name_full_disk(folder: Path, drafts: Path) -> Iterator[None]:
     """Say which file did not fit: libraries that draw and save leave its name out.
 
     Raises:
@@ -237,7 +252,7 @@ def require_writable(path: Path, error_type: type[ArchiveError] = ArchiveError) 
     try:
         if not path.parent.is_dir():
             raise error_type(f"cannot write {path}: folder {path.parent} does not exist")
-        sweep(path.parent)
+        remove_drafts(path.parent)
         if path.is_dir():
             raise error_type(f"cannot write {path}: it is a folder, expected a file name")
         if path.exists() and not (path.is_file() and os.access(path, os.W_OK)):
@@ -248,7 +263,7 @@ def require_writable(path: Path, error_type: type[ArchiveError] = ArchiveError) 
         raise error_type(f"cannot write {str(path)[:200]}: {error.strerror}") from None
 
 
-def made_folder(name: str, out: str | Path, mode: int = 0o777) -> Path:
+def make_folder(name: str, out: str | Path, mode: int = 0o777) -> Path:
     """Create the output folder if needed, with these rights less the umask; check that files can be written there.
 
     Raises:
@@ -257,7 +272,7 @@ def made_folder(name: str, out: str | Path, mode: int = 0o777) -> Path:
     folder = Path(out)
     try:
         folder.mkdir(mode, parents=True, exist_ok=True)
-        sweep(folder)
+        remove_drafts(folder)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
@@ -266,15 +281,16 @@ def made_folder(name: str, out: str | Path, mode: int = 0o777) -> Path:
 
 
 @contextmanager
-def output_folder(name: str, out: str | Path) -> Iterator[Path]:
-    """`made_folder` for the time of a block; at its end, folders that it made and that stayed empty go away again."""
+def open_output_folder(name: str, out: str | Path) -> Iterator[Path]:
+    """`make_folder` for the time of a block; at its end, folders that it made and that stayed empty go away again."""
     folder = Path(out)
     new = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
-        yield made_folder(name, folder)
+        yield make_folder(name, folder)
     finally:
         for place in new:
-            with suppress(OSError):  # it is not empty, as it should be
+            # A folder that is not empty stays.
+            with suppress(OSError):
                 place.rmdir()
 
 
@@ -299,55 +315,57 @@ def read_table(
     Raises:
         PathFileError: names the file, the line, and what is wrong there.
     """
-    lines = _lines(Path(path), what)
+    lines = _read_lines(Path(path), what)
     if not least <= len(lines) - 1 <= most:
         came = f"it has {max(len(lines) - 1, 0)} {rows} after the header"
         raise PathFileError(f"{what} {path}: {came}, expected {least} to {most}")
     header = [cell.strip() for cell in lines[0][1]]
     try:
         chosen = list(columns(header))
-        return np.array([_numbers(line, cells, header, chosen) for line, cells in lines[1:]])
+        return np.array([_parse_row(line, cells, header, chosen) for line, cells in lines[1:]])
     except ValueError as error:
         raise PathFileError(f"{what} {path}: {error}") from None
 
 
-def column_places(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
+def find_columns(names: Sequence[str], columns: Sequence[str]) -> list[int]:
     """Where the wanted names stand in a header, for `read_table`; every one has to be there once."""
-    for name in wanted:
+    for name in columns:
         if name not in names:
-            raise ValueError(f"line 1: column {name[:LONGEST]!r} is missing, expected {', '.join(wanted)}")
+            raise ValueError(f"line 1: column {name[: RULES.cell]!r} is missing, expected {', '.join(columns)}")
         if names.count(name) > 1:
-            raise ValueError(f"line 1: column {name[:LONGEST]!r} comes twice")
-    return [names.index(name) for name in wanted]
+            raise ValueError(f"line 1: column {name[: RULES.cell]!r} comes twice")
+    return [names.index(name) for name in columns]
 
 
-def _lines(path: Path, what: str) -> list[tuple[int, list[str]]]:
+def _read_lines(path: Path, what: str) -> list[tuple[int, list[str]]]:
     """The lines that are not empty, with their numbers."""
     try:
         with path.open("rb") as stream:
-            content = stream.read(_LARGEST_FILE + 1)
-        if len(content) > _LARGEST_FILE:
-            raise PathFileError(f"{what} {path}: larger than {_LARGEST_FILE / 2**20:.0f} MiB")
+            content = stream.read(RULES.table + 1)
+        if len(content) > RULES.table:
+            raise PathFileError(f"{what} {path}: larger than {RULES.table / 2**20:.0f} MiB")
         reader = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
         return [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
     except OSError as error:
         raise PathFileError(f"{what} {path}: cannot be read, {error.strerror}") from None
-    except (ValueError, csv.Error) as error:  # also bytes that are no text
-        raise PathFileError(f"{what} {path}: no CSV text, {str(error)[:LONGEST]}") from None
+    # ValueError also stands for bytes that are no text.
+    except (ValueError, csv.Error) as error:
+        raise PathFileError(f"{what} {path}: no CSV text, {str(error)[: RULES.cell]}") from None
 
 
-def _numbers(line: int, cells: Sequence[str], header: Sequence[str], chosen: Sequence[int]) -> list[float]:
+def _parse_row(line: int, cells: Sequence[str], header: Sequence[str], chosen: Sequence[int]) -> list[float]:
+    """The numbers of the chosen columns of a line."""
+    # Columns that nobody reads may hold anything, but none may be missing.
     if len(cells) != len(header):
         raise ValueError(f"line {line}: {len(cells)} numbers, expected {len(header)} as in the header")
-    return [_number(line, cells[k], header[k]) for k in chosen]
-
-
-def _number(line: int, cell: str, name: str) -> float:
-    try:
-        value = float("nan" if "_" in cell else cell)
-    except ValueError:
-        value = np.nan
-    if not abs(value) <= _LARGEST:
-        want = f"a number from {-_LARGEST:g} to {_LARGEST:g}"
-        raise ValueError(f"line {line}: {name} is {cell[:LONGEST]!r}, expected {want}")
-    return value
+    values = []
+    for cell, name in ((cells[k], header[k]) for k in chosen):
+        try:
+            value = float("nan" if "_" in cell else cell)
+        except ValueError:
+            value = np.nan
+        if not abs(value) <= RULES.largest:
+            want = f"a number from {-RULES.largest:g} to {RULES.largest:g}"
+            raise ValueError(f"line {line}: {name} is {cell[: RULES.cell]!r}, expected {want}")
+        values.append(value)
+    return values

@@ -16,52 +16,63 @@ from orthocas.tools.checks import Array
 
 T = TypeVar("T")
 _KINDS: dict[type, str] = {dict: "an object", list: "a list", str: "text"}
-_LARGEST_FILE = 2**23  # bytes
-_LARGEST = 1e6  # larger numbers are mistakes and would overflow later
-_LONGEST = 80  # most characters of the input that an error repeats
 
 
-def plain(value: Any) -> Any:
-    """Convert records and arrays as `as_data` does, and numbers that are not finite to None, at all levels."""
-    data = as_data(value)
+@dataclass(frozen=True, slots=True)
+class JsonRules:
+    """Bounds of what people write."""
+
+    file: int = 2**23  #: bytes of a file
+    largest: float = 1e6  #: larger numbers are mistakes and would overflow later
+    longest: int = 80  #: most characters of the input that an error repeats
+
+
+RULES = JsonRules()
+
+
+def clean(value: Any) -> Any:
+    """Convert records and arrays as `convert` does, and numbers that are not finite to None, at all levels."""
+    data = convert(value)
     if isinstance(data, dict):
-        return {key: plain(item) for key, item in data.items()}
+        return {key: clean(item) for key, item in data.items()}
     if isinstance(data, list):
-        return [plain(item) for item in data]
+        return [clean(item) for item in data]
     return None if isinstance(data, float) and not math.isfinite(data) else data
 
 
-def as_data(value: Any) -> Any:
+def convert(value: Any) -> Any:
     """Convert arrays and tuples to lists, and records to objects: by their own `as_dict`, or with all their fields."""
     if hasattr(value, "as_dict"):
         return value.as_dict()
     if is_dataclass(value):
-        return attributes(value, *(field.name for field in fields(value)))
+        return collect_attributes(value, *(field.name for field in fields(value)))
     if isinstance(value, Mapping):
-        return {str(key): as_data(item) for key, item in value.items()}
+        return {str(key): convert(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [as_data(item) for item in value]
+        return [convert(item) for item in value]
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
-def attributes(record: Any, *names: str) -> dict[str, Any]:
-    """The chosen fields and properties of a record by name, for its `as_dict`; see `as_data`."""
-    return {name: as_data(getattr(record, name)) for name in names}
+def collect_attributes(record: Any, *names: str) -> dict[str, Any]:
+    """The chosen fields and properties of a record by name, for its `as_dict`; see `convert`."""
+    return {name: convert(getattr(record, name)) for name in names}
 
 
-def to_json(data: Mapping[str, Any], indent: int | None = None) -> str:
-    """Write one JSON object. Values are converted by `plain`."""
-    return json.dumps(plain(data), allow_nan=False, indent=indent)
+def write_json(data: Mapping[str, Any], indent: int | None = None) -> str:
+    """Write one JSON object. Values are converted by `clean`."""
+    return json.dumps(clean(data), allow_nan=False, indent=indent)
 
 
-def from_strict_json(text: str | bytes) -> Any:
+def read_strict_json(text: str | bytes) -> Any:
     """Data of a file that programs wrote: finite numbers, no key twice, no halves of surrogate pairs.
 
     Raises:
         ValueError: in one line, for everything else.
     """
     try:
-        data = json.loads(text, parse_constant=_refused, parse_float=_finite, object_pairs_hook=without_doubles)
+        data = json.loads(
+            text, parse_constant=_refuse_constant, parse_float=_parse_finite, object_pairs_hook=refuse_doubles
+        )
         json.dumps(data, ensure_ascii=False).encode()
     except json.JSONDecodeError as error:
         raise ValueError(f"{error.msg} (line {error.lineno}, column {error.colno})") from None
@@ -72,7 +83,7 @@ def from_strict_json(text: str | bytes) -> Any:
     return data
 
 
-def part(data: Mapping[str, Any], name: str, kind: type[T]) -> T:
+def get_part(data: Mapping[str, Any], name: str, kind: type[T]) -> T:
     """A field of data that were read.
 
     Raises:
@@ -87,7 +98,7 @@ def part(data: Mapping[str, Any], name: str, kind: type[T]) -> T:
     return value
 
 
-def without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def refuse_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """An object of JSON.
 
     Raises:
@@ -100,14 +111,14 @@ def without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return data
 
 
-def _refused(text: str) -> None:
+def _refuse_constant(text: str) -> None:
     raise ValueError(f"it holds {text}, expected finite numbers")
 
 
-def _finite(text: str) -> float:
+def _parse_finite(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
-        _refused(text[:80])
+        _refuse_constant(text[:80])
     return value
 
 
@@ -121,17 +132,19 @@ class Reader:
         """The data of the file. NaN and duplicate keys are errors."""
         try:
             with self.path.open("rb") as stream:
-                content = stream.read(_LARGEST_FILE + 1)
+                content = stream.read(RULES.file + 1)
         except OSError as error:
             raise self.fault(f"cannot be read, {error.strerror}") from None
-        except ValueError as error:  # a path with a zero
+        # ValueError stands for a path with a zero.
+        except ValueError as error:
             raise self.fault(f"cannot be read, {error}") from None
-        if len(content) > _LARGEST_FILE:
-            raise self.fault(f"larger than {_LARGEST_FILE / 2**20:.0f} MiB, no steps file")
+        if len(content) > RULES.file:
+            raise self.fault(f"larger than {RULES.file / 2**20:.0f} MiB, no steps file")
         try:
-            return from_strict_json(content.decode("utf-8-sig"))
-        except ValueError as error:  # also bytes that are no text
-            raise self.fault(f"truncated or not JSON, {str(error)[:_LONGEST]}") from None
+            return read_strict_json(content.decode("utf-8-sig"))
+        # ValueError also stands for bytes that are no text.
+        except ValueError as error:
+            raise self.fault(f"truncated or not JSON, {str(error)[: RULES.longest]}") from None
 
     def fault(self, text: str) -> StepsFileError:
         """An error that names the file."""
@@ -139,7 +152,7 @@ class Reader:
 
     def wrong(self, where: str, got: object, want: str) -> StepsFileError:
         """An error that names the place, the value there and what was expected."""
-        return self.fault(f"{where} is {json.dumps(got)[:_LONGEST]}, expected {want}")
+        return self.fault(f"{where} is {json.dumps(got)[: RULES.longest]}, expected {want}")
 
     def fields(self, data: object, where: str, known: Collection[str], what: str = "key") -> dict[str, Any]:
         """An object that has only known keys."""
@@ -148,7 +161,7 @@ class Reader:
         for key in data:
             if key not in known:
                 names = ", ".join(known)
-                raise self.fault(f"{where} has an unknown {what} '{key[:_LONGEST]}', known: {names}")
+                raise self.fault(f"{where} has an unknown {what} '{key[: RULES.longest]}', known: {names}")
         return data
 
     def items(self, data: object, where: str) -> list[Any]:
@@ -157,7 +170,7 @@ class Reader:
             raise self.wrong(where, data, "a list")
         return data
 
-    def number(self, data: object, where: str, least: float = -_LARGEST, above: float = -inf) -> float:
+    def number(self, data: object, where: str, least: float = -RULES.largest, above: float = -inf) -> float:
         """A number that is at least `least` or above `above`, and at most 1e6."""
         if data is None:
             raise self.fault(f"{where} is missing, expected a number")
@@ -165,9 +178,9 @@ class Reader:
         if (
             isinstance(data, bool)
             or not isinstance(data, int | float)
-            or not (above < data and least <= data <= _LARGEST)
+            or not (above < data and least <= data <= RULES.largest)
         ):
-            raise self.wrong(where, data, f"a number {low} to {_LARGEST:g}")
+            raise self.wrong(where, data, f"a number {low} to {RULES.largest:g}")
         return float(data)
 
     def numbers(self, data: object, where: str, length: int) -> Array:

@@ -16,13 +16,12 @@ import pinocchio as pin
 import scipy
 
 from orthocas.errors import RobotError
-from orthocas.robots.kinematics import body_poses, tip_pose
-from orthocas.robots.pinocchio_model import frame_index, joint_axis
+from orthocas.robots.kinematics import build_body_poses, build_tip_pose
+from orthocas.robots.pinocchio_model import find_axis, find_frame, lock_joints, lock_off_chain
 from orthocas.robots.robot import Robot
-from orthocas.robots.spatial import rotation_z_to
+from orthocas.robots.spatial import rotate_z_to
 from orthocas.robots.tree import KinematicTree
-from orthocas.robots.urdf import lock_joints, lock_off_chain, read_urdf
-from orthocas.robots.xml import read_xml
+from orthocas.robots.urdf import read_urdf, read_xml
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array, Indices
 
@@ -134,7 +133,7 @@ def build_capsule(
         _build_arc(radii[1], 0.0, np.pi / 2, facets) + np.array([0.0, length]),
     )
     axis = np.array([0.0, 0.0, 1.0]) if length == 0 else (end - start) / length
-    return _revolve(np.concatenate([low, high]), colour, facets).move(rotation_z_to(axis), start)
+    return _revolve(np.concatenate([low, high]), colour, facets).move(rotate_z_to(axis), start)
 
 
 def build_drum(radius: float, half_height: float, colour: Colour, facets: int = RULES.facets) -> Solid:
@@ -287,12 +286,12 @@ def read_urdf_look(path: Path, tree: KinematicTree, locked: Mapping[str, float] 
     model = lock_off_chain(lock_joints(read_urdf(path, tips, locked), locked or {}), *tips)
     _check_same(path, model, tree)
     # Frames of our tree have the joint's axis as z; Pinocchio's have those of the file.
-    turns = [np.eye(3), *(rotation_z_to(joint_axis(model, i)[1]) for i in range(1, model.njoints))]
+    turns = [np.eye(3), *(rotate_z_to(find_axis(model, i)[1]) for i in range(1, model.njoints))]
     colours = _read_materials(root)
     look: Look = [[] for _ in range(tree.n + 2)]
     missing: list[str] = []
     for link in root.findall("link"):
-        frame = model.frames[frame_index(model, link.get("name", ""))]
+        frame = model.frames[find_frame(model, link.get("name", ""))]
         body = frame.parentJoint
         for visual in link.findall("visual"):
             solid = _build_solid(path, visual, colours, missing)
@@ -419,7 +418,7 @@ class BodyPoses:
     def __init__(self, tree: KinematicTree) -> None:
         q = ca.SX.sym("q", tree.n)
         base = (ca.SX.eye(3), ca.SX.zeros(3))
-        poses = [base, *body_poses(tree, q), tip_pose(tree, q)]
+        poses = [base, *build_body_poses(tree, q), build_tip_pose(tree, q)]
         self._batched = Batched(dense_function("poses", [q], [ca.horzcat(*(ca.horzcat(R, p) for R, p in poses))]))
 
     def __call__(self, q: Array) -> tuple[Array, Array]:

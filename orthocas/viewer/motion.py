@@ -13,8 +13,8 @@ from orthocas.errors import InvalidValueError, PathError, PathFileError
 from orthocas.paths.joint_motion import JointMotion
 from orthocas.robots.robot import Robot
 from orthocas.simulation.trajectory import Trajectory
-from orthocas.tools.checks import Array, as_float_array, as_point_set, frozen_array, require_count, require_kind
-from orthocas.tools.files import column_places, read_table
+from orthocas.tools.checks import Array, as_float_array, as_point_set, freeze_array, require_count, require_kind
+from orthocas.tools.files import find_columns, read_table
 from orthocas.viewer.looks import RULES
 
 _TIME = "time_s"
@@ -95,12 +95,12 @@ def read_joint_motion(path: Path, robot: Robot) -> Motion:
     """
     header: list[str] = []
 
-    def find_columns(names: Sequence[str]) -> list[int]:
-        column_places(names, (_TIME, *robot.joint_names))
+    def choose_columns(names: Sequence[str]) -> list[int]:
+        find_columns(names, (_TIME, *robot.joint_names))
         header.extend(names)
-        return column_places(names, names)
+        return find_columns(names, names)
 
-    table = read_table(path, "motion file", "instants", RULES.most_instants, find_columns)
+    table = read_table(path, "motion file", "instants", RULES.most_instants, choose_columns)
     rates = {f"{order}_{name}" for order in ("d", "dd") for name in robot.joint_names}
     labels = tuple(name for name in header if name not in {_TIME, *robot.joint_names, *rates})
     times, q, values = (
@@ -108,7 +108,7 @@ def read_joint_motion(path: Path, robot: Robot) -> Motion:
     )
     if (np.diff(times[:, 0]) <= 0).any():
         raise PathFileError(f"motion file {path}: time_s does not increase in every line")
-    arrays = (frozen_array("a column", part, (None, None)) for part in (q, values))
+    arrays = (freeze_array("a column", part, (None, None)) for part in (q, values))
     return Motion(Path(path).stem, times[:, 0], next(arrays), labels, next(arrays))
 
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from orthocas.charts.chart import Chart
 from orthocas.robots.robot import Robot
-from orthocas.tasks.domains import bounds_of
 from orthocas.tools.checks import Array
 from orthocas.viewer.looks import RULES
 from orthocas.viewer.motion import Motion
@@ -54,7 +53,7 @@ class Readers:
     def __init__(self, chart: Chart) -> None:
         self._chart = chart
         domain = chart.problem.domain
-        low, high = bounds_of(domain)
+        low, high = domain.bounds
         self._free = ~np.isfinite(low) | ~np.isfinite(high)
         self._middle, self._half_width = domain.centre, domain.half_width
 
@@ -86,7 +85,7 @@ class ChartPanel:
         self.place = place
         problem = chart.problem
         robot, domain = problem.robot, problem.domain
-        low, high = (-np.inf, np.inf) if mirrored else bounds_of(domain)
+        low, high = (-np.inf, np.inf) if mirrored else domain.bounds
         self._joints = JointBars(
             robot.joint_names, robot.tree.prismatic, robot.lower, robot.upper, low + np.zeros(chart.n),
             high + np.zeros(chart.n),

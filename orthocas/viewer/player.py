@@ -171,7 +171,7 @@ class RobotPage:
     def __init__(self, server: Any, robot: Robot, look: Look) -> None:
         self._server, self._panel = server, RobotPanel(robot)
         self._arm = Arm(server.scene, "/arm", robot, look)
-        self._home = robot.tree.middle
+        self._home = robot.tree.centre_posture
         self._robot, self._q = robot, self._home
         self._loop = Loop(lambda: None, partial(show_error, server))
         place_scene(server, robot, self._home[None])
@@ -273,8 +273,8 @@ def show_motions(
 def show_robot(robot: Robot, look: Look, server: Any) -> tuple[float, Callable[[float], None]]:
     """A robot that stands still; a `Scene`."""
     arm = Arm(server.scene, "/arm", robot, look)
-    place_scene(server, robot, robot.tree.middle[None])
-    return 0.0, lambda seconds: arm.show(robot.tree.middle)
+    place_scene(server, robot, robot.tree.centre_posture[None])
+    return 0.0, lambda seconds: arm.show(robot.tree.centre_posture)
 
 
 def _find_position(chart: Chart, fan: Fan, fraction: float) -> Array:

@@ -12,8 +12,8 @@ from orthocas.errors import ArchiveError, InvalidValueError, NoExpressionError
 from orthocas.paths.joint_motion import JointMotion
 from orthocas.robots.robot import Robot
 from orthocas.simulation.trajectory import Trajectory
-from orthocas.tools.checks import as_path, part_hint
-from orthocas.tools.files import published, require_replaceable, require_writable
+from orthocas.tools.checks import as_path, suggest_attribute
+from orthocas.tools.files import publish, require_replaceable, require_writable
 from orthocas.viewer.chart_page import ChartPage
 from orthocas.viewer.looks import Look, build_stick_arm, decimate, read_urdf_look
 from orthocas.viewer.motion import Motion, require_joints
@@ -151,7 +151,7 @@ def export_page(
     else:
         scene = partial(show_robot, arm, shape.look)
     page = record_scene(scene)
-    with published(target.parent) as drafts:
+    with publish(target.parent) as drafts:
         (drafts / target.name).write_bytes(page.encode() + _OURS)
     return shape
 
@@ -192,7 +192,7 @@ def _read_motions(shown: Any) -> tuple[Motion, ...]:
         return (Motion.of_path(shown),)
     several = shown if isinstance(shown, list | tuple) else [shown]
     if not several or not all(isinstance(part, Motion) for part in several):
-        wanted = f"a chart, a robot, a run or a joint motion{part_hint(shown, Chart)}"
+        wanted = f"a chart, a robot, a run or a joint motion{suggest_attribute(shown, Chart)}"
         raise InvalidValueError("shown", f"a {type(shown).__name__}", wanted)
     return tuple(several)
 

@@ -29,8 +29,8 @@ import numpy as np
 
 from orthocas.errors import InvalidValueError, OrthocasError, ViewError
 from orthocas.robots.robot import Robot
-from orthocas.robots.spatial import rotation_z_to
-from orthocas.tools.checks import Array, of_extra, require_count
+from orthocas.robots.spatial import rotate_z_to
+from orthocas.tools.checks import Array, import_extra, require_count
 from orthocas.viewer.looks import RULES, compute_chain_length
 
 _INPUT, _CAMERA = "GuiUpdateMessage", "ViewerCameraMessage"
@@ -407,7 +407,7 @@ def viser() -> ModuleType:
     Raises:
         MissingExtraError: if it is not installed.
     """
-    return of_extra("viser", "a view in the browser", "view")
+    return import_extra("viser", "a view in the browser", "view")
 
 
 def open_window(host: str, port: int, title: str) -> tuple[Any, str]:
@@ -590,7 +590,7 @@ def place_floor(server: Any, robot: Robot) -> None:
     # Into the white of the background.
     fade = np.stack([0 * shade + 255, shade, shade, 0 * shade + 255], axis=1)
     lines, colours = np.concatenate([points, points[..., [1, 0, 2]]]), np.concatenate([fade, fade])
-    lines = lines - [0.0, 0.0, 0.15 * size] if is_planar(robot) else lines @ rotation_z_to(compute_up(robot)).T
+    lines = lines - [0.0, 0.0, 0.15 * size] if is_planar(robot) else lines @ rotate_z_to(compute_up(robot)).T
     ends, tones = (np.stack([rows[:, :-1], rows[:, 1:]], axis=2).reshape(-1, 2, 3) for rows in (lines, colours))
     server.scene.add_line_segments("/floor", ends, tones.astype(np.uint8), thickness=RULES.line * size)
 

@@ -15,7 +15,7 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.codegen import check_c
 from orthocas.control import Kinematic, Reference
 from orthocas.errors import InvalidValueError
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 
 RING = oc.Box([0.0, 1.2], [np.pi, 0.4], unbounded=[0])  # joint 1 turns without end
 
@@ -54,7 +54,7 @@ def test_gradients_are_those_of_the_angles() -> None:
     for k in range(3):
         shift = 1e-6 * np.eye(3)[:, [k]]
         ahead, behind = (evaluated(found, theta, q + sign * shift)[0] for sign in (1, -1))
-        slopes = shortest((ahead - behind).T, np.full(2, 2 * np.pi)).T / 2e-6
+        slopes = wrap_shortest((ahead - behind).T, np.full(2, 2 * np.pi)).T / 2e-6
         assert gradients[:, k] == pytest.approx(slopes, rel=1e-5, abs=1e-6)
 
 
@@ -92,13 +92,13 @@ def test_inverse_goes_the_shorter_way_across_the_cut(around: oc.Chart) -> None:
     steps.append(around.tracker(q).step(beyond))
     for reached in steps:
         assert np.abs(reached - q).max() < 0.1
-        assert shortest(around.phi(reached) - beyond, around.turns) == pytest.approx(np.zeros(2), abs=1e-8)
+        assert wrap_shortest(around.phi(reached) - beyond, around.turns) == pytest.approx(np.zeros(2), abs=1e-8)
     wanted = beyond - np.array([0.0, 2 * np.pi])  # the same point of the circle
     assert around.inverse(wanted, q) == pytest.approx(steps[0], abs=1e-9)
 
 
 def test_laws_pull_the_shorter_way(around: oc.Chart) -> None:
-    error = shortest(ca.DM([0.1, 6.0]), around.turns)
+    error = wrap_shortest(ca.DM([0.1, 6.0]), around.turns)
     assert np.asarray(error).ravel() == pytest.approx([0.1, 6.0 - 2 * np.pi])
 
 
@@ -152,7 +152,7 @@ def test_c_equals_python_and_its_inverse_crosses_the_cut(around: oc.Chart, tmp_p
     found = oc.compile_inverse(around, tmp_path).solve(beyond, np.tile(q, (2, 1))).require().q
     assert np.abs(found - q).max() < 0.1
     assert found[0] == pytest.approx(found[1], abs=1e-9)
-    assert shortest(around.phi(found) - beyond, around.turns) == pytest.approx(np.zeros((2, 2)), abs=1e-8)
+    assert wrap_shortest(around.phi(found) - beyond, around.turns) == pytest.approx(np.zeros((2, 2)), abs=1e-8)
 
 
 def bounded(chart: oc.Chart, half_width: float) -> oc.Chart:
@@ -180,7 +180,7 @@ def test_path_goes_round_by_the_shorter_ways_of_its_schedule(around: oc.Chart) -
     path, xi = around.task([0.0, 1.2]) + bend[:, None], np.linspace(0, 10, 9)[:, None]
     motions = [
         oc.follow(around, path, schedule, q_start=[0.0, 1.2], velocity_limits=1.0, period=0.1)
-        for schedule in (xi, shortest(xi, np.array([2 * np.pi])))
+        for schedule in (xi, wrap_shortest(xi, np.array([2 * np.pi])))
     ]
     assert np.abs(motions[1].q - motions[0].q).max() < 1e-9
     assert np.ptp(motions[1].q[:, 0]) > 2 * np.pi

@@ -6,7 +6,7 @@ import pytest
 from paper.planar_flow import deviations, planar_problem
 
 import orthocas as oc
-from orthocas.tools.expressions import shortest
+from orthocas.tools.expressions import wrap_shortest
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +30,8 @@ TURN = np.full(1, 2 * np.pi)
 
 def test_angle_is_even_and_changes_its_sign_half_a_turn_away(chart: oc.Chart) -> None:
     xi = chart.xi(POINTS)
-    assert np.abs(shortest(chart.xi(-POINTS) - xi, TURN)).max() < 1e-9
-    assert np.abs(shortest(chart.xi(POINTS + np.array([np.pi, 0.0])) + xi, TURN)).max() < 1e-9
+    assert np.abs(wrap_shortest(chart.xi(-POINTS) - xi, TURN)).max() < 1e-9
+    assert np.abs(wrap_shortest(chart.xi(POINTS + np.array([np.pi, 0.0])) + xi, TURN)).max() < 1e-9
 
 
 def test_leak_is_that_of_the_chart_and_its_gradient_is_right(

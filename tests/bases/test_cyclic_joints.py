@@ -18,8 +18,7 @@ from orthocas.control import ControlStatus, Kinematic, PDPlus
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.probe import judged_chart, leak_and_conditioning
-from orthocas.tasks.domains import bounds_of, sample_heavily, sample_uniform
-from orthocas.tasks.samples import samples_at
+from orthocas.tasks.samples import evaluate_samples, sample_boundary_weighted, sample_uniform
 from orthocas.tools.archive import read_archive
 from orthocas.tools.batch import Batched
 
@@ -91,10 +90,12 @@ def test_chart_holds_over_the_full_turn_of_the_first_axis(cyclic_fit: Fit) -> No
     chart = cyclic_fit.chart
     assert cyclic_fit.cyclic_joints == ("A1",)
     np.testing.assert_allclose(chart.problem.domain.half_width[0], np.radians(170), atol=1e-6)
-    here = sample_heavily(problems.get("iiwa").domain, 60, seed=8)
+    here = sample_boundary_weighted(problems.get("iiwa").domain, 60, seed=8)
     there = here.copy()
     there[:, 0] = FULL_TURN
-    found = [leak_and_conditioning(samples_at(chart.problem, q), chart.coordinates.jacobian(q)) for q in (here, there)]
+    found = [
+        leak_and_conditioning(evaluate_samples(chart.problem, q), chart.coordinates.jacobian(q)) for q in (here, there)
+    ]
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-7)
     report = oc.evaluate(chart, 20_000, seed=5)
@@ -114,7 +115,7 @@ def test_free_fit_leaks_more_at_other_angles(cyclic_fit: Fit, iiwa_fit: Fit) -> 
 def test_joint_without_limits_becomes_unbounded(endless: oc.Chart) -> None:
     domain = endless.problem.domain
     assert (domain.unbounded, domain.half_width[0]) == ((0,), np.pi)
-    lower, upper = bounds_of(domain)
+    lower, upper = domain.bounds
     assert (lower[0], upper[0]) == (-np.inf, np.inf)
     q = np.tile(domain.centre, (3, 1))
     q[:, 0] = (0.1, 0.1 + 2 * np.pi, -40.0)
@@ -174,7 +175,7 @@ def test_prismatic_cyclic_joint_covers_its_limits() -> None:
     file, tip = ROBOTS["tiago with its prismatic torso"]
     robot = oc.Robot.from_urdf(robot_data(file), tip)
     chart = oc.fit(oc.Problem(robot, oc.Task.position(robot)), oc.Polynomial(1, cyclic="auto"), samples=200).chart
-    low, high = bounds_of(chart.problem.domain)
+    low, high = chart.problem.domain.bounds
     np.testing.assert_allclose([low[:2], high[:2]], [robot.lower[:2], robot.upper[:2]])
     assert np.isfinite(high).all()
 

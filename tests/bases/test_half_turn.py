@@ -135,9 +135,9 @@ def test_derivatives_of_errors_are_finite_differences(kind: str) -> None:
     symbols = [ca.MX.sym(name, size) for name, size in (("q", 7), ("x_d", m), ("dx", m), ("ddx", m))]
     Q, X, V, A = symbols
     e, J = relative.error(Q, X)
-    rate = J @ ca.DM(w) - relative.drift(Q, X, V)
-    bend = relative.bend(Q, ca.DM(dq), ca.DM(w), (X, V, A))
-    run = ca.Function("run", symbols, [e, J, relative.drift(Q, X, V), rate, bend])
+    rate = J @ ca.DM(w) - relative.compute_drift(Q, X, V)
+    bend = relative.compute_bias(Q, ca.DM(dq), ca.DM(w), (X, V, A))
+    run = ca.Function("run", symbols, [e, J, relative.compute_drift(Q, X, V), rate, bend])
 
     def along(s: float, k: int, rest: bool = False, still: bool = False) -> Numbers:
         here = q if rest else q + s * dq

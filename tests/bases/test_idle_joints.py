@@ -36,7 +36,7 @@ def robot(request: pytest.FixtureRequest, tmp_path: Path) -> oc.Robot:
 
 def tilt(robot: oc.Robot) -> float:
     """How far one turn of the last joint moves the axis, by the rotations alone."""
-    q = robot.tree.middle
+    q = robot.tree.centre_posture
     axes = [robot.tip_rotation(q + turn * np.eye(6)[5])[:, 2] for turn in np.linspace(0, 6, 7)]
     return float(np.ptp(axes, axis=0).max())
 

@@ -12,7 +12,7 @@ from orthocas.bases import JointSpace, ProductFamily, component_gradients, parse
 from orthocas.charts.coordinates import point_functions
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError, UnknownNameError
 from orthocas.fitting.basis_gradients import BasisGradients, ProductGradients, SparseGradients
-from orthocas.tools.columns import COLUMNS, by_sample
+from orthocas.tools.columns import COLUMNS, split_by_sample
 
 SPACE = JointSpace(np.array([0.1, -0.3, 0.2]), np.array([0.5, 0.7, 0.4]), (False, False, False), ("a", "b", "c"))
 SLIDING = JointSpace(SPACE.centre, SPACE.half_width, (False, True, False), SPACE.joint_names)
@@ -173,7 +173,7 @@ def test_products_with_basis_gradients_are_those_with_all_entries(
     gradients = form(family, 3)
     X, C = gradients.at(points), rng.normal(size=(2, family.width))
     G = gradients.dense(X, 300)  # (N, n, K)
-    J = by_sample((gradients.table(C) @ X).reshape(len(X), 3, 2, -1), 300)
+    J = split_by_sample((gradients.table(C) @ X).reshape(len(X), 3, 2, -1), 300)
     np.testing.assert_allclose(J, C @ G.transpose(0, 2, 1), atol=1e-12)
     slopes = np.zeros((len(X) * COLUMNS, 6))  # dL/dJ_xi, joint by joint
     slopes[:300] = rng.normal(size=(300, 6))

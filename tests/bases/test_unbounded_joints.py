@@ -13,7 +13,7 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.bases import JointSpace, Parametrisation
 from orthocas.bases.cyclic import leaves_stay
-from orthocas.certificates.certify import whole_domain
+from orthocas.certificates.certify import cover_domain
 from orthocas.charts.certificate import ELIMINATION, PROVED, Certificate, Subdivision
 from orthocas.charts.chart_file import fingerprint
 from orthocas.charts.coordinates import Coordinates
@@ -33,10 +33,10 @@ def on_torus(task: Callable[[ca.SX], ca.SX], xi: Parametrisation | Callable[[ca.
 
 def forged(chart: oc.Chart, **changes: object) -> Certificate:
     """A proof in one part, as if all were proved."""
-    base = whole_domain(chart.problem.domain)
+    base = cover_domain(chart.problem.domain)
     whole = Subdivision(base.low, base.high, np.array([PROVED], dtype=np.uint8))
     made = Certificate(fingerprint(chart.problem, chart.coordinates), ELIMINATION, 0.0, whole, 0.0)
-    return replace(made, **changes).sealed()  # type: ignore[arg-type]
+    return replace(made, **changes).seal()  # type: ignore[arg-type]
 
 
 WAVE = lambda q: q[0] + 0.3 * ca.sin(q[1])  # noqa: E731
@@ -81,7 +81,7 @@ def test_periodic_charts_are_proved_on_the_torus(xi: Callable[[ca.SX], ca.SX]) -
 @pytest.mark.parametrize("centre", [0.0, 3.0, -10.0])
 def test_the_box_of_a_full_turn_holds_every_angle(centre: float) -> None:
     """pi is rounded down, and so may be the boundaries."""
-    box = whole_domain(oc.Box([centre], np.pi, [0]))
+    box = cover_domain(oc.Box([centre], np.pi, [0]))
     assert (box.high[0] - centre) - np.pi > 1e-15
     assert (centre - box.low[0]) - np.pi > 1e-15
 
@@ -151,7 +151,7 @@ def test_leaves_are_proved_to_stay_where_finite_motions_say_so(kind: str, wanted
     """Reference: the projector on the task gradients at other positions of each joint, by samples."""
     file, tip = ROBOTS["tiago with its prismatic torso"]
     robot = oc.Robot.from_urdf(robot_data(file), tip)
-    centre = robot.tree.middle + 0.1
+    centre = robot.tree.centre_posture + 0.1
     problem = oc.Problem(robot, oc.Task.named(robot, kind, centre), domain=oc.Box(centre, 0.01))
     rng = np.random.default_rng(5)
     q = centre + 0.1 * rng.uniform(-1, 1, (20, robot.n))

@@ -54,14 +54,14 @@ def test_a_forged_certificate_does_not_hold() -> None:
     whole = Subdivision(known.regular.low, known.regular.high, np.array([PROVED], dtype=np.uint8))
     wide = chart(0.4)
     honest = certified(0.4)
-    forged = replace(honest, regular=Subdivision(honest.regular.low, honest.regular.high, whole.codes)).sealed()
+    forged = replace(honest, regular=Subdivision(honest.regular.low, honest.regular.high, whole.codes)).seal()
     assert not oc.check_certificate(wide, forged)
-    other = replace(honest, regular=known.regular).sealed()
+    other = replace(honest, regular=known.regular).seal()
     with pytest.raises(CertifyError, match="another domain"):
         oc.check_certificate(wide, other)
     with pytest.raises(CertifyError, match="method"):
-        oc.check_certificate(wide, replace(honest, method="guess/1").sealed())
-    assert not oc.check_certificate(wide, replace(honest, conditioning=0.99).sealed())
+        oc.check_certificate(wide, replace(honest, method="guess/1").seal())
+    assert not oc.check_certificate(wide, replace(honest, conditioning=0.99).seal())
 
 
 @pytest.mark.parametrize(
@@ -92,20 +92,20 @@ def test_what_is_printed_is_computed_again() -> None:
     """With a digest that fits: it protects against accidents, and the check against the rest."""
     known, honest = chart(), certified()
     centre = tuple(known.problem.domain.centre)
-    assert not oc.check_certificate(known, replace(honest, fold=(centre, centre)).sealed())
+    assert not oc.check_certificate(known, replace(honest, fold=(centre, centre)).seal())
     with pytest.raises(CertifyError, match="leaves out singular values up to 0.3, the domain 0"):
-        oc.check_certificate(known, replace(honest, least_singular_value=0.3).sealed())
+        oc.check_certificate(known, replace(honest, least_singular_value=0.3).seal())
     box = honest.injective
     assert box is not None
     shifted = replace(box, low=box.low + 0.01, high=box.high + 0.01)
-    assert not oc.check_certificate(known, replace(honest, injective=shifted).sealed())
+    assert not oc.check_certificate(known, replace(honest, injective=shifted).seal())
 
 
 def test_a_bound_under_another_metric_is_refused() -> None:
     linear = oc.fit(planar(), oc.Linear()).chart
     found = oc.certify(linear)
     with pytest.raises(CertifyError, match="bound is 0.1 with metric inertia"):
-        oc.check_certificate(linear, replace(found, bound=0.1).sealed())
+        oc.check_certificate(linear, replace(found, bound=0.1).seal())
 
 
 def test_a_fold_is_checked_at_its_two_points() -> None:
@@ -113,10 +113,10 @@ def test_a_fold_is_checked_at_its_two_points() -> None:
     found = oc.certify(folding)
     assert len(found.fold) == 2
     assert oc.check_certificate(folding, found)
-    assert not oc.check_certificate(folding, replace(found, fold=found.fold[:1] * 2).sealed())
+    assert not oc.check_certificate(folding, replace(found, fold=found.fold[:1] * 2).seal())
     domain = folding.problem.domain
     outside = tuple(domain.centre + 3 * (np.array(found.fold[1]) - domain.centre))
-    assert not oc.check_certificate(folding, replace(found, fold=(found.fold[0], outside)).sealed())
+    assert not oc.check_certificate(folding, replace(found, fold=(found.fold[0], outside)).seal())
 
 
 @pytest.mark.parametrize("codes", [[0], [0, PROVED], [PROVED, PROVED], [7, PROVED, PROVED], []])
@@ -239,7 +239,7 @@ def test_the_command_says_first_what_is_not_proved(tmp_path: Path) -> None:
     assert "100" not in checked.stdout.split("method")[0].replace("1000", "")
     known = oc.load(path).certificate
     assert known is not None
-    nearly = replace(known, regular=almost_whole(known.regular)).sealed()
+    nearly = replace(known, regular=almost_whole(known.regular)).seal()
     assert nearly.share > 1 - 1e-12
     assert "no fold on 99.9999% of the domain" in nearly.heading
 
@@ -257,7 +257,7 @@ def test_numbers_that_no_check_covers_are_left_out_of_certificates(tmp_path: Pat
     for count, honest in ((7, True), (8, False)):
         known.save(path)
         header: Any = header_of(path)
-        header["certificate"] |= {"dead": count, "digest": certified()._content_digest(7)}
+        header["certificate"] |= {"dead": count, "digest": certified()._compute_digest(7)}
         resealed(path, header)
         if honest:
             assert "dead" not in oc.load(path).certificate.as_dict()  # type: ignore[union-attr]

@@ -7,11 +7,12 @@ from test_taylor_models import values_at
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.certificates.chart_rows import joint_models, true_gradients
 from orthocas.certificates.graph import TaylorGraph
+from orthocas.certificates.outside import find_periodic_joints
+from orthocas.certificates.rows import build_joint_models, build_true_gradients
 from orthocas.errors import CertifyError
 from orthocas.tools.batch import dense_function
-from orthocas.tools.expressions import gradient_dependences, periodic_joints, to_tape
+from orthocas.tools.expressions import find_gradient_dependences, write_tape
 
 C = 2.0**55  #: spacing of numbers there: 8
 
@@ -63,11 +64,11 @@ def test_gradients_contain_those_of_casadi() -> None:
     rng = np.random.default_rng(5)
     low = rng.uniform(0.5, 1.0, (100, 2))
     half = rng.uniform(0, 0.1, (100, 2))
-    joints, _ = joint_models(low, low + 2 * half, (0, 1))
+    joints, _ = build_joint_models(low, low + 2 * half, (0, 1))
     t = rng.uniform(-1, 1, (100, 2))
     points = low + half + half * t
     J = np.array([np.array(true(point)).ravel("F") for point in points])
-    entries = TaylorGraph.of(h, "it", (0, 1))(joints)
+    entries = TaylorGraph.build(h, "it", (0, 1))(joints)
     assert len(entries) == J.shape[1] == 14
     for entry, wanted in zip(entries, J.T, strict=True):
         there = np.broadcast_to(values_at(entry, t), wanted.shape)
@@ -81,8 +82,8 @@ def test_gradients_of_tasks_contain_finite_differences(kind: str) -> None:
     task = oc.Task.named(known.robot, kind, known.domain.centre)
     rng, n = np.random.default_rng(5), known.robot.n
     q = known.domain.centre + 0.3 * rng.uniform(-1, 1, (30, n))
-    rows, depends = true_gradients(task, range(n))
-    J = rows(joint_models(q - 0.01, q + 0.01, tuple(sorted(depends)))[0])
+    rows, depends = build_true_gradients(task, range(n))
+    J = rows(build_joint_models(q - 0.01, q + 0.01, tuple(sorted(depends)))[0])
     t = rng.uniform(-1, 1, (30, n))
     h, step = task.batched, 1e-5
     for k in range(n):
@@ -95,11 +96,11 @@ def test_gradients_of_tasks_contain_finite_differences(kind: str) -> None:
 def test_joints_that_gradients_depend_on_are_read_from_the_steps() -> None:
     q = ca.SX.sym("q", 4)
     h = dense_function("h", [q], [ca.vertcat(0.3 * q[0] + q[1] * q[2] - q[3] / 2, ca.sin(q[1]) + 2 / q[3])])
-    linear, bent = gradient_dependences(to_tape(h))
+    linear, bent = find_gradient_dependences(write_tape(h))
     assert linear == {0: set(), 1: {2}, 2: {1}, 3: set()}
     assert bent == {1: {1}, 3: {3}}
     hidden = dense_function("h", [q], [rounded(q)])  # CasADi's derivative of C (x + 1) - C x has no x
-    assert gradient_dependences(to_tape(hidden))[0] == {0: {0}}
+    assert find_gradient_dependences(write_tape(hidden))[0] == {0: {0}}
 
 
 def test_periods_are_read_from_the_steps() -> None:
@@ -107,8 +108,14 @@ def test_periods_are_read_from_the_steps() -> None:
     turning = ca.sin(q[0]) + ca.cos(3 * q[1] - 2 * q[2])
     whole = ca.vertcat(turning, q[3] + ca.atan2(ca.sin(q[3]), 2 + ca.cos(q[3])), ca.sin(q[4] / 2), q[5] ** 2)
     h = dense_function("h", [q], [whole])
-    assert periodic_joints(to_tape(h), 6) == {0, 1, 2, 3}
-    assert periodic_joints(to_tape(dense_function("h", [q], [ca.sin(1.5 * q[0]) + ca.tan(q[1])])), 6) == {1, 2, 3, 4, 5}
+    assert find_periodic_joints(write_tape(h), 6) == {0, 1, 2, 3}
+    assert find_periodic_joints(write_tape(dense_function("h", [q], [ca.sin(1.5 * q[0]) + ca.tan(q[1])])), 6) == {
+        1,
+        2,
+        3,
+        4,
+        5,
+    }
 
 
 @pytest.mark.parametrize(
@@ -124,4 +131,4 @@ def test_periods_are_read_from_the_steps() -> None:
 def test_what_has_no_bounds_is_refused_by_name(made: object, complaint: str) -> None:
     q = ca.SX.sym("q", 2)
     with pytest.raises(CertifyError, match=complaint):
-        TaylorGraph.of(dense_function("h", [q], [made(q)]), "it", (0, 1))  # type: ignore[operator]
+        TaylorGraph.build(dense_function("h", [q], [made(q)]), "it", (0, 1))  # type: ignore[operator]

@@ -10,24 +10,32 @@ from public_objects import planar
 
 import orthocas as oc
 from orthocas.bases.family import JointSpace
-from orthocas.certificates.chart_rows import chart_rows
-from orthocas.certificates.determinant import DEGREE, CofactorJudge, Determinant, least_value, multi_indices_up_to
-from orthocas.certificates.judges import NEVER
-from orthocas.certificates.outside import OutsideJudge, inside_judge, judge_of
-from orthocas.certificates.waves import Waves, cofactors, waves_of
-from orthocas.charts.certificate import COFACTORS, ELIMINATION, OPEN, PROVED, Subdivision, halfway
+from orthocas.certificates.box_checks import NEVER
+from orthocas.certificates.determinant import (
+    SERIES_DEGREE,
+    CofactorCheck,
+    Determinant,
+    Waves,
+    bound_polynomial,
+    compute_cofactors,
+    expand_waves,
+    list_indices,
+)
+from orthocas.certificates.outside import OutsideCheck, choose_check, choose_inside_check
+from orthocas.certificates.rows import build_chart_rows
+from orthocas.charts.certificate import COFACTORS, ELIMINATION, OPEN, PROVED, Subdivision, halve_interval
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import CertifyError
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import to_tape
+from orthocas.tools.expressions import write_tape
 
 ROUNDING = 1e-12  # of plain evaluations that bounds are compared with
 
 
 def values_at(coefficients: Array, t: Array) -> Array:
     """Polynomials (monomials, boxes) at t (boxes, n)."""
-    terms = [t[:, list(m)].prod(axis=1) for m in multi_indices_up_to(t.shape[1], DEGREE)]
+    terms = [t[:, list(m)].prod(axis=1) for m in list_indices(t.shape[1], SERIES_DEGREE)]
     return np.asarray((coefficients * np.array(terms)).sum(axis=0))
 
 
@@ -76,16 +84,16 @@ def test_sums_of_waves_are_what_they_stand_for() -> None:
     mixed = (s * c + Waves.constant(0.3, 2)) * (s - c)
     np.testing.assert_allclose(mixed(q), (sine * cosine + 0.3) * (sine - cosine), atol=ROUNDING)
     slope = np.cos(q[:, 0]) * (cosine * (sine - cosine) + sine * cosine + 0.3)
-    np.testing.assert_allclose(mixed.derivative(0)(q), slope, atol=ROUNDING)
+    np.testing.assert_allclose(mixed.differentiate(0)(q), slope, atol=ROUNDING)
     assert 0 < mixed.error < 1e-13
-    assert 1.0 <= (s * s + Waves.cosine(0, 2) * Waves.cosine(0, 2)).trimmed().size < 1 + 1e-12  # one wave is left
+    assert 1.0 <= (s * s + Waves.cosine(0, 2) * Waves.cosine(0, 2)).trim().size < 1 + 1e-12  # one wave is left
 
 
 def test_errors_of_waves_are_carried() -> None:
     wrong = Waves.constant(2.0, 1, 0.1)
     assert (wrong * wrong).error >= 0.41  # (2 + 0.1)^2 - 2^2
     assert (wrong + wrong).error >= 0.2
-    assert wrong.derivative(0).error == 0  # of a constant
+    assert wrong.differentiate(0).error == 0  # of a constant
 
 
 @pytest.mark.parametrize("expression", ["exp", "slide", "double"])
@@ -95,12 +103,12 @@ def test_what_makes_no_waves_is_refused(expression: str) -> None:
     q = ca.SX.sym("q", 2)
     value = {"exp": ca.exp(ca.sin(q[0])), "slide": q[0] * ca.cos(q[1]), "double": ca.sin(3 * q[0])}[expression]
     with pytest.raises(CertifyError, match="the task uses"):
-        waves_of(to_tape(ca.Function("h", [q], [value])), 2)
+        expand_waves(write_tape(ca.Function("h", [q], [value])), 2)
 
 
 def test_cofactors_are_those_of_numbers() -> None:
     numbers = np.random.default_rng(2).normal(size=(3, 4))
-    found = cofactors([[Waves.constant(x, 1) for x in row] for row in numbers])
+    found = compute_cofactors([[Waves.constant(x, 1) for x in row] for row in numbers])
     z = np.array([each(np.zeros((1, 1)))[0] for each in found])
     g = np.random.default_rng(3).normal(size=4)
     assert z @ g == pytest.approx(np.linalg.det(np.vstack([numbers, g])), abs=1e-13)
@@ -109,7 +117,7 @@ def test_cofactors_are_those_of_numbers() -> None:
 @pytest.mark.parametrize("name", ["planar", pytest.param("poses", marks=pytest.mark.slow)])
 def test_expansions_contain_det_j(name: str) -> None:
     chart = folding() if name == "planar" else of_poses()
-    found, rng = Determinant.of(chart), np.random.default_rng(4)
+    found, rng = Determinant.build(chart), np.random.default_rng(4)
     assert found is not None
     domain, count = chart.problem.domain, 100
     middle = domain.centre + 0.8 * domain.half_width * rng.uniform(-1, 1, (count, chart.n))
@@ -131,7 +139,7 @@ def test_joints_on_which_self_motions_do_not_depend_do_not_count() -> None:
     problem = oc.Problem(
         known.robot, oc.Task.pose(known.robot), domain=oc.Box([0.0, 0.6, 0.2, -1.2, 0.2, 0.9, 0.0], 0.4)
     )
-    found = Determinant.of(oc.fit(problem, oc.Linear()).chart)
+    found = Determinant.build(oc.fit(problem, oc.Linear()).chart)
     assert found is not None
     assert found.joints == (1, 2, 3, 4, 5)
 
@@ -139,27 +147,27 @@ def test_joints_on_which_self_motions_do_not_depend_do_not_count() -> None:
 def test_least_values_are_below_all_values_and_exact_at_corners() -> None:
     rng = np.random.default_rng(5)
     for n in (1, 3, 5):
-        size = np.array([0.3 ** len(m) for m in multi_indices_up_to(n, DEGREE)])
+        size = np.array([0.3 ** len(m) for m in list_indices(n, SERIES_DEGREE)])
         coefficients = rng.normal(size=(len(size), 40)) * size[:, None]
-        least = least_value(coefficients, n)
+        least = bound_polynomial(coefficients, n)
         corners = rng.choice([-1.0, 1.0], (40, n))
         for t in [*rng.uniform(-1, 1, (20, 40, n)), corners]:
             assert (values_at(coefficients, t) >= least).all()
-    bilinear = np.zeros((len(multi_indices_up_to(2, DEGREE)), 1))
+    bilinear = np.zeros((len(list_indices(2, SERIES_DEGREE)), 1))
     bilinear[[0, 1, 2, 4], 0] = 1.0, 1.0, 1.0, 0.5  # 1 + x + y + x y / 2, least at (-1, -1); sizes alone give -1.5
-    assert least_value(bilinear, 2)[0] == pytest.approx(-0.5, abs=1e-12)
+    assert bound_polynomial(bilinear, 2)[0] == pytest.approx(-0.5, abs=1e-12)
 
 
 @pytest.mark.slow
 def test_the_fastest_judge_that_applies_is_taken() -> None:
-    assert isinstance(inside_judge(folding(), chart_rows(folding()), 0.0), CofactorJudge)
-    assert inside_judge(folding(), chart_rows(folding()), 0.1).method == ELIMINATION
-    assert inside_judge(folding(), chart_rows(folding()), 0.0, ELIMINATION).method == ELIMINATION
-    assert Determinant.of(oc.fit(planar("euclidean"), oc.Fourier(2), samples=300).chart) is None
+    assert isinstance(choose_inside_check(folding(), build_chart_rows(folding()), 0.0), CofactorCheck)
+    assert choose_inside_check(folding(), build_chart_rows(folding()), 0.1).method == ELIMINATION
+    assert choose_inside_check(folding(), build_chart_rows(folding()), 0.0, ELIMINATION).method == ELIMINATION
+    assert Determinant.build(oc.fit(planar("euclidean"), oc.Fourier(2), samples=300).chart) is None
     position = oc.problems.get("iiwa")
     four = oc.fit(oc.Problem(position.robot, position.task, domain=oc.Box(position.domain.centre, 0.2)), oc.Linear())
     with pytest.raises(CertifyError, match="no expansion"):
-        inside_judge(four.chart, chart_rows(four.chart), 0.0, COFACTORS)
+        choose_inside_check(four.chart, build_chart_rows(four.chart), 0.0, COFACTORS)
 
 
 @pytest.mark.slow
@@ -168,7 +176,10 @@ def test_both_judges_see_the_same_signs() -> None:
     domain = chart.problem.domain
     middle = domain.centre + 0.9 * domain.half_width * rng.uniform(-1, 1, (100, 7))
     low, high = middle - 0.02, middle + 0.02
-    one, two = (inside_judge(chart, chart_rows(chart), 0.0, method)(low, high) for method in (COFACTORS, ELIMINATION))
+    one, two = (
+        choose_inside_check(chart, build_chart_rows(chart), 0.0, method)(low, high)
+        for method in (COFACTORS, ELIMINATION)
+    )
     both = one.proved & two.proved
     assert both.sum() > 50
     assert (one.sign == two.sign)[both].all()
@@ -201,9 +212,9 @@ def test_the_domain_keeps_folds_out_of_what_is_not_proved(tmp_path: Path) -> Non
     assert again.certificate is not None
     assert again.certificate.as_dict() == found.as_dict()
     assert oc.check_certificate(again)
-    assert not oc.check_certificate(chart, replace(found, clear_share=0.9999).sealed())
+    assert not oc.check_certificate(chart, replace(found, clear_share=0.9999).seal())
     with pytest.raises(CertifyError, match="by another volume"):
-        oc.check_certificate(chart, replace(found, least_volume=0.2).sealed())
+        oc.check_certificate(chart, replace(found, least_volume=0.2).seal())
 
 
 def test_what_the_domain_keeps_out_is_not_halved() -> None:
@@ -213,8 +224,8 @@ def test_what_the_domain_keeps_out_is_not_halved() -> None:
     points = sample_uniform(oc.Box(domain.centre, domain.half_width), 2000, 1)
     kept_out = points[(domain.volumes(points) < -0.1) & (domain.singular_values(points) > 0.2)][:20]
     assert len(kept_out) > 5
-    judge = judge_of(chart, chart_rows(chart), 0.0)
-    assert isinstance(judge, OutsideJudge)
+    judge = choose_check(chart, build_chart_rows(chart), 0.0)
+    assert isinstance(judge, OutsideCheck)
     found = judge(kept_out - 1e-3, kept_out + 1e-3)
     assert not found.proved.any()
     assert not found.regular.any()  # no fold of the chart, whose domain ends before it
@@ -230,7 +241,7 @@ def test_parts_are_found_in_order() -> None:
         if code >= PROVED:
             return k + 1, [(code, low.tolist(), high.tolist())]
         top, bottom = high.copy(), low.copy()
-        top[code] = bottom[code] = halfway(low[code], high[code])
+        top[code] = bottom[code] = halve_interval(low[code], high[code])
         middle, first = walked(k + 1, low, top)
         end, second = walked(middle, bottom, high)
         return end, first + second

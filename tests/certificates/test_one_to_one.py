@@ -12,24 +12,24 @@ from public_objects import network, planar
 from random_arms import random_arm, second_solutions
 
 import orthocas as oc
-from orthocas.certificates.chart_rows import chart_rows
 from orthocas.certificates.jets import Jets
-from orthocas.certificates.one_to_one import OneToOneJudge, one_to_one_judge
-from orthocas.certificates.search import Limits, Search, largest_first
+from orthocas.certificates.one_to_one import OneToOneCheck, choose_one_to_one_check
+from orthocas.certificates.rows import build_chart_rows
+from orthocas.certificates.search import Limits, Search, rank_by_volume
 from orthocas.charts.certificate import PROVED, Subdivision
 
 certifying = importlib.import_module("orthocas.certificates.certify")  # a function has the name of the module
 
 
-def judge_on(known: oc.Chart, half: np.ndarray) -> tuple[OneToOneJudge, Subdivision]:
+def judge_on(known: oc.Chart, half: np.ndarray) -> tuple[OneToOneCheck, Subdivision]:
     centre = known.problem.domain.centre
     box = Subdivision.whole(centre - half, centre + half)
-    return one_to_one_judge(known, chart_rows(known), box), box
+    return choose_one_to_one_check(known, build_chart_rows(known), box), box
 
 
 def proved(known: oc.Chart, half: np.ndarray, boxes: int) -> bool:
     judge, box = judge_on(known, half)
-    search = Search(judge, box, Limits(boxes=boxes), largest_first(box))
+    search = Search(judge, box, Limits(boxes=boxes), rank_by_volume(box))
     search.run(lambda _: None)
     return search.finished
 
@@ -75,9 +75,9 @@ def test_finite_differences_of_phi_lie_within_their_bounds(task: str, order: int
     middle = known.problem.domain.centre + (half - width) * rng.uniform(-1, 1, (parts, known.n))
     low, high = middle - width, middle + width
     active = list(judge.active)
-    around = replace(judge._around(low, high), order=order)
+    around = replace(judge._build_around(low, high), order=order)
     assert judge.coordinates is not None
-    jets = Jets.joined([judge.task(middle.T, around), judge.coordinates.jets(around)])
+    jets = Jets.join([judge.task(middle.T, around), judge.coordinates.build_jets(around)])
     model, terms = jets.average(around, judge.active)
     for k in range(parts):
         for _ in range(20):
@@ -120,7 +120,7 @@ def test_no_second_solution_is_found_in_a_proved_box_of_a_random_arm(task: str) 
     held = 0
     for seed in range(2):
         known = arm_chart(seed, task)
-        base = certifying.whole_domain(known.problem.domain)
+        base = certifying.cover_domain(known.problem.domain)
         for scale in (1.0, 0.6, 0.3):
             if proved(known, known.problem.domain.half_width * scale, 50):
                 middle, half = known.problem.domain.centre, known.problem.domain.half_width * scale
@@ -176,7 +176,7 @@ def test_one_to_one_part_of_an_older_method_is_void() -> None:
 def test_forged_one_to_one_box_in_one_part_does_not_pass_the_check() -> None:
     regular = certified(0.4).regular
     box = Subdivision(regular.low, regular.high, np.array([PROVED], dtype=np.uint8))
-    assert not oc.check_certificate(chart(0.4), replace(certified(0.4), injective=box).sealed())
+    assert not oc.check_certificate(chart(0.4), replace(certified(0.4), injective=box).seal())
 
 
 def test_angle_of_a_whole_turn_is_no_difference() -> None:
@@ -197,4 +197,4 @@ def test_angle_of_a_whole_turn_is_no_difference() -> None:
 
     jumping = oc.Problem(arm, oc.Task.custom(arm, "angle", angle), domain=oc.Box(centre, half))
     chart_ = oc.fit(jumping, oc.Linear(), samples=200).chart
-    assert one_to_one_judge(chart_, chart_rows(chart_), judge_on(known, half)[1]) is None
+    assert choose_one_to_one_check(chart_, build_chart_rows(chart_), judge_on(known, half)[1]) is None

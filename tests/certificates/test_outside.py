@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import orthocas as oc
-from orthocas.certificates.chart_rows import chart_rows
-from orthocas.certificates.outside import OutsideJudge, judge_of
-from orthocas.certificates.search import Limits, Search, largest_first
+from orthocas.certificates.outside import OutsideCheck, choose_check
+from orthocas.certificates.rows import build_chart_rows
+from orthocas.certificates.search import Limits, Search, rank_by_volume
 
 certifying = importlib.import_module("orthocas.certificates.certify")  # a function has the name of the module
 BOUND = 0.1
@@ -28,9 +28,9 @@ def test_boxes_that_lie_outside_for_a_pose_hold_no_position_that_is_clear_for_th
     domain, bound, rng = pose_chart.problem.domain, BOUND / 2, np.random.default_rng(0)
     middle = domain.centre + domain.half_width * rng.uniform(-1, 1, (2000, 7))
     half = rng.uniform(0.001, 0.05, (2000, 1)) * np.ones(7)
-    judge = judge_of(pose_chart, chart_rows(pose_chart), 0.0)
-    assert isinstance(judge, OutsideJudge)
-    outside = judge.lie_outside(middle - half, middle + half)[0]
+    judge = choose_check(pose_chart, build_chart_rows(pose_chart), 0.0)
+    assert isinstance(judge, OutsideCheck)
+    outside = judge.check_outside(middle - half, middle + half)[0]
     assert outside.sum() > 50
     points = middle[outside, None] + half[outside, None] * rng.uniform(-1, 1, (int(outside.sum()), 100, 7))
     assert domain.singular_values(points.reshape(-1, 7)).max() <= bound
@@ -52,9 +52,9 @@ def test_boxes_without_a_proof_of_their_own_hold_no_clear_position(chart: oc.Cha
     domain, rng = chart.problem.domain, np.random.default_rng(0)
     middle = domain.centre + domain.half_width * rng.uniform(-1, 1, (3000, 7))
     half = rng.uniform(0.01, 0.2, (3000, 1)) * np.ones(7)
-    judge = judge_of(chart, chart_rows(chart), 0.0)
-    assert isinstance(judge, OutsideJudge)
-    found, outside = judge(middle - half, middle + half), judge.lie_outside(middle - half, middle + half)[0]
+    judge = choose_check(chart, build_chart_rows(chart), 0.0)
+    assert isinstance(judge, OutsideCheck)
+    found, outside = judge(middle - half, middle + half), judge.check_outside(middle - half, middle + half)[0]
     assert outside.sum() > 50
     points = middle[outside, None] + half[outside, None] * rng.uniform(-1, 1, (int(outside.sum()), 400, 7))
     assert domain.singular_values(points.reshape(-1, 7)).max() <= BOUND
@@ -64,8 +64,8 @@ def test_boxes_without_a_proof_of_their_own_hold_no_clear_position(chart: oc.Cha
 
 @pytest.mark.slow
 def test_a_chart_next_to_singular_positions_needs_few_boxes(chart: oc.Chart) -> None:
-    base = certifying.whole_domain(chart.problem.domain)
-    search = Search(judge_of(chart, chart_rows(chart), 0.0), base, Limits(), largest_first(base))
+    base = certifying.cover_domain(chart.problem.domain)
+    search = Search(choose_check(chart, build_chart_rows(chart), 0.0), base, Limits(), rank_by_volume(base))
     search.run(lambda _: None)
     assert search.finished
-    assert search.judged < 400  # 165; with singular vectors that stay and boxes halved by linear terms alone 2,421
+    assert search.evaluated < 400  # 165; with singular vectors that stay and boxes halved by linear terms alone 2,421

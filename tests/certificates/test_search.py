@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 import orthocas as oc
-from orthocas.certificates.judges import UNKNOWN, Verdicts
-from orthocas.certificates.search import Limits, Search, largest_first
+from orthocas.certificates.box_checks import UNKNOWN, BoxResults
+from orthocas.certificates.search import Limits, Search, rank_by_volume
 from orthocas.charts.certificate import Subdivision
 
 
@@ -18,15 +18,15 @@ class SmallBoxes:
     narrow: float
     choice: int = UNKNOWN
 
-    def __call__(self, low: np.ndarray, high: np.ndarray) -> Verdicts:
+    def __call__(self, low: np.ndarray, high: np.ndarray) -> BoxResults:
         proved = ((high - low)[:, list(self.joints)] <= self.narrow).all(axis=1)
         nothing = np.zeros(len(low))
-        return Verdicts(proved, proved, nothing, nothing, np.full(len(low), self.choice))
+        return BoxResults(proved, proved, nothing, nothing, np.full(len(low), self.choice))
 
 
 def searched(judge: SmallBoxes, **limits: float) -> Search:
     base = Subdivision.whole(np.zeros(3), np.array([1.0, 8.0, 1.0]))
-    search = Search(judge, base, Limits(**limits), largest_first(base))
+    search = Search(judge, base, Limits(**limits), rank_by_volume(base))
     search.run(lambda _: None)
     return search
 
@@ -35,19 +35,19 @@ def test_joints_are_halved_in_turn_where_bounds_are_infinite() -> None:
     """A choice that stays the same would halve the first joint for ever."""
     search = searched(SmallBoxes((0, 1), 0.5))
     assert search.finished
-    assert search.subdivision().proved_count == 16 * 16  # both down to a 16th; joint 3 is never halved
+    assert search.build_subdivision().proved_count == 16 * 16  # both down to a 16th; joint 3 is never halved
 
 
 def test_search_that_gives_up_counts_its_dead_boxes() -> None:
     search = searched(SmallBoxes((0, 1), 0.5, choice=0), smallest=2.0**-3)
     assert not search.finished
     assert search.dead == 8  # joint 1 was halved three times, and then not any more
-    assert search.subdivision().open_count == search.open_count == 8
+    assert search.build_subdivision().open_count == search.open_count == 8
 
 
 def test_search_that_is_too_slow_ends_early() -> None:
     search = searched(SmallBoxes((0, 1, 2), 0.01), boxes=10_000, hopeless=600)
-    assert 600 < search.judged < 3000
+    assert 600 < search.evaluated < 3000
 
 
 def test_a_search_that_gives_up_proves_nothing_and_says_so_first() -> None:

@@ -11,19 +11,19 @@ from public_objects import given, network
 
 import orthocas as oc
 from orthocas.certificates import taylor
-from orthocas.certificates.chart_rows import chart_rows, joint_models
+from orthocas.certificates.box_checks import bound_conditioning, compute_pivots, lower_bound, rotate_to_singular_basis
 from orthocas.certificates.graph import TaylorGraph
-from orthocas.certificates.judges import conditioning_bound, in_singular_basis, lower_bound, pivots
+from orthocas.certificates.rows import build_chart_rows, build_joint_models
 from orthocas.certificates.taylor import (
     TaylorModel,
-    above,
-    exponential,
-    hyperbolic_tangent,
-    monomials,
-    sine_and_cosine,
+    compute_margin,
+    evaluate_exponential,
+    evaluate_sine_cosine,
+    evaluate_tanh,
+    list_monomials,
     sum_error,
 )
-from orthocas.tasks.samples import samples_at
+from orthocas.tasks.samples import evaluate_samples
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
 
@@ -45,15 +45,15 @@ def factorial(k: int) -> int:
 
 def values_at(model: TaylorModel, t: Array) -> Array:
     """The polynomial of a model at t (boxes, n)."""
-    powers = np.stack([t[:, list(m)].prod(axis=1) for m in monomials(model.variables)])
+    powers = np.stack([t[:, list(m)].prod(axis=1) for m in list_monomials(model.variables)])
     return np.asarray((model.coefficients * powers.reshape(len(powers), *[1] * (model.remainder.ndim - 1), -1)).sum(0))
 
 
 @pytest.mark.slow
 def test_sine_cosine_and_exponential_contain_the_exact_values() -> None:
     points = np.random.default_rng(5).uniform(-9, 9, 60)
-    (s, s_error), (c, c_error) = sine_and_cosine(points)
-    e, e_error = exponential(points)
+    (s, s_error), (c, c_error) = evaluate_sine_cosine(points)
+    e, e_error = evaluate_exponential(points)
     for k, x in enumerate(points):
         sine = exact_series(x, lambda j: Fraction((0, 1, 0, -1)[j % 4], factorial(j)), 70)
         cosine = exact_series(x, lambda j: Fraction((1, 0, -1, 0)[j % 4], factorial(j)), 70)
@@ -65,29 +65,29 @@ def test_sine_cosine_and_exponential_contain_the_exact_values() -> None:
 
 def test_sines_of_large_numbers_contain_the_values_of_the_sum_formula() -> None:
     half = np.random.default_rng(5).uniform(1e3, 4e5, 1000)
-    (s, error), (c, _) = sine_and_cosine(half)
-    (double, double_error), _ = sine_and_cosine(2 * half)
+    (s, error), (c, _) = evaluate_sine_cosine(half)
+    (double, double_error), _ = evaluate_sine_cosine(2 * half)
     assert (np.abs(double - 2 * s * c) <= double_error + 4 * error + 1e-15).all()
 
 
 def test_tanh_is_within_its_error_of_the_library() -> None:
     points = np.random.default_rng(5).uniform(-25, 25, 1000)
-    value, error = hyperbolic_tangent(points)
+    value, error = evaluate_tanh(points)
     assert (np.abs(value - np.tanh(points)) <= error + 2e-16).all()
     assert error.max() < 1e-13
 
 
 @pytest.mark.parametrize("x", [1e7, np.inf, np.nan])
 def test_nothing_is_known_outside_the_range_of_the_proof(x: float) -> None:
-    assert np.isinf(sine_and_cosine(np.array([x]))[0][1]).all()
-    assert np.isinf(exponential(np.array([x]))[1]).all()
+    assert np.isinf(evaluate_sine_cosine(np.array([x]))[0][1]).all()
+    assert np.isinf(evaluate_exponential(np.array([x]))[1]).all()
 
 
 @pytest.mark.parametrize("name", [*taylor.UNARY])
 def test_functions_of_models_contain_sampled_values(name: str) -> None:
     rng = np.random.default_rng(5)
     low = rng.uniform(0.3, 0.6, (200, 2))
-    (x, y), _ = joint_models(low, low + rng.uniform(0, 0.2, (200, 2)), (0, 1))
+    (x, y), _ = build_joint_models(low, low + rng.uniform(0, 0.2, (200, 2)), (0, 1))
     t = rng.uniform(-1, 1, (200, 2))
     inner = x * y + x
     model = taylor.UNARY[name](inner)
@@ -102,7 +102,7 @@ def test_functions_of_models_contain_sampled_values(name: str) -> None:
 
 
 def test_reciprocals_and_roots_give_up_where_they_may_be_undefined() -> None:
-    (x,), _ = joint_models(np.array([[-0.1]]), np.array([[0.2]]), (0,))
+    (x,), _ = build_joint_models(np.array([[-0.1]]), np.array([[0.2]]), (0,))
     for function in (taylor.reciprocal, taylor.square_root, taylor.reciprocal_square_root):
         assert not np.isfinite(function(x).remainder).any()
         assert not (lower_bound(function(x)) > -np.inf).any()
@@ -118,7 +118,7 @@ def test_exact_products_lie_within_the_remainder() -> None:
     for box in range(20):
         exact = []
         for model in (a, b, product):
-            powers = [Fraction(1) * np.prod([t[v] for v in m] or [Fraction(1)]) for m in monomials((0, 1))]
+            powers = [Fraction(1) * np.prod([t[v] for v in m] or [Fraction(1)]) for m in list_monomials((0, 1))]
             exact.append(sum(Fraction(c) * p for c, p in zip(model.coefficients[:, box], powers, strict=True)))
         ends = [
             (exact[0] + Fraction(a.remainder[box]) * i) * (exact[1] + Fraction(b.remainder[box]) * j)
@@ -134,7 +134,7 @@ def test_lower_bounds_lie_below_all_values_and_are_sharp_for_parabolas() -> None
     bound = lower_bound(model)
     for _ in range(200):
         assert (values_at(model, rng.uniform(-1, 1, (50, 2))) - model.remainder >= bound).all()
-    (x,), _ = joint_models(np.array([[-1.0]]), np.array([[2.0]]), (0,))
+    (x,), _ = build_joint_models(np.array([[-1.0]]), np.array([[2.0]]), (0,))
     assert lower_bound(x * x)[0] == pytest.approx(0, abs=1e-12)
 
 
@@ -142,7 +142,7 @@ def test_lower_bounds_lie_below_all_values_and_are_sharp_for_parabolas() -> None
 def test_models_of_the_jacobian_contain_it(build: Callable[[], oc.Chart]) -> None:
     known = build()
     rng = np.random.default_rng(5)
-    domain, rows = known.problem.domain, chart_rows(known)
+    domain, rows = known.problem.domain, build_chart_rows(known)
     half = domain.half_width / 3
     middle = domain.centre + (domain.half_width - half) * rng.uniform(-1, 1, (300, known.n))
     t = rng.uniform(-1, 1, (300, known.n))
@@ -164,25 +164,25 @@ def test_models_of_the_jacobian_contain_it(build: Callable[[], oc.Chart]) -> Non
 
 def test_products_of_pivots_are_the_determinant() -> None:
     known, rng = chart(), np.random.default_rng(5)
-    domain, rows = known.problem.domain, chart_rows(known)
+    domain, rows = known.problem.domain, build_chart_rows(known)
     half = np.full((50, 7), 0.02)
     middle = domain.centre + 0.18 * rng.uniform(-1, 1, (50, 7))
-    turned, signs = in_singular_basis(rows(middle - half, middle + half))
-    found = np.prod([p.centre for p in pivots(turned)], axis=0) * signs
+    turned, signs = rotate_to_singular_basis(rows(middle - half, middle + half))
+    found = np.prod([p.centre for p in compute_pivots(turned)], axis=0) * signs
     true = np.linalg.det(known.jacobian(middle)) / known.coordinates.scale.prod()
     assert np.allclose(found, true, rtol=1e-9)
 
 
 def test_bounds_of_the_conditioning_lie_below_it() -> None:
     known, rng = chart(), np.random.default_rng(5)
-    domain, rows = known.problem.domain, chart_rows(known)
+    domain, rows = known.problem.domain, build_chart_rows(known)
     half = np.full((40, 7), 0.05)
     middle = domain.centre + 0.15 * rng.uniform(-1, 1, (40, 7))
-    bound = conditioning_bound(rows(middle - half, middle + half), known.m)
+    bound = bound_conditioning(rows(middle - half, middle + half), known.m)
     assert (bound > 0.2).all()
     for _ in range(50):
         q = middle + half * rng.uniform(-1, 1, middle.shape)
-        samples = samples_at(known.problem, q)
+        samples = evaluate_samples(known.problem, q)
         unit = known.coordinates.jacobian(q)
         unit /= np.linalg.norm(unit, axis=2, keepdims=True)
         smallest = np.linalg.svd(np.concatenate([samples.task_basis, unit], axis=1), compute_uv=False)[:, -1]
@@ -192,8 +192,8 @@ def test_bounds_of_the_conditioning_lie_below_it() -> None:
 def test_graphs_with_whole_powers_are_bounded() -> None:
     q = ca.SX.sym("q", 2)
     f = dense_function("f", [q], [ca.vertcat(q[0] ** 5 / q[1], q[1] ** -3)])
-    joints, _ = joint_models(np.array([[1.0, 2.0]]), np.array([[1.1, 2.2]]), (0, 1))
-    for k, model in enumerate(TaylorGraph.of(f, "it")(joints)):
+    joints, _ = build_joint_models(np.array([[1.0, 2.0]]), np.array([[1.1, 2.2]]), (0, 1))
+    for k, model in enumerate(TaylorGraph.build(f, "it")(joints)):
         true = float(f([1.1, 2.2])[k])
         assert abs(values_at(model, np.ones((1, 2)))[0] - true) <= model.remainder[0] + 1e-14
 
@@ -202,8 +202,10 @@ def test_graphs_with_whole_powers_are_bounded() -> None:
 def test_lower_bounds_of_long_sums_lie_below_the_exact_ones(count: int) -> None:
     """1 + many numbers below half of its spacing: each of them is lost, and all roundings go the same way."""
     variables = tuple(range(count))
-    coefficients = np.full((len(monomials(variables)), 2), 2**-53 * 0.9999)  # two boxes: NumPy adds row by row
-    coefficients[[monomials(variables).index((v, v)) for v in variables]] *= -1  # least at the ends of the interval
+    coefficients = np.full((len(list_monomials(variables)), 2), 2**-53 * 0.9999)  # two boxes: NumPy adds row by row
+    coefficients[
+        [list_monomials(variables).index((v, v)) for v in variables]
+    ] *= -1  # least at the ends of the interval
     coefficients[1 + count + 1] = 1.0
     exact = [Fraction(float(value)) for value in coefficients[:, 0]]
     bound = lower_bound(TaylorModel(variables, coefficients, np.zeros(2)))[0]
@@ -214,4 +216,4 @@ def test_the_error_of_a_sum_grows_with_its_terms() -> None:
     for terms in (1, 250, 286, 1771, 10**6):
         exact = Fraction(terms, 2**53) / (1 - Fraction(terms, 2**53))
         assert exact < Fraction(sum_error(terms)) < exact + Fraction(1, 2**53) * (9 + terms // 50)
-        assert Fraction(above(terms)) > 1 + exact
+        assert Fraction(compute_margin(terms)) > 1 + exact

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import orthocas as oc
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 
 Array = np.ndarray
 Header = dict[str, Any]

@@ -8,7 +8,7 @@ from charts import in_a_corridor
 from public_objects import clear
 
 import orthocas as oc
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 
 ROUNDING = 1e-12
 

@@ -6,7 +6,7 @@ from dense_search import STARTS, positions_at
 from public_objects import wide
 
 import orthocas as oc
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 
 FOUND, NEAREST = oc.InverseStatus.FOUND, oc.InverseStatus.NEAREST
 
@@ -84,5 +84,5 @@ def test_orientations_are_embedded_without_a_seam() -> None:
     q = sample_uniform(chart.problem.domain, 300, 4)
     x, y = chart.task(q), chart.task(q + 1e-3 * rng.normal(size=q.shape))
     error = np.linalg.norm(chart.relative.difference(x, y)[:, 3:], axis=1)
-    apart = np.linalg.norm(chart.relative.embedded(x) - chart.relative.embedded(y), axis=1)
+    apart = np.linalg.norm(chart.relative.embed(x) - chart.relative.embed(y), axis=1)
     np.testing.assert_allclose(apart, error, rtol=1e-4, atol=1e-12)

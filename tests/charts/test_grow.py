@@ -25,8 +25,7 @@ from orthocas.errors import (
     UnknownNameError,
 )
 from orthocas.exact.flow import Arrival, GrownCoordinates, TaskFlow
-from orthocas.exact.leaves import leaf_from_arrays
-from orthocas.tasks.metric import metric_matrices
+from orthocas.exact.leaves import read_leaf
 from orthocas.tools.archive import read_archive, write_archive
 
 ARM = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
@@ -83,7 +82,7 @@ def test_coordinates_do_not_change_along_flow_lines(chart: oc.Chart) -> None:
 def test_gradients_are_orthogonal_to_the_task(chart: oc.Chart) -> None:
     """True by construction; that the gradients are those of xi is what the test after this one shows."""
     points = known_points(chart)
-    J, A = chart.jacobian(points), metric_matrices(chart.problem.metric, points)
+    J, A = chart.jacobian(points), chart.problem.metric.evaluate(points)
     raised = np.linalg.solve(A, J[:, : chart.m].transpose(0, 2, 1))
     assert np.abs(J[:, chart.m :] @ raised).max() < 1e-6
     assert oc.evaluate(chart, 300).task_angle.max < 1e-4
@@ -363,4 +362,4 @@ def test_edited_leaves_are_refused(leaf: str, name: str, change: Callable[[np.nd
     arrays = dict(chart.coordinates.leaf.to_arrays())
     arrays[name] = change(arrays[name])
     with pytest.raises((InvalidValueError, ShapeError)):
-        leaf_from_arrays(chart.problem, leaf, arrays)
+        read_leaf(chart.problem, leaf, arrays)

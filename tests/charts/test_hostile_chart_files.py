@@ -78,7 +78,7 @@ def test_any_flipped_byte_is_an_error_or_harmless(planar_fit: Fit, saved: Path) 
 def test_array_that_numpy_cannot_read_is_an_error_of_ours(saved: Path) -> None:
     """Its checksum is right: whoever edited the file knew how."""
     garbled, header = np.lib.format.magic(1, 0) + b"\x0b\x00{'descr': (", header_of(saved)
-    header["sha256"] = {**header["sha256"], "offset.npy": archive._digest(garbled)}  # type: ignore[dict-item]
+    header["sha256"] = {**header["sha256"], "offset.npy": archive._compute_digest(garbled)}  # type: ignore[dict-item]
     with pytest.raises(ChartFileError, match="contains an array that cannot be read"):
         oc.load(rewritten(saved, {"offset.npy": garbled, "header.json": json.dumps(header).encode()}))
 
@@ -153,7 +153,7 @@ def test_arrays_are_never_unpickled(saved: Path) -> None:
     buffer = io.BytesIO()
     np.save(buffer, np.array([{"a": 1}], dtype=object), allow_pickle=True)
     header = header_of(saved)
-    header["sha256"] = {**header["sha256"], "theta.npy": archive._digest(buffer.getvalue())}  # type: ignore[dict-item]
+    header["sha256"] = {**header["sha256"], "theta.npy": archive._compute_digest(buffer.getvalue())}  # type: ignore[dict-item]
     with pytest.raises(ChartFileError, match="cannot be read"):
         oc.load(rewritten(saved, {"theta.npy": buffer.getvalue(), "header.json": json.dumps(header).encode()}))
 
@@ -267,7 +267,7 @@ def test_notes_hold_texts_and_finite_numbers(saved: Path, text: str, message: st
         ({"robot_translations": np.full((3, 3), 1e300)}, r"largest entry of translations at joint .* is 1e\+300"),
         ({"robot_lower": [np.inf] * 3, "robot_upper": [np.inf] * 3}, r"limits \[inf, inf\]"),
         ({"theta": np.zeros(34, dtype=complex) * 2}, "contains an array that cannot be read: theta.npy"),
-        ({"theta": archive.to_npy(np.zeros(3))[:-1]}, "23 bytes for the shape"),
+        ({"theta": archive.write_npy(np.zeros(3))[:-1]}, "23 bytes for the shape"),
         ({"scale": np.full(2, 1e308), "offset": np.full(2, -1e308)}, "xi is not finite at any of 8 points"),
     ],
 )

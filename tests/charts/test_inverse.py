@@ -12,7 +12,7 @@ from orthocas.charts.inverse import beyond_reach
 from orthocas.charts.newton import inverses
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError
 from orthocas.fitting.fit import Fit
-from orthocas.tasks.domains import bounds_of, sample_uniform
+from orthocas.tasks.samples import sample_uniform
 
 FOUND = oc.InverseStatus.FOUND
 BEYOND = (oc.InverseStatus.OUTSIDE_DOMAIN, oc.InverseStatus.LIMIT)
@@ -146,7 +146,7 @@ def test_corner_heavy_round_trips_of_a_ready_chart_are_found(name: str, inside: 
     rng = np.random.default_rng(77)
     unit = rng.uniform(-1, 1, (2000, chart.n))
     unit = np.sign(unit) * np.abs(unit) ** rng.choice([0.25, 0.1, 0.0], (2000, 1))
-    phi = chart.phi(np.clip(domain.centre + domain.half_width * unit, *bounds_of(domain)))
+    phi = chart.phi(np.clip(domain.centre + domain.half_width * unit, *domain.bounds))
     solutions = chart.solve(phi, inside=inside)
     assert solutions.found.all()
     np.testing.assert_allclose(chart.phi(solutions.q), phi, atol=1e-8)

@@ -9,7 +9,7 @@ from public_objects import clear
 import orthocas as oc
 from orthocas.charts.inside import Programs, minimum
 from orthocas.fitting.fit import Fit
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 
 FOUND, NEAREST = oc.InverseStatus.FOUND, oc.InverseStatus.NEAREST
 

@@ -13,8 +13,7 @@ import orthocas as oc
 from orthocas.charts.angles import judge_by_columns, judge_by_lapack
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
 from orthocas.fitting.fit import Fit
-from orthocas.tasks.domains import sample_uniform
-from orthocas.tasks.samples import samples_at
+from orthocas.tasks.samples import evaluate_samples, sample_uniform
 
 
 def leaks_by_hand(chart: oc.Chart, q: np.ndarray) -> np.ndarray:
@@ -56,7 +55,7 @@ def test_leaks_are_those_of_a_least_squares_projection(charts: dict[str, oc.Char
 def test_formulas_of_one_sample_agree_with_lapack(charts: dict[str, oc.Chart], name: str) -> None:
     chart = charts[name]
     points = sample_uniform(chart.problem.domain, 300, 5)
-    samples, J = samples_at(chart.problem, points), chart.coordinates.jacobian(points)
+    samples, J = evaluate_samples(chart.problem, points), chart.coordinates.jacobian(points)
     found, wanted = judge_by_columns(samples, J), judge_by_lapack(samples, J)
     for key, values in found.items():
         np.testing.assert_allclose(values, wanted[key], rtol=0, atol=1e-11, err_msg=key)

@@ -16,8 +16,7 @@ from orthocas.errors import UnknownNameError
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.dense_objectives import GraphObjective
 from orthocas.fitting.terms import Weights
-from orthocas.tasks.domains import sample_evenly
-from orthocas.tasks.samples import Samples, sample_problem
+from orthocas.tasks.samples import Samples, sample_evenly, sample_problem
 
 IN_METRIC = Weights(1000.0, 30.0, 0.0, angles="metric")
 

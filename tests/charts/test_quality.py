@@ -12,7 +12,7 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.quality import AngleStatistics
 from orthocas.errors import InvalidValueError, MemoryNeedError, SingularTaskError
 from orthocas.fitting.fit import Fit
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 
 
 def chart_with_normals(normals: list[list[float]], metric: object = "euclidean") -> Chart:

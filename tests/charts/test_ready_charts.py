@@ -12,7 +12,7 @@ from programs import Run, nightly
 import orthocas as oc
 from orthocas.charts.chart_file import fingerprint
 from orthocas.errors import UnknownNameError
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 
 ROOT = Path(__file__).parents[2]
 NAMES = oc.charts.names()

@@ -16,7 +16,7 @@ from orthocas.charts.regular_part import RegularPart
 from orthocas.codegen.library import CompiledLibrary, compile_shared
 from orthocas.errors import DomainError, InvalidValueError, NoExpressionError, ShapeError
 from orthocas.fitting.fit import Fit
-from orthocas.tasks.domains import Domain, bounds_of
+from orthocas.tasks.domains import Domain
 
 
 def circle_of_the_tool(chart: oc.Chart, count: int = 500) -> np.ndarray:
@@ -120,7 +120,7 @@ def differences(f: Callable[[np.ndarray], Any], q: np.ndarray) -> np.ndarray:
 def metres_nearer(chart: oc.Chart, phi: np.ndarray, q: np.ndarray) -> float:
     """How much nearer SLSQP comes from q (n,), with the domain's own conditions: of |D^-1 e_x|, in sizes of a place."""
     domain, scale = chart.problem.domain, 1 / cost(chart, phi, q)
-    low, high = bounds_of(domain)
+    low, high = domain.bounds
 
     def rooms(q: np.ndarray) -> np.ndarray:
         bound = domain.singular_bound

@@ -15,7 +15,7 @@ from simulate_command import FILES, written
 import orthocas as oc
 from orthocas.cli import simulate as command
 from orthocas.simulation import Trajectory
-from orthocas.tools.files import published
+from orthocas.tools.files import publish
 from orthocas.tools.progress import Monitor, Progress
 
 
@@ -111,7 +111,7 @@ def interrupting(stage: str) -> Callable[[], Any]:
 @pytest.mark.usefixtures("blank_pictures")
 def test_ctrl_c_in_the_run_keeps_what_was_simulated(run_simulate: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("out").mkdir()
-    with published(Path("out"), listed=True) as drafts:
+    with publish(Path("out"), listed=True) as drafts:
         (drafts / "animation.gif").write_text("of an earlier run")
     monkeypatch.setattr(command, "terminal_monitor", interrupting("simulate"))
     code, out, err = run_simulate("pd_plus", "--json")

@@ -20,7 +20,7 @@ from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_share
 from orthocas.codegen.kernels import with_shared_calls, with_turns_once
 from orthocas.control import Controller, ControlStatus, Impedance, Kinematic, PDPlus
 from orthocas.errors import CompileError, ProofError
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 
 pytestmark = needs_c
 

@@ -24,11 +24,11 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.codegen.export import LIBRARIES, module_text
 from orthocas.codegen.export_forms import function_code
 from orthocas.errors import ArchiveError, InvalidValueError, NoExpressionError, UnknownNameError
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import TASK_KINDS
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array
-from orthocas.tools.expressions import BINARY, CODES, UNARY, to_tape
+from orthocas.tools.expressions import BINARY, CODES, UNARY, write_tape
 
 FITTED = [name for name in CHARTS if name not in ("circle chart", "disk chart", "linear leaf chart")]
 AGREED = 1e-10
@@ -50,7 +50,7 @@ def points_of(chart: oc.Chart, count: int = 40) -> Array:
 
 def random_chart(robot: oc.Robot, task: oc.Task, parametrisation: Any, idle: tuple[int, ...] = ()) -> oc.Chart:
     """A chart without a fit, with random parameters."""
-    problem = oc.Problem(robot, task, domain=oc.Box(robot.tree.middle, 0.1))
+    problem = oc.Problem(robot, task, domain=oc.Box(robot.tree.centre_posture, 0.1))
     space, rng, r = JointSpace.of(problem), np.random.default_rng(3), problem.r - len(idle)
     active = [k for k in range(robot.n) if k not in idle]
     size = parametrisation.family(space.restricted_to(active), r).size
@@ -147,7 +147,7 @@ def test_every_operation_is_written(library: str) -> None:
     points = np.random.default_rng(1).uniform(0.4, 0.6, (5, 3))
     found = np.asarray(scope["f"](array(np.ascontiguousarray(points.T))))
     np.testing.assert_allclose(found, Batched(function)(points)[0].T, rtol=1e-14, atol=1e-14)
-    assert len({step[0] for step in to_tape(function)["steps"]}) > 40
+    assert len({step[0] for step in write_tape(function)["steps"]}) > 40
 
 
 @pytest.mark.slow

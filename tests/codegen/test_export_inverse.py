@@ -17,7 +17,8 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.charts.solutions import InverseStatus
 from orthocas.codegen.export import LIBRARIES
-from orthocas.tasks.domains import Domain, sample_uniform
+from orthocas.tasks.domains import Domain
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 FOUND, OUTSIDE, LIMIT, NOT_FOUND, BAD_INPUT = 0, 2, 3, 5, 6

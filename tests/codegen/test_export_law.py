@@ -14,7 +14,7 @@ import orthocas as oc
 from orthocas import control
 from orthocas.control import ControlStatus
 from orthocas.errors import InvalidValueError
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
 

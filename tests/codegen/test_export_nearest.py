@@ -15,7 +15,7 @@ from test_export_inverse import CHARTS as CHARTS_OF_INVERSE
 import orthocas as oc
 from orthocas.charts.solutions import InverseStatus
 from orthocas.codegen.export import LIBRARIES
-from orthocas.tasks.domains import bounds_of, sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 FOUND, NEAREST, NOT_FOUND, BAD_INPUT = 0, 1, 5, 6
@@ -104,7 +104,7 @@ def test_scipy_finds_nothing_nearer(tmp_path: Path, name: str) -> None:
                 lambda q, wanted=wanted: ((chart.xi(q) - wanted) ** 2).sum(),
                 start,
                 jac=lambda q, wanted=wanted: 2 * chart.jacobian(q)[chart.m :].T @ (chart.xi(q) - wanted),
-                bounds=list(zip(*bounds_of(domain), strict=True)),
+                bounds=list(zip(*domain.bounds, strict=True)),
                 constraints={
                     "type": "eq",
                     "fun": lambda q, k=k: chart.task(q) - x[k],

@@ -16,7 +16,7 @@ import orthocas as oc
 from orthocas.codegen import compiled
 from orthocas.errors import CompileError, InvalidValueError, NoExpressionError
 from orthocas.fitting.fit import Fit
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 
 FOUND = oc.InverseStatus.FOUND
 

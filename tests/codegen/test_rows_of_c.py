@@ -14,7 +14,7 @@ import orthocas as oc
 from orthocas.codegen import GeneratedC
 from orthocas.codegen.library import NO_DOUBLE, STRICT, compilers
 from orthocas.errors import InvalidValueError
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 pytestmark = needs_c

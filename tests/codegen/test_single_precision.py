@@ -20,7 +20,6 @@ from orthocas.codegen.precision import SINGLE
 from orthocas.control import Controller, ControlStatus, Impedance, Kinematic, PDPlus, Safety
 from orthocas.errors import ProofError
 from orthocas.fitting.fit import Fit
-from orthocas.tasks.domains import bounds_of
 from orthocas.tools.checks import Array
 
 pytestmark = needs_c
@@ -176,7 +175,7 @@ def test_a_processor_in_single_precision_emulates_nothing(generated: GeneratedC,
 @pytest.mark.slow
 def test_bounds_belong_to_the_domain(library: CompiledLibrary, law: Controller) -> None:
     low, high = library.domain
-    np.testing.assert_allclose(library.domain, bounds_of(law.problem.domain), rtol=3e-7)
+    np.testing.assert_allclose(library.domain, law.problem.domain.bounds, rtol=3e-7)
     for corner in (low, high):
         assert law.problem.domain.contains(corner)
         assert library.chart(corner)[2] == ControlStatus.OK

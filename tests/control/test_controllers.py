@@ -19,7 +19,7 @@ from orthocas.errors import (
     UnreachableReferenceError,
 )
 from orthocas.problems.iiwa import urdf_path
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 RNG = np.random.default_rng(21)

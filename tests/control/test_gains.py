@@ -13,7 +13,7 @@ from orthocas.control import Impedance, PDPlus, matched_stiffness
 from orthocas.errors import (
     InvalidValueError,
 )
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 

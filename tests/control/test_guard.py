@@ -16,7 +16,7 @@ from orthocas.errors import (
     ShapeError,
     UnknownNameError,
 )
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
 

@@ -15,7 +15,7 @@ import orthocas as oc
 from orthocas.control import Impedance, PDPlus, Reference, RunTimeModel, Safety
 from orthocas.errors import LawWarning
 from orthocas.simulation import Outcome, Push, Trajectory, simulate
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 SHOULDER = "l_shoulder_lift_joint"

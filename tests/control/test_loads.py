@@ -10,7 +10,7 @@ from charts import with_upper_limit
 import orthocas as oc
 from orthocas.control import Kinematic, PDPlus, Reference
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
-from orthocas.robots.kinematics import point_jacobian
+from orthocas.robots.kinematics import build_point_jacobian
 from orthocas.simulation import Push, Stops, simulate
 from orthocas.simulation.disturbances import Loads
 
@@ -62,10 +62,10 @@ def test_jacobian_of_the_tips_point_is_the_tips(iiwa: oc.Problem) -> None:
     robot = iiwa.robot
     tree, q = robot.tree, ca.SX.sym("q", 7)
     point = tree.tip_translation + tree.tip_rotation @ np.array([0.1, 0.2, 0.3])
-    J = ca.Function("J", [q], [point_jacobian(tree, q, tree.tip_parent, point)])
+    J = ca.Function("J", [q], [build_point_jacobian(tree, q, tree.tip_parent, point)])
     at = iiwa.domain.centre + 0.1
     np.testing.assert_allclose(J(at), robot.with_tool([0.1, 0.2, 0.3]).tip_jacobian(at)[:3], atol=1e-12)
-    np.testing.assert_array_equal(point_jacobian(tree, q, -1, point).is_zero(), True)
+    np.testing.assert_array_equal(build_point_jacobian(tree, q, -1, point).is_zero(), True)
 
 
 def test_rows_of_loads_add_up_by_place_and_time(planar_x: oc.Problem) -> None:

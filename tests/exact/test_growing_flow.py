@@ -11,7 +11,6 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.errors import GrowError
 from orthocas.exact.flow import Arrival, BatchedFlow, TaskFlow
-from orthocas.tasks.metric import metric_matrices
 
 ARM = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
 STIFFNESS = np.diag([3.0, 2.0, 1.0]) + 0.2
@@ -31,7 +30,7 @@ def test_batched_flow_solves_a_closed_form() -> None:
     y, p = ca.SX.sym("y", 2), ca.SX.sym("p")
     field = ca.Function("field", [y, p], [ca.vertcat(-p * y[1], p * y[0])])  # turns by the angle p
     angles = np.linspace(0.1, 30, 300)[:, None]
-    ends, arrived = BatchedFlow(field, np.ones(2)).end_points(np.tile([1.0, 0.0], (300, 1)), angles, 1e-11)
+    ends, arrived = BatchedFlow(field, np.ones(2)).find_end_points(np.tile([1.0, 0.0], (300, 1)), angles, 1e-11)
     assert arrived.all()
     np.testing.assert_allclose(ends, np.hstack([np.cos(angles), np.sin(angles)]), atol=1e-9)  # 10 to 60 steps
 
@@ -39,7 +38,7 @@ def test_batched_flow_solves_a_closed_form() -> None:
 def test_batched_flow_stops_where_the_solution_ends() -> None:
     y, p = ca.SX.sym("y"), ca.SX.sym("p")
     flow = BatchedFlow(ca.Function("field", [y, p], [p * y**2]), np.ones(1))  # 1 / (1/y0 - p s): ends at s = 1 / p
-    ends, arrived = flow.end_points(np.ones((3, 1)), np.array([[0.5], [2.0], [np.nan]]), 1e-9)
+    ends, arrived = flow.find_end_points(np.ones((3, 1)), np.array([[0.5], [2.0], [np.nan]]), 1e-9)
     np.testing.assert_array_equal(arrived, [True, False, False])
     np.testing.assert_allclose(ends[0], 2.0, atol=1e-8)
 
@@ -54,7 +53,7 @@ def test_pull_ends_where_the_paper_s_gradient_flow_ends(metric: object) -> None:
     h, J = problem.task.function, problem.task.jacobian_function
 
     def rate(t: float, q: np.ndarray) -> np.ndarray:
-        A = metric_matrices(problem.metric, q[None])[0]
+        A = problem.metric.evaluate(q[None])[0]
         return (0.3 - float(h(q))) * np.linalg.solve(A, np.array(J(q))[0])
 
     for start, end in zip(points, pulled.points, strict=True):

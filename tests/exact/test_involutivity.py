@@ -17,7 +17,7 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
 from orthocas.problems.iiwa import urdf_path
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
 

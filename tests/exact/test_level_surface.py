@@ -9,7 +9,7 @@ import trimesh
 from numpy.testing import assert_allclose
 
 from orthocas.errors import InvalidValueError, NotADiskError, ShapeError
-from orthocas.exact.harmonic import Function, TriangleMesh, level_surface, require_disk
+from orthocas.exact.harmonic import Function, TriangleMesh, build_level_surface, require_disk
 from orthocas.exact.mesh import flip_to_delaunay
 from orthocas.tools.checks import Array
 
@@ -27,11 +27,13 @@ def tip_x_gradient(q: Array) -> Array:
 
 
 def arm_leaf(level: float = 0.0, cells: int = 24, box: tuple[tuple[float, ...], ...] = ARM_BOX) -> TriangleMesh:
-    return level_surface(tip_x, tip_x_gradient, level, *box, cells)
+    return build_level_surface(tip_x, tip_x_gradient, level, *box, cells)
 
 
 def sphere(half_width: float, cells: int) -> TriangleMesh:
-    return level_surface(lambda q: (q**2).sum(axis=1), lambda q: 2 * q, 1.0, [-half_width] * 3, [half_width] * 3, cells)
+    return build_level_surface(
+        lambda q: (q**2).sum(axis=1), lambda q: 2 * q, 1.0, [-half_width] * 3, [half_width] * 3, cells
+    )
 
 
 def of_height(f: Function, slope: Function) -> tuple[Function, Function]:
@@ -86,7 +88,7 @@ def test_normals_point_along_the_gradient() -> None:
 
 @pytest.mark.parametrize("level", [0.0, 0.123])
 def test_plane_is_a_square_of_the_exact_area(level: float) -> None:
-    mesh = level_surface(*of_height(lambda z: z, np.ones_like), level, [-1, -1, -1], [1, 1, 1], 10)
+    mesh = build_level_surface(*of_height(lambda z: z, np.ones_like), level, [-1, -1, -1], [1, 1, 1], 10)
     assert topology(mesh) == (1, 1, 1, 0)
     assert_allclose(mesh.vertices[:, 2], level, rtol=0, atol=ON_LEVEL)
     assert_allclose(area(mesh), 4.0, rtol=1e-12)
@@ -210,14 +212,14 @@ def test_vertices_that_cannot_slide_stay_on_the_surface() -> None:
         r = radius(q)
         return q * (400 / (1 + (400 * (r - 1)) ** 2) / r)[:, None]
 
-    mesh = level_surface(steep, slope, 0.0, [-1.25] * 3, [1.25] * 3, 6)
+    mesh = build_level_surface(steep, slope, 0.0, [-1.25] * 3, [1.25] * 3, 6)
     assert topology(mesh) == (1, 0, 2, 0)
     assert_allclose(radius(mesh.vertices), 1.0, rtol=0, atol=ON_LEVEL)
 
 
 def test_bisection_takes_over_where_newton_runs_away() -> None:
     h, slope = of_height(lambda z: np.arctan(50 * (z - 0.05)), lambda z: 50 / (1 + (50 * (z - 0.05)) ** 2))
-    mesh = level_surface(h, slope, 0.0, [-1, -1, -1], [1, 1, 1], 4)
+    mesh = build_level_surface(h, slope, 0.0, [-1, -1, -1], [1, 1, 1], 4)
     assert_allclose(mesh.vertices[:, 2], 0.05, rtol=0, atol=ON_LEVEL)
     assert_allclose(area(mesh), 4.0, rtol=1e-12)
 
@@ -225,7 +227,7 @@ def test_bisection_takes_over_where_newton_runs_away() -> None:
 def test_function_that_jumps_is_refused() -> None:
     h, slope = of_height(lambda z: np.where(z > 0.05, 1.0, -1.0), np.zeros_like)
     with pytest.raises(InvalidValueError, match=r"level is 0.0, .* that h does not jump across, as near .* 0.05\]"):
-        level_surface(h, slope, 0.0, [-1, -1, -1], [1, 1, 1], 4)
+        build_level_surface(h, slope, 0.0, [-1, -1, -1], [1, 1, 1], 4)
 
 
 def test_level_outside_the_box_says_what_h_does_there() -> None:
@@ -236,7 +238,7 @@ def test_level_outside_the_box_says_what_h_does_there() -> None:
 def test_bad_arguments_are_named() -> None:
     def surface(h: Function = tip_x, gradient: Function = tip_x_gradient, **changed: object) -> TriangleMesh:
         settings = {"level": 0.0, "low": ARM_BOX[0], "high": ARM_BOX[1], "cells": 6} | changed
-        return level_surface(h, gradient, **settings)  # type: ignore[arg-type]
+        return build_level_surface(h, gradient, **settings)  # type: ignore[arg-type]
 
     with pytest.raises(InvalidValueError, match=r"h\(q\)\[\d+\] is nan"):
         surface(h=lambda q: np.where(q[:, 0] > 1, np.nan, tip_x(q)))

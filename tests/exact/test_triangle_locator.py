@@ -4,6 +4,7 @@ import copy
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from test_level_surface import arm_leaf, sphere
 
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.exact import mesh as triangle_locator
-from orthocas.exact.harmonic import TriangleMesh, harmonic_disk
+from orthocas.exact.harmonic import TriangleMesh, map_to_disk
 from orthocas.exact.mesh import Located, TriangleLocator
 from orthocas.tools.checks import Array
 
@@ -88,7 +89,7 @@ def test_no_other_triangle_is_closer(leaf: TriangleMesh, kind: str) -> None:
 
 
 def test_points_of_the_disk_lie_in_their_triangles(leaf: TriangleMesh) -> None:
-    disk = harmonic_disk(leaf)
+    disk = map_to_disk(leaf)
     rng = np.random.default_rng(7)
     weights, face = rng.dirichlet([1, 1, 1], 2000), rng.integers(len(leaf.faces), size=2000)
     found = checked(disk, leaf.faces, np.einsum("nc,ncd->nd", weights, disk[leaf.faces[face]]))
@@ -99,7 +100,7 @@ def test_points_of_the_disk_lie_in_their_triangles(leaf: TriangleMesh) -> None:
 
 @pytest.mark.slow
 def test_distance_to_a_disk_from_outside(leaf: TriangleMesh) -> None:
-    disk = harmonic_disk(leaf)
+    disk = map_to_disk(leaf)
     points = 3 * np.random.default_rng(7).normal(size=(200, 2))
     found = checked(disk, leaf.faces, points)
     assert_allclose(found.distance, np.maximum(np.linalg.norm(points, axis=1) - 1, 0), rtol=0, atol=2e-3)  # a polygon
@@ -194,7 +195,7 @@ def test_any_triangles_and_points(mesh_and_points: tuple[Array, Array], spread: 
 def test_result_does_not_depend_on_the_chunks(leaf: TriangleMesh, monkeypatch: pytest.MonkeyPatch) -> None:
     points = queries(leaf)["off"]
     whole = checked(leaf.vertices, leaf.faces, points)
-    monkeypatch.setattr(triangle_locator, "_CHUNK", 7)
+    monkeypatch.setattr(triangle_locator, "RULES", replace(triangle_locator.RULES, chunk=7))
     for one, other in zip(whole, checked(leaf.vertices, leaf.faces, points), strict=True):
         assert np.array_equal(one, other)
 
@@ -205,7 +206,7 @@ def test_no_points_are_no_trouble(leaf: TriangleMesh) -> None:
 
 def test_locators_are_pickled_and_copied(leaf: TriangleMesh) -> None:
     points = queries(leaf)["near"]
-    for vertices, queried in ((leaf.vertices, points), (harmonic_disk(leaf), points[:, :2])):
+    for vertices, queried in ((leaf.vertices, points), (map_to_disk(leaf), points[:, :2])):
         locator = TriangleLocator(vertices, leaf.faces)
         for again in (pickle.loads(pickle.dumps(locator)), copy.deepcopy(locator)):
             for one, other in zip(locator.locate(queried), again.locate(queried), strict=True):

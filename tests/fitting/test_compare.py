@@ -235,7 +235,7 @@ def test_processes_use_one_thread_each_and_leave_the_environment_alone(monkeypat
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     with processes.starting_workers():
         assert os.environ["OMP_NUM_THREADS"] == "1"
-        assert batch._threads() == 1
+        assert batch._count_cores() == 1
     assert os.environ["OMP_NUM_THREADS"] == "7"
     monkeypatch.delenv("OMP_NUM_THREADS")
     with processes.starting_workers():

@@ -15,8 +15,7 @@ from orthocas.fitting.residuals import Loss, sample_loss
 from orthocas.fitting.stages import FoldSearch
 from orthocas.fitting.starts import Mirror, find_mirror
 from orthocas.fitting.terms import LEAST_CONDITIONING, Sizes, Weights
-from orthocas.tasks.domains import sample_heavily
-from orthocas.tasks.samples import sample_problem
+from orthocas.tasks.samples import sample_boundary_weighted, sample_problem
 
 ACTIVE = list(range(6))
 SPACE = JointSpace(np.zeros(2), np.ones(2), (False, False), ("a", "b"))
@@ -85,7 +84,7 @@ def test_no_fold_is_left_where_other_samples_look_for_one(iiwa_fit: Fit) -> None
     chart = iiwa_fit.chart
     assert iiwa_fit.worst is not None
     found = []
-    for part in np.array_split(sample_heavily(chart.problem.domain, 200_000, 77), 20):
+    for part in np.array_split(sample_boundary_weighted(chart.problem.domain, 200_000, 77), 20):
         judged = Judged.at(chart.problem, chart.coordinates, part)
         found.append(judged.signs * judged.conditioning)
     values = np.concatenate(found)

@@ -10,8 +10,7 @@ from orthocas import problems
 from orthocas.errors import InvalidValueError, OrthocasError
 from orthocas.fitting.like import Like
 from orthocas.fitting.terms import Sizes
-from orthocas.tasks.domains import sample_uniform
-from orthocas.tasks.samples import sample_problem
+from orthocas.tasks.samples import sample_problem, sample_uniform
 from orthocas.tools.checks import Array
 
 

@@ -33,9 +33,9 @@ from orthocas.fitting.terms import (
     task_cosines,
     volume_hinges,
 )
-from orthocas.tasks.samples import Draw, Samples, sample_problem, samples_at
+from orthocas.tasks.samples import Draw, Samples, evaluate_samples, sample_problem
 from orthocas.tools import columns
-from orthocas.tools.expressions import determinant
+from orthocas.tools.expressions import compute_determinant
 
 WEIGHTS = Weights.of((1000.0, 30.0))
 REGULAR = Weights(1000.0, 30.0, 120.0)
@@ -197,14 +197,16 @@ def test_taylor_remainder_falls_with_the_square_of_the_step(planar_x: oc.Problem
 
 
 def test_gauss_newton_matrix_is_that_of_the_residuals(planar_x: oc.Problem) -> None:
-    twice = samples_at(planar_x, np.repeat(sample_problem(planar_x, 40, 9).points, 2, axis=0))  # every second is used
+    twice = evaluate_samples(
+        planar_x, np.repeat(sample_problem(planar_x, 40, 9).points, 2, axis=0)
+    )  # every second is used
     family = oc.Polynomial(2).family(JointSpace.of(planar_x), 2)
     theta = family.initial(3)
     objective = BasisObjective(family, twice, REGULAR, theta, draw_from(planar_x))
     loss = Loss.of(Sizes(n=3, m=1, r=2, identity_metric=False), REGULAR.by_name)
     J, data = loss.arguments()
     rho = ca.Function("rho", [J, *data], [loss.residuals(J, data)])
-    parts = twice.described(loss.data, twice.orientation(objective.coordinate_jacobians(theta)))
+    parts = twice.collect_data(loss.data, twice.orientation(objective.coordinate_jacobians(theta)))
 
     def residuals(theta: np.ndarray) -> np.ndarray:
         rows = zip(objective.coordinate_jacobians(theta), *parts, strict=True)
@@ -302,7 +304,7 @@ def test_weights_of_a_command_line_have_terms_by_name() -> None:
 def test_determinants_and_their_gradients_are_those_of_numpy(rows: int) -> None:
     """The gradient is det A times the transposed inverse."""
     A = ca.SX.sym("A", rows, rows)
-    value = determinant(A)
+    value = compute_determinant(A)
     function = ca.Function("det", [A], [value, ca.gradient(value, A)])
     given = np.random.default_rng(7).normal(size=(rows, rows))
     found, gradient = function(given)
@@ -376,7 +378,7 @@ def test_loss_with_volumes_is_the_loss() -> None:
     data = [rng.normal(size=(N, *symbol.shape)) for symbol in loss.symbols()]
     place = loss.data.index("metric_inverse")
     data[place] = data[place] @ data[place].transpose(0, 2, 1) + np.eye(sizes.n)
-    inputs = [columns.blocked(rng.normal(size=(N, sizes.r, sizes.n))), *map(columns.blocked, data)]
+    inputs = [columns.arrange_blocks(rng.normal(size=(N, sizes.r, sizes.n))), *map(columns.arrange_blocks, data)]
     value, slopes = loss_with_slopes(loss)(*inputs)
     for found, wanted in zip(loss_columns(loss)(*inputs), (value, slopes), strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-11, atol=1e-13 * np.abs(wanted).max())

@@ -10,7 +10,7 @@ from conftest import robot_data
 
 import orthocas as oc
 from orthocas.errors import InvalidValueError, MetricError, ShapeError, UnknownNameError
-from orthocas.tasks.metric import Metric, metric_matrices
+from orthocas.tasks.metric import Metric
 
 POINTS = np.random.default_rng(0).uniform(-1, 1, (10, 2))
 
@@ -21,13 +21,13 @@ def problem(metric: object) -> oc.Problem:
 
 
 def test_kinds_give_their_matrices() -> None:
-    np.testing.assert_array_equal(metric_matrices(problem("euclidean").metric, POINTS)[3], np.eye(2))
+    np.testing.assert_array_equal(problem("euclidean").metric.evaluate(POINTS)[3], np.eye(2))
     inertia = problem("inertia")
-    np.testing.assert_allclose(metric_matrices(inertia.metric, POINTS), inertia.robot.mass_matrix(POINTS))
+    np.testing.assert_allclose(inertia.metric.evaluate(POINTS), inertia.robot.mass_matrix(POINTS))
     stiffness = np.array([[2.0, 0.5], [0.5, 1.0]])
-    np.testing.assert_allclose(metric_matrices(problem(stiffness).metric, POINTS)[7], stiffness)
+    np.testing.assert_allclose(problem(stiffness).metric.evaluate(POINTS)[7], stiffness)
     custom = problem(lambda q: ca.diag(ca.vertcat(1 + q[0] ** 2, 2)))
-    np.testing.assert_allclose(metric_matrices(custom.metric, POINTS)[:, 0, 0], 1 + POINTS[:, 0] ** 2)
+    np.testing.assert_allclose(custom.metric.evaluate(POINTS)[:, 0, 0], 1 + POINTS[:, 0] ** 2)
 
 
 @pytest.mark.parametrize("matrix", [[[1.0, 0.0], [0.0, -1.0]], [[1.0, 1.0], [1.0, 1.0]], [[1.0, 0.5], [0.0, 1.0]]])
@@ -71,14 +71,14 @@ def test_named_metric_shows_its_name_in_reports_and_after_loading(tmp_path: Path
     chart.save(tmp_path / "a.orthocas")
     again = oc.load(tmp_path / "a.orthocas").problem.metric
     assert again.name == "stiffness"
-    np.testing.assert_array_equal(metric_matrices(again, POINTS), metric_matrices(stiffness, POINTS))
+    np.testing.assert_array_equal(again.evaluate(POINTS), stiffness.evaluate(POINTS))
 
 
 def test_name_of_a_custom_metric_does_not_make_it_the_identity() -> None:
     robot = oc.Robot.planar([1.0, 1.0], [3.0, 3.0])
     metric = Metric.custom(robot, "euclidean", lambda q: 3 * ca.SX.eye(2))
     assert not metric.is_identity
-    np.testing.assert_array_equal(metric_matrices(metric, POINTS)[0], 3 * np.eye(2))
+    np.testing.assert_array_equal(metric.evaluate(POINTS)[0], 3 * np.eye(2))
 
 
 def massless(robot: oc.Robot, i: int, **change: object) -> oc.Robot:

@@ -16,11 +16,11 @@ import pytest
 import orthocas as oc
 from orthocas.errors import ArchiveError, ChartFileError
 from orthocas.tools import files
-from orthocas.tools.files import LIST, draft_folder, is_listed, output_folder, published
+from orthocas.tools.files import LIST, is_listed, open_draft_folder, open_output_folder, publish
 
 
-def publish(folder: Path, text: str, force: bool = False) -> None:
-    with published(folder, listed=True, force=force) as place:
+def publish_number(folder: Path, text: str, force: bool = False) -> None:
+    with publish(folder, listed=True, force=force) as place:
         (place / "numbers.csv").write_text(text)
 
 
@@ -28,20 +28,20 @@ def test_only_listed_files_are_replaced(tmp_path: Path) -> None:
     file = tmp_path / "numbers.csv"
     file.write_text("mine")
     with pytest.raises(ArchiveError, match=r"orthocas did not write the file that is there"):
-        publish(tmp_path, "first")
+        publish_number(tmp_path, "first")
     assert (file.read_text(), [*tmp_path.iterdir()]) == ("mine", [file])
-    publish(tmp_path, "first", force=True)
-    publish(tmp_path, "second")
+    publish_number(tmp_path, "first", force=True)
+    publish_number(tmp_path, "second")
     assert file.read_text() == "second"
     file.write_text("second, edited")
     with pytest.raises(ArchiveError):
-        publish(tmp_path, "third")
+        publish_number(tmp_path, "third")
     assert file.read_text() == "second, edited"
 
 
 def test_empty_files_are_nobodys(tmp_path: Path) -> None:
     (tmp_path / "numbers.csv").touch()
-    publish(tmp_path, "first")
+    publish_number(tmp_path, "first")
     assert is_listed(tmp_path / "numbers.csv")
 
 
@@ -50,12 +50,12 @@ def test_links_are_neither_followed_nor_replaced(tmp_path: Path) -> None:
     (tmp_path / "numbers.csv").symlink_to(tmp_path / "elsewhere")
     for force in (False, True):
         with pytest.raises(ArchiveError, match="it is a symbolic link"):
-            publish(tmp_path, "first", force)
+            publish_number(tmp_path, "first", force)
     assert (tmp_path / "elsewhere").read_text() == "mine"
 
 
 def test_a_kill_between_list_and_file_leaves_both_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    publish(tmp_path, "first")
+    publish_number(tmp_path, "first")
     replace = os.replace
 
     def killed(source: Path, target: Path) -> None:
@@ -66,19 +66,19 @@ def test_a_kill_between_list_and_file_leaves_both_known(tmp_path: Path, monkeypa
     for text in ("second", "third"):
         monkeypatch.setattr(os, "replace", killed)
         with pytest.raises(OSError, match="as if killed"):
-            publish(tmp_path, text)
+            publish_number(tmp_path, text)
         monkeypatch.undo()
         assert is_listed(tmp_path / "numbers.csv")
-    publish(tmp_path, "third")
+    publish_number(tmp_path, "third")
     assert (tmp_path / "numbers.csv").read_text() == "third"
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"files": [1]}', '{"files": {"numbers.csv": 3}}', "[" * 100_000])
 def test_a_broken_list_knows_nothing(tmp_path: Path, text: str) -> None:
-    publish(tmp_path, "first")
+    publish_number(tmp_path, "first")
     (tmp_path / LIST).write_text(text)
     with pytest.raises(ArchiveError):
-        publish(tmp_path, "second")
+        publish_number(tmp_path, "second")
 
 
 def test_drafts_of_dead_processes_are_swept_and_no_others(tmp_path: Path) -> None:
@@ -92,14 +92,14 @@ def test_drafts_of_dead_processes_are_swept_and_no_others(tmp_path: Path) -> Non
         folder.mkdir()
         (folder / "part").write_text("half")
     mine.write_text("a file is no draft folder")
-    with draft_folder(tmp_path):
+    with open_draft_folder(tmp_path):
         assert not left.exists()
     assert {*tmp_path.iterdir()} == {alive, elsewhere, mine}
 
 
 def test_folders_that_stay_empty_go_away(tmp_path: Path) -> None:
     (tmp_path / "old").mkdir()
-    with output_folder("out", tmp_path / "old" / "new" / "deep") as folder:
+    with open_output_folder("out", tmp_path / "old" / "new" / "deep") as folder:
         assert folder.is_dir()
     assert [*tmp_path.rglob("*")] == [tmp_path / "old"]
 
@@ -145,7 +145,7 @@ def test_a_readme_that_mentions_orthocas_stays(planar_chart: oc.Chart, tmp_path:
 
 
 def test_the_list_is_plain(tmp_path: Path) -> None:
-    publish(tmp_path, "first")
+    publish_number(tmp_path, "first")
     found = json.loads((tmp_path / LIST).read_text())
     assert found["format"] == "orthocas-list"
     assert [len(entry) for entry in found["files"]["numbers.csv"]] == [64]
@@ -156,7 +156,7 @@ def test_a_full_disk_names_the_file(tmp_path: Path, begun: list[str], named: str
     """Libraries that draw and save raise errors without a file name."""
 
     def write() -> None:
-        with published(tmp_path / "out", listed=True) as place:
+        with publish(tmp_path / "out", listed=True) as place:
             for name in begun:
                 (place / name).write_text("half")
             raise OSError(errno.ENOSPC, "No space left on device")
@@ -186,6 +186,6 @@ def test_ctrl_c_while_drafts_are_made_or_removed_leaves_none(tmp_path: Path, mon
     ):
         with monkeypatch.context() as patch:
             patch.setattr(place, name, replacement)
-            with pytest.raises(KeyboardInterrupt), draft_folder(tmp_path) as folder:
+            with pytest.raises(KeyboardInterrupt), open_draft_folder(tmp_path) as folder:
                 (folder / "half").write_text("a")
         assert not list(tmp_path.iterdir())

@@ -15,7 +15,7 @@ from orthocas.bases.given import SEW_KINDS, sew_angle
 from orthocas.errors import RobotError, UnknownNameError
 from orthocas.problems.iiwa import CENTRE, urdf_path
 from orthocas.problems.iiwa import robot as iiwa_robot
-from orthocas.robots import urdf
+from orthocas.robots import pinocchio_model, urdf
 
 Z = np.array([0.0, 0.0, 1.0])
 
@@ -26,7 +26,7 @@ def iiwa_model() -> pin.Model:
 
 
 def panda_model() -> pin.Model:
-    return urdf.lock_off_chain(urdf.read_urdf(robot_data("panda_description/urdf/panda.urdf")), "panda_hand")
+    return pinocchio_model.lock_off_chain(urdf.read_urdf(robot_data("panda_description/urdf/panda.urdf")), "panda_hand")
 
 
 def changed(robot: oc.Robot, **changes: Any) -> oc.Robot:
@@ -196,7 +196,7 @@ def test_robots_without_shoulder_elbow_and_wrist_are_refused() -> None:
 
 def test_axes_that_do_not_meet_are_named_with_their_distance() -> None:
     torso = urdf.read_urdf(robot_data("tiago_description/robots/tiago.urdf"))
-    arm = urdf.lock_joints(urdf.lock_off_chain(torso, "arm_tool_link"), {"torso_lift_joint": 0.1})
+    arm = pinocchio_model.lock_joints(pinocchio_model.lock_off_chain(torso, "arm_tool_link"), {"torso_lift_joint": 0.1})
     with pytest.raises(RobotError, match="'arm_1_joint' and 'arm_2_joint' are 0.125 m apart, expected axes that meet"):
         sew_angle(oc.Robot.from_model(arm, "arm_tool_link"), "conventional")
     iiwa = iiwa_robot()

@@ -16,9 +16,8 @@ from orthocas.bases.family import JointSpace
 from orthocas.charts.quality import evaluate
 from orthocas.errors import DomainError, InvalidValueError, NotRedundantError, SingularTaskError, UnknownNameError
 from orthocas.fitting.probe import Prober, judged_chart, leak_and_conditioning
-from orthocas.tasks.domains import sample_heavily
-from orthocas.tasks.regular_box import home_posture
-from orthocas.tasks.samples import samples_at
+from orthocas.tasks.regular_box import find_home
+from orthocas.tasks.samples import evaluate_samples, sample_boundary_weighted
 from orthocas.tools.progress import Progress
 
 HOME = (0.6, 0.8, 0.8)
@@ -42,7 +41,7 @@ def test_leak_and_conditioning_are_those_of_their_definitions() -> None:
     """Against principal angles and singular values in coordinates where A is the identity."""
     known = problems.get("planar_3r_xy")
     problem = oc.Problem(known.robot, known.task, "inertia", known.domain)
-    samples = samples_at(problem, sample_heavily(known.domain, 20, 3))
+    samples = evaluate_samples(problem, sample_boundary_weighted(known.domain, 20, 3))
     J = np.random.default_rng(1).normal(size=(20, 1, 3))
     leaks, conditioning = leak_and_conditioning(samples, J)
     for k, q in enumerate(samples.points):
@@ -57,7 +56,7 @@ def test_leak_and_conditioning_are_those_of_their_definitions() -> None:
 
 def test_two_thirds_of_heavy_samples_lie_near_faces_and_corners() -> None:
     box = oc.Box(np.full(5, 0.3), [0.1, 0.2, 0.3, 0.4, 0.5])
-    distances = np.abs(sample_heavily(box, 9000, 2) - box.centre) / box.half_width
+    distances = np.abs(sample_boundary_weighted(box, 9000, 2) - box.centre) / box.half_width
     assert distances.max() <= 1
     means = distances.reshape(3, 3000, 5).mean(axis=(1, 2))
     np.testing.assert_allclose(means, [1 / 2, 2 / 3, 4 / 5], atol=0.01)  # of |u|^p: 1 / (1 + p)
@@ -120,13 +119,13 @@ def test_joint_limits_end_the_box() -> None:
 
 def test_home_comes_from_the_files_or_is_a_bent_posture() -> None:
     panda, xarm, ur10 = arm("panda"), arm("xarm7"), arm("ur10")
-    assert "default" in home_posture(panda, oc.Task.position(panda)).source
+    assert "default" in find_home(panda, oc.Task.position(panda)).source
     for robot in (xarm, ur10):  # the postures of the xarm7 lie at limits, and the middle of the ur10 is stretched out
-        home = home_posture(robot, oc.Task.position(robot))
+        home = find_home(robot, oc.Task.position(robot))
         assert home.source.startswith("bent posture")
         J = robot.tip_jacobian(home.q)[:3]
         assert np.linalg.svd(J, compute_uv=False)[-1] > 0.15
-    np.testing.assert_array_equal(home_posture(xarm, oc.Task.position(xarm), "hold-up").q, xarm.homes["hold-up"])
+    np.testing.assert_array_equal(find_home(xarm, oc.Task.position(xarm), "hold-up").q, xarm.homes["hold-up"])
 
 
 @pytest.mark.slow
@@ -135,7 +134,7 @@ def test_trial_charts_are_as_good_as_fits_of_their_degree(metric: str) -> None:
     """With Euclidean cosines, the loss of the other metric, the trial for A = M folds and leaks 1.5 times as much."""
     robot = arm("ur10")
     task = oc.Task.position(robot)
-    box = oc.Box(home_posture(robot, task).q, [0.5, *[0.25] * 5])
+    box = oc.Box(find_home(robot, task).q, [0.5, *[0.25] * 5])
     problem = oc.Problem(robot, task, metric, box)
     trial = Prober(problem, list(range(6))).verdict(box)
     fitted = judged_chart(oc.fit(problem, oc.Polynomial(2), split_idle=False).chart, 3000, 0)
@@ -225,7 +224,7 @@ def test_coordinates_are_continued_to_another_box() -> None:
     prober.verdict(problem.domain)
     widths = np.linspace(0.05, 0.4, 8)
     small, large = family_of(problem, 0.1), family_of(problem, widths)
-    q = sample_heavily(oc.Box([0.3] * 8, 0.5), 30, 1).T
+    q = sample_boundary_weighted(oc.Box([0.3] * 8, 0.5), 30, 1).T
     gradients = []
     for family in (small, large):
         theta = prober.start_on(family)

@@ -11,8 +11,7 @@ from orthocas.bases import JointSpace, Parametrisation
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.dense_objectives import GraphObjective
-from orthocas.tasks.domains import sample_evenly
-from orthocas.tasks.samples import samples_at
+from orthocas.tasks.samples import evaluate_samples, sample_evenly
 
 EVERY_TERM = oc.Weights(length=3.0, angles="paper")
 CASES = [
@@ -35,7 +34,7 @@ def test_fast_objectives_have_its_value_and_gradient(
     family = parametrisation.family(JointSpace.of(problem), problem.r)
     theta = family.initial(3)
     fast = BasisObjective if parametrisation.linear else GraphObjective
-    value, gradient = fast(family, samples_at(problem, points), weights, theta, None).value_and_gradient(theta)
+    value, gradient = fast(family, evaluate_samples(problem, points), weights, theta, None).value_and_gradient(theta)
     L = oc.loss(problem, parametrisation, weights=weights, samples=points, start=theta)
     x = ca.MX.sym("x", family.size)
     slope = ca.Function("slope", [x], [ca.gradient(L(x), x)])
@@ -50,7 +49,7 @@ def test_hessian_of_a_basis_is_the_fast_one(planar_x: oc.Problem) -> None:
     L = oc.loss(planar_x, oc.Polynomial(2), weights=EVERY_TERM, samples=points, start=theta)
     x = ca.MX.sym("x", family.size)
     H = ca.Function("H", [x], [ca.hessian(L(x), x)[0]])(theta).full()
-    fast = BasisObjective(family, samples_at(planar_x, points), EVERY_TERM, theta, None).hessian(theta)
+    fast = BasisObjective(family, evaluate_samples(planar_x, points), EVERY_TERM, theta, None).hessian(theta)
     np.testing.assert_allclose(H, fast, atol=1e-12 * np.abs(fast).max())
 
 

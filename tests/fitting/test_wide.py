@@ -41,8 +41,9 @@ from orthocas.fitting.volume_loss import BasisField, BasisShortfall, NetworkFiel
 from orthocas.fitting.wide import _run
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.branches import _Arm
-from orthocas.tasks.domains import StopKind, sample_heavily, sample_uniform
-from orthocas.tasks.regular_box import joint_range
+from orthocas.tasks.domains import StopKind
+from orthocas.tasks.regular_box import find_joint_range
+from orthocas.tasks.samples import sample_boundary_weighted, sample_uniform
 from orthocas.tools.display import number_list, percent
 from orthocas.tools.progress import Progress, silent
 
@@ -207,7 +208,7 @@ def test_one_polynomial_is_regular_on_a_whole_branch() -> None:
     chart, domain = fit.chart, fit.chart.problem.domain
     assert isinstance(domain, oc.RegularPart)
     assert domain.half_width[1] > 0.99 * iiwa().upper[1] / 2  # from the cut to the limit
-    q = sample_heavily(domain, 3000, 8)
+    q = sample_boundary_weighted(domain, 3000, 8)
     slopes = np.einsum("sn,sn->s", chart.coordinates.jacobian(q)[:, 0], self_motions(iiwa(), q))
     assert np.sign(slopes).min() == np.sign(slopes).max()
     assert fit.worst is not None
@@ -604,13 +605,13 @@ def test_laws_stop_where_coordinates_end() -> None:
     chart = narrower()
     domain = chart.problem.domain
     assert isinstance(domain, oc.RegularPart)
-    q = sample_heavily(oc.Box(domain.centre, domain.half_width), 20_000, 3)
+    q = sample_boundary_weighted(oc.Box(domain.centre, domain.half_width), 20_000, 3)
     clear = domain.singular_values(q) > 1.05 * domain.least_singular_value
     bad = q[clear & (domain.volumes(q) < domain.least_volume)][0]
     law, zero = control.PDPlus(chart, 50.0), np.zeros(7)
     _, status = law.function(bad, zero, chart.phi(bad), zero, zero, *law.gains.values())
     assert int(status) == control.ControlStatus.OUTSIDE_DOMAIN
-    assert "volume" in domain.explained(bad)
+    assert "volume" in domain.explain(bad)
 
 
 @needs_c
@@ -806,15 +807,15 @@ def test_ctrl_c_before_a_network_has_a_middle_is_no_error_of_the_domain(monkeypa
 def test_slivers_join_one_neighbour(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cuts at -0.4 and 0.4 that self-motions do not cross, with nothing clear between them: the weaker one goes."""
     robot = oc.problems.get("iiwa").robot
-    whole = joint_range(robot, 0)
-    arm = _Arm.all_of(robot, None, whole)[0]
+    whole = find_joint_range(robot, 0)
+    arm = _Arm.build_all(robot, None, whole)[0]
 
     def sizes(self: _Arm, k: int, value: float, count: int) -> tuple[float, float]:
         clear = 0.05 if abs(value) < 0.4 else 0.3
         return clear, min(abs(value + 0.4), abs(value - 0.4) + 1e-3)
 
-    monkeypatch.setattr(_Arm, "_sizes", sizes)
-    found = arm.cuts(3)
+    monkeypatch.setattr(_Arm, "_measure_slice", sizes)
+    found = arm.find_cuts(3)
     assert [(cut.value, cut.singular) for cut in found] == [(pytest.approx(-0.4, abs=1e-3), False)]
 
 

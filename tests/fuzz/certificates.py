@@ -18,7 +18,7 @@ import public_objects
 import orthocas as oc
 from fuzz.child import Finding, run, verdict
 from fuzz.mutants import Rng, entries_of, npy, packed, pick, sealed
-from orthocas.tools.archive import from_npy
+from orthocas.tools.archive import read_npy
 
 _ARM = "planar_3r_xy"
 Way = tuple[Any, ...]  #: keys and indices down to a number of a header
@@ -113,8 +113,8 @@ def mutant(original: Path, rng: Rng) -> tuple[bytes, str]:
         way = pick(rng, ways)
         _set(header, way, rng)
         return packed(sealed(header, arrays)), "/".join(map(str, way))
-    name = pick(rng, [name for name in arrays if from_npy(arrays[name]).size])
-    array = from_npy(arrays[name]).copy()
+    name = pick(rng, [name for name in arrays if read_npy(arrays[name]).size])
+    array = read_npy(arrays[name]).copy()
     place = int(rng.integers(array.size))
     array.flat[place] = _other(rng, array.flat[place], array.dtype.kind)
     return packed(sealed(header, {**arrays, name: npy(array)})), f"{name}[{place}]"

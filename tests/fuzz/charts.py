@@ -17,7 +17,7 @@ from fuzz.child import Finding, run
 from fuzz.mutants import Rng, entries_of, npy, packed, pick, sealed
 from fuzz.sealed_files import bomb, judged, mutant
 from orthocas.errors import OrthocasError
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 
 
 def _torus() -> oc.Chart:

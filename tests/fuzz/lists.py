@@ -9,7 +9,7 @@ import numpy as np
 
 from fuzz.child import Finding, run, verdict
 from fuzz.mutants import Rng, changed_data, flipped, pick
-from orthocas.tools.files import LIST, digest, is_listed, list_text, read_list
+from orthocas.tools.files import LIST, compute_digest, is_listed, read_list, write_list
 
 
 def lists(count: int) -> list[Finding]:
@@ -26,16 +26,16 @@ def _use(rng: Rng) -> None:
     with TemporaryDirectory() as folder:
         file = Path(folder) / "arm.c"
         file.write_bytes(b"int answer;\n")
-        file.with_name(LIST).write_text(list_text(file.parent, [file]), encoding="utf-8")
+        file.with_name(LIST).write_text(write_list(file.parent, [file]), encoding="utf-8")
         assert is_listed(file)
         if rng.integers(2):
             file.write_bytes(flipped(rng, file.read_bytes()))
         file.with_name(LIST).write_bytes(_mutant(rng, file.with_name(LIST).read_bytes()))
         known = read_list(file.parent)
         assert all(isinstance(entry, str) for name in known for entry in (name, *known[name]))
-        assert is_listed(file) == (digest(file) in known.get(file.name, []))
+        assert is_listed(file) == (compute_digest(file) in known.get(file.name, []))
         assert b"answer;" in file.read_bytes() or not is_listed(file), "a changed file counts as ours"
-        assert json.loads(list_text(file.parent, [file]))["files"][file.name][-1] == digest(file)
+        assert json.loads(write_list(file.parent, [file]))["files"][file.name][-1] == compute_digest(file)
 
 
 def _mutant(rng: Rng, content: bytes) -> bytes:

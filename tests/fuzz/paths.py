@@ -11,7 +11,7 @@ from fuzz.child import Finding, run
 from fuzz.mutants import TEXTS, Rng, flipped, pick
 from fuzz.sealed_files import judged
 from orthocas.paths.tool_path import read_path
-from orthocas.robots.homes import read_postures
+from orthocas.tasks.corridor import read_postures
 
 _CELLS = (
     "0",

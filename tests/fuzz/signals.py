@@ -27,7 +27,7 @@ from PIL import Image
 import orthocas as oc
 from fuzz.child import Finding, run
 from orthocas.simulation import Trajectory
-from orthocas.tools.json import plain
+from orthocas.tools.json import clean
 
 KILLS = 5  #: of one round
 _ROOT = Path(__file__).parent.parent.parent
@@ -261,7 +261,7 @@ def numbers(folder: Path, out: str) -> dict[str, Any]:
     found["files"] = sorted(path.name for path in folder.glob("out/*"))
     if out.startswith(("{", "[")):
         found["out"] = json.loads(out)
-    return dict(plain(_without_times(found)))
+    return dict(clean(_without_times(found)))
 
 
 def _without_times(value: Any) -> Any:

@@ -29,7 +29,7 @@ ORDER = (  # packages import what stands before them, and nothing else
 LOADERS = {
     "import_module",
     "__import__",
-    "of_extra",
+    "import_extra",
     "resolve_name",
     "run_module",
     "run_path",
@@ -40,7 +40,7 @@ LOADERS = {
 COMPUTED = {  # files that may compute the name of a module, and why
     "orthocas.__init__",  # the public names of __init__.pyi, which is above all packages
     "orthocas.cli.commands",  # commands of its own package, on demand
-    "orthocas.tools.checks",  # `of_extra`, whose callers write the name out
+    "orthocas.tools.checks",  # `import_extra`, whose callers write the name out
 }
 
 
@@ -238,7 +238,7 @@ def test_names_of_modules_are_written_out() -> None:
         "from importlib import import_module as load\nload('orthocas.' + name)",
         "list(map(import_module, names))",
         "__import__(name)",
-        "of_extra(package, 'view', 'view')",
+        "import_extra(package, 'view', 'view')",
         "exec(text)",
     ],
 )

@@ -13,7 +13,7 @@ import orthocas as oc
 from orthocas import learn
 from orthocas.charts.solutions import TrackerStatus
 from orthocas.errors import DomainError, InvalidValueError, InverseError, ShapeError
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 

@@ -44,7 +44,7 @@ from PIL import Image
 from programs import needs_c
 
 import orthocas as oc
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 
 
 @pytest.mark.slow

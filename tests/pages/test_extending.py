@@ -72,13 +72,13 @@ def test_loss_term_acts_and_its_gauss_newton_matrix_and_hessian_are_right(tmp_pa
     more = """
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.bases import JointSpace
-from orthocas.tasks.samples import samples_at
-from orthocas.tasks.domains import sample_evenly
+from orthocas.tasks.samples import evaluate_samples
+from orthocas.tasks.samples import sample_evenly
 weights = oc.Weights(extra={"quiet": 3000.0}, angles="metric")
 points = np.repeat(sample_evenly(problem.domain, 30, 3), 2, axis=0)  # every second one makes the Gauss-Newton matrix
 family = oc.Polynomial(2).family(JointSpace.of(problem), 2)
 theta = family.initial(1)
-fast = BasisObjective(family, samples_at(problem, points), weights, theta, None)
+fast = BasisObjective(family, evaluate_samples(problem, points), weights, theta, None)
 slow = oc.loss(problem, oc.Polynomial(2), weights=weights, samples=points, start=theta)
 x = ca.MX.sym("x", family.size)
 H, g, value = ca.hessian(slow(x), x)[0], ca.gradient(slow(x), x), slow(x)
@@ -86,7 +86,7 @@ exact = ca.Function("exact", [x], [value, g, H])
 value, gradient, hessian = (part.full().squeeze() for part in exact(theta))
 print(abs(fast.value(theta) / value - 1), np.abs(fast.value_and_gradient(theta)[1] - gradient).max())
 print(np.abs(fast.hessian(theta) - hessian).max() / np.abs(hessian).max())
-without = BasisObjective(family, samples_at(problem, points), oc.Weights(angles="metric"), theta, None)
+without = BasisObjective(family, evaluate_samples(problem, points), oc.Weights(angles="metric"), theta, None)
 assert fast.value(theta) > without.value(theta)
 """
     (
@@ -146,9 +146,9 @@ def test_task_and_metric_keep_names_and_units_in_files(tmp_path: Path) -> None:
 def test_domain_of_a_user_does_what_the_package_s_own_do(tmp_path: Path) -> None:
     more = """
 import copy, pickle
-from orthocas.tasks.domains import sample_heavily, sample_uniform
+from orthocas.tasks.samples import sample_boundary_weighted, sample_uniform
 ball = round_problem.domain
-for points in (sample_uniform(ball, 2000, 0), sample_heavily(ball, 2000, 0)):
+for points in (sample_uniform(ball, 2000, 0), sample_boundary_weighted(ball, 2000, 0)):
     assert len(points) == 2000 and (np.linalg.norm(points - ball.centre, axis=1) <= 0.5).all()
 loaded = oc.load("ball.orthocas")
 assert isinstance(loaded.problem.domain, Ball) and loaded.problem.domain.radius == 0.5

@@ -10,8 +10,8 @@ import trimesh
 
 import orthocas as oc
 from orthocas.errors import InvalidValueError, RobotError, UnknownNameError
-from orthocas.robots.mjcf import model_from_mjcf
-from orthocas.robots.urdf import lock_joints
+from orthocas.robots.mjcf import read_mjcf
+from orthocas.robots.pinocchio_model import lock_joints
 
 mujoco = pytest.importorskip("mujoco", minversion="4")  # older ones find principal axes to 1e-7 only
 
@@ -42,7 +42,7 @@ def assert_close(got: np.ndarray, want: np.ndarray) -> None:
 
 def assert_agrees(path: Path, states: int = 5) -> None:
     """Names, limits, mass matrix, bias, and the poses of all named bodies and sites."""
-    theirs, ours = mujoco.MjModel.from_xml_path(str(path)), model_from_mjcf(path)
+    theirs, ours = mujoco.MjModel.from_xml_path(str(path)), read_mjcf(path)
     data = ours.createData()
     assert list(ours.names)[1:] == [theirs.joint(i).name or f"joint{i}" for i in range(theirs.njnt)]
     ranges = np.where(theirs.jnt_limited[:, None], theirs.jnt_range, [-np.inf, np.inf])
@@ -64,7 +64,7 @@ def assert_agrees(path: Path, states: int = 5) -> None:
 def test_robot_has_the_mass_matrix_bias_and_tip_pose_of_mujoco(name: str) -> None:
     path, tip = DATA / f"{name}.xml", TIPS[name]
     assert_agrees(path)
-    robot, theirs = oc.Robot.from_model(model_from_mjcf(path), tip), mujoco.MjModel.from_xml_path(str(path))
+    robot, theirs = oc.Robot.from_model(read_mjcf(path), tip), mujoco.MjModel.from_xml_path(str(path))
     for q, dq in np.random.default_rng(3).uniform(-2, 2, (5, 2, robot.n)):
         state, M, bias = mujoco_dynamics(theirs, q, dq)
         there = state.body(tip) if name in ("joints", "corrected") else state.site(tip)
@@ -96,7 +96,7 @@ def test_included_arm_beside_free_bodies_has_the_dynamics_of_mujoco() -> None:
         assert_close(robot.bias(q, dq), bias[:6])
         assert_close(robot.tip_position(q), state.site("tool").xpos)
     with pytest.raises(RobotError, match="box.*FreeFlyer"):
-        oc.Robot.from_model(model_from_mjcf(path), "tool")
+        oc.Robot.from_model(read_mjcf(path), "tool")
 
 
 def test_locked_joints_keep_armatures_and_masses_of_the_others() -> None:
@@ -116,7 +116,7 @@ def test_total_mass_scales_every_body(tmp_path: Path) -> None:
     theirs = mujoco.MjModel.from_xml_path(str(path))
     mujoco.mj_setTotalmass(theirs, 14.0)
     path.write_text(text.replace("<compiler ", '<compiler settotalmass="14" '))
-    ours = model_from_mjcf(path)
+    ours = read_mjcf(path)
     q, dq = np.random.default_rng(2).uniform(-2, 2, (2, 4))
     assert_close(pin.nonLinearEffects(ours, ours.createData(), q, dq), mujoco_dynamics(theirs, q, dq)[2])
 
@@ -298,10 +298,10 @@ def test_last_site_is_the_default_tip_and_wrong_tips_list_bodies_and_sites(tmp_p
 def test_ball_joints_are_refused_unless_they_can_be_locked_off_the_chain(tmp_path: Path) -> None:
     path = write(tmp_path, '<body name="c"><joint name="neck" type="ball"/><geom size="0.1"/></body>')
     with pytest.raises(RobotError, match="neck.*Spherical"):
-        oc.Robot.from_model(model_from_mjcf(path), "b")
+        oc.Robot.from_model(read_mjcf(path), "b")
     assert oc.Robot.from_mjcf(path, "b").joint_names == ("j",)
     with pytest.raises(RobotError, match="neck.*degrees of freedom"):
-        lock_joints(model_from_mjcf(path), {"neck": 0.5})
+        lock_joints(read_mjcf(path), {"neck": 0.5})
 
 
 BOMB = '<!DOCTYPE m [<!ENTITY a "ha">' + "".join(

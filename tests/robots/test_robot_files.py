@@ -13,7 +13,7 @@ from conftest import ROBOTS, arm, one_joint, robot_data
 import orthocas as oc
 from orthocas.errors import InvalidValueError, OrthocasError, RobotError, ShapeError, UnknownNameError
 from orthocas.robots import urdf
-from orthocas.robots.pinocchio_model import planar_model
+from orthocas.robots.pinocchio_model import build_planar
 
 XACRO = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
 
@@ -197,9 +197,9 @@ def test_wrong_shapes_and_nan_are_refused() -> None:
 
 def test_bad_planar_arms_are_refused() -> None:
     with pytest.raises(ShapeError, match="masses"):
-        planar_model([1.0, 1.0], [1.0])
+        build_planar([1.0, 1.0], [1.0])
     with pytest.raises(InvalidValueError, match="lengths"):
-        planar_model([1.0, -1.0], [1.0, 1.0])
+        build_planar([1.0, -1.0], [1.0, 1.0])
 
 
 def test_effort_and_velocity_limits_come_from_the_file() -> None:
@@ -242,7 +242,7 @@ def test_negative_limits_are_refused_by_name(tmp_path: Path, what: str) -> None:
 
 
 def test_limits_of_a_model_are_not_nan() -> None:
-    model = planar_model([1.0, 1.0], [1.0, 1.0])
+    model = build_planar([1.0, 1.0], [1.0, 1.0])
     model.effortLimit = np.array([1.0, np.nan])
     with pytest.raises(RobotError, match="joint 'q2' has the effort limit nan, expected a number >= 0"):
         oc.Robot.from_model(model, "tip")

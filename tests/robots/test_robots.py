@@ -11,7 +11,7 @@ from conftest import ROBOTS, arm, pinocchio_position, robot_data
 import orthocas as oc
 from orthocas.errors import RobotError
 from orthocas.problems.iiwa import robot as iiwa_robot
-from orthocas.robots import urdf
+from orthocas.robots import pinocchio_model, urdf
 
 
 @pytest.mark.slow
@@ -171,10 +171,10 @@ def test_ranges_of_mjcf_slides_are_metres(tmp_path: Path, angle: str, hinge: flo
 
 def test_mimic_joint_on_the_way_names_the_joint_to_lock() -> None:
     path = robot_data("panda_description/urdf/panda.urdf")
-    remedy = r"locked=\{'panda_finger_joint1': 0.0\} or --lock panda_finger_joint1=0"
-    with pytest.raises(RobotError, match=f"panda_finger_joint2.*mimic.*{remedy}"):
+    suggest_lock = r"locked=\{'panda_finger_joint1': 0.0\} or --lock panda_finger_joint1=0"
+    with pytest.raises(RobotError, match=f"panda_finger_joint2.*mimic.*{suggest_lock}"):
         oc.Robot.from_urdf(path, "panda_rightfinger")
-    with pytest.raises(RobotError, match=f"'panda_finger_joint2' mimics joint 'panda_finger_joint1'.*{remedy}"):
+    with pytest.raises(RobotError, match=f"'panda_finger_joint2' mimics joint 'panda_finger_joint1'.*{suggest_lock}"):
         oc.Robot.from_urdf(path, "panda_rightfinger", {"panda_finger_joint2": 0.0})
     finger = oc.Robot.from_urdf(path, "panda_rightfinger", {"panda_finger_joint1": 0.03})
     hand = oc.Robot.from_urdf(path, "panda_hand")
@@ -187,7 +187,7 @@ def test_mimic_joint_on_the_way_names_the_joint_to_lock() -> None:
 def test_joints_off_the_way_are_locked_next_to_zero_and_those_of_the_user_where_asked() -> None:
     path = robot_data("panda_description/urdf/panda.urdf")
     q = np.full(7, 0.3)
-    model = urdf.lock_joints(urdf.read_urdf(path), {"panda_finger_joint1": 0.0})
+    model = pinocchio_model.lock_joints(urdf.read_urdf(path), {"panda_finger_joint1": 0.0})
     want = oc.Robot.from_model(model, "panda_hand").mass_matrix(q)
     np.testing.assert_allclose(oc.Robot.from_urdf(path, "panda_hand").mass_matrix(q), want, atol=1e-12)
     opened = oc.Robot.from_urdf(path, "panda_hand", {"panda_finger_joint1": 0.04}).mass_matrix(q)

@@ -10,7 +10,7 @@ from conftest import robot_data
 
 import orthocas as oc
 from orthocas.errors import InvalidValueError, OrthocasError, UnknownNameError
-from orthocas.robots.kinematics import point_jacobian
+from orthocas.robots.kinematics import build_point_jacobian
 from orthocas.simulation.disturbances import place_of
 from orthocas.tools.checks import Array
 
@@ -252,7 +252,7 @@ def test_pushes_act_at_frames(baxter: oc.Robot) -> None:
     tree = baxter.tree
     q = postures(baxter, 1)[0]
     symbol = ca.SX.sym("q", baxter.n)
-    J = ca.Function("J", [symbol], [point_jacobian(tree, symbol, place.body, np.array(place.point))])(q)
+    J = ca.Function("J", [symbol], [build_point_jacobian(tree, symbol, place.body, np.array(place.point))])(q)
     R, whole = baxter.frame_rotation(q, "right_wrist"), baxter.frame_jacobian(q, "right_wrist")
     arm = R @ [0.1, 0.0, 0.0]
     moved = whole[:3] + np.cross(whole[3:].T, arm).T

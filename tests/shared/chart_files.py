@@ -13,7 +13,7 @@ def rewritten(path: Path, changes: dict[str, bytes], honest: bool = True, withou
     with zipfile.ZipFile(path) as source:
         entries = {name: source.read(name) for name in source.namelist() if name not in without} | changes
     if honest:
-        entries["digest.txt"] = archive._digest(entries["header.json"]).encode()
+        entries["digest.txt"] = archive._compute_digest(entries["header.json"]).encode()
     with zipfile.ZipFile(path, "w") as target:
         for name, content in entries.items():
             target.writestr(name, content)
@@ -32,8 +32,8 @@ def polynomial(degree: int, idle: list[object] | None = None) -> dict[str, objec
 def resealed(path: Path, header: dict[str, object] | None = None, **arrays: object) -> Path:
     """Another header, or other arrays, with checksums that match."""
     contents = {
-        f"{name}.npy": value if isinstance(value, bytes) else archive.to_npy(value) for name, value in arrays.items()
+        f"{name}.npy": value if isinstance(value, bytes) else archive.write_npy(value) for name, value in arrays.items()
     }  # type: ignore[arg-type]
     header = header or header_of(path)
-    sums = {**header["sha256"], **{name: archive._digest(text) for name, text in contents.items()}}  # type: ignore[dict-item]
+    sums = {**header["sha256"], **{name: archive._compute_digest(text) for name, text in contents.items()}}  # type: ignore[dict-item]
     return rewritten(path, {"header.json": json.dumps({**header, "sha256": sums}).encode(), **contents})

@@ -6,7 +6,7 @@ import numpy as np
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 
 
 def with_metric(problem: oc.Problem, metric: str) -> oc.Problem:

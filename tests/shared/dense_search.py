@@ -3,14 +3,13 @@
 import numpy as np
 
 import orthocas as oc
-from orthocas.tasks.domains import bounds_of
 
 STARTS = 4000
 
 
 def positions_at(chart: oc.Chart, x: np.ndarray, pool: np.ndarray) -> np.ndarray:
     """Positions of the domain with the task value x (m,) to which damped least squares lead from a pool (S, n)."""
-    m, sizes, (low, high) = chart.m, chart.phi_sizes[: chart.m], bounds_of(chart.problem.domain)
+    m, sizes, (low, high) = chart.m, chart.phi_sizes[: chart.m], chart.problem.domain.bounds
     q, wanted = pool.copy(), np.broadcast_to(x, (len(pool), m))
     for _ in range(15):
         e = chart.relative.difference(wanted, chart.task(q)) / sizes

@@ -18,7 +18,7 @@ from orthocas import control, problems, solvers
 from orthocas.control import Controller, Reference
 from orthocas.fitting.compare import Comparison
 from orthocas.fitting.fit import ClearPart, Fit
-from orthocas.robots.tree import on_moving_base
+from orthocas.robots.tree import place_on_base
 from orthocas.simulation import (
     Elasticity,
     Friction,
@@ -32,9 +32,8 @@ from orthocas.simulation import (
     coupling_index,
     simulate,
 )
-from orthocas.tasks.domains import sample_uniform
-from orthocas.tasks.metric import Metric, metric_matrices
-from orthocas.tasks.samples import sample_problem
+from orthocas.tasks.metric import Metric
+from orthocas.tasks.samples import sample_problem, sample_uniform
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
 
@@ -253,9 +252,9 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "task of a frame in another": lambda: oc.Task.relative_pose(planar().robot, "tip", "tip"),
     "stacked tasks": lambda: oc.Task.stack(oc.Task.position(planar().robot, "x"), oc.Task.axis(planar().robot)),
     "fit with a meaning": lambda: oc.fit(planar(), oc.Polynomial(1), like="q3", samples=200),
-    "robot on a rail": lambda: oc.Robot(on_moving_base(planar().robot.tree, "rail:x", 1.0, np.zeros(3), np.eye(3))),
+    "robot on a rail": lambda: oc.Robot(place_on_base(planar().robot.tree, "rail:x", 1.0, np.zeros(3), np.eye(3))),
     "robot that floats": lambda: oc.Robot(
-        on_moving_base(planar().robot.tree, "floating:xy", 1.0, np.zeros(3), np.eye(3))
+        place_on_base(planar().robot.tree, "floating:xy", 1.0, np.zeros(3), np.eye(3))
     ),
     "task of a quadratic program": lambda: oc.control.XiTask(fitted().chart, cost=1.0),
     "mobile": lambda: oc.Mobile(oc.Polynomial(2)),
@@ -371,7 +370,7 @@ def _of_task(task: oc.Task) -> Iterator[Any]:
 @_numbers.register
 def _of_problem(problem: oc.Problem) -> Iterator[Any]:
     yield from (*_numbers(problem.task), *_numbers(problem.robot), *_numbers(problem.domain), problem.name)
-    yield metric_matrices(problem.metric, sample_uniform(problem.domain, 5, 0))
+    yield problem.metric.evaluate(sample_uniform(problem.domain, 5, 0))
 
 
 @_numbers.register

@@ -20,8 +20,8 @@ from paper import Drawing, Recipe, registry
 from programs import Run, nightly, python
 
 import orthocas as oc
-from orthocas.certificates.judges import Verdicts
-from orthocas.certificates.search import Limits, Search, largest_first
+from orthocas.certificates.box_checks import BoxResults
+from orthocas.certificates.search import Limits, Search, rank_by_volume
 from orthocas.certificates.taylor import Variables
 from orthocas.charts.certificate import Subdivision
 from orthocas.cli import entry
@@ -141,12 +141,12 @@ class Disturbed:
     joints: Variables = (0, 1)
     boxes: int = 0
 
-    def __call__(self, low: Array, high: Array) -> Verdicts:
+    def __call__(self, low: Array, high: Array) -> BoxResults:
         self.boxes += len(low)
         with suppress(BaseException):
             signal.raise_signal(self.number)
         no = np.zeros(len(low), dtype=bool)
-        return Verdicts(no, no, np.zeros(len(low)), np.zeros(len(low)), np.zeros(len(low), dtype=int))
+        return BoxResults(no, no, np.zeros(len(low)), np.zeros(len(low)), np.zeros(len(low), dtype=int))
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
@@ -157,7 +157,7 @@ def test_a_search_ends_soon_after_a_signal_that_a_library_swallowed(name: str) -
     of_this_process = signal.signal(number, handler)
     box = Subdivision.whole(-np.ones(2), np.ones(2))
     judge = Disturbed(number)
-    search = Search(judge, box, Limits(boxes=1000), largest_first(box))
+    search = Search(judge, box, Limits(boxes=1000), rank_by_volume(box))
     try:
         with ended_in_order(), remembered(), pytest.raises((KeyboardInterrupt, SystemExit)):
             search.run(lambda _: None)

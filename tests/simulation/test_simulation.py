@@ -15,7 +15,7 @@ import orthocas as oc
 from orthocas.control import ControlStatus, Impedance, Kinematic, PDPlus, Reference
 from orthocas.errors import InvalidValueError
 from orthocas.problems.iiwa import urdf_path
-from orthocas.robots.pinocchio_model import planar_model
+from orthocas.robots.pinocchio_model import build_planar
 from orthocas.simulation import (
     Outcome,
     coupling_index,
@@ -29,7 +29,7 @@ def test_run_agrees_with_another_integrator_on_pinocchios_dynamics(
     planar_chart: oc.Chart, planar_steps: Reference, planar_q0: Array
 ) -> None:
     """SciPy's DOP853 with Pinocchio's forward dynamics, segment by segment."""
-    model = planar_model([1, 1, 1], [3, 3, 3])
+    model = build_planar([1, 1, 1], [3, 3, 3])
     data, law = model.createData(), PDPlus(planar_chart, K, coupling="decoupled")
     short = replace(
         planar_steps,

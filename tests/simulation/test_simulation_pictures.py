@@ -19,7 +19,7 @@ from orthocas.errors import ArchiveError, InvalidValueError, UnknownNameError
 from orthocas.fitting.fit import Fit
 from orthocas.simulation import Outcome, Trajectory, figure
 from orthocas.simulation.figure import ACTUAL, RULES, MovingPicture, save_animation, trajectory_figure, units_of
-from orthocas.tools.files import LIST, published
+from orthocas.tools.files import LIST, publish
 from orthocas.tools.progress import Progress
 
 
@@ -210,7 +210,7 @@ def test_interrupted_animation_leaves_nothing_and_keeps_the_old_one(
     planar_run: Trajectory, planar_fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     fake_ffmpeg(tmp_path, monkeypatch, TAKE_ALL)
-    with published(tmp_path, listed=True) as drafts:
+    with publish(tmp_path, listed=True) as drafts:
         (drafts / name).write_text("old")
 
     def stop(progress: Progress) -> None:
@@ -241,7 +241,7 @@ def test_targets_are_drawn_for_positions_of_the_first_tip_only() -> None:
     q = np.zeros((3, robot.n))
     own, other = oc.Task.position(robot), oc.Task.position(robot, frame="right_gripper")
     for task, drawn in ((own, True), (other, False), (oc.Task.stack(own, other), False)):
-        problem = oc.Problem(robot, task, domain=oc.Box(robot.tree.middle, 0.1))
+        problem = oc.Problem(robot, task, domain=oc.Box(robot.tree.centre_posture, 0.1))
         run: Any = SimpleNamespace(times=np.arange(3.0), q=q, reference=np.tile(task.batched(q[:1])[0], (3, 1)))
         targets = figure._compute_tip_targets(run, problem)
         assert np.isfinite(targets).all() == drawn

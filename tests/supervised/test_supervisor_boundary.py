@@ -11,7 +11,7 @@ import orthocas as oc
 from orthocas.charts.coordinates import Coordinates
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.control import ControlStatus, PDPlus, Safety
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 pytestmark = needs_c

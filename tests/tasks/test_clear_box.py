@@ -22,7 +22,7 @@ from orthocas.codegen import CompiledLibrary, check_c, compile_shared
 from orthocas.control import ControlStatus
 from orthocas.errors import ChartFileError, DomainError, InvalidValueError, UnreachableReferenceError
 from orthocas.fitting.fit import offer_clear_part
-from orthocas.tasks.domains import sample_evenly, sample_heavily, sample_uniform
+from orthocas.tasks.samples import sample_boundary_weighted, sample_evenly, sample_uniform
 
 Numbers = NDArray[np.float64]
 BOUND = 0.2
@@ -98,7 +98,7 @@ def test_singular_values_do_not_depend_on_how_the_world_is_turned() -> None:
     np.testing.assert_allclose(clear.singular_values(turned), clear.singular_values(points), rtol=1e-10)
 
 
-@pytest.mark.parametrize("draw", [sample_uniform, sample_heavily, sample_evenly])
+@pytest.mark.parametrize("draw", [sample_uniform, sample_boundary_weighted, sample_evenly])
 def test_samples_lie_inside_and_follow_the_seed(problem: oc.Problem, draw: object) -> None:
     assert callable(draw)
     points = draw(problem.domain, 5000, 3)
@@ -111,12 +111,14 @@ def test_samples_lie_inside_and_follow_the_seed(problem: oc.Problem, draw: objec
     np.testing.assert_allclose(points.mean(axis=0), wanted, atol=0.05)  # standard error 0.01
     plain = draw(WIDE, 5000, 3)  # even and uniform samples are the first ones of the box that lie inside
     kept = plain[problem.domain.contains(plain)]
-    assert draw is sample_heavily or np.array_equal(points[: len(kept)], kept)
+    assert draw is sample_boundary_weighted or np.array_equal(points[: len(kept)], kept)
 
 
 def test_a_single_sample_is_drawn(problem: oc.Problem) -> None:
     for domain in (WIDE, problem.domain):
-        assert [draw(domain, 1, 0).shape for draw in (sample_uniform, sample_heavily, sample_evenly)] == [(1, 3)] * 3
+        assert [draw(domain, 1, 0).shape for draw in (sample_uniform, sample_boundary_weighted, sample_evenly)] == [
+            (1, 3)
+        ] * 3
 
 
 def test_a_domain_of_which_nothing_is_left_is_refused_soon(problem: oc.Problem) -> None:
@@ -226,7 +228,7 @@ def test_the_bound_takes_the_folds_out_of_a_box_with_singular_positions(problem:
     whole = oc.fit(oc.Problem(problem.robot, problem.task, domain=WIDE), oc.Polynomial(3))
     assert whole.worst is not None
     assert whole.worst.least < 0
-    points = sample_heavily(problem.domain, 100_000, (7, 7))
+    points = sample_boundary_weighted(problem.domain, 100_000, (7, 7))
     volumes = np.linalg.det(chart.jacobian(points))
     assert np.sign(volumes).min() == np.sign(volumes).max()
     report = oc.evaluate(chart, 20_000)

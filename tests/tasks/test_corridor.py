@@ -11,11 +11,11 @@ from programs import Run
 
 import orthocas as oc
 from orthocas import codegen, problems
-from orthocas.certificates.chart_rows import chart_rows
-from orthocas.certificates.outside import judge_of
+from orthocas.certificates.outside import choose_check
+from orthocas.certificates.rows import build_chart_rows
 from orthocas.control import ControlStatus
 from orthocas.errors import DomainError, InvalidValueError, ShapeError, UnreachableReferenceError
-from orthocas.tasks.domains import sample_heavily, sample_uniform
+from orthocas.tasks.samples import sample_boundary_weighted, sample_uniform
 from orthocas.tools.checks import Array
 
 PATH = np.array([[0.0, 0.6, 0.8], [0.7, 0.9, 1.2], [0.9, 1.7, 1.2]])
@@ -90,7 +90,7 @@ def test_samples_are_uniform() -> None:
         places = np.concatenate([a, b])
         gap = np.abs(np.searchsorted(a, places) / len(a) - np.searchsorted(b, places) / len(b)).max()
         assert gap < 1.95 * np.sqrt(1 / len(a) + 1 / len(b))
-    assert domain.contains(sample_heavily(domain, 300, 2)).all()
+    assert domain.contains(sample_boundary_weighted(domain, 300, 2)).all()
 
 
 @pytest.mark.slow
@@ -112,7 +112,7 @@ def test_certificate_covers_the_corridor_and_leaves_out_nothing_of_it(chart: oc.
     certificate = oc.certify(chart)
     assert certificate.proved
     assert oc.check_certificate(chart, certificate)
-    judge = judge_of(chart, chart_rows(chart), 0.0)
+    judge = choose_check(chart, build_chart_rows(chart), 0.0)
     rng = np.random.default_rng(7)
     middle = rng.uniform(-1, 1, (200, 3))
     corners = [domain.centre + domain.half_width * (middle + side) for side in (-0.1, 0.1)]

@@ -12,7 +12,8 @@ from orthocas import problems
 from orthocas.charts.reaching import RULES
 from orthocas.charts.self_motion import Interval, Stop
 from orthocas.errors import DomainError
-from orthocas.tasks.domains import StopKind, sample_uniform
+from orthocas.tasks.domains import StopKind
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
 FOUND, NEAREST = oc.InverseStatus.FOUND, oc.InverseStatus.NEAREST

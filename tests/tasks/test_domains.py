@@ -8,7 +8,8 @@ from conftest import robot_data
 
 import orthocas as oc
 from orthocas.errors import DomainError, InvalidValueError, ShapeError
-from orthocas.tasks.domains import Box, contains, default_box, require_within_limits, sample_evenly, sample_uniform
+from orthocas.tasks.domains import Box, contains, default_box, require_within_limits
+from orthocas.tasks.samples import sample_evenly, sample_uniform
 
 
 def panda() -> oc.Robot:

@@ -14,7 +14,7 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.errors import InvalidValueError
 from orthocas.robots.obstacles import Capsule, LinkDistances, Obstacle, Plane, Sphere
-from orthocas.robots.tree import on_moving_base
+from orthocas.robots.tree import place_on_base
 from orthocas.tools.checks import Array
 
 RADIUS = 0.04
@@ -105,7 +105,7 @@ def test_gradients_are_finite_differences() -> None:
     ]
     distances, rng = LinkDistances(robot, obstacles, RADIUS), np.random.default_rng(5)
     q = rng.uniform(-1, 1, (4, 7))
-    values, gradients = distances.with_gradients(q)
+    values, gradients = distances.evaluate_gradients(q)
     np.testing.assert_allclose(values, distances(q), atol=1e-12)
     for i in range(7):
         step = 1e-6 * np.eye(7)[i]
@@ -158,7 +158,7 @@ def test_a_link_under_both_arms_counts_once() -> None:
 
 def test_nothing_solid_joins_the_world_and_a_moving_base() -> None:
     arm = problems.get("iiwa").robot
-    robot = oc.Robot(on_moving_base(arm.tree, "planar", 10.0, np.zeros(3), np.eye(3)))
+    robot = oc.Robot(place_on_base(arm.tree, "planar", 10.0, np.zeros(3), np.eye(3)))
     q = np.array([3.0, 2.0, 0.5, *np.linspace(-0.5, 0.5, 7)])
     pairs = LinkDistances(robot, [Sphere([1.5, 0.0, 0.0], 0.2), Sphere([3.0, 1.0, 0.0], 0.2)])
     assert not any(name in pair for pair in pairs.pairs for name in ("base_x", "base_y"))

@@ -7,7 +7,7 @@ import pytest
 import orthocas as oc
 from orthocas import problems
 from orthocas.errors import InvalidValueError, NotRedundantError, SingularTaskError, UnknownNameError
-from orthocas.tasks.samples import sample_problem, samples_at
+from orthocas.tasks.samples import evaluate_samples, sample_problem
 
 
 def arm(joints: int = 3) -> oc.Robot:
@@ -62,7 +62,7 @@ def test_task_that_is_not_finite_is_located() -> None:
 def test_samples_with_vanishing_gradient_are_dropped() -> None:
     robot = arm(2)
     problem = oc.Problem(robot, oc.Task.position(robot, "x"), domain=oc.Torus(2))
-    samples = samples_at(problem, np.array([[0.0, 0.0], [0.5, 0.5]]))
+    samples = evaluate_samples(problem, np.array([[0.0, 0.0], [0.5, 0.5]]))
     np.testing.assert_array_equal(samples.points, [[0.5, 0.5]])
 
 
@@ -71,7 +71,7 @@ def test_task_basis_is_orthonormal_in_the_metric_and_spans_the_gradients(planar_
     A = planar_xy.robot.mass_matrix(samples.points)
     E = samples.task_basis
     np.testing.assert_allclose(E @ A @ E.transpose(0, 2, 1), np.broadcast_to(np.eye(2), (50, 2, 2)), atol=1e-10)
-    for basis, gradients in zip(E, samples.raised(samples.task_jacobian), strict=True):
+    for basis, gradients in zip(E, samples.compute_metric_gradients(samples.task_jacobian), strict=True):
         assert np.linalg.matrix_rank(np.vstack([basis, gradients]), tol=1e-9) == 2
 
 

@@ -10,7 +10,7 @@ import orthocas as oc
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
 from orthocas.problems.iiwa import robot as iiwa_robot
 from orthocas.tasks.domains import default_box
-from orthocas.tools.expressions import from_tape, to_tape
+from orthocas.tools.expressions import read_tape, write_tape
 
 Q = np.array([0.3, 0.7, -0.4, -1.0, 0.5, 0.9, 0.2])
 READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])  # of the Panda: its hand points down
@@ -169,7 +169,7 @@ def test_custom_task_survives_its_recipe() -> None:
 
     task = oc.Task.custom(robot, "odd", odd, labels=("a", "b"))
     symbol = ca.SX.sym("q", 3)
-    again = ca.Function("again", [symbol], [from_tape(to_tape(task.function), symbol)])
+    again = ca.Function("again", [symbol], [read_tape(write_tape(task.function), symbol)])
     for q in np.random.default_rng(0).uniform(-2, 2, (20, 3)):
         np.testing.assert_allclose(np.array(again(q)), np.array(task.function(q)), atol=1e-14)
 
@@ -260,5 +260,5 @@ def test_the_distance_from_half_a_turn_is_that_of_rotation_matrices(kind: str) -
     if kind == "pose:z":  # its turn ends at half a turn as well
         wanted = np.minimum(wanted, np.cos(task.batched(points)[0][:, 5] / 2))
     assert task.turn is not None
-    found = task.turn.distance_from_half_a_turn(task.batched(points)[0].reshape(50, -1))
+    found = task.turn.measure_half_turn_distance(task.batched(points)[0].reshape(50, -1))
     np.testing.assert_allclose(found, wanted, atol=1e-7)

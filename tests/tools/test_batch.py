@@ -28,14 +28,14 @@ def test_many_samples_give_what_numpy_gives(monkeypatch: pytest.MonkeyPatch, N: 
 @pytest.mark.parametrize(("told", "threads"), [("3", 3), ("1", 1)])
 def test_the_environment_tells_how_many_threads(monkeypatch: pytest.MonkeyPatch, told: str, threads: int) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", told)
-    assert batch._threads() == threads
+    assert batch._count_cores() == threads
 
 
 def test_without_a_wish_every_core_gets_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 2, 5}, raising=False)
     for told in ("", "0", "-2", "many"):
         monkeypatch.setenv("OMP_NUM_THREADS", told)
-        assert batch._threads() == 3
+        assert batch._count_cores() == 3
 
 
 def test_results_of_single_calls_stay_when_the_next_one_comes() -> None:

@@ -11,9 +11,9 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.bases import JointSpace
 from orthocas.charts.coordinates import Coordinates
-from orthocas.tasks.domains import sample_uniform
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools import columns
-from orthocas.tools.batch import Batched, dense_function, using_threads
+from orthocas.tools.batch import Batched, dense_function, use_threads
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import BlockedFunction
 
@@ -50,7 +50,7 @@ def test_values_are_those_of_numpy(count: int) -> None:
 def test_threads_change_nothing(parametrisation: oc.Polynomial | oc.MLP, name: str) -> None:
     coordinates, points, found = of_arm(parametrisation), points_of(7, 9000), []
     for count in (1, 2, 5):
-        with using_threads(count):
+        with use_threads(count):
             found.append(getattr(coordinates, name)(points))
     for other in found[1:]:
         np.testing.assert_array_equal(other, found[0])

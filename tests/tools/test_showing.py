@@ -176,6 +176,6 @@ def test_no_text_of_the_library_rounds_a_share_to_the_nearest() -> None:
         f"{path.name}: {line.strip()}"
         for path in sorted(Path(oc.__file__).parent.rglob("*.py"))
         for line in path.read_text("utf-8").splitlines()
-        if re.search(r":\.\d%\}", line) and "_LEAST_SHARE" not in line
+        if re.search(r":\.\d%\}", line) and "least_fraction" not in line
     ]
     assert not found

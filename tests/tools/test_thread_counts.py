@@ -15,7 +15,7 @@ import orthocas as oc
 from orthocas import solvers
 from orthocas.fitting import basis_objective
 from orthocas.solvers.protocol import Solver
-from orthocas.tools.batch import in_threads, in_threads_with, one_blas_thread, using_threads
+from orthocas.tools.batch import one_blas_thread, run_in_threads, run_in_threads_with, use_threads
 
 
 def blas_threads() -> list[int]:
@@ -28,11 +28,11 @@ def test_results_come_in_order(count: int) -> None:
         time.sleep(0.01 * (k == 0))
         return k * k
 
-    with using_threads(count):
-        assert in_threads(late, range(7)) == [k * k for k in range(7)]
-        assert in_threads(late, []) == []
+    with use_threads(count):
+        assert run_in_threads(late, range(7)) == [k * k for k in range(7)]
+        assert run_in_threads(late, []) == []
         with pytest.raises(ZeroDivisionError):
-            in_threads(lambda k: 1 // k, range(3))
+            run_in_threads(lambda k: 1 // k, range(3))
 
 
 def test_after_an_exception_no_piece_is_at_work() -> None:
@@ -46,16 +46,16 @@ def test_after_an_exception_no_piece_is_at_work() -> None:
         time.sleep(0.05)
         busy.remove(k)
 
-    with using_threads(3):
+    with use_threads(3):
         for _ in range(3):
             with pytest.raises(KeyError):
-                in_threads(work, range(20))
+                run_in_threads(work, range(20))
             assert not busy
 
 
 def test_threads_within_threads_do_not_wait_for_each_other() -> None:
-    with using_threads(2):
-        found = in_threads(lambda k: sum(in_threads(lambda i: i, range(k))), range(6))
+    with use_threads(2):
+        found = run_in_threads(lambda k: sum(run_in_threads(lambda i: i, range(k))), range(6))
     assert found == [0, 0, 1, 3, 6, 10]
 
 
@@ -68,8 +68,8 @@ def test_a_tool_serves_one_piece_at_a_time() -> None:
         assert tool.pop() == piece
         return piece
 
-    with using_threads(3):
-        assert in_threads_with(tools, work, range(60)) == list(range(60))
+    with use_threads(3):
+        assert run_in_threads_with(tools, work, range(60)) == list(range(60))
 
 
 def test_normal_blocks_are_sums_of_products() -> None:
@@ -80,7 +80,7 @@ def test_normal_blocks_are_sums_of_products() -> None:
     X = [D.astype(float) @ G.astype(float) for D, G in zip(derivatives, gradients, strict=True)]
     found = []
     for count in (1, 2, 5):
-        with using_threads(count):
+        with use_threads(count):
             found.append(basis_objective.normal_matrix(derivatives, gradients, [(1, 0, 2, 1)]))
     for j, part in enumerate((slice(K), slice(K, None))):
         np.testing.assert_allclose(found[0][part, part], np.einsum("srk,srl->kl", X[j], X[j]), rtol=0, atol=5e-2)

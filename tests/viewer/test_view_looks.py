@@ -15,7 +15,8 @@ import orthocas as oc
 from orthocas.errors import (
     RobotError,
 )
-from orthocas.robots.urdf import lock_off_chain, read_urdf
+from orthocas.robots.pinocchio_model import lock_off_chain
+from orthocas.robots.urdf import read_urdf
 from orthocas.viewer.looks import (
     RULES,
     BodyPoses,
@@ -92,7 +93,7 @@ def test_all_tips_are_drawn() -> None:
     path = robot_data("baxter_description/urdf/baxter.urdf")
     tips = ["left_gripper", "right_gripper"]
     robot = oc.Robot.from_urdf(path, tips=tips)
-    q = robot.tree.middle
+    q = robot.tree.centre_posture
     positions, quaternions = BodyPoses(robot.tree)(q[None])
     balls = []
     for i, solids in enumerate(build_stick_arm(robot.tree)):
