@@ -17,7 +17,6 @@ from orthocas.control.controller import FROM_THE_LAW, Controller, ControlStatus
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError, OrthocasError, TrajectoryFileError
 from orthocas.simulation.disturbances import RULES, Push
-from orthocas.tasks.domains import contains
 from orthocas.tools.archive import Stored, open_archive, read_npy
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import building
@@ -311,7 +310,7 @@ def find_loss(run: Trajectory, controller: Controller, pushes: Sequence[Push], s
 def _find_outside(run: Trajectory, controller: Controller) -> tuple[NDArray[np.bool_], str]:
     """At which instants the arm is outside what the law respects, (N,), and what that is."""
     if controller.chart is not None:
-        return np.asarray(~contains(controller.problem.domain, run.q)), "the domain of the chart"
+        return np.asarray(~controller.problem.domain.contains(run.q)), "the domain of the chart"
     robot = controller.problem.robot
     beyond = (run.q < robot.lower - RULES.beyond) | (run.q > robot.upper + RULES.beyond)
     return np.asarray(beyond.any(axis=1)), "the joint limits"

@@ -12,9 +12,7 @@ import pytest
 from conftest import robot_data
 
 import orthocas as oc
-from orthocas.errors import (
-    RobotError,
-)
+from orthocas.errors import RobotError
 from orthocas.robots.pinocchio_model import lock_off_chain
 from orthocas.robots.urdf import read_urdf
 from orthocas.viewer.looks import (

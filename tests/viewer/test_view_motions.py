@@ -8,11 +8,7 @@ import pytest
 from public_objects import fitted, joint_motion, trajectory
 
 from orthocas import problems
-from orthocas.errors import (
-    InvalidValueError,
-    PathError,
-    PathFileError,
-)
+from orthocas.errors import InvalidValueError, PathError, PathFileError
 from orthocas.fitting.fit import Fit
 from orthocas.viewer import cyclic_motions
 from orthocas.viewer.motion import read_joint_motion, read_run

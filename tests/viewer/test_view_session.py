@@ -8,11 +8,7 @@ from public_objects import circle, clear, cyclic, fitted
 
 import orthocas as oc
 from orthocas.charts.self_motion import fan_along
-from orthocas.errors import (
-    InvalidValueError,
-    NoExpressionError,
-    UnknownNameError,
-)
+from orthocas.errors import InvalidValueError, NoExpressionError, UnknownNameError
 from orthocas.fitting.fit import Fit
 from orthocas.viewer.session import Session
 

@@ -15,12 +15,7 @@ from public_objects import circle, fitted, joint_motion, trajectory
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.errors import (
-    InvalidValueError,
-    MissingExtraError,
-    NoExpressionError,
-    ViewError,
-)
+from orthocas.errors import InvalidValueError, MissingExtraError, NoExpressionError, ViewError
 from orthocas.tools import checks
 from orthocas.viewer import Motion, export_page, window
 from orthocas.viewer.panel import ChartPanel, PlayerPanel, RobotPanel, format_drift
