@@ -17,11 +17,11 @@ from numpy.typing import ArrayLike
 from orthocas.charts.chart import Chart
 from orthocas.control.controller import (
     Command,
+    build_function,
     count_turns_from_centre,
     fallback_function,
     guarded_graph,
     law_facts,
-    named_function,
     named_inputs,
 )
 from orthocas.control.gains import (
@@ -30,13 +30,12 @@ from orthocas.control.gains import (
     LIMIT,
     STIFFNESS,
     command_limit,
+    find_holding_doubts,
     non_negative_gains,
     positive_gains,
 )
-from orthocas.control.holding import holding_doubts
-from orthocas.control.linear_algebra import block_inertia, damped, median_volume
-from orthocas.control.posture import joint_path
-from orthocas.control.reference import Reference
+from orthocas.control.linear_algebra import apply_damping, build_block_inertia, compute_median_volume
+from orthocas.control.reference import Reference, joint_path
 from orthocas.errors import InvalidValueError, SingularTaskError, UnreachableReferenceError
 from orthocas.robots.tree import require_driven
 from orthocas.tasks.metric import Metric
@@ -175,12 +174,12 @@ class KinematicProjector(TwoTaskLaw):
         known = Relative(problem.task)
         e, J = known.error(q, x_d[:m])
         A = problem.metric.function(q)
-        B, Lambda, volume = block_inertia(problem.n, (m,))(J, A)
+        B, Lambda, volume = build_block_inertia(problem.n, (m,))(J, A)
         J_2_inverse, _, relative = self._second.weighted(q, A)
-        rest = self._second.shortest(x_d - self.measured(q))[m:]
+        rest = self._second.wrap_shortest(x_d - self.measured(q))[m:]
         second = J_2_inverse @ (dx_d[m:] + gain[m:] * rest)
         velocity = second + B @ (Lambda @ (known.compute_drift(q, x_d[:m], dx_d[:m]) - gain[:m] * e - J @ second))
-        scale = median_volume(problem, known.rates, problem.metric, (m,))
+        scale = compute_median_volume(problem, known.rates, problem.metric, (m,))
         domain = None if self.chart is None else self.chart.problem.domain
         return guarded_graph(self.name, inputs, velocity, ca.MX(problem.n, 1), volume / scale * relative, domain, True)
 
@@ -277,7 +276,7 @@ class Projector(TwoTaskLaw):
 
     def remarks(self) -> list[str]:
         """A warning if the motors cannot hold the arm."""
-        return holding_doubts(self.problem.robot, self.problem.domain, self.limit)
+        return find_holding_doubts(self.problem.robot, self.problem.domain, self.limit)
 
     def facts(self) -> dict[str, str]:
         """Quantities, gains and problem."""
@@ -310,10 +309,10 @@ class Projector(TwoTaskLaw):
         known = Relative(problem.task)
         J, A, gravity = known.error(q, inputs["reference"][:m])[1], problem.metric.function(q), problem.robot.gravity(q)
         f_x, f_2 = two_task_forces(problem, self._second, inputs, self.feed_forward)
-        B, Lambda, volume = block_inertia(problem.n, (m,))(J, A)
+        B, Lambda, volume = build_block_inertia(problem.n, (m,))(J, A)
         second = self._second.jacobian(q).T @ f_2
         torque = J.T @ f_x + second - J.T @ (Lambda @ (B.T @ second)) + gravity
-        scale = median_volume(problem, known.rates, problem.metric, (m,))
+        scale = compute_median_volume(problem, known.rates, problem.metric, (m,))
         relative = volume / scale * self._second.weighted(q, A)[2]
         domain = None if self.chart is None else self.chart.problem.domain
         return guarded_graph(self.name, inputs, torque, gravity, relative, domain)
@@ -340,12 +339,12 @@ class Projector(TwoTaskLaw):
         q, dq = inputs["q"], inputs["dq"]
         e, J, damped_x, damped_2 = errors_and_damping(problem, self._second, inputs)
         J_2 = self._second.jacobian(q)
-        B, Lambda, _ = block_inertia(problem.n, (m,))(J, problem.metric.function(q))
+        B, Lambda, _ = build_block_inertia(problem.n, (m,))(J, problem.metric.function(q))
         through = dq - B @ (Lambda @ (J @ dq))  # P dq
         storage = (ca.bilin(problem.robot.mass_matrix(q), dq, dq) + ca.dot(e, inputs["stiffness"] * e)) / 2
         power = ca.dot(J @ dq, damped_x(J @ dq)) + ca.dot(J_2 @ through, damped_2(J_2 @ dq))
         outputs = {"storage": storage, "dissipated_power": power}
-        return named_function("energy", inputs, outputs)
+        return build_function("energy", inputs, outputs)
 
     def _inputs(self) -> dict[str, ca.MX]:
         return named_inputs(self.problem.n, self.gains, len(self.labels))
@@ -405,7 +404,7 @@ class SecondTask(Protocol):
         """dJ_2/dt dq, (k_2, 1)."""
         ...
 
-    def shortest(self, difference: ca.MX) -> ca.MX:
+    def wrap_shortest(self, difference: ca.MX) -> ca.MX:
         """A difference of two [x; x_2], without whole turns of joints that turn without end."""
         ...
 
@@ -462,7 +461,7 @@ class _Joints:
     def curvature(self, q: ca.MX, dq: ca.MX) -> ca.MX:
         return ca.MX.zeros(self.problem.n)
 
-    def shortest(self, difference: ca.MX) -> ca.MX:
+    def wrap_shortest(self, difference: ca.MX) -> ca.MX:
         return difference
 
     def runnable(self, graph: ca.Function) -> ca.Function:
@@ -526,7 +525,7 @@ class _OwnTask:
     def curvature(self, q: ca.MX, dq: ca.MX) -> ca.MX:
         return self.task.second_derivative_function(q, dq, dq)
 
-    def shortest(self, difference: ca.MX) -> ca.MX:
+    def wrap_shortest(self, difference: ca.MX) -> ca.MX:
         return difference
 
     def runnable(self, graph: ca.Function) -> ca.Function:
@@ -568,7 +567,7 @@ class _ExtraCoordinates:
     def curvature(self, q: ca.MX, dq: ca.MX) -> ca.MX:
         return self.chart.coordinates.functions["second_derivative"](q, dq, dq)
 
-    def shortest(self, difference: ca.MX) -> ca.MX:
+    def wrap_shortest(self, difference: ca.MX) -> ca.MX:
         shorter: ca.MX = wrap_shortest(difference, self.chart.turns)
         return shorter
 
@@ -587,8 +586,8 @@ def _stacked(problem: Problem, q: ca.MX, second: ca.MX) -> ca.Function:
 def _weighted(problem: Problem, metric: Metric, jacobian: ca.Function, q: ca.MX, A: ca.MX) -> tuple[Any, Any, Any]:
     """`SecondTask.weighted` from the Jacobian J_2 as a function of q, on the domain of a problem."""
     k = jacobian.size1_out(0)
-    B, Lambda, volume = block_inertia(problem.n, (k,))(jacobian(q), A)
-    return B @ Lambda, Lambda, volume / median_volume(problem, jacobian, metric, (k,))
+    B, Lambda, volume = build_block_inertia(problem.n, (k,))(jacobian(q), A)
+    return B @ Lambda, Lambda, volume / compute_median_volume(problem, jacobian, metric, (k,))
 
 
 Inputs = dict[str, ca.MX]
@@ -608,7 +607,7 @@ def two_task_forces(problem: Problem, second: SecondTask, inputs: Inputs, feed_f
     if not feed_forward:
         return f_x - damped_x(J @ dq), f_2 - damped_2(J_2 @ dq)
     M, C_dq = problem.robot.mass_matrix(q), problem.robot.coriolis_product(q, dq, dq)
-    B, M_x, _ = block_inertia(problem.n, (m,))(J, M)
+    B, M_x, _ = build_block_inertia(problem.n, (m,))(J, M)
     sharp, M_2, _ = second.weighted(q, M)
     x_d, rate, acceleration = (inputs[name] for name in ("reference", "reference_velocity", "reference_acceleration"))
     relative = Relative(problem.task)
@@ -630,14 +629,14 @@ def errors_and_damping(problem: Problem, second: SecondTask, inputs: Inputs) -> 
     q, K, Z, m = inputs["q"], inputs["stiffness"], inputs["damping_ratio"], problem.m
     M = problem.robot.mass_matrix(q)
     e_x, J = Relative(problem.task).error(q, inputs["reference"][:m])
-    M_x = block_inertia(problem.n, (m,))(J, M)[1]
+    M_x = build_block_inertia(problem.n, (m,))(J, M)[1]
     M_2 = second.weighted(q, M)[1]
-    rest = second.shortest(second.measured(q) - inputs["reference"])[m:]
+    rest = second.wrap_shortest(second.measured(q) - inputs["reference"])[m:]
     return ca.vertcat(e_x, rest), J, _damping(M_x, K[:m], Z[:m]), _damping(M_2, K[m:], Z[m:])
 
 
 def _damping(inertia: ca.MX, stiffness: ca.MX, damping_ratio: ca.MX) -> Damped:
     size = inertia.shape[0]
     M, K, Z, v = ca.MX.sym("M", size, size), *(ca.MX.sym(name, size) for name in ("K", "Z", "v"))
-    D_v = ca.Function("damping", [M, K, Z, v], [ca.densify(damped("square_root", M, K, Z, v))])
+    D_v = ca.Function("damping", [M, K, Z, v], [ca.densify(apply_damping("square_root", M, K, Z, v))])
     return lambda velocity: D_v(inertia, stiffness, damping_ratio, velocity)

@@ -14,7 +14,7 @@ import orthocas as oc
 from orthocas.codegen import Supervisor
 from orthocas.codegen.library import CompiledLibrary, compile_shared, gain_numbers
 from orthocas.control import ControlStatus, Impedance, PDPlus, Safety
-from orthocas.control.gains import SPRING_FREQUENCY
+from orthocas.control.gains import RULES
 from orthocas.tools.checks import Array
 
 COULOMB = (1.0, 1.0, 1.0, 1.0, 0.3, 0.3, 0.3)  # friction [N m]
@@ -46,7 +46,7 @@ def laws_on(chart: oc.Chart) -> Iterator[list[Law]]:
             library = CompiledLibrary(compile_shared(generated, generated.folder), generated.name, chart.n)
             laws.append(in_coordinates(name, law, library))
         for name, posture in (("textbook", True), ("textbook, posture only damped", False)):
-            laws.append(textbook(name, TextbookLaw(library, chart.m, SPRING_FREQUENCY, 0.7, posture)))
+            laws.append(textbook(name, TextbookLaw(library, chart.m, RULES.frequency, 0.7, posture)))
         law = PDPlus.on_chart(chart, inputs="extra_torque")
         generated = oc.generate_c(chart, Path(folder) / "friction", law, "friction")
         library = CompiledLibrary(compile_shared(generated, generated.folder), "friction", chart.n)

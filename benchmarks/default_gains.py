@@ -27,7 +27,7 @@ from orthocas import problems
 from orthocas.codegen import Supervisor
 from orthocas.codegen.library import CompiledLibrary, compile_shared, gain_numbers
 from orthocas.control import ControlStatus, PDPlus, Reference, Safety
-from orthocas.control.gains import fastest_posture, mobility
+from orthocas.control.gains import compute_mobility, find_fastest_posture
 from orthocas.errors import UnreachableReferenceError
 from orthocas.problems.iiwa import urdf_path
 from orthocas.simulation import MuJoCoPlant
@@ -104,7 +104,7 @@ def chart_of(name: str, task: str, metric: str) -> oc.Chart:
 def modes_row(label: str, law: PDPlus) -> str:
     """Medians of slowest and fastest mode, the fastest found, and the same with springs of 2 Hz at single inertias."""
     chart, points = law.chart, sample_uniform(law.problem.domain, 256, 0)
-    W, m = mobility(chart, points, chart.problem.robot), chart.m
+    W, m = compute_mobility(chart, points, chart.problem.robot), chart.m
     blocks = [np.diagonal(np.linalg.inv(W[:, part, part]), axis1=1, axis2=2) for part in (slice(m), slice(m, None))]
     before = PDPlus(chart, (4 * np.pi) ** 2 * np.median(np.hstack(blocks), axis=0))
     words = [label]
@@ -220,7 +220,7 @@ def delay_row(name: str) -> str:
 def settled(law: PDPlus, library: CompiledLibrary, delay: int) -> float:
     """The fastest joint of the last of 1.5 s, at the worst of five postures [rad/s]."""
     domain, rng, plant = law.problem.domain, np.random.default_rng(5), MuJoCoPlant(law.problem.robot)
-    fastest = fastest_posture(law.chart, law.stiffness, law.problem.robot)
+    fastest = find_fastest_posture(law.chart, law.stiffness, law.problem.robot)
     inner = sample_uniform(domain, 4, 1)
     gains, most = gain_numbers(law), 0.0
     for q in domain.centre + INNER * (np.vstack([fastest, inner]) - domain.centre):

@@ -17,7 +17,7 @@ from benchmark import run, table
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, compile_shared, generate_c
-from orthocas.codegen.ticks import time_ticks
+from orthocas.codegen.library import time_ticks
 from orthocas.tools.checks import Array
 from orthocas.tools.display import percent
 

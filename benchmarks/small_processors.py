@@ -21,8 +21,8 @@ from benchmark import run, table
 
 import orthocas as oc
 from orthocas.codegen import GeneratedC
-from orthocas.codegen.description import numbers
 from orthocas.codegen.precision import DOUBLE, SINGLE
+from orthocas.codegen.rendering import write_numbers
 from orthocas.control import PDPlus
 from orthocas.tools.checks import Array
 
@@ -57,7 +57,7 @@ class States:
         dq = rng.normal(0, 0.2, (count, n))
         reference = np.hstack([chart.phi(q) + rng.normal(0, 0.01, (count, n)), rng.normal(0, 0.05, (count, 2 * n))])
         found = (q, dq, reference, q + rng.uniform(-0.2, 0.2, (count, n)))
-        return cls(*(SINGLE.rounded(array) for array in found))
+        return cls(*(SINGLE.round(array) for array in found))
 
     def header(self, single: bool, iterations: int) -> str:
         """states.h."""
@@ -66,10 +66,10 @@ class States:
         lines = [f"#define NUMBER {kind}", f"#define STATES {count}", f"#define ITERATIONS {iterations}"]
         arrays = {"q": self.q, "dq": self.dq, "references": self.reference, "start": self.start}
         for name, rows in arrays.items():
-            values = ",\n".join(f"{{{numbers(row)}}}" for row in rows)
+            values = ",\n".join(f"{{{write_numbers(row)}}}" for row in rows)
             lines.append(f"static const NUMBER {name}[STATES][{rows.shape[1]}] = {{{values}}};")
         text = "\n".join(lines)
-        return SINGLE.code(text) if single else text
+        return SINGLE.translate(text) if single else text
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,7 @@ def laws(chart: oc.Chart, linear: oc.Chart) -> Iterator[tuple[str, oc.Chart, Con
         yield f"PD+ {coupling}, fitted", chart, PDPlus(chart, STIFFNESS, coupling=coupling), steps(chart)
         yield f"PD+ {coupling}, linear", linear, PDPlus(linear, STIFFNESS, coupling=coupling), steps(linear)
         yield f"impedance {coupling}, fitted", chart, Impedance(chart, STIFFNESS, coupling=coupling), steps(chart)
-    yield "kinematic, fitted", chart, Kinematic(chart), steps(chart)
+    yield "kinematic, fitted", chart, Kinematic(chart, 0.0), steps(chart)
     posture = posture_reference(chart, steps(chart), q0)
     for metric, letter in (("euclidean", "I"), ("inertia", "M")):
         other = oc.Problem(problem.robot, problem.task, metric, problem.domain)

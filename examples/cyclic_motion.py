@@ -55,8 +55,8 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     cases = [
         Case("pseudo-inverse", KinematicProjector(chart.problem, limit=np.inf), TIGHT, "#d95f02"),
         Case("pseudo-inverse, loose", KinematicProjector(chart.problem, limit=np.inf), LOOSE, "#222222", ":"),
-        Case("xi constant, loose", Kinematic(chart, limit=np.inf), LOOSE, "#66c2a5", "--"),
-        Case("xi constant", Kinematic(chart, limit=np.inf), TIGHT, "#1b9e77"),
+        Case("xi constant, loose", Kinematic(chart, 0.0, np.inf), LOOSE, "#66c2a5", "--"),
+        Case("xi constant", Kinematic(chart, 0.0, np.inf), TIGHT, "#1b9e77"),
         Case("xi constant, feedback", Kinematic(chart, FEEDBACK, np.inf), TIGHT, "#1f5fa8"),
     ]
     runs = [repeat(case, chart, cycles) for case in cases]

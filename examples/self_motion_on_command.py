@@ -51,7 +51,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     out.mkdir(parents=True, exist_ok=True)
     problem = oc.problems.get("iiwa")
     charts = {"A = I": oc.fit(problem, oc.Polynomial(2 if quick else 4)).chart}
-    cases = [Case("velocity, A = I", charts["A = I"], Kinematic(charts["A = I"], limit=np.inf))]
+    cases = [Case("velocity, A = I", charts["A = I"], Kinematic(charts["A = I"], 0.0, np.inf))]
     cases += [pd_plus("A = I", charts["A = I"], coupling) for coupling in ("coupled", "decoupled")]
     if not quick:
         inertia = oc.Problem(problem.robot, problem.task, "inertia", problem.domain)

@@ -92,7 +92,7 @@ def main(out: Path, quick: bool = False) -> dict[str, dict[str, float]]:
     out.mkdir(parents=True, exist_ok=True)
     chart = arm_chart(quick, USUAL)
     reference = journey(chart)
-    run = simulate(Kinematic(chart, limit=np.inf), reference, chart.problem.domain.centre)
+    run = simulate(Kinematic(chart, 0.0, np.inf), reference, chart.problem.domain.centre)
     times = np.arange(0.0, SECONDS if quick else reference.duration, TICK)
     wanted, rates, desired = (
         np.column_stack([np.interp(times, run.times, column) for column in rows.T])

@@ -199,7 +199,7 @@ class CompileError(OrthocasError, RuntimeError):
     """The generated C code cannot be compiled on this machine."""
 
 
-class ProofError(OrthocasError, RuntimeError):
+class AgreementError(OrthocasError, RuntimeError):
     """The compiled C code disagrees with the Python function that it was generated from."""
 
 

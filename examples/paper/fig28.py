@@ -49,7 +49,7 @@ def draw(quick: bool, chosen: ChosenFit = USUAL) -> Drawing:
     """Draw task, coordinates and joints over time; the numbers tell how exactly the arm returns."""
     chart = arm_chart(quick, chosen)
     reference = journey(chart)
-    run = simulate(Kinematic(chart, limit=np.inf), reference, chart.problem.domain.centre, tolerance=_TOLERANCE)
+    run = simulate(Kinematic(chart, 0.0, np.inf), reference, chart.problem.domain.centre, tolerance=_TOLERANCE)
     figure = _picture(chart, run.times, run.q, run.value, run.reference)
     quality = evaluate(chart, 5_000 if quick else 30_000)
     away = np.abs(run.q - run.q[0])

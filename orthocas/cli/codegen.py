@@ -101,9 +101,9 @@ def _build_report(generated: GeneratedC, proof: Proof | None) -> dict[str, Any]:
         "source": str(source),
         "lines": len(source.read_text().splitlines()),
         "stack_bytes": generated.stack_bytes,
-        "checked_states": None if proof is None else proof.states,
-        "compilers": None if proof is None else list(proof.compilers),
-        "relative_differences": None if proof is None else proof.differences,
+        "checked_states": None if agreement is None else agreement.states,
+        "compilers": None if agreement is None else list(agreement.compilers),
+        "relative_differences": None if agreement is None else agreement.differences,
     }
 
 

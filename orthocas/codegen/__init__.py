@@ -1,17 +1,23 @@
 """Charts and controllers as small C libraries."""
 
+from orthocas.codegen.check import AgreementCheck, check_c
 from orthocas.codegen.compiled_inverse import CompiledInverse, compile_inverse
-from orthocas.codegen.generate import generate_c
-from orthocas.codegen.library import CompiledLibrary, GeneratedC, compile_shared, gain_numbers
-from orthocas.codegen.proof import Proof, check_c
-from orthocas.codegen.supervisor import Supervisor
-from orthocas.codegen.ticks import Ticks, control_tick, time_ticks
+from orthocas.codegen.generate import GeneratedC, generate_c
+from orthocas.codegen.library import (
+    CompiledLibrary,
+    Supervisor,
+    Ticks,
+    compile_shared,
+    control_tick,
+    gain_numbers,
+    time_ticks,
+)
 
 __all__ = [
+    "AgreementCheck",
     "CompiledInverse",
     "CompiledLibrary",
     "GeneratedC",
-    "Proof",
     "Supervisor",
     "Ticks",
     "check_c",

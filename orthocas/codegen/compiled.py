@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import casadi as ca
@@ -17,6 +16,7 @@ import scipy
 
 from orthocas.codegen.kernels import generate_kernels
 from orthocas.codegen.library import compilers
+from orthocas.codegen.rendering import render
 from orthocas.errors import CompileError, SimulationError
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_path
@@ -29,7 +29,7 @@ _PREFIX = "kernel"
 _ENTRY = """int {name}(const double **arg, double **res, int *iw, double *w) {{
   return {prefix}_{name}(arg, res, iw, w, 0);
 }}"""
-_STAGES = 12  # as in templates/runner.c.in
+_STAGES = 12  # as in templates/runner.c.jinja
 
 
 def kept_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], folder: str | Path | None = None) -> Path:
@@ -83,15 +83,16 @@ def _require_own(place: Path) -> None:
     Raises:
         CompileError: if a folder or file belongs to somebody else but root, or others may write there.
     """
-    if not hasattr(os, "geteuid"):  # Windows: the rights of a folder come from the one above
+    # On Windows, the rights of a folder come from the one above.
+    if not hasattr(os, "geteuid"):
         return
     try:
-        found = place.stat()
+        result = place.stat()
     except OSError as error:
         raise CompileError(f"cannot load {place}: {error.strerror}") from None
-    if found.st_uid not in (os.geteuid(), 0):
-        raise CompileError(f"no library is loaded from {place}: it belongs to user {found.st_uid}, expected your own")
-    if found.st_mode & 0o022:
+    if result.st_uid not in (os.geteuid(), 0):
+        raise CompileError(f"no library is loaded from {place}: it belongs to user {result.st_uid}, expected your own")
+    if result.st_mode & 0o022:
         raise CompileError(f"no library is loaded from {place}: others may write there, expected your own (chmod go-w)")
 
 
@@ -110,12 +111,12 @@ def template(name: str) -> str:
 
 def _cache() -> Path:
     """Relative paths in XDG_CACHE_HOME do not count, as its specification demands."""
-    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return (given if given.is_absolute() else Path.home() / ".cache") / "orthocas" / "libraries"
+    inputs = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (inputs if inputs.is_absolute() else Path.home() / ".cache") / "orthocas" / "libraries"
 
 
 class Kernel(ctypes.Structure):
-    """`kernel` of templates/runner.c.in: a function with its own work arrays, for one thread."""
+    """`kernel` of templates/runner.c.jinja: a function with its own work arrays, for one thread."""
 
     _fields_ = (
         ("run", ctypes.c_void_p),
@@ -168,11 +169,11 @@ class CompiledFunctions:
         for i, value in enumerate(kept):
             arguments[i] = None if value is None else value.ctypes.data
         run = ctypes.cast(getattr(self._c, name), ctypes.c_void_p)
-        found = Kernel(
+        result = Kernel(
             run, ctypes.addressof(arguments), ctypes.addressof(results), integers.ctypes.data, doubles.ctypes.data
         )
-        found._alive = (arguments, results, integers, doubles, kept)
-        return found
+        result._alive = (arguments, results, integers, doubles, kept)
+        return result
 
     def rows(self, name: str, *arguments: Array) -> list[Array]:
         """Evaluate a function for N rows of each argument, (N, size) or, where all rows are equal, (size,)."""
@@ -180,7 +181,9 @@ class CompiledFunctions:
         kernel = self.kernel(name, [None] * len(arguments))
         inputs = [np.ascontiguousarray(argument, dtype=float) for argument in arguments]
         outputs = [np.empty((N, size)) for size in self._functions[name].outputs]
-        places = [_pointers(arrays) for arrays in (inputs, outputs)]
+        places = [
+            (ctypes.c_void_p * len(arrays))(*(array.ctypes.data for array in arrays)) for arrays in (inputs, outputs)
+        ]
         strides = [
             (ctypes.c_long * len(arrays))(*(array.shape[1] if array.ndim == 2 else 0 for array in arrays))
             for arrays in (inputs, outputs)
@@ -197,20 +200,15 @@ class CompiledFunctions:
 
 @cache
 def runner(name: str) -> Any:
-    """A function of templates/runner.c.in, which calls kernels."""
+    """A function of templates/runner.c.jinja, which calls kernels."""
     method = scipy.integrate.DOP853
     tables = {"a": method.A, "b": method.B, "c": method.C, "e3": method.E3[:-1], "e5": method.E5[:-1]}
-    values = {key: ", ".join(repr(float(x)) for x in table.ravel()) for key, table in tables.items()}
-    source = Template(template("runner.c.in")).substitute(values)
+    source = render("runner.c", tables)
     return getattr(loaded(kept_library("runner", {"runner.c": source}, ("-O3",))), f"orthocas_{name}")
 
 
-def _pointers(arrays: Sequence[Array]) -> Any:
-    return (ctypes.c_void_p * len(arrays))(*(array.ctypes.data for array in arrays))
-
-
 class _State(ctypes.Structure):
-    """`loop` of templates/runner.c.in."""
+    """`loop` of templates/runner.c.jinja."""
 
     _fields_ = (
         *((name, Kernel) for name in ("law", "plant", "profile")),
@@ -255,8 +253,8 @@ class Integrator:
         """
         states = np.empty((parts, len(start)))
         times = [ctypes.c_double(t) for t in (*span, since)]
-        given = [np.ascontiguousarray(array) for array in (parameters, load)]
-        self._run("continuous", *times, *given, ctypes.c_long(parts), np.ascontiguousarray(start), states)
+        inputs = [np.ascontiguousarray(array) for array in (parameters, load)]
+        self._run("continuous", *times, *inputs, ctypes.c_long(parts), np.ascontiguousarray(start), states)
         return states
 
     def ticks(self, period: float, start: Array, *columns: Array) -> tuple[Array, Array, Array]:
@@ -270,10 +268,10 @@ class Integrator:
         Raises:
             SimulationError: if the steps become too short.
         """
-        N, given = len(columns[0]), [np.ascontiguousarray(column) for column in columns]
-        found = np.empty((N, len(start))), np.empty((N, self._state.n)), np.empty((N, 1))
-        self._run("ticks", ctypes.c_double(period), ctypes.c_long(N), np.ascontiguousarray(start), *given, *found)
-        return found
+        N, inputs = len(columns[0]), [np.ascontiguousarray(column) for column in columns]
+        result = np.empty((N, len(start))), np.empty((N, self._state.n)), np.empty((N, 1))
+        self._run("ticks", ctypes.c_double(period), ctypes.c_long(N), np.ascontiguousarray(start), *inputs, *result)
+        return result
 
     def _run(self, name: str, *arguments: Any) -> None:
         pointers = [ctypes.c_void_p(a.ctypes.data) if isinstance(a, np.ndarray) else a for a in arguments]

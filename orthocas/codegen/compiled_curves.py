@@ -12,8 +12,8 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.curve_tracer import RULES
 from orthocas.charts.curves import Nearest, SelfMotionCurves
 from orthocas.codegen.compiled import template
-from orthocas.codegen.description import flags, numbers
 from orthocas.codegen.kernels import generate_kernels
+from orthocas.codegen.rendering import write_numbers
 from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.checks import Array
 
@@ -70,14 +70,15 @@ def curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
         functions.append(dense_function("curve_pivots", [q], [domain.condition.pivots(q)]))
         sizes["CONDITION"] = functions[-1].numel_out(0)
     kernels, turn = generate_kernels(functions, "kernel"), float(chart.turns[chart.m])
-    sizes |= {**kernels.sizes(), **{name.upper(): repr(value) for name, value in asdict(RULES).items()}}
+    sizes |= {f"{name}_{word}": size for name, work in kernels.sizes().items() for word, size in work.items()}
+    sizes |= {name.upper(): repr(value) for name, value in asdict(RULES).items()}
     sizes["XI_SIZE"] = repr(float(chart.phi_sizes[chart.m]))
     sizes["PERIOD"] = repr(turn) if turn > 0 else "INFINITY"
     low, high = domain.bounds
     arrays = {"low": low, "high": high, "centre": domain.centre, "half_width": domain.half_width}
     lines = [f"#define {name} {value}" for name, value in sizes.items()]
-    lines += [f"static const double {name}[N] = {{{numbers(values)}}};" for name, values in arrays.items()]
+    lines += [f"static const double {name}[N] = {{{write_numbers(values)}}};" for name, values in arrays.items()]
     kinds = {"turning": curves.tracer.turning, "bounded": np.isfinite(low), "winding": curves.winding}
-    lines += [f"static const int {name}[N] = {{{flags(values)}}};" for name, values in kinds.items()]
+    lines += [f"static const int {name}[N] = {{{write_numbers(values)}}};" for name, values in kinds.items()]
     head = "#include <math.h>\n#include <stddef.h>\n#include <string.h>"
     return "\n".join([head, kernels.code, *lines, template("curve_rows.c")])

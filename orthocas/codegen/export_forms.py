@@ -49,122 +49,53 @@ _FUNCTIONS = {
 }  # names in NumPy, which PyTorch and JAX share
 
 
-def function_code(name: str, summary: str, *functions: ca.Function) -> str:
-    """A Python function of columns q (n, N) with the entries of dense SX functions' outputs, row by row, (k, N)."""
-    q = ca.SX.sym("q", functions[0].size_in(0)[0])
-    rows = ca.vertcat(*(ca.vec(ca.densify(function(q)).T) for function in functions))
-    lines = tape_lines(write_tape(ca.Function("rows", [q], [ca.cse(rows)])))
-    body = "\n".join(f"    {line}" for line in lines)
-    return f'def {name}(q):\n    """{summary}"""\n{body}\n'
-
-
-def tape_lines(tape: Tape) -> list[str]:
-    """The lines that compute a tape's output from columns q (n, N), and return it as (k, N)."""
-    lines: list[str] = []
-    known: dict[int, str] = {}  # words for the constants in work slots
-    results: dict[int, str] = {}
-    for (name, into, *of), uses in zip(tape["steps"], _uses(tape["steps"]), strict=True):
-        if name == "const":
-            known[into] = _literal(float(of[0]))
-        elif name == "output":
-            results[into] = f"y{into}"
-            lines.append(f"y{into} = {_array(of[0], known)}")
-        else:
-            text = f"q[{of[0]}]" if name == "input" else _operation(name, of, known)
-            known.pop(into, None)
-            lines.append(f"w{into} = _shared({text}, q)" if uses > 1 and name != "input" else f"w{into} = {text}")
-    return [*lines, f"return np.stack([{', '.join(results[k] for k in range(len(results)))}])"]
-
-
-def _uses(steps: Sequence[Sequence[Any]]) -> list[int]:
-    """How many operands of later steps each step's result is."""
-    found, writer = [0] * len(steps), dict[int, int]()
-    for k, (name, into, *of) in enumerate(steps):
-        for slot in () if name in ("const", "input") else of:
-            found[writer[slot]] += 1
-        if name != "output":
-            writer[into] = k
-    return found
-
-
-def _operation(name: str, of: list[Any], known: dict[int, str]) -> str:
-    """One operation on work slots."""
-    if name in _OPERATORS:
-        return _OPERATORS[name].format(*(known.get(slot, f"w{slot}") for slot in of))
-    words = [_array(slot, known) for slot in of]
-    if name in _CONDITIONS:
-        return f"({_CONDITIONS[name].format(*words)}) * np.ones_like(q[0])"
-    if name == "if_else_zero":
-        return f"np.where({words[0]} != 0, {words[1]}, np.zeros_like(q[0]))"
-    return f"_erf({words[0]})" if name == "erf" else f"np.{_FUNCTIONS[name]}({', '.join(words)})"
-
-
-def _array(slot: int, known: dict[int, str]) -> str:
-    """The value in a work slot as an array, for functions that take nothing else."""
-    return f"np.full_like(q[0], {known[slot]})" if slot in known else f"w{slot}"
-
-
-def _literal(value: float) -> str:
-    """The number in Python, exactly; in brackets where an operator beside it would take its sign."""
-    if value in (float("inf"), float("-inf")):
-        return f'float("{value}")'
-    return repr(value) if value >= 0 else f"({value!r})"
-
-
 @dataclass(frozen=True, eq=False)
 class Form:
     """The functions `_xi` and `_xi_jacobian` of columns q (n, N): a template, and what it uses."""
 
     template: str  #: name of a file in templates/
-    values: Mapping[str, str]  #: of its placeholders
+    values: Mapping[str, Any]  #: that it is filled with
     functions: str  #: further functions
     tables: Mapping[str, Array]
     indices: Mapping[str, Sequence[int]]
 
 
-def idle_part(coordinates: Coordinates) -> tuple[Array, Array]:
-    """A (r, n) and c (r, 1) with A q + c = q - centre for the idle joints, and 0 for the other coordinates."""
-    r, n, idle = coordinates.r, coordinates.space.n, list(coordinates.idle)
-    A, c = np.zeros((r, n)), np.zeros((r, 1))
-    A[r - len(idle) :] = np.eye(n)[idle]
-    c[r - len(idle) :, 0] = -coordinates.space.centre[idle]
-    return A, c
+def build_form(chart: Chart) -> Form:
+    """The coordinates of a chart in the first form that fits.
+
+    Raises:
+        NoExpressionError: if the chart is grown.
+    """
+    coordinates = chart.coordinates
+    if isinstance(coordinates, Coordinates) and len(coordinates.offset):
+        # what `_build_expression` would write as many thousand lines
+        form = _build_network(coordinates) or _build_products(coordinates)
+        if form is not None:
+            return form
+    return _build_expression(chart)
 
 
-def network_form(coordinates: Coordinates) -> Form | None:
-    """xi = W_out tanh(... tanh(W_0 u + b_0) ...) + A q + c; None if the coordinates are no network."""
-    family = coordinates.family if len(coordinates.offset) else None
-    if not isinstance(family, MLPFamily):
+def _build_products(coordinates: Coordinates) -> Form | None:
+    """xi = C psi + A q + c and J_xi = T psi' + D; None if the coordinates are no such products."""
+    family = coordinates.family
+    if not isinstance(family, ProductFamily):
         return None
-    scale, fitted, depth = coordinates.scale[:, None], len(coordinates.offset), len(family.hidden)
-    layers = _layers(family, coordinates.theta)
-    A, c = idle_part(coordinates)
-    W_out = np.zeros((coordinates.r, family.hidden[-1]))
-    W_out[:fitted] = scale * layers[depth][0]
-    c[:fitted] = scale * (layers[depth][1] - coordinates.offset[:, None])
-    active, slides = np.array(coordinates.active, dtype=int), np.array(family.direct, dtype=bool)
-    turning, sliding, idle = active[~slides], active[slides], np.array(coordinates.idle, dtype=int)
-    indices = {"turning": turning, "sliding": sliding, "idle": idle}
-    indices["order"] = np.argsort(np.concatenate(list(indices.values())))
-    tables = {"W_out": W_out, "A": A, "c": c}
-    for k, (W, b) in enumerate(layers[:depth]):
-        tables |= {f"W_{k}": W, f"b_{k}": b}
-    plain = {name: [int(k) for k in of] for name, of in indices.items()}
-    return Form("network", {"depth": str(depth)}, "", tables, plain)
-
-
-def _layers(family: MLPFamily, theta: Array) -> list[tuple[Array, Array]]:
-    """Weights (out, width) and biases (out, 1) of all layers."""
-    layers, start = [], 0
-    for width, out in pairwise(family.widths):
-        middle, end = start + out * width, start + out * (width + 1)
-        layers.append((theta[start:middle].reshape(width, out).T, theta[middle:end, None]))
-        start = end
-    return layers
+    slopes = coordinates.scale[:, None, None] * family.derivative_tables(coordinates.theta).transpose(1, 0, 2)
+    used = np.flatnonzero(slopes[:, :, 1:].any(axis=(0, 1)))
+    plan = TermLevels.of(family.terms, [family.terms[k] for k in used])
+    rows = {term: k for k, term in enumerate(family.terms)}
+    # The family may have no term for a function that its terms contain.
+    if not set(plan.levels[0]) <= set(rows):
+        return None
+    q = ca.SX.sym("q", coordinates.space.n)
+    functions = family.basis(q[coordinates.active])[[rows[term] for term in plan.levels[0]]]
+    code = write_function("_one_joint", "Functions of one joint each, (k, N).", dense_function("f", [q], [functions]))
+    tables = _build_coefficients(coordinates, plan, rows) | _build_slopes(coordinates, slopes, plan, rows)
+    return Form("coordinates", {"kind": "products", **plan.counts}, code, tables, plan.indices)
 
 
 @dataclass(frozen=True)
-class Plan:
+class TermLevels:
     """Terms by number of factors. Each is a term of the level before times its last factor.
 
     In every level, the terms that derivatives need come first.
@@ -175,9 +106,9 @@ class Plan:
 
     @classmethod
     def of(cls, terms: Iterable[Term], of_derivatives: Iterable[Term]) -> Self:
-        """The plan for these terms, with what they are made of."""
+        """The levels of these terms, with what they are made of."""
         every, lower = with_parts(terms), with_parts(of_derivatives)
-        every |= {_split(term)[1] for term in every}
+        every |= {_split_term(term)[1] for term in every}
         lower = lower or {min(term for term in every if np.count_nonzero(term) == 1)}
         ordered = sorted(every, key=lambda term: (term not in lower, term))
         most = max(np.count_nonzero(term) for term in every)
@@ -192,43 +123,31 @@ class Plan:
     def counts(self) -> dict[str, str]:
         """How many terms each level has, and how many of them derivatives need, as Python."""
         lower = [sum(term in self.lower for term in level) for level in self.levels]
-        return {"all": _tuple(map(len, self.levels)), "lower": _tuple(count for count in lower if count)}
+        return {"all": _write_tuple(map(len, self.levels)), "lower": _write_tuple(count for count in lower if count)}
 
     @property
     def indices(self) -> dict[str, list[int]]:
         """For the terms of each level, rows of the level before and rows of one-joint functions."""
-        found: dict[str, list[int]] = {}
+        result: dict[str, list[int]] = {}
         functions = {term: k for k, term in enumerate(self.levels[0])}
         for k, (before, level) in enumerate(pairwise(self.levels), start=1):
             rows = {term: row for row, term in enumerate(before)}
-            split = [_split(term) for term in level]
-            found[f"parents_{k}"] = [rows[rest] for rest, _ in split]
-            found[f"factors_{k}"] = [functions[alone] for _, alone in split]
-        return found
+            split = [_split_term(term) for term in level]
+            result[f"parents_{k}"] = [rows[rest] for rest, _ in split]
+            result[f"factors_{k}"] = [functions[alone] for _, alone in split]
+        return result
 
 
-def product_form(coordinates: Coordinates) -> Form | None:
-    """xi = C psi + A q + c and J_xi = T psi' + D; None if the coordinates are no such products."""
-    family = coordinates.family if len(coordinates.offset) else None
-    if not isinstance(family, ProductFamily):
-        return None
-    slopes = coordinates.scale[:, None, None] * family.derivative_tables(coordinates.theta).transpose(1, 0, 2)
-    used = np.flatnonzero(slopes[:, :, 1:].any(axis=(0, 1)))
-    plan = Plan.of(family.terms, [family.terms[k] for k in used])
-    rows = {term: k for k, term in enumerate(family.terms)}
-    if not set(plan.levels[0]) <= set(rows):  # then the family has no term for a function that its terms contain
-        return None
-    q = ca.SX.sym("q", coordinates.space.n)
-    functions = family.basis(q[coordinates.active])[[rows[term] for term in plan.levels[0]]]
-    code = function_code("_one_joint", "Functions of one joint each, (k, N).", dense_function("f", [q], [functions]))
-    tables = _coefficients(coordinates, plan, rows) | _slopes(coordinates, slopes, plan, rows)
-    return Form("products", plan.counts, code, tables, plan.indices)
+def _split_term(term: Term) -> tuple[Term, Term]:
+    """A term without its last factor, and that factor alone."""
+    rest, joint, index = split(term)
+    return rest, tuple(index if k == joint else 0 for k in range(len(term)))
 
 
-def _coefficients(coordinates: Coordinates, plan: Plan, rows: dict[Term, int]) -> dict[str, Array]:
+def _build_coefficients(coordinates: Coordinates, plan: TermLevels, rows: dict[Term, int]) -> dict[str, Array]:
     """C (r, terms), A (r, n) and c (r, 1)."""
     fitted, scale = len(coordinates.offset), coordinates.scale[:, None]
-    A, c = idle_part(coordinates)
+    A, c = _split_idle(coordinates)
     C = np.zeros((coordinates.r, len(plan.terms)))
     theta = coordinates.theta.reshape(fitted, -1)
     for k, term in enumerate(plan.terms):
@@ -238,11 +157,11 @@ def _coefficients(coordinates: Coordinates, plan: Plan, rows: dict[Term, int]) -
     return {"C": C, "A": A, "c": c}
 
 
-def _slopes(coordinates: Coordinates, slopes: Array, plan: Plan, rows: dict[Term, int]) -> dict[str, Array]:
+def _build_slopes(coordinates: Coordinates, slopes: Array, plan: TermLevels, rows: dict[Term, int]) -> dict[str, Array]:
     """T (r n, terms of derivatives) and D (r, n, 1), from the slopes (fitted, active, 1 + K)."""
     r, n, fitted, active = coordinates.r, coordinates.space.n, len(coordinates.offset), coordinates.active
     lower = [term for term in plan.terms if term in plan.lower]
-    T, D = np.zeros((r, n, len(lower))), idle_part(coordinates)[0]
+    T, D = np.zeros((r, n, len(lower))), _split_idle(coordinates)[0]
     for k, term in enumerate(lower):
         if term in rows:
             T[:fitted, active, k] = slopes[:, :, 1 + rows[term]]
@@ -250,39 +169,121 @@ def _slopes(coordinates: Coordinates, slopes: Array, plan: Plan, rows: dict[Term
     return {"T": T.reshape(r * n, -1), "D": D[:, :, None]}
 
 
-def _split(term: Term) -> tuple[Term, Term]:
-    """A term without its last factor, and that factor alone."""
-    rest, joint, index = split(term)
-    return rest, tuple(index if k == joint else 0 for k in range(len(term)))
+def _split_idle(coordinates: Coordinates) -> tuple[Array, Array]:
+    """A (r, n) and c (r, 1) with A q + c = q - centre for the idle joints, and 0 for the other coordinates."""
+    r, n, idle = coordinates.r, coordinates.space.n, list(coordinates.idle)
+    A, c = np.zeros((r, n)), np.zeros((r, 1))
+    A[r - len(idle) :] = np.eye(n)[idle]
+    c[r - len(idle) :, 0] = -coordinates.space.centre[idle]
+    return A, c
 
 
-def _tuple(values: Iterable[int]) -> str:
+def _write_tuple(values: Iterable[int]) -> str:
     return f"({', '.join(map(str, values))},)"
 
 
-_SPECIAL = (product_form, network_form)  # what `expression_form` would write as many thousand lines
+def _build_network(coordinates: Coordinates) -> Form | None:
+    """xi = W_out tanh(... tanh(W_0 u + b_0) ...) + A q + c; None if the coordinates are no network."""
+    family = coordinates.family
+    if not isinstance(family, MLPFamily):
+        return None
+    scale, fitted, depth = coordinates.scale[:, None], len(coordinates.offset), len(family.hidden)
+    layers = _split_layers(family, coordinates.theta)
+    A, c = _split_idle(coordinates)
+    W_out = np.zeros((coordinates.r, family.hidden[-1]))
+    W_out[:fitted] = scale * layers[depth][0]
+    c[:fitted] = scale * (layers[depth][1] - coordinates.offset[:, None])
+    active, slides = np.array(coordinates.active, dtype=int), np.array(family.direct, dtype=bool)
+    turning, sliding, idle = active[~slides], active[slides], np.array(coordinates.idle, dtype=int)
+    indices = {"turning": turning, "sliding": sliding, "idle": idle}
+    indices["order"] = np.argsort(np.concatenate(list(indices.values())))
+    tables = {"W_out": W_out, "A": A, "c": c}
+    for k, (W, b) in enumerate(layers[:depth]):
+        tables |= {f"W_{k}": W, f"b_{k}": b}
+    plain = {name: [int(k) for k in of] for name, of in indices.items()}
+    return Form("coordinates", {"kind": "network", "depth": depth}, "", tables, plain)
 
 
-def form_of(chart: Chart) -> Form:
-    """The coordinates of a chart in the first form that fits.
-
-    Raises:
-        NoExpressionError: if the chart is grown.
-    """
-    if isinstance(chart.coordinates, Coordinates):
-        for form in _SPECIAL:
-            if (found := form(chart.coordinates)) is not None:
-                return found
-    return expression_form(chart)
+def _split_layers(family: MLPFamily, theta: Array) -> list[tuple[Array, Array]]:
+    """Weights (out, width) and biases (out, 1) of all layers."""
+    layers, start = [], 0
+    for width, out in pairwise(family.widths):
+        middle, end = start + out * width, start + out * (width + 1)
+        layers.append((theta[start:middle].reshape(width, out).T, theta[middle:end, None]))
+        start = end
+    return layers
 
 
-def expression_form(chart: Chart) -> Form:
+def _build_expression(chart: Chart) -> Form:
     """xi and its Jacobian, operation by operation."""
     q = ca.SX.sym("q", chart.n)
     slopes = dense_function("J_xi", [q], [chart.function("jacobian")(q)[chart.m :, :]])
     xi = chart.function("xi")
     code = [
-        function_code("_xi", "Coordinates, (r, N), of columns q (n, N).", xi),
-        function_code("_xi_and_slopes", "Coordinates, then their Jacobian row by row, (r + r n, N).", xi, slopes),
+        write_function("_xi", "Coordinates, (r, N), of columns q (n, N).", xi),
+        write_function("_xi_and_slopes", "Coordinates, then their Jacobian row by row, (r + r n, N).", xi, slopes),
     ]
-    return Form("expression", {}, "\n\n".join(code), {}, {})
+    return Form("coordinates", {"kind": "expression"}, "\n\n".join(code), {}, {})
+
+
+def write_function(name: str, summary: str, *functions: ca.Function) -> str:
+    """A Python function of columns q (n, N) with the entries of dense SX functions' outputs, row by row, (k, N)."""
+    q = ca.SX.sym("q", functions[0].size_in(0)[0])
+    rows = ca.vertcat(*(ca.vec(ca.densify(function(q)).T) for function in functions))
+    lines = _write_tape(write_tape(ca.Function("rows", [q], [ca.cse(rows)])))
+    body = "\n".join(f"    {line}" for line in lines)
+    return f'def {name}(q):\n    """{summary}"""\n{body}\n'
+
+
+def _write_tape(tape: Tape) -> list[str]:
+    """The lines that compute a tape's output from columns q (n, N), and return it as (k, N)."""
+    lines: list[str] = []
+    # Constants in slots of the work array stay words.
+    constants: dict[int, str] = {}
+    results: dict[int, str] = {}
+    for (name, into, *of), uses in zip(tape["steps"], _count_uses(tape["steps"]), strict=True):
+        if name == "const":
+            constants[into] = _write_literal(float(of[0]))
+        elif name == "output":
+            results[into] = f"y{into}"
+            lines.append(f"y{into} = {_write_array(of[0], constants)}")
+        else:
+            text = f"q[{of[0]}]" if name == "input" else _write_operation(name, of, constants)
+            constants.pop(into, None)
+            lines.append(f"w{into} = _shared({text}, q)" if uses > 1 and name != "input" else f"w{into} = {text}")
+    return [*lines, f"return np.stack([{', '.join(results[k] for k in range(len(results)))}])"]
+
+
+def _count_uses(steps: Sequence[Sequence[Any]]) -> list[int]:
+    """How many operands of later steps each step's result is."""
+    result, writer = [0] * len(steps), dict[int, int]()
+    for k, (name, into, *of) in enumerate(steps):
+        for slot in () if name in ("const", "input") else of:
+            result[writer[slot]] += 1
+        if name != "output":
+            writer[into] = k
+    return result
+
+
+def _write_operation(name: str, of: list[Any], constants: dict[int, str]) -> str:
+    """One operation on work slots."""
+    if name in _OPERATORS:
+        return _OPERATORS[name].format(*(constants.get(slot, f"w{slot}") for slot in of))
+    words = [_write_array(slot, constants) for slot in of]
+    if name in _CONDITIONS:
+        return f"({_CONDITIONS[name].format(*words)}) * np.ones_like(q[0])"
+    if name == "if_else_zero":
+        return f"np.where({words[0]} != 0, {words[1]}, np.zeros_like(q[0]))"
+    return f"_erf({words[0]})" if name == "erf" else f"np.{_FUNCTIONS[name]}({', '.join(words)})"
+
+
+def _write_array(slot: int, constants: dict[int, str]) -> str:
+    """The value in a work slot as an array, for functions that take nothing else."""
+    return f"np.full_like(q[0], {constants[slot]})" if slot in constants else f"w{slot}"
+
+
+def _write_literal(value: float) -> str:
+    """The number in Python, exactly; in brackets where an operator beside it would take its sign."""
+    if value in (float("inf"), float("-inf")):
+        return f'float("{value}")'
+    return repr(value) if value >= 0 else f"({value!r})"

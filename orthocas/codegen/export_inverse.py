@@ -5,7 +5,7 @@ import numpy as np
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.solutions import InverseStatus
-from orthocas.codegen.export_forms import Form, function_code
+from orthocas.codegen.export_forms import Form, write_function
 from orthocas.tasks.domains import Domain, FoldBound, PathBound, SingularBound
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import dense_function
@@ -28,7 +28,7 @@ def statuses() -> str:
     return ", ".join(str(int(InverseStatus[name])) for name in STATUSES)
 
 
-def inverse_forms(chart: Chart) -> list[Form]:
+def build_inverse_forms(chart: Chart) -> list[Form]:
     """The functions `_inverse` of columns phi and q_start (2 n, N), and `_nearest` of columns q_wish and x (n + m, N).
 
     And what they call beside the functions of phi.
@@ -46,7 +46,7 @@ def _newton(chart: Chart) -> Form:
     target, value = ca.SX.sym("target", n), ca.SX.sym("value", n)
     difference = chart.phi_map.difference(target, value)
     functions = [
-        function_code(
+        write_function(
             "_difference",
             "Targets less values of phi by the shorter way around, (n, N), of both in columns (2 n, N).",
             dense_function("f", [ca.vertcat(target, value)], [difference]),
@@ -56,7 +56,7 @@ def _newton(chart: Chart) -> Form:
     if chart.relative.turned:
         summary = "Task values, then how fast they move, angular velocities in the tip's axes, (m + m n, N)."
         rates = "_task_and_rates"
-        functions.append(function_code(rates, summary, problem.task.function, chart.relative.rates))
+        functions.append(write_function(rates, summary, problem.task.function, chart.relative.rates))
     tables = {"centre": domain.centre[:, None], "sizes": chart.phi_sizes[:, None], "bounds": bounds[:, :, None]}
     return Form("inverse", {"rates": rates}, "\n\n".join(functions), tables, {})
 
@@ -69,7 +69,7 @@ def _nearest(chart: Chart) -> Form:
         "half_width": domain.half_width[:, None],
         "identity": np.eye(chart.n + _rooms(domain)),
     }
-    return Form("nearest", {"rooms": str(_rooms(domain))}, "", tables, {})
+    return Form("nearest", {"rooms": _rooms(domain)}, "", tables, {})
 
 
 def _rooms(domain: Domain) -> int:
@@ -90,34 +90,35 @@ def _condition(chart: Chart) -> list[Form]:
     if domain.path_bound is not None:
         return [_near_path(domain.path_bound)]
     if domain.condition is None:
-        return [Form("box", {}, "", {}, {})]
+        return [Form("room", {"kind": "box"}, "", {}, {})]
     summary = "Numbers (k, N) that are positive at columns q that meet the condition of the domain."
-    return [Form("condition", {}, function_code("_pivots", summary, domain.condition.pivots), {}, {})]
+    return [Form("room", {"kind": "condition"}, write_function("_pivots", summary, domain.condition.pivots), {}, {})]
 
 
 def _clear(chart: Chart, clear: SingularBound, fold: FoldBound | None) -> Form:
     own = clear.jacobian_function
-    code = function_code("_frame_rows", "Rows that must not be singular, one by one, (m n, N).", own)
+    code = write_function("_frame_rows", "Rows that must not be singular, one by one, (m n, N).", own)
     values = {
-        "squared_bound": repr(clear.least_singular_value**2),
-        "and_regular": "" if fold is None else ", and the coordinates do not fold",
-        "fold": "" if fold is None else ", _room_to_fold(q, rows)",
+        "kind": "clear",
+        "squared_bound": clear.least_singular_value**2,
+        "folds": fold is not None,
     }
     tables = {"row_scale": clear.scale[:, None], "unit": np.eye(chart.m)}
-    return Form("clear", values, code, tables, {})
+    return Form("room", values, code, tables, {})
 
 
 def _unfolded(chart: Chart, fold: FoldBound) -> Form:
+    same = _same_directions(chart, fold)
     values = {
-        "least_volume": repr(fold.least_volume),
-        "orientation": "" if fold.orientation > 0 else "-",
-        "gradients": "_xi_jacobian(q)",
+        "kind": "fold",
+        "least_volume": fold.least_volume,
+        "orientation": fold.orientation,
+        "own_gradients": not same,
     }
-    if _same_directions(chart, fold):
-        return Form("fold", values, "", {}, {})
-    code = function_code("_own_gradients", "Gradients of the domain's coordinates, (r n, N).", fold.gradients)
-    values["gradients"] = "_own_gradients(q).reshape(len(LABELS) - len(UNITS), q.shape[0], q.shape[1])"
-    return Form("fold", values, code, {}, {})
+    if same:
+        return Form("room", values, "", {}, {})
+    code = write_function("_own_gradients", "Gradients of the domain's coordinates, (r n, N).", fold.gradients)
+    return Form("room", values, code, {}, {})
 
 
 def _same_directions(chart: Chart, fold: FoldBound) -> bool:
@@ -139,4 +140,4 @@ def _near_path(corridor: PathBound) -> Form:
         "path_axes": axes[:, :, None],
         "path_lengths": np.sqrt(squares)[:, None],
     }
-    return Form("path", {}, "", tables, {"path_joints": corridor.counted.tolist()})
+    return Form("room", {"kind": "path"}, "", tables, {"path_joints": corridor.counted.tolist()})

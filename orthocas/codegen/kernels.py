@@ -6,201 +6,20 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from orthocas.codegen.rendering import render
 from orthocas.control.linear_algebra import LARGE_INVERSE, ROOT_TIMES, ROUNDS
 from orthocas.errors import CompileError
 
 _VERSION = f"by CasADi {ca.CasadiMeta.version()}"
 _PLACE = re.compile(r"\*w(\d+)=w\+(\d+)")
 _CALL = re.compile(r"\bcasadi_f\d+(?=\(arg1, res1, iw, w, 0\))")
-# The sweeps of `orthocas.control.linear_algebra`, in place, on the lower triangle. It takes less of `w` than the graph.
-_INVERSE = """{
-  casadi_real *a = w, *column = w + SIZE * SIZE, volume = 1.0;
-  casadi_int i, j, k;
-  (void)iw;
-  for (i = 0; i < SIZE * SIZE; ++i) a[i] = arg[0][i];
-  for (k = 0; k < SIZE; ++k) {
-    const casadi_real pivot = a[k * SIZE + k], scale = 1.0 / pivot;
-    volume *= pivot;
-    for (j = 0; j <= k; ++j) column[j] = a[k * SIZE + j];
-    for (i = k + 1; i < SIZE; ++i) column[i] = a[i * SIZE + k];
-    for (i = 0; i < SIZE; ++i) {
-      const casadi_real share = column[i] * scale;
-      for (j = 0; j <= i; ++j) a[i * SIZE + j] -= share * column[j];
-    }
-    for (j = 0; j < k; ++j) a[k * SIZE + j] = column[j] * scale;
-    for (i = k + 1; i < SIZE; ++i) a[i * SIZE + k] = column[i] * scale;
-    a[k * SIZE + k] = -scale;
-  }
-  if (res[0] != 0)
-    for (i = 0; i < SIZE; ++i)
-      for (j = 0; j <= i; ++j) res[0][i * SIZE + j] = res[0][j * SIZE + i] = -a[i * SIZE + j];
-  if (res[1] != 0) res[1][0] = volume;
-  return 0;
-}"""
-# The rounds of `orthocas.control.linear_algebra.root_times`. They end as soon as X = I + E is so near to I that
-# I - E/2 + 3/8 E^2 is X^-1/2 to rounding. The arrays lie behind those that a round uses.
-_ROOT_TIMES = """{
-  casadi_real *X = w + BELOW, *found = X + SIZE * SIZE, *other = found + SIZE * COUNT, rest = 1.0;
-  const casadi_real** from = arg + 2;
-  casadi_real** to = res + 1;
-  casadi_int i, j, round;
-  for (i = 0; i < SIZE * SIZE; ++i) X[i] = arg[0][i];
-  for (i = 0; i < SIZE * COUNT; ++i) found[i] = 0.0;
-  casadi_product_SIZE_SIZE_COUNT(X, arg[1], found);
-  for (round = 0; round < ROUNDS; ++round) {
-    for (rest = 0.0, i = 0; i < SIZE; ++i)
-      for (j = 0; j <= i; ++j) {
-        const casadi_real size = fabs(i == j ? X[i * SIZE + j] - 1.0 : X[i * SIZE + j]);
-        if (size > rest) rest = size;
-      }
-    if (!(1.0 + rest * rest * rest > 1.0)) break;
-    from[0] = X;
-    from[1] = found;
-    to[0] = other;
-    to[1] = other + SIZE * SIZE;
-    if (ROUND(from, to, iw, w, mem)) return 1;
-    other = X;
-    X = to[0];
-    found = to[1];
-  }
-  for (i = 0; i < SIZE * SIZE; ++i) X[i] *= -0.5;
-  for (i = 0; i < SIZE; ++i) X[i * SIZE + i] += 0.5;
-  for (i = 0; i < SIZE * COUNT; ++i) other[i] = 0.0;
-  casadi_product_SIZE_SIZE_COUNT(X, found, other);
-  for (i = 0; i < SIZE * COUNT; ++i) other[i] = found[i] + 1.5 * other[i];
-  casadi_product_SIZE_SIZE_COUNT(X, other, found);
-  if (res[0] != 0)
-    for (i = 0; i < SIZE * COUNT; ++i) res[0][i] = found[i];
-  return 0;
-}"""
-#: what stands for `pow`, which is slow on small processors: products for whole exponents
-POWER = """static double NAME(double base, double exponent) {
-  double power = 1.0, factor = base;
-  int left = (int)fmin(fabs(exponent), 65.0);
-  if (left > 64 || fabs(exponent - floor(exponent)) > 0.0) return exp(exponent * log(base));
-  for (; left > 0; left /= 2) {
-    if (left % 2 == 1) power *= factor;
-    if (left > 1) factor *= factor;
-  }
-  return exponent < 0.0 ? 1.0 / power : power;
-}"""
-_OPTIONS: dict[str, Any] = {"with_header": False, "with_export": False, "casadi_int": "int"}
 _FUNCTION = re.compile(r"^(?:static |inline |const )*\w+\s?\*?\s+\**(\w+)\((.*)", re.DOTALL)
 _DATA = re.compile(r"^static const \w+ (\w+)\[")
 _PRODUCT = re.compile(r"casadi_mtimes_dense\((\w+), (\d+), (\d+), (\w+), (\d+), (\w+), 0\)")
-
-
-def compacted(blocks: dict[str, str], functions: list[ca.Function]) -> tuple[dict[str, str], dict[str, int]]:
-    """C code with smaller work arrays, and the number of doubles that each function needs.
-
-    Args:
-        blocks: C code by name; called functions are casadi_f0, casadi_f1, ... in the order in which CasADi meets them.
-        functions: the functions that the code was generated from, in the same order.
-
-    Raises:
-        CompileError: if a new version of CasADi lays the code out in another way.
-    """
-    names = {hash(f): f"casadi_f{number}" for number, f in enumerate(in_order_of_generation(functions))}
-    changed = dict(blocks)
-    needed: dict[str, int] = {}
-
-    def need(function: ca.Function) -> int:
-        name = names[hash(function)]
-        if name not in needed:
-            callees = _callees(function)
-            if set(_CALL.findall(blocks[name])) != {names[hash(callee)] for callee in callees}:
-                raise CompileError(f"the C code of {function.name()} does not call what its graph calls, {_VERSION}")
-            below = max(map(need, callees), default=0)
-            changed[name], needed[name] = _moved(blocks[name], function, below)
-        return needed[name]
-
-    return changed, {function.name(): need(function) for function in functions}
-
-
-def in_order_of_generation(functions: list[ca.Function]) -> list[ca.Function]:
-    """The functions and all that they call, callers before callees."""
-    found: dict[int, ca.Function] = {}
-
-    def visit(function: ca.Function) -> None:
-        if hash(function) not in found:
-            found[hash(function)] = function
-            for callee in _callees(function):
-                visit(callee)
-
-    for function in functions:
-        visit(function)
-    return list(found.values())
-
-
-def _callees(function: ca.Function) -> list[ca.Function]:
-    if not function.is_a("MXFunction"):
-        return []
-    calls = [k for k in range(function.n_instructions()) if function.instruction_id(k) == ca.OP_CALL]
-    return [function.instruction_MX(k).which_function() for k in calls]
-
-
-def _moved(block: str, function: ca.Function, below: int) -> tuple[str, int]:
-    """Code whose slots in the work array begin at `below`, and the end of these slots."""
-    body = _PLACE.sub("", block.split("{", 1)[1])
-    if re.search(r"\bw\b", re.sub(rf"{_CALL.pattern}\(arg1, res1, iw, w, 0\)", "", body)):
-        return block, function.sz_w()  # an operation uses the array in a way of its own
-    sizes = _place_sizes(function)
-    places = sorted((int(offset), sizes[int(place)]) for place, offset in _PLACE.findall(block))
-    for (offset, size), (following, _) in pairwise(places):
-        if offset + size > following:
-            raise CompileError(f"work slots at {offset} and {following} of {function.name()} overlap, {_VERSION}")
-    if not places:
-        return block, below
-    shift = below - places[0][0]
-    return _PLACE.sub(lambda found: f"*w{found[1]}=w+{int(found[2]) + shift}", block), sum(places[-1]) + shift
-
-
-def _place_sizes(function: ca.Function) -> dict[int, int]:
-    """Size of every slot of the work array, in numbers."""
-    found: dict[int, int] = {}
-    for k in range(function.n_instructions() if function.is_a("MXFunction") else 0):
-        node = function.instruction_MX(k)
-        places = [] if function.instruction_id(k) == ca.OP_OUTPUT else function.instruction_output(k)
-        for index, place in enumerate(places):
-            if function.instruction_id(k) == ca.OP_CALL:
-                found[place] = node.which_function().nnz_out(index)
-            else:
-                found[place] = (node.get_output(index) if len(places) > 1 else node).nnz()
-    return {place: size for place, size in found.items() if place >= 0}
-
-
-def with_own_code(blocks: dict[str, str], functions: list[ca.Function]) -> dict[str, str]:
-    """C code by name, with that of inverses and roots replaced.
-
-    Args:
-        blocks: as in `work_arrays.compacted`.
-        functions: as in `work_arrays.compacted`.
-    """
-    changed = dict(blocks)
-    for number, function in enumerate(in_order_of_generation(functions)):
-        name = f"casadi_f{number}"
-        body = _body(function, blocks[name])
-        if body is not None:
-            changed[name] = blocks[name].split("{", 1)[0] + body
-    return changed
-
-
-def _body(function: ca.Function, block: str) -> str | None:
-    """The body in C of a function of `orthocas.control.linear_algebra` that is faster than what CasADi writes."""
-    size = str(function.size1_in(0)) if function.n_in() else ""
-    if function.name() == LARGE_INVERSE:
-        return _INVERSE.replace("SIZE", size)
-    if function.name() != ROOT_TIMES:
-        return None
-    below = min(int(offset) for _, offset in _PLACE.findall(block))
-    known = {"SIZE": size, "COUNT": str(function.size2_in(1)), "BELOW": str(below), "ROUNDS": str(ROUNDS)}
-    known["ROUND"] = _CALL.findall(block)[0]
-    return re.sub("|".join(sorted(known, key=len, reverse=True)), lambda found: known[found[0]], _ROOT_TIMES)
 
 
 @dataclass(frozen=True)
@@ -210,14 +29,27 @@ class Kernels:
     code: str
     work: dict[str, tuple[int, int, int, int]]  #: lengths of arg, res, iw and w that a call needs, by function name
     numbers: dict[str, int]  #: length of the first output, by function name
+    prefix: str
 
-    def sizes(self) -> dict[str, str]:
-        """Values of the placeholders for these lengths: NAME_arg, NAME_res, NAME_iw, NAME_w and NAME_numbers."""
+    def sizes(self) -> dict[str, dict[str, int]]:
+        """These lengths for templates, at least 1: `work.NAME.arg`, `.res`, `.iw`, `.w` and `.numbers`."""
+        words = ("arg", "res", "iw", "w", "numbers")
         return {
-            f"{kernel}_{word}": str(max(1, size))
-            for kernel, sizes in self.work.items()
-            for word, size in zip(("arg", "res", "iw", "w", "numbers"), (*sizes, self.numbers[kernel]), strict=True)
+            name: {word: max(1, size) for word, size in zip(words, (*sizes, self.numbers[name]), strict=True)}
+            for name, sizes in self.work.items()
         }
+
+    def declare_arrays(self, name: str, numbers: str = "", integers: str = "") -> str:
+        """C that declares the arrays of a call of a function, and with them further numbers and integers."""
+        arg, res, iw, w = (max(1, size) for size in self.work[name])
+        lines = f"const double *arg[{arg}] = {{0}};", f"double *res[{res}] = {{0}};"
+        return "\n  ".join([*lines, f"double w[{w}]{numbers};", f"int iw[{iw}]{integers};"])
+
+    def write_call(self, name: str, inputs: list[str], outputs: list[str]) -> str:
+        """C that calls a function with such arrays, for the places of its inputs and outputs."""
+        lines = [f"arg[{i}] = {place};" for i, place in enumerate(inputs)]
+        lines += [f"res[{i}] = {place};" for i, place in enumerate(outputs)]
+        return "\n  ".join([*lines, f"{self.prefix}_{name}(arg, res, iw, w, 0);"])
 
     def array_bytes(self, name: str, number_size: int) -> int:
         """Size of the work arrays that a call of a function needs, with numbers of a size, in bytes."""
@@ -232,45 +64,41 @@ def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
         functions: functions with different names.
         prefix: prefix of every C name that the code defines.
     """
-    generator = ca.CodeGenerator("kernels.c", _OPTIONS)
+    # CasADi writes the functions and all that they call, as casadi_f0, casadi_f1, ...
+    generator = ca.CodeGenerator("kernels.c", {"with_header": False, "with_export": False, "casadi_int": "int"})
     for function in functions:
         generator.add(function)
-    items, doubles = compacted(_definitions(_with_products_of_known_sizes(generator.dump())), functions)
-    items = with_own_code(items, functions)
+    blocks = _split_definitions(_fix_product_sizes(generator.dump()))
+
+    # Functions at work reuse the arrays of those that have ended; inverses and roots get faster bodies.
+    blocks, doubles = _compact_work_arrays(blocks, functions)
+    for number, function in enumerate(_order_functions(functions)):
+        name = f"casadi_f{number}"
+        if (body := _write_body(function, blocks[name])) is not None:
+            blocks[name] = blocks[name].split("{", 1)[0] + body
+
+    # What is used remains, as C99 that compilers do not warn of, with our prefix.
     names = [function.name() for function in functions]
-    code = "\n\n".join(_without_warnings(items[name]) for name in _needed(items, names))
+    code = "\n\n".join(_silence_warnings(blocks[name]) for name in _find_needed(blocks, names))
     code = re.sub(r"\bcasadi_inf\b", "INFINITY", re.sub(r"\bcasadi_nan\b", "NAN", code))
-    code = _with_explicit_conditions(code)
+    code = _make_conditions_explicit(code)
     code = re.sub(r"CASADI_CAST\((\w+), ([^()]+)\)", r"(\1)(\2)", code)
     code = re.sub(r"\bcasadi_real\b", "double", re.sub(r"\bcasadi_int\b", "int", code))
     code = re.sub(rf"\b(?:casadi_(?=\w)|(?={'|'.join(names)})(?=\w+\(const double\*\* arg))", f"{prefix}_", code)
-    code = _without_pow(code, f"{prefix}_power")
+    if re.search(r"\bpow\(", code):
+        code = f"{write_power(f'{prefix}_power')}\n\n" + re.sub(r"\bpow\(", f"{prefix}_power(", code)
     work = {f.name(): (f.sz_arg(), f.sz_res(), f.sz_iw(), doubles[f.name()]) for f in functions}
-    return Kernels(code, work, {f.name(): f.numel_out(0) for f in functions})
+    return Kernels(code, work, {f.name(): f.numel_out(0) for f in functions}, prefix)
 
 
-def _without_pow(code: str, name: str) -> str:
-    """C code with a function of its own, of this name, for powers."""
-    changed = re.sub(r"\bpow\(", f"{name}(", code)
-    return code if changed == code else f"{POWER.replace('NAME', name)}\n\n{changed}"
-
-
-def _with_explicit_conditions(code: str) -> str:
-    """Compare numbers with zero where C would convert them to truth values; clang warns of such conversions."""
-    name = r"\(?(\*?\w+(?:\+\+|\[\w+\])?)\)?"
-    code = re.sub(rf"\({name}\?", r"((\1 != 0)?", code)
-    code = re.sub(rf"\(! ?{name} ?\)", r"(\1 == 0)", code)
-    return re.sub(rf"\({name}(&&|\|\|){name}\)", r"((\1 != 0)\2(\3 != 0))", code)
-
-
-def _with_products_of_known_sizes(text: str) -> str:
+def _fix_product_sizes(text: str) -> str:
     """Replace dense products by versions with constant sizes, which compilers vectorise; CasADi passes the sizes."""
-    sizes = sorted({found.group(2, 3, 5) for found in _PRODUCT.finditer(text)})
+    sizes = sorted({result.group(2, 3, 5) for result in _PRODUCT.finditer(text)})
     calls = _PRODUCT.sub(r"casadi_product_\2_\3_\5(\1, \4, \6)", text)
-    return "\n\n".join([*(_product(*map(int, size)) for size in sizes), calls])
+    return "\n\n".join([*(_write_product(*map(int, size)) for size in sizes), calls])
 
 
-def _product(rows: int, columns: int, count: int) -> str:
+def _write_product(rows: int, columns: int, count: int) -> str:
     """C code for z += x y, with x (rows, columns) and y (columns, count). Four columns at a time save accesses to z."""
     fours = columns - columns % 4
     lines = [
@@ -291,9 +119,9 @@ def _product(rows: int, columns: int, count: int) -> str:
     return "\n".join([*lines, "  }", "}"])
 
 
-def _definitions(text: str) -> dict[str, str]:
+def _split_definitions(text: str) -> dict[str, str]:
     """Functions and constants by name, in order, without the preprocessor lines and comments between them."""
-    found: dict[str, str] = {}
+    result: dict[str, str] = {}
     lines = iter(text.splitlines())
     for line in lines:
         data = _DATA.match(line)
@@ -305,11 +133,109 @@ def _definitions(text: str) -> dict[str, str]:
             block[-1].endswith(";") if data else block[-1] == "}" or line.endswith("}")
         ):  # or the definition is a single line
             block.append(next(lines))
-        found[name.group(1)] = "\n".join(block)
-    return found
+        result[name.group(1)] = "\n".join(block)
+    return result
 
 
-def _needed(items: dict[str, str], roots: list[str]) -> list[str]:
+def _compact_work_arrays(blocks: dict[str, str], functions: list[ca.Function]) -> tuple[dict[str, str], dict[str, int]]:
+    """C code with smaller work arrays, and the number of doubles that each function needs.
+
+    Args:
+        blocks: C code by name; called functions are casadi_f0, casadi_f1, ... in the order in which CasADi meets them.
+        functions: the functions that the code was generated from, in the same order.
+
+    Raises:
+        CompileError: if a new version of CasADi lays the code out in another way.
+    """
+    names = {hash(f): f"casadi_f{number}" for number, f in enumerate(_order_functions(functions))}
+    changed = dict(blocks)
+    needed: dict[str, int] = {}
+
+    def need(function: ca.Function) -> int:
+        name = names[hash(function)]
+        if name not in needed:
+            callees = _find_callees(function)
+            if set(_CALL.findall(blocks[name])) != {names[hash(callee)] for callee in callees}:
+                raise CompileError(f"the C code of {function.name()} does not call what its graph calls, {_VERSION}")
+            below = max(map(need, callees), default=0)
+            changed[name], needed[name] = _move_slots(blocks[name], function, below)
+        return needed[name]
+
+    return changed, {function.name(): need(function) for function in functions}
+
+
+def _order_functions(functions: list[ca.Function]) -> list[ca.Function]:
+    """The functions and all that they call, callers before callees."""
+    result: dict[int, ca.Function] = {}
+
+    def visit(function: ca.Function) -> None:
+        if hash(function) not in result:
+            result[hash(function)] = function
+            for callee in _find_callees(function):
+                visit(callee)
+
+    for function in functions:
+        visit(function)
+    return list(result.values())
+
+
+def _find_callees(function: ca.Function) -> list[ca.Function]:
+    if not function.is_a("MXFunction"):
+        return []
+    calls = [k for k in range(function.n_instructions()) if function.instruction_id(k) == ca.OP_CALL]
+    return [function.instruction_MX(k).which_function() for k in calls]
+
+
+def _move_slots(block: str, function: ca.Function, below: int) -> tuple[str, int]:
+    """Code whose slots in the work array begin at `below`, and the end of these slots."""
+    body = _PLACE.sub("", block.split("{", 1)[1])
+    if re.search(r"\bw\b", re.sub(rf"{_CALL.pattern}\(arg1, res1, iw, w, 0\)", "", body)):
+        # An operation uses the array in a way of its own.
+        return block, function.sz_w()
+    sizes = _measure_slots(function)
+    places = sorted((int(offset), sizes[int(place)]) for place, offset in _PLACE.findall(block))
+    for (offset, size), (following, _) in pairwise(places):
+        if offset + size > following:
+            raise CompileError(f"work slots at {offset} and {following} of {function.name()} overlap, {_VERSION}")
+    if not places:
+        return block, below
+    shift = below - places[0][0]
+    return _PLACE.sub(lambda result: f"*w{result[1]}=w+{int(result[2]) + shift}", block), sum(places[-1]) + shift
+
+
+def _measure_slots(function: ca.Function) -> dict[int, int]:
+    """Size of every slot of the work array, in numbers."""
+    result: dict[int, int] = {}
+    for k in range(function.n_instructions() if function.is_a("MXFunction") else 0):
+        node = function.instruction_MX(k)
+        places = [] if function.instruction_id(k) == ca.OP_OUTPUT else function.instruction_output(k)
+        for index, place in enumerate(places):
+            if function.instruction_id(k) == ca.OP_CALL:
+                result[place] = node.which_function().nnz_out(index)
+            else:
+                result[place] = (node.get_output(index) if len(places) > 1 else node).nnz()
+    return {place: size for place, size in result.items() if place >= 0}
+
+
+def _write_body(function: ca.Function, block: str) -> str | None:
+    """The body in C of a function of `orthocas.control.linear_algebra` that is faster than what CasADi writes."""
+    size = function.size1_in(0) if function.n_in() else 0
+    if function.name() == LARGE_INVERSE:
+        return render("algebra.c", {"what": "inverse", "size": size}).rstrip("\n")
+    if function.name() != ROOT_TIMES:
+        return None
+    values = {
+        "what": "root",
+        "size": size,
+        "count": function.size2_in(1),
+        "below": min(int(offset) for _, offset in _PLACE.findall(block)),
+        "rounds": ROUNDS,
+        "newton_round": _CALL.findall(block)[0],
+    }
+    return render("algebra.c", values).rstrip("\n")
+
+
+def _find_needed(items: dict[str, str], roots: list[str]) -> list[str]:
     """Names of everything that the roots use, directly or indirectly, in order of definition."""
     needed, waiting = set(), list(roots)
     while waiting:
@@ -320,7 +246,7 @@ def _needed(items: dict[str, str], roots: list[str]) -> list[str]:
     return [name for name in items if name in needed]
 
 
-def _without_warnings(block: str) -> str:
+def _silence_warnings(block: str) -> str:
     """Make a function static, and silence warnings about its unused parameters."""
     match = _FUNCTION.match(block)
     if match is None:
@@ -333,7 +259,20 @@ def _without_warnings(block: str) -> str:
     return f"{static}{{{silenced}{body}"
 
 
-def with_shared_calls(functions: list[ca.Function], states: Mapping[str, int]) -> list[ca.Function]:
+def _make_conditions_explicit(code: str) -> str:
+    """Compare numbers with zero where C would convert them to truth values; clang warns of such conversions."""
+    name = r"\(?(\*?\w+(?:\+\+|\[\w+\])?)\)?"
+    code = re.sub(rf"\({name}\?", r"((\1 != 0)?", code)
+    code = re.sub(rf"\(! ?{name} ?\)", r"(\1 == 0)", code)
+    return re.sub(rf"\({name}(&&|\|\|){name}\)", r"((\1 != 0)\2(\3 != 0))", code)
+
+
+def write_power(name: str) -> str:
+    """C of a function that stands for `pow`, which is slow on small processors."""
+    return render("algebra.c", {"what": "power", "name": name}).rstrip("\n")
+
+
+def share_calls(functions: list[ca.Function], states: Mapping[str, int]) -> list[ca.Function]:
     """The same graphs after a graph `shared` of (q, dq), which computes what they call several times for these alone.
 
     Args:
@@ -341,47 +280,51 @@ def with_shared_calls(functions: list[ca.Function], states: Mapping[str, int]) -
         states: which graphs share, by name: 1 if only their first input is of the state (q, dq), 2 if the second one is
             dq. They take what `shared` computes as an additional last input.
     """
+    # Open calls until what several graphs call is called by name.
     sharing = {function.name(): function for function in functions if function.name() in states}
     while True:
-        called = [found for name, function in sharing.items() for found in _called_for(function, states[name])]
+        called = [result for name, function in sharing.items() for result in _find_calls(function, states[name])]
         times = Counter(hash(function) for function, _ in called)
         several = {key for key, count in times.items() if count > 1}
-        opened = partial(_content, but=several)
-        changed = {name: found for name, function in sharing.items() if (found := _replaced(function, opened))}
+        opened = partial(_open_call, but=several)
+        changed = {name: result for name, function in sharing.items() if (result := _replace_calls(function, opened))}
         if not changed:
             break
         sharing |= changed
+
+    # What they have in common gets a place in `shared`.
     common = {hash(function): (function, inputs) for function, inputs in called if hash(function) in several}
     n = functions[0].size1_in(0)
     ends = np.cumsum([0, *(function.numel_out(0) for function, _ in common.values())]).tolist()
     places = {key: slice(*of) for key, of in zip(common, pairwise(ends), strict=True)}
     shared, state = ca.MX.sym("shared", max(1, ends[-1])), [ca.MX.sym(name, n) for name in ("q", "dq")]
 
-    def taken(given: list[ca.MX], called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
+    def take_shared(given: list[ca.MX], called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
         place = places.get(hash(called)) if _are_first(arguments, given) else None
         return None if place is None else ca.reshape(shared[place], *called.size_out(0))
 
+    # The graphs take it from there.
     for name, function in sharing.items():
         symbols = function.mx_in()
-        with_shared = _replaced(function, partial(taken, symbols[: states[name]]), [shared])
+        with_shared = _replace_calls(function, partial(take_shared, symbols[: states[name]]), [shared])
         sharing[name] = with_shared or ca.Function(name, [*symbols, shared], function.call(symbols))
     values = [ca.vec(ca.densify(function(*state[:inputs]))) for function, inputs in common.values()] or [ca.MX(0)]
     whole = [sharing.get(function.name(), function) for function in functions]
     return [ca.Function("shared", state, [ca.vertcat(*values)]), *whole]
 
 
-def _called_for(function: ca.Function, states: int) -> list[tuple[ca.Function, int]]:
+def _find_calls(function: ca.Function, states: int) -> list[tuple[ca.Function, int]]:
     """What a graph calls for its first inputs alone, in this order, and for how many; and what that calls for q."""
-    found: list[tuple[ca.Function, int]] = []
+    result: list[tuple[ca.Function, int]] = []
     given = function.mx_in()[:states]
 
-    def seen(called: ca.Function, arguments: list[ca.MX]) -> None:
+    def collect(called: ca.Function, arguments: list[ca.MX]) -> None:
         if _are_first(arguments, given):
-            found.append((called, len(arguments)))
-            found.extend(_called_for(called, 1))
+            result.append((called, len(arguments)))
+            result.extend(_find_calls(called, 1))
 
-    _replaced(function, seen)
-    return found
+    _replace_calls(function, collect)
+    return result
 
 
 def _are_first(arguments: list[ca.MX], given: list[ca.MX]) -> bool:
@@ -389,38 +332,39 @@ def _are_first(arguments: list[ca.MX], given: list[ca.MX]) -> bool:
     return len(arguments) <= len(given) and all(hash(a) == hash(b) for a, b in zip(arguments, given, strict=False))
 
 
-def with_turns_once(functions: list[ca.Function]) -> list[ca.Function]:
+def share_sines(functions: list[ca.Function]) -> list[ca.Function]:
     """The same graphs, in which sines and cosines of joint positions are computed once for all that is called.
 
     Args:
         functions: graphs whose first inputs are joint positions (n, 1); others are returned as they are.
     """
-    made: dict[int, ca.Function | None] = {}  # one form of each called function, so that its code appears once
+    # One form of each called function, so that its code appears once.
+    made: dict[int, ca.Function | None] = {}
     at = ca.SX.sym("q", max((function.size1_in(0) for function in functions), default=0))
     turns = ca.Function("turns", [at], [ca.sin(at), ca.cos(at)])
 
-    def given_turns(called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
+    def take_given(called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
         if called.size1_in(0) != at.shape[0]:
             return None
         if hash(called) not in made:
-            made[hash(called)] = _given_turns(called)
+            made[hash(called)] = _take_sines(called)
         form = made[hash(called)]
         return None if form is None else form(*turns(arguments[0]), *arguments)
 
-    def rewritten(function: ca.Function) -> ca.Function:
-        within = _replaced(function, _content)
-        return (_replaced(function, given_turns) or function) if within is None else rewritten(within)
+    def rewrite(function: ca.Function) -> ca.Function:
+        within = _replace_calls(function, _open_call)
+        return (_replace_calls(function, take_given) or function) if within is None else rewrite(within)
 
-    return [rewritten(function) for function in functions]
+    return [rewrite(function) for function in functions]
 
 
-def _content(called: ca.Function, arguments: list[ca.MX], but: Collection[int] = ()) -> ca.MX | None:
+def _open_call(called: ca.Function, arguments: list[ca.MX], but: Collection[int] = ()) -> ca.MX | None:
     """What a called graph consists of; None for other functions, and for those with the given hashes."""
     whole = hash(called) in but or not called.is_a("MXFunction")
     return None if whole else called.call(arguments, True, False)[0]
 
 
-def _replaced(
+def _replace_calls(
     function: ca.Function,
     form: Callable[[ca.Function, list[ca.MX]], ca.MX | None],
     more: list[ca.MX] | None = None,
@@ -449,19 +393,21 @@ def _replaced(
                 old.append(node.get_output(0))
     if not old:
         return None
-    outputs = ca.cse(ca.graph_substitute(outputs, old, new))  # substitution copies what is between
+    # Substitution copies what is between.
+    outputs = ca.cse(ca.graph_substitute(outputs, old, new))
     inputs, names = inputs + (more or []), function.name_in() + [symbol.name() for symbol in more or []]
     return ca.Function(function.name(), inputs, outputs, names, function.name_out())
 
 
-def _given_turns(function: ca.Function) -> ca.Function | None:
+def _take_sines(function: ca.Function) -> ca.Function | None:
     """A scalar function of q, ... with one output, as one of sin q, cos q, q, ...; None if it has no sines of q."""
     if not function.is_a("SXFunction") or function.n_out() != 1:
         return None
     n, inputs = function.size1_in(0), function.sx_in()
     turns = {ca.OP_SIN: ca.SX.sym("sine", n), ca.OP_COS: ca.SX.sym("cosine", n)}
     work: dict[int, ca.SX] = {}
-    joints: dict[int, int] = {}  # which joint a place of the work array holds
+    # Which joint a place of the work array holds.
+    joints: dict[int, int] = {}
     entries: dict[int, ca.SX] = {}
     has_turns = False
     for k in range(function.n_instructions()):

@@ -1,34 +1,35 @@
-"""Generated C as a compiled library, called from Python."""
+"""Generated C as a compiled library, called from Python: functions, supervised law, and the time of a tick."""
 
 import ctypes
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from orthocas.charts.chart import Chart
+from orthocas.codegen.generate import GeneratedC, generate_c
 from orthocas.codegen.precision import DOUBLE, SINGLE, Precision
-from orthocas.control.controller import Controller
+from orthocas.control.controller import Controller, ControlStatus, require_controller
+from orthocas.control.memory import memory_of
+from orthocas.control.operational_space import PDPlus
+from orthocas.control.safety import Safety
 from orthocas.errors import CompileError
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, require_shape
+from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind, require_shape
+from orthocas.tools.files import open_draft_folder
+from orthocas.tools.interrupts import deferred
 from orthocas.tools.processes import run_program
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 NO_DOUBLE = ("-Wdouble-promotion", "-Wfloat-conversion")  #: for code in single precision
 _POINTER = ctypes.c_void_p
-
-
-@dataclass(frozen=True)
-class GeneratedC:
-    """The location and names of a generated library."""
-
-    folder: Path
-    name: str  #: prefix of every C name, and of the files
-    stack_bytes: int  #: largest stack use of a call
-    single_precision: bool = False  #: whether its numbers are `float`, not `double`
+_STATES = 64  # as in templates/ticks.c
+_MICROSECONDS = 3e5  # to spend on one measurement
 
 
 def compilers() -> tuple[str, ...]:
@@ -37,11 +38,11 @@ def compilers() -> tuple[str, ...]:
     Raises:
         CompileError: if there is no compiler.
     """
-    found = [path for name in ("gcc", "clang") if (path := shutil.which(name)) is not None]
-    found = found or [path for path in (shutil.which("cc"),) if path is not None]
-    if not found:
+    result = [path for name in ("gcc", "clang") if (path := shutil.which(name)) is not None]
+    result = result or [path for path in (shutil.which("cc"),) if path is not None]
+    if not result:
         raise CompileError("no C compiler found, expected gcc, clang or cc on the PATH")
-    return tuple(found)
+    return tuple(result)
 
 
 def compile_shared(
@@ -169,7 +170,8 @@ class CompiledLibrary:
     def _call(self, function: str, inputs: list[Array], outputs: list[Array]) -> int:
         run = getattr(self._c, f"{self.name}_{function}")
         arrays = [self.numbers(array) for array in inputs] + outputs
-        for array in arrays[: len(inputs)][:2]:  # q and dq; C would read beyond the end of a short array
+        # C would read beyond the end of a short q or dq.
+        for array in arrays[: len(inputs)][:2]:
             require_shape(f"an argument of {function}", array.shape[:1], (self.n,))
         return int(run(*(array.ctypes.data_as(ctypes.c_void_p) for array in arrays)))
 
@@ -177,3 +179,219 @@ class CompiledLibrary:
 def gain_numbers(controller: Controller) -> Array:
     """The gains of a controller in the order of the C struct."""
     return np.concatenate(list(controller.gains.values()))
+
+
+class Supervisor:
+    """One supervised law: the state in C, and the functions that change it.
+
+    Args:
+        library: a compiled library with this controller.
+        controller: the law.
+        safety: other settings than those that the library was generated with.
+    """
+
+    def __init__(self, library: CompiledLibrary, controller: Controller, safety: Safety | None = None) -> None:
+        require_kind("library", library, CompiledLibrary)
+        require_controller(controller)
+        self._n, self._k, self._library = library.n, len(controller.labels), library
+        self._functions = {
+            name: library.function(name) for name in ("start", "take_over", "resume", "hold", "release", "step")
+        }
+        self._functions["step"].argtypes = [*[_POINTER] * 6, library.precision.c_type, _POINTER]
+        stream, pace = (library.function(f"reference_{name}") for name in ("stream", "pace"))
+        stream.argtypes = [*[_POINTER] * 3, *[library.precision.c_type] * 2]
+        pace.argtypes, pace.restype = [_POINTER, _POINTER, library.precision.c_type], library.precision.c_type
+        self._functions |= {"stream": stream, "pace": pace}
+        if safety is not None:
+            require_kind("safety", safety, Safety)
+        values = (safety or Safety.of(controller)).in_c(controller.command)
+        number = library.precision.c_type
+        kinds = {name: ctypes.c_int if isinstance(value, int) else number for name, value in values.items()}
+        arrays = {name: number * value.size for name, value in values.items() if isinstance(value, np.ndarray)}
+        settings = _build_struct("Safety", kinds | arrays)
+        self._safety: Any = library.address("default_safety")
+        if safety is not None:
+            struct = settings(*(tuple(value) if isinstance(value, np.ndarray) else value for value in values.values()))
+            self._safety = ctypes.pointer(struct)
+        memory = memory_of(controller)
+        fields = {} if memory is None else {name: number * len(value) for name, value in memory.start.items()}
+        self._state = _build_state(self._n, self._k, number, settings, _build_struct("Memory", fields))()
+        self._command = library.numbers(np.zeros(self._n))
+        self.gains = gain_numbers(controller)  #: numbers of the gains in the order of the C struct
+
+    def start(self, q: ArrayLike, command: ArrayLike | None = None) -> None:
+        """Begin at joint positions (n,), with the command (n,) that the robot executes now; default the fallback."""
+        self._begin("start", q, command)
+
+    def take_over(self, q: ArrayLike, command: ArrayLike) -> None:
+        """Take over from another controller while the arm moves."""
+        points = self._point("q", q), self._point("command", command)
+        self._functions["take_over"](self._here, *map(_pointer, points))
+
+    def resume(self) -> None:
+        """Ask for the law again."""
+        self._functions["resume"](self._here)
+
+    def hold(self, q: ArrayLike, command: ArrayLike | None = None) -> None:
+        """Brakes hold the arm at joint positions (n,); what the motors do now (n,), default the last command."""
+        self._begin("hold", q, command)
+
+    def release(self, q: ArrayLike, command: ArrayLike | None = None) -> None:
+        """Brakes open: the catcher holds the arm until `resume`."""
+        self._begin("release", q, command)
+
+    def step(self, q: Array, dq: Array, reference: Array, period: float = 1e-3) -> tuple[Array, ControlStatus]:
+        """Command (n,) and status of one control period.
+
+        Args:
+            q: joint positions (n,).
+            dq: joint velocities (n,).
+            reference: [value, velocity, acceleration], (3 k,).
+            period: time since the last call [s].
+        """
+        inputs = [self._numbers(name, value, self._n) for name, value in (("q", q), ("dq", dq))]
+        inputs += [self._reference(reference), self._library.numbers(self.gains)]
+        time, command = as_number("period", period), _pointer(self._command)
+        status = self._functions["step"](self._here, self._safety, *map(_pointer, inputs), time, command)
+        return self._command.copy(), ControlStatus(status)
+
+    def stream(self, reference: Array, target: ArrayLike, omega: float, period: float = 1e-3) -> ControlStatus:
+        """Move a reference by one tick towards a target (k,), with poles at omega [1/s]; the status.
+
+        OK, NEAR_BOUNDARY if the target lies beyond the boundary, so that the stream stops before it, or NOT_FINITE.
+        """
+        numbers = self._reference(reference)
+        goal, speed, time = (
+            self._numbers("target", target, self._k),
+            as_number("omega", omega),
+            as_number("period", period),
+        )
+        status = self._functions["stream"](self._here, _pointer(numbers), _pointer(goal), speed, time)
+        reference[:] = numbers
+        return ControlStatus(status)
+
+    def pace(self, reference: Array, period: float = 1e-3) -> float:
+        """Scale the derivatives of a reference to what joints can follow; the pace at which time goes on, 0 to 1."""
+        numbers = self._reference(reference)
+        pace = float(self._functions["pace"](self._here, _pointer(numbers), as_number("period", period)))
+        reference[:] = numbers
+        return pace
+
+    def __getattr__(self, name: str) -> Any:
+        """The fields of the state in C: mode, cause, weight, anchor, ...; `memory` is a dictionary of arrays."""
+        if name.startswith("_"):
+            raise AttributeError(name)
+        value = getattr(self._state, name)
+        if name == "memory":
+            return {field[0]: np.array(getattr(value, field[0])) for field in value._fields_}
+        return np.array(value) if isinstance(value, ctypes.Array) else value
+
+    def _reference(self, reference: Array) -> Array:
+        return self._numbers("reference", reference, 3 * self._k)
+
+    def _begin(self, name: str, q: ArrayLike, command: ArrayLike | None) -> None:
+        point, given = self._point("q", q), None if command is None else self._point("command", command)
+        self._functions[name](self._here, _pointer(point), None if given is None else _pointer(given))
+
+    def _numbers(self, name: str, values: ArrayLike, size: int) -> Array:
+        """Numbers of the library's type, which may be NaN or infinite."""
+        array = as_float_array(name, values)
+        # C would read beyond the end of a short array.
+        require_shape(name, array.shape, (size,))
+        return self._library.numbers(array)
+
+    def _point(self, name: str, values: ArrayLike) -> Array:
+        return self._library.numbers(as_point(name, values, self._n))
+
+    @property
+    def _here(self) -> Any:
+        return ctypes.byref(self._state)
+
+
+def _build_state(
+    n: int, k: int, number: Any, settings: type[ctypes.Structure], memory: type[ctypes.Structure]
+) -> type[ctypes.Structure]:
+    """The struct `NAME_state` of templates/robot.h.jinja."""
+    joints, quantities = number * n, number * k
+    has_spring = any(field[0] == "brake_stiffness" for field in settings._fields_)
+    counts = ("mode", "cause", "asked", "bad_ticks", "fresh", "stale_ticks", "same_ticks")
+    names = ("q", "dq", "seen_q", "seen_dq", "command", "led", "impulse", "impulse_from", "law", "anchor", "safe")
+    layout: dict[str, Any] = dict.fromkeys(counts, ctypes.c_int)
+    layout |= dict.fromkeys(("weight", "brake", "unseen"), number)
+    layout |= dict.fromkeys(names, joints) | dict.fromkeys(("offset", "integral"), quantities)
+    if has_spring:
+        layout |= dict.fromkeys(("load", "drive", "speed"), joints) | {"inertia": number * n**2}
+        layout |= dict.fromkeys(("expected", "unexplained"), joints)
+    if memory._fields_:
+        layout["memory"] = memory
+    layout |= dict.fromkeys(("value", "velocity", "acceleration"), quantities)
+    return _build_struct("State", layout | {"safety": settings, "limit": joints})
+
+
+def _build_struct(name: str, layout: dict[str, Any]) -> type[ctypes.Structure]:
+    """A struct of C with these fields, in order."""
+    return type(name, (ctypes.Structure,), {"_fields_": list(layout.items())})
+
+
+def _pointer(array: Array) -> Any:
+    """The address of an array, which must live until C has read it. `data_as` would keep it, and takes microseconds."""
+    return _POINTER(array.ctypes.data)
+
+
+@dataclass(frozen=True)
+class Ticks:
+    """Computing times of one controller [us]."""
+
+    median: float
+    p99: float
+    worst: float  #: includes interrupts and other activity of the machine
+    slowest_state: float  #: best time of the slowest of 64 states, which excludes other activity of the machine
+
+
+def control_tick(chart: Chart) -> float:
+    """Time of one call of decoupled PD+ on a chart in generated C [us]: the best time of the slowest of 64 states.
+
+    Raises:
+        CompileError: if there is no C compiler.
+    """
+    with open_draft_folder() as folder:
+        # CasADi may lose Ctrl-C while it builds functions.
+        with deferred():
+            law = PDPlus(chart, 50.0, coupling="decoupled")
+            generated = generate_c(chart, folder, law, "tick")
+        library = CompiledLibrary(compile_shared(generated, folder), "tick", chart.n)
+        about = time_ticks([(law, library)], 200)[0].median
+        calls = int(np.clip(_MICROSECONDS / about, 1_000, 100_000))
+        return time_ticks([(law, library)], calls)[0].slowest_state
+
+
+def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int = 100_000) -> list[Ticks]:
+    """Measure compiled controllers of one robot and number type, with their own gains, on 64 states inside the domain.
+
+    Raises:
+        CompileError: if there is no C compiler, or the timing program cannot be built or run.
+    """
+    first = cases[0][1]
+    with open_draft_folder() as folder:
+        data, program = folder / "states", folder / "ticks"
+        numbers = np.concatenate([part.ravel() for law, _ in cases for part in (_states(law), gain_numbers(law))])
+        first.numbers(numbers).tofile(data)
+        source = files(__package__) / "templates" / "ticks.c"
+        (folder / "ticks.c").write_text(source.read_text())
+        number = f"-DNUMBER={first.precision.c_name}"
+        run_program([compilers()[0], "-O2", number, str(folder / "ticks.c"), "-o", str(program), "-ldl"])
+        arguments = [str(program), str(data), str(calls), str(cases[0][0].problem.n)]
+        for law, library in cases:
+            sizes = (3 * len(law.labels), len(gain_numbers(law)))
+            arguments += [str(library.path), f"{library.name}_control", *map(str, sizes)]
+        lines = run_program(arguments).splitlines()
+    return [Ticks(*map(float, line.split())) for line in lines]
+
+
+def _states(law: Controller) -> Array:
+    """States inside the domain with references nearby, (64, 2 n + 3 k)."""
+    rng, domain, n, k = np.random.default_rng(0), law.problem.domain, law.problem.n, len(law.labels)
+    q = domain.centre + 0.4 * domain.half_width * rng.uniform(-1, 1, (_STATES, n))
+    q[~domain.contains(q)] = domain.centre
+    reference = np.array([law.measured(point).full().ravel() for point in q]) + 0.01 * rng.normal(size=(_STATES, k))
+    return np.hstack([q, rng.normal(size=(_STATES, n)), reference, rng.normal(size=(_STATES, 2 * k))])

@@ -8,10 +8,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from orthocas.charts.chart import Chart
 from orthocas.charts.reaching import RULES, ReachingRules
-from orthocas.codegen.description import numbers
-from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, Controller, with_smallest_volume
+from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, Controller, replace_smallest_volume
 from orthocas.tasks.domains import Domain
 from orthocas.tools.checks import Array
 
@@ -35,7 +33,7 @@ _TOKEN = re.compile(
 
 @dataclass(frozen=True)
 class Precision:
-    """A number type of C. Templates and kernels are written in double; `code` puts them into this type."""
+    """A number type of C. Templates and kernels are written in double; `translate` puts them into this type."""
 
     c_name: str
     scalar: type[np.floating[Any]]
@@ -50,8 +48,8 @@ class Precision:
     coarse: float  #: share of a wanted value that counts as size, so that `solved` of it is not below rounding
     pivot: float  #: of the scaled Jacobian; smaller ones are singular
     checked: float  #: largest difference that `NAME_check` returns
-    tolerance: float  #: of the proof, relative to the largest entry of a result
-    sensitive: float  #: relative change of a command by one rounding of q, from which the proof accepts more
+    tolerance: float  #: of the comparison with Python, relative to the largest entry of a result
+    sensitive: float  #: relative change of a command by one rounding of q, from which the comparison accepts more
     reaching: ReachingRules  #: of the descent to the nearest x
 
     @property
@@ -59,7 +57,7 @@ class Precision:
         """Bytes of a number."""
         return ctypes.sizeof(self.c_type)
 
-    def rounded(self, values: Array) -> Array:
+    def round(self, values: Array) -> Array:
         """The nearest numbers of this type; those beyond its range become infinite."""
         with np.errstate(over="ignore"):
             return np.asarray(values, dtype=self.scalar).astype(float)
@@ -72,16 +70,17 @@ class Precision:
         """The graph of a law, whose guard knows how near to a singularity this type still gives good numbers."""
         if self.smallest_volume == SMALLEST_VOLUME:
             return controller.graph
-        return with_smallest_volume(controller.graph, self.smallest_volume)
+        return replace_smallest_volume(controller.graph, self.smallest_volume)
 
-    def code(self, text: str) -> str:
+    def translate(self, text: str) -> str:
         """C code that was written in double, in this type. Comments, strings and integers stay as they are."""
-        return text if self is DOUBLE else _TOKEN.sub(_in_single_precision, text)
+        return text if self is DOUBLE else _TOKEN.sub(_make_single, text)
 
-    def words(self) -> dict[str, str]:
-        """Values of the placeholders that depend on the type."""
+    def describe(self) -> dict[str, Any]:
+        """Values of the templates that depend on the type."""
         names = ("largest", "smallest", "farthest", "rounding", "solved", "exact", "coarse", "pivot", "checked")
-        return {"number": self.c_name, **{name: _EXPONENT.sub(r"e\1", f"{getattr(self, name):.0e}") for name in names}}
+        rules = {name: _EXPONENT.sub(r"e\1", f"{getattr(self, name):.0e}") for name in names}
+        return {"number": self.c_name, "single": self is SINGLE, "reaching": self.reaching, **rules}
 
 
 DOUBLE = Precision(
@@ -122,7 +121,7 @@ SINGLE = Precision(
 )
 
 
-def _in_single_precision(token: re.Match[str]) -> str:
+def _make_single(token: re.Match[str]) -> str:
     if token["call"] in _MATHEMATICS:
         return f"{token['call']}f"
     if token["literal"] is not None:
@@ -131,44 +130,20 @@ def _in_single_precision(token: re.Match[str]) -> str:
     return SINGLE.c_name if token["word"] == DOUBLE.c_name else token[0]
 
 
-def bounds_inside(domain: Domain, precision: Precision) -> tuple[Array, Array]:
+def find_bounds_inside(domain: Domain, precision: Precision) -> tuple[Array, Array]:
     """Lower and upper bounds in a precision, (n,) each, that belong to the domain in Python and in C."""
-    centre, found = precision.rounded(domain.centre), []
+    centre, bounds = precision.round(domain.centre), []
     for boundary in domain.bounds:
-        bound = precision.rounded(boundary)
-        while (beyond := _is_beyond(domain, bound, precision)).any():
+        bound = precision.round(boundary)
+        while (beyond := _lies_beyond(domain, bound, precision)).any():
             inwards = np.nextafter(bound.astype(precision.scalar), centre.astype(precision.scalar))
             bound = np.where(beyond, inwards, bound)
-        found.append(bound)
-    return found[0], found[1]
+        bounds.append(bound)
+    return bounds[0], bounds[1]
 
 
-def _is_beyond(domain: Domain, q: Array, precision: Precision) -> Any:
+def _lies_beyond(domain: Domain, q: Array, precision: Precision) -> Any:
     """Whether Python or C finds the joints of q outside, (n,)."""
     distance, largest = abs(q - domain.centre), domain.reach
-    in_c = precision.rounded(abs(q - precision.rounded(domain.centre)))
-    return (distance > largest) | (in_c > precision.rounded(largest))
-
-
-def check_values(chart: Chart, controller: Controller | None, q: Array, precision: Precision) -> dict[str, str]:
-    """Values of the placeholders: a state, and what every function gives there."""
-    n, robot = chart.n, chart.problem.robot
-    dq = precision.rounded(np.round(np.linspace(0.1, -0.2, n), 3))
-    values = {
-        "check_q": q,
-        "check_dq": dq,
-        "check_phi": chart.phi(q),
-        "check_jacobian": chart.jacobian(q).ravel(),
-        "check_curvature": chart.function("second_derivative")(q, dq, dq).full().ravel(),
-        "check_mass_matrix": robot.mass_matrix(q).ravel(),
-        "check_bias": robot.bias(q, dq),
-    }
-    if controller is not None:
-        value = controller.measured(q).full().ravel() + 0.001
-        reference = [precision.rounded(part) for part in (value, *np.full((2, len(value)), 0.01))]
-        command, _ = controller.function(q, dq, *reference, *controller.gains.values())
-        values["check_command"] = command.full().ravel()
-    words = {name: numbers(value) for name, value in values.items()}
-    if controller is not None:
-        words["check_reference"] = ", ".join(f"{{{numbers(part)}}}" for part in reference)
-    return words
+    in_c = precision.round(abs(q - precision.round(domain.centre)))
+    return (distance > largest) | (in_c > precision.round(largest))

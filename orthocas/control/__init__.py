@@ -1,16 +1,13 @@
 """Controllers as CasADi functions of state, reference and gains, with the references they follow."""
 
-from orthocas.control.controller import Controller, ControlStatus, Law
-from orthocas.control.gains import Setting, matched_stiffness
-from orthocas.control.kinematic import Kinematic
+from orthocas.control.controller import Controller, ControlStatus, Law, Setting, law_names, law_of, register
+from orthocas.control.gains import Modes, matched_stiffness
+from orthocas.control.kinematic import Kinematic, XiTask
 from orthocas.control.memory import Adaptation, Memory, MomentumObserver, Remembering
-from orthocas.control.operational_space import DampingCheck, Impedance, Modes, PDPlus
-from orthocas.control.posture import joint_path
-from orthocas.control.reference import Reference
-from orthocas.control.registry import law_names, law_of, register
+from orthocas.control.operational_space import DampingCheck, Impedance, PDPlus
+from orthocas.control.reference import Reference, joint_path
 from orthocas.control.run_time_model import RunTimeModel
 from orthocas.control.safety import Safety
-from orthocas.control.xi_task import XiTask
 
 __all__ = [
     "Adaptation",
@@ -36,3 +33,6 @@ __all__ = [
     "matched_stiffness",
     "register",
 ]
+
+for _law in (Impedance, PDPlus, Kinematic):
+    register(_law)

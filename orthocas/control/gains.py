@@ -1,4 +1,4 @@
-"""Settings that laws share: gains by stiffness and damping ratio, and the stiffness that two laws have in common."""
+"""Gains: their values and settings, the stiffness by modes of the loop, the modes, and what the motors can hold."""
 
 from dataclasses import dataclass, field
 
@@ -10,6 +10,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.point_quality import least_in_domain
 from orthocas.errors import InvalidValueError
 from orthocas.robots.robot import Robot
+from orthocas.tasks.domains import Domain
 from orthocas.tasks.metric import require_mass
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import (
@@ -21,6 +22,7 @@ from orthocas.tools.checks import (
     require_kind,
     require_shape,
 )
+from orthocas.tools.display import Shown, number_list, percent
 
 STIFFNESS, DAMPING_RATIO, FEEDBACK, LIMIT = (  #: units of gains, in words
     "J per squared unit of the quantity, > 0",
@@ -28,17 +30,11 @@ STIFFNESS, DAMPING_RATIO, FEEDBACK, LIMIT = (  #: units of gains, in words
     "1/s, >= 0",
     "largest command per joint, > 0; INFINITY for no limit",
 )
-SPRING_FREQUENCY = 12 * np.pi  #: [rad/s], 6 Hz; what it holds: docs/measurements/control.md
-FASTEST = 36 * np.pi  #: [rad/s], 18 Hz: stable with a delay of 6.5 ms at a damping ratio of 0.7
-MARGIN = np.pi / 6  #: [rad], 30 degrees of phase that are left to the fastest mode at a stated delay
-_SAMPLES, _SEED = 512, 0
-_ROUNDS, _CLOSE = 12, 1.05  # of descents for a delay; how much of a bound on squared frequencies is left to scaling
-_TOO_FAST = 3000.0  # weight of the squared logarithm by which a mode exceeds the fastest frequency
 
 
-@dataclass(frozen=True)
-class Setting:
-    """A setting of a law that commands offer as an option.
+@dataclass(frozen=True, slots=True)
+class GainRules:
+    """Numbers of gains. What the default stiffness holds: docs/measurements/control.md."""
 
     Example:
         >>> from orthocas.control import Setting
@@ -52,56 +48,13 @@ class Setting:
     option: str = field(default="", repr=False)  #: its option of commands, if it is not named after the setting
 
 
-STIFFNESS_SETTING = Setting('"100", or "100,50,..." per quantity; default: modes around 6 Hz.')
-DAMPING_RATIO_SETTING = Setting('"0.7", or "0.7,1,..." per quantity; default: 0.7.')
-DELAY_SETTING = Setting("Delay from measurement to torque that the default stiffness is to bear [s]; default: 0.")
-FEEDBACK_SETTING = Setting("Feedback gain [1/s]; default: 0.")
-
-
-def positive_gains(name: str, value: ArrayLike, length: int) -> Array:
-    """Finite numbers > 0, (length,), from one number or (length,)."""
-    gains = _spread(name, value, length)
-    _require(name, gains, gains > 0, "positive numbers")
-    return gains
-
-
-def non_negative_gains(name: str, value: ArrayLike, length: int) -> Array:
-    """Finite numbers >= 0, (length,), from one number or (length,)."""
-    gains = _spread(name, value, length)
-    _require(name, gains, gains >= 0, "numbers >= 0")
-    return gains
-
-
-def command_limit(name: str, value: ArrayLike | None, default: Array) -> Array:
-    """Numbers > 0, (n,), possibly infinite; the limits of the robot if `value` is None."""
-    length = len(default)
-    limit = np.array(np.broadcast_to(_one_or(name, default if value is None else value, length), (length,)))
-    _require(name, limit, limit > 0, "positive numbers")
-    limit.setflags(write=False)
-    return limit
-
-
-def _spread(name: str, value: ArrayLike, length: int) -> Array:
-    return freeze_array(name, np.broadcast_to(_one_or(name, value, length), (length,)), (length,))
-
-
-def _one_or(name: str, value: ArrayLike, length: int) -> Array:
-    array = as_float_array(name, value)
-    if array.ndim:
-        require_shape(name, array.shape, (length,))
-    return array
-
-
-def _require(name: str, gains: Array, good: NDArray[np.bool_], want: str) -> None:
-    bad = np.flatnonzero(~good)
-    if bad.size:
-        raise InvalidValueError(f"{name}[{bad[0]}]", gains[bad[0]], want)
+RULES = GainRules()
 
 
 def matched_stiffness(
     chart: Chart,
-    frequency: float = SPRING_FREQUENCY,
-    fastest: float = FASTEST,
+    frequency: float = RULES.frequency,
+    fastest: float = RULES.fastest,
     delay: float = 0.0,
     damping_ratio: ArrayLike = 0.7,
 ) -> Array:
@@ -135,60 +88,43 @@ def matched_stiffness(
         ours, docs/explanation/derivations_control.md#stiffness
     """
     require_kind("chart", chart, Chart)
-    chart.function("xi")  # raises for grown charts
+    # Grown charts raise here.
+    chart.function("xi")
     require_mass(chart.problem.robot, "gains by modes")
     if not 0 <= as_number("delay", delay) < np.inf:
         raise InvalidValueError("delay", delay, "a finite number >= 0")
-    bearable = _bearable(delay, damping_ratio, chart.n) if delay else np.inf
+    bearable = _bound_modes(delay, damping_ratio, chart.n) if delay else np.inf
     bound = min(as_number("fastest", fastest), bearable)
-    points = sample_uniform(chart.problem.domain, _SAMPLES, _SEED)
-    known = mobility(chart, points, chart.problem.robot)
-    return _matched(known, frequency, bound) if not delay else _kept_everywhere(chart, known, frequency, bound)
+    points = sample_uniform(chart.problem.domain, RULES.samples, RULES.seed)
+    mobilities = compute_mobility(chart, points, chart.problem.robot)
+    return _match(mobilities, frequency, bound) if not delay else _match_everywhere(chart, mobilities, frequency, bound)
 
 
-def _kept_everywhere(chart: Chart, known: Array, frequency: float, bound: float) -> Array:
+def _match_everywhere(chart: Chart, mobilities: Array, frequency: float, bound: float) -> Array:
     """The stiffness with all modes below the bound: postures that descents find to be too fast join the samples."""
     robot, corners = chart.problem.robot, np.empty((0, chart.n, chart.n))
-    for _ in range(_ROUNDS):
-        stiffness = _matched(known, frequency, bound, corners)
-        W = mobility(chart, fastest_posture(chart, stiffness, robot)[None], robot)
+    for _ in range(RULES.rounds):
+        stiffness = _match(mobilities, frequency, bound, corners)
+        W = compute_mobility(chart, find_fastest_posture(chart, stiffness, robot)[None], robot)
         root = np.sqrt(stiffness)
         excess = float(np.linalg.eigvalsh(root[:, None] * W[0] * root)[-1]) / bound**2
-        if excess <= _CLOSE:
+        if excess <= RULES.close:
             break
         corners = np.concatenate([corners, W])
     return np.asarray(stiffness / max(1.0, excess))
 
 
-def _bearable(delay: float, damping_ratio: ArrayLike, n: int) -> float:
+def _bound_modes(delay: float, damping_ratio: ArrayLike, n: int) -> float:
     """The fastest mode [rad/s] that has the phase margin at a delay."""
     ratio = float(positive_gains("damping_ratio", damping_ratio, n).min())
     crossing = np.sqrt(2 * ratio**2 + np.sqrt(4 * ratio**4 + 1))
-    phase = np.arctan(2 * ratio * crossing) - MARGIN
+    phase = np.arctan(2 * ratio * crossing) - RULES.margin
     if phase <= 0:
         raise InvalidValueError("damping_ratio", ratio, "a larger one: this leaves less than 30 deg without a delay")
     return float(phase / (crossing * delay))
 
 
-def fastest_posture(chart: Chart, stiffness: Array, robot: Robot) -> Array:
-    """The posture of the domain with the fastest mode that descents find, (n,)."""
-    scale = np.sqrt(stiffness)
-
-    def slowness(q: Array) -> Array:
-        W = scale[:, None] * mobility(chart, q, robot) * scale
-        known = np.asarray(np.isfinite(W).all(axis=(1, 2)))
-        return np.where(known, -np.linalg.eigvalsh(np.where(known[:, None, None], W, 0))[:, -1], np.nan)
-
-    return least_in_domain(slowness, chart.problem.domain)
-
-
-def mobility(chart: Chart, points: ArrayLike, robot: Robot) -> Array:
-    """M_phi^-1 = J M^-1 J^T of a robot at points (N, n), (N, n, n)."""
-    J, M = chart.batched_rates(as_point_set("points", points, chart.n)[0]), robot.mass_matrix(points)
-    return np.asarray(J @ np.linalg.solve(M, J.transpose(0, 2, 1)))
-
-
-def _matched(mobilities: Array, frequency: float, fastest: float, bounded: Array | None = None) -> Array:
+def _match(mobilities: Array, frequency: float, fastest: float, bounded: Array | None = None) -> Array:
     """The stiffness for M_phi^-1 at several postures, (N, n, n); singular postures are left out.
 
     `bounded` are further ones, whose modes are only kept from being too fast, each with the weight of all others.
@@ -198,17 +134,16 @@ def _matched(mobilities: Array, frequency: float, fastest: float, bounded: Array
         raise InvalidValueError("fastest", fastest, "a number > 0 or infinity")
     W = mobilities[np.isfinite(mobilities).all(axis=(1, 2))]
     W = W[np.linalg.eigvalsh(W)[:, 0] > 0]
-    start = -np.log(np.median(np.diagonal(W, axis1=1, axis2=2), axis=0))  # the solution where W is diagonal
+    # The start is the solution where W is diagonal.
+    start = -np.log(np.median(np.diagonal(W, axis1=1, axis2=2), axis=0))
     bound, count = 2 * np.log(fastest / omega), len(W)
     W = W if bounded is None else np.concatenate([W, bounded])
     spread, excess = (np.append(np.full(count, 1 / count), np.full(len(W) - count, more)) for more in (0.0, 1.0))
-    found = scipy.optimize.minimize(_eigenvalue_spread, start, (W, bound, spread, excess), method="BFGS", jac=True)
-    return np.asarray(omega**2 * np.exp(found.x))
+    solution = scipy.optimize.minimize(_compute_spread, start, (W, bound, spread, excess), method="BFGS", jac=True)
+    return np.asarray(omega**2 * np.exp(solution.x))
 
 
-def _eigenvalue_spread(
-    log_stiffness: Array, W: Array, bound: float, spread: Array, excess: Array
-) -> tuple[float, Array]:
+def _compute_spread(log_stiffness: Array, W: Array, bound: float, spread: Array, excess: Array) -> tuple[float, Array]:
     """Sum of spread sum_i log^2(lambda_i) + excess 3000 max(0, log(lambda_i) - bound)^2 for K = exp(log_stiffness).
 
     Weights are those of postures (N,). With unit eigenvectors v_i, d log(lambda_i) / d log(K_j) = v_ij^2: the gradient.
@@ -217,6 +152,143 @@ def _eigenvalue_spread(
     values, vectors = np.linalg.eigh(root[:, None] * W * root)
     logs = np.log(values.clip(np.finfo(float).tiny))
     above = (logs - bound).clip(0)
-    slopes = 2 * (spread[:, None] * logs + _TOO_FAST * excess[:, None] * above)
-    cost = spread @ (logs**2).sum(axis=1) + _TOO_FAST * excess @ (above**2).sum(axis=1)
+    slopes = 2 * (spread[:, None] * logs + RULES.too_fast * excess[:, None] * above)
+    cost = spread @ (logs**2).sum(axis=1) + RULES.too_fast * excess @ (above**2).sum(axis=1)
     return float(cost), (vectors**2 @ slopes[..., None])[..., 0].sum(axis=0)
+
+
+def find_fastest_posture(chart: Chart, stiffness: Array, robot: Robot) -> Array:
+    """The posture of the domain with the fastest mode that descents find, (n,)."""
+    scale = np.sqrt(stiffness)
+
+    def slowness(q: Array) -> Array:
+        W = scale[:, None] * compute_mobility(chart, q, robot) * scale
+        finite = np.asarray(np.isfinite(W).all(axis=(1, 2)))
+        return np.where(finite, -np.linalg.eigvalsh(np.where(finite[:, None, None], W, 0))[:, -1], np.nan)
+
+    return least_in_domain(slowness, chart.problem.domain)
+
+
+def compute_mobility(chart: Chart, points: ArrayLike, robot: Robot) -> Array:
+    """M_phi^-1 = J M^-1 J^T of a robot at points (N, n), (N, n, n)."""
+    J, M = chart.batched_rates(as_point_set("points", points, chart.n)[0]), robot.mass_matrix(points)
+    return np.asarray(J @ np.linalg.solve(M, J.transpose(0, 2, 1)))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Modes(Shown):
+    """Modes of M_phi dde + D de + K e = 0 at one posture (n,) or at several (N, n).
+
+    Mode i has the shape v_i with K v_i = omega_i^2 M_phi v_i and v_i^T M_phi v_i = 1. Its damping ratio is
+    v_i^T D v_i / (2 omega_i). This is exact if D is diagonal in the modes, as for coupled laws with `double_diagonal`
+    and one damping ratio for all.
+    """
+
+    frequencies: Array  #: [Hz], in ascending order
+    damping_ratios: Array  #: infinite for a mode without a spring
+    delays: Array  #: longest delay of the loop with which the mode alone stays stable [s]
+
+    def facts(self) -> dict[str, str]:
+        """Frequencies, damping ratios and delay."""
+        return {
+            "modes": f"{number_list(np.median(np.atleast_2d(self.frequencies), axis=0))} Hz",
+            "fastest": f"{self.frequencies.max():.4g} Hz",
+            "damping ratios": f"{self.damping_ratios.min():.3g} to {self.damping_ratios.max():.3g}",
+            "delay": f"stable up to {1e3 * self.delays.min():.3g} ms",
+        }
+
+
+def compute_modes(mobility: Array, stiffness: Array, damping: Array) -> Modes:
+    """Modes for M_phi^-1 (N, n, n), the diagonal of K (n,), and D (N, n, n).
+
+    With S = M_phi^-1/2 and the unit eigenvectors u_i of S K S, v_i = S u_i.
+    """
+    values, vectors = np.linalg.eigh(mobility)
+    half = (vectors * np.sqrt(values.clip(0))[:, None, :]) @ vectors.transpose(0, 2, 1)
+    squares, shapes = np.linalg.eigh((half * stiffness) @ half)
+    omega = np.sqrt(squares.clip(0))
+    # 2 zeta omega of each mode [1/s]
+    rates = np.einsum("kij,kij->kj", shapes, half @ damping @ half @ shapes)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = rates / (2 * omega)
+    return Modes(omega / (2 * np.pi), ratios, _compute_delays(omega, rates))
+
+
+def _compute_delays(omega: Array, rates: Array) -> Array:
+    """Delay [s] at which s^2 + (rate s + omega^2) exp(-s T) = 0 gets a root i Omega.
+
+    The modulus gives Omega^2 = rate^2/2 + sqrt(rate^4/4 + omega^4), the phase T = atan(rate Omega / omega^2) / Omega.
+    """
+    crossing = np.sqrt(rates**2 / 2 + np.sqrt(rates**4 / 4 + omega**4))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.arctan2(rates * crossing, omega**2) / crossing)
+
+
+def find_holding_doubts(robot: Robot, domain: Domain, limit: Array) -> list[str]:
+    """What to know of an arm whose motors cannot hold it: one sentence, or none if they can at all samples.
+
+    A joint is held at q if |g_i(q)| <= limit_i. The sentence names the joint that lacks most at the centre of the
+    domain, or else at the worst sample, and the share of uniform samples at which some joint is not held, rounded up.
+
+    Args:
+        robot: the arm, with its payload.
+        domain: where it is to be held.
+        limit: largest torque or force of each joint, (n,) [N m] or [N], infinite where there is none.
+    """
+    points = np.vstack([domain.centre, sample_uniform(domain, RULES.samples, RULES.seed)])
+    needed = np.abs(robot.gravity(points))
+    excess = needed / limit
+    heavy = (excess > 1).any(axis=1)
+    if not heavy.any():
+        return []
+    worst = 0 if heavy[0] else int(np.argmax(excess.max(axis=1)))
+    joint = int(np.argmax(excess[worst]))
+    unit = "N" if robot.tree.prismatic[joint] else "N m"
+    where, most = ("at the centre of", "") if heavy[0] else ("everywhere in", "up to ")
+    share = percent(heavy[1:].mean(), fault=True)
+    return [
+        f"the motors cannot hold the arm {where} the domain: gravity needs {most}{needed[worst, joint]:.4g} {unit} at "
+        f"joint '{robot.joint_names[joint]}', the limit is {limit[joint]:.4g} {unit}, and at {share} of "
+        f"{RULES.samples} samples of the domain gravity alone exceeds a limit"
+    ]
+
+
+def positive_gains(name: str, value: ArrayLike, length: int) -> Array:
+    """Finite numbers > 0, (length,), from one number or (length,)."""
+    gains = spread_gains(name, value, length)
+    _require(name, gains, gains > 0, "positive numbers")
+    return gains
+
+
+def non_negative_gains(name: str, value: ArrayLike, length: int) -> Array:
+    """Finite numbers >= 0, (length,), from one number or (length,)."""
+    gains = spread_gains(name, value, length)
+    _require(name, gains, gains >= 0, "numbers >= 0")
+    return gains
+
+
+def command_limit(name: str, value: ArrayLike | None, default: Array) -> Array:
+    """Numbers > 0, (n,), possibly infinite; the limits of the robot if `value` is None."""
+    length = len(default)
+    limit = np.array(np.broadcast_to(_check_length(name, default if value is None else value, length), (length,)))
+    _require(name, limit, limit > 0, "positive numbers")
+    limit.setflags(write=False)
+    return limit
+
+
+def spread_gains(name: str, value: ArrayLike, length: int) -> Array:
+    """Finite numbers (length,), from one number or (length,)."""
+    return freeze_array(name, np.broadcast_to(_check_length(name, value, length), (length,)), (length,))
+
+
+def _check_length(name: str, value: ArrayLike, length: int) -> Array:
+    array = as_float_array(name, value)
+    if array.ndim:
+        require_shape(name, array.shape, (length,))
+    return array
+
+
+def _require(name: str, gains: Array, good: NDArray[np.bool_], want: str) -> None:
+    bad = np.flatnonzero(~good)
+    if bad.size:
+        raise InvalidValueError(f"{name}[{bad[0]}]", gains[bad[0]], want)

@@ -1,41 +1,51 @@
-"""Velocity control in the coordinates phi = [x; xi] ([AS2023] Sec. 9)."""
+"""Joint velocities from phi = [x; xi]: a law ([AS2023] Sec. 9), and a task for quadratic programs of others."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import casadi as ca
+import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
 from orthocas.control.controller import (
     Command,
-    count_turns_from_centre,
+    LawOfChart,
+    Setting,
+    compute_drift,
+    compute_errors,
     fallback_function,
     guarded_graph,
-    law_facts,
     named_inputs,
 )
-from orthocas.control.errors import drift, errors
-from orthocas.control.gains import FEEDBACK, FEEDBACK_SETTING, LIMIT, Setting, command_limit, non_negative_gains
-from orthocas.control.linear_algebra import block_inertia, median_volume
-from orthocas.control.posture import joint_path
-from orthocas.control.reference import Reference
+from orthocas.control.gains import (
+    FEEDBACK,
+    LIMIT,
+    RULES,
+    command_limit,
+    non_negative_gains,
+)
+from orthocas.control.linear_algebra import build_block_inertia, compute_median_volume
+from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.robots.tree import require_driven
-from orthocas.tasks.problem import Problem
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, require_kind
-from orthocas.tools.display import Shown
+from orthocas.tools.checks import Array, as_float_array, require_at_least, require_kind
+from orthocas.tools.display import Shown, listed, number_list
+from orthocas.tools.expressions import wrap_shortest
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Kinematic(Shown):
+class Kinematic(LawOfChart):
     """Joint velocity dq = J^-1 (d_phi_d + Lambda (phi_d - phi)).
+
+    The error e = phi - phi_d obeys de/dt = -Lambda e, so every start ends on the reference.
 
     Args:
         chart: a chart with a closed expression (not a grown one).
-        feedback: diagonal of Lambda, >= 0, (n,) or one number [1/s]; the paper uses 0.
+        feedback: diagonal of Lambda, >= 0, (n,) or one number [1/s]; default 10. The paper uses 0, which keeps every
+            error: of the start, of the integration, and of jumps of the reference or the sensors.
         limit: largest speed of each joint, (n,) or one number [rad/s] or [m/s]; default those of the robot.
 
     Raises:
@@ -57,18 +67,19 @@ class Kinematic(Shown):
     energy_graph = None
     gain_units = MappingProxyType({"feedback": FEEDBACK, "limit": LIMIT})
     settings = MappingProxyType[str, str]({})
-    options: ClassVar[Mapping[str, Setting]] = {"feedback": FEEDBACK_SETTING}
+    options: ClassVar[Mapping[str, Setting]] = {"feedback": Setting("Feedback gain [1/s]; default: 10.")}
 
-    def __init__(self, chart: Chart, feedback: ArrayLike = 0.0, limit: ArrayLike | None = None) -> None:
+    def __init__(self, chart: Chart, feedback: ArrayLike = RULES.feedback, limit: ArrayLike | None = None) -> None:
         require_kind("chart", chart, Chart)
         require_driven(f"the law {self.name}", chart.problem.robot.tree)
-        chart.function("xi")  # raises for grown charts
+        # Grown charts raise here.
+        chart.function("xi")
         object.__setattr__(self, "chart", chart)
         object.__setattr__(self, "feedback", non_negative_gains("feedback", feedback, chart.n))
         object.__setattr__(self, "limit", command_limit("limit", limit, chart.problem.robot.velocity_limits))
 
     @classmethod
-    def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, *, feedback: ArrayLike = 0.0) -> Self:
+    def on_chart(cls, chart: Chart, limit: ArrayLike | None = None, *, feedback: ArrayLike = RULES.feedback) -> Self:
         """Build the law on a chart."""
         return cls(chart, feedback, limit)
 
@@ -77,33 +88,9 @@ class Kinematic(Shown):
         return []
 
     @property
-    def problem(self) -> Problem:
-        """Robot, task, metric and domain of the chart."""
-        return self.chart.problem
-
-    def facts(self) -> dict[str, str]:
-        """Quantities, gains and problem."""
-        return law_facts(self)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Task labels, then xi1, xi2, ..."""
-        return self.chart.labels
-
-    @property
     def gains(self) -> dict[str, Array]:
         """Inputs of the law besides state and targets: the feedback gain [1/s] and the limit of the task speed."""
         return {"feedback": self.feedback, "limit": self.limit}
-
-    @property
-    def measured(self) -> ca.Function:
-        """Phi(q)."""
-        return self.chart.function("phi")
-
-    @cached_property
-    def function(self) -> ca.Function:
-        """q, dq (n, 1), reference and its derivatives (n, 1), gains -> command (n, 1), status (1, 1)."""
-        return self.chart.runnable(count_turns_from_centre(self.graph, self.problem))
 
     @cached_property
     def graph(self) -> ca.Function:
@@ -111,11 +98,15 @@ class Kinematic(Shown):
         n, problem = self.chart.n, self.problem
         inputs = named_inputs(n, self.gains, n)
         q = inputs["q"]
-        e, J = errors(self.chart, q, inputs["reference"])
-        B, Lambda, volume = block_inertia(n, (n,))(J, problem.metric.function(q))
-        rate = drift(self.chart, q, inputs["reference"], inputs["reference_velocity"]) - inputs["feedback"] * e
-        scale = median_volume(problem, self.chart.rates, problem.metric, (n,))
-        velocity = B @ (Lambda @ rate)  # J^-1 = A^-1 J^T (J A^-1 J^T)^-1
+
+        # The rate d_phi_d - Lambda_feedback e that phi is to have
+        e, J = compute_errors(self.chart, q, inputs["reference"])
+        rate = compute_drift(self.chart, q, inputs["reference"], inputs["reference_velocity"]) - inputs["feedback"] * e
+
+        # dq = J^-1 rate, with J^-1 = A^-1 J^T (J A^-1 J^T)^-1
+        B, Lambda, volume = build_block_inertia(n, (n,))(J, problem.metric.function(q))
+        velocity = B @ (Lambda @ rate)
+        scale = compute_median_volume(problem, self.chart.rates, problem.metric, (n,))
         return guarded_graph(self.name, inputs, velocity, ca.MX(n, 1), volume / scale, problem.domain, True)
 
     @cached_property
@@ -123,6 +114,133 @@ class Kinematic(Shown):
         """q, gains -> zero velocity."""
         return fallback_function(named_inputs(self.chart.n, self.gains, 0), ca.MX(self.chart.n, 1))
 
-    def require_reachable(self, reference: Reference, q_start: Array) -> None:
-        """Raise UnreachableReferenceError if the motion from q_start along the reference leaves the chart's domain."""
-        joint_path(self.chart, reference, q_start)
+
+class XiTask(Shown):
+    """e = xi(q) - xi_d for differential inverse kinematics with pink or mink: J_xi dq = -gain e, at a cost.
+
+    It stands in their lists of tasks, or of constraints, in place of a posture task. The tool's own task does not
+    disturb xi, so both are met together; a posture pulls at the tool. It needs neither package: it has the methods that
+    both ask for, and finds joints in the `model` of their configurations by name, of Pinocchio or MuJoCo.
+
+    Args:
+        chart: a chart with a closed expression, of the arm in the model.
+        cost: for errors of xi, one number or (r,), >= 0, as in their tasks.
+        gain: share of the error that a step removes, 0 to 1.
+        lm_damping: their Levenberg-Marquardt damping, >= 0.
+        joints: names in the model of the chart's joints; default: those of the chart's robot.
+
+    Raises:
+        NoExpressionError: for grown charts.
+        InvalidValueError: if a number is out of range.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> task = oc.control.XiTask(chart, cost=1.0)
+        >>> task.set_target(chart.xi([0.6, 0.8, 0.8]))
+    """
+
+    def __init__(
+        self,
+        chart: Chart,
+        cost: ArrayLike,
+        gain: float = 1.0,
+        lm_damping: float = 0.0,
+        joints: tuple[str, ...] | None = None,
+    ) -> None:
+        require_kind("chart", chart, Chart)
+        require_driven("a task of a quadratic program", chart.problem.robot.tree)
+        # Grown charts raise here.
+        chart.function("xi")
+        require_at_least("gain", gain, 0)
+        require_at_least("lm_damping", lm_damping, 0)
+        if gain > 1:
+            raise InvalidValueError("gain", gain, "a number from 0 to 1")
+        self.chart = chart
+        self.cost = non_negative_gains("cost", cost, chart.r)
+        self.gain, self.lm_damping = float(gain), float(lm_damping)
+        self.joints = chart.problem.robot.joint_names if joints is None else tuple(joints)
+        if len(self.joints) != chart.n:
+            raise ShapeError("joints", (len(self.joints),), (chart.n,))
+        self.target_xi: Array | None = None
+        # Turns of joints that turn without end count from the last position.
+        self._last: Array | None = None
+        # The last model, and the places of joints in it: looking them up takes longer than xi.
+        self._known: tuple[Any, list[tuple[Any, int]]] = (None, [])
+
+    def facts(self) -> dict[str, str]:
+        """Cost, gain and target."""
+        target = "none yet" if self.target_xi is None else number_list(self.target_xi)
+        labels = listed(self.chart.named_coordinates)
+        return {"task": f"{labels}, cost {number_list(self.cost)}, gain {self.gain:g}", "target": target}
+
+    def set_target(self, xi: ArrayLike) -> None:
+        """Wanted coordinates xi_d, (r,)."""
+        target = as_float_array("xi", xi)
+        if target.shape != (self.chart.r,):
+            raise ShapeError("xi", target.shape, (self.chart.r,))
+        self.target_xi = target.copy()
+
+    def set_target_from_configuration(self, configuration: Any) -> None:
+        """Keep the coordinates of a configuration."""
+        self.target_xi = self.chart.xi(self._read_position(configuration))
+
+    def compute_error(self, configuration: Any) -> Array:
+        """e (r,), by the shorter way around for circle-valued coordinates.
+
+        Raises:
+            InvalidValueError: before a target is set, or if the model has no joint of a name.
+        """
+        if self.target_xi is None:
+            raise InvalidValueError("target of the task", "none", "one from `set_target`")
+        error = self.chart.xi(self._read_position(configuration)) - self.target_xi
+        return np.asarray(wrap_shortest(error, self.chart.turns[self.chart.m :]))
+
+    def compute_jacobian(self, configuration: Any) -> Array:
+        """de/dq, (r, nv), with zeros for joints that the chart does not have."""
+        places = [place for _, place in self._places(configuration.model)]
+        J = np.zeros((self.chart.r, configuration.model.nv))
+        J[:, places] = self.chart.coordinates.jacobian(self._read_position(configuration)[None])[0]
+        return J
+
+    def compute_qp_residual(self, configuration: Any) -> tuple[Array, Array, float]:
+        """Weighted J, weighted -gain e, and the damping mu = lm_damping |that|^2; mink calls it."""
+        error = -self.gain * self.cost * self.compute_error(configuration)
+        J = self.cost[:, None] * self.compute_jacobian(configuration)
+        return J, error, self.lm_damping * float(error @ error)
+
+    def compute_qp_objective(self, configuration: Any) -> tuple[Array, Array]:
+        """H and c of the cost 1/2 dq^T H dq + c^T dq; pink calls it."""
+        J, error, damping = self.compute_qp_residual(configuration)
+        return J.T @ J + damping * np.eye(J.shape[1]), -error @ J
+
+    def _read_position(self, configuration: Any) -> Array:
+        """The chart's joint positions, (n,)."""
+        q = configuration.q
+        values = (q[place] for place, _ in self._places(configuration.model))
+        q = np.array([value if np.ndim(value) == 0 else np.arctan2(value[1], value[0]) for value in values])
+        self._last = q if self._last is None else np.asarray(self.chart.problem.unwrap(q, self._last))
+        return self._last
+
+    def _places(self, model: Any) -> list[tuple[Any, int]]:
+        """The places of joints; looking them up takes longer than xi."""
+        if model is not self._known[0]:
+            self._known = model, self._find_places(model)
+        return self._known[1]
+
+    def _find_places(self, model: Any) -> list[tuple[Any, int]]:
+        """For each joint its place in q, a slice for joints that Pinocchio stores as cosine and sine, and in dq."""
+        of_mujoco = not hasattr(model, "getJointId")
+        names = [model.joint(k).name for k in range(model.njnt)] if of_mujoco else [*model.names]
+        missing = [name for name in self.joints if name not in names]
+        if missing:
+            raise InvalidValueError("model", f"without a joint '{missing[0]}'", f"one of {', '.join(names)}")
+        if of_mujoco:
+            joints = [model.joint(name) for name in self.joints]
+            return [(int(joint.qposadr[0]), int(joint.dofadr[0])) for joint in joints]
+        places = []
+        for name in self.joints:
+            joint = model.joints[model.getJointId(name)]
+            places.append((joint.idx_q if joint.nq == 1 else slice(joint.idx_q, joint.idx_q + joint.nq), joint.idx_v))
+        return places

@@ -16,11 +16,10 @@ from orthocas.tools.expressions import WRITTEN_OUT
 LARGE_INVERSE = "large_inverse"  #: name of the functions for which generated C has code of its own
 ROOT_TIMES = "root_times"  #: likewise
 ROUNDS = 8  #: accurate to rounding up to a condition number of 1e6 (tests/control/test_control_algebra.py)
-_SAMPLES, _SEED = 256, 0
 SOFTEST = 1e-6  #: smallest squared frequency in double_diagonal, relative to the largest: K_i = 0 divides by zero
 
 
-def spd_inverse(matrix: Expression) -> tuple[Any, Any]:
+def invert_spd(matrix: Expression) -> tuple[Any, Any]:
     """Inverse and determinant of a symmetric positive definite matrix (k, k), without pivoting.
 
     NaN or infinite where the matrix is singular. SX are written out, by L D L^T; graphs (MX) have loops instead, whose
@@ -30,33 +29,34 @@ def spd_inverse(matrix: Expression) -> tuple[Any, Any]:
     if k == 1:
         return 1 / matrix, matrix
     if isinstance(matrix, ca.MX):
-        inverse, determinant = _swept(k)(matrix)
+        inverse, determinant = _build_sweeps(k)(matrix)
         return inverse, determinant
     D, LT, order = ca.ldl(matrix, False)
     volume = ca.SX(1)
     for i in range(k):
         volume *= D[i]
-    return _symmetric(ca.ldl_solve(ca.SX.eye(k), D, LT, order)), volume
+    return _mirror(ca.ldl_solve(ca.SX.eye(k), D, LT, order)), volume
 
 
 @cache
-def _swept(k: int) -> ca.Function:
+def _build_sweeps(k: int) -> ca.Function:
     """Inverse and determinant of A (k, k) by k sweeps: each pivots on the first entry, and moves it to the end.
 
     A sweep turns [[p, w^T], [w, R]] into [[R - w w^T / p, w / p], [w^T / p, -1 / p]]; k of them lead to -A^-1.
     """
-    state = ca.MX.sym("state", k * k + 1)  # the matrix and the product of the pivots: what `fold` carries along
+    # `fold` carries the matrix and the product of the pivots along.
+    state = ca.MX.sym("state", k * k + 1)
     A = ca.reshape(state[:-1], k, k)
     p, w = A[0, 0], A[1:, 0]
     share = w / p
-    moved = ca.vertcat(ca.horzcat(A[1:, 1:] - w @ share.T, share), ca.horzcat(share.T, -1 / p))
-    sweeps = ca.Function("sweep", [state], [ca.vertcat(ca.vec(moved), state[-1] * p)]).fold(k)
+    swept = ca.vertcat(ca.horzcat(A[1:, 1:] - w @ share.T, share), ca.horzcat(share.T, -1 / p))
+    sweeps = ca.Function("sweep", [state], [ca.vertcat(ca.vec(swept), state[-1] * p)]).fold(k)
     matrix = ca.MX.sym("A", k, k)
     end = sweeps(ca.vertcat(ca.vec(matrix), 1))
     return ca.Function(LARGE_INVERSE, [matrix], [-ca.reshape(end[:-1], k, k), end[-1]])
 
 
-def root_times(matrix: Expression, vectors: Expression) -> Expression:
+def multiply_by_root(matrix: Expression, vectors: Expression) -> Expression:
     """S V with the symmetric positive definite S, S S = A, for A (k, k) and V (k, c).
 
     Newton's iteration in the product form of Denman and Beavers, scaled by determinants, with a fixed number of rounds;
@@ -68,41 +68,41 @@ def root_times(matrix: Expression, vectors: Expression) -> Expression:
     """
     if matrix.shape[0] == 1:
         return ca.sqrt(matrix) * vectors
-    return _rounds(*vectors.shape)(matrix, vectors)
+    return _build_rounds(*vectors.shape)(matrix, vectors)
 
 
 @cache
-def _rounds(k: int, c: int) -> ca.Function:
+def _build_rounds(k: int, c: int) -> ca.Function:
     A, V = ca.MX.sym("A", k, k), ca.MX.sym("V", k, c)
-    product, found = A, A @ V
+    product, result = A, A @ V
     for _ in range(ROUNDS):
-        product, found = _newton_round(k, c)(product, found)
-    return ca.Function(ROOT_TIMES, [A, V], [found])
+        product, result = _build_newton_round(k, c)(product, result)
+    return ca.Function(ROOT_TIMES, [A, V], [result])
 
 
 @cache
-def _newton_round(k: int, c: int) -> ca.Function:
+def _build_newton_round(k: int, c: int) -> ca.Function:
     """One round on the product X (k, k), a rational function of A and therefore symmetric, and on S V (k, c)."""
-    kind = kind_of(k)
-    product, found, identity = kind.sym("X", k, k), kind.sym("SV", k, c), ca.DM.eye(k)
-    inverse, determinant = spd_inverse(product)
+    kind = choose_kind(k)
+    product, result, identity = kind.sym("X", k, k), kind.sym("SV", k, c), ca.DM.eye(k)
+    inverse, determinant = invert_spd(product)
     mu_squared = determinant ** (-1 / k)
-    next_found = ca.sqrt(mu_squared) * (found + inverse @ found / mu_squared) / 2
+    next_result = ca.sqrt(mu_squared) * (result + inverse @ result / mu_squared) / 2
     next_product = (identity + (mu_squared * product + inverse / mu_squared) / 2) / 2
-    return ca.Function("newton_round", [product, found], [_symmetric(next_product), ca.densify(next_found)])
+    return ca.Function("newton_round", [product, result], [_mirror(next_product), ca.densify(next_result)])
 
 
-def _symmetric(matrix: Any) -> Any:
+def _mirror(matrix: Any) -> Any:
     """Mirror the lower triangle of an SX that is symmetric up to rounding, which halves the operations."""
     return matrix if isinstance(matrix, ca.MX) else ca.SX(ca.tril2symm(ca.tril(matrix)))
 
 
-def kind_of(k: int) -> Any:
+def choose_kind(k: int) -> Any:
     """SX for matrices with few rows, which are fastest written out; MX for others, which then take C too long."""
     return ca.SX if k <= WRITTEN_OUT else ca.MX
 
 
-def block_inertia(n: int, blocks: tuple[int, ...]) -> ca.Function:
+def build_block_inertia(n: int, blocks: tuple[int, ...]) -> ca.Function:
     """J (k, n), A (n, n) -> B = A^-1 J^T (n, k), Lambda (k, k), volume (1, 1).
 
     The rows of J are divided into blocks, k = sum(blocks). Lambda is block diagonal with (J_b A^-1 J_b^T)^-1, [AS2023]
@@ -110,25 +110,24 @@ def block_inertia(n: int, blocks: tuple[int, ...]) -> ca.Function:
     singularities.
     """
     k = sum(blocks)
-    kind = kind_of(n)
+    kind = choose_kind(n)
     J, A = kind.sym("J", k, n), kind.sym("A", n, n)
-    B = spd_inverse(A)[0] @ J.T
+    B = invert_spd(A)[0] @ J.T
     parts, volume, start = [], kind(1), 0
     for size in blocks:
         rows = list(range(start, start + size))
-        inverse, determinant = spd_inverse(J[rows, :] @ B[:, rows])
+        inverse, determinant = invert_spd(J[rows, :] @ B[:, rows])
         parts.append(inverse)
         volume *= determinant
         start += size
     return ca.Function("inertia", [J, A], [ca.densify(B), ca.densify(ca.diagcat(*parts)), volume])
 
 
-def median_volume(problem: Problem, jacobian: ca.Function, metric: str | Metric, blocks: tuple[int, ...]) -> float:
-    """Median of the volume of `block_inertia` over the domain. It sets the scale for "near singular"."""
-    metric = Metric.from_spec(problem.robot, metric) if isinstance(metric, str) else metric
+def compute_median_volume(problem: Problem, jacobian: ca.Function, metric: Metric, blocks: tuple[int, ...]) -> float:
+    """Median of the volume of `build_block_inertia` over the domain. It sets the scale for "near singular"."""
     q = ca.MX.sym("q", problem.n)
-    volume = block_inertia(problem.n, blocks)(jacobian(q), metric.function(q))[2]
-    points = sample_uniform(problem.domain, _SAMPLES, _SEED)
+    volume = build_block_inertia(problem.n, blocks)(jacobian(q), metric.function(q))[2]
+    points = sample_uniform(problem.domain, 256, 0)
     return float(np.nanmedian(Batched(dense_function("volume", [q], [volume]))(points)[0]))
 
 
@@ -136,7 +135,7 @@ DampingDesign = Literal["square_root", "double_diagonal"]
 DAMPING_DESIGNS: tuple[DampingDesign, ...] = ("square_root", "double_diagonal")
 
 
-def damped(
+def apply_damping(
     design: DampingDesign,
     inertia: Expression,
     stiffness: Expression,
@@ -158,14 +157,14 @@ def damped(
     c = velocities.shape[1]
     if design == "square_root":
         share = ca.repmat(damping_ratio * ca.sqrt(stiffness), 1, c)
-        both = root_times(inertia, ca.horzcat(share * velocities, velocities))
+        both = multiply_by_root(inertia, ca.horzcat(share * velocities, velocities))
         return both[:, :c] + share * both[:, c:]
-    root_K = ca.sqrt(_not_too_soft(stiffness, inertia))
+    root_K = ca.sqrt(_stiffen(stiffness, inertia))
     scale = ca.repmat(root_K * ca.sqrt(damping_ratio), 1, c)
-    return 2 * scale * root_times(inertia / (root_K @ root_K.T), scale * velocities)
+    return 2 * scale * multiply_by_root(inertia / (root_K @ root_K.T), scale * velocities)
 
 
-def _not_too_soft(stiffness: Expression, inertia: Expression) -> Expression:
+def _stiffen(stiffness: Expression, inertia: Expression) -> Expression:
     """The stiffness with springs as soft as the rounds of the square root can resolve; K_i < 0 and NaN stay invalid.
 
     Squared frequencies K_i / M_ii are at least 1e-6 of the largest one, and 1e-12 1/s^2.

@@ -13,13 +13,14 @@ from orthocas.control.controller import (
     LARGEST,
     Controller,
     ControlStatus,
-    counted_function,
-    named_function,
+    build_function,
+    compute_bias,
+    get_counted_function,
     named_inputs,
     require_controller,
 )
-from orthocas.control.errors import bend
-from orthocas.control.linear_algebra import block_inertia
+from orthocas.control.gains import positive_gains
+from orthocas.control.linear_algebra import build_block_inertia
 from orthocas.errors import InvalidValueError
 from orthocas.robots import dynamics
 from orthocas.robots.tree import KinematicTree
@@ -38,9 +39,17 @@ from orthocas.tools.display import Shown, number_list
 if TYPE_CHECKING:
     from orthocas.control.operational_space import _OperationalSpace
 
-_SHARE = 0.5  # of the law's limit that a correction may use, by default
-_GRAVITY = 9.81  # [m/s^2]
-_CROSSED = 0.5  # weight of the error in J^-1 (de + weight e), in the decay rate of the slowest mode
+
+@dataclass(frozen=True, slots=True)
+class MemoryRules:
+    """Numbers of the memories that come with orthocas."""
+
+    fraction: float = 0.5  #: of the law's limit that a correction may use, by default
+    gravity: float = 9.81  #: to compare moments with torques [m/s^2]
+    crossed: float = 0.5  #: weight of the error in J^-1 (de + weight e), in the decay rate of the slowest mode
+
+
+RULES = MemoryRules()
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,24 +85,23 @@ class Memory:
             if not re.fullmatch(r"[a-z]\w*", name, flags=re.ASCII):
                 raise InvalidValueError("name of a field", repr(name), "small letters, digits and underscores, for C")
         object.__setattr__(self, "start", start)
-        wanted = {name: len(value) for name, value in start.items()}
-        known = self.step.name_in()
-        found = {name.removeprefix("next_"): self.step.size1_out(name) for name in self.step.name_out()}
-        last = {name: self.step.size1_in(name) for name in known[len(known) - len(start) :]}
-        if found != wanted or last != wanted:
-            raise InvalidValueError("outputs and last inputs of step", f"{found} and {last}", str(wanted))
+        sizes, inputs = {name: len(value) for name, value in start.items()}, self.step.name_in()
+        outputs = {name.removeprefix("next_"): self.step.size1_out(name) for name in self.step.name_out()}
+        last = {name: self.step.size1_in(name) for name in inputs[len(inputs) - len(start) :]}
+        if outputs != sizes or last != sizes:
+            raise InvalidValueError("outputs and last inputs of step", f"{outputs} and {last}", str(sizes))
         for gain, name in self.adds.items():
-            if name not in start or gain not in known:
+            if name not in start or gain not in inputs:
                 raise InvalidValueError("adds", f"{name} to {gain}", "a field, and a gain that is an input of step")
 
     def require_fitting(self, controller: Controller) -> None:
         """Raise InvalidValueError unless the step takes what the law has, and fields have the sizes of their gains."""
         n, gains = controller.problem.n, controller.gains
-        wanted = {name: symbol.shape[0] for name, symbol in named_inputs(n, gains, len(controller.labels)).items()}
-        wanted |= {"command": n, "active": 1, "period": 1} | {name: len(value) for name, value in self.start.items()}
-        found = {name: self.step.size1_in(name) for name in self.step.name_in()}
-        if list(found.items()) != list(wanted.items()):
-            raise InvalidValueError("inputs of step", found, str(wanted))
+        sizes = {name: symbol.shape[0] for name, symbol in named_inputs(n, gains, len(controller.labels)).items()}
+        sizes |= {"command": n, "active": 1, "period": 1} | {name: len(value) for name, value in self.start.items()}
+        inputs = {name: self.step.size1_in(name) for name in self.step.name_in()}
+        if list(inputs.items()) != list(sizes.items()):
+            raise InvalidValueError("inputs of step", inputs, str(sizes))
         for gain, name in self.adds.items():
             if len(self.start[name]) != len(gains[gain]) or gain == "limit":
                 raise InvalidValueError("adds", f"{name} to {gain}", "a field of the size of its gain, not the limit")
@@ -111,7 +119,6 @@ class Remembers(Protocol):
 
     def of(self, law: "_OperationalSpace") -> Memory:
         """The memory of a law that has the input `extra_torque`."""
-        ...
 
 
 def memory_of(controller: Controller) -> Memory | None:
@@ -144,8 +151,8 @@ class Remembering(Shown):
         require_controller(controller)
         memory = memory_of(controller)
         self._controller, self._memory = controller, memory
-        self._law = _on_arrays(counted_function(controller))
-        self._step = None if memory is None else _on_arrays(memory.step)
+        self._law = _call_with_arrays(get_counted_function(controller))
+        self._step = None if memory is None else _call_with_arrays(memory.step)
         self.fields: dict[str, Array] = {}  #: what it remembers
         self.q: Array | None = None  #: the last position with its turns counted, (n,); None before the first tick
         self.start()
@@ -181,23 +188,23 @@ class Remembering(Shown):
         state = self.q, as_point("dq", dq, n), *targets
         adds = {} if self._memory is None else self._memory.adds
         used = law.gains | {gain: law.gains[gain] + self.fields[name] for gain, name in adds.items()}
-        command, (number,) = _values(self._law, *state, *used.values())
+        command, (number,) = _evaluate(self._law, *state, *used.values())
         status = ControlStatus(int(number))
         if self._step is not None:
             active, since = float(status == ControlStatus.OK), 0.0 if self._fresh else as_number("period", period)
-            fields = _values(self._step, *state, *law.gains.values(), command, active, since, *self.fields.values())
+            fields = _evaluate(self._step, *state, *law.gains.values(), command, active, since, *self.fields.values())
             self.fields = dict(zip(self.fields, fields, strict=True))
         self._fresh = False
         return command, status
 
 
-def _on_arrays(function: ca.Function) -> Batched:
+def _call_with_arrays(function: ca.Function) -> Batched:
     """A function of columns, to be called with arrays: CasADi's own conversions take most of the time of a tick."""
     inputs = [ca.MX.sym(name, *function.size_in(i)) for i, name in enumerate(function.name_in())]
     return Batched(dense_function(function.name(), inputs, function.call(inputs), function.name_in()))
 
 
-def _values(function: Batched, *columns: ArrayLike) -> list[Array]:
+def _evaluate(function: Batched, *columns: ArrayLike) -> list[Array]:
     return [out[0] for out in function(*(np.reshape(column, (1, -1)) for column in columns))]
 
 
@@ -244,18 +251,21 @@ class MomentumObserver(_Correcting):
                 laws whose model is given.
         """
         n, model = law.problem.n, law.model
-        bound = _bound(self.bound, law)
+        bound = _check_bound(self.bound, law)
         fields = {name: np.zeros(n) for name in ("expected", "drive", "correction")}
-        inputs = _inputs(law, fields)
+        inputs = _name_inputs(law, fields)
         q, dq, period = inputs["q"], inputs["dq"], inputs["period"]
         payload = [inputs["payload"]] if "payload" in inputs else []
-        p, rate = _momentum(law.problem.robot.tree, bool(payload), model.gravity == "law")(q, dq, *payload)
+        p, rate = _build_momentum(law.problem.robot.tree, bool(payload), model.gravity == "law")(q, dq, *payload)
+
+        # The momentum that the last tick foresaw; after a start, the one that explains the correction
         anew, later = p + inputs["correction"] / self.rate, inputs["expected"] + period * inputs["drive"]
         expected = ca.if_else(ca.logic_and(period > 0, ca.fabs(later) <= LARGEST), later, anew)
+
+        # r follows tau_ext; dp/dt = tau + C^T dq - g + r drives the momentum until the next tick
         r = self.rate * (p - expected)
         drive = inputs["command"] - model.feed_forward(law.problem.robot, inputs) + rate + r
-        found = {"expected": expected, "drive": drive, "correction": _cut(-r, bound)}
-        return _of_torque(fields, inputs, found)
+        return _build_memory(fields, inputs, {"expected": expected, "drive": drive, "correction": _clip(-r, bound)})
 
 
 @dataclass(frozen=True)
@@ -289,37 +299,44 @@ class Adaptation(_Correcting):
                 laws whose model is given.
         """
         problem, chart = law.problem, law.chart
-        bound, tree = _bound(self.bound, law), problem.robot.tree
-        regressor, joints = _regressor(tree)
+        bound, tree = _check_bound(self.bound, law), problem.robot.tree
+        regressor, joints = _build_regressor(tree)
         fields = {"moments": np.zeros(len(joints)), "offset": np.zeros(problem.n), "correction": np.zeros(problem.n)}
-        inputs = _inputs(law, fields)
+        inputs = _name_inputs(law, fields)
         q, dq = inputs["q"], inputs["dq"]
-        e, de, J = law._errors(inputs)
-        B, Lambda, _ = block_inertia(chart.n, (chart.n,))(J, law.model.own_mass_matrix(problem.robot, inputs))
-        w = B @ (Lambda @ law._drift(inputs))
-        wanted = inputs["reference"], inputs["reference_velocity"], inputs["reference_acceleration"]
-        a = -B @ (Lambda @ bend(chart, q, dq, w, wanted))
+
+        # Y at the desired velocity w and acceleration a of the joints
+        e, de, J = law._compute_errors(inputs)
+        B, Lambda, _ = build_block_inertia(chart.n, (chart.n,))(J, law.model.own_mass_matrix(problem.robot, inputs))
+        w = B @ (Lambda @ law._compute_drift(inputs))
+        reference = inputs["reference"], inputs["reference_velocity"], inputs["reference_acceleration"]
+        a = -B @ (Lambda @ compute_bias(chart, q, dq, w, reference))
         Y = regressor(q, dq, w, a)
-        springs = self._springs(law)[list(joints)] / _GRAVITY**2
-        slowest = self._crossed(law)
+
+        # dp/dt = -rate gain Y^T J^-1 (de / c + e), while the law commands
+        springs = self._compute_joint_stiffness(law)[list(joints)] / RULES.gravity**2
+        slowest = self._compute_crossing(law)
         slope = -min(self.rate, slowest) * springs * (Y.T @ (B @ (Lambda @ (de / slowest + e))))
         change = ca.if_else(inputs["active"] > 0, inputs["active"] * inputs["period"] * slope, 0)
-        largest = np.full(len(joints), float(bound.max()) / _GRAVITY)
-        moments = _cut(inputs["moments"] + _known(change), largest)
-        offset = ca.if_else(inputs["period"] > 0, inputs["offset"], inputs["correction"] - Y @ moments)
-        found = {"moments": moments, "offset": _known(offset), "correction": _cut(Y @ moments + offset, bound)}
-        return _of_torque(fields, inputs, found)
+        largest = np.full(len(joints), float(bound.max()) / RULES.gravity)
+        moments = _clip(inputs["moments"] + _replace_invalid(change), largest)
 
-    def _crossed(self, law: "_OperationalSpace") -> float:
+        # What no moment explains is known from the start only
+        offset = ca.if_else(inputs["period"] > 0, inputs["offset"], inputs["correction"] - Y @ moments)
+        correction = _clip(Y @ moments + offset, bound)
+        offset = _replace_invalid(offset)
+        return _build_memory(fields, inputs, {"moments": moments, "offset": offset, "correction": correction})
+
+    def _compute_crossing(self, law: "_OperationalSpace") -> float:
         """c [1/s]; larger weights, and faster learning, make soft laws swing."""
         modes = law.modes(law.problem.domain.centre)
         sprung = modes.frequencies > 0
         decays = 2 * np.pi * modes.frequencies[sprung] * np.minimum(modes.damping_ratios[sprung], 1.0)
         if not (decays > 0).any():
             raise InvalidValueError("law with a memory", "without springs and damping", "both, to learn from errors")
-        return _CROSSED * float(decays[decays > 0].min())
+        return RULES.crossed * float(decays[decays > 0].min())
 
-    def _springs(self, law: "_OperationalSpace") -> Array:
+    def _compute_joint_stiffness(self, law: "_OperationalSpace") -> Array:
         """Stiffness of the law at the joints, the diagonal of J^T K J in the middle of the domain, (n,)."""
         J = law.chart.batched_rates(law.problem.domain.centre[None])[0]
         return np.asarray((J**2 * law.stiffness[:, None]).sum(axis=0))
@@ -330,42 +347,41 @@ MEMORIES: Mapping[str, type[MomentumObserver] | type[Adaptation]] = {
 }
 
 
-def _bound(bound: ArrayLike | None, law: "_OperationalSpace") -> Array:
+def _check_bound(bound: ArrayLike | None, law: "_OperationalSpace") -> Array:
     """Largest corrections (n,)."""
     if law.model.source == "given":
         raise InvalidValueError("model of a law with a memory", "given", "own, because it needs the momentum")
-    given = _SHARE * law.limit if bound is None else as_float_array("bound", bound)
-    if given.ndim:
-        require_shape("bound", given.shape, (law.problem.n,))
-    found = np.broadcast_to(given, (law.problem.n,))
-    if not (np.isfinite(found) & (found > 0)).all():
-        raise InvalidValueError("bound of the correction", found.tolist(), "finite numbers > 0, or a finite limit")
-    return np.asarray(found)
+    if bound is not None:
+        return positive_gains("bound", bound, law.problem.n)
+    largest = RULES.fraction * law.limit
+    if not np.isfinite(largest).all():
+        raise InvalidValueError("bound of the correction", largest.tolist(), "finite numbers > 0, or a finite limit")
+    return largest
 
 
-def _inputs(law: "_OperationalSpace", fields: Mapping[str, Array]) -> dict[str, ca.MX]:
+def _name_inputs(law: "_OperationalSpace", fields: Mapping[str, Array]) -> dict[str, ca.MX]:
     """Symbols for the inputs of a step, in order."""
     further = {"command": law.problem.n, "active": 1, "period": 1} | {name: len(fields[name]) for name in fields}
     symbols = {name: ca.MX.sym(name, size) for name, size in further.items()}
     return named_inputs(law.problem.n, law.gains, len(law.labels)) | symbols
 
 
-def _of_torque(fields: Mapping[str, Array], inputs: dict[str, ca.MX], found: Mapping[str, ca.MX]) -> Memory:
+def _build_memory(fields: Mapping[str, Array], inputs: dict[str, ca.MX], values: Mapping[str, ca.MX]) -> Memory:
     """A memory whose `correction` is a torque."""
-    outputs = {f"next_{name}": value for name, value in found.items()}
-    return Memory(fields, {"extra_torque": "correction"}, named_function("memory", inputs, outputs))
+    outputs = {f"next_{name}": value for name, value in values.items()}
+    return Memory(fields, {"extra_torque": "correction"}, build_function("memory", inputs, outputs))
 
 
-def _cut(values: ca.MX, bound: Array) -> Any:
+def _clip(values: ca.MX, bound: Array) -> Any:
     """Values within +- bound; 0 where they are no numbers."""
-    return ca.fmin(ca.fmax(_known(values), -ca.DM(bound)), ca.DM(bound))
+    return ca.fmin(ca.fmax(_replace_invalid(values), -ca.DM(bound)), ca.DM(bound))
 
 
-def _known(values: ca.MX) -> Any:
+def _replace_invalid(values: ca.MX) -> Any:
     return ca.if_else(ca.fabs(values) <= LARGEST, values, 0)
 
 
-def _momentum(tree: KinematicTree, with_payload: bool, with_gravity: bool) -> ca.Function:
+def _build_momentum(tree: KinematicTree, with_payload: bool, with_gravity: bool) -> ca.Function:
     """q, dq, and the payload if there is one -> p = M dq and C^T dq - g, (n, 1) each, without g if the robot adds it.
 
     C^T dq is the gradient of the kinetic energy dq^T M dq / 2 by q: dM/dt dq = C dq + C^T dq.
@@ -379,14 +395,16 @@ def _momentum(tree: KinematicTree, with_payload: bool, with_gravity: bool) -> ca
     return ca.Function("momentum", [q, dq, *payload], [ca.densify(p), ca.densify(rate)])
 
 
-def _regressor(tree: KinematicTree) -> tuple[ca.Function, tuple[int, ...]]:
+def _build_regressor(tree: KinematicTree) -> tuple[ca.Function, tuple[int, ...]]:
     """q, dq, w, a -> Y (n, k) of M a + C(q, dq) w + g in the first moments, and the joint whose link has each."""
     q, dq, w, a = (ca.SX.sym(name, tree.n) for name in ("q", "dq", "w", "a"))
     numbers = ca.SX.sym("numbers", len(dynamics.collect_inertials(tree)))
     rest, weightless = ca.SX(tree.n, 1), np.zeros(3)
     force = dynamics.build_inverse_dynamics(tree, q, rest, a, tree.gravity, inertials=numbers)
-    for sign in (1, -1):  # C(q, dq) w by polarisation, as in `dynamics.build_coriolis_product`
+    # C(q, dq) w by polarisation, as in `dynamics.build_coriolis_product`
+    for sign in (1, -1):
         force += sign / 4 * dynamics.build_bias(tree, q, dq + sign * w, weightless, inertials=numbers)
     places, joints = dynamics.find_first_moments(tree)
-    Y = ca.jacobian(force, numbers)[:, places]  # linear, but for the rotors' inertias, which do not depend on them
+    # The force is linear in them, but for the rotors' inertias, which do not depend on the first moments.
+    Y = ca.jacobian(force, numbers)[:, places]
     return ca.Function("regressor", [q, dq, w, a], [ca.densify(Y)]), joints

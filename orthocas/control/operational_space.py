@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self, get_args
 
 import casadi as ca
 import numpy as np
@@ -13,99 +13,62 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.point_quality import Judged
 from orthocas.control.controller import (
     Command,
+    LawOfChart,
+    Setting,
+    build_function,
+    compute_bias,
+    compute_drift,
+    compute_errors,
     count_turns_from_centre,
     fallback_function,
     guarded_graph,
-    law_facts,
-    named_function,
     named_inputs,
 )
-from orthocas.control.errors import bend, drift, errors
 from orthocas.control.gains import (
     DAMPING_RATIO,
-    DAMPING_RATIO_SETTING,
-    DELAY_SETTING,
     LIMIT,
     STIFFNESS,
-    STIFFNESS_SETTING,
-    Setting,
+    Modes,
     command_limit,
-    fastest_posture,
+    compute_mobility,
+    compute_modes,
+    find_fastest_posture,
+    find_holding_doubts,
     matched_stiffness,
-    mobility,
     non_negative_gains,
     positive_gains,
 )
-from orthocas.control.holding import holding_doubts
-from orthocas.control.linear_algebra import DAMPING_DESIGNS, DampingDesign, block_inertia, damped, median_volume
+from orthocas.control.linear_algebra import (
+    DAMPING_DESIGNS,
+    DampingDesign,
+    apply_damping,
+    build_block_inertia,
+    compute_median_volume,
+)
 from orthocas.control.memory import MEMORIES, Memory, Remembers
-from orthocas.control.posture import joint_path
-from orthocas.control.reference import Reference
-from orthocas.control.run_time_model import Gravity, RunTimeModel, Source
+from orthocas.control.run_time_model import UNITS, Gravity, RunTimeModel, Source
 from orthocas.errors import InvalidValueError, LawWarning
 from orthocas.robots.tree import require_driven
-from orthocas.tasks.problem import Problem
+from orthocas.tasks.metric import Metric
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_point_set, require_kind, require_known
-from orthocas.tools.display import Shown, number_list, percent
-
-_MODE_SAMPLES = 256
-_MUCH_DEG = 15.0  # leak from which on decoupled laws are warned of
-_LARGE_RATIO = 5.0  # damping ratio from which on a percentage is suspected
+from orthocas.tools.display import percent
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Modes(Shown):
-    """Modes of M_phi dde + D de + K e = 0 at one posture (n,) or at several (N, n).
+@dataclass(frozen=True, slots=True)
+class TorqueRules:
+    """Numbers of torque laws."""
 
-    Mode i has the shape v_i with K v_i = omega_i^2 M_phi v_i and v_i^T M_phi v_i = 1. Its damping ratio is
-    v_i^T D v_i / (2 omega_i). This is exact if D is diagonal in the modes, as for coupled laws with `double_diagonal`
-    and one damping ratio for all.
-    """
-
-    frequencies: Array  #: [Hz], in ascending order
-    damping_ratios: Array  #: infinite for a mode without a spring
-    delays: Array  #: longest delay of the loop with which the mode alone stays stable [s]
-
-    def facts(self) -> dict[str, str]:
-        """Frequencies, damping ratios and delay."""
-        return {
-            "modes": f"{number_list(np.median(np.atleast_2d(self.frequencies), axis=0))} Hz",
-            "fastest": f"{self.frequencies.max():.4g} Hz",
-            "damping ratios": f"{self.damping_ratios.min():.3g} to {self.damping_ratios.max():.3g}",
-            "delay": f"stable up to {1e3 * self.delays.min():.3g} ms",
-        }
+    samples: int = 256  #: of the domain, for modes and leaks
+    much_deg: float = 15.0  #: leak from which on decoupled laws are warned of [deg]
+    large_ratio: float = 5.0  #: damping ratio from which on a percentage is suspected
 
 
-def modes_of(mobility: Array, stiffness: Array, damping: Array) -> Modes:
-    """Modes for M_phi^-1 (N, n, n), the diagonal of K (n,), and D (N, n, n).
-
-    With S = M_phi^-1/2 and the unit eigenvectors u_i of S K S, v_i = S u_i.
-    """
-    values, vectors = np.linalg.eigh(mobility)
-    half = (vectors * np.sqrt(values.clip(0))[:, None, :]) @ vectors.transpose(0, 2, 1)
-    squares, shapes = np.linalg.eigh((half * stiffness) @ half)
-    omega = np.sqrt(squares.clip(0))
-    rates = np.einsum("kij,kij->kj", shapes, half @ damping @ half @ shapes)  # 2 zeta omega [1/s]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratios = rates / (2 * omega)
-    return Modes(omega / (2 * np.pi), ratios, _longest_delays(omega, rates))
-
-
-def _longest_delays(omega: Array, rates: Array) -> Array:
-    """Delay [s] at which s^2 + (rate s + omega^2) exp(-s T) = 0 gets a root i Omega.
-
-    The modulus gives Omega^2 = rate^2/2 + sqrt(rate^4/4 + omega^4), the phase T = atan(rate Omega / omega^2) / Omega.
-    """
-    crossing = np.sqrt(rates**2 / 2 + np.sqrt(rates**4 / 4 + omega**4))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.arctan2(rates * crossing, omega**2) / crossing)
-
+RULES = TorqueRules()
 
 Coupling = Literal["coupled", "decoupled"]
-COUPLINGS: tuple[Coupling, ...] = ("coupled", "decoupled")
 
 
 @dataclass(frozen=True)
@@ -119,7 +82,7 @@ class DampingCheck:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class _OperationalSpace(Shown):
+class _OperationalSpace(LawOfChart):
     """The common part of impedance control and PD+: settings, inertia and damping in the coordinates of a chart.
 
     Args:
@@ -159,9 +122,9 @@ class _OperationalSpace(Shown):
     force: ClassVar[str]  #: the formula, without torques that do not act through the coordinates
     command: ClassVar[Command] = "torque"
     options: ClassVar[Mapping[str, Setting]] = {
-        "stiffness": STIFFNESS_SETTING,
-        "delay": DELAY_SETTING,
-        "damping_ratio": DAMPING_RATIO_SETTING,
+        "stiffness": Setting('"100", or "100,50,..." per quantity; default: modes around 6 Hz.'),
+        "delay": Setting("Delay from measurement to torque that the default stiffness is to bear [s]; default: 0."),
+        "damping_ratio": Setting('"0.7", or "0.7,1,..." per quantity; default: 0.7.'),
         "coupling": Setting("coupled (default) or decoupled.", is_word=True),
         "damping": Setting("double_diagonal (default) or square_root.", is_word=True),
         "damping_stiffness": Setting("Design the damping for this stiffness, so that --stiffness may be 0 in places."),
@@ -195,7 +158,7 @@ class _OperationalSpace(Shown):
         model: RunTimeModel | None = None,
         remembers: Remembers | None = None,
     ) -> None:
-        require_known("coupling", coupling, COUPLINGS)
+        require_known("coupling", coupling, get_args(Coupling))
         require_known("damping", damping, DAMPING_DESIGNS)
         require_kind("chart", chart, Chart)
         require_driven(f"the law {self.name}", chart.problem.robot.tree)
@@ -207,13 +170,18 @@ class _OperationalSpace(Shown):
             )
         if remembers is not None and model.extra_torque is None:
             model = replace(model, extra_torque=0.0)
-        chart.function("xi")  # raises for grown charts
+        # Grown charts, and values of another size, raise here.
+        chart.function("xi")
         n, as_stiffness = chart.n, damping_stiffness is None
-        model.gains(chart.problem, self.feed_forward)  # raises for values of another size
+        if damping_stiffness is not None:
+            damping_stiffness = positive_gains("damping_stiffness", damping_stiffness, n)
+        model.gains(chart.problem, self.feed_forward)
         for name, value in {
             "chart": chart,
             "stiffness": (positive_gains if as_stiffness else non_negative_gains)("stiffness", stiffness, n),
-            "damping_stiffness": _positive_or_none("damping_stiffness", damping_stiffness, n),
+            "damping_stiffness": None
+            if damping_stiffness is None
+            else positive_gains("damping_stiffness", damping_stiffness, n),
             "model": model,
             "damping_ratio": non_negative_gains("damping_ratio", damping_ratio, n),
             "coupling": coupling,
@@ -223,8 +191,9 @@ class _OperationalSpace(Shown):
         }.items():
             object.__setattr__(self, name, value)
         if remembers is not None:
-            _ = self.memory  # raises for bounds of another size
-        doubts = [*_like_a_percentage(self.damping_ratio), *self._holding_doubts()]
+            # Bounds of another size raise here.
+            _ = self.memory
+        doubts = [*_doubt_ratio(self.damping_ratio), *self._find_holding_doubts()]
         if coupling == "decoupled" and (metric := chart.problem.metric.name) != "inertia":
             doubts.append(f"a decoupled law relies on A = M (inertia), but the metric of this chart is {metric}")
         for doubt in doubts:
@@ -247,21 +216,11 @@ class _OperationalSpace(Shown):
         memory: Literal["none", "momentum", "adaptive"] = "none",
         delay: float = 0.0,
     ) -> Self:
-        """Build the law on a chart.
+        """Build the law on a chart from numbers and words; other settings are those of the law itself.
 
-        Args:
-            chart: the chart.
-            limit: largest torque of each joint.
-            stiffness: default: `matched_stiffness`, modes around 6 Hz, or slower ones that bear the delay.
-            damping_ratio: as for the law itself.
-            coupling: as for the law itself.
-            damping: as for the law itself.
-            damping_stiffness: as for the law itself.
-            model: the source of the `RunTimeModel`.
-            gravity: its gravity.
-            inputs: its inputs, such as "payload,wrench,extra_torque".
-            memory: none, momentum for a `MomentumObserver`, or adaptive for an `Adaptation`.
-            delay: from the measurement to the torque [s], for the default stiffness.
+        `model`, `gravity` and `inputs` ("payload,wrench,extra_torque") are those of a `RunTimeModel`, `memory` names a
+        `MomentumObserver` or an `Adaptation`. Without a stiffness, `matched_stiffness` puts the modes around 6 Hz, or
+        lower so that they bear a `delay` from the measurement to the torque [s].
 
         Raises:
             ShapeError, InvalidValueError, UnknownNameError: as for the law itself, and for a delay beside a stiffness.
@@ -272,7 +231,11 @@ class _OperationalSpace(Shown):
             stiffness = matched_stiffness(chart, delay=delay, damping_ratio=damping_ratio)
         elif delay:
             raise InvalidValueError("delay", delay, "none with a given stiffness")
-        run_time = RunTimeModel.with_inputs(model, gravity, inputs.split(",") if inputs else ())
+        zeros: dict[str, ArrayLike] = {"payload": 0.0, "wrench": np.zeros(6), "extra_torque": 0.0}
+        names = inputs.split(",") if inputs else []
+        for name in names:
+            require_known("input", name, zeros)
+        run_time = RunTimeModel(model, gravity, **{name: zeros[name] for name in names})
         return cls(chart, stiffness, damping_ratio, coupling, damping, limit, damping_stiffness, run_time, remembers)
 
     @cached_property
@@ -302,7 +265,7 @@ class _OperationalSpace(Shown):
     def gain_units(self) -> Mapping[str, str]:
         """Units and admissible values of the gains, in words, by name."""
         design = {"damping_stiffness": "like stiffness, > 0; damping is designed for it"}
-        return {"stiffness": STIFFNESS, "damping_ratio": DAMPING_RATIO, "limit": LIMIT, **design, **self.model.units}
+        return {"stiffness": STIFFNESS, "damping_ratio": DAMPING_RATIO, "limit": LIMIT, **design, **UNITS}
 
     def remarks(self) -> list[str]:
         """Warnings.
@@ -310,48 +273,34 @@ class _OperationalSpace(Shown):
         The motors cannot hold the arm, the metric does not decouple task and extra coordinates, a damping ratio looks
         like a percentage, a decoupled law has a chart that leaks much, or D is not positive semi-definite.
         """
-        found, metric = [*self._holding_doubts()], self.problem.metric.name
+        result, metric = [*self._find_holding_doubts()], self.problem.metric.name
         if metric != "inertia":
-            found.append(
+            result.append(
                 f"the metric of this chart is {metric}, but task and extra coordinates are decoupled only for A = M "
                 "(inertia)"
             )
-        found += _like_a_percentage(self.damping_ratio)
-        if self.coupling == "decoupled" and (leak := self._leak_deg()) > _MUCH_DEG:
-            found.append(
+        result += _doubt_ratio(self.damping_ratio)
+        if self.coupling == "decoupled" and (leak := self._compute_leak_deg()) > RULES.much_deg:
+            result.append(
                 f"the gradients of this chart lean into the task by {leak:.0f} deg (rms): decoupled springs pull at "
                 "both, which coupled ones do not; see docs/how-to/wide.md"
             )
         if share := self.check_damping().indefinite_share:
             where = f"in {percent(share, fault=True)} of the domain with these gains"
-            found.append(f"the damping matrix (29) is indefinite {where}; the damping design double_diagonal never is")
-        return found + self.model.remarks()
+            result.append(f"the damping matrix (29) is indefinite {where}; the damping design double_diagonal never is")
+        return result + self.model.remarks()
 
-    def _holding_doubts(self) -> list[str]:
+    def _find_holding_doubts(self) -> list[str]:
         """Of an arm that the motors cannot hold; none if the robot compensates gravity itself."""
         if self.model.gravity == "robot":
             return []
-        return holding_doubts(self.model.robot(self.problem), self.problem.domain, self.limit)
+        return find_holding_doubts(self.model.robot(self.problem), self.problem.domain, self.limit)
 
-    def _leak_deg(self) -> float:
+    def _compute_leak_deg(self) -> float:
         """Root mean square of the chart's leaks at samples [deg]."""
-        points = sample_uniform(self.problem.domain, _MODE_SAMPLES, 0)
+        points = sample_uniform(self.problem.domain, RULES.samples, 0)
         sines = Judged.at(self.problem, self.chart.coordinates, points).leak_sines
         return float(np.degrees(np.sqrt(np.mean(np.arcsin(np.clip(sines, 0.0, 1.0)) ** 2))))
-
-    @property
-    def problem(self) -> Problem:
-        """Robot, task, metric and domain of the chart."""
-        return self.chart.problem
-
-    def facts(self) -> dict[str, str]:
-        """Quantities, gains, design and problem."""
-        return law_facts(self)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Task labels, then xi1, xi2, ..."""
-        return self.chart.labels
 
     @property
     def gains(self) -> dict[str, Array]:
@@ -366,24 +315,27 @@ class _OperationalSpace(Shown):
             **inputs,
         }
 
-    @property
-    def measured(self) -> ca.Function:
-        """Phi(q)."""
-        return self.chart.function("phi")
-
-    @cached_property
-    def function(self) -> ca.Function:
-        """q, dq (n, 1), reference and its derivatives (n, 1), gains -> command (n, 1), status (1, 1)."""
-        return self.chart.runnable(count_turns_from_centre(self.graph, self.problem))
-
     @cached_property
     def graph(self) -> ca.Function:
         """The same function as a graph with shared subexpressions; C is generated from it."""
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
-        robot = self.problem.robot
-        gravity = self.model.gravity_torque(robot, inputs)
-        force, volume, J = self._force(inputs)
-        torque = J.T @ force + gravity + self.model.feed_forward(robot, inputs)
+        q, dq, robot, model = inputs["q"], inputs["dq"], self.problem.robot, self.model
+
+        # f_imp = -K e - D de, (33); Lambda is M_phi, or its blocks
+        e, de, J = self._compute_errors(inputs)
+        B, Lambda, volume = self._compute_inertia(J, model.mass_matrix(robot, inputs))
+        force = -inputs["stiffness"] * e - self._apply_damping(Lambda, inputs, de)
+
+        # f_FF = Lambda (dd_phi_d + (J M^-1 C - dJ/dt) w), (35), with w = J^-1 d_phi_d: by (8) also when decoupled
+        if self.feed_forward:
+            w = B @ (Lambda @ self._compute_drift(inputs))
+            reference = inputs["reference"], inputs["reference_velocity"], inputs["reference_acceleration"]
+            bias = compute_bias(self.chart, q, dq, dq if model.source == "given" else w, reference)
+            force += Lambda @ (B.T @ model.coriolis_torque(robot, inputs, w) - bias)
+
+        # tau = J^T f + g + J_tip^T wrench + extra_torque
+        gravity = model.gravity_torque(robot, inputs)
+        torque = J.T @ force + gravity + model.feed_forward(robot, inputs)
         relative = volume / self.median_volume
         return guarded_graph(self.name, inputs, torque, gravity, relative, self.problem.domain)
 
@@ -409,27 +361,27 @@ class _OperationalSpace(Shown):
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
         K = ca.diag(inputs["stiffness"])
         M = self.model.own_mass_matrix(self.problem.robot, inputs)
-        e, de, J = self._errors(inputs)
-        damping_force = self._damped(self._inertia(J, M)[1], inputs, de)
-        M_phi = block_inertia(self.chart.n, (self.chart.n,))(J, M)[1]
+        e, de, J = self._compute_errors(inputs)
+        damping_force = self._apply_damping(self._compute_inertia(J, M)[1], inputs, de)
+        M_phi = build_block_inertia(self.chart.n, (self.chart.n,))(J, M)[1]
         kinetic = ca.bilin(M_phi, de, de) if self.feed_forward else ca.bilin(M, inputs["dq"], inputs["dq"])
         storage = (kinetic + ca.bilin(K, e, e)) / 2
         outputs = {"storage": storage, "dissipated_power": ca.dot(de, damping_force)}
-        return named_function("energy", inputs, outputs)
+        return build_function("energy", inputs, outputs)
 
     @cached_property
     def damping_matrix(self) -> ca.Function:
         """q, stiffness, damping_ratio, then damping_stiffness and payload if they are inputs -> D(q), (n, n)."""
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
-        chosen = {name: inputs[name] for name in ("q", *self._of_the_damping)}
+        chosen = {name: inputs[name] for name in ("q", *self._damping_inputs)}
         J, M = self.chart.rates(inputs["q"]), self.model.own_mass_matrix(self.problem.robot, inputs)
-        D = self._damped(self._inertia(J, M)[1], inputs, ca.MX.eye(self.chart.n))
-        return self.chart.runnable(named_function("damping_matrix", chosen, {"D": D}))
+        D = self._apply_damping(self._compute_inertia(J, M)[1], inputs, ca.MX.eye(self.chart.n))
+        return self.chart.runnable(build_function("damping_matrix", chosen, {"D": D}))
 
     def check_damping(self, samples: int = 1000, seed: int = 0) -> DampingCheck:
         """Find the smallest eigenvalue of D over uniform samples of the domain; (29) can make it negative."""
         points = sample_uniform(self.problem.domain, samples, seed)
-        values = np.linalg.eigvalsh(self._damping_at(points))
+        values = np.linalg.eigvalsh(self._compute_damping(points))
         ratio = values[:, 0] / np.abs(values).max(axis=1).clip(np.finfo(float).tiny)
         worst = int(np.argmin(ratio))
         return DampingCheck(samples, float(ratio[worst]), float((ratio < -1e-12).mean()), tuple(points[worst].tolist()))
@@ -444,27 +396,21 @@ class _OperationalSpace(Shown):
         Raises:
             ShapeError, InvalidValueError: if q has another shape, or is not finite.
         """
-        points, single = as_point_set("q", self._mode_points() if q is None else q, self.chart.n)
-        W = mobility(self.chart, points, self.model.robot(self.problem))
-        found = modes_of(W, self.stiffness, self._damping_at(points))
-        return Modes(*(values[0] for values in vars(found).values())) if single else found
+        if q is None:
+            fastest = find_fastest_posture(self.chart, self.stiffness, self.model.robot(self.problem))
+            q = np.vstack([sample_uniform(self.problem.domain, RULES.samples, 0), fastest])
+        points, single = as_point_set("q", q, self.chart.n)
+        W = compute_mobility(self.chart, points, self.model.robot(self.problem))
+        result = compute_modes(W, self.stiffness, self._compute_damping(points))
+        return Modes(*(values[0] for values in vars(result).values())) if single else result
 
-    def _mode_points(self) -> Array:
-        """Samples of the domain, and the posture with the fastest mode that a search finds, (N, n)."""
-        fastest = fastest_posture(self.chart, self.stiffness, self.model.robot(self.problem))
-        return np.vstack([sample_uniform(self.problem.domain, _MODE_SAMPLES, 0), fastest])
-
-    def _damping_at(self, points: Array) -> Array:
+    def _compute_damping(self, points: Array) -> Array:
         """D(q) with the law's gains at points (N, n), (N, n, n)."""
-        rows = [np.tile(self.gains[name], (len(points), 1)) for name in self._of_the_damping]
+        rows = [np.tile(self.gains[name], (len(points), 1)) for name in self._damping_inputs]
         return Batched(self.damping_matrix)(points, *rows)[0].reshape(-1, self.chart.n, self.chart.n)
 
-    def require_reachable(self, reference: Reference, q_start: Array) -> None:
-        """Raise UnreachableReferenceError if the motion from q_start along the reference leaves the chart's domain."""
-        joint_path(self.chart, reference, q_start)
-
     @property
-    def _of_the_damping(self) -> tuple[str, ...]:
+    def _damping_inputs(self) -> tuple[str, ...]:
         """The inputs that the damping depends on."""
         return tuple(n for n in ("stiffness", "damping_ratio", "damping_stiffness", "payload") if n in self.gains)
 
@@ -472,49 +418,37 @@ class _OperationalSpace(Shown):
     def _blocks(self) -> tuple[int, ...]:
         return (self.chart.n,) if self.coupling == "coupled" else (self.chart.m, self.chart.r)
 
-    def _inertia(self, J: ca.MX, M: ca.MX) -> tuple[ca.MX, ca.MX, ca.MX]:
+    def _compute_inertia(self, J: ca.MX, M: ca.MX) -> tuple[ca.MX, ca.MX, ca.MX]:
         """B = M^-1 J^T, the inertia Lambda in blocks, and its volume."""
-        B, Lambda, volume = block_inertia(self.chart.n, self._blocks)(J, M)
+        B, Lambda, volume = build_block_inertia(self.chart.n, self._blocks)(J, M)
         return B, Lambda, volume
 
-    def _damped(self, Lambda: ca.MX, inputs: dict[str, ca.MX], velocities: ca.MX) -> ca.MX:
+    def _apply_damping(self, Lambda: ca.MX, inputs: dict[str, ca.MX], velocities: ca.MX) -> ca.MX:
         """D V, with the same blocks, for V (n, c)."""
         designed_for = inputs.get("damping_stiffness", inputs["stiffness"])
-        function = _block_damping(self.damping, self._blocks, velocities.shape[1])
+        function = _build_block_damping(self.damping, self._blocks, velocities.shape[1])
         return function(Lambda, designed_for, inputs["damping_ratio"], velocities)
 
-    def _errors(self, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
+    def _compute_errors(self, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
         """The error e, how fast it changes, and J = de/dq."""
-        e, J = errors(self.chart, inputs["q"], inputs["reference"])
+        e, J = compute_errors(self.chart, inputs["q"], inputs["reference"])
         velocity = J @ inputs["dq"]
-        return e, velocity - self._drift(inputs) if self.feed_forward else velocity, J
+        return e, velocity - self._compute_drift(inputs) if self.feed_forward else velocity, J
 
-    def _drift(self, inputs: dict[str, ca.MX]) -> ca.MX:
-        return drift(self.chart, inputs["q"], inputs["reference"], inputs["reference_velocity"])
-
-    def _force(self, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
-        """Force in the coordinates, (n, 1), the volume of the gradients, and J."""
-        q, dq, robot, model = inputs["q"], inputs["dq"], self.problem.robot, self.model
-        e, de, J = self._errors(inputs)
-        B, Lambda, volume = self._inertia(J, model.mass_matrix(robot, inputs))
-        force = -inputs["stiffness"] * e - self._damped(Lambda, inputs, de)
-        if self.feed_forward:
-            w = B @ (Lambda @ self._drift(inputs))  # J^-1 d_phi_d; if (5) holds, by (8) also when decoupled
-            wanted = inputs["reference"], inputs["reference_velocity"], inputs["reference_acceleration"]
-            bent = bend(self.chart, q, dq, dq if model.source == "given" else w, wanted)
-            force += Lambda @ (B.T @ model.coriolis_torque(robot, inputs, w) - bent)
-        return force, volume, J
+    def _compute_drift(self, inputs: dict[str, ca.MX]) -> ca.MX:
+        return compute_drift(self.chart, inputs["q"], inputs["reference"], inputs["reference_velocity"])
 
     @cached_property
     def median_volume(self) -> float:
         """Of the gradients over the domain, squared; in blocks if the law is decoupled."""
-        return median_volume(self.problem, self.chart.rates, "inertia", self._blocks)
+        inertia = Metric.from_spec(self.problem.robot, "inertia")
+        return compute_median_volume(self.problem, self.chart.rates, inertia, self._blocks)
 
 
-def _like_a_percentage(damping_ratio: Array) -> list[str]:
+def _doubt_ratio(damping_ratio: Array) -> list[str]:
     """A remark on damping ratios that are far above 1."""
     largest = float(damping_ratio.max())
-    if largest <= _LARGE_RATIO:
+    if largest <= RULES.large_ratio:
         return []
     return [f"damping_ratio = {largest:g} is far above critical damping, which is 1; 0.7 is usual"]
 
@@ -558,14 +492,10 @@ class PDPlus(_OperationalSpace):
     force = "Operational space PD+: tau = J^T (f_imp + f_FF)"
 
 
-def _positive_or_none(name: str, value: ArrayLike | None, length: int) -> Array | None:
-    return None if value is None else positive_gains(name, value, length)
-
-
-def _block_damping(design: DampingDesign, blocks: tuple[int, ...], columns: int) -> ca.Function:
+def _build_block_damping(design: DampingDesign, blocks: tuple[int, ...], columns: int) -> ca.Function:
     """Lambda (block diagonal), stiffness, damping_ratio, V (n, columns) -> D V; D has the same blocks."""
     n = sum(blocks)
     Lambda, K, Z, V = (ca.MX.sym(*of) for of in (("Lambda", n, n), ("K", n), ("Z", n), ("V", n, columns)))
     places = [place.tolist() for place in np.split(np.arange(n), np.cumsum(blocks)[:-1])]
-    parts = [damped(design, Lambda[p, p], K[p], Z[p], V[p, :]) for p in places]
+    parts = [apply_damping(design, Lambda[p, p], K[p], Z[p], V[p, :]) for p in places]
     return ca.Function("damping", [Lambda, K, Z, V], [ca.densify(ca.vertcat(*parts))])

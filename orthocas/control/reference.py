@@ -1,4 +1,4 @@
-"""References over time: steps, splines, and low-pass filters of what is measured."""
+"""References over time: steps, splines, low-pass filters, and whether joints can follow them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,53 +11,39 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from orthocas.errors import InvalidValueError
+from orthocas.charts.chart import Chart
+from orthocas.charts.self_motion import too_far
+from orthocas.charts.solutions import Tracker, TrackerStatus
+from orthocas.errors import InvalidValueError, InverseError, OrthocasError, UnreachableReferenceError, degrees_hint
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, freeze_array, require_kind, require_known, require_shape
+from orthocas.tools.checks import (
+    Array,
+    as_float_array,
+    as_point,
+    freeze_array,
+    require_kind,
+    require_known,
+    require_shape,
+)
 from orthocas.tools.display import Shown, listed, number_list
 
 NATURAL_FREQUENCY = 2 * np.pi  #: omega0 [rad/s] of [AS2023] Sec. 8
 DAMPING_RATIO = 0.7  #: zeta of [AS2023] Sec. 8
-_GRID = 0.05  # [s]
-_SWING = 0.3  # [rad] phase of the low-pass oscillation between two grid times; 0.048 s for the paper's filter
-_DEGREE = 5  # of splines through points
-
-
-@lru_cache(32)
-def low_pass_response(k: int, natural_frequency: float, damping_ratio: float) -> ca.Function:
-    """Response of k equal low-pass filters to a constant target, from any start.
-
-    The error e = value - target obeys dd_e + 2 zeta omega0 d_e + omega0^2 e = 0, solved in closed form for
-    underdamped, critically damped and overdamped filters.
-
-    Args:
-        k: number of quantities.
-        natural_frequency: omega0 > 0 [rad/s].
-        damping_ratio: zeta >= 0.
-
-    Returns:
-        A function of time t >= 0 and [target; value at t = 0; velocity at t = 0] (3 k, 1) -> value, velocity and
-        acceleration, each (k, 1).
-    """
-    t, parameters = ca.SX.sym("t"), ca.SX.sym("parameters", 3 * k)
-    target, value0, velocity0 = parameters[:k], parameters[k : 2 * k], parameters[2 * k :]
-    decay, beat = damping_ratio * natural_frequency, natural_frequency * np.sqrt(abs(1 - damping_ratio**2))
-    if np.isclose(damping_ratio, 1.0, rtol=0, atol=1e-9):
-        cosine, sine = ca.exp(-decay * t), t * ca.exp(-decay * t)
-    elif damping_ratio < 1:
-        cosine, sine = ca.exp(-decay * t) * ca.cos(beat * t), ca.exp(-decay * t) * ca.sin(beat * t) / beat
-    else:  # hyperbolic functions, written so that they do not overflow
-        slow, fast = ca.exp((beat - decay) * t), ca.exp(-(beat + decay) * t)
-        cosine, sine = (slow + fast) / 2, (slow - fast) / (2 * beat)
-    e0 = value0 - target
-    e = e0 * cosine + (velocity0 + decay * e0) * sine
-    velocity = velocity0 * cosine - (decay * velocity0 + natural_frequency**2 * e0) * sine
-    acceleration = -2 * decay * velocity - natural_frequency**2 * e
-    return dense_function("low_pass", [t, parameters], [target + e, velocity, acceleration])
-
-
 Change = tuple[float, Mapping[str, float]]  #: a time [s] and the new targets by label
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceRules:
+    """Numbers of references."""
+
+    grid: float = 0.05  #: largest distance of grid times [s]
+    swing: float = 0.3  #: phase of the low-pass oscillation between them; 0.048 s for the paper's filter [rad]
+    degree: int = 5  #: of splines through points
+
+
+RULES = ReferenceRules()
+_VALUES = "; targets of a Reference are values of phi, not changes of it ('move' in a steps file is a change)"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -70,7 +56,7 @@ class Reference(Shown):
     start: Array  #: (k,) value at the start
     parameters: Array  #: (S, p) inputs of the profile
     profile: ca.Function  #: time since the start of the segment, parameters -> value, velocity, acceleration (k, 1)
-    spacing: float = _GRID  #: [s], fine enough to resolve every oscillation
+    spacing: float = RULES.grid  #: [s], fine enough to resolve every oscillation
 
     @classmethod
     def steps(
@@ -106,19 +92,19 @@ class Reference(Shown):
             >>> value.round(2).tolist()
             [[1.0, 0.0], [1.2, 0.0]]
         """
-        names = _names(labels)
+        names = _check_names(labels)
         value = freeze_array("start", start, (len(labels),))
         omega0 = _require_number("natural_frequency", natural_frequency, above=0.0)
         _require_number("duration", duration, above=0.0)
         zeta = _require_number("damping_ratio", damping_ratio, above=-np.finfo(float).tiny)
-        times, targets = _stairs(names, value, changes, duration)
-        profile = low_pass_response(len(names), omega0, zeta)
+        times, targets = _build_stairs(names, value, changes, duration)
+        profile = build_low_pass(len(names), omega0, zeta)
         run = Batched(profile)
         parameters = [np.concatenate([targets[0], value, np.zeros_like(value)])]
         for target, lasted in zip(targets[1:], np.diff(times)[:-1], strict=True):
             position, velocity, _ = (out[0] for out in run(np.array([[lasted]]), parameters[-1][None]))
             parameters.append(np.concatenate([target, position, velocity]))
-        return cls(names, times, targets, value, np.array(parameters), profile, min(_GRID, _SWING / omega0))
+        return cls(names, times, targets, value, np.array(parameters), profile, min(RULES.grid, RULES.swing / omega0))
 
     @classmethod
     def through(cls, labels: Sequence[str], times: ArrayLike, points: ArrayLike) -> Self:
@@ -132,17 +118,17 @@ class Reference(Shown):
         Raises:
             InvalidValueError, ShapeError: for arguments of the wrong value or shape.
         """
-        names = _names(labels)
+        names = _check_names(labels)
         t = freeze_array("times", times, (None,))
         values = freeze_array("points", points, (len(t), len(names)))
         if len(t) < 2 or t[0] != 0 or np.diff(t).min() <= 0:
             raise InvalidValueError("times", t.tolist(), "at least two increasing times that begin with 0")
         rest = [(order, np.zeros(len(names))) for order in (1, 2)]
-        spline = scipy.interpolate.make_interp_spline(t, values, _DEGREE, bc_type=(rest, rest))
-        taylor = [spline(t[:-1], order) / factorial(order) for order in reversed(range(_DEGREE + 1))]
+        spline = scipy.interpolate.make_interp_spline(t, values, RULES.degree, bc_type=(rest, rest))
+        taylor = [spline(t[:-1], order) / factorial(order) for order in reversed(range(RULES.degree + 1))]
         coefficients = np.stack(taylor, axis=2).reshape(len(t) - 1, -1)
-        spacing = min(_GRID, float(np.diff(t).min()) / 4)
-        return cls(names, t, values[1:], values[0], coefficients, _polynomial(len(names)), spacing)
+        spacing = min(RULES.grid, float(np.diff(t).min()) / 4)
+        return cls(names, t, values[1:], values[0], coefficients, _build_polynomial(len(names)), spacing)
 
     def facts(self) -> dict[str, str]:
         """Quantities, time, start and targets."""
@@ -186,14 +172,58 @@ class Reference(Shown):
         return Batched(self.profile)
 
 
-def _names(labels: Sequence[str]) -> tuple[str, ...]:
+@lru_cache(32)
+def build_low_pass(k: int, natural_frequency: float, damping_ratio: float) -> ca.Function:
+    """Response of k equal low-pass filters to a constant target, from any start.
+
+    The error e = value - target obeys dd_e + 2 zeta omega0 d_e + omega0^2 e = 0, solved in closed form for
+    underdamped, critically damped and overdamped filters.
+
+    Args:
+        k: number of quantities.
+        natural_frequency: omega0 > 0 [rad/s].
+        damping_ratio: zeta >= 0.
+
+    Returns:
+        A function of time t >= 0 and [target; value at t = 0; velocity at t = 0] (3 k, 1) -> value, velocity and
+        acceleration, each (k, 1).
+    """
+    t, parameters = ca.SX.sym("t"), ca.SX.sym("parameters", 3 * k)
+    target, value0, velocity0 = parameters[:k], parameters[k : 2 * k], parameters[2 * k :]
+    decay, beat = damping_ratio * natural_frequency, natural_frequency * np.sqrt(abs(1 - damping_ratio**2))
+    if np.isclose(damping_ratio, 1.0, rtol=0, atol=1e-9):
+        cosine, sine = ca.exp(-decay * t), t * ca.exp(-decay * t)
+    elif damping_ratio < 1:
+        cosine, sine = ca.exp(-decay * t) * ca.cos(beat * t), ca.exp(-decay * t) * ca.sin(beat * t) / beat
+    else:
+        # Hyperbolic functions, written so that they do not overflow.
+        slow, fast = ca.exp((beat - decay) * t), ca.exp(-(beat + decay) * t)
+        cosine, sine = (slow + fast) / 2, (slow - fast) / (2 * beat)
+    e0 = value0 - target
+    e = e0 * cosine + (velocity0 + decay * e0) * sine
+    velocity = velocity0 * cosine - (decay * velocity0 + natural_frequency**2 * e0) * sine
+    acceleration = -2 * decay * velocity - natural_frequency**2 * e
+    return dense_function("low_pass", [t, parameters], [target + e, velocity, acceleration])
+
+
+@lru_cache(32)
+def _build_polynomial(k: int) -> ca.Function:
+    """Time and coefficients of k polynomials, highest power first -> value and two derivatives."""
+    t, coefficients = ca.SX.sym("t"), ca.SX.sym("coefficients", k * (RULES.degree + 1))
+    table = ca.reshape(coefficients, RULES.degree + 1, k).T
+    value = ca.SX(table @ ca.vertcat(*(t ** (RULES.degree - i) for i in range(RULES.degree + 1))))
+    velocity = ca.jacobian(value, t)
+    return dense_function("spline", [t, coefficients], [value, velocity, ca.jacobian(velocity, t)])
+
+
+def _check_names(labels: Sequence[str]) -> tuple[str, ...]:
     require_kind("labels", labels, Sequence)
     if isinstance(labels, str) or not all(isinstance(label, str) for label in labels):
         raise InvalidValueError("labels", repr(labels)[:80], "a sequence of names")
     return tuple(labels)
 
 
-def _pairs(changes: Sequence[Change]) -> Sequence[Change]:
+def _check_changes(changes: Sequence[Change]) -> Sequence[Change]:
     require_kind("changes", changes, Sequence)
     for change in changes:
         if not isinstance(change, Sequence) or len(change) != 2:
@@ -201,10 +231,12 @@ def _pairs(changes: Sequence[Change]) -> Sequence[Change]:
     return changes
 
 
-def _stairs(labels: tuple[str, ...], start: Array, changes: Sequence[Change], duration: float) -> tuple[Array, Array]:
+def _build_stairs(
+    labels: tuple[str, ...], start: Array, changes: Sequence[Change], duration: float
+) -> tuple[Array, Array]:
     """Segment boundaries (S + 1,) and targets (S, k)."""
     times, targets = [0.0], [start]
-    for time, moves in _pairs(changes):
+    for time, moves in _check_changes(changes):
         at = _require_number("time of a step", time)
         if not times[-1] <= at < duration:
             raise InvalidValueError("time of a step", at, f"from {times[-1]:g} to below the duration {duration:g} s")
@@ -221,16 +253,6 @@ def _stairs(labels: tuple[str, ...], start: Array, changes: Sequence[Change], du
     return np.array([*times, float(duration)]), np.array(targets)
 
 
-@lru_cache(32)
-def _polynomial(k: int) -> ca.Function:
-    """Time and coefficients of k polynomials, highest power first -> value and two derivatives."""
-    t, coefficients = ca.SX.sym("t"), ca.SX.sym("coefficients", k * (_DEGREE + 1))
-    table = ca.reshape(coefficients, _DEGREE + 1, k).T
-    value = ca.SX(table @ ca.vertcat(*(t ** (_DEGREE - i) for i in range(_DEGREE + 1))))
-    velocity = ca.jacobian(value, t)
-    return dense_function("spline", [t, coefficients], [value, velocity, ca.jacobian(velocity, t)])
-
-
 def _require_number(name: str, value: float, above: float = -np.inf) -> float:
     array = as_float_array(name, value)
     require_shape(name, array.shape, ())
@@ -239,3 +261,57 @@ def _require_number(name: str, value: float, above: float = -np.inf) -> float:
             name, value, "a finite number" if above == -np.inf else f"a finite number > {above:.0f}"
         )
     return float(array)
+
+
+def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
+    """Joint positions with phi(q) equal to the reference, followed from q_start, (N, n) on `reference.grid()`.
+
+    Raises:
+        UnreachableReferenceError: names the first time at which no such q exists near the previous one, or q lies
+            outside the domain.
+    """
+    require_kind("chart", chart, Chart)
+    require_kind("reference", reference, Reference)
+    q_start = as_point("q_start", q_start, chart.n)
+    if reference.labels != chart.labels:
+        raise InvalidValueError("labels of the reference", reference.labels, f"those of the chart {chart.labels}")
+    if not chart.problem.domain.contains(q_start):
+        hint = degrees_hint(*q_start[~np.array(chart.problem.robot.tree.prismatic)])
+        raise UnreachableReferenceError(f"the start lies outside the domain: {_explain_outside(chart, q_start)}{hint}")
+    times = reference.grid()
+    targets = reference.targets[reference.segment(times)]
+    path, q, tracker = np.empty((len(times), chart.n)), q_start, _start_tracker(chart, q_start)
+    for k, value in enumerate(reference.sample(times)[0]):
+        words = ", ".join(f"{label} = {number:.3g}" for label, number in zip(reference.labels, value, strict=True))
+        where, hint = f"at t = {times[k]:.3g} s, at {words}", f"{too_far(chart, q, targets[k, chart.m :])}{_VALUES}"
+        # A tracker solves phi(q) = value; where it gives up or J is singular, the inverse map takes more care.
+        solution = q if tracker is None else tracker.step(value)
+        if tracker is None or tracker.status != TrackerStatus.OK:
+            try:
+                solution = chart.inverse(value, q, outside=True)
+            except InverseError as error:
+                raise UnreachableReferenceError(f"the reference cannot be reached {where}: {error}{hint}") from None
+            tracker = _start_tracker(chart, solution)
+        if not chart.problem.domain.contains(solution):
+            reason = _explain_outside(chart, solution)
+            raise UnreachableReferenceError(f"the reference leaves the domain {where}: {reason}{hint}")
+        path[k] = q = solution
+    return path
+
+
+def _start_tracker(chart: Chart, q: Array) -> Tracker | None:
+    """None for grown coordinates, a singular J, or a point outside the domain."""
+    try:
+        return chart.tracker(q)
+    except OrthocasError:
+        return None
+
+
+def _explain_outside(chart: Chart, q: Array) -> str:
+    domain = chart.problem.domain
+    if domain.condition is not None and not np.all(np.asarray(domain.condition.pivots(q)) > 0):
+        return domain.explain(q)
+    low, high = domain.bounds
+    i = int(np.argmax(np.abs(q - domain.centre) / (high - low)))
+    low, high = low[i], high[i]
+    return f"joint '{chart.problem.robot.joint_names[i]}' at {q[i]:.4g}, expected within [{low:.4g}, {high:.4g}]"

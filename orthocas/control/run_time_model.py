@@ -1,26 +1,24 @@
 """What a law learns of the robot at run time: payload, contact forces, extra torque, or the model itself."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from orthocas.control.gains import spread_gains
 from orthocas.errors import InvalidValueError
 from orthocas.robots.dynamics import check_payload
 from orthocas.robots.robot import Robot
 from orthocas.tasks.problem import Problem
-from orthocas.tools.checks import Array, as_float_array, freeze_array, require_finite, require_known, require_shape
+from orthocas.tools.checks import Array, freeze_array, require_known
 
 Source = Literal["own", "given"]
 Gravity = Literal["law", "robot"]
-SOURCES: tuple[Source, ...] = ("own", "given")
-GRAVITIES: tuple[Gravity, ...] = ("law", "robot")
-INPUTS = ("payload", "wrench", "extra_torque")  #: inputs that may be asked for by name
 
-_UNITS: Mapping[str, str] = {
+UNITS: Mapping[str, str] = {  #: meaning of the inputs, in words
     "payload": "at the tip: mass [kg], centre in the tip frame [m], inertia xx, xy, xz, yy, yz, zz about it [kg m^2]",
     "wrench": "that the tip exerts on its surroundings, in world axes: force [N], torque about the tip [N m]",
     "extra_torque": "added to the command, for example against friction [N m] or [N]",
@@ -61,8 +59,8 @@ class RunTimeModel:
     extra_torque: ArrayLike | None = None
 
     def __post_init__(self) -> None:
-        require_known("source of the model", self.source, SOURCES)
-        require_known("gravity", self.gravity, GRAVITIES)
+        require_known("source of the model", self.source, get_args(Source))
+        require_known("gravity", self.gravity, get_args(Gravity))
         if self.payload is not None:
             if self.source == "given":
                 raise InvalidValueError("payload", self.payload, "none, because the given model includes the load")
@@ -70,58 +68,40 @@ class RunTimeModel:
         if self.wrench is not None:
             object.__setattr__(self, "wrench", freeze_array("wrench", self.wrench, (6,)))
 
-    @classmethod
-    def with_inputs(cls, source: Source, gravity: Gravity, inputs: Iterable[str]) -> "RunTimeModel":
-        """The model with inputs by name, which are zero by default.
-
-        Raises:
-            UnknownNameError: for a name other than payload, wrench and extra_torque.
-        """
-        chosen = tuple(inputs)
-        for name in chosen:
-            require_known("input", name, INPUTS)
-        zeros: dict[str, ArrayLike] = {"payload": 0.0, "wrench": np.zeros(6), "extra_torque": 0.0}
-        return cls(source, gravity, **{name: zeros[name] for name in chosen})
-
     @property
     def settings(self) -> dict[str, str]:
         """The choices that differ from the default."""
-        chosen = {"model": self.source, "gravity": self.gravity}
-        return {name: word for name, word in chosen.items() if word not in ("own", "law")}
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """Meaning of the inputs, in words, by name."""
-        return _UNITS
+        choices = {"model": self.source, "gravity": self.gravity}
+        return {name: word for name, word in choices.items() if word not in ("own", "law")}
 
     def gains(self, problem: Problem, coriolis: bool) -> dict[str, Array]:
         """The default values of the inputs by name; a given model is that of the centre of the domain at rest."""
-        found: dict[str, Array] = {}
+        result: dict[str, Array] = {}
         for name in ("payload", "wrench"):
             if (value := getattr(self, name)) is not None:
-                found[name] = value
+                result[name] = value
         if self.extra_torque is not None:
-            found["extra_torque"] = _per_joint(self.extra_torque, problem.n)
+            result["extra_torque"] = spread_gains("extra_torque", self.extra_torque, problem.n)
         if self.source == "given":
             robot, q = problem.robot, problem.domain.centre
-            found["mass_matrix"] = freeze_array("mass_matrix", robot.mass_matrix(q).ravel(), (problem.n**2,))
+            result["mass_matrix"] = freeze_array("mass_matrix", robot.mass_matrix(q).ravel(), (problem.n**2,))
             if coriolis:
-                found["coriolis_torque"] = np.zeros(problem.n)
+                result["coriolis_torque"] = np.zeros(problem.n)
             if self.gravity == "law":
-                found["gravity_torque"] = freeze_array("gravity_torque", robot.gravity(q), (problem.n,))
-        return found
+                result["gravity_torque"] = freeze_array("gravity_torque", robot.gravity(q), (problem.n,))
+        return result
 
     def remarks(self) -> list[str]:
         """What to know before the law is switched on."""
-        found = []
+        result = []
         if self.source == "given":
-            found.append(
+            result.append(
                 "the robot's model is an input of this law: pass mass matrix and torques in every tick, because their "
                 "defaults hold only at rest at the centre of the domain"
             )
         if self.gravity == "robot":
-            found.append("this law leaves gravity to the robot: its fallback is zero torque")
-        return found
+            result.append("this law leaves gravity to the robot: its fallback is zero torque")
+        return result
 
     def robot(self, problem: Problem) -> Robot:
         """The robot with the default payload, for analysis."""
@@ -129,7 +109,7 @@ class RunTimeModel:
 
     def own_mass_matrix(self, robot: Robot, inputs: Mapping[str, ca.MX]) -> ca.MX:
         """M(q) from the robot of the problem, with the payload."""
-        return _of(robot, "mass_matrix", inputs, inputs["q"])
+        return _call_robot(robot, "mass_matrix", inputs, inputs["q"])
 
     def mass_matrix(self, robot: Robot, inputs: Mapping[str, ca.MX]) -> ca.MX:
         """M(q), (n, n), computed or given."""
@@ -141,13 +121,14 @@ class RunTimeModel:
         """The part of the command that holds the robot at rest, (n, 1)."""
         if self.gravity == "robot":
             return ca.MX(robot.n, 1)
-        return inputs["gravity_torque"] if self.source == "given" else _of(robot, "gravity", inputs, inputs["q"])
+        given = self.source == "given"
+        return inputs["gravity_torque"] if given else _call_robot(robot, "gravity", inputs, inputs["q"])
 
     def coriolis_torque(self, robot: Robot, inputs: Mapping[str, ca.MX], w: ca.MX) -> ca.MX:
         """C(q, dq) w, (n, 1); the given C(q, dq) dq instead if the model is given."""
         if self.source == "given":
             return inputs["coriolis_torque"]
-        return _of(robot, "coriolis_product", inputs, inputs["q"], inputs["dq"], w)
+        return _call_robot(robot, "coriolis_product", inputs, inputs["q"], inputs["dq"], w)
 
     def feed_forward(self, robot: Robot, inputs: Mapping[str, ca.MX]) -> ca.MX:
         """J_tip^T wrench + extra_torque, (n, 1), as far as they are inputs."""
@@ -157,16 +138,8 @@ class RunTimeModel:
         return torque + inputs["extra_torque"] if "extra_torque" in inputs else torque
 
 
-def _of(robot: Robot, name: str, inputs: Mapping[str, ca.MX], *arguments: ca.MX) -> ca.MX:
+def _call_robot(robot: Robot, name: str, inputs: Mapping[str, ca.MX], *arguments: ca.MX) -> ca.MX:
     """A function of the robot, with the payload if that is an input."""
     if "payload" in inputs:
         return robot.function(f"{name}_with_payload")(*arguments, inputs["payload"])
     return robot.function(name)(*arguments)
-
-
-def _per_joint(value: ArrayLike, n: int) -> Array:
-    given = as_float_array("extra_torque", value)
-    require_finite("extra_torque", given)
-    if given.ndim:
-        require_shape("extra_torque", given.shape, (n,))
-    return freeze_array("extra_torque", np.broadcast_to(given, (n,)), (n,))

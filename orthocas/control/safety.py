@@ -17,24 +17,35 @@ from orthocas.tools.checks import Array, as_float_array, as_number, require_coun
 from orthocas.tools.display import number_list
 from orthocas.tools.interrupts import deferred
 
-_SAMPLES, _SEED = 256, 0
-_RATE = {"torque": 1000.0, "velocity": 20.0}  # [N m/s] as on many arms, 1 N m in a millisecond; [rad/s^2]
-_TORQUE_ONLY = (  # velocity laws do not use them
-    *("observer_rate", "stop_zone", "stop_damping", "brake_stiffness", "brake_yield"),
-)
 UNBOUNDED = (  #: settings that may be infinite
     *("command_rate", "speed_limit", "stuck_speed", "lower", "upper", "error_limit"),
     *("reference_speed", "reference_acceleration"),
 )
 SIGNED = ("lower", "upper")  #: settings that may be negative
-_SPEED = 4 * np.pi  # [rad/s] or [m/s], of joints without a limit
-_SHARE = 0.7  # of the speed limit, for references
-_STARTING = 0.25  # [s] in which a reference may reach the speed limit
-_CATCHER = 12.0  # [1/s] natural frequency and damping rate of the catcher, stable with delays up to 59 ms
-_RETURN = 0.3  # [rad/s] or [m/s], on the way back
-_STOPS = 30.0  # [rad/s] natural frequency at the joint limits
-_ZONE = 0.05  # [rad] or [m], at most this share of the range of a joint
-_STUCK = {"torque": 0.15, "velocity": 0.03}  # [rad/s] that commands must have given; [rad] of velocity laws
+TORQUE_ONLY = ("observer_rate", "stop_zone", "stop_damping", "brake_stiffness", "brake_yield")  #: not of velocity laws
+
+
+@dataclass(frozen=True, slots=True)
+class SafetyRules:
+    """Numbers behind the default settings of the supervised law."""
+
+    samples: int = 256  #: of the domain, for spans and gravity
+    seed: int = 0  #: of the samples
+    torque_rate: float = 1000.0  #: of commands, as on many arms: 1 N m in a millisecond [N m/s]
+    acceleration: float = 20.0  #: of commands of velocity laws [rad/s^2]
+    speed: float = 4 * np.pi  #: of joints without a limit [rad/s] or [m/s]
+    fraction: float = 0.7  #: of the speed limit, for references
+    starting: float = 0.25  #: time in which a reference may reach the speed limit [s]
+    catcher: float = 12.0  #: natural frequency and damping rate of the catcher, stable with delays up to 59 ms [1/s]
+    anchor: float = 5.0  #: rate of the way to the anchor, of velocity laws [1/s]
+    return_speed: float = 0.3  #: on the way back [rad/s] or [m/s]
+    stops: float = 30.0  #: natural frequency at the joint limits [rad/s]
+    zone: float = 0.05  #: of stops, at most this share of the range of a joint [rad] or [m]
+    stuck_speed: float = 0.15  #: that commands must have given to an arm that measures the same [rad/s]
+    stuck_way: float = 0.03  #: likewise of velocity laws [rad]
+
+
+RULES = SafetyRules()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -90,7 +101,7 @@ class Safety:
             elif get_args(setting.type)[0] is float:
                 _require_number(setting.name, value)
             else:
-                object.__setattr__(self, setting.name, _numbers(setting.name, value))
+                object.__setattr__(self, setting.name, _freeze_numbers(setting.name, value))
         if not self.catch_margin < self.near_margin < self.return_margin < 1:
             margins = (self.catch_margin, self.near_margin, self.return_margin)
             raise InvalidValueError("margins", margins, "catch_margin < near_margin < return_margin < 1")
@@ -101,7 +112,7 @@ class Safety:
 
     def in_c(self, command: Command) -> dict[str, Any]:
         """The settings that generated C has for a kind of command, by name."""
-        unused = () if command == "torque" else _TORQUE_ONLY
+        unused = () if command == "torque" else TORQUE_ONLY
         return {setting.name: getattr(self, setting.name) for setting in fields(self) if setting.name not in unused}
 
     @classmethod
@@ -123,15 +134,15 @@ class Safety:
         require_controller(controller)
         robot, n, domain = controller.problem.robot, controller.problem.n, controller.problem.domain
         M = np.asarray(robot.mass_matrix(domain.centre))
-        points = sample_uniform(domain, _SAMPLES, _SEED)
+        points = sample_uniform(domain, RULES.samples, RULES.seed)
         gravity = np.abs(robot.gravity(points)).max(axis=0)
         measured = Batched(controller.measured)(points)[0]
         span = np.nanmax(measured, axis=0) - np.nanmin(measured, axis=0)
         torque = controller.command == "torque"
-        speed_limit = np.where(np.isfinite(robot.velocity_limits), robot.velocity_limits, _SPEED)
-        slow = np.minimum(_RETURN, speed_limit / 3)
+        speed_limit = np.where(np.isfinite(robot.velocity_limits), robot.velocity_limits, RULES.speed)
+        slow = np.minimum(RULES.return_speed, speed_limit / 3)
         settings = {
-            "command_rate": np.full(n, _RATE[controller.command]),
+            "command_rate": np.full(n, RULES.torque_rate if torque else RULES.acceleration),
             "speed_limit": speed_limit,
             "rest_speed": np.full(n, 0.5),
             "near_margin": 0.06,
@@ -139,25 +150,25 @@ class Safety:
             "return_margin": 0.1,
             "fade_in": 0.02,
             "fade_out": 0.03,
-            "return_speed": _RETURN,
+            "return_speed": RULES.return_speed,
             "error_limit": 0.15 * span,
-            "reference_speed": _SHARE * speed_limit,
-            "reference_acceleration": speed_limit / _STARTING,
-            "offset_rate": 1 / _joint_motion(controller, points, slow),
+            "reference_speed": RULES.fraction * speed_limit,
+            "reference_acceleration": speed_limit / RULES.starting,
+            "offset_rate": 1 / _compute_joint_motion(controller, points, slow),
             "integral_rate": 0 * span,
             "integral_limit": 0.05 * span,
             "hold_ticks": 10,
             "stale_ticks": 5,
-            "stuck_speed": np.full(n, _STUCK[controller.command]),
+            "stuck_speed": np.full(n, RULES.stuck_speed if torque else RULES.stuck_way),
             "longest_period": 0.02,
             "observer_rate": np.zeros(n),
             "lower": robot.lower,
             "upper": robot.upper,
-            "stop_zone": np.fmin(_ZONE, _ZONE * (robot.upper - robot.lower)),
-            "stop_stiffness": np.full(n, _STOPS**2 if torque else _STOPS),
-            "stop_damping": np.full(n, 2 * _STOPS),
-            "damping": _CATCHER if torque else 5.0,
-            "brake_stiffness": _CATCHER**2,
+            "stop_zone": np.fmin(RULES.zone, RULES.zone * (robot.upper - robot.lower)),
+            "stop_stiffness": np.full(n, RULES.stops**2 if torque else RULES.stops),
+            "stop_damping": np.full(n, 2 * RULES.stops),
+            "damping": RULES.catcher if torque else RULES.anchor,
+            "brake_stiffness": RULES.catcher**2,
             "brake_yield": 0.5 * gravity + 10 * np.diag(M),
         }
         unknown = sorted(set(changes) - set(settings))
@@ -167,10 +178,11 @@ class Safety:
         return cls(**{**settings, **spread})
 
 
-def _joint_motion(controller: Controller, points: Array, slow: Array) -> Array:
+def _compute_joint_motion(controller: Controller, points: Array, slow: Array) -> Array:
     """Time that joints take at slow speeds (n,) per unit of each controlled quantity, at 90 % of the points (k,)."""
     n, m, relative = controller.problem.n, controller.problem.m, Relative(controller.problem.task)
-    with deferred(), building:  # threads share the law
+    # Threads share the law.
+    with deferred(), building:
         q = ca.MX.sym("q", n)
         moving = ca.vertcat(relative.rates(q), ca.jacobian(controller.measured(q)[m:], q))
         function = dense_function("J", [q], [moving])
@@ -183,10 +195,10 @@ def _spread(name: str, value: ArrayLike, default: object) -> object:
     """One number for all entries of an array; other values are checked."""
     if not isinstance(default, np.ndarray):
         return value
-    given = as_float_array(name, value)
-    if given.ndim:
-        require_shape(name, given.shape, default.shape)
-    return np.full(default.shape, given)
+    numbers = as_float_array(name, value)
+    if numbers.ndim:
+        require_shape(name, numbers.shape, default.shape)
+    return np.full(default.shape, numbers)
 
 
 def _require_number(name: str, value: float) -> None:
@@ -194,7 +206,7 @@ def _require_number(name: str, value: float) -> None:
         raise InvalidValueError(name, value, "a finite number > 0")
 
 
-def _numbers(name: str, value: ArrayLike) -> Array:
+def _freeze_numbers(name: str, value: ArrayLike) -> Array:
     array = np.array(as_float_array(name, value))
     if array.ndim != 1 or np.isnan(array).any() or (name not in UNBOUNDED and np.isinf(array).any()):
         raise InvalidValueError(name, array.tolist(), "a list of numbers")

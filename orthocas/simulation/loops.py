@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from orthocas.control.controller import Controller, counted_function
+from orthocas.control.controller import Controller, get_counted_function
 from orthocas.control.reference import Reference
 from orthocas.errors import SimulationError
 from orthocas.robots import dynamics
@@ -115,7 +115,7 @@ class ClosedLoop:
         """Command and status for a (measured) state and a reference with two derivatives."""
         dq = state[self.n :] if self.torque else ca.MX(self.n, 1)
         gains = [ca.DM(gain) for gain in self.controller.gains.values()]
-        command, status = counted_function(self.controller).call([state[: self.n], dq, *reference, *gains])
+        command, status = get_counted_function(self.controller).call([state[: self.n], dq, *reference, *gains])
         return command, status
 
     def rate(self, reference: Reference) -> ca.Function:

@@ -20,7 +20,7 @@ from orthocas.tools.files import open_draft_folder
 from orthocas.tools.interrupts import deferred
 
 if TYPE_CHECKING:
-    from orthocas.codegen.supervisor import Supervisor
+    from orthocas.codegen.library import Supervisor
 
 
 class SupervisedLaw:

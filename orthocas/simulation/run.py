@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.control.controller import Controller, counted_function, require_controller
+from orthocas.control.controller import Controller, get_counted_function, require_controller
 from orthocas.control.memory import memory_of
 from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety

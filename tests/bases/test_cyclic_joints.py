@@ -13,7 +13,7 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.bases import parse_parametrisation
 from orthocas.charts.chart_file import CHART
-from orthocas.codegen.proof import check_c
+from orthocas.codegen.check import check_c
 from orthocas.control import ControlStatus, Kinematic, PDPlus
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.fit import Fit

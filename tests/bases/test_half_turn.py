@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 import orthocas as oc
 from orthocas import control
 from orthocas.charts.solutions import InverseStatus, TrackerStatus
-from orthocas.codegen.library import CompiledLibrary, compile_shared
-from orthocas.codegen.supervisor import Supervisor
+from orthocas.codegen.library import CompiledLibrary, Supervisor, compile_shared
 from orthocas.control.controller import ControlStatus
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.tasks.relative import Relative

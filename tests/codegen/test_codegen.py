@@ -17,9 +17,9 @@ from programs import needs_c, nightly
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared, gain_numbers
-from orthocas.codegen.kernels import with_shared_calls, with_turns_once
+from orthocas.codegen.kernels import share_calls, share_sines
 from orthocas.control import Controller, ControlStatus, Impedance, Kinematic, PDPlus
-from orthocas.errors import CompileError, ProofError
+from orthocas.errors import AgreementError, CompileError
 from orthocas.tasks.samples import sample_uniform
 
 pytestmark = needs_c
@@ -118,13 +118,13 @@ def test_check_finds_what_is_wrong(
     assert old in text
     shutil.copy(impedance_c.folder / "arm.h", tmp_path)
     (tmp_path / "arm.c").write_text(text.replace(old, new))
-    with pytest.raises((ProofError, CompileError), match=message):
+    with pytest.raises((AgreementError, CompileError), match=message):
         check_c(replace(impedance_c, folder=tmp_path), planar_chart, laws(planar_chart)[0], states=100)
 
 
 @pytest.mark.slow
 def test_check_compares_with_the_gains_of_the_controller(impedance_c: GeneratedC, planar_chart: oc.Chart) -> None:
-    with pytest.raises(ProofError, match="default gains"):
+    with pytest.raises(AgreementError, match="default gains"):
         check_c(impedance_c, planar_chart, Impedance(planar_chart, 51.0, limit=90.0), states=50)
 
 
@@ -153,7 +153,7 @@ def test_check_is_fair_near_singularities(tmp_path: Path) -> None:
         check_c(generated, chart, law)
         source = tmp_path / law.name / "arm.c"
         source.write_text(source.read_text().replace("arg[3] = reference->velocity", "arg[3] = reference->value"))
-        with pytest.raises(ProofError, match="control"):
+        with pytest.raises(AgreementError, match="control"):
             check_c(generated, chart, law)
 
 
@@ -200,7 +200,7 @@ def test_what_several_graphs_call_for_the_state_alone_is_computed_once() -> None
         ca.Function("third", [q, dq], [rate(q, dq) + rate(dq, q)]),
         ca.Function("alone", [q], [place(q)]),
     ]
-    shared, *given = with_shared_calls(graphs, {"first": 2, "second": 1, "third": 2})
+    shared, *given = share_calls(graphs, {"first": 2, "second": 1, "third": 2})
     at, speed, other = np.array([0.3, -0.7]), np.array([0.2, 1.1]), np.array([5.0, 6.0])
     values = shared(at, speed)
     assert values.shape == (4, 1)  # place and rate
@@ -210,7 +210,7 @@ def test_what_several_graphs_call_for_the_state_alone_is_computed_once() -> None
         np.testing.assert_allclose(changed(*inputs, values).full(), graph(*inputs).full(), rtol=1e-15)
         assert abs(changed(*inputs, values + 1).full() - graph(*inputs).full()).min() > 0.1  # it uses them
     assert given[3].n_in() == 1
-    nothing, only = with_shared_calls(graphs[3:], {"alone": 1})
+    nothing, only = share_calls(graphs[3:], {"alone": 1})
     assert nothing(at, speed).shape == (1, 1)
     np.testing.assert_array_equal(only(at, 0.0).full(), graphs[3](at).full())
 
@@ -219,7 +219,7 @@ def test_kernels_compute_sines_of_joints_once(planar_chart: oc.Chart, tmp_path: 
     """The law calls five functions with sines and cosines of three joints; its numbers stay the same, bit by bit."""
     law = PDPlus(planar_chart, 50.0, limit=90.0)
     graph, rng = law.graph, np.random.default_rng(4)
-    (once,) = with_turns_once([graph])
+    (once,) = share_sines([graph])
     for _ in range(20):
         given = [rng.normal(size=graph.size_in(i)) for i in range(5)] + list(law.gains.values())
         for wanted, found in zip(graph(*given), once(*given), strict=True):
@@ -250,13 +250,13 @@ def test_an_inverse_that_stopped_early_goes_on_where_it_stopped(
     q, wanted = box.centre - 0.5 * box.half_width, chart.phi(box.centre + 0.5 * box.half_width)
     whole, status = supervised_library.inverse(wanted, q)
     assert status == ControlStatus.OK
-    errors, seen = [], []
-    while status != ControlStatus.OK or not seen:
+    errors, collect = [], []
+    while status != ControlStatus.OK or not collect:
         errors.append(np.abs(chart.phi(q) - wanted).max())
         q, status = supervised_library.inverse(wanted, q, max_iterations=2)
-        seen.append(status)
-    assert seen[:-1] == [ControlStatus.STOPPED_EARLY] * (len(seen) - 1)
-    assert len(seen) > 2
+        collect.append(status)
+    assert collect[:-1] == [ControlStatus.STOPPED_EARLY] * (len(collect) - 1)
+    assert len(collect) > 2
     assert errors == sorted(errors, reverse=True)
     np.testing.assert_allclose(q, whole, atol=1e-8)
 

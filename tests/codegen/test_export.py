@@ -21,8 +21,8 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.bases import JointSpace
 from orthocas.charts.coordinates import Coordinates
-from orthocas.codegen.export import LIBRARIES, module_text
-from orthocas.codegen.export_forms import function_code
+from orthocas.codegen.export import LIBRARIES, write_module
+from orthocas.codegen.export_forms import write_function
 from orthocas.errors import ArchiveError, InvalidValueError, NoExpressionError, UnknownNameError
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import TASK_KINDS
@@ -141,9 +141,9 @@ def test_every_operation_is_written(library: str) -> None:
     """Against CasADi: also comparisons, choices, constants and infinity."""
     array, q = array_of(library), ca.SX.sym("q", 3)
     function = dense_function("f", [q], [every_operation(q)])
-    code = LIBRARIES[library].code(function_code("f", "All operations.", function))
+    code = write_function("f", "All operations.", function)
     scope: dict[str, Any] = {"_shared": lambda value, q: value}
-    exec(f"{LIBRARIES[library].imports_for(code)}\n{code}", scope)
+    exec(f"{LIBRARIES[library].imports_for(code)}\n{LIBRARIES[library].translate(code)}", scope)
     points = np.random.default_rng(1).uniform(0.4, 0.6, (5, 3))
     found = np.asarray(scope["f"](array(np.ascontiguousarray(points.T))))
     np.testing.assert_allclose(found, Batched(function)(points)[0].T, rtol=1e-14, atol=1e-14)
@@ -210,7 +210,7 @@ def test_names_of_any_kind_stay_names(tmp_path: Path) -> None:
     chart = oc.fit(oc.Problem(known.problem.robot, task, domain=oc.Box([0.5] * 3, 0.1), name=name), oc.Linear()).chart
     module = module_of(chart, "numpy", tmp_path)
     assert (module.PROBLEM, module.LABELS[0], module.UNITS) == (name, name, (name,))
-    assert module_text(chart, "torch").isascii()
+    assert write_module(chart, "torch").isascii()
 
 
 def test_what_cannot_be_exported_is_named(tmp_path: Path) -> None:
@@ -245,7 +245,7 @@ def test_command_writes_a_module(run: Run, tmp_path: Path) -> None:
     code, out, err = run("export", "arm.orthocas", "--to", "numpy", "--out", "arm.py")
     assert (code, err) == (0, "")
     assert "arm.py, with numpy alone" in out
-    assert (tmp_path / "arm.py").read_text() == module_text(fitted().chart, "numpy")
+    assert (tmp_path / "arm.py").read_text() == write_module(fitted().chart, "numpy")
     code, out, err = run("export", "arm.orthocas", "--to", "numpy", "--out", "arm.orthocas")
     assert (code, len(err.splitlines())) == (2, 1)
     assert json.loads(run("export", "arm.orthocas", "--to", "jax", "--out", "arm.py", "--json")[1])["joints"] == 3

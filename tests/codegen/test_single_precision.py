@@ -18,7 +18,7 @@ from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, check_c, c
 from orthocas.codegen.library import compilers
 from orthocas.codegen.precision import SINGLE
 from orthocas.control import Controller, ControlStatus, Impedance, Kinematic, PDPlus, Safety
-from orthocas.errors import ProofError
+from orthocas.errors import AgreementError
 from orthocas.fitting.fit import Fit
 from orthocas.tools.checks import Array
 
@@ -68,7 +68,7 @@ def in_double(law: Controller, tmp_path_factory: pytest.TempPathFactory) -> Comp
     ],
 )
 def test_code_is_translated_word_by_word(double: str, single: str) -> None:
-    assert SINGLE.code(double) == single
+    assert SINGLE.translate(double) == single
 
 
 @pytest.mark.slow
@@ -114,7 +114,7 @@ def test_a_wrong_gain_is_found(law: Controller, tmp_path: Path) -> None:
     generated = oc.generate_c(law.chart, tmp_path, law, "arm", single_precision=True)
     source = tmp_path / "arm.c"
     source.write_text(source.read_text().replace("arg[3] = reference->velocity", "arg[3] = reference->value"))
-    with pytest.raises(ProofError, match="control"):
+    with pytest.raises(AgreementError, match="control"):
         check_c(generated, law.chart, law, states=100)
 
 

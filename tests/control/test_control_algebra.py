@@ -13,7 +13,7 @@ from scipy.linalg import eigh, sqrtm
 
 from orthocas.codegen.kernels import generate_kernels
 from orthocas.codegen.library import compilers
-from orthocas.control.linear_algebra import DAMPING_DESIGNS, DampingDesign, damped, root_times, spd_inverse
+from orthocas.control.linear_algebra import DAMPING_DESIGNS, DampingDesign, apply_damping, invert_spd, multiply_by_root
 from orthocas.tools.checks import Array
 from orthocas.tools.processes import run_program
 
@@ -28,11 +28,11 @@ def spd(size: int, condition: float) -> Array:
 
 
 def square_root(A: Any) -> Any:
-    return root_times(A, type(A).eye(A.shape[0]))
+    return multiply_by_root(A, type(A).eye(A.shape[0]))
 
 
 def damping_matrix(design: DampingDesign, M: Any, K: Any, Z: Any) -> Any:
-    return damped(design, M, K, Z, type(M).eye(M.shape[0]))
+    return apply_damping(design, M, K, Z, type(M).eye(M.shape[0]))
 
 
 def function_of(expression: object, symbol: ca.SX) -> ca.Function:
@@ -70,7 +70,7 @@ def test_square_root_is_differentiable_where_eigenvalues_meet() -> None:
 
 def test_inverse_and_determinant_agree_with_numpy() -> None:
     A = ca.SX.sym("A", 5, 5)
-    inverse, determinant = ca.Function("f", [A], list(spd_inverse(A)))(given := spd(5, 1e4))
+    inverse, determinant = ca.Function("f", [A], list(invert_spd(A)))(given := spd(5, 1e4))
     np.testing.assert_allclose(inverse.full() @ given, np.eye(5), atol=1e-10)
     assert float(determinant) == pytest.approx(np.linalg.det(given), rel=1e-10)
 
@@ -79,7 +79,7 @@ def test_inverse_and_determinant_agree_with_numpy() -> None:
 def test_matrices_in_loops_are_those_written_out(size: int) -> None:
     """What graphs compute by sweeps, as for robots with many joints."""
     A = ca.MX.sym("A", size, size)
-    inverse, determinant, root = ca.Function("f", [A], [*spd_inverse(A), square_root(A)])(given := spd(size, 1e4))
+    inverse, determinant, root = ca.Function("f", [A], [*invert_spd(A), square_root(A)])(given := spd(size, 1e4))
     np.testing.assert_allclose(inverse.full() @ given, np.eye(size), atol=1e-10)
     assert float(determinant) == pytest.approx(np.linalg.det(given), rel=1e-10)
     np.testing.assert_allclose(root.full() @ root.full(), given, atol=1e-8)
@@ -147,7 +147,7 @@ def test_damping_generates_to_c_that_agrees(tmp_path: Path) -> None:
 def test_roots_in_generated_c_stop_when_they_are_exact(tmp_path: Path, size: int) -> None:
     """On eigenvalues up to 1e6 apart, in any units, and no further in arrays than they are long."""
     A, V = ca.MX.sym("A", size, size), ca.MX.sym("V", size, 2)
-    kernels = generate_kernels([ca.Function("root", [A, V], [root_times(A, V)])], "own")
+    kernels = generate_kernels([ca.Function("root", [A, V], [multiply_by_root(A, V)])], "own")
     source, library = tmp_path / "root.c", tmp_path / "root.so"
     source.write_text(f"#include <math.h>\n{kernels.code.replace('static int own_root', 'int own_root')}\n")
     strict = ["-std=c99", "-O2", "-Warray-bounds", "-Werror"]

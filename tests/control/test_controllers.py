@@ -1,6 +1,8 @@
 """Control laws against formulas written out with NumPy and Pinocchio's matrices."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,9 +11,11 @@ import pytest
 from baselines import KinematicProjector, Projector
 from charts import with_metric
 from laws import torque
+from programs import needs_c
 from scipy.linalg import block_diag, sqrtm
 
 import orthocas as oc
+from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared, gain_numbers
 from orthocas.control import ControlStatus, Impedance, Kinematic, PDPlus, Reference
 from orthocas.control.controller import Controller
 from orthocas.errors import (
@@ -154,6 +158,57 @@ def test_kinematic_control_inverts_the_jacobian(arm_chart: oc.Chart, model: pin.
         rate = s.dphi_d + feedback * (s.phi_d - arm_chart.phi(s.q))
         want = np.linalg.solve(arm_chart.jacobian(s.q), rate)
         np.testing.assert_allclose(called(Kinematic(arm_chart, feedback), s), want, rtol=1e-8)
+
+
+def ends_on_its_reference(
+    command_from: Callable[[Array], Callable[[Array, Array], Array]],
+    chart: oc.Chart,
+    rate: float,
+    delay: float,
+    seconds: float = 3.0,
+) -> bool:
+    """Whether x and xi of an ideal plant end within 1e-6 of a reference at rest, from starts 0.3 rad beside it."""
+    for start in np.random.default_rng(5).uniform(-0.3, 0.3, (4, chart.n)):
+        q, reference = chart.problem.domain.centre + start, chart.phi(chart.problem.domain.centre)
+        command = command_from(q)
+        on_the_way = [np.zeros(chart.n)] * round(delay * rate)
+        for _ in range(round(seconds * rate)):
+            on_the_way.append(command(q, reference))
+            q = q + on_the_way.pop(0) / rate
+        if not np.abs(chart.phi(q) - reference).max() < 1e-6:
+            return False
+    return True
+
+
+@pytest.mark.parametrize(("rate", "delay"), [(1000.0, 0.0), (500.0, 0.0), (1000.0, 5e-3), (500.0, 6e-3)])
+def test_velocity_law_ends_on_its_reference_by_default(planar_arm: oc.Chart, rate: float, delay: float) -> None:
+    rest = np.zeros(3)
+
+    def ends(law: Kinematic) -> bool:
+        return ends_on_its_reference(
+            lambda start: lambda q, phi_d: torque(law, q, rest, phi_d, rest, rest)[0], planar_arm, rate, delay
+        )
+
+    assert ends(Kinematic(planar_arm))
+    assert not ends(Kinematic(planar_arm, 0.0))
+
+
+@needs_c
+def test_velocity_law_in_c_ends_on_its_reference_by_default(planar_arm: oc.Chart, tmp_path: Path) -> None:
+    law, rest = Kinematic(planar_arm), np.zeros(3)
+    library = CompiledLibrary(compile_shared(oc.generate_c(planar_arm, tmp_path, law, "arm"), tmp_path), "arm", 3)
+    gains = library.default_gains(len(gain_numbers(law)))
+
+    def alone(start: Array) -> Callable[[Array, Array], Array]:
+        return lambda q, phi_d: library.control(q, rest, np.concatenate([phi_d, rest, rest]), gains)[0]
+
+    def supervised(start: Array) -> Callable[[Array, Array], Array]:
+        supervisor = Supervisor(library, law)
+        supervisor.start(start)
+        return lambda q, phi_d: supervisor.step(q, rest, np.concatenate([phi_d, rest, rest]), 2e-3)[0]
+
+    assert ends_on_its_reference(alone, planar_arm, 500.0, 6e-3)
+    assert ends_on_its_reference(supervised, planar_arm, 500.0, 6e-3, seconds=16.0)  # its offset fades with 0.5 s
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from test_payload import arm_model
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared, gain_numbers
 from orthocas.control import Adaptation, ControlStatus, Memory, MomentumObserver, PDPlus, Remembering, RunTimeModel
-from orthocas.control.memory import _momentum, _regressor
+from orthocas.control.memory import _build_momentum, _build_regressor
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.tools.checks import Array
 
@@ -58,17 +58,17 @@ def test_momentum_and_its_rate_are_pinocchios() -> None:
         q, dq = rng.uniform(-1, 1, (2, 7))
         M, C = pin.crba(model, data, q).copy(), pin.computeCoriolisMatrix(model, data, q, dq).copy()
         M = np.triu(M) + np.triu(M, 1).T
-        p, rate = (out.full().ravel() for out in _momentum(tree, False, True)(q, dq))
+        p, rate = (out.full().ravel() for out in _build_momentum(tree, False, True)(q, dq))
         np.testing.assert_allclose(p, M @ dq, atol=1e-12)
         np.testing.assert_allclose(rate, C.T @ dq - pin.computeGeneralizedGravity(model, data, q), atol=1e-11)
-        np.testing.assert_allclose(_momentum(tree, False, False)(q, dq)[1].full().ravel(), C.T @ dq, atol=1e-11)
+        np.testing.assert_allclose(_build_momentum(tree, False, False)(q, dq)[1].full().ravel(), C.T @ dq, atol=1e-11)
 
 
 def test_regressor_of_first_moments_is_pinocchios() -> None:
     """But for the axes of bodies: ours have z along the joint."""
     model, rng = arm_model(), np.random.default_rng(2)
     data = model.createData()
-    regressor, joints = _regressor(oc.problems.get("iiwa").robot.tree)
+    regressor, joints = _build_regressor(oc.problems.get("iiwa").robot.tree)
     assert joints == tuple(np.repeat(range(7), 2))
     states = rng.uniform(-1, 1, (6, 3, 7))
     theirs = np.vstack([pin.computeJointTorqueRegressor(model, data, *state).reshape(7, 7, 10) for state in states])
@@ -83,7 +83,7 @@ def test_regressor_of_first_moments_is_pinocchios() -> None:
 
 def test_regressor_is_bilinear_in_its_two_velocities() -> None:
     """C(q, u + v)(u + v) = C(q, u) u + C(q, v) v + 2 C(q, u) v."""
-    regressor, _ = _regressor(oc.problems.get("iiwa").robot.tree)
+    regressor, _ = _build_regressor(oc.problems.get("iiwa").robot.tree)
     q, u, v = np.random.default_rng(3).uniform(-1, 1, (3, 7))
 
     def turned(a: Array, b: Array) -> Array:

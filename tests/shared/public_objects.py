@@ -222,6 +222,7 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "task": lambda: planar().task,
     "run-time model": run_time_model,
     "momentum observer": control.MomentumObserver,
+    "ticks of a law without a memory": lambda: control.Remembering(control.Kinematic(fitted().chart, 1.0)),
     "law in ticks": lambda: control.Remembering(CONTROLLERS["PD+ with a memory"]()),
     "safety": lambda: control.Safety.of(impedance(), fade_in=0.1),
     "modes": lambda: impedance().modes(),

@@ -5,10 +5,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from public_objects import circle, disk, fitted, impedance, network, points_of, states_of
+from public_objects import circle, disk, fitted, impedance, network, numbers, points_of, states_of
 
 import orthocas as oc
-from orthocas.control import Controller
+from orthocas.control import Controller, Kinematic, Remembering
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
 
@@ -45,10 +45,17 @@ def calls_of_law(law: Controller) -> list[Call]:
     return [command]
 
 
+def calls_of_ticks() -> list[Call]:
+    """A law without a memory in ticks, copied for each call."""
+    ticks = Remembering(Kinematic(copy.deepcopy(fitted().chart), 1.0))
+    return [lambda k: np.hstack(numbers(ticks))]
+
+
 SERIES: dict[str, tuple[Callable[[], list[Call]], int]] = {  #: of 5,000 calls
     "polynomial": (lambda: calls_of_chart(copy.deepcopy(fitted().chart)), 2400),
     "network": (lambda: calls_of_chart(copy.deepcopy(network())), 1200),
     "circle": (lambda: calls_of_chart(copy.deepcopy(circle())), 60),
     "disk": (lambda: calls_of_chart(copy.deepcopy(disk())), 40),
+    "law in ticks": (calls_of_ticks, 200),
     "law": (lambda: calls_of_law(copy.deepcopy(impedance())), 1300),
 }

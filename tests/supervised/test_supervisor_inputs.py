@@ -9,8 +9,7 @@ from programs import built, needs_c, nightly
 from supervised import TICK, Arm, at_rest, moving, run
 
 import orthocas as oc
-from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
-from orthocas.codegen.library import GeneratedC
+from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared
 from orthocas.control import Controller, ControlStatus, PDPlus, Safety
 from orthocas.simulation import MuJoCoPlant
 from orthocas.tools.checks import Array

@@ -10,8 +10,7 @@ from programs import needs_c
 from supervised import TICK, Arm, at_rest, run
 
 import orthocas as oc
-from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
-from orthocas.codegen.library import GeneratedC
+from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared
 from orthocas.control import Controller, ControlStatus, Kinematic, Safety
 from orthocas.errors import InvalidValueError, ShapeError
 

@@ -1,0 +1,344 @@
+"""`check_c`: compiles C with gcc and clang, and compares it with Python at random states."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.charts.chart import Chart
+from orthocas.codegen.generate import GeneratedC
+from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
+from orthocas.codegen.precision import DOUBLE, SINGLE, Precision, find_bounds_inside
+from orthocas.control.controller import (
+    FROM_THE_LAW,
+    Controller,
+    ControlStatus,
+    count_turns_from_centre,
+    find_squared_volume,
+)
+from orthocas.errors import AgreementError
+from orthocas.tools.batch import Batched
+from orthocas.tools.checks import Array, require_kind
+from orthocas.tools.expressions import wrap_shortest
+from orthocas.tools.files import open_draft_folder
+
+
+@dataclass(frozen=True, slots=True)
+class CheckRules:
+    """Numbers of the comparison."""
+
+    bad: tuple[float, ...] = (np.nan, np.inf, -np.inf, 1e200)  #: numbers that spoil an input
+    spoil_every: int = 20  #: states
+    reach: float = 1.2  #: random states lie in the domain enlarged by this factor
+    nearby: float = 0.01  #: in single precision, a status may be that of a place so near, in half-widths
+    start: float = 0.01  #: starts of the inverse map beside the solution [rad]
+    far: float = 1e3  #: change of phi that has no solution
+    solved: float = 0.9  #: least fraction of targets that the inverse map must solve from nearby
+    regular: float = 1e6  #: largest condition number of J where it must
+
+
+RULES = CheckRules()
+
+
+@dataclass(frozen=True)
+class AgreementCheck:
+    """Largest relative differences over all states and compilers, by function; all statuses were equal."""
+
+    states: int
+    compilers: tuple[str, ...]
+    differences: dict[str, float]
+
+
+def check_c(
+    generated: GeneratedC,
+    chart: Chart,
+    controller: Controller | None = None,
+    states: int = 1000,
+    seed: int = 0,
+) -> AgreementCheck:
+    """Compile with gcc and clang (C99, warnings as errors), if installed, and compare with Python.
+
+    Args:
+        generated: what `generate_c` returned.
+        chart: the chart that it was made from.
+        controller: the law of the library, if it has one.
+        states: number of random states.
+        seed: of the states.
+
+    Compares numbers and statuses at random states inside and around the domain, some with NaN, infinite or huge
+    numbers. It also compares them at rest, at the centre of the domain, its lowest and highest corners, and the centres
+    of its faces.
+
+    Raises:
+        CompileError: if there is no compiler, or compilation fails.
+        AgreementError: if a result differs by more than 1e-10 of its largest entry (single precision: 1e-3), or a
+            status differs. Near singularities, where one rounding of q, or of one joint, changes commands by more than
+            1e-12 (1e-5), the accepted difference is a hundred times that change. In single precision, that of commands
+            also grows with the inverse square of the volume of the gradients, relative to its median, and their status
+            may be that of a place within 0.01 half-widths.
+    """
+    require_kind("chart", chart, Chart)
+    n, precision = chart.n, SINGLE if generated.single_precision else DOUBLE
+    domain = chart.problem.domain
+
+    # Random positions in and around the domain, then corner cases, which belong to it.
+    corners = np.clip(domain.centre + domain.half_width * list_corners(n), *find_bounds_inside(domain, precision))
+    around = domain.half_width * RULES.reach * np.random.default_rng(seed).uniform(-1, 1, (states, n))
+    q = precision.round(np.vstack([domain.centre + around, corners]))
+    differences: dict[str, float] = {}
+    for compiler in compilers():
+        with open_draft_folder() as folder:
+            path = compile_shared(generated, folder, compiler=compiler)
+            library = CompiledLibrary(path, generated.name, n, generated.single_precision)
+            results = _compare(library, chart, controller, q, seed)
+        for name, value in results.items():
+            if not value <= precision.tolerance:
+                raise AgreementError(
+                    f"C, compiled by {compiler}, differs from Python by {value:.3g} in {name}, "
+                    f"expected at most {precision.tolerance:g} relative"
+                )
+            differences[name] = max(value, differences.get(name, 0.0))
+    return AgreementCheck(len(q), tuple(Path(compiler).name for compiler in compilers()), differences)
+
+
+def list_corners(n: int) -> Array:
+    """Centre, two corners and centres of the faces of the box from -1 to 1, (3 + 2 n, n)."""
+    return np.vstack([np.zeros(n), np.full(n, -1), np.full(n, 1), -np.eye(n), np.eye(n)])
+
+
+def spoil(rng: np.random.Generator, *arrays: Array) -> list[Array]:
+    """Copies with a NaN, infinite or huge number in every twentieth row of one array; corner cases stay as they are."""
+    copies = [array.copy() for array in arrays]
+    for row in range(0, len(arrays[0]) - len(list_corners(arrays[0].shape[1])), RULES.spoil_every):
+        array = copies[rng.integers(len(copies))]
+        array[row, rng.integers(array.shape[1])] = RULES.bad[rng.integers(len(RULES.bad))]
+    return copies
+
+
+def _compare(
+    library: CompiledLibrary, chart: Chart, controller: Controller | None, q: Array, seed: int
+) -> dict[str, float]:
+    """Largest relative differences by function; the last positions are corner cases, taken at rest."""
+    rng = np.random.default_rng(seed)
+    if not np.array_equal(library.domain, find_bounds_inside(chart.problem.domain, library.precision)):
+        raise AgreementError("the domain in C differs from the domain of the chart")
+    dq = library.precision.round(rng.normal(size=q.shape))
+    dq[len(q) - len(list_corners(chart.n)) :] = 0
+    differences = _compare_chart_and_dynamics(library, chart, *spoil(rng, q, dq))
+    differences["curvature"] = _compare_curvature(library, chart, q, dq, rng)
+    differences["check"] = library.check()
+    differences["inverse"] = _compare_inverse(library, chart, q)
+    if controller is not None:
+        differences["control"] = _compare_control(library, controller, q, dq, rng)
+    return differences
+
+
+def _compare_chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array, dq: Array) -> dict[str, float]:
+    domain, robot = chart.problem.domain, chart.problem.robot
+    largest = library.precision.largest
+    finite, moving = _are_numbers(largest, q), _are_numbers(largest, q, dq)
+    somewhere, speed = np.where(finite[:, None], q, domain.centre), np.where(moving[:, None], dq, 0)
+    inside = np.where(domain.contains(somewhere), ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN)
+    expected = {"phi": chart.phi(somewhere), "jacobian": chart.jacobian(somewhere)}
+    has_value = finite & np.isfinite(expected["phi"]).all(axis=1) & np.isfinite(expected["jacobian"]).all(axis=(1, 2))
+    status = np.select([~finite, ~has_value], [ControlStatus.NOT_FINITE, ControlStatus.SINGULAR], inside)
+    results = [library.chart(row) for row in q]
+    _require_status("chart", [row[-1] for row in results], status, q)
+    phi, J = (np.array([row[k] for row in results]) for k in range(2))
+    expected = {name: _blank(has_value, value) for name, value in expected.items()}
+    # pi and -pi are one angle.
+    phi = expected["phi"] + wrap_shortest(phi - expected["phi"], chart.turns)
+    differences = {"phi": _compute_largest(phi, expected["phi"]), "jacobian": _compute_largest(J, expected["jacobian"])}
+    expected = {
+        "mass_matrix": robot.mass_matrix(somewhere),
+        "bias": robot.bias(somewhere, speed),
+        "gravity": robot.gravity(somewhere),
+    }
+    pushed = [library.dynamics(*row) for row in zip(q, dq, strict=True)]
+    _require_status("dynamics", [row[-1] for row in pushed], np.where(moving, inside, ControlStatus.NOT_FINITE), q)
+    return differences | {
+        name: _compute_largest(np.array([row[k] for row in pushed]), _blank(moving, value))
+        for k, (name, value) in enumerate(expected.items())
+    }
+
+
+def _compare_curvature(library: CompiledLibrary, chart: Chart, q: Array, dq: Array, rng: np.random.Generator) -> float:
+    """Largest relative difference of dJ/dt v where it has a value, with any v."""
+    v = library.precision.round(rng.normal(size=q.shape))
+    expected = Batched(chart.function("second_derivative"))(q, dq, v)[0]
+    results = [library.curvature(*row) for row in zip(q, dq, v, strict=True)]
+    good = np.asarray(np.isfinite(expected).all(axis=1))
+    return _compute_largest(np.array([row[0] for row in results]), _blank(good, expected))
+
+
+def _compare_inverse(library: CompiledLibrary, chart: Chart, q: Array) -> float:
+    """Largest remaining error in phi of the solutions. Most targets must be solved from nearby, but not from afar."""
+    inner = q[: len(q) // 10]
+    J = chart.jacobian(inner)
+    finite = np.asarray(np.isfinite(chart.phi(inner)).all(axis=1) & np.isfinite(J).all(axis=(1, 2)))
+    inner = inner[finite & (np.linalg.cond(np.where(finite[:, None, None], J, np.eye(chart.n))) < RULES.regular)]
+    targets, starts = chart.phi(inner), library.precision.round(inner + RULES.start)
+    near = [_measure_inverse(library, chart, *pair) for pair in zip(targets, starts, strict=True)]
+    far = [_measure_inverse(library, chart, *pair) for pair in zip(targets + RULES.far, inner, strict=True)]
+    solved = np.isfinite(near).sum()
+    if solved < RULES.solved * len(inner):
+        raise AgreementError(
+            f"the inverse map solved {solved} of {len(inner)} targets from {RULES.start:g} away, expected most"
+        )
+    nothing = np.full(chart.n, np.nan)
+    for given in ((nothing, q[0]), (q[0], nothing)):
+        solution, status = library.inverse(*given)
+        if status != ControlStatus.NOT_FINITE or solution.any():
+            raise AgreementError(
+                f"inverse returns {solution.tolist()} and status {status} for NaN, expected zeros and 3"
+            )
+    return max((error for error in (*near, *far) if np.isfinite(error)), default=0.0)
+
+
+def _measure_inverse(library: CompiledLibrary, chart: Chart, target: Array, start: Array) -> float:
+    """Largest remaining error in phi. Infinite without a solution; status and output must then be as documented."""
+    solution, status = library.inverse(target, start)
+    if status in (ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN):
+        if (status == ControlStatus.OK) != chart.problem.domain.contains(solution.astype(float)):
+            raise AgreementError(f"the status of inverse is {status} at q = {solution.tolist()}")
+        return float(np.abs(wrap_shortest(chart.phi(solution.astype(float)) - target, chart.turns)).max())
+    if status == ControlStatus.STOPPED_EARLY:
+        after, before = (_measure_remaining(library, chart, target, q) for q in (solution, start))
+        if not after <= before * (1 + 1e-5):
+            raise AgreementError(
+                f"inverse returns {solution.tolist()}, farther off than its start: {after} for {before}"
+            )
+    elif status != ControlStatus.SINGULAR or not np.array_equal(solution, start):
+        raise AgreementError(f"inverse returns {solution.tolist()} and status {status}, expected its start")
+    return np.inf
+
+
+def _measure_remaining(library: CompiledLibrary, chart: Chart, target: Array, q: Array) -> float:
+    """The largest error in phi as the library has it, with its own phi and scale: far outside, rounding is large."""
+    phi = library.chart(q)[0].astype(float)
+    scale = chart.phi_sizes + library.precision.coarse * np.abs(target)
+    return float(np.abs(chart.phi_map.difference(target[None], phi[None])[0] / scale).max())
+
+
+def _compare_control(
+    library: CompiledLibrary, controller: Controller, q: Array, dq: Array, rng: np.random.Generator
+) -> float:
+    numbers = library.precision.round(gain_numbers(controller))
+    if not np.array_equal(library.default_gains(len(numbers)), numbers):
+        raise AgreementError("the default gains in C differ from the gains of the controller")
+    inputs = _sample_law_inputs(library.precision, controller, q, dq, rng)
+    law = Batched(count_turns_from_centre(library.precision.graph(controller), controller.problem))
+    command, status = law(*inputs)
+    if not (status == ControlStatus.OK).any():
+        raise AgreementError(f"{controller.name} is well defined at none of {len(q)} states, expected at least one")
+    rows = zip(*inputs[:2], np.hstack(inputs[2:5]), np.hstack(inputs[5:]), strict=True)
+    results, statuses = zip(*(library.control(*row) for row in rows), strict=True)
+    same = np.array(statuses) == status[:, 0]
+    if library.single_precision:
+        expected = np.where(_is_near_another_status(controller, law, inputs), statuses, status[:, 0])
+    else:
+        expected = status[:, 0]
+    _require_status("control", statuses, expected, inputs[0])
+    relative = _compute_differences(np.array(results), command) / _estimate_amplification(
+        library.precision, controller, law, inputs
+    )
+    return float(relative[same].max())
+
+
+def _sample_law_inputs(
+    precision: Precision, controller: Controller, q: Array, dq: Array, rng: np.random.Generator
+) -> list[Array]:
+    """Positions, velocities, references with two derivatives, and gains, some of them spoiled."""
+    around = np.nan_to_num(Batched(controller.measured)(q)[0])
+    reference = (around + 0.1 * rng.normal(size=around.shape), *rng.normal(size=(2, *around.shape)))
+    state = spoil(rng, q, dq, *reference)
+    return [precision.round(values) for values in (*state, *sample_gains(controller, len(q), rng))]
+
+
+def sample_gains(controller: Controller, rows: int, rng: np.random.Generator) -> list[Array]:
+    """Random gains around those of the controller, (rows, length) each; limits are finite or, at times, infinite."""
+    gains = []
+    for name, gain in controller.gains.items():
+        if name == "payload":
+            # up to 2 kg, within some 0.1 m of the tip, with positive definite inertias
+            mass, factors = rng.uniform(0, 2, (rows, 1)), 0.05 * rng.normal(size=(rows, 3, 3))
+            inertia = factors @ factors.transpose(0, 2, 1)
+            values = np.hstack([mass, 0.1 * rng.normal(size=(rows, 3)), inertia[:, *np.triu_indices(3)]])
+        elif name == "mass_matrix":
+            # one factor and a diagonal, so that it stays symmetric positive definite
+            n = controller.problem.n
+            diagonal = np.eye(n) * rng.uniform(0, 0.1, (rows, 1, n))
+            values = (gain.reshape(n, n) * rng.uniform(0.5, 1.5, (rows, 1, 1)) + diagonal).reshape(rows, -1)
+        elif name in ("wrench", "extra_torque", "coriolis_torque", "gravity_torque"):
+            values = gain + rng.normal(size=(rows, len(gain)))
+        else:
+            values = np.where(np.isfinite(gain), gain, 50.0) * rng.uniform(0.5, 1.5, (rows, len(gain)))
+        if name == "limit":
+            # States of a weak arm may all saturate, which would say little of the law.
+            values[::3] = np.inf
+            values[7::40, 0] = rng.choice([0.0, -1.0, np.nan, np.inf], size=len(values[7::40]))
+        gains.append(values)
+    return gains
+
+
+def _estimate_amplification(precision: Precision, controller: Controller, law: Batched, inputs: list[Array]) -> Array:
+    """How much more than the tolerance the command may differ at each state, (N,) >= 1."""
+    q, others = inputs[0], inputs[1:]
+    command, status = law(*inputs)
+    change = np.zeros(len(q))
+    # Effects of joints may cancel, so each moves alone, too.
+    for joints in (np.ones(q.shape[1], dtype=bool), *np.eye(q.shape[1], dtype=bool)):
+        moved, status_there = law(np.where(joints, precision.next_above(q), q), *others)
+        same = (status_there == status)[:, 0]
+        change = np.where(same, np.maximum(change, _compute_differences(moved, command)), change)
+    results: Array = change.clip(precision.sensitive, 1) / precision.sensitive
+    # The volume does not depend on whole turns.
+    volume = find_squared_volume(controller.graph)
+    if precision is SINGLE and volume is not None:
+        squares = np.where(np.isin(status, FROM_THE_LAW), Batched(volume)(*inputs)[0], 1.0)[:, 0]
+        results /= squares.clip(precision.smallest_volume**2, 1)
+    return results
+
+
+def _is_near_another_status(controller: Controller, law: Batched, inputs: list[Array]) -> NDArray[np.bool_]:
+    """Whether the status of the law is another one at a place next to q along a joint, (N,)."""
+    q, others = inputs[0], inputs[1:]
+    step = np.diag(RULES.nearby * controller.problem.domain.half_width)
+    here = law(*inputs)[1][:, 0]
+    near = [law(q + way, *others)[1][:, 0] != here for way in np.vstack([step, -step])]
+    return np.asarray(np.any(near, axis=0))
+
+
+def _are_numbers(largest: float, *arrays: Array) -> NDArray[np.bool_]:
+    """Rows without NaN, infinities and numbers that the C code rejects."""
+    finite: NDArray[np.bool_] = np.all([(np.abs(array) <= largest).all(axis=1) for array in arrays], axis=0)
+    return finite
+
+
+def _blank(good: NDArray[np.bool_], values: Array) -> Array:
+    """Values at good states, zeros at the others."""
+    return np.where(good.reshape(-1, *[1] * (values.ndim - 1)), values, 0.0)
+
+
+def _require_status(function: str, results: Sequence[int], expected: Array, q: Array) -> None:
+    unequal = np.flatnonzero(np.array(results) != expected)
+    if unequal.size:
+        row = int(unequal[0])
+        raise AgreementError(
+            f"the status of {function} is {results[row]} at q = {q[row].tolist()}, expected {expected[row]:.0f}"
+        )
+
+
+def _compute_largest(results: Array, expected: Array) -> float:
+    """Largest of `_compute_differences`."""
+    return float(_compute_differences(results, expected).max())
+
+
+def _compute_differences(results: Array, expected: Array) -> Array:
+    """Difference at each state relative to the largest entry, (N,); infinite where an entry is not finite."""
+    flat = (len(results), -1)
+    scale = np.abs(expected.reshape(flat)).max(axis=1).clip(1e-300)
+    difference = np.abs(results - expected).reshape(flat).max(axis=1) / scale
+    return np.where(np.isfinite(difference), difference, np.inf)

@@ -1,0 +1,234 @@
+"""The supervised law in generated C: what its kernels compute, and what its templates are filled with."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from orthocas.charts.chart import Chart
+from orthocas.codegen.rendering import clean_word, clean_words, write_number, write_numbers
+from orthocas.control.controller import Controller
+from orthocas.control.memory import memory_of
+from orthocas.control.safety import SIGNED, UNBOUNDED, Safety
+from orthocas.tasks.domains import Domain
+from orthocas.tasks.relative import Relative
+from orthocas.tasks.samples import sample_uniform
+from orthocas.tools.batch import Batched
+from orthocas.tools.expressions import expand_scalars, wrap_shortest
+
+
+@dataclass(frozen=True, slots=True)
+class SupervisionRules:
+    """Numbers of the kernels of the supervised law."""
+
+    unit: float = 1.001  #: squared length of a quaternion, to rounding
+    damping: float = 1e-6  #: of least squares, for joint motions of fewer or more quantities than joints
+    samples: int = 256  #: of a domain, whose median room to a fold is the usual one
+
+
+RULES = SupervisionRules()
+
+
+def build_supervision_kernels(controller: Controller) -> list[ca.Function]:
+    """What the supervised law and its references compute besides the law itself.
+
+    - fallback(q, gains) -> command;
+    - deviation(q, reference) -> quantities, reference - quantities;
+    - gap(reference with two derivatives, value) -> value - reference, rates of the reference as errors count;
+    - implied(q, dq, reference with two derivatives, change) -> A (n, n) row by row and B (n, 3), such that A^-1 B are
+      the change, velocity and acceleration of the joints that follow; dq is about that velocity;
+    - memory(q, dq, reference with two derivatives, gains, command, active, period, fields) -> fields, if it has one;
+    - gram(q) and room(q), how far q is from singular positions and from folds, if the domain is bounded by them.
+    """
+    n, m, k = controller.problem.n, controller.problem.m, len(controller.labels)
+    fallback, q, reference = controller.fallback, ca.MX.sym("q", n), ca.MX.sym("reference", k)
+    inputs = fallback.mx_in()
+    measured, relative = controller.measured(q), Relative(controller.problem.task)
+    start, velocity, acceleration, end = (ca.MX.sym(name, k) for name in ("start", "velocity", "acceleration", "end"))
+    turned = relative.convert_rates(start[:m], velocity[:m], acceleration[:m])
+    rates = [ca.vertcat(*parts) for parts in zip(turned, (velocity[m:], acceleration[m:]), strict=True)]
+    deviation = [ca.densify(measured), _subtract(controller, relative, reference, measured)]
+    gap = [_subtract(controller, relative, end, start), *map(ca.densify, rates)]
+    kernels = [
+        ca.Function("fallback", inputs, fallback.call(inputs)),
+        ca.Function("deviation", [q, reference], deviation),
+        ca.Function("gap", [start, velocity, acceleration, end], gap),
+        _build_implied(controller, relative),
+    ]
+    if relative.turned:
+        kernels += [relative.moved, relative.turned_by]
+    if (memory := memory_of(controller)) is not None:
+        inputs = memory.step.mx_in()
+        kernels.append(ca.Function("memory", inputs, [ca.densify(out) for out in memory.step.call(inputs)]))
+    domain = None if controller.chart is None else find_condition(controller.chart)
+    if domain is not None and (bound := domain.singular_bound) is not None:
+        kernels.append(expand_scalars(ca.Function("gram", [q], [bound.gram(q)])))
+        if (room := domain.room_to_fold) is not None:
+            kernels.append(expand_scalars(ca.Function("room", [q], [room(q)])))
+    return kernels
+
+
+def _subtract(controller: Controller, relative: Relative, end: ca.MX, start: ca.MX) -> ca.MX:
+    """The difference of two values of the controlled quantities, (k, 1), by the shorter turns. NaN: end is no value."""
+    m = controller.problem.m
+    difference = ca.vertcat(relative.difference(end[:m], start[:m]), end[m:] - start[m:])
+    # Orientations differ by sines of half an angle.
+    if relative.turned:
+        unit = ca.sumsqr(relative.task.quaternion_function(end[:m])) < RULES.unit
+        difference = ca.if_else(unit, difference, ca.MX.nan(len(controller.labels)))
+    if controller.chart is not None and controller.labels == controller.chart.labels:
+        difference = wrap_shortest(difference, controller.chart.turns)
+    return ca.densify(difference)
+
+
+def _build_implied(controller: Controller, relative: Relative) -> ca.Function:
+    """A and B of the joint motions that a reference implies; of damped least squares where k is not n."""
+    n, m, k = controller.problem.n, controller.problem.m, len(controller.labels)
+    names = ("value", "velocity", "acceleration", "change")
+    q, dq = (ca.MX.sym(name, n) for name in ("q", "dq"))
+    value, *rates, change = (ca.MX.sym(name, k) for name in names)
+
+    # J and dJ/dt dq of the quantities, orientations relative to the reference
+    slope = relative.error(q, value[:m])[1]
+    if controller.chart is not None and controller.labels == controller.chart.labels:
+        own = controller.chart.coordinates.functions
+        J, bias = ca.vertcat(slope, own["jacobian"](q)), own["second_derivative"](q, dq, dq)
+    else:
+        J_2 = ca.jacobian(controller.measured(q)[m:], q)
+        J, bias = ca.vertcat(slope, J_2), ca.jtimes(J_2 @ dq, q, dq)
+    bias = ca.vertcat(controller.problem.task.rates_derivative_function(q, dq, dq), bias)
+
+    turned = relative.convert_rates(value[:m], rates[0][:m], rates[1][:m])
+    velocity, acceleration = (ca.vertcat(a, b[m:]) for a, b in zip(turned, rates, strict=True))
+    B = ca.horzcat(change, velocity, acceleration - bias)
+    if k != n:
+        J, B = J.T @ J + RULES.damping * ca.trace(J.T @ J) * ca.MX.eye(n), J.T @ B
+    return ca.Function("implied", [q, dq, value, *rates, change], [ca.densify(J.T), ca.densify(B)])
+
+
+def find_condition(chart: Chart) -> Domain | None:
+    """The domain of a chart, if it has a condition beside its box.
+
+    Raises:
+        DomainError: if that condition has no form in C.
+    """
+    domain = chart.problem.domain
+    domain.require_bounds("form in C")
+    return None if domain.is_box else domain
+
+
+def describe_law(controller: Controller) -> dict[str, Any]:
+    """Values of the templates about the law: gains, what its command means, and how it counts turns of joints."""
+    problem, torque = controller.problem, controller.command == "torque"
+    turns = np.zeros(problem.n)
+    turns[list(problem.turning)] = 2 * np.pi
+    if controller.settings.get("gravity") == "robot":
+        fallback = "zero torque, because the robot compensates gravity"
+    else:
+        fallback = "the gravity torque, or zero where it is not finite"
+    return {
+        "law": controller.formula,
+        "k": len(controller.labels),
+        "reference_labels": ", ".join(clean_words(controller.labels)),
+        "gains": [
+            {
+                "name": name,
+                "size": len(values),
+                "numbers": values,
+                "unit": clean_word(unit) if (unit := controller.gain_units.get(name)) else "",
+            }
+            for name, values in controller.gains.items()
+        ],
+        "gain_arguments": [f"gains->{name}" for name in controller.gains],
+        "command": controller.command,
+        "torque": torque,
+        "fallback": fallback if torque else "zero velocity",
+        "has_chart": controller.chart is not None,
+        "remarks": clean_words(controller.remarks()),
+        "turns": turns.tolist() if turns.any() else None,
+    }
+
+
+def describe_supervision(controller: Controller, safety: Safety) -> dict[str, Any]:
+    """Values of the templates about the supervised law: settings, boundary, memory, and orientations."""
+    problem, robot, domain = controller.problem, controller.problem.robot, controller.problem.domain
+    lower, upper = domain.bounds
+    path, relative = domain.path_bound, Relative(problem.task)
+    return {
+        "settings": [_describe_setting(name, value) for name, value in safety.in_c(controller.command).items()],
+        "turning": np.isinf(robot.lower) & np.isinf(robot.upper) & ~np.array(robot.tree.prismatic),
+        "bounded": np.isfinite(lower) & np.isfinite(upper) & (controller.chart is not None),
+        # a path of a corridor ends one radius before the boundary of its box, which may be many radii wide
+        "boundary_unit": domain.half_width if path is None else np.minimum(domain.half_width, path.radius),
+        "boundary": _describe_boundary(controller),
+        "turned_first": relative.first,
+        "turned_end": problem.m,
+        "memory": _describe_memory(controller),
+    }
+
+
+def _describe_setting(name: str, value: Any) -> dict[str, Any]:
+    """A setting of `Safety` as a field of a struct, its value, and what C requires of it."""
+    place, meaning = f"safety->{name}", Safety.meaning(name)
+    if not isinstance(value, np.ndarray):
+        whole = isinstance(value, int)
+        check = f"{place} >= 0" if whole else f"{place} > 0.0 && {place} <= LARGEST"
+        literal = write_number(value if whole else float(value))
+        kind = "int" if whole else "double"
+        return {"name": name, "kind": kind, "size": 0, "meaning": meaning, "check": check, "literal": literal}
+    check = f"all_from({'-INFINITY' if name in SIGNED else '0.0'}, {place}, {value.size})"
+    if name not in UNBOUNDED:
+        check += f" && all_within({place}, {value.size}, LARGEST)"
+    literal = f"{{{write_numbers(value)}}}"
+    return {"name": name, "kind": "double", "size": value.size, "meaning": meaning, "check": check, "literal": literal}
+
+
+def _describe_boundary(controller: Controller) -> dict[str, Any] | None:
+    """The condition of the law's domain as a part of its boundary, if it has one."""
+    domain = None if controller.chart is None else find_condition(controller.chart)
+    if domain is None:
+        return None
+    if (path := domain.path_bound) is not None:
+        starts, axes, squares = path.lines
+        return {
+            "meaning": "The distance to the path of postures is a part of the boundary; it counts in radii.",
+            "path": {"starts": starts, "axes": axes, "lengths": np.sqrt(squares)},
+            "joints": list(path.counted),
+            "radii": path.radius[path.counted],
+            "fold_span": None,
+        }
+    if (bound := domain.singular_bound) is None:
+        return None
+    meaning = (
+        "The bound on the relative singular value of the task is a part of the boundary; its\n"
+        " * distance counts in shares of that from the centre."
+    )
+    fold_span = None
+    if (room := domain.room_to_fold) is not None:
+        meaning += " So is\n * the bound on the volume of the coordinates, in shares of the median."
+        # of a median position, because the centre may be near the bound
+        fold_span = float(np.median(Batched(room)(sample_uniform(domain, RULES.samples, 0))[0]))
+    return {
+        "meaning": meaning,
+        "path": None,
+        "bound": bound.least_singular_value,
+        "span": float(bound.singular_values(bound.centre)) - bound.least_singular_value,
+        "fold_span": fold_span,
+    }
+
+
+def _describe_memory(controller: Controller) -> dict[str, Any] | None:
+    """The fields that a law remembers, and the gains that they are added to."""
+    memory = memory_of(controller)
+    if memory is None:
+        return None
+    return {
+        "torque": memory.torque,
+        "last": [f"last.{name}" for name in memory.start],
+        "kept": [f"state->memory.{name}" for name in memory.start],
+        "fields": [{"name": name, "size": len(values), "numbers": values} for name, values in memory.start.items()],
+        "adds": [
+            {"name": gain, "size": len(controller.gains[gain]), "field": name} for gain, name in memory.adds.items()
+        ],
+    }
