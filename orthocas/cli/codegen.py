@@ -10,14 +10,11 @@ import typer
 from orthocas.charts.chart import Chart
 from orthocas.cli.options import AsJson, ChartPath, Force, Limit, parse_one_or_all, spread_options
 from orthocas.cli.output import note, print_json, print_rows
+from orthocas.codegen.check import AgreementCheck, check_c
 from orthocas.codegen.export import LIBRARIES
 from orthocas.codegen.export import export as export_chart
-from orthocas.codegen.generate import generate_c
-from orthocas.codegen.library import GeneratedC
-from orthocas.codegen.proof import Proof, check_c
-from orthocas.control.controller import Controller
-from orthocas.control.gains import Setting
-from orthocas.control.registry import law_names, law_of
+from orthocas.codegen.generate import GeneratedC, generate_c
+from orthocas.control.controller import Controller, Setting, law_names, law_of
 from orthocas.errors import LawWarning, OptionError
 from orthocas.tools.interrupts import deferred
 
@@ -84,8 +81,8 @@ def codegen(
         law = None if controller == _NONE else build_controller(controller, loaded, settings, limit)
         generated = generate_c(loaded, out, law, name, force, single_precision=single_precision)
         remarks = [] if law is None else law.remarks()
-    proof = check_c(generated, loaded, law) if check else None
-    report = _build_report(generated, proof)
+    agreement = check_c(generated, loaded, law) if check else None
+    report = _build_report(generated, agreement)
     if json:
         print_json(report)
     else:
@@ -94,7 +91,7 @@ def codegen(
         note(remark)
 
 
-def _build_report(generated: GeneratedC, proof: Proof | None) -> dict[str, Any]:
+def _build_report(generated: GeneratedC, agreement: AgreementCheck | None) -> dict[str, Any]:
     source = generated.folder / f"{generated.name}.c"
     return {
         "name": generated.name,

@@ -37,7 +37,7 @@ from orthocas.cli.output import (
     print_rows,
     terminal_monitor,
 )
-from orthocas.control.holding import holding_doubts
+from orthocas.control.gains import find_holding_doubts
 from orthocas.errors import BranchWarning, Interrupted, InvalidValueError, OptionError
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
@@ -313,7 +313,7 @@ def _save_and_report(
     if isinstance(result, WideFit) and result.left_out:
         note(f"the chart of branch '{result.chart.notes['branch']}' leaves out {result.left_out}")
     fitted = result.chart.problem
-    for doubt in holding_doubts(fitted.robot, fitted.domain, fitted.robot.effort_limits):
+    for doubt in find_holding_doubts(fitted.robot, fitted.domain, fitted.robot.effort_limits):
         note(doubt)
     result.chart.save(target, force)
     report = evaluate(result.chart, seed=seed + 1)

@@ -14,9 +14,8 @@ from orthocas.charts.quality import evaluate
 from orthocas.cli.codegen import CONTROLLERS, add_law_options, build_controller, require_settings
 from orthocas.cli.options import AsJson, ChartPath, Force, Limit, parse_number, parse_numbers, parse_whole_number
 from orthocas.cli.output import note, print_json, print_rows, terminal_monitor
-from orthocas.control.controller import Controller, ControlStatus
+from orthocas.control.controller import Controller, ControlStatus, law_of
 from orthocas.control.reference import Reference
-from orthocas.control.registry import law_of
 from orthocas.control.safety import Safety
 from orthocas.errors import ArchiveError, Interrupted, InvalidValueError, OptionError, SingularTaskError
 from orthocas.robots.robot import Robot

@@ -1,6 +1,6 @@
 """Gains: their values and settings, the stiffness by modes of the loop, the modes, and what the motors can hold."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -36,16 +36,15 @@ STIFFNESS, DAMPING_RATIO, FEEDBACK, LIMIT = (  #: units of gains, in words
 class GainRules:
     """Numbers of gains. What the default stiffness holds: docs/measurements/control.md."""
 
-    Example:
-        >>> from orthocas.control import Setting
-        >>> Setting("Damping of the joints [N m s/rad]; default: 1.")
-        Setting(help='Damping of the joints [N m s/rad]; default: 1.', is_word=False, codegen_only=False)
-    """
-
-    help: str  #: what it is, with its unit and default
-    is_word: bool = False  #: passed on as text; otherwise it is one number, or several with commas between
-    codegen_only: bool = False  #: about inputs that simulations do not give, so `orthocas simulate` does not offer it
-    option: str = field(default="", repr=False)  #: its option of commands, if it is not named after the setting
+    frequency: float = 12 * np.pi  #: of the springs, 6 Hz [rad/s]
+    fastest: float = 36 * np.pi  #: mode, 18 Hz: stable with a delay of 6.5 ms at a damping ratio of 0.7 [rad/s]
+    feedback: float = 10.0  #: of velocity laws: 0.23 s to a tenth; no overshoot with up to 36 ms to the motion [1/s]
+    margin: float = np.pi / 6  #: 30 degrees of phase that are left to the fastest mode at a stated delay [rad]
+    samples: int = 512  #: of the domain
+    seed: int = 0  #: of the samples
+    rounds: int = 12  #: of descents for a delay
+    close: float = 1.05  #: excess of squared frequencies over a bound that is left to scaling
+    too_fast: float = 3000.0  #: weight of the squared logarithm by which a mode exceeds the fastest frequency
 
 
 RULES = GainRules()

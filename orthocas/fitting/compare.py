@@ -20,7 +20,7 @@ from orthocas.bases.registry import require_savable
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.quality import evaluate
-from orthocas.codegen.ticks import control_tick
+from orthocas.codegen.library import control_tick
 from orthocas.errors import ChartFileError, Interrupted, InvalidValueError, OrthocasError
 from orthocas.fitting.fit import fit
 from orthocas.fitting.settings import default_solver

@@ -379,7 +379,7 @@ class Prepared:
         controller = self.loop.controller
         if name == "measured":
             return Batched(controller.measured)(*arguments)
-        function = counted_function(controller, "function" if name == "command" else "energy")
+        function = get_counted_function(controller, "function" if name == "command" else "energy")
         assert function is not None
         gains = [np.tile(gain, (len(arguments[0]), 1)) for gain in controller.gains.values()]
         return Batched(function)(*arguments, *gains)
