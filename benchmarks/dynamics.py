@@ -13,7 +13,7 @@ from benchmark import run
 from c_timing import nanoseconds_per_call
 
 import orthocas as oc
-from orthocas.problems import arms
+from orthocas.problems.arms import iiwa
 
 WORDS = {
     "orthocas": "orthocas",
@@ -25,10 +25,10 @@ WORDS = {
 
 def main(quick: bool = False) -> dict[str, float]:
     """Print nanoseconds per call, medians of 9 alternating rounds in one process; `quick`: few calls of Pinocchio."""
-    robot = arms.iiwa_robot()
+    robot = iiwa.robot()
     q, dq = ca.SX.sym("q", robot.n), ca.SX.sym("dq", robot.n)
     ours = [robot.function("mass_matrix")(q), robot.function("bias")(q, dq)]
-    with arms.urdf_path() as path:
+    with iiwa.urdf_path() as path:
         peer = KinDynComputations(str(path), list(robot.joint_names))
         model = pin.buildModelFromUrdf(str(path))
     peer.set_frame_velocity_representation(adam.Representations.MIXED_REPRESENTATION)
@@ -56,7 +56,7 @@ def main(quick: bool = False) -> dict[str, float]:
 
 def _generated(folder: Path) -> str:
     """C that calls the functions of `orthocas codegen`: mass matrix, bias and gravity, with a status."""
-    chart = oc.fit(arms.iiwa(), oc.Linear()).chart
+    chart = oc.fit(iiwa.iiwa(), oc.Linear()).chart
     generated = oc.generate_c(chart, folder, None, "arm")
     return f"""
 #include "{generated.folder / "arm.c"}"

@@ -77,7 +77,7 @@ def basis_row(parametrisation: oc.Polynomial | oc.Fourier, samples: int, rounds:
         "ours": lambda: double.value_and_gradient(theta),
         "ours in 32 bits": lambda: single.value_and_gradient(theta),
     }
-    C, G = theta.reshape(problem.r, -1), build_gradients(family, 7).expand(double.X, samples)
+    C, G = theta.reshape(problem.r, -1), build_gradients(family, 7).dense(double.X, samples)
     peers = {str(dtype): basis_step(C, G, drawn.unit_task_gradients, dtype) for dtype in (torch.float64, torch.float32)}
     times = _times({**ours, **peers}, rounds)
     what = f"{parametrisation.label}, {family.width} functions"

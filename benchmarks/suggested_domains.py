@@ -75,7 +75,7 @@ def row(name: str, task: str, metric: str, degree: int, samples: int) -> str:
         return f"| {name}, {task}, {metric} | refused: {error} | | | |"
     widths = ", ".join(f"{joint.half_width:.2f} {MARKS.get(joint.reason, joint.reason)}" for joint in found.joints)
     verdicts = [evaluate_chart(found.fit.chart, 50_000, seed=100 + k) for k in range(samples // 50_000)]
-    least = min(quality.conditioning for quality in verdicts)
+    least = min(verdict.conditioning for verdict in verdicts)
     home = "bent" if found.home_source.startswith("bent") else found.home_source
     shown = f"{least:.3f}" if least > 0 else "folds"
     return f"| {name}, {task}, {metric} | {home} | {widths} | {verdicts[0].leak_deg:.2f} | {shown} |"
@@ -98,11 +98,11 @@ def row_of_many(name: str, robot: oc.Robot, task: oc.Task, home: Array) -> str:
     seconds = time.process_time() - began
     chart = found.fit.chart
     widths = [joint.half_width for joint in found.joints if joint.reason not in ("idle", "cyclic")]
-    quality = evaluate_chart(chart, 100_000, OTHER_SEED)
+    verdict = evaluate_chart(chart, 100_000, OTHER_SEED)
     least = worst_points(chart.problem, chart.coordinates, OTHER_SEED, thorough=True).least
     return (
         f"| {name} | {chart.n}, {chart.m}, {chart.r} | {seconds:.0f} | {np.exp(np.mean(np.log(widths))):.2f} "
-        f"| {quality.leak_deg:.1f} | {quality.conditioning:.2f} | {least:.2f} |"
+        f"| {verdict.leak_deg:.1f} | {verdict.conditioning:.2f} | {least:.2f} |"
     )
 
 

@@ -10,7 +10,8 @@ import typer
 from orthocas.bases import parse_parametrisation
 from orthocas.charts.chart import load
 from orthocas.cli.commands import run
-from orthocas.cli.output import AsJson, Force, parse_whole_number, print_json, print_rows, terminal_monitor
+from orthocas.cli.options import AsJson, Force, parse_whole_number
+from orthocas.cli.output import print_json, print_rows, terminal_monitor
 from orthocas.errors import InvalidValueError
 from orthocas.tools.files import open_output_folder
 

@@ -60,9 +60,10 @@ def fitted_from_grown(problem: Problem, quick: bool) -> Chart:
     points = sample_evenly(problem.domain, _sample_count(quick), 0)
     start = _cosine_of_grown(problem, family, points)
 
-    samples = evaluate_samples(problem, points)
-    objective = BasisObjective(family, samples, _WEIGHTS, start, partial(sample_problem, problem))
-    theta = GaussNewton().minimise(objective, start).require_finished().theta
+    objective = BasisObjective(
+        family, evaluate_samples(problem, points), _WEIGHTS, start, partial(sample_problem, problem)
+    )
+    theta = GaussNewton().minimise(objective, start).finished().theta
     return Chart(problem, Coordinates(series, space, (), theta, np.zeros(1), np.ones(1)))
 
 

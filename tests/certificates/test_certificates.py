@@ -316,6 +316,6 @@ def test_dask_shares_the_work() -> None:
 
 def test_the_command_names_a_missing_scheduler(tmp_path: Path) -> None:
     chart().save(tmp_path / "a.chart")
-    done = command("certify", tmp_path / "a.chart", "--scheduler", "tcp://127.0.0.1:1")
+    done = command("certify", tmp_path / "a.chart", "--workers", "tcp://127.0.0.1:1")
     assert done.exit_code != 0
     assert isinstance(done.exception, SchedulerError)

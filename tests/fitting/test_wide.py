@@ -22,7 +22,7 @@ from orthocas.bases.family import JointSpace, LinearFamily, component_gradients
 from orthocas.bases.given import sew_angle
 from orthocas.charts.certificate import PROVED
 from orthocas.charts.coordinates import Coordinates
-from orthocas.cli.fit import _rows
+from orthocas.cli.fit import _format_fit
 from orthocas.cli.output import format_report_rows
 from orthocas.codegen import check_c
 from orthocas.errors import (
@@ -652,24 +652,22 @@ def test_command_fits_a_branch(run: Run) -> None:
         "iiwa",
         "--task",
         "pose",
-        "--domain",
-        "branch",
         "--param",
         "polynomial:3:cyclic=A1,A7",
         "--out",
         "a",
     )
-    code, out, err = run(*words, "--branch", "shoulder+ elbow- wrist+", "--samples", "3000", "--json")
+    code, out, err = run(*words, "--domain", "branch:shoulder+ elbow- wrist+", "--samples", "3000", "--json")
     assert (code, err) == (0, "")
     assert json.loads(out)["branch"] == "shoulder+ elbow- wrist+"
-    code, out, _ = run(*words, "--branch", "shoulder+ elbow- wrist+", "--samples", "3000", "--force")
+    code, out, _ = run(*words, "--domain", "branch:shoulder+ elbow- wrist+", "--samples", "3000", "--force")
     assert code == 0
     assert ": xi1, like swivel at home [rad]" in out
-    assert run(*words, "--solver", "lbfgs")[::2] == (
-        2,
-        "orthocas: --domain branch has a solver of its own: leave out --solver\n",
-    )
-    assert run("fit", "iiwa", "--branch", "up")[::2] == (2, "orthocas: --branch requires --domain branch\n")
+    for option, value in (("--solver", "lbfgs"), ("--weights", "1,1"), ("--angles", "paper")):
+        message = f"orthocas: --domain branch has a solver and a loss of its own: leave out {option}\n"
+        assert run(*words, "--domain", "branch", option, value)[::2] == (2, message)
+    message = "orthocas: no such option: --branch; the branch is named by --domain branch:NAME\n"
+    assert run("fit", "iiwa", "--branch", "up")[::2] == (2, message)
 
 
 def test_command_notes_what_a_chart_leaves_out_of_its_branch(run: Run) -> None:
@@ -690,7 +688,7 @@ def test_command_notes_what_a_chart_leaves_out_of_its_branch(run: Run) -> None:
 def test_command_gives_no_advice_that_wide_fits_refuse() -> None:
     uneven = replace(oc.evaluate(wide_plane().chart, 500), length_ratio=50.0)
     assert "--weights" in format_report_rows(uneven)["lengths"]
-    assert "--weights" not in _rows(wide_plane(), uneven, Path("a.orthocas"))["lengths"]
+    assert "--weights" not in _format_fit(wide_plane(), uneven, Path("a.orthocas"))["lengths"]
 
 
 @pytest.mark.slow

@@ -63,7 +63,6 @@ def _searches() -> dict[str, Call]:
                 "parametrisation": oc.Polynomial(1),
                 "home": q,
                 "like": None,
-                "weights": {"length": 0.1},
                 "samples": 100,
                 "seed": 0,
             },

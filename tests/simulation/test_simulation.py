@@ -16,7 +16,12 @@ from orthocas.control import ControlStatus, Impedance, Kinematic, PDPlus, Refere
 from orthocas.errors import InvalidValueError
 from orthocas.problems.arms import urdf_path
 from orthocas.robots.pinocchio_model import build_planar
-from orthocas.simulation import Outcome, coupling_index, simulate, task_acceleration_breakdown
+from orthocas.simulation import (
+    Outcome,
+    coupling_index,
+    simulate,
+    task_acceleration_breakdown,
+)
 from orthocas.tools.checks import Array
 
 
