@@ -8,7 +8,7 @@ import numpy as np
 from benchmark import run
 from c_timing import nanoseconds_per_call
 
-from orthocas.fitting.residuals import Loss, loss_with_slopes
+from orthocas.fitting.loss import Loss, build_loss_with_slopes
 from orthocas.fitting.terms import Sizes, Weights
 from orthocas.tools.columns import COLUMNS
 
@@ -21,7 +21,7 @@ def main(quick: bool = False) -> dict[str, float]:
     J, data = loss.arguments()
     value = ca.sumsqr(loss.residuals(J, data)) / 2
     compiled = ca.Function("loss", [J, *data], ca.cse([value, ca.densify(ca.gradient(value, J))]))
-    columns, rng = loss_with_slopes(loss), np.random.default_rng(0)
+    columns, rng = build_loss_with_slopes(loss), np.random.default_rng(0)
     inputs = [rng.normal(size=(BLOCKS, compiled.numel_in(i), COLUMNS)) for i in range(compiled.n_in())]
     columns(*inputs)
     times = []

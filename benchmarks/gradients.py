@@ -18,9 +18,9 @@ from torch_loss import WEIGHTS, Step, basis_step, network_step
 import orthocas as oc
 from orthocas import problems
 from orthocas.bases import JointSpace, LinearFamily
-from orthocas.fitting.basis_gradients import gradients_of
+from orthocas.fitting.basis_gradients import build_gradients
 from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.fitting.dense_objectives import ArrayObjective
+from orthocas.fitting.network_objective import ArrayObjective
 from orthocas.fitting.terms import Weights
 from orthocas.tasks.samples import sample_problem
 from orthocas.tools.batch import one_blas_thread
@@ -70,14 +70,14 @@ def basis_row(parametrisation: oc.Polynomial | oc.Fourier, samples: int, rounds:
     drawn, theta = sample_problem(problem, samples, 0), family.initial(0)
     weights, kinds = Weights.of(WEIGHTS), (np.float64, np.float32)
     double, single = (
-        BasisObjective(family, drawn, weights, theta, lambda *_: drawn, gradients=gradients_of(family, 7, kind))
+        BasisObjective(family, drawn, weights, theta, lambda *_: drawn, gradients=build_gradients(family, 7, kind))
         for kind in kinds
     )
     ours = {
         "ours": lambda: double.value_and_gradient(theta),
         "ours in 32 bits": lambda: single.value_and_gradient(theta),
     }
-    C, G = theta.reshape(problem.r, -1), gradients_of(family, 7).dense(double.X, samples)
+    C, G = theta.reshape(problem.r, -1), build_gradients(family, 7).dense(double.X, samples)
     peers = {str(dtype): basis_step(C, G, drawn.unit_task_gradients, dtype) for dtype in (torch.float64, torch.float32)}
     times = _times({**ours, **peers}, rounds)
     what = f"{parametrisation.label}, {family.width} functions"

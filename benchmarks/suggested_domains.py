@@ -16,7 +16,7 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.charts.point_quality import worst_points
 from orthocas.errors import DomainError
-from orthocas.fitting.probe import judged_chart
+from orthocas.fitting.probe import evaluate_chart
 from orthocas.tools.checks import Array
 
 CASES = (  # robot, task, metric
@@ -74,7 +74,7 @@ def row(name: str, task: str, metric: str, degree: int, samples: int) -> str:
     except DomainError as error:
         return f"| {name}, {task}, {metric} | refused: {error} | | | |"
     widths = ", ".join(f"{joint.half_width:.2f} {MARKS.get(joint.reason, joint.reason)}" for joint in found.joints)
-    verdicts = [judged_chart(found.fit.chart, 50_000, seed=100 + k) for k in range(samples // 50_000)]
+    verdicts = [evaluate_chart(found.fit.chart, 50_000, seed=100 + k) for k in range(samples // 50_000)]
     least = min(verdict.conditioning for verdict in verdicts)
     home = "bent" if found.home_source.startswith("bent") else found.home_source
     shown = f"{least:.3f}" if least > 0 else "folds"
@@ -98,7 +98,7 @@ def row_of_many(name: str, robot: oc.Robot, task: oc.Task, home: Array) -> str:
     seconds = time.process_time() - began
     chart = found.fit.chart
     widths = [joint.half_width for joint in found.joints if joint.reason not in ("idle", "cyclic")]
-    verdict = judged_chart(chart, 100_000, OTHER_SEED)
+    verdict = evaluate_chart(chart, 100_000, OTHER_SEED)
     least = worst_points(chart.problem, chart.coordinates, OTHER_SEED, thorough=True).least
     return (
         f"| {name} | {chart.n}, {chart.m}, {chart.r} | {seconds:.0f} | {np.exp(np.mean(np.log(widths))):.2f} "

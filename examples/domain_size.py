@@ -19,7 +19,7 @@ from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.fitting.probe import judged_chart
+from orthocas.fitting.probe import evaluate_chart
 
 HALF_WIDTHS_DEG = (5, 10, 15, 20, 30, 37, 45, 52, 59)  # A4 meets its limit at 59.8 degrees
 DEGREES = (3, 4, 5)
@@ -84,7 +84,7 @@ def measured(half_width_deg: float, degree: int, samples: int) -> Row:
         angle_in_metric(chart, samples),
         report.task_angle.std,
         report.mutual_angle.std,
-        judged_chart(chart, 3 * samples, seed=1).conditioning,
+        evaluate_chart(chart, 3 * samples, seed=1).conditioning,
         oc.involutivity(problem).expected_angle_deg,
     )
 

@@ -6,7 +6,7 @@ Reproduces [AS2023] Sec. 9 and Fig. 27 with polynomials instead of a network.
 import argparse
 from pathlib import Path
 
-from orthocas.cli.demo import made
+from orthocas.cli.compare import fit_demo
 
 
 def main(out: Path, quick: bool = False) -> dict[str, float]:
@@ -16,7 +16,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
         out: folder for chart and pictures.
         quick: degree 3 and few samples.
     """
-    fit, found = made(out, quick)
+    fit, found = fit_demo(out, quick)
     reach = fit.chart.xi_range(fit.chart.problem.domain.centre)
     return found | {f"{one.label} {end}": getattr(one, end) for one in reach for end in ("low", "high")}
 

@@ -21,7 +21,7 @@ from orthocas.charts import Card, Model
 from orthocas.charts.chart_file import fingerprint
 from orthocas.charts.self_motion import fan_along
 from orthocas.tools.display import percent
-from orthocas.viewer.looks import urdf_look
+from orthocas.viewer.looks import read_urdf_look
 
 ROOT = Path(__file__).parent.parent
 DATA = ROOT / "orthocas" / "charts" / "data"
@@ -188,7 +188,7 @@ def draw(name: str, data: Path, path: Path) -> None:
     """Draw the arm along the coordinate that moves it farthest."""
     chart, file = oc.load(data / f"{name}.orthocas"), ARMS[RECIPES[name][0]].path
     robot, centre = chart.problem.robot, chart.problem.domain.centre
-    look = None if file is None else urdf_look(file, robot.tree).look
+    look = None if file is None else read_urdf_look(file, robot.tree).look
     curve = fan_along(chart, centre, widest_coordinate(chart, centre)).spread(POSTURES)
     save_trimmed(fan_picture(robot, centre, curve, WIDTH, HEIGHT, look), path)
 

@@ -11,7 +11,17 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.self_motion import fan_along
 from orthocas.robots.robot import Robot
 from orthocas.tools.checks import Array, Indices
-from orthocas.viewer.looks import SHELL, BodyPoses, Colour, Look, Solid, capsule, chain_length, shades, stick_arm
+from orthocas.viewer.looks import (
+    RULES,
+    BodyPoses,
+    Colour,
+    Look,
+    Solid,
+    build_capsule,
+    build_stick_arm,
+    compute_chain_length,
+    compute_shades,
+)
 
 _SAMPLES = 2  # per pixel and axis
 _MOST = 2_000_000  # candidates of pixels that are looked at together
@@ -189,14 +199,14 @@ def fan_picture(robot: Robot, q: Array, curve: Array, width: int, height: int, l
         curve: joint positions (N, n), at even distances.
         width: of the picture, in pixels.
         height: of the picture, in pixels.
-        look: what the bodies carry, see `urdf_look`. Default: rods and drums.
+        look: what the bodies carry, see `read_urdf_look`. Default: rods and drums.
     """
-    solids = stick_arm(robot.tree) if look is None else look
+    solids = build_stick_arm(robot.tree) if look is None else look
     poses = BodyPoses(robot.tree)
     place = _placed(poses, q)
     layers = [Layer([*_arm(solids, place), *_trace(robot, curve)], above=True)]
     shown = curve[np.round(np.linspace(0, len(curve) - 1, GHOSTS)).astype(int)]
-    for posture, colour in zip(shown, shades(GHOSTS), strict=True):
+    for posture, colour in zip(shown, compute_shades(GHOSTS), strict=True):
         there = _placed(poses, posture)
         moving = [body if _differ(one, other) else [] for body, one, other in zip(solids, place, there, strict=True)]
         layers.append(Layer(_tinted(_arm(moving, there), tuple(colour.tolist())), _OPACITY))
@@ -222,14 +232,14 @@ def _differ(one: tuple[Array, Array], other: tuple[Array, Array]) -> bool:
 
 
 def _arm(look: Look, places: Sequence[tuple[Array, Array]]) -> list[Solid]:
-    return [solid.moved(*place) for solids, place in zip(look, places, strict=True) for solid in solids]
+    return [solid.move(*place) for solids, place in zip(look, places, strict=True) for solid in solids]
 
 
 def _tinted(solids: Sequence[Solid], colour: Colour) -> list[Solid]:
     """Solids in shades of one colour: dark ones stay darker."""
     found = []
     for solid in solids:
-        share = _DIM + (1 - _DIM) * min(sum(solid.colour) / sum(SHELL), 1.0)
+        share = _DIM + (1 - _DIM) * min(sum(solid.colour) / sum(RULES.shell), 1.0)
         red, green, blue = (round(share * part) for part in colour)
         found.append(replace(solid, colour=(red, green, blue)))
     return found
@@ -239,10 +249,10 @@ def _trace(robot: Robot, curve: Array) -> list[Solid]:
     """The path of the joint that moves farthest."""
     points = robot.joint_points(curve)  # (N, points, 3)
     way = points[:, int(np.argmax(np.ptp(points, axis=0).max(axis=1)))]
-    radius = _TRACE * chain_length(robot.tree)
-    colours = shades(len(way) - 1).tolist()
+    radius = _TRACE * compute_chain_length(robot.tree)
+    colours = compute_shades(len(way) - 1).tolist()
     return [
-        capsule(start, end, (radius, radius), tuple(colour), 8)
+        build_capsule(start, end, (radius, radius), tuple(colour), 8)
         for start, end, colour in zip(way[:-1], way[1:], colours, strict=True)
     ]
 

@@ -9,7 +9,7 @@ from PIL import Image
 from rendering import Picture, fan_picture
 
 import orthocas as oc
-from orthocas.viewer.looks import urdf_look
+from orthocas.viewer.looks import read_urdf_look
 
 POSTURE = (0.0, -0.5, 0.0, -2.2, 0.0, 1.7, np.pi / 4)  #: of the solid arm [rad]
 WIDTH, HEIGHT, MARGIN = 1000, 780, 16  #: [pixels]
@@ -35,7 +35,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     motion = chart.self_motion(q)
     curve = motion.q[np.round(np.linspace(0, len(motion.q) - 1, POSTURES)).astype(int)]
     size = (WIDTH // 4, HEIGHT // 4) if quick else (WIDTH, HEIGHT)
-    look = None if quick else urdf_look(file, robot.tree).look
+    look = None if quick else read_urdf_look(file, robot.tree).look
     picture = fan_picture(robot, q, curve, *size, look)
     save_trimmed(picture, out / "self_motion.png")
     elbows = robot.joint_points(curve)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from self_motion_picture import POSTURE, robot_file
 
 import orthocas as oc
-from orthocas.viewer.looks import BodyPoses, Look, Solid, capsule, stick_arm, urdf_look
+from orthocas.viewer.looks import BodyPoses, Look, Solid, build_capsule, build_stick_arm, read_urdf_look
 
 RADIUS, LOOPS, STEPS = 0.1, 4, 400  #: of the circle [m]; circles; steps of each
 SWING, LOOP, PAUSE = 36, 16, 8  #: pictures of the swing, of each circle, and at rest after it
@@ -39,9 +39,9 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     chart = oc.charts.load("panda-wide")
     q, robot = np.array(POSTURE), chart.problem.robot
     swung, held, drifted = swing(chart, q), circles(chart, q), least_norm(chart, q)
-    look = stick_arm(robot.tree)
+    look = build_stick_arm(robot.tree)
     if not quick:
-        look = urdf_look(robot_file("panda_description/urdf/panda.urdf"), robot.tree).look
+        look = read_urdf_look(robot_file("panda_description/urdf/panda.urdf"), robot.tree).look
     draw(out / "wide_chart.gif", robot, look, swung, held, drifted, 8 if quick else 1)
     return {
         "hand_moves": float(np.abs(chart.task(swung) - chart.task(q)).max()),
@@ -130,7 +130,7 @@ def panel(
     robot: oc.Robot, look: Look, q: np.ndarray, start: np.ndarray, hand: np.ndarray, size: tuple[int, int]
 ) -> np.ndarray:
     """The arm at q, a ghost of it at the start, and the circle of the hand."""
-    ring = [capsule(a, b, (0.004, 0.004), TRACE, 6) for a, b in zip(hand[:-10:10], hand[10::10], strict=True)]
+    ring = [build_capsule(a, b, (0.004, 0.004), TRACE, 6) for a, b in zip(hand[:-10:10], hand[10::10], strict=True)]
     layers = [Layer([*placed(robot, look, q), *ring]), Layer(placed(robot, look, start), 0.25)]
     return on_white(render(layers, CAMERA, *size))
 
@@ -140,7 +140,7 @@ def placed(robot: oc.Robot, look: Look, q: np.ndarray) -> list[Solid]:
     positions, quaternions = BodyPoses(robot.tree)(q[None])
     turns = Rotation.from_quat(quaternions[0], scalar_first=True).as_matrix()
     places = zip(look, turns, positions[0], strict=True)
-    return [solid.moved(turn, place) for solids, turn, place in places for solid in solids]
+    return [solid.move(turn, place) for solids, turn, place in places for solid in solids]
 
 
 def captioned(panels: list[np.ndarray], words: list[str]) -> Image.Image:

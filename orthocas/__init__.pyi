@@ -12,11 +12,11 @@ from orthocas import simulation as simulation
 from orthocas import solvers as solvers
 from orthocas import viewer as viewer
 from orthocas.bases.circle import Circle as Circle
+from orthocas.bases.cyclic import Mobile as Mobile
 from orthocas.bases.cyclic import cyclic_joints as cyclic_joints
 from orthocas.bases.given import SEW as SEW
 from orthocas.bases.given import Given as Given
 from orthocas.bases.mlp import MLP as MLP
-from orthocas.bases.mobile import Mobile as Mobile
 from orthocas.bases.products import Fourier as Fourier
 from orthocas.bases.products import Linear as Linear
 from orthocas.bases.products import Polynomial as Polynomial
@@ -49,8 +49,8 @@ from orthocas.fitting.compare import compare as compare
 from orthocas.fitting.distil import distil as distil
 from orthocas.fitting.fit import Fit as Fit
 from orthocas.fitting.fit import fit as fit
+from orthocas.fitting.loss import loss as loss
 from orthocas.fitting.suggest_domain import suggest_domain as suggest_domain
-from orthocas.fitting.symbolic_loss import loss as loss
 from orthocas.fitting.terms import Weights as Weights
 from orthocas.fitting.terms import register_loss_term as register_loss_term
 from orthocas.fitting.wide import WideFit as WideFit

@@ -1,6 +1,6 @@
 """Run the command line with `python -m orthocas`."""
 
-from orthocas.cli.entry import main
+from orthocas.cli import main
 
 if __name__ == "__main__":
     main()

@@ -2,17 +2,17 @@
 
 from collections.abc import Callable
 
-from orthocas.problems import iiwa, planar, propellers
+from orthocas.problems import arms, propellers
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import require_known
 
 __all__ = ["get", "names"]
 
 _PROBLEMS: dict[str, Callable[[], Problem]] = {
-    "planar_2r": planar.planar_2r,
-    "planar_3r_x": planar.planar_3r_x,
-    "planar_3r_xy": planar.planar_3r_xy,
-    "iiwa": iiwa.iiwa,
+    "planar_2r": arms.planar_2r,
+    "planar_3r_x": arms.planar_3r_x,
+    "planar_3r_xy": arms.planar_3r_xy,
+    "iiwa": arms.iiwa,
     "hexarotor": propellers.hexarotor,
 }
 

@@ -6,12 +6,9 @@ from itertools import repeat
 
 import numpy as np
 
-from orthocas.solvers.protocol import BestPoint, Objective, SampledObjective, SolveResult, Status
+from orthocas.solvers.protocol import RULES, BestPoint, Objective, SampledObjective, SolveResult, Status
 from orthocas.tools.checks import Array, require_at_least, require_count
 from orthocas.tools.progress import UNWATCHED, Watch
-
-_MOMENT, _SQUARE, _SMALL = 0.9, 0.999, 1e-8  # the usual constants of [KB2015]
-_PART = 2**14  # parameters at a time, which stay in the cache
 
 
 @dataclass(frozen=True)
@@ -84,14 +81,14 @@ class _Run:
         """Take step k = 0, 1, ..., counted over all epochs."""
         total = self.settings.epochs * self.settings.steps
         rate = self.settings.learning_rate * 0.5 * (1 + np.cos(np.pi * k / total))
-        for start in range(0, len(gradient), _PART):
+        for start in range(0, len(gradient), RULES.part):
             theta, mean, square, slope = (
-                array[start : start + _PART] for array in (self.theta, self.mean, self.square, gradient)
+                array[start : start + RULES.part] for array in (self.theta, self.mean, self.square, gradient)
             )
-            mean += (1 - _MOMENT) * (slope - mean)
-            square += (1 - _SQUARE) * (slope**2 - square)
-            unbiased = np.sqrt(square / (1 - _SQUARE ** (k + 1))) + _SMALL
-            theta -= rate / (1 - _MOMENT ** (k + 1)) * mean / unbiased
+            mean += (1 - RULES.moment) * (slope - mean)
+            square += (1 - RULES.square) * (slope**2 - square)
+            unbiased = np.sqrt(square / (1 - RULES.square ** (k + 1))) + RULES.small
+            theta -= rate / (1 - RULES.moment ** (k + 1)) * mean / unbiased
 
     def _evaluate(self) -> bool:
         """Evaluate the loss on the fixed samples, and return whether it is finite."""

@@ -6,11 +6,9 @@ import numpy as np
 import scipy
 
 from orthocas.errors import InvalidValueError
-from orthocas.solvers.protocol import BestPoint, LeastSquaresObjective, Objective, SolveResult, Status
+from orthocas.solvers.protocol import RULES, BestPoint, LeastSquaresObjective, Objective, SolveResult, Status
 from orthocas.tools.checks import Array, require_at_least, require_count
 from orthocas.tools.progress import UNWATCHED, Watch
-
-_MAX_REJECTIONS = 16  # the damping may grow from its least to 400
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,8 @@ class _Run:
         self.settings, self.objective = settings, objective
         self.best = BestPoint(objective, theta0, watch)
         self.damping = 1e-3
-        self._gained_little = False  # in the last step
+        # in the last step
+        self._gained_little = False
 
     def iterate(self) -> Status:
         best = self.best
@@ -71,7 +70,8 @@ class _Run:
             damping = self.damping
             if not self._step(gradient, H):
                 return Status.STALLED if np.any(gradient) else Status.CONVERGED
-            cautious = self.damping > damping  # a step after rejections is short: a small gain is no convergence
+            # a step after rejections is short: a small gain is no convergence
+            cautious = self.damping > damping
             little = not cautious and before - best.value <= self.settings.tolerance * before
             converged, self._gained_little = little and self._gained_little, little
             best.next_iteration(self.settings.max_iterations)
@@ -83,11 +83,11 @@ class _Run:
         """Try steps with growing damping until the loss falls, and return whether it fell."""
         diagonal = H.diagonal()
         scale = np.maximum(diagonal, 1e-3 * diagonal.mean())
-        for _ in range(_MAX_REJECTIONS):
+        for _ in range(RULES.most_rejections):
             damped = H.copy()
             damped[np.diag_indices_from(H)] += self.damping * scale
             try:
-                candidate = self.best.theta - _solved(damped, gradient)
+                candidate = self.best.theta - _solve(damped, gradient)
             except np.linalg.LinAlgError:
                 self.damping *= 10
                 continue
@@ -99,7 +99,7 @@ class _Run:
         return False
 
 
-def _solved(H: Array, gradient: Array) -> Array:
+def _solve(H: Array, gradient: Array) -> Array:
     """H^-1 gradient: by Cholesky, or by LU where rounding in single precision has left H indefinite."""
     try:
         return np.asarray(scipy.linalg.cho_solve(scipy.linalg.cho_factor(H), gradient), dtype=float)

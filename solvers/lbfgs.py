@@ -7,12 +7,10 @@ import numpy as np
 import scipy
 
 from orthocas.errors import InvalidValueError, SolveError
-from orthocas.solvers.protocol import BestPoint, EstimatedObjective, Objective, SolveResult, Status
+from orthocas.solvers.protocol import RULES, BestPoint, EstimatedObjective, Objective, SolveResult, Status
 from orthocas.tools.checks import Array, require_at_least, require_count
 from orthocas.tools.progress import UNWATCHED, Watch
 
-_DAMPING = 3e-3  # of the diagonal of the Gauss-Newton matrix
-_RENEWED = 0.8  # share of the loss at the last matrix below which a new one is worth its time
 _STATUS = {0: Status.CONVERGED, 1: Status.ITERATION_LIMIT}  # of SciPy
 
 
@@ -144,7 +142,7 @@ class QuasiNewton(LBFGS):
             little = before - value <= self.tolerance * before
             gained_little, converged = little, little and gained_little
             best.next_iteration(self.max_iterations)
-            if converged or value < _RENEWED * height:
+            if converged or value < RULES.renewal * height:
                 raise StopIteration
 
         left = self.max_iterations - best.iterations
@@ -153,7 +151,7 @@ class QuasiNewton(LBFGS):
             return Status.CONVERGED
         if best.iterations == self.max_iterations:
             return Status.ITERATION_LIMIT
-        return None if value < _RENEWED * height else status
+        return None if value < RULES.renewal * height else status
 
 
 class _Finite:
@@ -193,7 +191,7 @@ def _factor(H: Array) -> Array:
     """
     diagonal = H.diagonal()
     scale = np.maximum(diagonal, 1e-3 * diagonal.mean())
-    damping = _DAMPING
+    damping = RULES.damping
     while True:
         damped = H + np.diag(damping * scale)
         if not np.isfinite(damped).all():

@@ -14,6 +14,29 @@ from orthocas.tools.interrupts import check_remembered
 from orthocas.tools.progress import UNWATCHED, Watch
 
 
+@dataclass(frozen=True, slots=True)
+class SolverRules:
+    """Numbers of the solvers."""
+
+    moment: float = 0.9  #: decay of Adam's mean gradient [KB2015]
+    square: float = 0.999  #: decay of its mean square
+    small: float = 1e-8  #: added to the root of it
+    part: int = 2**14  #: parameters that Adam moves at a time, which stay in the cache
+    most_rejections: int = 16  #: of a Gauss-Newton step: the damping may grow from its least to 400
+    damping: float = 3e-3  #: of the matrix of QuasiNewton, relative to its diagonal
+    renewal: float = 0.8  #: fraction of the loss at the last matrix below which a new one is worth its time
+    exact_hessian: int = 1500  #: largest number of parameters for exact, dense Hessians in Ipopt
+    barrier: float = 1e-4  #: of Ipopt: starts are good, a stronger one would push away from them into worse minima
+    feasible: float = 1e-6  #: constraint violations up to this size count as zero
+    difference: float = 1e-7  #: step of finite differences of the gradient flow, relative to theta
+    first_interval: float = 1e-3  #: of the flow's time, in units of |theta0| / |grad L|
+    moved: float = 0.03  #: relative change of theta after which a Jacobian of the flow is out of date
+    most_uses: int = 10  #: of a Jacobian, so that Newton's method gets a new one where it does not converge
+
+
+RULES = SolverRules()
+
+
 class Objective(Protocol):
     """A smooth function of theta."""
 
@@ -102,7 +125,7 @@ class SolveResult:
     evaluations: int
     seconds: float
 
-    def finished(self) -> "SolveResult":
+    def require_finished(self) -> "SolveResult":
         """The result, for callers that cannot use an unfinished one: raises KeyboardInterrupt if Ctrl-C ended it.
 
         Raises:

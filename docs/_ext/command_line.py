@@ -10,7 +10,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 from typer.main import get_command
 
-from orthocas.cli.commands import COMMANDS, app_for
+from orthocas.cli.commands import COMMANDS, build_app
 
 OPTION = re.compile(r"(--[a-z][a-z-]*)")
 
@@ -53,7 +53,7 @@ class CommandLine(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """Called by Sphinx for the directive."""
-        program = get_command(app_for(list(COMMANDS)))
+        program = get_command(build_app(list(COMMANDS)))
         texts = [described(name, command) for name, command in leaves(program, "orthocas")]
         return self.parse_text_to_nodes("\n".join(texts), allow_section_headings=True)
 

@@ -10,7 +10,8 @@ import typer
 from orthocas.bases import parse_parametrisation
 from orthocas.charts.chart import load
 from orthocas.cli.commands import run
-from orthocas.cli.output import AsJson, Force, print_json, print_rows, terminal_monitor, whole_number
+from orthocas.cli.options import AsJson, Force, parse_whole_number
+from orthocas.cli.output import print_json, print_rows, terminal_monitor
 from orthocas.errors import InvalidValueError
 from orthocas.tools.files import open_output_folder
 
@@ -26,7 +27,7 @@ def paper(
         str | None,
         typer.Option("--param", help="Parametrisation for figures of a fit, such as mlp:64x64 or polynomial:6."),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", parser=whole_number, help="Seed for figures of a fit.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", parser=parse_whole_number, help="Seed for figures of a fit.")] = 0,
     log: Annotated[
         Path | None, typer.Option("--log", help="CSV file of logged joint positions, for fig28; see docs/paper.md.")
     ] = None,

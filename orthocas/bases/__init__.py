@@ -1,7 +1,7 @@
 """Parametrisations xi_theta(q): linear, polynomial, Fourier, MLP, closed forms, and your own."""
 
 from orthocas.bases.circle import Circle
-from orthocas.bases.cyclic import cyclic_joints
+from orthocas.bases.cyclic import Mobile, cyclic_joints
 from orthocas.bases.family import (
     ArrayFamily,
     BasisFamily,
@@ -20,7 +20,6 @@ from orthocas.bases.family import (
 )
 from orthocas.bases.given import SEW, Given
 from orthocas.bases.mlp import MLP
-from orthocas.bases.mobile import Mobile
 from orthocas.bases.products import Fourier, Linear, Polynomial, ProductFamily, Term
 from orthocas.bases.registry import (
     parametrisation_from_data,

@@ -123,14 +123,14 @@ class CircleFamily:
     def reordered(self, theta: Array, order: Sequence[int]) -> Array:
         """Parameters of the coordinates in another order, (size,)."""
         pick, none = np.eye(self.outputs)[list(order)], np.zeros((self.outputs, self.outputs))
-        return self._combined(theta, np.block([[pick, none], [none, pick]]))
+        return self._combine(theta, np.block([[pick, none], [none, pick]]))
 
     def turned(self, theta: Array, angles: Array) -> Array:
         """Parameters of xi - angles, (size,): every pair is turned back by its angle (r,) [rad]."""
         c, s = np.diag(np.cos(angles)), np.diag(np.sin(angles))
-        return self._combined(theta, np.block([[c, s], [-s, c]]))
+        return self._combine(theta, np.block([[c, s], [-s, c]]))
 
-    def _combined(self, theta: Array, B: Array) -> Array:
+    def _combine(self, theta: Array, B: Array) -> Array:
         """Parameters of the pairs B (u, v), for a matrix B (2 r, 2 r)."""
         own, rest = theta[: self.pairs.size], theta[self.pairs.size :]
         assert isinstance(self.pairs, CombinableFamily)

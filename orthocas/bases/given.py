@@ -18,7 +18,6 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_count, require_known, require_shape, require_text
 from orthocas.tools.expressions import Tape, build_expression, replay, require_tape, write_tape
 
-_MOST_JOINTS = 1000
 SEWKind = Literal["conventional", "stereographic"]
 SEW_KINDS: tuple[SEWKind, ...] = ("conventional", "stereographic")
 # (e_t, e_r) in the world. The singular half-line e_t points down into the base. With e_r = -x, an arm that reaches
@@ -27,8 +26,18 @@ _DIRECTIONS = {
     "conventional": ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
     "stereographic": ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0)),
 }
-_MEETING = 1e-5  # axes closer than this meet [m]
-_PARALLEL = 1e-6  # axes at a smaller angle are parallel [rad]
+
+
+@dataclass(frozen=True, slots=True)
+class GivenRules:
+    """Numbers of given coordinates and of the angle of the elbow."""
+
+    most_joints: int = 1000  #: of a function without a robot
+    meeting: float = 1e-5  #: axes closer than this meet [m]
+    parallel: float = 1e-6  #: axes at a smaller angle are parallel [rad]
+
+
+RULES = GivenRules()
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +77,7 @@ class Given:
             >>> chart.labels
             ('x', 'y', 'xi1')
         """
-        q = ca.SX.sym("q", require_count("n", n, most=_MOST_JOINTS))
+        q = ca.SX.sym("q", require_count("n", n, most=RULES.most_joints))
         xi = build_expression(f"coordinates '{name}'", function, q)
         require_shape(f"coordinates '{name}'", xi.shape, (None, 1))
         return cls(name, n, write_tape(dense_function("xi", [q], [xi])))
@@ -159,15 +168,15 @@ def sew_angle(robot: Robot, kind: str) -> ca.Function:
     """
     require_known("SEW angle", kind, SEW_KINDS)
     _require_seven_revolute(robot.tree)
-    shoulder, elbow, wrist = _heights(robot.tree)
+    shoulder, elbow, wrist = _find_heights(robot.tree)
     q = ca.SX.sym("q", robot.n)
     poses = build_body_poses(robot.tree, q)
-    S, E, W = _on_axis(poses[0], shoulder), _on_axis(poses[3], elbow), _on_axis(poses[4], wrist)
+    S, E, W = _project_on_axis(poses[0], shoulder), _project_on_axis(poses[3], elbow), _project_on_axis(poses[4], wrist)
     e_t, e_r = (ca.SX(ca.DM(direction)) for direction in _DIRECTIONS[kind])
-    return dense_function("sew_angle", [q], [_angle(E - S, W - S, e_t, e_r)])
+    return dense_function("sew_angle", [q], [_compute_angle(E - S, W - S, e_t, e_r)])
 
 
-def _angle(p_SE: ca.SX, p_SW: ca.SX, e_t: ca.SX, e_r: ca.SX) -> ca.SX:
+def _compute_angle(p_SE: ca.SX, p_SW: ca.SX, e_t: ca.SX, e_r: ca.SX) -> ca.SX:
     """psi of columns (3, 1). atan2 needs no unit k_x."""
     e_SW = p_SW / ca.norm_2(p_SW)
     k_r = ca.cross(e_SW - e_t, e_r)
@@ -175,42 +184,43 @@ def _angle(p_SE: ca.SX, p_SW: ca.SX, e_t: ca.SX, e_r: ca.SX) -> ca.SX:
     return ca.atan2(ca.dot(e_SW, ca.cross(k_x, p_SE)), ca.dot(k_x, p_SE))
 
 
-def _on_axis(pose: Pose, height: float) -> ca.SX:
+def _project_on_axis(pose: Pose, height: float) -> ca.SX:
     """The point of a joint's axis (z of its body) at a height above the body's origin, (3, 1) in the world."""
     R, p = pose
     return p + R[:, 2] * height
 
 
-def _heights(tree: KinematicTree) -> tuple[float, float, float]:
+def _find_heights(tree: KinematicTree) -> tuple[float, float, float]:
     """Heights [m] of S on axis 1, of E on axis 4 and of W on axis 5, above the origins of bodies 1, 4 and 5.
 
     The heights do not depend on q, because neighbouring axes are fixed to each other: S is fixed in the base and in
     bodies 1 to 3, E in bodies 3 and 4, and W in bodies 4 to 6.
     """
     names = tree.joint_names
-    shoulder, on_2, gap_12 = _common_normal(tree, 0)
-    also_on_2, _, gap_23 = _common_normal(tree, 1)
-    _, elbow, _ = _common_normal(tree, 2)
-    wrist, _, gap_56 = _common_normal(tree, 4)
+    shoulder, on_2, gap_12 = _find_common_normal(tree, 0)
+    also_on_2, _, gap_23 = _find_common_normal(tree, 1)
+    _, elbow, _ = _find_common_normal(tree, 2)
+    wrist, _, gap_56 = _find_common_normal(tree, 4)
     for first, gap in ((0, gap_12), (1, gap_23), (4, gap_56)):
-        if gap > _MEETING:
+        if gap > RULES.meeting:
             raise RobotError(
                 f"the axes of joints '{names[first]}' and '{names[first + 1]}' are {gap:.3g} m apart, "
-                f"expected axes that meet within {_MEETING:g} m"
+                f"expected axes that meet within {RULES.meeting:g} m"
             )
-    if abs(on_2 - also_on_2) > _MEETING:
+    if abs(on_2 - also_on_2) > RULES.meeting:
         raise RobotError(
             f"the axes of joints '{names[0]}' and '{names[2]}' meet that of '{names[1]}' at points "
-            f"{abs(on_2 - also_on_2):.3g} m apart, expected one point within {_MEETING:g} m"
+            f"{abs(on_2 - also_on_2):.3g} m apart, expected one point within {RULES.meeting:g} m"
         )
     return shoulder, elbow, wrist
 
 
-def _common_normal(tree: KinematicTree, i: int) -> tuple[float, float, float]:
+def _find_common_normal(tree: KinematicTree, i: int) -> tuple[float, float, float]:
     """Ends of the common normal of axes i and i + 1, as heights on the two axes, and its length [m]."""
-    origin, axis = tree.translations[i + 1], tree.rotations[i + 1][:, 2]  # of joint i + 1 in body i, whose axis is z
+    # of joint i + 1 in body i, whose axis is z
+    origin, axis = tree.translations[i + 1], tree.rotations[i + 1][:, 2]
     across = axis[:2]
-    if np.linalg.norm(across) < _PARALLEL:
+    if np.linalg.norm(across) < RULES.parallel:
         names = tree.joint_names
         raise RobotError(
             f"the axes of joints '{names[i]}' and '{names[i + 1]}' are parallel, expected axes at an angle"

@@ -54,12 +54,12 @@ class NetworkArrays:
         *hidden, last = self._V
         np.multiply(last.T[:, None, :], self._s[-1], out=self._below[-1][:-1])
         for k in reversed(range(len(hidden))):
-            np.matmul(_flat(self._below[k + 1][:-1]), hidden[k].T, out=_flat(self._below[k][:-1]))
+            np.matmul(_flatten(self._below[k + 1][:-1]), hidden[k].T, out=_flatten(self._below[k][:-1]))
             if k:
                 self._below[k][:-1] *= self._s[k]
         return self._below[0][:-1]
 
-    def pulled_back(self, slopes: Array, result: Array) -> Array:
+    def pull_back(self, slopes: Array, result: Array) -> Array:
         """dL/dtheta from the derivatives of L with respect to `gradients`, (r, N, inputs). Call `gradients` before.
 
         Args:
@@ -70,8 +70,9 @@ class NetworkArrays:
         self._up[0][:-1] = slopes
         for k, V in enumerate(self._V[:-1], start=1):
             up, h = self._up[k][:-1], self._below[k][:-1]
-            np.matmul(_flat(self._up[k - 1][:-1]), V, out=_flat(up))  # by h
-            np.einsum("rsw,rsw->sw", up, h, out=self._work[k])  # by s, times s
+            np.matmul(_flatten(self._up[k - 1][:-1]), V, out=_flatten(up))  # by h
+            # by s, times s
+            np.einsum("rsw,rsw->sw", up, h, out=self._work[k])
             up *= self._s[k]
         np.sum(self._up[-1][:-1], axis=1, out=by_V[-1].T)
         by_b[-1][...] = 0
@@ -85,12 +86,12 @@ class NetworkArrays:
                 by_z += rest
             else:
                 by_z[...] = rest
-            np.matmul(_flat(self._up[k - 1]).T, _flat(self._below[k]), out=by_V[k - 1])
+            np.matmul(_flatten(self._up[k - 1]).T, _flatten(self._below[k]), out=by_V[k - 1])
             np.sum(by_z, axis=0, out=by_b[k - 1])
         return result
 
 
-def _flat(stack: Array) -> Array:
+def _flatten(stack: Array) -> Array:
     """(r, N, width) as (r N, width)."""
     return stack.reshape(-1, stack.shape[2])
 
@@ -204,7 +205,8 @@ class MLPFamily:
         t = len(self._turning)
         by_angle = gradients[:t, :] * ca.repmat(ca.cos(q[self._turning, :]), 1, self.outputs)
         by_angle -= gradients[t : 2 * t, :] * ca.repmat(ca.sin(q[self._turning, :]), 1, self.outputs)
-        rows = np.argsort([*self._turning, *self._direct_joints]).tolist()  # back to the order of the joints
+        # back to the order of the joints
+        rows = np.argsort([*self._turning, *self._direct_joints]).tolist()
         stacked = ca.vertcat(by_angle, gradients[2 * t :, :])[rows, :]
         return [stacked[:, j * N : (j + 1) * N] for j in range(self.outputs)]
 
@@ -222,7 +224,7 @@ class MLPFamily:
         def back(slopes: Array, result: Array) -> Array:
             by_angle, direct = slopes[:, :, self._turning].astype(theta.dtype), slopes[:, :, self._direct_joints]
             parts = [by_angle * cos[:, None], -by_angle * sin[:, None], direct.astype(theta.dtype)]
-            return network.pulled_back(np.concatenate(parts, axis=2).transpose(1, 0, 2), result)
+            return network.pull_back(np.concatenate(parts, axis=2).transpose(1, 0, 2), result)
 
         return J, back
 
@@ -268,10 +270,12 @@ class MLPFamily:
 
     def reordered(self, theta: Array, order: Sequence[int]) -> Array:
         """Parameters with the outputs in another order, (size,)."""
-        return self.combined(theta, np.eye(self.outputs)[list(order)])  # the products with 0 and 1 are exact
+        # the products with 0 and 1 are exact
+        return self.combined(theta, np.eye(self.outputs)[list(order)])
 
     def combined(self, theta: Array, B: Array) -> Array:
         """Parameters of B xi, (size,), for a matrix B (r, r)."""
-        last = self.outputs * (self.widths[-2] + 1)  # W_out column by column, then b_out
+        # W_out column by column, then b_out
+        last = self.outputs * (self.widths[-2] + 1)
         columns = theta[-last:].reshape(-1, self.outputs) @ B.T
         return np.concatenate([theta[:-last], columns.ravel()])

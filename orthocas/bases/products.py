@@ -24,7 +24,7 @@ Term = tuple[int, ...]  #: index of the one-joint function of every joint; 0 is 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ProductFamily(BasisFamily):
-    """psi_k(q) = prod_i f_i,k_i(q_i) over the joints. Use `product_family` to build one.
+    """psi_k(q) = prod_i f_i,k_i(q_i) over the joints. Use `build_product_family` to build one.
 
     Derivatives of terms are sums of terms. So with each term, the family contains the terms of its derivatives.
     """
@@ -68,7 +68,7 @@ class ProductFamily(BasisFamily):
             found.append((values, rows.astype(int), columns.astype(int)))
         return found
 
-    def derivative_matrix(self, joint: int) -> Any:
+    def build_derivative_matrix(self, joint: int) -> Any:
         """D_i as a sparse matrix, (1 + K, 1 + K)."""
         values, rows, columns = self.derivatives[joint]
         return scipy.sparse.csr_array((values, (rows, columns)), shape=(1 + self.width,) * 2)
@@ -82,7 +82,7 @@ class ProductFamily(BasisFamily):
         return tables
 
 
-def product_family(
+def build_product_family(
     space: JointSpace,
     outputs: int,
     terms: tuple[Term, ...],
@@ -100,20 +100,21 @@ def product_family(
     """
 
     def basis(q: Any) -> Any:
-        return _products(terms, ca.vertcat(*one_joint_functions(q)))
+        return _multiply(terms, ca.vertcat(*one_joint_functions(q)))
 
     return ProductFamily(space, outputs, basis, terms=terms, one_joint_derivatives=one_joint_derivatives)
 
 
-def _products(terms: tuple[Term, ...], factors: Any) -> Any:
+def _multiply(terms: tuple[Term, ...], factors: Any) -> Any:
     """Values of terms, (K, N), from those of the one-joint functions f_1 of all joints, then f_2 and so on.
 
     All terms with as many factors are one product of columns: to build them one by one takes CasADi ten times as long.
     """
     n = len(terms[0])
     levels: list[Any] = []
-    rows: list[dict[Term, int]] = []  # of the terms in their levels
-    for level in by_factors(terms):
+    # of the terms in their levels
+    rows: list[dict[Term, int]] = []
+    for level in group_by_factors(terms):
         parts = [split(term) for term in level]
         values = factors[[n * (index - 1) + joint for _, joint, index in parts], :]
         levels.append(levels[-1][[rows[-1][rest] for rest, *_ in parts], :] * values if levels else values)
@@ -122,7 +123,7 @@ def _products(terms: tuple[Term, ...], factors: Any) -> Any:
     return ca.vertcat(*levels)[[places[term] for term in terms], :]
 
 
-def by_factors(terms: Iterable[Term]) -> list[list[Term]]:
+def group_by_factors(terms: Iterable[Term]) -> list[list[Term]]:
     """Terms and what they are made of, by the number of factors; each level is sorted."""
     levels: dict[int, list[Term]] = {}
     for term in sorted(with_parts(terms)):
@@ -150,15 +151,15 @@ def split(term: Term) -> tuple[Term, int, int]:
     return (*term[:joint], 0, *term[joint + 1 :]), joint, term[joint]
 
 
-def reduced_terms(
+def reduce_terms(
     degrees: list[list[int]], total: int, linear: list[int], joints: int | None = None
 ) -> tuple[Term, ...]:
-    """The terms of `terms_up_to` without those in the joints `linear`, then the term linear in each of these."""
+    """The terms of `list_terms` without those in the joints `linear`, then the term linear in each of these."""
     kept = [[0] if k in linear else own for k, own in enumerate(degrees)]
-    return (*terms_up_to(kept, total, joints), *(tuple(int(i == k) for i in range(len(degrees))) for k in linear))
+    return (*list_terms(kept, total, joints), *(tuple(int(i == k) for i in range(len(degrees))) for k in linear))
 
 
-def terms_up_to(degrees: list[list[int]], total: int, joints: int | None = None) -> Iterator[Term]:
+def list_terms(degrees: list[list[int]], total: int, joints: int | None = None) -> Iterator[Term]:
     """All non-constant choices of one function per joint whose degrees add up to at most `total`.
 
     Args:
@@ -185,13 +186,14 @@ class Products:
 
     degree: int
     cyclic: Cyclic = ()
-    joints: int | None = field(default=None, metadata={"stored": "if given"})  # others keep their fingerprints
+    # others keep their fingerprints
+    joints: int | None = field(default=None, metadata={"stored": "if given"})
     linear = True
     closed_form = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "degree", require_count("degree", self.degree))
-        object.__setattr__(self, "cyclic", cyclic_choice.checked_cyclic(self.cyclic))
+        object.__setattr__(self, "cyclic", cyclic_choice.check_cyclic(self.cyclic))
         if self.joints is not None:
             object.__setattr__(self, "joints", require_count("joints", self.joints))
 
@@ -209,7 +211,7 @@ class Products:
         most = "" if self.joints is None else f":{JOINTS}={self.joints}"
         return f"{self.degree}{most}{cyclic_choice.suffix(self.cyclic)}"
 
-    def _term_count(self, n: int, functions: int) -> int:
+    def _count_terms(self, n: int, functions: int) -> int:
         """Sum over j of C(n, j) C(d, j) f^j without the constant, for f functions of each degree of a joint."""
         linear = min(n, cyclic_choice.count(self.cyclic))
         most = min(n - linear, self.degree, self.degree if self.joints is None else self.joints)
@@ -246,7 +248,7 @@ class Polynomial(Products):
 
     def term_count(self, n: int) -> int:
         """C(n + d, d) - 1 with all products of n joints that are not cyclic, plus one term for each that is."""
-        return self._term_count(n, 1)
+        return self._count_terms(n, 1)
 
     def family(self, space: JointSpace, outputs: int) -> ProductFamily:
         """Polynomials in u_i = (q_i - centre_i) / half_width_i."""
@@ -266,8 +268,8 @@ class Polynomial(Products):
             return values
 
         degrees = [list(range(self.degree + 1))] * space.n
-        terms = reduced_terms(degrees, self.degree, cyclic_choice.indices(self.cyclic, space), self.joints)
-        return product_family(space, outputs, terms, legendre, derivatives)
+        terms = reduce_terms(degrees, self.degree, cyclic_choice.indices(self.cyclic, space), self.joints)
+        return build_product_family(space, outputs, terms, legendre, derivatives)
 
 
 @dataclass(frozen=True)
@@ -294,7 +296,7 @@ class Fourier(Products):
 
     def term_count(self, n: int) -> int:
         """Sum over j of C(n, j) C(d, j) 2^j, without the constant. Cyclic joints do not count in n, but add a term."""
-        return self._term_count(n, 2)
+        return self._count_terms(n, 2)
 
     def family(self, space: JointSpace, outputs: int) -> ProductFamily:
         """Fourier terms of the joint angles.
@@ -324,8 +326,8 @@ class Fourier(Products):
             return D
 
         degrees = [[0] + [k for k in range(1, self.degree + 1) for _ in range(2)]] * space.n
-        terms = reduced_terms(degrees, self.degree, linear, self.joints)
-        return product_family(space, outputs, terms, waves, derivatives)
+        terms = reduce_terms(degrees, self.degree, linear, self.joints)
+        return build_product_family(space, outputs, terms, waves, derivatives)
 
 
 Normals = Literal["orthonormal", "paper"]
@@ -380,7 +382,7 @@ class Linear:
         def displacement(q: Any) -> list[Any]:
             return [q - ca.repmat(ca.DM(space.centre), 1, q.shape[1])]
 
-        return product_family(space, outputs, terms, displacement, lambda i: np.array([[0.0, 0.0], [1.0, 0.0]]))
+        return build_product_family(space, outputs, terms, displacement, lambda i: np.array([[0.0, 0.0], [1.0, 0.0]]))
 
     def normal_vectors(self, gradients: Array) -> Array:
         """Rows n_j of unit length with n_j . grad_A h_i = 0, (r, n).

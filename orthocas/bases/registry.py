@@ -7,11 +7,10 @@ from dataclasses import asdict, dataclass, fields, is_dataclass
 from typing import Any, cast
 
 from orthocas.bases.circle import Circle
-from orthocas.bases.cyclic import Cyclic, parse_suffix
+from orthocas.bases.cyclic import Cyclic, Mobile, parse_suffix
 from orthocas.bases.family import Parametrisation
 from orthocas.bases.given import SEW, Given, SEWKind
 from orthocas.bases.mlp import MLP
-from orthocas.bases.mobile import Mobile
 from orthocas.bases.products import JOINTS, Fourier, Linear, Polynomial
 from orthocas.errors import InvalidValueError, NotSavableWarning
 from orthocas.tools.checks import require_kind, require_known
@@ -146,7 +145,7 @@ def parse_parametrisation(label: str) -> Parametrisation:
     return parse(text)
 
 
-def _whole(text: str) -> int:
+def _parse_whole(text: str) -> int:
     try:
         return int(text)
     except ValueError:
@@ -155,32 +154,32 @@ def _whole(text: str) -> int:
         ) from None
 
 
-def _degree_cyclic_joints(text: str) -> tuple[int, Cyclic, int | None]:
+def _parse_degree(text: str) -> tuple[int, Cyclic, int | None]:
     degree, _, rest = text.partition(":")
     most = None
     if rest.startswith(f"{JOINTS}="):
         number, _, rest = rest.removeprefix(f"{JOINTS}=").partition(":")
-        most = _whole(number)
-    return _whole(degree), parse_suffix(rest), most
+        most = _parse_whole(number)
+    return _parse_whole(degree), parse_suffix(rest), most
 
 
-def _mlp(text: str) -> MLP:
+def _parse_mlp(text: str) -> MLP:
     widths, colon, inputs = text.partition(":")
     if colon and inputs != "raw":
         raise InvalidValueError("parametrisation", repr(f"mlp:{text}")[:80], "nothing but ':raw' after the widths")
-    return MLP(tuple(_whole(width) for width in widths.split("x")), bool(colon))
+    return MLP(tuple(_parse_whole(width) for width in widths.split("x")), bool(colon))
 
 
-def _linear(text: str) -> Linear:
+def _parse_linear(text: str) -> Linear:
     if text:
         raise InvalidValueError("parametrisation", repr(f"linear:{text}"), "'linear' without a number")
     return Linear()
 
 
-register_parametrisation("linear", Linear, _linear)
-register_parametrisation("polynomial", Polynomial, lambda text: Polynomial(*_degree_cyclic_joints(text)))
-register_parametrisation("fourier", Fourier, lambda text: Fourier(*_degree_cyclic_joints(text)))
-register_parametrisation("mlp", MLP, _mlp)
+register_parametrisation("linear", Linear, _parse_linear)
+register_parametrisation("polynomial", Polynomial, lambda text: Polynomial(*_parse_degree(text)))
+register_parametrisation("fourier", Fourier, lambda text: Fourier(*_parse_degree(text)))
+register_parametrisation("mlp", MLP, _parse_mlp)
 register_parametrisation("sew", SEW, lambda text: SEW(cast(SEWKind, text or "stereographic")))
 register_parametrisation("circle", Circle, lambda text: Circle(parse_parametrisation(text)))
 register_parametrisation("mobile", Mobile, lambda text: Mobile(parse_parametrisation(text)))

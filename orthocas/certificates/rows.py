@@ -24,8 +24,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocas.bases.cyclic import Mobile
 from orthocas.bases.mlp import MLPFamily
-from orthocas.bases.mobile import Mobile
 from orthocas.bases.products import ProductFamily
 from orthocas.certificates.graph import TaylorGraph
 from orthocas.certificates.jets import (
@@ -466,7 +466,7 @@ class ProductRows:
 
 def _differentiate_basis(family: ProductFamily, terms: Array, C: Array, highest: int) -> tuple[Derivatives, ...]:
     n = family.space.n
-    steps = [family.derivative_matrix(i) for i in range(n)]
+    steps = [family.build_derivative_matrix(i) for i in range(n)]
     known: dict[Monomial, tuple[Any, Any]] = {(): (C, np.abs(C))}
     orders: list[Derivatives] = []
     for order in range(1, highest + 1):

@@ -1,13 +1,38 @@
-"""`orthocas charts`: the ready charts of known arms."""
+"""`orthocas charts`, `evaluate` and `certify`: ready charts, and what is known of a chart."""
 
+import os
+import time
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from orthocas.charts import quality
+from orthocas.charts.certificate import METHODS, Certificate
+from orthocas.charts.chart import Chart
+from orthocas.charts.chart_file import CHART
 from orthocas.charts.ready import Card, card, load, names
-from orthocas.cli.output import AsJson, Force, print_json, print_rows, print_table
-from orthocas.errors import OptionError
+from orthocas.cli.options import AsJson, ChartPath, Force, parse_number, parse_whole_number
+from orthocas.cli.output import (
+    build_reach_data,
+    format_reach_rows,
+    format_report_rows,
+    note,
+    print_json,
+    print_rows,
+    print_table,
+    terminal_monitor,
+)
+from orthocas.errors import Interrupted, OptionError
+from orthocas.tools.archive import require_free
+from orthocas.tools.checks import require_count
+from orthocas.tools.interrupts import INTERRUPTED
+
+_NOT_PROVED = 1  # exit code
 
 
 def charts(
@@ -22,28 +47,149 @@ def charts(
     if name is None:
         if out is not None:
             raise OptionError("--out requires the name of a ready chart")
-        _list([card(known) for known in names()], json)
+        cards = [card(ready) for ready in names()]
+        if json:
+            print_json({"charts": [ready.as_dict() for ready in cards]})
+        else:
+            head = ("name", "robot", "n", "m", "r", "leak [deg]", "least conditioning", "licence")
+            print_table([head, *map(_format_card, cards)])
         return
-    found = card(name)
+    ready = card(name)
     if out is not None:
         load(name).save(out, force)
+    written = {} if out is None else {"chart": str(out)}
     if json:
-        print_json({**found.as_dict(), **({} if out is None else {"chart": str(out)})})
+        print_json({**ready.as_dict(), **written})
     else:
-        rows = {**found.facts(), **{f"command {k}": line for k, line in enumerate(found.commands, 1)}}
-        print_rows(rows if out is None else {**rows, "chart": str(out)})
+        commands = {f"command {k}": line for k, line in enumerate(ready.commands, 1)}
+        print_rows({**ready.facts(), **commands, **written})
 
 
-def _list(cards: list[Card], json: bool) -> None:
+def _format_card(ready: Card) -> tuple[str, ...]:
+    numbers = ready.quality
+    sizes = (str(numbers[name]) for name in "nmr")
+    leak, least = f"{numbers['leak_deg']['rms']:.2f}", f"{numbers['conditioning']['min']:.2f}"
+    return ready.name, ready.model.robot, *sizes, leak, least, ready.model.licence
+
+
+def evaluate(
+    chart: ChartPath,
+    samples: Annotated[
+        int, typer.Option("--samples", parser=parse_whole_number, help="Number of held-out samples.")
+    ] = 100_000,
+    seed: Annotated[
+        int,
+        typer.Option(
+            "--seed", parser=parse_whole_number, help="Seed of the samples; use another one than for the fit."
+        ),
+    ] = 1,
+    json: AsJson = False,
+) -> None:
+    """Measure the quality of a chart on held-out samples of its domain."""
+    loaded = Chart.load(chart)
+    report = quality.evaluate(loaded, samples, seed)
     if json:
-        print_json({"charts": [known.as_dict() for known in cards]})
-        return
-    head = ("name", "robot", "n", "m", "r", "leak [deg]", "least conditioning", "licence")
-    print_table([head, *(_row(known) for known in cards)])
+        print_json({**report.as_dict(), **build_reach_data(loaded)})
+    else:
+        print_rows({**format_report_rows(report), **format_reach_rows(loaded)})
 
 
-def _row(known: Card) -> tuple[str, ...]:
-    quality = known.quality
-    sizes = (str(quality[name]) for name in "nmr")
-    leak, least = f"{quality['leak_deg']['rms']:.2f}", f"{quality['conditioning']['min']:.2f}"
-    return known.name, known.model.robot, *sizes, leak, least, known.model.licence
+def certify(
+    chart: ChartPath,
+    bound: Annotated[
+        float | None,
+        typer.Option(
+            "--bound", parser=parse_number, help="Also prove that the conditioning is at least this; default: 0."
+        ),
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option("--seconds", parser=parse_number, help="Time limit; what is proved by then is kept."),
+    ] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Check the certificate in the file, without a search.")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Chart file to write, with the certificate; default: CHART itself.")
+    ] = None,
+    workers: Annotated[
+        str,
+        typer.Option("--workers", help="Number of processes, or the address of a Dask scheduler, tcp://host:8786."),
+    ] = "1",
+    force: Force = False,
+    json: AsJson = False,
+) -> None:
+    """Prove that a chart does not fold anywhere on its domain, and keep the proof in its file.
+
+    A certificate without a fold that does not cover the domain is resumed. The exit code is 1 if not all is proved,
+    with --check too.
+    """
+    from orthocas import certificates  # with multiprocessing, long to import, and other commands need neither
+
+    processes = 0 if "://" in workers else require_count("--workers", parse_whole_number(workers))
+    target = out or chart
+    require_free(target, CHART, force)
+    loaded = Chart.load(chart)
+    with _start_workers(processes, workers) as executor, terminal_monitor() as monitor:
+        start = time.monotonic()
+        if check:
+            holds = certificates.check_certificate(loaded, executor=executor, monitor=monitor)
+            assert loaded.certificate is not None
+            _report_check(loaded.certificate, holds, time.monotonic() - start, json)
+            raise typer.Exit(0 if holds and loaded.certificate.proved else _NOT_PROVED)
+        resume = _find_unfinished(loaded, bound)
+        try:
+            certificate = certificates.certify(
+                loaded,
+                resume.bound if bound is None and resume else bound or 0.0,
+                time_limit=seconds,
+                executor=executor,
+                monitor=monitor,
+                resume=resume,
+            )
+            interrupted = False
+        except Interrupted as stop:
+            certificate, interrupted = stop.result, True
+    replace(loaded, certificate=certificate).save(target, force)
+    if json:
+        print_json({"chart": str(target), **certificate.as_dict()})
+    else:
+        print_rows({**certificate.facts(), "chart": str(target)})
+    if interrupted:
+        note("interrupted: the file holds what is proved so far; the same command goes on from it")
+        raise typer.Exit(INTERRUPTED)
+    raise typer.Exit(0 if certificate.proved else _NOT_PROVED)
+
+
+@contextmanager
+def _start_workers(processes: int, address: str) -> Iterator[Executor | None]:
+    """What shares the work: processes, for 0 of them a Dask scheduler, for one nothing."""
+    from orthocas.tools.processes import Processes, begin_worker, scheduler_executor  # as in `certify`
+
+    if processes == 0:
+        with scheduler_executor(address) as executor:
+            yield executor
+    elif processes > 1:
+        with Processes(processes, begin_worker, os.getpid()) as executor:
+            yield executor
+    else:
+        yield None
+
+
+def _find_unfinished(chart: Chart, bound: float | None) -> Certificate | None:
+    """The certificate in the file if there is more to prove, it is about the same bound, and it can be resumed."""
+    saved = chart.certificate
+    if saved is None or saved.method not in METHODS or not saved.digest:
+        return None
+    if saved.proved or saved.fold or (bound is not None and bound != saved.bound):
+        return None
+    return saved
+
+
+def _report_check(certificate: Certificate, holds: bool, seconds: float, json: bool) -> None:
+    if json:
+        print_json({"holds": holds, **certificate.as_dict(), "seconds": seconds})
+    else:
+        verdict = "holds" if holds else "does NOT hold"
+        partly = "" if certificate.proved or not holds else " for the part that is proved"
+        print_rows({"check": f"the certificate {verdict}{partly}, {seconds:.3g} s", **certificate.facts()})

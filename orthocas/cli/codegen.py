@@ -1,5 +1,7 @@
-"""`orthocas codegen`: a chart and a controller as a C library."""
+"""`orthocas codegen` and `export`: a chart as C or as a Python module; and the options of laws, for `simulate` too."""
 
+import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,16 +11,20 @@ from orthocas.charts.chart import Chart
 from orthocas.cli.codegen import CONTROLLERS, Limit, add_law_options, build_controller, require_settings
 from orthocas.cli.output import AsJson, Force, note, print_json, print_rows
 from orthocas.codegen.check import AgreementCheck, check_c
+from orthocas.codegen.export import LIBRARIES
+from orthocas.codegen.export import export as export_chart
 from orthocas.codegen.generate import GeneratedC, generate_c
-from orthocas.errors import OptionError
+from orthocas.control.controller import Controller, Setting, law_names, law_of
+from orthocas.errors import LawWarning, OptionError
 from orthocas.tools.interrupts import deferred
 
+CONTROLLERS = law_names()
 _NONE = "none"
 
 
 @add_law_options(for_codegen=True)
 def codegen(
-    chart: Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")],
+    chart: ChartPath,
     controller: Annotated[str, typer.Option("--controller", help=f"Control law: {', '.join(CONTROLLERS)} or {_NONE}.")],
     out: Annotated[Path, typer.Option("--out", help="Folder for the generated library.")],
     settings: dict[str, str],
@@ -38,23 +44,25 @@ def codegen(
         require_settings(controller, settings)
     elif settings or limit is not None:
         raise OptionError("settings of a controller require a controller: --controller is none")
-    with deferred():  # CasADi may lose Ctrl-C while it builds functions
+    # CasADi may lose Ctrl-C while it builds functions
+    with deferred():
         loaded = Chart.load(chart)
-        loaded.function("xi")  # raises for grown charts
+        # Raises for grown charts.
+        loaded.function("xi")
         law = None if controller == _NONE else build_controller(controller, loaded, settings, limit)
         generated = generate_c(loaded, out, law, name, force, single_precision=single_precision)
         remarks = [] if law is None else law.remarks()
     agreement = check_c(generated, loaded, law) if check else None
-    report = _report(generated, agreement)
+    report = _build_report(generated, agreement)
     if json:
         print_json(report)
     else:
-        print_rows(_rows(report))
+        print_rows(_format_rows(report))
     for remark in remarks:
         note(remark)
 
 
-def _report(generated: GeneratedC, agreement: AgreementCheck | None) -> dict[str, Any]:
+def _build_report(generated: GeneratedC, agreement: AgreementCheck | None) -> dict[str, Any]:
     source = generated.folder / f"{generated.name}.c"
     return {
         "name": generated.name,
@@ -67,7 +75,7 @@ def _report(generated: GeneratedC, agreement: AgreementCheck | None) -> dict[str
     }
 
 
-def _rows(report: dict[str, Any]) -> dict[str, str]:
+def _format_rows(report: dict[str, Any]) -> dict[str, str]:
     rows = {
         "library": f"{report['name']}: {report['lines']} lines of C99, {report['source']}",
         "stack": f"{report['stack_bytes']} bytes at most per call",
@@ -79,3 +87,51 @@ def _rows(report: dict[str, Any]) -> dict[str, str]:
             f"largest relative difference {differences[worst]:.1e} ({worst})"
         )
     return rows
+
+
+def require_settings(name: str, settings: Mapping[str, str]) -> None:
+    """Check that a controller exists and takes every setting that was given.
+
+    Raises:
+        UnknownNameError: if there is no such controller.
+        OptionError: for a setting that the controller would ignore.
+    """
+    law = law_of(name)
+    for field in settings:
+        if field not in law.options:
+            takers = _find_laws_with(field)
+            option = _name_option(field, law_of(takers[0]).options[field])
+            raise OptionError(f"{name} has no {option}, which belongs to {', '.join(takers)}")
+
+
+def build_controller(name: str, chart: Chart, settings: Mapping[str, str], limit: str | None = None) -> Controller:
+    """Build the controller that a command line describes; `require_settings` has checked the settings.
+
+    Raises:
+        OrthocasError: if anything does not fit together.
+    """
+    law = law_of(name)
+    values: dict[str, Any] = {}
+    for field, text in settings.items():
+        setting = law.options[field]
+        values[field] = text if setting.is_word else parse_one_or_all(_name_option(field, setting), text)
+    with warnings.catch_warnings():
+        # commands print the remarks of the law instead
+        warnings.simplefilter("ignore", LawWarning)
+        return law.on_chart(chart, None if limit is None else parse_one_or_all("--limit", limit), **values)
+
+
+def export(
+    chart: ChartPath,
+    to: Annotated[str, typer.Option("--to", help=f"Library: {', '.join(LIBRARIES)}.")],
+    out: Annotated[Path, typer.Option("--out", help="The module to write, NAME.py.")],
+    force: Force = False,
+    json: AsJson = False,
+) -> None:
+    """Write task, xi, phi, Jacobian and inverse of a chart as one Python module that needs the library only."""
+    loaded = Chart.load(chart)
+    module = export_chart(loaded, to, out, force)
+    if json:
+        print_json({"module": str(module), "library": to, "joints": loaded.n, "labels": list(loaded.labels)})
+    else:
+        print_rows({"module": f"{module}, with {to} alone", "functions": "task, xi, phi, jacobian, inverse"})

@@ -1,5 +1,6 @@
 """Collects the commands, and turns errors into one line and exit code 2."""
 
+import sys
 from collections.abc import Sequence
 from importlib import import_module
 from typing import Annotated
@@ -23,10 +24,11 @@ COMMANDS = {
     "export": "Write task, xi, phi, Jacobian and inverse of a chart as one Python module that needs the library only.",
     "view": "Show a chart, a robot or a motion in the browser, until Ctrl-C.",
     "charts": "List the ready charts of known arms, show the card of one, or write it to a file.",
-}  #: names of the commands, modules of this package, and the first lines of their help
+}  #: names of the commands and the first lines of their help
+_MODULES = {"demo": "compare", "evaluate": "charts", "certify": "charts", "export": "codegen"}
 
 
-def app_for(words: Sequence[str]) -> typer.Typer:
+def build_app(words: Sequence[str]) -> typer.Typer:
     """The command line with the commands that `words` name. Of others it knows the help: their imports take time."""
     app = typer.Typer(
         name="orthocas",
@@ -38,12 +40,13 @@ def app_for(words: Sequence[str]) -> typer.Typer:
     )
     app.callback()(_options)
     for name, summary in COMMANDS.items():
-        command = getattr(import_module(f"{__package__}.{name}"), name) if name in words else _idle
+        module = f"{__package__}.{_MODULES.get(name, name)}"
+        command = getattr(import_module(module), name) if name in words else _do_nothing
         app.command(name, help=None if name in words else summary)(command)
     return app
 
 
-def _say_version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     """Print the version, and end."""
     if wanted:
         typer.echo(f"orthocas {VERSION}")
@@ -52,51 +55,57 @@ def _say_version(wanted: bool) -> None:
 
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_say_version, help="Print the version and exit.")
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version and exit.")
     ] = False,
 ) -> None:
     """Options of the command line itself."""
 
 
-def _idle() -> None:
+def _do_nothing() -> None:
     """Stands for a command that is not called."""
 
 
-def _complain(text: str) -> None:
+def _print_error(text: str) -> None:
     """Print one line of bounded length on standard error."""
     line = one_line(text)
     typer.echo(f"orthocas: {line[:1000]}{'...' if len(line) > 1000 else ''}", err=True)
 
 
 def run(app: typer.Typer) -> int:
-    """Run a command line of `app_for`; bad input gives one line on standard error and exit code 2, a signal its own."""
+    """Run a command line. Bad input gives one line on standard error and exit code 2, a signal its own code."""
     with ended_in_order() as ended, remembered() as pressed:
         try:
             code = app(prog_name="orthocas", standalone_mode=False) or 0
         except KeyboardInterrupt:
             code = INTERRUPTED
         except Exception as error:
-            if type(error).__name__ == "NoArgsIsHelpError":  # its message is the help
-                typer.echo(_message(error), err=True)
-            elif not (pressed() or ended()):  # otherwise it is what a library made of a signal
-                _complain(_message(error))
+            # Its message is the help.
+            if type(error).__name__ == "NoArgsIsHelpError":
+                typer.echo(_format_error(error), err=True)
+            elif not (pressed() or ended()):
+                # Otherwise it is what a library made of a signal.
+                _print_error(_format_error(error))
             code = 2
-        return ended() or (interrupted() if pressed() or code == INTERRUPTED else code)
+        return ended() or (report_interrupt() if pressed() or code == INTERRUPTED else code)
 
 
-def _message(error: Exception) -> str:
+def _format_error(error: Exception) -> str:
     """What to say of an error; raises those that are defects."""
     if isinstance(error, typer.TyperException):
-        return error.format_message()
+        # Only a command imports the options, so a refusal of one finds them imported.
+        former = getattr(sys.modules.get(f"{__package__}.options"), "FORMER", {})
+        option = getattr(error, "option_name", None)
+        return f"no such option: {option}; {former[option]}" if option in former else error.format_message()
     if isinstance(error, OrthocasError):
         return str(error)
     from_library = isinstance(error, OSError | MemoryError) or type(error).__name__ == "LinAlgError"
-    if from_library:  # also one line, no traceback
+    # Also one line, no traceback.
+    if from_library:
         return f"{type(error).__name__}: {error}"
     raise error
 
 
-def interrupted() -> int:
+def report_interrupt() -> int:
     """Say that it was Ctrl-C; the exit code."""
     typer.echo("orthocas: interrupted", err=True)
     return INTERRUPTED

@@ -1,32 +1,36 @@
-"""`orthocas compare`: parametrisations and solvers side by side."""
+"""`orthocas compare` and `demo`: parametrisations and solvers side by side, and the first minute, with pictures."""
 
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated
 
 import typer
 
+from orthocas import problems
+from orthocas.bases.products import Polynomial
 from orthocas.bases.registry import parse_parametrisation
-from orthocas.cli.output import AsJson, Force, note, print_json, print_table, terminal_monitor, whole_number
-from orthocas.cli.problem_argument import (
-    CHAIN,
-    DOMAIN,
+from orthocas.charts.chart import Chart
+from orthocas.charts.figures import quality_figure, self_motion_figure
+from orthocas.charts.quality import evaluate
+from orthocas.cli.options import (
     WEIGHTS_TEXT,
-    AnglesName,
-    PrecisionName,
-    ProblemName,
+    AsJson,
+    Force,
     ProblemOptions,
     SampleCount,
     WeightsText,
-    build_problem,
+    is_robot_file,
     parse_weights,
-    with_options,
+    parse_whole_number,
 )
+from orthocas.cli.output import format_reach_rows, note, print_json, print_table, terminal_monitor
 from orthocas.errors import Interrupted, printable
 from orthocas.fitting.compare import Comparison
 from orthocas.fitting.compare import compare as compare_fits
 from orthocas.fitting.comparison_figures import convergence_figure, front_figure
-from orthocas.fitting.settings import PRECISIONS, Precision
+from orthocas.fitting.fit import Fit
+from orthocas.fitting.fit import fit as fit_chart
 from orthocas.solvers import get as get_solver
+from orthocas.solvers.protocol import Solver
 from orthocas.tools.files import open_output_folder, publish, require_replaceable_files
 from orthocas.tools.interrupts import INTERRUPTED
 
@@ -34,52 +38,52 @@ _FILES = ("comparison.csv", "comparison.json", "front.png", "convergence.png")
 _PARAMETRISATIONS = ["linear", "polynomial:2", "polynomial:3", "polynomial:4", "mlp:32x32"]
 
 
-@with_options(*CHAIN, *DOMAIN)
 def compare(
-    problem: ProblemName,
-    words: ProblemOptions,
+    problem: Annotated[
+        str, typer.Argument(metavar="PROBLEM|CHART|FILE.urdf", help="A named problem, that of a chart, or a robot.")
+    ],
     param: Annotated[
         list[str] | None, typer.Option("--param", help="Parametrisation; repeat for more. Default: a small selection.")
     ] = None,
     solver: Annotated[
         list[str] | None, typer.Option("--solver", help="Solver; repeat for more. Default: one that suits each.")
     ] = None,
-    seeds: Annotated[int, typer.Option("--seeds", parser=whole_number, help="Number of seeds per fit.")] = 1,
+    seeds: Annotated[int, typer.Option("--seeds", parser=parse_whole_number, help="Number of seeds per fit.")] = 1,
     samples: SampleCount = None,
     held_out: Annotated[
         int,
         typer.Option(
-            "--held-out", parser=whole_number, help="Number of held-out samples that every fit is evaluated on."
+            "--held-out", parser=parse_whole_number, help="Number of held-out samples that every fit is evaluated on."
         ),
     ] = 100_000,
     weights: WeightsText = WEIGHTS_TEXT,
-    angles: AnglesName = None,
-    precision: PrecisionName = PRECISIONS[0],
     jobs: Annotated[
         int | None,
-        typer.Option("--jobs", parser=whole_number, help="Number of processes, one thread each; default: all cores."),
+        typer.Option(
+            "--jobs", parser=parse_whole_number, help="Number of processes, one thread each; default: all cores."
+        ),
     ] = None,
     out: Annotated[Path, typer.Option("--out", help="Folder for tables, pictures and charts.")] = Path("comparison"),
     force: Force = False,
     json: AsJson = False,
 ) -> None:
     """Fit a grid of parametrisations, solvers and seeds; write tables, pictures and charts."""
-    built = build_problem(problem, words)
+    is_name = problem in problems.names() or is_robot_file(problem) or not Path(problem).exists()
+    built = ProblemOptions().build_problem(problem) if is_name else Chart.load(problem).problem
     parametrisations = [parse_parametrisation(name) for name in param or _PARAMETRISATIONS]
-    minimisers = [get_solver(name) for name in solver] if solver else None
-    loss = parse_weights(weights, angles)
+    minimisers: list[Solver] | None = [get_solver(name) for name in solver] if solver else None
+    loss = parse_weights(weights, None)
     with open_output_folder("--out", out) as folder, open_output_folder("--out", folder / "charts") as charts:
         require_replaceable_files(folder, _FILES, force)
         try:
             with terminal_monitor() as monitor:
-                found = compare_fits(
+                comparison = compare_fits(
                     built,
                     parametrisations,
                     minimisers,
                     seeds=seeds,
                     weights=loss,
                     samples=samples,
-                    precision=cast(Precision, precision),
                     held_out=held_out,
                     jobs=jobs,
                     charts=charts,
@@ -88,31 +92,76 @@ def compare(
                     force=force,
                 )
         except Interrupted as stop:
-            found = stop.result
-        save(found, folder, force)
-    _tell(found, out, json)
-
-
-def _tell(found: Comparison, out: Path, json: bool) -> None:
-    """Print the table, or all as JSON."""
+            comparison = stop.result
+        write_comparison(comparison, folder, force)
     if json:
-        print_json(found.as_dict())
+        print_json(comparison.as_dict())
     else:
-        print_table(found.rows())
+        print_table(comparison.rows())
         typer.echo(f"\nTables, pictures and charts are in {printable(str(out))}.")
-    failed = sum(result.failed for result in found.results)
+    failed = sum(result.failed for result in comparison.results)
     if failed:
-        note(f"{failed} of {len(found.results)} fits failed, see comparison.csv")
-    if found.interrupted:
-        note(f"interrupted after {len(found.results)} fits")
+        note(f"{failed} of {len(comparison.results)} fits failed, see comparison.csv")
+    if comparison.interrupted:
+        note(f"interrupted after {len(comparison.results)} fits")
         raise typer.Exit(INTERRUPTED)
 
 
-def save(found: Comparison, out: Path, force: bool = False) -> None:
+def write_comparison(comparison: Comparison, folder: Path, force: bool) -> None:
     """Write tables and pictures."""
-    found.write(out, force)
-    if all(result.failed for result in found.results):
+    comparison.write(folder, force)
+    if all(result.failed for result in comparison.results):
         return
-    with publish(out, listed=True, force=force) as drafts:
-        front_figure(found).savefig(drafts / "front.png", dpi=150)
-        convergence_figure(found).savefig(drafts / "convergence.png", dpi=150)
+    with publish(folder, listed=True, force=force) as drafts:
+        front_figure(comparison).savefig(drafts / "front.png", dpi=150)
+        convergence_figure(comparison).savefig(drafts / "convergence.png", dpi=150)
+
+
+_PAPER = {"task": 2.06, "mutual": 3.44, "minutes": 100.64}  # [AS2023] Sec. 9
+
+
+def demo(
+    out: Annotated[Path, typer.Option("--out", help="Folder for chart and pictures.")] = Path("out"),
+    force: Force = False,
+) -> None:
+    """Fit coordinates for the 7-DoF arm of the paper, print their quality, save a chart and pictures (10 s)."""
+    fit, numbers = fit_demo(out, force=force)
+    lines = (
+        "KUKA iiwa, flange position, 4 extra coordinates on a cube of edge pi/2",
+        f"  task angles    std {numbers['task_std_deg']:.2f} deg   (paper's network: {_PAPER['task']})",
+        f"  mutual angles  std {numbers['mutual_std_deg']:.2f} deg   (paper's network: {_PAPER['mutual']})",
+        f"  conditioning   mean {numbers['conditioning_mean']:.3f}, least found {numbers['conditioning_min']:.3f}",
+        *(f"  {name:<13}  {text}" for name, text in format_reach_rows(fit.chart).items()),
+        f"  fitted in      {numbers['seconds']:.1f} s       (paper: {_PAPER['minutes']} min on a GPU)",
+        f"  chart and pictures in {out}/; try orthocas view {out / 'iiwa.orthocas'}",
+    )
+    for line in lines:
+        typer.echo(line)
+
+
+def fit_demo(out: Path, quick: bool = False, force: bool = False) -> tuple[Fit, dict[str, float]]:
+    """Fit, evaluate and save.
+
+    Args:
+        out: folder for chart and pictures.
+        quick: degree 3 and few samples.
+        force: replace files that orthocas did not write.
+
+    Returns:
+        The fit; standard deviations [deg], conditioning and seconds.
+    """
+    with terminal_monitor() as monitor:
+        fit = fit_chart(problems.get("iiwa"), Polynomial(degree=3 if quick else 5), monitor=monitor)
+    report = evaluate(fit.chart, samples=5_000 if quick else 100_000)
+    with open_output_folder("--out", out) as folder, publish(folder, listed=True, force=force) as drafts:
+        fit.chart.save(drafts / "iiwa.orthocas")
+        quality_figure(report).savefig(drafts / "iiwa_quality.png", dpi=150)
+        self_motion_figure(fit.chart, reach=None).savefig(drafts / "iiwa_self_motion.png", dpi=150)
+    return fit, {
+        "task_std_deg": report.task_angle.std,
+        "mutual_std_deg": report.mutual_angle.std,
+        "conditioning_mean": report.conditioning.mean,
+        "conditioning_p01": report.conditioning.p01,
+        "conditioning_min": report.conditioning.min,
+        "seconds": fit.seconds,
+    }

@@ -15,7 +15,8 @@ def open_closed_streams() -> None:
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
-            place = os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+            # takes the lowest number that is free
+            place = os.open(os.devnull, os.O_RDWR)
             os.set_inheritable(place, place == number)
             setattr(sys, name, open(place, "w" if number else "r", encoding="utf-8"))  # noqa: SIM115
 
@@ -23,35 +24,36 @@ def open_closed_streams() -> None:
 def leave_on_ctrl_c() -> None:
     """Let Ctrl-C end the process at once, with one line, until `main` has imported what it needs.
 
-    `orthocas` calls it first in the command line: Python imports all of `orthocas` on its way to `main`. Nothing
-    is lost meanwhile, and an exception would come out of half-imported libraries as anything.
+    Nothing is lost meanwhile, and an exception would come out of half-imported libraries as anything.
     """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)
-
-
-def main() -> None:
-    """Run the command line."""
-    from orthocas.cli import commands  # takes a second
-
-    watched = signal.getsignal(signal.SIGINT) is _leave
-    open_closed_streams()
-    os.environ["MPLBACKEND"] = "agg"  # pictures go to files; a name that is none would stop matplotlib
-    app = commands.app_for(sys.argv[1:])  # which imports the command
-    try:
-        if watched:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-        code = commands.run(app)
-        sys.stdout.flush()
-    except KeyboardInterrupt:
-        code = commands.interrupted()
-    finally:
-        if watched:
-            signal.signal(signal.SIGINT, signal.SIG_DFL)  # while Python ends, and runs no handlers any more
-    sys.exit(code)
 
 
 def _leave(number: int, frame: FrameType | None) -> None:
     """End the process without any more Python."""
     os.write(2, b"orthocas: interrupted\n")
     os._exit(INTERRUPTED)
+
+
+def main() -> None:
+    """Import the command that `sys.argv` names, run it, and exit with its code."""
+    from orthocas.cli import commands  # takes a second
+
+    watched = signal.getsignal(signal.SIGINT) is _leave
+    open_closed_streams()
+    # Pictures go to files. Another name that the variable may have would stop matplotlib.
+    os.environ["MPLBACKEND"] = "agg"
+    app = commands.build_app(sys.argv[1:])
+    try:
+        if watched:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        code = commands.run(app)
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        code = commands.report_interrupt()
+    finally:
+        # While Python ends, it runs no handlers any more.
+        if watched:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+    sys.exit(code)

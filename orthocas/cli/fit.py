@@ -1,8 +1,10 @@
 """`orthocas fit`: from a robot to a chart file."""
 
+import warnings
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import typer
 
@@ -27,23 +29,22 @@ from orthocas.cli.problem_argument import (
     CHAIN,
     DOMAIN,
     WEIGHTS_TEXT,
-    AnglesName,
-    BranchName,
-    DomainText,
-    LikeName,
-    PrecisionName,
+    AsJson,
+    Force,
     ProblemName,
     ProblemOptions,
     SampleCount,
     WeightsText,
-    build_problem,
+    add_problem_options,
+    is_robot_file,
+    parse_number,
     parse_weights,
     parse_whole_number,
     suggested,
     wide_fit,
 )
 from orthocas.control.gains import find_holding_doubts
-from orthocas.errors import Interrupted, InvalidValueError, OptionError
+from orthocas.errors import BranchWarning, Interrupted, InvalidValueError, OptionError
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
 from orthocas.fitting.probe import Bounds
@@ -51,17 +52,22 @@ from orthocas.fitting.settings import PRECISIONS, Precision, choose_parametrisat
 from orthocas.fitting.suggest_domain import CONDITIONING, LEAK_DEG, DomainSuggestion
 from orthocas.fitting.wide import WideFit
 from orthocas.paths.chart_along import RADIUS, corridor_problem
+from orthocas.robots.robot import Robot
 from orthocas.solvers import get as get_solver
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.corridor import read_postures
+from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem import Problem
+from orthocas.tasks.task import Task
 from orthocas.tools.archive import require_free
 from orthocas.tools.display import listed, number_list, percent
 from orthocas.tools.interrupts import INTERRUPTED
 from orthocas.tools.json import collect_attributes
+from orthocas.tools.progress import Monitor
 
-_WIDE_ROWS = ("regular", "left out", "meaning")  # facts of wide fits
+_AUTO, _BRANCH = "auto", "branch"  # words of --domain
 _IN_CORRIDOR = "polynomial:3:cyclic"  # more terms gain little there
+_WIDE_ROWS = ("regular", "left out", "meaning")  # facts of wide fits
 
 
 @parse_whole_number(*CHAIN, *DOMAIN, "least_singular_value")
@@ -85,40 +91,56 @@ def fit(
             "default: one that suits the parametrisation.",
         ),
     ] = None,
-    domain: DomainText = None,
-    branch: BranchName = None,
-    like: LikeName = None,
+    domain: Annotated[
+        str | None,
+        typer.Option(
+            "--domain",
+            help="auto: the widest box around the home on which the fit keeps --leak-deg and --conditioning; "
+            "branch: all of the home's branch of the joint range (a wide chart); branch:NAME: of another one, "
+            "see orthocas info --branches.",
+        ),
+    ] = None,
+    like: Annotated[
+        str | None,
+        typer.Option("--like", help="What the first coordinates are like: a joint or swivel; several: NAME,NAME."),
+    ] = None,
     corridor: Annotated[
         Path | None,
         typer.Option(
             "--corridor",
             metavar="POSTURES.csv",
-            help="Domain: the surroundings of a path of postures, one a line, with the joint names in the first line.",
+            help="Domain: the surroundings of a path of postures, one a line, with the joint names in the first line; "
+            f"their radius is --half-width [rad], default {RADIUS:g}.",
         ),
     ] = None,
-    radius: Annotated[
-        float | None,
-        typer.Option("--radius", parser=number, help=f"Of the corridor [rad]; default {RADIUS:g}."),
-    ] = None,
     leak_deg: Annotated[
-        float | None, typer.Option("--leak-deg", parser=number, help="Largest leak for --domain auto [deg]; default 8.")
+        float | None,
+        typer.Option("--leak-deg", parser=parse_number, help="Largest leak for --domain auto [deg]; default 8."),
     ] = None,
     conditioning: Annotated[
         float | None,
-        typer.Option("--conditioning", parser=number, help="Smallest conditioning for --domain auto; default 0.2."),
+        typer.Option(
+            "--conditioning", parser=parse_number, help="Smallest conditioning for --domain auto; default 0.2."
+        ),
     ] = None,
     samples: SampleCount = None,
     seed: Annotated[
         int, typer.Option("--seed", parser=parse_whole_number, help="Seed of the samples and of random starts.")
     ] = 0,
     weights: WeightsText = WEIGHTS_TEXT,
-    angles: AnglesName = None,
-    precision: PrecisionName = PRECISIONS[0],
+    angles: Annotated[
+        str | None,
+        typer.Option(
+            "--angles",
+            help="Angles in the loss: paper (Euclidean norms) or metric; default: metric with --metric inertia and "
+            "for tasks that turn the tool.",
+        ),
+    ] = None,
     max_mutual_deg: Annotated[
         float | None,
         typer.Option(
             "--max-mutual-deg",
-            parser=number,
+            parser=parse_number,
             help="Bound on the rms deviation of the mutual angles from 90 deg; Ipopt minimises the task angle.",
         ),
     ] = None,
@@ -129,32 +151,34 @@ def fit(
     json: AsJson = False,
 ) -> None:
     """Fit extra coordinates to a problem and save the chart."""
-    bounds = _bounds(domain, leak_deg, conditioning, corridor)
-    wide = domain == BRANCH
-    if branch is not None and not wide:
-        raise OptionError("--branch requires --domain branch")
-    if wide:
-        usual_loss = weights == WEIGHTS_TEXT and angles is None and precision == PRECISIONS[0]
-        _require_none({"solver": solver, "max-mutual-deg": max_mutual_deg})
-        _require_none({"weights, --angles and --precision": None if usual_loss else weights})
-    built = _corridor_or_box(problem, words, corridor, radius) if bounds is None and not wide else None
+    bounds = {"leak_deg": leak_deg, "conditioning": conditioning}
+    kind, branch = _check_domain(domain, corridor, bounds)
+    if kind == _BRANCH:
+        loss_text = None if weights == WEIGHTS_TEXT else weights
+        _check_none(solver=solver, max_mutual_deg=max_mutual_deg, weights=loss_text, angles=angles)
+
+    # What can be refused is refused before anything takes time.
+    built = None if kind else _build_problem(problem, words, corridor)
     target = out or Path(f"{Path(problem).stem if built is None else built.name}.orthocas")
     require_free(target, CHART, force)
     param = _IN_CORRIDOR if param is None and corridor is not None else param
     parametrisation = None if param is None else parse_parametrisation(param)
     minimiser = None if solver is None else get_solver(solver)
     loss = parse_weights(weights, angles)
-    suggestion = None
+    quantities = None if like is None else [word.strip() for word in like.split(",")]
+
+    suggestion, result = None, None
     try:
         with terminal_monitor() as monitor:
-            if bounds is not None:
-                built, suggestion = suggested(problem, words, parametrisation, bounds, loss, seed, monitor)
-            if built is None:
-                result: Fit = wide_fit(problem, words, branch, like, parametrisation, samples, seed, monitor)
-            else:
-                others = (minimiser, samples, max_mutual_deg, like)
-                usual = others == (None,) * 4 and precision == PRECISIONS[0]
-                result = (_confirming(suggestion, built, parametrisation) if usual else None) or fit_chart(
+            if kind == _AUTO:
+                built, suggestion = _suggest_problem(problem, words, parametrisation, bounds, loss, seed, monitor)
+                if (minimiser, samples, max_mutual_deg, like) == (None,) * 4:
+                    result = _reuse_fit(suggestion, built, parametrisation)
+            elif kind == _BRANCH:
+                result = _fit_wide(problem, words, branch, quantities, parametrisation, samples, seed, monitor)
+            if result is None:
+                assert built is not None
+                result = fit_chart(
                     built,
                     parametrisation,
                     minimiser,
@@ -163,22 +187,148 @@ def fit(
                     seed=seed,
                     monitor=monitor,
                     max_mutual_deg=max_mutual_deg,
-                    precision=cast(Precision, precision),
-                    like=None if like is None else [word.strip() for word in like.split(",")],
+                    like=quantities,
                 )
     except Interrupted as stop:
         result = stop.result
+
+    _save_and_report(result, suggestion, target, seed, force, json)
+
+
+def _check_domain(domain: str | None, corridor: Path | None, bounds: Mapping[str, float | None]) -> tuple[str, str]:
+    """The kind of a domain, and the name of its branch; raises OptionError for options of another kind."""
+    kind, _, branch = (domain or "").partition(":")
+    if domain is not None and corridor is not None:
+        raise OptionError("--corridor is a domain: leave out --domain")
+    if kind != _AUTO:
+        for option, value in bounds.items():
+            if value is not None:
+                raise OptionError(f"--{option.replace('_', '-')} requires --domain auto")
+    if domain not in (None, _AUTO) and kind != _BRANCH:
+        raise InvalidValueError(
+            "--domain",
+            repr(domain),
+            "auto, branch, branch:NAME, or --centre and --half-width for a box of your own",
+        )
+    return kind, branch.strip()
+
+
+def _check_none(**values: object) -> None:
+    """Raise OptionError for options that wide charts do not have."""
+    for name, value in values.items():
+        if value is not None:
+            option = f"--{name.replace('_', '-')}"
+            raise OptionError(f"--domain branch has a solver and a loss of its own: leave out {option}")
+
+
+def _build_problem(name: str, words: ProblemOptions, corridor: Path | None) -> Problem:
+    """The problem of a command line, in the surroundings of the postures of a file if one is given."""
+    if corridor is None:
+        return words.build_problem(name)
+    words.require_none(("centre", "home", "least_singular_value"), "--corridor is a domain")
+    radius = words.parse_half_width()
+    if radius is not None and not isinstance(radius, float):
+        raise InvalidValueError("--half-width", words.half_width, "one number: the radius of the corridor")
+    problem = replace(words, half_width=None).build_problem(name)
+    return corridor_problem(problem, read_postures(corridor, problem.robot), RADIUS if radius is None else radius)
+
+
+def _suggest_problem(
+    name: str,
+    words: ProblemOptions,
+    parametrisation: Parametrisation | None,
+    bounds: Mapping[str, float | None],
+    weights: Weights,
+    seed: int,
+    monitor: Monitor,
+) -> tuple[Problem, DomainSuggestion]:
+    """The problem of `--domain auto`, and the suggestion that its domain comes from."""
+    words.require_none(("half_width",), "--domain auto finds the half-width")
+    words.require_none(("least_singular_value",), "--domain auto stays clear of singular postures")
+    base = None if is_robot_file(name) else words.build_problem(name)
+    robot, task, metric = _build_parts(name, words, base)
+    home = words.home or (words.find_centre(robot) if base is None else base.domain.centre)
+    suggestion = suggest_domain(
+        robot,
+        task,
+        home,
+        metric,
+        leak_deg=LEAK_DEG if bounds["leak_deg"] is None else bounds["leak_deg"],
+        conditioning=CONDITIONING if bounds["conditioning"] is None else bounds["conditioning"],
+        parametrisation=parametrisation,
+        weights=weights,
+        seed=seed,
+        monitor=monitor,
+    )
+    return Problem(robot, task, metric, suggestion.domain, Path(name).stem if base is None else base.name), suggestion
+
+
+def _reuse_fit(suggestion: DomainSuggestion, built: Problem, parametrisation: Parametrisation | None) -> Fit | None:
+    """The fit that confirmed the domain, if it has the family that is asked for."""
+    default = choose_parametrisation(built, True) == choose_parametrisation(built, False)
+    if parametrisation is None and not default:
+        return None
+    return replace(suggestion.fit, chart=replace(suggestion.fit.chart, problem=built))
+
+
+def _fit_wide(
+    name: str,
+    words: ProblemOptions,
+    branch: str,
+    like: list[str] | None,
+    parametrisation: Parametrisation | None,
+    samples: int | None,
+    seed: int,
+    monitor: Monitor,
+) -> WideFit:
+    """Fit the wide chart of `--domain branch`; the home chooses the branch if it has no name."""
+    words.require_none(("centre", "half_width"), "--domain branch is a domain")
+    base = None if is_robot_file(name) else replace(words, least_singular_value=None).build_problem(name)
+    robot, task, metric = _build_parts(name, words, base)
+    centre = None if base is None or branch else base.domain.centre
+    with warnings.catch_warnings():
+        # commands print a note instead
+        warnings.simplefilter("ignore", BranchWarning)
+        return fit_wide(
+            robot,
+            task,
+            branch or None,
+            metric,
+            clearance=CLEARANCE if words.least_singular_value is None else words.least_singular_value,
+            parametrisation=parametrisation,
+            home=words.home if base is None else centre,
+            like=like[0] if like and len(like) == 1 else like,
+            samples=samples,
+            seed=seed,
+            monitor=monitor,
+        )
+
+
+def _build_parts(name: str, words: ProblemOptions, base: Problem | None) -> tuple[Robot, Task, Metric | str]:
+    """Those of a named problem, or those that the options describe for a robot file."""
+    if base is not None:
+        return base.robot, base.task, base.metric
+    robot = words.build_robot(name)
+    return robot, Task.named(robot, words.task or "position"), words.metric or "euclidean"
+
+
+def _save_and_report(
+    result: Fit, suggestion: DomainSuggestion | None, target: Path, seed: int, force: bool, json: bool
+) -> None:
+    """Write the chart, print what it is like, and end with the exit code of Ctrl-C if that ended the fit."""
     if isinstance(result, WideFit) and result.left_out:
         note(f"the chart of branch '{result.chart.notes['branch']}' leaves out {result.left_out}")
-    known = result.chart.problem
-    for doubt in find_holding_doubts(known.robot, known.domain, known.robot.effort_limits):
+    fitted = result.chart.problem
+    for doubt in find_holding_doubts(fitted.robot, fitted.domain, fitted.robot.effort_limits):
         note(doubt)
     result.chart.save(target, force)
     report = evaluate(result.chart, seed=seed + 1)
     if json:
-        print_json(_as_dict(result, report, target, suggestion))
+        print_json(_describe_fit(result, report, target, suggestion))
     else:
-        print_rows({**_rows(result, report, target), **({} if suggestion is None else _domain_rows(suggestion))})
+        print_rows(
+            {**_format_fit(result, report, target), **({} if suggestion is None else _format_domain(suggestion))}
+        )
     if result.status is Status.INTERRUPTED:
         note("interrupted: the chart holds the best coordinates found so far")
         raise typer.Exit(INTERRUPTED)
@@ -274,7 +424,7 @@ def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
     return {**rows, **format_reach_rows(result.chart), "chart": str(target)}
 
 
-def _domain_rows(suggestion: DomainSuggestion) -> dict[str, str]:
+def _format_domain(suggestion: DomainSuggestion) -> dict[str, str]:
     """What ends the domain in each joint."""
     rows = {"home": f"{number_list(suggestion.home)} ({suggestion.home_source})"}
     for joint in suggestion.joints:
@@ -282,7 +432,7 @@ def _domain_rows(suggestion: DomainSuggestion) -> dict[str, str]:
     return rows
 
 
-def _wide(result: Fit) -> dict[str, Any]:
+def _describe_wide(result: Fit) -> dict[str, Any]:
     if not isinstance(result, WideFit) or result.branch is None:
         return {}
     meaning = None if result.meaning is None else {"like": result.chart.notes["meaning"], **asdict(result.meaning)}
@@ -293,7 +443,7 @@ def _wide(result: Fit) -> dict[str, Any]:
     }
 
 
-def _as_dict(result: Fit, report: Report, target: Path, suggestion: DomainSuggestion | None) -> dict[str, Any]:
+def _describe_fit(result: Fit, report: Report, target: Path, suggestion: DomainSuggestion | None) -> dict[str, Any]:
     check = result.problem_check
     return {
         **({} if suggestion is None else {"suggested_domain": suggestion.as_dict()}),
@@ -304,7 +454,7 @@ def _as_dict(result: Fit, report: Report, target: Path, suggestion: DomainSugges
         "status": result.status.value,
         "seconds": result.seconds,
         "idle_joints": list(result.idle_joints),
-        **_wide(result),
+        **_describe_wide(result),
         "least_conditioning": None if result.worst is None else result.worst.least,
         "cyclic_joints": list(result.cyclic_joints),
         "near_singular_share": check.singular_share,

@@ -1,7 +1,6 @@
 """`orthocas follow`: joint motions along a tool path."""
 
 import time
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,13 +8,13 @@ from typing import Annotated, Any
 import typer
 
 from orthocas.charts.chart import Chart
-from orthocas.cli.output import AsJson, ChartPath, Force, number, print_json, print_rows
-from orthocas.cli.problem_argument import parse_numbers
+from orthocas.cli.options import AsJson, ChartPath, Force, parse_number, parse_numbers, parse_one_or_all
+from orthocas.cli.output import print_json, print_rows
 from orthocas.errors import InvalidValueError
 from orthocas.paths.follow import HOLD, OBJECTIVE
 from orthocas.paths.follow import follow as follow_path
 from orthocas.paths.joint_motion import JointMotion, require_place
-from orthocas.paths.plan import read_path
+from orthocas.paths.tool_path import read_path
 from orthocas.robots.obstacles import Capsule, Obstacle, Plane, Sphere
 from orthocas.tools.checks import Array, require_known
 from orthocas.tools.interrupts import deferred
@@ -35,7 +34,9 @@ def follow(
     start: Annotated[
         str | None, typer.Option("--start", help='Joint positions near the start, "0,0.5,..."; default: the centre.')
     ] = None,
-    period: Annotated[float, typer.Option("--period", parser=number, help="Distance of the time stamps [s].")] = 0.01,
+    period: Annotated[
+        float, typer.Option("--period", parser=parse_number, help="Distance of the time stamps [s].")
+    ] = 0.01,
     velocity: Annotated[
         str | None,
         typer.Option("--velocity-limit", help="Of all joints or each [rad/s], [m/s]; default: the robot's."),
@@ -44,26 +45,30 @@ def follow(
         str | None,
         typer.Option("--acceleration-limit", help="Of all joints or each [rad/s^2]; default: full speed in 0.5 s."),
     ] = None,
-    sphere: Annotated[list[str] | None, typer.Option("--sphere", help='Obstacle "x,y,z,radius" [m].')] = None,
-    capsule: Annotated[list[str] | None, typer.Option("--capsule", help='Obstacle "x,y,z,x,y,z,radius" [m].')] = None,
-    plane: Annotated[
-        list[str] | None, typer.Option("--plane", help='Obstacle: normal and point, "0,0,1,0,0,0".')
+    obstacle: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--obstacle",
+            help="sphere:X,Y,Z,RADIUS, capsule:X,Y,Z,X,Y,Z,RADIUS or plane:NORMAL,POINT [m]; repeat for more.",
+        ),
     ] = None,
     link_radius: Annotated[
-        float, typer.Option("--link-radius", parser=number, help="Radius of the robot's links [m].")
+        float, typer.Option("--link-radius", parser=parse_number, help="Radius of the robot's links [m].")
     ] = 0.0,
     clearance: Annotated[
-        float, typer.Option("--clearance", parser=number, help="Smallest distance from obstacles [m].")
+        float, typer.Option("--clearance", parser=parse_number, help="Smallest distance from obstacles [m].")
     ] = 0.0,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
     """Follow a tool path; write joint positions, velocities and accelerations on time stamps."""
     require_place(out, force)
-    with deferred():  # CasADi may lose Ctrl-C while it builds functions
+    # CasADi may lose Ctrl-C while it builds functions.
+    with deferred():
         loaded = Chart.load(chart)
-        loaded.function("xi")  # raises for grown charts
-    waypoints, choice = _task_of(path, loaded, xi)
+        # Raises for grown charts.
+        loaded.function("xi")
+    waypoints, choice = _read_task(path, loaded, xi)
     begin = time.perf_counter()
     motion = follow_path(
         loaded,
@@ -71,21 +76,21 @@ def follow(
         choice,
         q_start=None if start is None else parse_numbers("--start", start),
         period=period,
-        velocity_limits=_limits("--velocity-limit", velocity),
-        acceleration_limits=_limits("--acceleration-limit", acceleration),
-        obstacles=_obstacles(sphere or (), capsule or (), plane or ()),
+        velocity_limits=None if velocity is None else parse_one_or_all("--velocity-limit", velocity),
+        acceleration_limits=None if acceleration is None else parse_one_or_all("--acceleration-limit", acceleration),
+        obstacles=[_build_obstacle(text) for text in obstacle or ()],
         link_radius=link_radius,
         clearance=clearance,
     )
     seconds = time.perf_counter() - begin
     motion.save_csv(out, force)
     if json:
-        print_json(_report(motion, seconds, out))
+        print_json(_build_report(motion, seconds, out))
     else:
         print_rows({**motion.facts(), "computed in": f"{seconds:.2f} s", "file": str(out)})
 
 
-def _task_of(path: Path, chart: Chart, xi: str | None) -> tuple[Array, Any]:
+def _read_task(path: Path, chart: Chart, xi: str | None) -> tuple[Array, Any]:
     """The waypoints, and what to do with the coordinates: as asked for, or as the columns of the file suggest."""
     waypoints, schedule = read_path(path, chart)
     choice = xi or (HOLD if schedule is None else SCHEDULE)
@@ -97,37 +102,20 @@ def _task_of(path: Path, chart: Chart, xi: str | None) -> tuple[Array, Any]:
     return waypoints, choice if schedule is None else schedule
 
 
-def _limits(option: str, text: str | None) -> Array | float | None:
-    """Numbers of all joints, or one number."""
-    if text is None:
-        return None
-    values = parse_numbers(option, text)
-    return float(values[0]) if len(values) == 1 else values
+def _build_obstacle(text: str) -> Obstacle:
+    """Read sphere:X,Y,Z,RADIUS and the like."""
+    kind, _, numbers = text.partition(":")
+    counts = {"sphere": 4, "capsule": 7, "plane": 6}
+    require_known("kind of --obstacle", kind, counts)
+    values = parse_numbers(f"--obstacle {kind}", numbers, counts[kind])
+    if kind == "sphere":
+        return Sphere(values[:3], values[3])
+    if kind == "capsule":
+        return Capsule(values[:3], values[3:6], values[6])
+    return Plane(values[:3], values[3:])
 
 
-def _obstacles(spheres: Sequence[str], capsules: Sequence[str], planes: Sequence[str]) -> list[Obstacle]:
-    """The obstacles of the options, spheres first."""
-    found: list[Obstacle] = []
-    for text in spheres:
-        values = _numbers("--sphere", text, 4)
-        found.append(Sphere(values[:3], values[3]))
-    for text in capsules:
-        values = _numbers("--capsule", text, 7)
-        found.append(Capsule(values[:3], values[3:6], values[6]))
-    for text in planes:
-        values = _numbers("--plane", text, 6)
-        found.append(Plane(values[:3], values[3:]))
-    return found
-
-
-def _numbers(option: str, text: str, count: int) -> Array:
-    values = parse_numbers(option, text)
-    if len(values) != count:
-        raise InvalidValueError(option, repr(text)[:80], f"{count} numbers")
-    return values
-
-
-def _report(motion: JointMotion, seconds: float, out: Path) -> dict[str, Any]:
+def _build_report(motion: JointMotion, seconds: float, out: Path) -> dict[str, Any]:
     r = motion.xi.shape[1]
     return {
         "duration": motion.duration,

@@ -8,16 +8,8 @@ import typer
 
 from orthocas import problems
 from orthocas.bases.cyclic import cyclic_joints
-from orthocas.cli.output import AsJson, print_json, print_rows
-from orthocas.cli.problem_argument import (
-    ROBOT,
-    ProblemName,
-    ProblemOptions,
-    build_problem,
-    build_robot,
-    is_robot_file,
-    with_options,
-)
+from orthocas.cli.options import AsJson, ProblemName, ProblemOptions, add_problem_options, is_robot_file
+from orthocas.cli.output import build_reach_data, print_json, print_rows
 from orthocas.errors import OptionError, RobotError, SingularTaskError
 from orthocas.exact.involutivity import involutivity
 from orthocas.robots.robot import Robot
@@ -36,7 +28,7 @@ _FAULTS = ("near_singular_share", "half_turn_share")
 _SHARES = ("share", "clear_share", "share of the branch", "branches", *_FAULTS)  #: names of numbers to show in percent
 
 
-@with_options(*ROBOT)
+@add_problem_options("tip", "lock", "tool", "base")
 def info(
     target: ProblemName,
     words: ProblemOptions,
@@ -47,45 +39,44 @@ def info(
 ) -> None:
     """Show a chart file, a named problem, or a robot file."""
     if is_robot_file(target):
-        robot = build_robot(target, words)
-        data = {**_robot(robot), **_redundancy(robot), **(_branches(robot, None) if branches else {})}
+        robot = words.build_robot(target)
+        data = {
+            **_describe_robot(robot),
+            **_describe_redundancy(robot),
+            **(_describe_branches(robot, None) if branches else {}),
+        }
     elif target in problems.names():
-        problem = build_problem(target, words)
-        data = {**_problem(problem), **(_branches(problem.robot, problem.task) if branches else {})}
+        problem = words.build_problem(target)
+        data = {**_describe_problem(problem), **(_describe_branches(problem.robot, problem.task) if branches else {})}
     elif branches:
         raise OptionError(f"--branches requires a robot file or a named problem, not the chart {target}")
     else:
         words.require_no_robot(f"the chart {target}")
-        chart = _load(_chart_path(target))
+        chart = _load_chart(target)
         data = {
-            **_problem(chart.problem),
+            **_describe_problem(chart.problem),
             "parametrisation": chart.coordinates.label,
             "parameters": chart.coordinates.size,
-            **_reach(chart),
+            **build_reach_data(chart),
             "notes": dict(chart.notes),
             **({"certificate": chart.certificate.as_dict()} if chart.certificate else {}),
         }
     if json:
         print_json(data)
     else:
-        print_rows({name: _text(value, name) for name, value in data.items()})
+        print_rows({name: _format(value, name) for name, value in data.items()})
 
 
-def _load(path: Path) -> "Chart":
+def _load_chart(target: str) -> "Chart":
+    """The chart of a file; a target that is no file but looks like a name raises an error with the known names."""
     from orthocas.charts.chart import load  # takes long to import, and problems and robots do not need it
 
-    return load(path)
+    if not Path(target).exists() and not Path(target).suffix:
+        ProblemOptions().build_problem(target)
+    return load(target)
 
 
-def _chart_path(target: str) -> Path:
-    """The path of a chart; a target that is no file but looks like a name raises an error with the known names."""
-    path = Path(target)
-    if not path.exists() and not path.suffix:
-        build_problem(target, ProblemOptions())
-    return path
-
-
-def _robot(robot: Robot) -> dict[str, Any]:
+def _describe_robot(robot: Robot) -> dict[str, Any]:
     return {
         "joints": list(robot.joint_names),
         "kinds": list(robot.tree.joint_kinds),
@@ -101,11 +92,12 @@ def _robot(robot: Robot) -> dict[str, Any]:
     }
 
 
-def _redundancy(robot: Robot) -> dict[str, Any]:
+def _describe_redundancy(robot: Robot) -> dict[str, Any]:
     """The number r = n - m of extra coordinates of each task that has some, and the joints that do not move it."""
     kinds = ("position", "pose", *(("relative_position", "relative_pose") if len(robot.tips) == 2 else ()))
-    q = robot.tree.centre_posture + 0.1 * np.arange(1, robot.n + 1)  # no posture in which joints happen to be parallel
-    found, floating = {}, robot.tree.floating
+    # No posture in which joints happen to be parallel.
+    q = robot.tree.centre_posture + 0.1 * np.arange(1, robot.n + 1)
+    coordinates, floating = {}, robot.tree.floating
     for kind in kinds:
         task = Task.named(robot, kind, q)
         J = task.batched_frame_jacobian(q[None])[0].reshape(task.m, robot.n)
@@ -113,27 +105,29 @@ def _redundancy(robot: Robot) -> dict[str, Any]:
             columns = zip(robot.joint_names, J.T, strict=True)
             still = NEGLIGIBLE * np.abs(J).max()
             idle = [] if floating else [name for name, column in columns if np.abs(column).max() <= still]
-            found[kind] = f"r = {robot.n - len(floating) - task.m}" + (f", idle: {', '.join(idle)}" if idle else "")
-    return {"extra_coordinates": found}
+            coordinates[kind] = f"r = {robot.n - len(floating) - task.m}" + (
+                f", idle: {', '.join(idle)}" if idle else ""
+            )
+    return {"extra_coordinates": coordinates}
 
 
-def _branches(robot: Robot, task: Task | None) -> dict[str, Any]:
+def _describe_branches(robot: Robot, task: Task | None) -> dict[str, Any]:
     """The branches of the joint range: what cuts it, and for each its share of the clear positions and a posture.
 
     Branches that are too near to singular positions for the default clearance of wide charts have the one they allow.
     """
-    found = find_branches(robot, task)
-    lower = {item.name: item.clearance for item in found if item.clearance < BRANCH_RULES.nonsingular}
+    branching = find_branches(robot, task)
+    lower = {item.name: item.clearance for item in branching if item.clearance < BRANCH_RULES.nonsingular}
     return {
-        "cuts": [cut.explained for cut in found.cuts],
-        "branches": {item.name: item.share for item in found},
+        "cuts": [cut.explained for cut in branching.cuts],
+        "branches": {item.name: item.share for item in branching},
         **({"clearance_at_most": lower} if lower else {}),
-        "postures": {item.name: clean(item.posture) for item in found},
+        "postures": {item.name: clean(item.posture) for item in branching},
     }
 
 
-def _problem(problem: Problem) -> dict[str, Any]:
-    found = check(problem)
+def _describe_problem(problem: Problem) -> dict[str, Any]:
+    checked = check(problem)
     return {
         "problem": problem.name,
         "n": problem.n,
@@ -147,38 +141,32 @@ def _problem(problem: Problem) -> dict[str, Any]:
         "unbounded_joints": [problem.robot.joint_names[k] for k in problem.domain.unbounded],
         **problem.domain.report_condition(),
         "cyclic_joints": list(cyclic_joints(problem)),
-        "near_singular_share": found.singular_share,
-        "half_turn_share": found.half_turn_share,
-        "most_singular_point": list(found.most_singular_point),
-        **_involutivity(problem),
-        **_robot(problem.robot),
+        "near_singular_share": checked.singular_share,
+        "half_turn_share": checked.half_turn_share,
+        "most_singular_point": list(checked.most_singular_point),
+        **_describe_involutivity(problem),
+        **_describe_robot(problem.robot),
     }
 
 
-def _reach(chart: "Chart") -> dict[str, Any]:
-    from orthocas.cli.evaluate import reach_data  # as _load
-
-    return reach_data(chart)
-
-
-def _involutivity(problem: Problem) -> dict[str, Any]:
+def _describe_involutivity(problem: Problem) -> dict[str, Any]:
     try:
-        found = involutivity(problem)
+        result = involutivity(problem)
     except (SingularTaskError, RobotError) as error:
         return {"verdict": f"unknown whether exact coordinates exist: {error}"}
     return {
-        "involutivity_defect": {"mean": found.mean, "max": found.max},
-        "expected_leak_deg": found.expected_leak_deg,
-        "expected_angle_deg": found.expected_angle_deg,
-        "verdict": found.verdict,
+        "involutivity_defect": {"mean": result.mean, "max": result.max},
+        "expected_leak_deg": result.expected_leak_deg,
+        "expected_angle_deg": result.expected_angle_deg,
+        "verdict": result.verdict,
     }
 
 
-def _text(value: Any, name: str = "") -> str:
+def _format(value: Any, name: str = "") -> str:
     if isinstance(value, list):
-        return ", ".join(_text(item) for item in value) or "none"
+        return ", ".join(_format(item) for item in value) or "none"
     if isinstance(value, dict):
-        return ", ".join(f"{key} {_text(item, name if name in _SHARES else key)}" for key, item in value.items())
+        return ", ".join(f"{key} {_format(item, name if name in _SHARES else key)}" for key, item in value.items())
     if value is None:
         return "unlimited"
     if isinstance(value, float) and name in _SHARES:

@@ -1,86 +1,26 @@
-"""What commands share: how options are read, and output as aligned text for people or one JSON object."""
+"""What commands print: aligned text for people or one JSON object, remarks, and progress on standard error."""
 
-import inspect
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from functools import wraps
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from orthocas.errors import one_line, printable
+from orthocas.errors import InvalidValueError, one_line, printable
 from orthocas.tools.display import percent
-from orthocas.tools.json import write_json
-from orthocas.tools.progress import Monitor, Progress
+from orthocas.tools.json import clean, write_json
+from orthocas.tools.progress import Monitor, Progress, TerminalBars
 
 if TYPE_CHECKING:
+    from orthocas.charts.chart import Chart
     from orthocas.charts.quality import Report
-
-
-def whole_number(text: str) -> int:
-    """Parse the value of an option that takes a whole number."""
-    try:
-        return int(text)
-    except ValueError:
-        raise typer.BadParameter(f"received {text!r}, expected a whole number") from None
-
-
-def number(text: str) -> float:
-    """Parse the value of an option that takes a number."""
-    try:
-        return float(text)
-    except ValueError:
-        raise typer.BadParameter(f"received {text!r}, expected a number") from None
-
+    from orthocas.charts.self_motion import XiRange
 
 PAUSE = 10.0  #: [s] between lines of progress where there is no terminal
 _UNEVEN = 30.0  # ratio of gradient lengths above which the same gain means too different things across the domain
-
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
-
-ChartPath = Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")]
-
-Scheduler = Annotated[
-    str | None, typer.Option("--scheduler", help="Address of a Dask scheduler, for example tcp://host:8786.")
-]
-
-Force = Annotated[bool, typer.Option("--force", help="Replace files of the same names that orthocas did not write.")]
-
-
-def spread(
-    parameter: str, options: Mapping[str, Any], made: Callable[[dict[str, Any]], Any]
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """A decorator of commands: options take the place of one parameter.
-
-    Args:
-        parameter: its name.
-        options: annotations of the options, by name; they are optional.
-        made: the parameter, from the values of the options.
-    """
-
-    def decorated(command: Callable[..., None]) -> Callable[..., None]:
-        own = inspect.signature(command).parameters.values()
-        added = [
-            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
-            for name, annotation in options.items()
-        ]
-        parts = [added if part.name == parameter else [part.replace(kind=part.KEYWORD_ONLY)] for part in own]
-
-        @wraps(command)
-        def called(**given: Any) -> None:
-            chosen = {name: given.pop(name) for name in options}
-            command(**{parameter: made(chosen)}, **given)
-
-        parameters = [part for some in parts for part in some]
-        vars(called)["__signature__"] = inspect.Signature(parameters)
-        called.__annotations__ = {part.name: part.annotation for part in parameters}
-        return called
-
-    return decorated
 
 
 def print_json(data: Mapping[str, Any]) -> None:
@@ -110,7 +50,7 @@ def note(text: str) -> None:
     typer.echo(f"note: {one_line(text)}", err=True)
 
 
-def report_rows(report: "Report") -> dict[str, str]:
+def format_report_rows(report: "Report") -> dict[str, str]:
     """The rows of a quality report, with advice on command-line options."""
     rows = report.facts()
     if report.length_ratio > _UNEVEN:
@@ -118,10 +58,40 @@ def report_rows(report: "Report") -> dict[str, str]:
     return rows
 
 
+def format_reach_rows(chart: "Chart") -> dict[str, str]:
+    """The ranges of xi in one row."""
+    if (reach := _find_reach(chart)) is None:
+        return {}
+    return {"xi reach": ", ".join(f"{part.label} {part.low:.3g} to {part.high:.3g}" for part in reach)}
+
+
+def build_reach_data(chart: "Chart") -> dict[str, Any]:
+    """The ranges of xi and what stops them there, for JSON."""
+    if (reach := _find_reach(chart)) is None:
+        return {}
+    return {
+        "xi_range": {part.label: [clean(part.low), clean(part.high)] for part in reach},
+        "xi_stops": {part.label: [str(part.low_stop), str(part.high_stop)] for part in reach},
+    }
+
+
+def _find_reach(chart: "Chart") -> "XiRange | None":
+    """The ranges of xi at the centre; None for grown charts, which take seconds, and where the task is not finite."""
+    from orthocas.charts.coordinates import InvertibleMap  # only here: commands without charts print too
+
+    if isinstance(chart.coordinates, InvertibleMap):
+        return None
+    try:
+        return chart.xi_range(chart.problem.domain.centre)
+    except InvalidValueError:
+        return None
+
+
 @contextmanager
 def terminal_monitor() -> Iterator[Monitor]:
     """A monitor that draws one bar per stage; a line every ten seconds when standard error is not a terminal."""
-    with _stage_bars() if sys.stderr.isatty() else lines_of_progress(PAUSE) as show:
+    bars = sys.stderr.isatty()
+    with closing(TerminalBars(sys.stderr, transient=True)) if bars else lines_of_progress(PAUSE) as show:
         yield show
 
 
@@ -144,24 +114,3 @@ def lines_of_progress(pause: float) -> Iterator[Monitor]:
     finally:
         ended.set()
         speaker.join()
-
-
-@contextmanager
-def _stage_bars() -> Iterator[Monitor]:
-    """A monitor that draws one bar per stage by rich."""
-    from rich.console import Console  # takes longer to import than the rest
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bars
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TextColumn("{task.fields[detail]}"))
-    tasks: dict[str, Any] = {}
-    with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
-
-        def show(progress: Progress) -> None:
-            if progress.stage not in tasks:
-                for task in tasks.values():
-                    bars.update(task, completed=1.0)
-                tasks[progress.stage] = bars.add_task(progress.stage, total=1.0, detail="")
-            bars.update(tasks[progress.stage], completed=progress.fraction, detail=progress.detail)
-
-        yield show

@@ -11,27 +11,10 @@ import typer
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.quality import evaluate
-from orthocas.cli.controller_argument import (
-    CONTROLLERS,
-    Limit,
-    build_controller,
-    require_settings,
-    require_torques,
-    with_settings,
-)
-from orthocas.cli.output import (
-    AsJson,
-    ChartPath,
-    Force,
-    note,
-    number,
-    print_json,
-    print_rows,
-    terminal_monitor,
-    whole_number,
-)
-from orthocas.cli.problem_argument import parse_numbers
-from orthocas.control.controller import Controller, ControlStatus
+from orthocas.cli.codegen import CONTROLLERS, add_law_options, build_controller, require_settings
+from orthocas.cli.options import AsJson, ChartPath, Force, Limit, parse_number, parse_numbers, parse_whole_number
+from orthocas.cli.output import note, print_json, print_rows, terminal_monitor
+from orthocas.control.controller import Controller, ControlStatus, law_of
 from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
 from orthocas.errors import ArchiveError, Interrupted, InvalidValueError, OptionError, SingularTaskError
@@ -49,178 +32,12 @@ from orthocas.tools.interrupts import INTERRUPTED, deferred
 from orthocas.tools.json import clean, write_json
 from orthocas.tools.progress import Monitor
 
-_REASONS = {
-    ControlStatus.OUTSIDE_DOMAIN: "the arm left the domain",
-    ControlStatus.SINGULAR: "the coordinates became singular",
-    ControlStatus.NOT_FINITE: "the controller received an input that was not finite",
-    ControlStatus.BAD_INPUT: "a measurement or a reference could not be used",
-    ControlStatus.TOO_FAST: "a joint exceeded its limit of velocity",
-    ControlStatus.LATE: "a tick came too late",
-    ControlStatus.OK: "the arm was not well inside the domain",  # where a supervised law begins
-}
-
-
-def run_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajectory, seconds: float) -> dict[str, Any]:
-    """Numbers of a run, SI units, ready for JSON.
-
-    Args:
-        controller: the controller that ran.
-        chart: the chart whose coordinates the run is measured in.
-        plan: the motion that it was to follow.
-        seen: the run in the chart's coordinates.
-        seconds: computing time [s].
-    """
-    bad = np.flatnonzero(seen.fell_back)
-    first = int(bad[0]) if bad.size else None
-    inside = np.asarray(chart.problem.domain.contains(seen.q))
-    judged = plan.has_steps and not plan.pushes and seen.outcome is Outcome.COMPLETE and inside.all() and not bad.size
-    largest = np.abs(seen.command).max(axis=0)
-    lasting = {status.name: seconds for status, seconds in seen.seconds_in_status.items()}
-    report = {
-        "controller": controller.name,
-        "coupling": controller.settings.get("coupling"),
-        "second": controller.settings.get("second"),
-        "gains": controller.gains,
-        "outcome": seen.outcome.value,
-        "reason": seen.reason or None,
-        "duration": float(seen.times[-1]),
-        "tracking_error": dict(zip(seen.labels, seen.tracking_error, strict=True)),
-        "coupling_index": _coupling(chart, plan.reference, seen) if judged else None,
-        "angles_on_path": _angles(chart, seen),
-        "fallback": {
-            "share": len(bad) / len(seen.times),
-            "since": None if first is None else float(seen.times[first]),
-            "reason": None if first is None else _REASONS[_cause(seen, first)],
-        },
-        "seconds_in_status": lasting,
-        "catches": [{"time": time, "cause": cause.name} for time, cause in seen.catches],
-        "saturated_share": float(seen.saturated.mean()),
-        "share_inside_domain": float(inside.mean()),
-        "command": seen.kind,
-        "largest_command": dict(zip(seen.joint_names, largest, strict=True)),
-        "energy": _energy(seen) if seen.kind == "torque" and not bad.size else None,
-        "seconds": seconds,
-    }
-    return dict(clean(report))
-
-
-def run_rows(report: dict[str, Any], problem: Problem) -> dict[str, str]:
-    """The report as rows of text."""
-    units = units_of(problem)
-    errors = [
-        f"{label} {_text(value)} {units.get(label, '')}".strip() for label, value in report["tracking_error"].items()
-    ]
-    joint, command = max(report["largest_command"].items(), key=lambda pair: pair[1])
-    by_torque = report["command"] == "torque"
-    lengths = units.get(joint) == "m"
-    unit = ("N" if lengths else "N m") if by_torque else ("m/s" if lengths else "rad/s")
-    rows = {
-        "run": f"{report['controller']}, {report['duration']:.4g} s: {report['outcome']}",
-        "largest error": ", ".join(errors),
-    }
-    if report["coupling_index"]:
-        rows["coupling index"] = _worst_couplings(report["coupling_index"], problem.task.labels)
-    if angles := report["angles_on_path"]:
-        task, leak = angles["task_angle_deg"], angles["leak_deg"]
-        rows["angles on path"] = (
-            f"leak rms {leak['rms']:.2f}, largest {leak['max']:.1f} deg (in the metric); "
-            f"task angle mean {task['mean']:.2f}, std {task['std']:.2f} deg (the paper's cosines)"
-        )
-    rows["command"] = f"at most {command:.4g} {unit}, {joint}"
-    if report["saturated_share"]:
-        rows["limit"] = f"reached for {percent(report['saturated_share'], fault=True)} of the run"
-    if report["catches"]:
-        rows["statuses"] = ", ".join(f"{name} {time:.3g} s" for name, time in report["seconds_in_status"].items())
-    if energy := report["energy"]:
-        rows["energy"] = (
-            f"V at most {_text(energy['storage_largest'])} J, at the end {_text(energy['storage_end'])} J; "
-            f"{_text(energy['dissipated'])} J dissipated"
-        )
-    rows["computed in"] = f"{report['seconds']:.2f} s"
-    return rows
-
-
-def fallback_text(report: dict[str, Any]) -> str | None:
-    """A sentence that says when and why the controller used its fallback; None if it never did."""
-    fallback = report["fallback"]
-    if fallback["since"] is None:
-        return None
-    if report["catches"]:
-        times = "once" if len(report["catches"]) == 1 else f"{len(report['catches'])} times"
-        return (
-            f"at t = {fallback['since']:.4g} s {fallback['reason']}: the catcher took over, {times} in all, "
-            f"and commanded for {percent(fallback['share'], fault=True)} of the run"
-        )
-    what = "the gravity torque" if report["command"] == "torque" else "zero velocity"
-    return (
-        f"at t = {fallback['since']:.4g} s {fallback['reason']}: the controller commanded only {what} "
-        f"for {percent(fallback['share'], fault=True)} of the run"
-    )
-
-
-def _cause(seen: Trajectory, k: int) -> ControlStatus:
-    """Why the law did not command at an instant."""
-    status = ControlStatus(int(seen.status[k]))
-    return status if status in _REASONS else ControlStatus(int(seen.cause[k]))
-
-
-def _angles(chart: Chart, seen: Trajectory) -> dict[str, Any] | None:
-    """The paper's angles and the leak along the run; None where no gradient has a value."""
-    try:
-        found = evaluate(chart, points=seen.q[np.isfinite(seen.q).all(axis=1)]).as_dict()
-    except (SingularTaskError, InvalidValueError):
-        return None
-    return {name: found[name] for name in ("task_angle_deg", "mutual_angle_deg", "leak_deg")}
-
-
-def _coupling(chart: Chart, reference: Reference, seen: Trajectory) -> dict[str, dict[str, float]]:
-    """Commanded -> disturbed -> index, for quantities that were commanded alone."""
-    found = coupling_index(chart, reference, seen)
-    return {
-        commanded: {
-            disturbed: float(found.index[i, j])
-            for i, disturbed in enumerate(found.labels)
-            if isfinite(found.index[i, j])
-        }
-        for j, commanded in enumerate(found.labels)
-        if np.isfinite(found.index[:, j]).any()
-    }
-
-
-def _worst_couplings(index: dict[str, dict[str, float]], task: tuple[str, ...]) -> str:
-    """The worst disturbance of the task by an extra coordinate, and the reverse."""
-    pairs = [(value, to, by) for by, column in index.items() for to, value in column.items()]
-    texts = []
-    for name, of_task in (("task <- extra", True), ("extra <- task", False)):
-        chosen = [pair for pair in pairs if (pair[1] in task) == of_task and (pair[2] in task) != of_task]
-        if chosen:
-            value, to, by = max(chosen)
-            texts.append(f"{name} {value:.3g} ({to} <- {by})")
-    return ", ".join(texts) or "see report.json"
-
-
-def _energy(seen: Trajectory) -> dict[str, float]:
-    """Storage, and the energy dissipated by the controller's damping, [J]."""
-    taken = seen.energy_balance[-1] - seen.storage[-1] + seen.storage[0]
-    return {
-        "storage_start": seen.storage[0],
-        "storage_end": seen.storage[-1],
-        "storage_largest": seen.storage.max(),
-        "storage_rise": seen.storage_rise,
-        "dissipated": taken,
-    }
-
-
-def _text(value: float | None) -> str:
-    return "not finite" if value is None else f"{value:.3g}"
-
-
 _FILES = ("trajectory.npz", "coordinates.png", "report.json")
 CVODES = "cvodes"  #: the default plant
 _FAILED = (Outcome.DIVERGED, Outcome.LOST)  # the input was valid, but the run failed: exit code 1
 
 
-@with_settings(for_codegen=False)
+@add_law_options(for_codegen=False)
 def simulate(
     chart: ChartPath,
     controller: Annotated[str, typer.Option("--controller", help=f"Control law: {', '.join(CONTROLLERS)}.")],
@@ -231,7 +48,8 @@ def simulate(
     settings: dict[str, str],
     limit: Limit = None,
     rate: Annotated[
-        float | None, typer.Option("--rate", parser=number, help="Control rate [Hz]; default: continuous control.")
+        float | None,
+        typer.Option("--rate", parser=parse_number, help="Control rate [Hz]; default: continuous control."),
     ] = None,
     plant: Annotated[
         str, typer.Option("--plant", help="Simulator: cvodes, or mujoco (needs --rate and the extra [mujoco]).")
@@ -245,7 +63,9 @@ def simulate(
     ] = False,
     mass_factor: Annotated[
         float | None,
-        typer.Option("--mass-factor", parser=number, help="True masses divided by those of the controller's model."),
+        typer.Option(
+            "--mass-factor", parser=parse_number, help="True masses divided by those of the controller's model."
+        ),
     ] = None,
     friction: Annotated[
         str | None, typer.Option("--friction", help='Joint friction, "viscous,coulomb" [N m s/rad], [N m].')
@@ -257,7 +77,7 @@ def simulate(
         ),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option("--seed", parser=whole_number, help="Seed of the noise; default: 0.")
+        int | None, typer.Option("--seed", parser=parse_whole_number, help="Seed of the noise; default: 0.")
     ] = None,
     animation: Annotated[
         str, typer.Option("--animation", help="Format of the animation: gif, mp4 (needs ffmpeg) or none.")
@@ -267,19 +87,21 @@ def simulate(
 ) -> None:
     """Run a controller in a chart's coordinates; write the run, pictures, an animation and a report."""
     require_settings(controller, settings)
-    require_torques(controller, mass_factor=mass_factor, friction=friction)
-    _require_plant(plant, rate, supervised)
-    _require_folder(out, animation, force)
-    with deferred():  # CasADi may lose Ctrl-C while it builds functions
+    _check_torques(controller, {"--mass-factor": mass_factor, "--friction": friction})
+    _check_plant(plant, rate, supervised)
+    _check_folder(out, animation, force)
+    # CasADi may lose Ctrl-C while it builds functions.
+    with deferred():
         loaded = Chart.load(chart)
-        loaded.function("xi")  # raises for grown charts
+        # Raises for grown charts.
+        loaded.function("xi")
         plan = read_steps(steps, loaded)
         law = build_controller(controller, loaded, settings, limit)
     conditions = {
         "control_rate": rate,
-        "plant": _plant(plant, loaded.problem.robot, mass_factor),
-        "friction": None if friction is None else Friction(*_pair("--friction", friction)),
-        "noise": _noise(law, noise, seed, rate),
+        "plant": _build_plant(plant, loaded.problem.robot, mass_factor),
+        "friction": None if friction is None else Friction(*parse_numbers("--friction", friction, 2).tolist()),
+        "noise": _build_noise(law, noise, seed, rate),
         "safety": Safety.of(law) if supervised else None,
         "compiled": compiled,
     }
@@ -292,19 +114,20 @@ def simulate(
             report = finish()
             if animation != "none" and not interrupted:
                 save_animation(out / f"animation.{animation}", run, loaded.problem, monitor, force)
-        except KeyboardInterrupt:  # the run is complete: keep it
+        except KeyboardInterrupt:
+            # The run is complete: keep it.
             report = finish()
             interrupted = True
     if json:
         print_json(report)
     else:
-        print_rows(run_rows(report, loaded.problem) | {"files": str(out)})
-    _notes(law, report, interrupted)
+        print_rows(format_report(report, loaded.problem) | {"files": str(out)})
+    _print_notes(law, report, interrupted)
     if code := INTERRUPTED if interrupted else int(run.outcome in _FAILED):
         raise typer.Exit(code)
 
 
-def _require_folder(out: Path, animation: str, force: bool) -> None:
+def _check_folder(out: Path, animation: str, force: bool) -> None:
     """Check, before anything is written, the format, and that the folder can be made or holds no files of others."""
     if animation != "none":
         require_format(animation)
@@ -315,7 +138,15 @@ def _require_folder(out: Path, animation: str, force: bool) -> None:
     require_replaceable_files(out, names, force)
 
 
-def _require_plant(plant: str, rate: float | None, supervised: bool) -> None:
+def _check_torques(controller: str, conditions: dict[str, object]) -> None:
+    """Raise OptionError for conditions of the plant that matter only to laws that command torques."""
+    for option, value in conditions.items():
+        if value is not None and law_of(controller).command != "torque":
+            takers = ", ".join(name for name in CONTROLLERS if law_of(name).command == "torque")
+            raise OptionError(f"{controller} has no {option}, which belongs to {takers}")
+
+
+def _check_plant(plant: str, rate: float | None, supervised: bool) -> None:
     """Raise UnknownNameError for other plants, and InvalidValueError where a sampled controller is missing."""
     require_known("plant", plant, (CVODES, MUJOCO))
     if plant == MUJOCO and rate is None:
@@ -324,21 +155,13 @@ def _require_plant(plant: str, rate: float | None, supervised: bool) -> None:
         raise OptionError("--supervised requires --rate: a supervised law runs tick by tick")
 
 
-def _plant(plant: str, model: Robot, mass_factor: float | None) -> Robot | MuJoCo | None:
+def _build_plant(plant: str, model: Robot, mass_factor: float | None) -> Robot | MuJoCo | None:
     """The true robot, or MuJoCo with it; None if it is the controller's model."""
     robot = None if mass_factor is None else model.with_scaled_masses(mass_factor)
     return MuJoCo(robot) if plant == MUJOCO else robot
 
 
-def _pair(option: str, text: str) -> tuple[float, float]:
-    """Parse "0.1,0.2"."""
-    values = parse_numbers(option, text).tolist()
-    if len(values) != 2:
-        raise InvalidValueError(option, repr(text), "two numbers")
-    return values[0], values[1]
-
-
-def _noise(law: Controller, text: str | None, seed: int | None, rate: float | None) -> Noise | None:
+def _build_noise(law: Controller, text: str | None, seed: int | None, rate: float | None) -> Noise | None:
     """The noise of the sensors; raises InvalidValueError for an option that would be ignored."""
     if text is None:
         if seed is not None:
@@ -346,7 +169,7 @@ def _noise(law: Controller, text: str | None, seed: int | None, rate: float | No
         return None
     if rate is None:
         raise OptionError("--noise requires --rate: white noise needs control ticks")
-    position, velocity = _pair("--noise", text)
+    position, velocity = parse_numbers("--noise", text, 2).tolist()
     if law.command == "velocity" and velocity != 0:
         raise InvalidValueError("--noise", text, f"a velocity deviation of 0, because {law.name} measures no velocity")
     return Noise(position, velocity, 0 if seed is None else seed)
@@ -365,7 +188,7 @@ def _finish(
     law: Controller, chart: Chart, plan: Plan, run: Trajectory, seconds: float, out: Path, force: bool
 ) -> dict[str, Any]:
     """Write the run, its picture and its report, which is returned, and remove the animation of an earlier run."""
-    report = run_report(law, chart, plan, run, seconds)
+    report = build_report(law, chart, plan, run, seconds)
     with open_output_folder("--out", out) as folder, publish(folder, listed=True, force=force) as drafts:
         run.save(drafts / "trajectory.npz")
         trajectory_figure(run, units_of(chart.problem)).savefig(drafts / "coordinates.png", dpi=130)
@@ -376,11 +199,11 @@ def _finish(
     return report
 
 
-def _notes(law: Controller, report: dict[str, Any], interrupted: bool) -> None:
+def _print_notes(law: Controller, report: dict[str, Any], interrupted: bool) -> None:
     """Print remarks about the run on standard error."""
     for remark in law.remarks():
         note(remark)
-    fallback = fallback_text(report)
+    fallback = format_fallback(report)
     if fallback is not None:
         note(fallback)
     if report["outcome"] == Outcome.LOST.value:
@@ -389,3 +212,165 @@ def _notes(law: Controller, report: dict[str, Any], interrupted: bool) -> None:
         note(f"the run diverged: the integrator gave up at t = {report['duration']:.4g} s, the run so far is saved")
     if interrupted:
         note("interrupted: the run so far is saved, without an animation")
+
+
+_REASONS = {
+    ControlStatus.OUTSIDE_DOMAIN: "the arm left the domain",
+    ControlStatus.SINGULAR: "the coordinates became singular",
+    ControlStatus.NOT_FINITE: "the controller received an input that was not finite",
+    ControlStatus.BAD_INPUT: "a measurement or a reference could not be used",
+    ControlStatus.TOO_FAST: "a joint exceeded its limit of velocity",
+    ControlStatus.LATE: "a tick came too late",
+    ControlStatus.OK: "the arm was not well inside the domain",  # where a supervised law begins
+}
+
+
+def build_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajectory, seconds: float) -> dict[str, Any]:
+    """Numbers of a run, SI units, ready for JSON.
+
+    Args:
+        controller: the controller that ran.
+        chart: the chart whose coordinates the run is measured in.
+        plan: the motion that it was to follow.
+        seen: the run in the chart's coordinates.
+        seconds: computing time [s].
+    """
+    bad = np.flatnonzero(seen.fell_back)
+    first = int(bad[0]) if bad.size else None
+    status, cause = (ControlStatus(int(column[first or 0])) for column in (seen.status, seen.cause))
+    inside = np.asarray(chart.problem.domain.contains(seen.q))
+    evaluated = (
+        plan.has_steps and not plan.pushes and seen.outcome is Outcome.COMPLETE and inside.all() and not bad.size
+    )
+    largest = np.abs(seen.command).max(axis=0)
+    durations = {status.name: seconds for status, seconds in seen.seconds_in_status.items()}
+    report = {
+        "controller": controller.name,
+        "coupling": controller.settings.get("coupling"),
+        "gains": controller.gains,
+        "outcome": seen.outcome.value,
+        "reason": seen.reason or None,
+        "duration": float(seen.times[-1]),
+        "tracking_error": dict(zip(seen.labels, seen.tracking_error, strict=True)),
+        "coupling_index": _evaluate_coupling(chart, plan.reference, seen) if evaluated else None,
+        "angles_on_path": _evaluate_angles(chart, seen),
+        "fallback": {
+            "share": len(bad) / len(seen.times),
+            "since": None if first is None else float(seen.times[first]),
+            "reason": None if first is None else _REASONS[status if status in _REASONS else cause],
+        },
+        "seconds_in_status": durations,
+        "catches": [{"time": time, "cause": cause.name} for time, cause in seen.catches],
+        "saturated_share": float(seen.saturated.mean()),
+        "share_inside_domain": float(inside.mean()),
+        "command": seen.kind,
+        "largest_command": dict(zip(seen.joint_names, largest, strict=True)),
+        "energy": _evaluate_energy(seen) if seen.kind == "torque" and not bad.size else None,
+        "seconds": seconds,
+    }
+    return dict(clean(report))
+
+
+def format_report(report: dict[str, Any], problem: Problem) -> dict[str, str]:
+    """The report as rows of text."""
+    units = units_of(problem)
+    errors = [
+        f"{label} {_format(value)} {units.get(label, '')}".strip() for label, value in report["tracking_error"].items()
+    ]
+    joint, command = max(report["largest_command"].items(), key=lambda pair: pair[1])
+    by_torque = report["command"] == "torque"
+    lengths = units.get(joint) == "m"
+    unit = ("N" if lengths else "N m") if by_torque else ("m/s" if lengths else "rad/s")
+    rows = {
+        "run": f"{report['controller']}, {report['duration']:.4g} s: {report['outcome']}",
+        "largest error": ", ".join(errors),
+    }
+    if report["coupling_index"]:
+        rows["coupling index"] = _find_worst_couplings(report["coupling_index"], problem.task.labels)
+    if angles := report["angles_on_path"]:
+        task, leak = angles["task_angle_deg"], angles["leak_deg"]
+        rows["angles on path"] = (
+            f"leak rms {leak['rms']:.2f}, largest {leak['max']:.1f} deg (in the metric); "
+            f"task angle mean {task['mean']:.2f}, std {task['std']:.2f} deg (the paper's cosines)"
+        )
+    rows["command"] = f"at most {command:.4g} {unit}, {joint}"
+    if report["saturated_share"]:
+        rows["limit"] = f"reached for {percent(report['saturated_share'], fault=True)} of the run"
+    if report["catches"]:
+        rows["statuses"] = ", ".join(f"{name} {time:.3g} s" for name, time in report["seconds_in_status"].items())
+    if energy := report["energy"]:
+        rows["energy"] = (
+            f"V at most {_format(energy['storage_largest'])} J, at the end {_format(energy['storage_end'])} J; "
+            f"{_format(energy['dissipated'])} J dissipated"
+        )
+    rows["computed in"] = f"{report['seconds']:.2f} s"
+    return rows
+
+
+def format_fallback(report: dict[str, Any]) -> str | None:
+    """A sentence that says when and why the controller used its fallback; None if it never did."""
+    fallback = report["fallback"]
+    if fallback["since"] is None:
+        return None
+    if report["catches"]:
+        times = "once" if len(report["catches"]) == 1 else f"{len(report['catches'])} times"
+        return (
+            f"at t = {fallback['since']:.4g} s {fallback['reason']}: the catcher took over, {times} in all, "
+            f"and commanded for {percent(fallback['share'], fault=True)} of the run"
+        )
+    what = "the gravity torque" if report["command"] == "torque" else "zero velocity"
+    return (
+        f"at t = {fallback['since']:.4g} s {fallback['reason']}: the controller commanded only {what} "
+        f"for {percent(fallback['share'], fault=True)} of the run"
+    )
+
+
+def _evaluate_angles(chart: Chart, seen: Trajectory) -> dict[str, Any] | None:
+    """The paper's angles and the leak along the run; None where no gradient has a value."""
+    try:
+        report = evaluate(chart, points=seen.q[np.isfinite(seen.q).all(axis=1)]).as_dict()
+    except (SingularTaskError, InvalidValueError):
+        return None
+    return {name: report[name] for name in ("task_angle_deg", "mutual_angle_deg", "leak_deg")}
+
+
+def _evaluate_coupling(chart: Chart, reference: Reference, seen: Trajectory) -> dict[str, dict[str, float]]:
+    """Commanded -> disturbed -> index, for quantities that were commanded alone."""
+    coupling = coupling_index(chart, reference, seen)
+    return {
+        commanded: {
+            disturbed: float(coupling.index[i, j])
+            for i, disturbed in enumerate(coupling.labels)
+            if isfinite(coupling.index[i, j])
+        }
+        for j, commanded in enumerate(coupling.labels)
+        if np.isfinite(coupling.index[:, j]).any()
+    }
+
+
+def _find_worst_couplings(index: dict[str, dict[str, float]], task: tuple[str, ...]) -> str:
+    """The worst disturbance of the task by an extra coordinate, and the reverse."""
+    pairs = [(value, to, by) for by, column in index.items() for to, value in column.items()]
+    texts = []
+    for name, of_task in (("task <- extra", True), ("extra <- task", False)):
+        chosen = [pair for pair in pairs if (pair[1] in task) == of_task and (pair[2] in task) != of_task]
+        if chosen:
+            value, to, by = max(chosen)
+            texts.append(f"{name} {value:.3g} ({to} <- {by})")
+    return ", ".join(texts) or "see report.json"
+
+
+def _evaluate_energy(seen: Trajectory) -> dict[str, float]:
+    """Storage, and the energy dissipated by the controller's damping, [J]."""
+    taken = seen.energy_balance[-1] - seen.storage[-1] + seen.storage[0]
+    return {
+        "storage_start": seen.storage[0],
+        "storage_end": seen.storage[-1],
+        "storage_largest": seen.storage.max(),
+        "storage_rise": seen.storage_rise,
+        "dissipated": taken,
+    }
+
+
+def _format(value: float | None) -> str:
+    return "not finite" if value is None else f"{value:.3g}"

@@ -9,10 +9,10 @@ import typer
 
 from orthocas import problems
 from orthocas.charts.chart import Chart
-from orthocas.cli.output import AsJson, Force, note, print_json, print_rows, whole_number
-from orthocas.cli.problem_argument import ROBOT, ProblemOptions, build_robot, is_robot_file, locked_joints, with_options
+from orthocas.cli.options import AsJson, Force, ProblemOptions, add_problem_options, is_robot_file, parse_whole_number
+from orthocas.cli.output import note, print_json, print_rows
 from orthocas.errors import OptionError
-from orthocas.paths.plan import read_path
+from orthocas.paths.tool_path import read_path
 from orthocas.robots.robot import Robot
 from orthocas.tools.interrupts import deferred
 from orthocas.viewer import view as open_view
@@ -24,8 +24,8 @@ _RUN = "trajectory.npz"  # in the folders of `orthocas simulate`
 
 
 @dataclass(frozen=True)
-class _Asked:
-    """What is to be shown, and whose it is."""
+class _Scene:
+    """What the page shows, and whose it is."""
 
     shown: Any
     robot: Robot | Chart | None
@@ -33,7 +33,7 @@ class _Asked:
     locked: dict[str, float]
 
 
-@with_options(*ROBOT)
+@add_problem_options("tip", "lock")
 def view(
     target: Annotated[
         str,
@@ -54,13 +54,12 @@ def view(
     path: Annotated[
         Path | None, typer.Option("--path", metavar="PATH.csv", help="With --compare: waypoints of a closed path.")
     ] = None,
-    cycles: Annotated[int, typer.Option("--cycles", parser=whole_number, help="With --compare: how often.")] = 3,
     export: Annotated[
         Path | None,
         typer.Option("--export", metavar="PAGE.html", help="Write a page that moves by itself and works offline."),
     ] = None,
     host: Annotated[str, typer.Option("--host", help="Address to listen at; 0.0.0.0: open to the network.")] = LOCAL,
-    port: Annotated[int, typer.Option("--port", parser=whole_number, help="0: any free one.")] = PORT,
+    port: Annotated[int, typer.Option("--port", parser=parse_whole_number, help="0: any free one.")] = PORT,
     browse: Annotated[bool, typer.Option("--open", help="Open the page in the browser.")] = False,
     force: Force = False,
     json: AsJson = False,
@@ -72,58 +71,59 @@ def view(
         require_page(export, force)
     if not compare and path is not None:
         raise OptionError("--path requires --compare, which follows the path")
-    with deferred():  # CasADi may lose Ctrl-C while it builds functions
-        asked = _asked(target, chart, robot, words)
+    # CasADi may lose Ctrl-C while it builds functions.
+    with deferred():
+        scene = _read_scene(target, chart, robot, words)
     if compare:
-        asked = _compared(asked, path, cycles)
+        scene = _compare_motions(scene, path)
     if export is not None:
-        _export(asked, export, force, json)
+        _export(scene, export, force, json)
     else:
-        _serve(asked, host, port, browse, json)
+        _serve(scene, host, port, browse, json)
 
 
-def _asked(target: str, chart: Path | None, meshes: Path | None, words: ProblemOptions) -> _Asked:
+def _read_scene(target: str, chart: Path | None, meshes: Path | None, words: ProblemOptions) -> _Scene:
     """What the target is: by its suffix, or a folder of a run, or the name of a problem."""
     place = Path(target)
-    locked = locked_joints(words.lock)
+    locked = words.parse_locks()
     if is_robot_file(target):
         meshes = place if meshes is None and place.suffix.lower() == ".urdf" else meshes
-        return _Asked(build_robot(target, words), None, meshes, locked)
+        return _Scene(words.build_robot(target), None, meshes, locked)
     if target in problems.names() and not place.exists():
         words.require_no_robot(f"the named problem '{target}'")
-        return _Asked(problems.get(target).robot, None, meshes, locked)
+        return _Scene(problems.get(target).robot, None, meshes, locked)
     if place.is_dir() or place.suffix.lower() in (".npz", ".csv"):
-        owner = _owner(chart, meshes, words)
+        owner = _load_owner(chart, meshes, words)
         arm = owner.problem.robot if isinstance(owner, Chart) else owner
         file = place / _RUN if place.is_dir() else place
         motion = read_joint_motion(file, arm) if file.suffix.lower() == ".csv" else read_run(file, arm)
-        return _Asked(motion, owner, meshes, locked)
+        return _Scene(motion, owner, meshes, locked)
     if chart is not None:
         raise OptionError(f"{target} is a chart: leave out --chart")
-    return _Asked(Chart.load(place), None, meshes, locked)
+    return _Scene(Chart.load(place), None, meshes, locked)
 
 
-def _owner(chart: Path | None, meshes: Path | None, words: ProblemOptions) -> Robot | Chart:
+def _load_owner(chart: Path | None, meshes: Path | None, words: ProblemOptions) -> Robot | Chart:
     """Whose motion it is."""
     if chart is not None:
         return Chart.load(chart)
     if meshes is None:
         raise OptionError("files of motions hold no robot: give --chart or --robot")
-    return build_robot(str(meshes), words)
+    return words.build_robot(str(meshes))
 
 
-def _compared(asked: _Asked, path: Path | None, cycles: int) -> _Asked:
+def _compare_motions(scene: _Scene, path: Path | None) -> _Scene:
     """Motions along a closed path instead of a chart."""
-    chart = asked.shown
+    chart = scene.shown
     if not isinstance(chart, Chart):
         raise OptionError("--compare requires a chart file, whose coordinates are compared")
     points = None if path is None else read_path(path, chart)[0]
-    return _Asked(cyclic_motions(chart, points, cycles), chart, asked.meshes, asked.locked)
+    return _Scene(cyclic_motions(chart, points), chart, scene.meshes, scene.locked)
 
 
-def _export(asked: _Asked, page: Path, force: bool, json: bool) -> None:
+def _export(scene: _Scene, page: Path, force: bool, json: bool) -> None:
     shape = export_page(
-        asked.shown, page, robot=asked.robot, robot_file=asked.meshes, locked=asked.locked, force=force
+        scene.shown, page, robot=scene.robot, robot_file=scene.meshes, locked=scene.locked, force=force
     )  # fmt: skip
     _note_missing(shape.missing)
     size = page.stat().st_size
@@ -133,19 +133,19 @@ def _export(asked: _Asked, page: Path, force: bool, json: bool) -> None:
         print_rows({"page": str(page), "size": f"{size / 2**20:.1f} MiB, with all it needs: it works offline"})
 
 
-def _serve(asked: _Asked, host: str, port: int, browse: bool, json: bool) -> None:
+def _serve(scene: _Scene, host: str, port: int, browse: bool, json: bool) -> None:
     page = open_view(
-        asked.shown, robot=asked.robot, robot_file=asked.meshes, locked=asked.locked, host=host, port=port
+        scene.shown, robot=scene.robot, robot_file=scene.meshes, locked=scene.locked, host=host, port=port
     )  # fmt: skip
     with page:
         _note_missing(page.missing)
-        _tell(page, host, json)
+        _print_address(page, host, json)
         if browse and not webbrowser.open(page.url):
             note(f"no browser could be opened here; open {page.url} yourself")
         page.wait()
 
 
-def _tell(page: View, host: str, json: bool) -> None:
+def _print_address(page: View, host: str, json: bool) -> None:
     """Where the page is, and who can open it."""
     local = is_local(host)
     if json:

@@ -1,7 +1,7 @@
 """What all control laws share: the protocol, names, errors of phi, the guard at the boundary, and status."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, ClassVar, Literal, Protocol, Self
 
@@ -142,6 +142,7 @@ class Setting:
     help: str  #: what it is, with its unit and default
     is_word: bool = False  #: passed on as text; otherwise it is one number, or several with commas between
     codegen_only: bool = False  #: about inputs that simulations do not give, so `orthocas simulate` does not offer it
+    option: str = field(default="", repr=False)  #: its option of commands, if it is not named after the setting
 
 
 class Law(Controller, Protocol):

@@ -132,7 +132,10 @@ class _OperationalSpace(LawOfChart):
             "own (default), or given: mass matrix and torques become inputs.", is_word=True, codegen_only=True
         ),
         "gravity": Setting(
-            "law (default) compensates gravity; robot: the robot does so itself.", is_word=True, codegen_only=True
+            "law (default) compensates gravity; robot: the robot does so itself.",
+            is_word=True,
+            codegen_only=True,
+            option="--gravity-compensation",
         ),
         "inputs": Setting(
             "Additional inputs: payload, wrench, extra_torque, with commas between.", is_word=True, codegen_only=True

@@ -1,11 +1,12 @@
 """Fitting coordinates to a problem, choosing its domain, and comparing fits.
 
-- `fit` is the entry point. `settings` checks the arguments, `stages` runs the minimisations, `starts` begins them.
-- `terms` has the terms and weights of the loss, `residuals` the loss of one sample.
-- `basis_objective` (with `basis_gradients`) evaluates the loss for families linear in theta, `dense_objectives` for
-  networks and all others. `symbolic_loss` gives the loss as one CasADi expression.
-- `suggest_domain` (with `probe`) chooses domains. `distil` fits grown coordinates.
-- `compare` fits a `grid`, and has the result.
+- `fit` and `wide` are the entry points: plans over one engine. `settings` checks what is asked of a fit.
+- `stages` is the engine: it runs minimisations one after the other, and searches folds between them. `wide_search` has
+  the stages of wide fits. `starts` begins both.
+- `terms` has the terms and weights of the loss, `loss` the loss of one sample and of a fit as one CasADi expression.
+- `basis_objective` (with `basis_gradients`) evaluates the loss for families linear in theta, `network_objective` for
+  networks and all others. `like` holds coordinates to quantities.
+- `suggest_domain` (with `probe`) chooses domains. `distil` fits grown coordinates. `compare` fits a grid of settings.
 """
 
 __all__: list[str] = []

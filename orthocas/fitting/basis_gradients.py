@@ -14,7 +14,8 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import ColumnFunction, arrange_blocks
 
-_PART = 16  # blocks
+# blocks of samples at a time, so that the memory never holds all of them twice
+_PART = 16
 
 
 class BasisGradients(ABC):
@@ -37,11 +38,11 @@ class BasisGradients(ABC):
         """The numbers X at points (N, n), (B, g, S, c)."""
         blocks = arrange_blocks(points)
         if self.dtype == np.float64:
-            found = self._columns(blocks)[0]
+            numbers = self._columns(blocks)[0]
         else:  # some blocks at a time, so that the memory never holds all of them in double precision
             parts = (self._columns(blocks[k : k + _PART])[0] for k in range(0, len(blocks), _PART))
-            found = np.concatenate([part.astype(self.dtype) for part in parts])
-        return found.reshape(len(found), self.groups, -1, found.shape[2])
+            numbers = np.concatenate([part.astype(self.dtype) for part in parts])
+        return numbers.reshape(len(numbers), self.groups, -1, numbers.shape[2])
 
     @property
     @abstractmethod
@@ -49,15 +50,15 @@ class BasisGradients(ABC):
         """Number g of groups."""
 
     @abstractmethod
-    def table(self, C: Array) -> Array:
+    def build_table(self, C: Array) -> Array:
         """T for coefficients C (r, K), with numbers of the type of X."""
 
     @abstractmethod
-    def collected(self, slopes: Array) -> Array:
+    def collect(self, slopes: Array) -> Array:
         """dL/dC, (r, K), of a function L with slopes dL/dT."""
 
     @abstractmethod
-    def dense_part(
+    def expand_part(
         self, X: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike | None = None
     ) -> Array:
         """Gradients d psi_k / dq_i of some functions at some samples, zeros included, (samples, n, kept).
@@ -70,33 +71,25 @@ class BasisGradients(ABC):
             dtype: type of the numbers. Default: that of X.
         """
 
-    def dense(self, X: Array, samples: int) -> Array:
+    def expand(self, X: Array, samples: int) -> Array:
         """All gradients at all samples, (N, n, K)."""
-        return self.dense_part(X, samples, np.ones(self.family.width, dtype=bool))
+        return self.expand_part(X, samples, np.ones(self.family.width, dtype=bool))
 
     def jacobian(self, X: Array, C: Array, samples: int) -> Array:
         """J_xi = T X of coefficients C (r, K) at all samples, (N, r, n)."""
-        rows = np.matmul(self.table(C), X)  # (B, g, n r / g, c)
+        rows = np.matmul(self.build_table(C), X)  # (B, g, n r / g, c)
         B, _, _, c = rows.shape
         J: Array = rows.reshape(B, self.n, len(C), c).transpose(0, 3, 2, 1).reshape(B * c, len(C), self.n)
         return J[:samples]
 
-    def pullback(self, X: Array, slopes: Array) -> Array:
-        """dL/dC, (r, K), of a function L of J_xi at all samples, with slopes dL/dJ_xi (N, r, n)."""
-        B, g, _, c = X.shape
-        padded = np.zeros((B * c, self.n * slopes.shape[1]))
-        padded[: len(slopes)] = slopes.transpose(0, 2, 1).reshape(len(slopes), -1)
-        rows = padded.reshape(B, c, g, -1).transpose(0, 2, 3, 1)  # (B, g, n r / g, c)
-        return self.collected(np.matmul(rows, X.transpose(0, 1, 3, 2)).sum(axis=0))
-
-    def along(self, X: Array, directions: Array) -> Array:
+    def differentiate_along(self, X: Array, directions: Array) -> Array:
         """Derivatives a . d psi / dq along directions a (N, n) at samples, (N, K)."""
-        found, c = [], X.shape[3]
+        products, c = [], X.shape[3]
         for b in range(0, len(X), _PART):
             part = slice(b * c, min((b + _PART) * c, len(directions)))
-            G = self.dense(X[b : b + _PART], part.stop - part.start)
-            found.append(np.einsum("si,sik->sk", directions[part], G))
-        return np.concatenate(found)
+            G = self.expand(X[b : b + _PART], part.stop - part.start)
+            products.append(np.einsum("si,sik->sk", directions[part], G))
+        return np.concatenate(products)
 
     @abstractmethod
     def _numbers(self, q: ca.SX) -> ca.SX:
@@ -118,41 +111,45 @@ class ProductGradients(BasisGradients):
 
     def __init__(self, family: ProductFamily, n: int, dtype: DTypeLike = np.float64) -> None:
         super().__init__(family, n, dtype)
-        matrices = [family.derivative_matrix(i)[1:] for i in range(n)]
-        self._places = np.unique(np.concatenate([D.indices for D in matrices]))  # of psi' in (1, psi)
+        matrices = [family.build_derivative_matrix(i)[1:] for i in range(n)]
+        # places of psi' in (1, psi)
+        self._places = np.unique(np.concatenate([D.indices for D in matrices]))
         matrices = [D[:, self._places] for D in matrices]
-        self._upright = scipy.sparse.vstack(matrices).tocsr()  # all D_i, (n K, S)
-        self._lying = scipy.sparse.vstack([D.T for D in matrices]).tocsr()  # all D_i^T, (n S, K)
+        # all D_i, (n K, S)
+        self._upright = scipy.sparse.vstack(matrices).tocsr()
+        # all D_i^T, (n S, K)
+        self._lying = scipy.sparse.vstack([D.T for D in matrices]).tocsr()
         self._back = self._lying.T.tocsr()
-        self._parts: dict[tuple[bytes, str], Any] = {}  # of all D_i, for some of the functions
+        # rows of all D_i for some of the functions, so far
+        self._parts: dict[tuple[bytes, str], Any] = {}
 
     @property
     def groups(self) -> int:
         """One."""
         return 1
 
-    def table(self, C: Array) -> Array:
+    def build_table(self, C: Array) -> Array:
         """T = C D_i, (1, n r, S)."""
         rows = (self._lying @ C.T).reshape(self.n, -1, len(C)).transpose(0, 2, 1)
         return np.ascontiguousarray(rows, dtype=self.dtype).reshape(1, self.n * len(C), -1)
 
-    def collected(self, slopes: Array) -> Array:
+    def collect(self, slopes: Array) -> Array:
         """The sum over the joints of dL/dT D_i^T."""
         by_joint = slopes.reshape(self.n, -1, slopes.shape[2]).transpose(0, 2, 1)
-        found: Array = (self._back @ by_joint.reshape(-1, by_joint.shape[2])).T
-        return found
+        rows: Array = (self._back @ by_joint.reshape(-1, by_joint.shape[2])).T
+        return rows
 
-    def dense_part(
+    def expand_part(
         self, X: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike | None = None
     ) -> Array:
         """D_i psi'."""
         assert X.shape[3] % every == 0
         kind = X.dtype if dtype is None else np.dtype(dtype)
         values = X[:, 0, :, ::every].transpose(1, 0, 2).reshape(X.shape[2], -1)[:, : -(-samples // every)]
-        found = self._part(kept, kind) @ values.astype(kind, copy=False)  # (n kept, samples)
-        return np.ascontiguousarray(found.T).reshape(found.shape[1], self.n, int(kept.sum()))
+        dense = self._part(kept, kind) @ values.astype(kind, copy=False)  # (n kept, samples)
+        return np.ascontiguousarray(dense.T).reshape(dense.shape[1], self.n, int(kept.sum()))
 
-    def along(self, X: Array, directions: Array) -> Array:
+    def differentiate_along(self, X: Array, directions: Array) -> Array:
         """The sum over the joints of D_i (a_i psi')."""
         K, N = self.family.width, len(directions)
         values = X[:, 0].transpose(1, 0, 2).reshape(X.shape[2], -1)[:, :N]
@@ -195,19 +192,19 @@ class SparseGradients(BasisGradients):
         width = max(len(row) for row in rows)
         return np.array([sorted(row) + [-1] * (width - len(row)) for row in rows])
 
-    def table(self, C: Array) -> Array:
+    def build_table(self, C: Array) -> Array:
         """The coefficients of the functions of each joint, (n, r, S)."""
         return np.ascontiguousarray(C[:, self.terms_of_joints].transpose(1, 0, 2), dtype=self.dtype)
 
-    def collected(self, slopes: Array) -> Array:
+    def collect(self, slopes: Array) -> Array:
         """The sum over the joints."""
         total = np.zeros((slopes.shape[1], self.family.width))
         for places, part in zip(self.terms_of_joints, slopes, strict=True):
-            known = places >= 0
-            total[:, places[known]] += part[:, known]
+            used = places >= 0
+            total[:, places[used]] += part[:, used]
         return total
 
-    def dense_part(
+    def expand_part(
         self, X: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike | None = None
     ) -> Array:
         """The numbers in their places."""
@@ -232,7 +229,7 @@ class SparseGradients(BasisGradients):
         return ca.Function("jacobian", [q], [ca.jacobian(self.family.basis(q), q)])
 
 
-def gradients_of(family: LinearFamily, n: int, dtype: DTypeLike = np.float64) -> BasisGradients:
+def build_gradients(family: LinearFamily, n: int, dtype: DTypeLike = np.float64) -> BasisGradients:
     """Gradients of a family of n joints, with numbers of a type."""
     return (
         ProductGradients(family, n, dtype) if isinstance(family, ProductFamily) else SparseGradients(family, n, dtype)

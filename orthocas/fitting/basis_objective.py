@@ -2,91 +2,48 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
+from dataclasses import dataclass
 from functools import partial
 from math import ceil
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.bases.family import LinearFamily
-from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
-from orthocas.fitting.residuals import Loss, Pairs, curvature_columns, loss_columns, residual_columns, value_columns
-from orthocas.fitting.terms import Sizes, Weights
+from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
+from orthocas.fitting.loss import (
+    Loss,
+    build_curvature_columns,
+    build_loss_columns,
+    build_residual_columns,
+    build_value_columns,
+)
+from orthocas.fitting.terms import Pairs, Sizes, Weights
 from orthocas.tasks.samples import Draw, Samples, split_samples
 from orthocas.tools.batch import count_threads, run_in_threads, run_in_threads_with
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import COLUMNS, Run, arrange_blocks, build_weights, split_by_sample
 
-_ROWS_IN_CACHE = 512  # samples in a product: the rows stay in the cache
-_CHUNK = 512  # samples per product of the Hessian, so that the rows stay in the cache
-_BLOCKS = 8  # blocks of samples per thread: a fixed number, so that sums do not depend on the number of threads
-STRIDE = 2  #: every second sample estimates the Gauss-Newton matrix, which is a mean, well enough
-_MOST_STRIDE = 16  # of rough estimates; a divisor of the samples in a block
-_ROUGH = 12  # residuals per coefficient in a rough estimate
 
+@dataclass(frozen=True, slots=True)
+class ObjectiveRules:
+    """Numbers of the products that evaluate losses. They were chosen by the time that a product takes."""
+
+    chunk: int = 512  #: samples per product of a matrix, so that the rows stay in the cache
+    blocks: int = 8  #: blocks of samples per thread: fixed, so that sums do not depend on the number of threads
+    stride: int = 2  #: every second sample estimates the Gauss-Newton matrix, which is a mean, well enough
+    most_stride: int = 16  #: of rough estimates; a divisor of the samples in a block
+    rough: int = 12  #: residuals per coefficient in a rough estimate
+
+    orienting: int = 200  #: samples that determine the orientation of a network's start
+    piece: int = 2**18  #: entries of the largest array of a piece of samples; larger ones leave the cache
+    least_piece: int = 100  #: samples in a piece; smaller products waste time
+    graph: int = 2**20  #: entries of the largest matrix in a graph; larger ones leave the cache
+
+
+RULES = ObjectiveRules()
 Shared = Sequence[tuple[int, int, int, int]]
-
-
-def normal_matrix(derivatives: Sequence[Array], gradients: Sequence[Array], shared: Shared) -> Array:
-    """Sums over samples of X_j^T X_j, and of x_i^T x_j for residuals that two coordinates share, (size, size).
-
-    X_j = D_j G_j are the derivatives of the residuals of coordinate j with respect to its coefficients. Products are
-    taken over chunks of samples, and added in double precision in the order of the chunks.
-
-    Args:
-        derivatives: D_j of every coordinate, (N, rows, n).
-        gradients: G_j of every coordinate, (N, n, K_j).
-        shared: coordinates i > j and the places of their shared residual among the rows of X_i and of X_j.
-    """
-    r, ends = len(derivatives), np.cumsum([G.shape[2] for G in gradients])
-    places = [slice(end - G.shape[2], end) for G, end in zip(gradients, ends, strict=True)]
-    H = np.zeros((ends[-1], ends[-1]))
-    chunks = range(0, len(gradients[0]), _ROWS_IN_CACHE)
-    together = ceil(count_threads() / r)  # chunks, so that there is work for all threads
-    for k in range(0, len(chunks), together):
-        _add(H, places, chunks[k : k + together], derivatives, gradients, shared)
-    for i, j, *_ in shared:
-        H[places[j], places[i]] = H[places[i], places[j]].T
-    return H
-
-
-def _add(
-    H: Array,
-    places: Sequence[slice],
-    starts: Sequence[int],
-    derivatives: Sequence[Array],
-    gradients: Sequence[Array],
-    shared: Shared,
-) -> None:
-    """Add the products of some chunks: every block by one thread, in the order of the chunks."""
-
-    def rows(piece: tuple[int, int]) -> Array:
-        start, j = piece
-        part = slice(start, start + _ROWS_IN_CACHE)
-        product: Array = derivatives[j][part] @ gradients[j][part]  # (chunk, rows, K_j)
-        return product
-
-    def square(j: int) -> None:
-        for start in starts:
-            flat = X[start, j].reshape(-1, X[start, j].shape[2])
-            H[places[j], places[j]] += flat.T @ flat
-
-    def mixed(pair: tuple[int, int]) -> None:
-        i, j = pair
-        for start in starts:
-            for row, other in rows_of[i, j]:
-                H[places[i], places[j]] += X[start, i][:, row].T @ X[start, j][:, other]
-
-    r = len(derivatives)
-    rows_of: dict[tuple[int, int], list[tuple[int, int]]] = {}
-    for i, j, row, other in shared:
-        rows_of.setdefault((i, j), []).append((row, other))
-    pieces = [(start, j) for start in starts for j in range(r)]
-    X = dict(zip(pieces, run_in_threads(rows, pieces), strict=True))
-    work: list[Callable[[], None]] = [partial(square, j) for j in range(r)]
-    work += [partial(mixed, pair) for pair in rows_of]
-    run_in_threads(lambda block: block(), work)
 
 
 class BasisObjective:
@@ -110,6 +67,7 @@ class BasisObjective:
             C and J_xi are those of the components.
         gradients: gradients of the basis, if they are known already, or of another type than float64; products with
             them are computed with numbers of that type. Default: those of the family.
+        orientation: sign of the volume of the coordinates that the regularity term keeps. Default: that of the start.
     """
 
     def __init__(
@@ -122,29 +80,30 @@ class BasisObjective:
         kept: NDArray[np.bool_] | None = None,
         exchanged: Pairs = (),
         gradients: BasisGradients | None = None,
+        orientation: float | None = None,
     ) -> None:
         self.family, self.weights, self._draw = family, weights, draw
         self.r, self.K = family.outputs, family.width
         self.kept = np.ones((self.r, self.K), dtype=bool) if kept is None else kept
         m, self.n = samples.task_jacobian.shape[1:]
-        self._gradients = gradients_of(family, self.n) if gradients is None else gradients
+        self._gradients = build_gradients(family, self.n) if gradients is None else gradients
         self._loss = Loss.of(Sizes(self.n, m, self.r, samples.metric_inverse is None), weights.by_name, exchanged)
-        self._begin(samples, start)
+        self._orientation = orientation
+        self._use(samples, start)
 
-    def _begin(self, samples: Samples, start: Array) -> None:
-        self._put(samples)
-        oriented = self._loss.oriented or self.weights.folds > 0
-        self._orientation = samples.orientation(self.coordinate_jacobians(start)) if oriented else None
-        self._describe(samples)
+    def _use(self, samples: Samples, start: Array | None = None) -> None:
+        """Use these samples: the numbers of the basis there, and the data of the loss in blocks.
 
-    def _put(self, samples: Samples) -> None:
+        Args:
+            samples: the samples.
+            start: parameters that give the orientation, unless it is known.
+        """
         self.N, self.X = len(samples), self._gradients.at(samples.points)
-        self._share = build_weights(self.N)
-        self._expanded: dict[str, Array] = {}
-
-    def _describe(self, samples: Samples) -> None:
-        found = samples.collect_data(self._loss.data, self._orientation)
-        self._described = dict(zip(self._loss.data, map(arrange_blocks, found), strict=True))
+        self._share, self._expanded = build_weights(self.N), dict[str, Array]()
+        if start is not None and self._orientation is None and (self._loss.oriented or self.weights.folds > 0):
+            self._orientation = samples.orientation(self.coordinate_jacobians(start))
+        data = samples.collect_data(self._loss.data, self._orientation)
+        self._described = dict(zip(self._loss.data, map(arrange_blocks, data), strict=True))
 
     @property
     def _data(self) -> list[Array]:
@@ -155,51 +114,53 @@ class BasisObjective:
         """The same loss on `count` fresh sample sets of `size` each."""
         for part in split_samples(self._draw(size * count, seed), count):
             other = copy(self)
-            other._put(part)
-            other._describe(part)
+            other._use(part)
             yield other
 
     def coordinate_jacobians(self, theta: Array) -> Array:
         """J_xi at every sample, (N, r, n)."""
-        return split_by_sample(self._jacobian_entries(theta).reshape(-1, self.n, self.r, COLUMNS), self.N)
+        return split_by_sample(self._evaluate_jacobians(theta).reshape(-1, self.n, self.r, COLUMNS), self.N)
 
     def value(self, theta: Array) -> float:
         """L(theta)."""
-        (losses,) = value_columns(self._loss)(self._jacobian_entries(theta), *self._data)
+        (losses,) = build_value_columns(self._loss)(self._evaluate_jacobians(theta), *self._data)
         return float(np.vdot(losses[:, 0], self._share))
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """L(theta) and dL/dtheta."""
-        T, columns, parts = self._table(theta), loss_columns(self._loss), self._parts
+        # J_xi = T X block by block; the loss and its slopes there; and the slopes times X^T, which are dL/dT
+        T, columns, parts = self._table(theta), build_loss_columns(self._loss), self._parts
         with columns.borrow(min(count_threads(), len(parts))) as runs:
-            sums = run_in_threads_with(runs, lambda run, part: self._sums(T, run, part), parts)
-        slopes = self._gradients.collected(np.sum([gradient for _, gradient in sums], axis=0))
+            sums = run_in_threads_with(runs, lambda run, part: self._sum_part(T, run, part), parts)
+        slopes = self._gradients.collect(np.sum([gradient for _, gradient in sums], axis=0))
         return sum(value for value, _ in sums), slopes[self.kept]
 
     def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
         """L(theta), its gradient, and the Gauss-Newton matrix, computed with products in single precision."""
         value, gradient = self.value_and_gradient(theta)
-        return value, gradient, self._matrix(theta, STRIDE)
+        return value, gradient, self._build_matrix(theta, RULES.stride)
 
     def curvature_estimate(self, theta: Array) -> Array:
         """The Gauss-Newton matrix from as few samples as steer a quasi-Newton method."""
+        # as few samples as leave enough residuals for each coefficient
         residuals = self.N * (self._loss.hinge_rows.start or 1)
-        stride = STRIDE
-        while 2 * stride <= _MOST_STRIDE and residuals >= 2 * stride * _ROUGH * theta.size:
+        stride = RULES.stride
+        while 2 * stride <= RULES.most_stride and residuals >= 2 * stride * RULES.rough * theta.size:
             stride *= 2
-        return self._matrix(theta, stride)
+        return self._build_matrix(theta, stride)
 
     def hessian(self, theta: Array) -> Array:
         """d^2L/dtheta^2, exact, (size, size)."""
+        # second derivatives with respect to J_xi at each sample, then the gradients of the basis on both sides
         r, n, K = self.r, self.n, self.K
-        (curvature,) = curvature_columns(self._loss)(self._jacobian_entries(theta), *self._data)
+        (curvature,) = build_curvature_columns(self._loss)(self._evaluate_jacobians(theta), *self._data)
         W = split_by_sample(curvature.reshape(-1, n * r, n * r, curvature.shape[2]), self.N).reshape(-1, n, r, n, r)
         G, H = self._dense, np.zeros((r, K, r, K))
 
         def fill(pair: tuple[int, int]) -> None:
             i, j = pair
-            for start in range(0, self.N, _CHUNK):
-                part = slice(start, start + _CHUNK)
+            for start in range(0, self.N, RULES.chunk):
+                part = slice(start, start + RULES.chunk)
                 raised = W[part, :, i, :, j] @ G[part]  # (chunk, n, K)
                 H[i, :, j] += G[part].reshape(-1, K).T @ raised.reshape(-1, K) / self.N
             H[j, :, i] = H[i, :, j].T
@@ -209,7 +170,7 @@ class BasisObjective:
         block: Array = H.reshape(r * K, r * K)[np.ix_(free, free)]
         return block
 
-    def reweighted(self, weights: Weights) -> Self:
+    def reweigh(self, weights: Weights) -> Self:
         """The same loss on the same samples with other weights. It cannot add terms that need other sample data."""
         other = copy(self)
         other.weights, other._loss = weights, Loss.of(self._loss.sizes, weights.by_name, self._loss.exchanged)
@@ -225,11 +186,10 @@ class BasisObjective:
         """
         other = copy(self)
         other._loss = Loss.of(self._loss.sizes, weights, self._loss.exchanged)
-        other._put(samples)
-        other._describe(samples)
+        other._use(samples)
         return other
 
-    def moved(self, gradients: BasisGradients, samples: Samples, start: Array) -> Self:
+    def move_to(self, gradients: BasisGradients, samples: Samples, start: Array) -> Self:
         """The same loss of the same family on another box, without building it again.
 
         Args:
@@ -238,8 +198,8 @@ class BasisObjective:
             start: parameters whose orientation the regularity term keeps.
         """
         other = copy(self)
-        other._gradients = gradients
-        other._begin(samples, start)
+        other._gradients, other._orientation = gradients, None
+        other._use(samples, start)
         return other
 
     @property
@@ -253,84 +213,80 @@ class BasisObjective:
     def _dense(self) -> Array:
         """Gradients sample by sample, (N, n, K)."""
         if "all" not in self._expanded:
-            self._expanded["all"] = self._gradients.dense(self.X, self.N)
+            self._expanded["all"] = self._gradients.expand(self.X, self.N)
         return self._expanded["all"]
 
-    def _thinned(self, stride: int) -> list[Array]:
+    def _thin(self, stride: int) -> list[Array]:
         """Gradients of the functions of each coordinate at some samples, (N / stride, n, K_j), in single precision."""
         names = [f"{stride} {row.tobytes().hex()}" for row in self.kept]
         for name, row in zip(names, self.kept, strict=True):
             if name not in self._expanded:
-                self._expanded[name] = self._gradients.dense_part(self.X, self.N, row, stride, np.float32)
+                self._expanded[name] = self._gradients.expand_part(self.X, self.N, row, stride, np.float32)
         return [self._expanded[name] for name in names]
 
     def _table(self, theta: Array) -> Array:
         """T, (g, n r / g, S)."""
-        return self._gradients.table(expanded(theta, self.kept).reshape(self.r, self.K))
+        return self._gradients.build_table(expand(theta, self.kept).reshape(self.r, self.K))
 
     @property
     def _parts(self) -> list[slice]:
         """The blocks of samples in parts."""
-        return [slice(start, start + _BLOCKS) for start in range(0, len(self.X), _BLOCKS)]
+        return [slice(start, start + RULES.blocks) for start in range(0, len(self.X), RULES.blocks)]
 
-    def _sums(self, T: Array, run: Run, part: slice) -> tuple[float, Array]:
+    def _sum_part(self, T: Array, run: Run, part: slice) -> tuple[float, Array]:
         """Share of some blocks in the loss, and in its slopes with respect to T."""
         value, gradient = 0.0, np.zeros(T.shape)
         losses, slopes = np.empty(COLUMNS), np.empty((self.n * self.r, COLUMNS))
         arrays = (self.X, self._share, *self._data)
-        for X, share, *data in zip(*(array[part] for array in arrays), strict=True):  # X leaves memory only once
-            run([_double(T @ X), *data], [losses, slopes])
+        # block by block, so that X leaves memory only once
+        for X, share, *data in zip(*(array[part] for array in arrays), strict=True):
+            run([_to_double(T @ X), *data], [losses, slopes])
             value += float(losses @ share)
             gradient += (slopes * share).astype(X.dtype, copy=False).reshape(*T.shape[:2], -1) @ X.transpose(0, 2, 1)
         return value, gradient
 
-    def _jacobian_entries(self, theta: Array) -> Array:
+    def _evaluate_jacobians(self, theta: Array) -> Array:
         """J_xi, (B, n r, c)."""
         T = self._table(theta)
-        J = _double(np.concatenate(run_in_threads(lambda part: T @ self.X[part], self._parts)))
+        J = _to_double(np.concatenate(run_in_threads(lambda part: T @ self.X[part], self._parts)))
         return J.reshape(len(J), self.n * self.r, -1)
 
-    def _matrix(self, theta: Array, stride: int) -> Array:
+    def _build_matrix(self, theta: Array, stride: int) -> Array:
         """Gauss-Newton matrix; that of the smooth residuals from every `stride`-th sample."""
-        derivatives = residual_columns(self._loss)(self._jacobian_entries(theta), *self._data)
-        H = self._gauss_newton_matrix(derivatives[: self.r], stride)
+        derivatives = build_residual_columns(self._loss)(self._evaluate_jacobians(theta), *self._data)
+        free, rows = int(self.kept.sum()), self._loss.smooth_rows
+        H = np.zeros((free, free))
+        if any(rows):
+            # blocks of coordinate pairs, from few rows per sample in single precision
+            shared = [(i, j, rows[i].index(row), rows[j].index(row)) for i, j, row in self._loss.shared_rows]
+            gradients, by_coordinate = self._thin(stride), list[Any]()
+            for derivative in derivatives[: self.r]:
+                blocks = derivative.reshape(len(derivative), self.n, -1, derivative.shape[2])
+                by_coordinate.append(split_by_sample(blocks, self.N, stride).astype(np.float32))
+            H = build_normal_matrix(by_coordinate, gradients, shared) / len(gradients[0])
         hinges = derivatives[self.r :]
         for residual, derivative in zip(hinges[::2], hinges[1::2], strict=True):
-            H += self._hinge_matrix(residual, derivative)
+            H += self._sum_hinges(residual, derivative)
         return H
 
-    def _gauss_newton_matrix(self, derivatives: list[Array], stride: int) -> Array:
-        """Gauss-Newton matrix of the smooth residuals, by blocks of coordinate pairs."""
-        rows = self._loss.smooth_rows
-        if not any(rows):
-            return np.zeros((self.kept.sum(), self.kept.sum()))
-        shared = [(i, j, rows[i].index(row), rows[j].index(row)) for i, j, row in self._loss.shared_rows]
-        gradients = self._thinned(stride)
-        H = normal_matrix([self._rows(derivative, stride) for derivative in derivatives], gradients, shared)
-        return H / len(gradients[0])
-
-    def _rows(self, derivative: Array, stride: int) -> Array:
-        """Derivatives of residuals (B, n rows, c) at some samples, (N / stride, rows, n), in single precision."""
-        blocks = derivative.reshape(len(derivative), self.n, -1, derivative.shape[2])
-        return split_by_sample(blocks, self.N, stride).astype(np.float32)
-
-    def _hinge_matrix(self, residual: Array, derivative: Array) -> Array:
+    def _sum_hinges(self, residual: Array, derivative: Array) -> Array:
         """Gauss-Newton matrix of a hinge residual. It couples all coordinates, but acts at few samples."""
+        # only samples at which the hinge acts, without the padding of the last block
         block, column = np.nonzero((residual[:, 0] > 0) & (self._share > 0))
         D = derivative[block, :, column].reshape(-1, self.n, self.r).transpose(0, 2, 1).astype(np.float32)
         chosen: Array = self.X[block, :, :, column]  # (active, g, S)
-        G = self._gradients.dense(chosen.transpose(1, 2, 0)[None], len(chosen))
+        G = self._gradients.expand(chosen.transpose(1, 2, 0)[None], len(chosen))
         rows = (D @ G.astype(np.float32))[:, self.kept]
         product: Array = (rows.T @ rows).astype(float) / self.N
         return product
 
 
-def _double(products: Array) -> Array:
+def _to_double(products: Array) -> Array:
     """Numbers of the type that CasADi's functions read."""
     return products.astype(np.float64, copy=False)
 
 
-def expanded(theta: Array, kept: NDArray[np.bool_]) -> Array:
+def expand(theta: Array, kept: NDArray[np.bool_]) -> Array:
     """All coefficients, (r K,), from those that may differ from zero."""
     C = np.zeros(kept.shape)
     C[kept] = theta
@@ -356,10 +312,12 @@ class BoundedMutual:
     """
 
     def __init__(self, objective: BasisObjective, bound: float) -> None:
-        weights, self._gram = objective.weights, objective.gram  # sampled once, and shared by the objectives below
-        self._task = objective.reweighted(Weights(weights.task, 0.0, weights.regularity, angles=weights.angles))
-        only_mutual = Weights(0.0, 2.0, 0.0, angles=weights.angles)  # 2 cancels the factor 1/2 of the loss
-        self._mutual = objective.reweighted(only_mutual)
+        # the basis is sampled once, and shared by the objectives below
+        weights, self._gram = objective.weights, objective.gram
+        self._task = objective.reweigh(Weights(weights.task, 0.0, weights.regularity, angles=weights.angles))
+        # 2 cancels the factor 1/2 of the loss
+        only_mutual = Weights(0.0, 2.0, 0.0, angles=weights.angles)
+        self._mutual = objective.reweigh(only_mutual)
         self._r, self._K, self._bound = objective.r, objective.K, bound
 
     def value(self, theta: Array) -> float:
@@ -394,8 +352,70 @@ class BoundedMutual:
             H[block, block] += 2 * multiplier * self._gram
         return H
 
-    def in_gauge(self, theta: Array) -> Array:
+    def normalise_gradients(self, theta: Array) -> Array:
         """The same coordinates with E|grad xi_j|^2 = 1."""
         C = theta.reshape(self._r, self._K)
         scaled: Array = C / np.sqrt(((C @ self._gram) * C).sum(axis=1))[:, None]
         return scaled.ravel()
+
+
+def build_normal_matrix(derivatives: Sequence[Array], gradients: Sequence[Array], shared: Shared) -> Array:
+    """Sums over samples of X_j^T X_j, and of x_i^T x_j for residuals that two coordinates share, (size, size).
+
+    X_j = D_j G_j are the derivatives of the residuals of coordinate j with respect to its coefficients. Products are
+    taken over chunks of samples, and added in double precision in the order of the chunks.
+
+    Args:
+        derivatives: D_j of every coordinate, (N, rows, n).
+        gradients: G_j of every coordinate, (N, n, K_j).
+        shared: coordinates i > j and the places of their shared residual among the rows of X_i and of X_j.
+    """
+    r, ends = len(derivatives), np.cumsum([G.shape[2] for G in gradients])
+    places = [slice(end - G.shape[2], end) for G, end in zip(gradients, ends, strict=True)]
+    H = np.zeros((ends[-1], ends[-1]))
+    chunks = range(0, len(gradients[0]), RULES.chunk)
+    # so many chunks at a time that there is work for all threads
+    together = ceil(count_threads() / r)
+    for k in range(0, len(chunks), together):
+        _add(H, places, chunks[k : k + together], derivatives, gradients, shared)
+    for i, j, *_ in shared:
+        H[places[j], places[i]] = H[places[i], places[j]].T
+    return H
+
+
+def _add(
+    H: Array,
+    places: Sequence[slice],
+    starts: Sequence[int],
+    derivatives: Sequence[Array],
+    gradients: Sequence[Array],
+    shared: Shared,
+) -> None:
+    """Add the products of some chunks: every block by one thread, in the order of the chunks."""
+
+    def rows(piece: tuple[int, int]) -> Array:
+        start, j = piece
+        part = slice(start, start + RULES.chunk)
+        product: Array = derivatives[j][part] @ gradients[j][part]  # (chunk, rows, K_j)
+        return product
+
+    def square(j: int) -> None:
+        for start in starts:
+            flat = X[start, j].reshape(-1, X[start, j].shape[2])
+            H[places[j], places[j]] += flat.T @ flat
+
+    def mixed(pair: tuple[int, int]) -> None:
+        i, j = pair
+        for start in starts:
+            for row, other in rows_of[i, j]:
+                H[places[i], places[j]] += X[start, i][:, row].T @ X[start, j][:, other]
+
+    r = len(derivatives)
+    rows_of: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for i, j, row, other in shared:
+        rows_of.setdefault((i, j), []).append((row, other))
+    pieces = [(start, j) for start in starts for j in range(r)]
+    X = dict(zip(pieces, run_in_threads(rows, pieces), strict=True))
+    work: list[Callable[[], None]] = [partial(square, j) for j in range(r)]
+    work += [partial(mixed, pair) for pair in rows_of]
+    run_in_threads(lambda block: block(), work)

@@ -1,11 +1,14 @@
-"""Grids of fits, and their comparison."""
+"""Comparisons: a grid of parametrisations, solvers and seeds, fitted and evaluated on the same held-out samples."""
 
 import csv
 import io
 import math
+import os
+import pickle
 import re
+import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, as_completed, wait
 from dataclasses import dataclass, fields, replace
 from itertools import product
 from pathlib import Path
@@ -16,24 +19,350 @@ from orthocas.bases.family import Parametrisation
 from orthocas.bases.registry import require_savable
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import CHART
+from orthocas.charts.quality import evaluate
 from orthocas.codegen.library import control_tick
 from orthocas.errors import ChartFileError, Interrupted, InvalidValueError, OrthocasError
 from orthocas.fitting.grid import Cell, CellResult, run_cells
 from orthocas.fitting.settings import PRECISIONS, Precision, choose_solver
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.solvers.gauss_newton import GaussNewton
-from orthocas.solvers.protocol import Solver
+from orthocas.solvers.protocol import Solver, Status
 from orthocas.tasks.problem import Problem
 from orthocas.tools.archive import require_free
-from orthocas.tools.checks import as_path, require_count, require_kind, require_known
+from orthocas.tools.batch import THREADS
+from orthocas.tools.checks import as_path, require_count, require_kind
 from orthocas.tools.display import Shown
-from orthocas.tools.files import publish, require_writable
+from orthocas.tools.files import open_draft_folder, publish, require_writable, write_temporary
 from orthocas.tools.interrupts import deferred
 from orthocas.tools.json import clean, write_json
+from orthocas.tools.processes import Processes, begin_worker
 from orthocas.tools.progress import Monitor, Progress, silent
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+HELD_OUT_SEED = 2**31  #: seed of the held-out samples; no fit of a grid uses it
+
+
+def compare(
+    problem: Problem,
+    parametrisations: Sequence[Parametrisation],
+    solvers: Sequence[Solver] | None = None,
+    *,
+    seeds: int = 1,
+    weights: Weights | WeightNumbers = DEFAULT_WEIGHTS,
+    samples: int | None = None,
+    held_out: int = 100_000,
+    executor: Executor | None = None,
+    jobs: int | None = None,
+    charts: str | Path | None = None,
+    control_ticks: bool = False,
+    monitor: Monitor = silent,
+    force: bool = False,
+) -> "Comparison":
+    """Fit every parametrisation with every solver and seed, and evaluate all on the same held-out samples.
+
+    If a fit fails, the result says so and the others continue. Coordinates in closed form need no solver and no seed,
+    so they are evaluated once.
+
+    In scripts, call it under `if __name__ == "__main__"`: it starts processes.
+
+    Args:
+        problem: robot, task, metric and domain.
+        parametrisations: the parametrisations to fit.
+        solvers: the solvers to use. Default: for each parametrisation the default of `fit`.
+        seeds: number of seeds 0, 1, ... of samples and random starts.
+        weights: weights of the loss; see `fit`.
+        samples: number of training samples. Default: grows with the number of parameters.
+        held_out: number of held-out samples.
+        executor: any `concurrent.futures.Executor` (processes, threads, Dask, MPI, ...). Default: processes on this
+            machine with one thread each, so that seconds are those of one core.
+        jobs: number of these processes. Default: one for each core.
+        charts: folder to save charts in.
+        control_ticks: measure after all fits how long a control tick takes with each parametrisation. The tick is
+            decoupled PD+ as generated C, on a saved chart. NaN if there is no C compiler.
+        monitor: called with progress.
+        force: replace files in the folder for charts that are no charts.
+
+    Raises:
+        InvalidValueError: if the grid is empty, or two of its parametrisations or solvers have the same name.
+        ChartFileError: if the folder for charts cannot be written, or has another file with the name of a chart.
+        Interrupted: after Ctrl-C; its `result` is the comparison of the finished fits.
+
+    Example:
+        >>> from concurrent.futures import ThreadPoolExecutor
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> with ThreadPoolExecutor(1) as executor:
+        ...     comparison = oc.compare(
+        ...         problems.get("planar_3r_xy"),
+        ...         [oc.Linear(), oc.Polynomial(degree=2)],
+        ...         samples=200,
+        ...         held_out=1000,
+        ...         executor=executor,
+        ...     )
+        >>> [result.parametrisation for result in comparison.results]
+        ['linear', 'polynomial:2']
+    """
+    require_kind("problem", problem, Problem)
+    seeds, held_out, loss = require_count("seeds", seeds), require_count("held_out", held_out), Weights.of(weights)
+    jobs = None if jobs is None else require_count("jobs", jobs)
+    _check_grid(parametrisations, solvers)
+    folder = None if charts is None else as_path("charts", charts)
+    if folder is not None:
+        require_writable(folder / "chart", ChartFileError)
+        for parametrisation in parametrisations:
+            require_savable(parametrisation.for_problem(problem))
+    elif control_ticks:
+        raise InvalidValueError("charts", None, "a folder for charts: control_ticks are measured on them")
+
+    # Coordinates in closed form need neither solver nor seed.
+    cells = []
+    for parametrisation in parametrisations:
+        closed = parametrisation.closed_form is not None
+        fitting = [choose_solver(parametrisation, problem)] if closed or solvers is None else solvers
+        for solver, seed in product(fitting, range(1 if closed else seeds)):
+            name = re.sub(r"[^\w.-]", "-", f"{parametrisation.label}_{solver.name}_{seed}.orthocas")
+            file = None if folder is None else folder / name
+            if file is not None:
+                require_free(file, CHART, force)
+            cells.append(Cell(problem, parametrisation, solver, seed, loss, samples, held_out, file, force))
+
+    # Results arrive in any order, and return in that of the grid.
+    order = {(cell.parametrisation.label, cell.solver_name, cell.seed): k for k, cell in enumerate(cells)}
+    results: list[CellResult] = []
+    interrupted = False
+    try:
+        results.extend(run_cells(cells, executor, jobs, monitor))
+        if control_ticks:
+            results = measure_control_ticks(results, cells, monitor)
+    except KeyboardInterrupt:
+        interrupted = True
+    results.sort(key=lambda result: order[result.parametrisation, result.solver, result.seed])
+    comparison = Comparison(tuple(results), interrupted)
+    if interrupted:
+        raise Interrupted(comparison)
+    return comparison
+
+
+def _check_grid(parametrisations: Sequence[Parametrisation], solvers: Sequence[Solver] | None) -> None:
+    """Refuse grids that are empty, contain other objects, or have two entries of the same name."""
+    for name, members, kinds, example in (
+        ("parametrisations", parametrisations, Parametrisation, "Polynomial(degree=4)"),
+        ("solvers", [GaussNewton()] if solvers is None else solvers, Solver, "GaussNewton()"),
+    ):
+        require_kind(name, members, Sequence)
+        if not members:
+            raise InvalidValueError(name, "empty", f"at least one, such as [{example}]")
+        for member in members:
+            if not isinstance(member, kinds):
+                raise InvalidValueError(name, repr(member), f"objects such as {example}")
+        labels = [getattr(member, "label", getattr(member, "name", "")) for member in members]
+        twice = [label for label in labels if labels.count(label) > 1]
+        if twice:
+            raise InvalidValueError(
+                name, f"a list with two called '{twice[0]}'", "different names; compare these in two grids"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """One fit of a grid: settings that can be sent to another process."""
+
+    problem: Problem
+    parametrisation: Parametrisation
+    solver: Solver
+    seed: int
+    weights: Weights
+    samples: int | None
+    held_out: int
+    chart_file: Path | None  #: file to save the chart in
+    force: bool = False  #: replace a file there that is not a chart
+
+    @property
+    def solver_name(self) -> str:
+        """Name of the solver. Coordinates in closed form need none."""
+        return self.solver.name if self.parametrisation.closed_form is None else "closed form"
+
+    def fail(self, error: str) -> "CellResult":
+        """The result if the fit failed."""
+        names = (self.problem.name, self.parametrisation.label, self.solver_name)
+        return CellResult(*names, self.seed, Status.FAILED.value, " ".join(error.split()))
+
+
+@dataclass(frozen=True)
+class CellResult:
+    """The result of one fit, or its error. The numbers of a failed fit are NaN."""
+
+    problem: str
+    parametrisation: str
+    solver: str
+    seed: int
+    status: str
+    error: str = ""
+    seconds: float = float("nan")  #: duration of the fit
+    parameters: int = 0
+    samples: int = 0
+    iterations: int = 0
+    evaluations: int = 0
+    task_std_deg: float = float("nan")
+    mutual_std_deg: float = float("nan")
+    leak_rms_deg: float = float("nan")  #: in the metric; the two above are the paper's
+    conditioning_min: float = float("nan")
+    conditioning_p01: float = float("nan")
+    conditioning_mean: float = float("nan")
+    folded_samples: int = 0
+    control_tick_us: float = float("nan")  #: a tick of decoupled PD+ as generated C; NaN if not measured
+    #: seconds since the start of the fit, and training loss, in its last stage
+    history: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def failed(self) -> bool:
+        """Whether there is no chart."""
+        return bool(self.error)
+
+
+def run_cell(cell: Cell) -> CellResult:
+    """Fit and evaluate. An error becomes part of the result."""
+    history: list[tuple[float, float]] = []
+    stages: list[str] = []
+    start = time.perf_counter()
+
+    def record(progress: Progress) -> None:
+        if progress.stage not in stages:
+            stages.append(progress.stage)
+            history.clear()
+        if math.isfinite(progress.value):
+            history.append((time.perf_counter() - start, progress.value))
+
+    try:
+        result = fit(
+            cell.problem,
+            cell.parametrisation,
+            cell.solver,
+            weights=cell.weights,
+            samples=cell.samples,
+            seed=cell.seed,
+            monitor=record,
+        )
+        if cell.chart_file is not None:
+            result.chart.save(cell.chart_file, cell.force)
+        report = evaluate(result.chart, cell.held_out, HELD_OUT_SEED)
+    except Exception as error:
+        return cell.fail(f"{type(error).__name__}: {error}")
+    return CellResult(
+        problem=cell.problem.name,
+        parametrisation=cell.parametrisation.label,
+        solver=cell.solver_name,
+        seed=cell.seed,
+        status=result.status.value,
+        seconds=result.seconds,
+        parameters=result.chart.coordinates.size,
+        samples=int(result.chart.notes["samples"]),
+        iterations=sum(stage.result.iterations for stage in result.stages),
+        evaluations=sum(stage.result.evaluations for stage in result.stages),
+        task_std_deg=report.task_angle.std,
+        mutual_std_deg=report.mutual_angle.std,
+        leak_rms_deg=report.leak.rms,
+        conditioning_min=report.conditioning.min,
+        conditioning_p01=report.conditioning.p01,
+        conditioning_mean=report.conditioning.mean,
+        folded_samples=report.folded_samples,
+        history=tuple(history),
+    )
+
+
+def run_cells(
+    cells: Sequence[Cell], executor: Executor | None = None, jobs: int | None = None, monitor: Monitor = silent
+) -> Iterator[CellResult]:
+    """Run cells, and yield results as they arrive. A cell that fails or kills its process does not affect the others.
+
+    Args:
+        cells: the cells to run.
+        executor: runs the cells. Default: processes on this machine with one thread each.
+        jobs: number of these processes. Default: one for each core that this process may use.
+        monitor: called with the fraction of finished cells.
+    """
+    results = _run_in_processes(cells, jobs or THREADS) if executor is None else _run_on(executor, cells)
+    for done, result in enumerate(results, start=1):
+        detail = f"{result.parametrisation}, {result.solver}"
+        monitor(Progress("comparing", done / len(cells), f"{done} of {len(cells)}, {detail}"))
+        yield result
+
+
+def _run_on(executor: Executor, cells: Sequence[Cell]) -> Iterator[CellResult]:
+    futures = {executor.submit(run_cell, cell): cell for cell in cells}
+    try:
+        for future in as_completed(futures):
+            yield _read_result(future, futures[future])
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def _run_in_processes(cells: Sequence[Cell], size: int) -> Iterator[CellResult]:
+    """Run cells in new processes, which are killed if the caller stops.
+
+    Cells are passed in files: a pool whose process dies while it receives a large argument hangs in Python 3.11.2.
+    """
+    with open_draft_folder() as folder, Processes(size, begin_worker, os.getpid()) as processes:
+        queue, running = iter(enumerate(cells)), dict[Future[CellResult], Cell]()
+        while True:
+            # No process has more than one cell, so one that dies loses no other.
+            while len(running) < size and (entry := next(queue, None)) is not None:
+                k, cell = entry
+                try:
+                    content = pickle.dumps(cell)
+                except (pickle.PicklingError, TypeError, AttributeError) as error:
+                    yield cell.fail(f"{type(error).__name__}: {error}")
+                    continue
+                write_temporary(folder / f"{k}.pickle", content)
+                running[processes.submit(_run_stored, folder / f"{k}.pickle")] = cell
+            if not running:
+                return
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                yield _read_result(future, running.pop(future))
+
+
+def _run_stored(file: Path) -> CellResult:
+    """Run a cell from a file that this program wrote."""
+    cell: Cell = pickle.loads(file.read_bytes())
+    return run_cell(cell)
+
+
+def _read_result(future: Future[CellResult], cell: Cell) -> CellResult:
+    error = future.exception()
+    if error is None:
+        return future.result()
+    if isinstance(error, BrokenExecutor):
+        reason = "out of memory, or a script that calls compare outside `if __name__ == '__main__'`"
+        return cell.fail(f"its process died: {reason}")
+    return cell.fail(f"{type(error).__name__}: {error}")
+
+
+def measure_control_ticks(results: Sequence[CellResult], cells: Sequence[Cell], monitor: Monitor) -> list[CellResult]:
+    """Add `control_tick_us` to the results. Ticks are measured one at a time, so that they do not disturb each other.
+
+    It is NaN if there is no chart file, no C compiler, or the controller does not support the chart.
+    """
+    files = {
+        cell.parametrisation.label: cell.chart_file for cell in cells if cell.chart_file and cell.chart_file.exists()
+    }
+    ticks = {}
+    for k, (label, file) in enumerate(files.items()):
+        monitor(Progress("timing control ticks", k / len(files), label))
+        try:
+            # CasADi may make a RuntimeError of Ctrl-C while it builds functions.
+            with deferred():
+                chart = Chart.load(file)
+            ticks[label] = control_tick(chart)
+        except (OrthocasError, OSError, RuntimeError, MemoryError):
+            # A measurement that fails must not lose the fits.
+            ticks[label] = math.nan
+    return [
+        result if result.failed else replace(result, control_tick_us=ticks.get(result.parametrisation, math.nan))
+        for result in results
+    ]
 
 
 @dataclass(frozen=True)
@@ -69,7 +398,7 @@ class Comparison(Shown):
         groups: dict[tuple[str, str], list[CellResult]] = {}
         for result in self.results:
             groups.setdefault((result.parametrisation, result.solver), []).append(result)
-        summaries = [_summary(results) for results in groups.values()]
+        summaries = [summarise(results) for results in groups.values()]
         return sorted(summaries, key=lambda s: (math.isnan(s.task_std_deg), s.task_std_deg))
 
     def write(self, folder: Path, force: bool = False) -> None:
@@ -103,7 +432,7 @@ class Comparison(Shown):
         ended = ", interrupted" if self.interrupted else ""
         return {
             "comparison": f"{len(self.results)} fits, {failed} failed{ended}",
-            **{f"{s.parametrisation}, {s.solver}": _in_words(s) for s in self.summaries()},
+            **{f"{s.parametrisation}, {s.solver}": _describe(s) for s in self.summaries()},
         }
 
     def plot(self) -> "Figure":
@@ -119,17 +448,20 @@ class Comparison(Shown):
         return [head, *(_row(summary) for summary in self.summaries())]
 
 
-def _summary(results: Sequence[CellResult]) -> Summary:
+_MEDIANS = ("seconds", "task_std_deg", "mutual_std_deg", "leak_rms_deg", "conditioning_p01", "control_tick_us")
+
+
+def summarise(results: Sequence[CellResult]) -> Summary:
+    """Medians over the seeds of one parametrisation and solver."""
     good = [result for result in results if not result.failed]
     first = (good or results)[0]
 
-    def middle(name: str) -> float:
-        values = [float(getattr(result, name)) for result in good]
-        return median(values) if values else math.nan
+    def compute_median(name: str) -> float:
+        return median(float(getattr(result, name)) for result in good) if good else math.nan
 
-    def spread(name: str) -> float:
+    def compute_spread(name: str) -> float:
         values = [float(getattr(result, name)) for result in good]
-        return (max(values) - min(values)) / middle(name) if values and middle(name) else math.nan
+        return (max(values) - min(values)) / median(values) if values and median(values) else math.nan
 
     return Summary(
         parametrisation=first.parametrisation,
@@ -138,19 +470,14 @@ def _summary(results: Sequence[CellResult]) -> Summary:
         failed=len(results) - len(good),
         error=next((result.error for result in results if result.failed), ""),
         parameters=first.parameters,
-        seconds=middle("seconds"),
-        task_std_deg=middle("task_std_deg"),
-        mutual_std_deg=middle("mutual_std_deg"),
-        leak_rms_deg=middle("leak_rms_deg"),
-        conditioning_p01=middle("conditioning_p01"),
         folded_samples=max((result.folded_samples for result in good), default=0),
-        control_tick_us=middle("control_tick_us"),
-        task_spread=spread("task_std_deg"),
-        mutual_spread=spread("mutual_std_deg"),
+        task_spread=compute_spread("task_std_deg"),
+        mutual_spread=compute_spread("mutual_std_deg"),
+        **{name: compute_median(name) for name in _MEDIANS},
     )
 
 
-def _in_words(s: Summary) -> str:
+def _describe(s: Summary) -> str:
     if s.failed == s.seeds:
         return f"failed: {s.error}"
     angles = f"task std {s.task_std_deg:.3f}, mutual std {s.mutual_std_deg:.3f}, leak rms {s.leak_rms_deg:.3f} deg"

@@ -10,11 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from orthocas.fitting.grid import CellResult
 from orthocas.tools.picture import Picture
 
 if TYPE_CHECKING:
-    from orthocas.fitting.compare import Comparison, Summary
+    from orthocas.fitting.compare import CellResult, Comparison, Summary
 
 Colour = tuple[float, float, float, float]
 _HUES = {"linear": "Greys", "polynomial": "Blues", "fourier": "Greens", "mlp": "Oranges", "sew": "Purples"}
@@ -74,7 +73,8 @@ def convergence_figure(comparison: "Comparison") -> Figure:
         axes.plot(seconds[-1], loss[-1], ".", color=colour)
     axes.set_xscale("log")
     axes.set_yscale("log")
-    if drawn:  # how networks fall from their random starts is of no interest
+    # How networks fall from their random starts is of no interest.
+    if drawn:
         axes.set_ylim(top=_ROOM * max(result.history[-1][1] for result in drawn))
     axes.set_xlabel("time [s]")
     axes.set_ylabel("training loss")
@@ -88,11 +88,11 @@ def _problem(comparison: "Comparison") -> str:
     return comparison.results[0].problem if comparison.results else ""
 
 
-def _names(results: Sequence[CellResult], attribute: str) -> list[str]:
+def _names(results: "Sequence[CellResult]", attribute: str) -> list[str]:
     return list(dict.fromkeys(str(getattr(result, attribute)) for result in results))
 
 
-def _colours(results: Sequence[CellResult]) -> dict[str, Colour]:
+def _colours(results: "Sequence[CellResult]") -> dict[str, Colour]:
     """One hue for each kind of parametrisation, darker for labels later in the alphabet."""
     kinds: dict[str, list[str]] = {}
     for name in sorted(_names(results, "parametrisation")):
@@ -136,7 +136,8 @@ def _label(axes: Axes, summaries: "Sequence[Summary]", single: bool, colours: Ma
     axes.figure.draw_without_rendering()  # type: ignore[union-attr]  # so that places in points are known
     scale = 72 / axes.figure.dpi
     points = {(s.parametrisation, s.solver): scale * axes.transData.transform(_place(s, single)) for s in summaries}
-    boxes = [(x - _HIGH / 2, x + _HIGH / 2, y) for x, y in points.values()]  # left, right and height of what is there
+    # Left, right and height of what is there.
+    boxes = [(x - _HIGH / 2, x + _HIGH / 2, y) for x, y in points.values()]
     frame = axes.get_window_extent()
     low, high, end = scale * frame.y0 + _HIGH / 2, scale * frame.y1 - _HIGH / 2, scale * frame.x1
     for name, summary in sorted(best.items(), key=lambda entry: points[_key(entry[1])][1]):

@@ -25,10 +25,107 @@ from orthocas.tools.display import Shown, number_list, percent
 from orthocas.tools.expressions import wrap_shortest
 from orthocas.tools.progress import Monitor, Progress, Watch, silent
 
-_PER_PARAMETER = 4  # samples per parameter of a coordinate
-_LEAST, _MOST = 2000, 20_000  # samples
-_CHUNK = 500  # samples whose basis is in memory at once
-_HELD_OUT_SEED = 1
+
+@dataclass(frozen=True, slots=True)
+class DistilRules:
+    """Numbers of closed expressions for grown coordinates."""
+
+    degree: int = 6  #: of the default polynomial
+    per_parameter: int = 4  #: samples per parameter of a coordinate
+    least_samples: int = 2000
+    most_samples: int = 20_000
+    chunk: int = 500  #: samples whose basis is in memory at once
+    held_out: int = 5000  #: samples for errors, at most
+    held_out_seed: int = 1
+
+
+RULES = DistilRules()
+
+
+def distil(
+    chart: Chart,
+    parametrisation: Parametrisation | None = None,
+    solver: Solver | None = None,
+    samples: int | None = None,
+    seed: int = 0,
+    monitor: Monitor = silent,
+) -> "Distilled":
+    """Fit a closed expression to the values and gradients of a grown chart, for controllers and generated C.
+
+    Minimises the mean of |xi - xi_grown|^2 + w^2 |J_xi - J_grown|^2 over samples of the domain, where w is the mean
+    half-width of the domain. Bases that are linear in their parameters use least squares, networks use a minimiser.
+    With `Circle` pairs, it fits cos xi and sin xi of a closed leaf instead, which are smooth across its cut.
+
+    Args:
+        chart: a grown chart.
+        parametrisation: form of the closed expression; default Polynomial(degree=6).
+        solver: minimiser for networks; default LBFGS.
+        samples: number of samples; default four per parameter of a coordinate, between 2000 and 20,000.
+        seed: seed of samples and random starts.
+        monitor: called with progress.
+
+    Returns:
+        The chart, its errors in values and gradients, and the quality before and after.
+
+    Raises:
+        InvalidValueError: if the chart is not grown, or the parametrisation cannot be fitted.
+        GrowError: if the grown chart has no values on its domain.
+        KeyboardInterrupt: after Ctrl-C, also within the minimiser.
+
+    Example:
+        >>> import orthocas as oc
+        >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[3.0, 3.0])
+        >>> problem = oc.Problem(robot, oc.Task.position(robot, "x"), "inertia", oc.Box([0.6, 0.8], 0.2))
+        >>> result = oc.distil(oc.grow(problem), oc.Polynomial(degree=3), samples=300)
+        >>> result.distilled.task_angle.std < 1.0  # [deg]; 0 before
+        True
+        >>> result.chart.function("xi").name()
+        'xi'
+    """
+    parametrisation = Polynomial(RULES.degree) if parametrisation is None else parametrisation
+    if not isinstance(parametrisation, Parametrisation) or parametrisation.closed_form is not None:
+        raise InvalidValueError(
+            "parametrisation", repr(parametrisation), "a parametrisation that can be fitted, such as Polynomial(6)"
+        )
+    # the family: circle-valued ones are fitted by cosine and sine
+    require_kind("chart", chart, Chart)
+    watch = Watch(monitor, f"distil {parametrisation.label}")
+    if not isinstance(chart.coordinates, GrownCoordinates):
+        raise InvalidValueError("chart", f"a chart of kind {chart.coordinates.label}", "a grown chart")
+    space = JointSpace.of(chart.problem)
+    whole = parametrisation.family(space, chart.r)
+    circle = whole if isinstance(whole, CircleFamily) else None
+    if circle is not None and not chart.turns.any():
+        raise InvalidValueError("parametrisation", parametrisation.label, "one that is not circle-valued for this leaf")
+    family = whole if circle is None else circle.pairs
+    if isinstance(family, LinearFamily):
+        if solver is not None:
+            raise InvalidValueError("solver", repr(solver), "no solver, because bases are fitted by least squares")
+        needed = 8.0 * family.width * (3 * family.width + (chart.n + 1) * RULES.chunk)
+        require_memory(f"least squares with {family.width} terms", needed)
+    default = int(np.clip(RULES.per_parameter * family.size // chart.r, RULES.least_samples, RULES.most_samples))
+    count = default if samples is None else require_count("samples", samples)
+    if count * (1 + chart.n) <= family.size / chart.r:
+        raise InvalidValueError("samples", count, f"enough for the {family.size // chart.r} parameters of a coordinate")
+    require_memory(f"distilling with {count} samples", 8.0 * count * chart.n * (chart.n + 4))
+    # values and gradients of the grown chart at the samples that have them
+    points = sample_evenly(chart.problem.domain, count, require_count("seed", seed, least=0))
+    targets = _sample_targets(chart, points)
+    own_targets = targets if circle is None else _take_circle_pairs(targets)
+    # bases by least squares, networks by a minimiser
+    if isinstance(family, LinearFamily):
+        theta, offset = _solve_least_squares(family, own_targets, watch)
+    else:
+        minimiser = LBFGS(max_iterations=500, tolerance=1e-9) if solver is None else solver
+        result = minimiser.minimise(_Distance(family, own_targets), family.initial(seed), watch).require_finished()
+        # the output bias of a network includes the offset
+        theta, offset = result.theta, np.zeros(family.outputs)
+    if circle is not None:
+        theta, offset = np.concatenate([theta, -offset[: circle.constants]]), np.zeros(chart.r)
+    coordinates = Coordinates(parametrisation, space, (), theta, offset, np.ones(chart.r))
+    return _evaluate(
+        chart, Chart(chart.problem, coordinates, {"distilled from": chart.coordinates.label}), targets, count
+    )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -65,146 +162,61 @@ class _Targets:
     weight: float  #: length scale that makes gradients comparable to values
 
 
-def distil(
-    chart: Chart,
-    parametrisation: Parametrisation | None = None,
-    solver: Solver | None = None,
-    samples: int | None = None,
-    seed: int = 0,
-    monitor: Monitor = silent,
-) -> Distilled:
-    """Fit a closed expression to the values and gradients of a grown chart, for controllers and generated C.
-
-    Minimises the mean of |xi - xi_grown|^2 + w^2 |J_xi - J_grown|^2 over samples of the domain, where w is the mean
-    half-width of the domain. Bases that are linear in their parameters use least squares, networks use a minimiser.
-    With `Circle` pairs, it fits cos xi and sin xi of a closed leaf instead, which are smooth across its cut.
-
-    Args:
-        chart: a grown chart.
-        parametrisation: form of the closed expression; default Polynomial(degree=6).
-        solver: minimiser for networks; default LBFGS.
-        samples: number of samples; default four per parameter of a coordinate, between 2000 and 20,000.
-        seed: seed of samples and random starts.
-        monitor: called with progress.
-
-    Returns:
-        The chart, its errors in values and gradients, and the quality before and after.
-
-    Raises:
-        InvalidValueError: if the chart is not grown, or the parametrisation cannot be fitted.
-        GrowError: if the grown chart has no values on its domain.
-        KeyboardInterrupt: after Ctrl-C, also within the minimiser.
-
-    Example:
-        >>> import orthocas as oc
-        >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[3.0, 3.0])
-        >>> problem = oc.Problem(robot, oc.Task.position(robot, "x"), "inertia", oc.Box([0.6, 0.8], 0.2))
-        >>> result = oc.distil(oc.grow(problem), oc.Polynomial(degree=3), samples=300)
-        >>> result.distilled.task_angle.std < 1.0  # [deg]; 0 before
-        True
-        >>> result.chart.function("xi").name()
-        'xi'
-    """
-    parametrisation = Polynomial(degree=6) if parametrisation is None else parametrisation
-    if not isinstance(parametrisation, Parametrisation) or parametrisation.closed_form is not None:
-        raise InvalidValueError(
-            "parametrisation", repr(parametrisation), "a parametrisation that can be fitted, such as Polynomial(6)"
-        )
-    require_kind("chart", chart, Chart)
-    watch = Watch(monitor, f"distil {parametrisation.label}")
-    if not isinstance(chart.coordinates, GrownCoordinates):
-        raise InvalidValueError("chart", f"a chart of kind {chart.coordinates.label}", "a grown chart")
-    space = JointSpace.of(chart.problem)
-    whole = parametrisation.family(space, chart.r)
-    circle = whole if isinstance(whole, CircleFamily) else None
-    if circle is not None and not chart.turns.any():
-        raise InvalidValueError("parametrisation", parametrisation.label, "one that is not circle-valued for this leaf")
-    family = whole if circle is None else circle.pairs
-    if isinstance(family, LinearFamily):
-        if solver is not None:
-            raise InvalidValueError("solver", repr(solver), "no solver, because bases are fitted by least squares")
-        needed = 8.0 * family.width * (3 * family.width + (chart.n + 1) * _CHUNK)
-        require_memory(f"least squares with {family.width} terms", needed)
-    wanted = int(np.clip(_PER_PARAMETER * family.size // chart.r, _LEAST, _MOST))
-    count = wanted if samples is None else require_count("samples", samples)
-    if count * (1 + chart.n) <= family.size / chart.r:
-        raise InvalidValueError("samples", count, f"enough for the {family.size // chart.r} parameters of a coordinate")
-    require_memory(f"distilling with {count} samples", 8.0 * count * chart.n * (chart.n + 4))
-    points = sample_evenly(chart.problem.domain, count, require_count("seed", seed, least=0))
-    targets = _targets(chart, points)
-    wanted_values = targets if circle is None else _pairs(targets)
-    if isinstance(family, LinearFamily):
-        theta, offset = _least_squares(family, wanted_values, watch)
-    else:
-        minimiser = LBFGS(max_iterations=500, tolerance=1e-9) if solver is None else solver
-        theta, offset = _minimised(family, wanted_values, minimiser, seed, watch)
-    if circle is not None:
-        theta, offset = np.concatenate([theta, -offset[: circle.constants]]), np.zeros(chart.r)
-    coordinates = Coordinates(parametrisation, space, (), theta, offset, np.ones(chart.r))
-    return _judged(
-        chart, Chart(chart.problem, coordinates, {"distilled from": chart.coordinates.label}), targets, count
-    )
-
-
-def _pairs(targets: _Targets) -> _Targets:
+def _take_circle_pairs(targets: _Targets) -> _Targets:
     """Cosines, then sines of angles, and their gradients."""
     c, s, g = np.cos(targets.xi), np.sin(targets.xi), targets.gradients
     gradients = np.concatenate([-s[:, :, None] * g, c[:, :, None] * g], axis=1)
     return _Targets(targets.points, np.concatenate([c, s], axis=1), gradients, targets.weight)
 
 
-def _targets(chart: Chart, points: Array) -> _Targets:
+def _sample_targets(chart: Chart, points: Array) -> _Targets:
     """Grown values and gradients at the points that have them."""
     xi, gradients = chart.coordinates.xi(points), chart.coordinates.jacobian(points)
-    known = np.isfinite(xi).all(axis=1) & np.isfinite(gradients).all(axis=(1, 2))
-    if not known.any():
+    finite = np.isfinite(xi).all(axis=1) & np.isfinite(gradients).all(axis=(1, 2))
+    if not finite.any():
         raise GrowError(f"the grown chart has no value at any of {len(points)} samples of the domain")
     weight = float(chart.problem.domain.half_width.mean())
-    return _Targets(points[known], xi[known], gradients[known] * weight, weight)
+    return _Targets(points[finite], xi[finite], gradients[finite] * weight, weight)
 
 
-def _judged(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> Distilled:
-    held_out = sample_uniform(chart.problem.domain, min(count, 5000), _HELD_OUT_SEED)
-    known = _targets(chart, held_out)
-    errors = wrap_shortest(distilled.coordinates.xi(known.points) - known.xi, distilled.turns[chart.m :])
-    gradients = known.gradients / known.weight
-    turned = np.linalg.norm(distilled.coordinates.jacobian(known.points) - gradients, axis=2)
+def _evaluate(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> Distilled:
+    held_out = sample_uniform(chart.problem.domain, min(count, RULES.held_out), RULES.held_out_seed)
+    held_out_targets = _sample_targets(chart, held_out)
+    errors = wrap_shortest(
+        distilled.coordinates.xi(held_out_targets.points) - held_out_targets.xi, distilled.turns[chart.m :]
+    )
+    gradients = held_out_targets.gradients / held_out_targets.weight
+    turned = np.linalg.norm(distilled.coordinates.jacobian(held_out_targets.points) - gradients, axis=2)
     relative = turned / np.linalg.norm(gradients, axis=2)
     return Distilled(
         chart=distilled,
         value_rms=np.sqrt((errors**2).mean(axis=0)),
         gradient_rms=np.sqrt((relative**2).mean(axis=0)),
-        grown=evaluate(chart, len(held_out), _HELD_OUT_SEED),
-        distilled=evaluate(distilled, len(held_out), _HELD_OUT_SEED),
+        grown=evaluate(chart, len(held_out), RULES.held_out_seed),
+        distilled=evaluate(distilled, len(held_out), RULES.held_out_seed),
         left_out=1 - len(targets.points) / count,
     )
 
 
-def _least_squares(family: LinearFamily, targets: _Targets, watch: Watch) -> tuple[Array, Array]:
+def _solve_least_squares(family: LinearFamily, targets: _Targets, watch: Watch) -> tuple[Array, Array]:
     """Coefficients and offset of the best linear combination, by normal equations over chunks of samples."""
     n, K = targets.points.shape[1], family.width
     q = ca.SX.sym("q", n)
     basis = family.basis(q)
     both = Batched(dense_function("basis", [q], [basis, ca.jacobian(basis, q)]))
     normal, right = np.zeros((K + 1, K + 1)), np.zeros((K + 1, family.outputs))
-    for start in range(0, len(targets.points), _CHUNK):
-        part = slice(start, start + _CHUNK)
+    for start in range(0, len(targets.points), RULES.chunk):
+        part = slice(start, start + RULES.chunk)
         watch.monitor(Progress(watch.stage, start / len(targets.points), f"{start} samples"))
         values, slopes = both(targets.points[part])
         slopes = slopes.reshape(len(values), K, n).transpose(0, 2, 1).reshape(-1, K) * targets.weight
         constant = np.r_[np.ones(len(values)), np.zeros(len(slopes))]
         rows = np.column_stack([np.vstack([values, slopes]), constant])
-        wanted = np.vstack([targets.xi[part], targets.gradients[part].transpose(0, 2, 1).reshape(-1, family.outputs)])
+        sides = np.vstack([targets.xi[part], targets.gradients[part].transpose(0, 2, 1).reshape(-1, family.outputs)])
         normal += rows.T @ rows
-        right += rows.T @ wanted
+        right += rows.T @ sides
     solution: Array = np.asarray(np.linalg.lstsq(normal, right, rcond=1e-14)[0], dtype=float)
     return solution[:-1].T.ravel(), -solution[-1]
-
-
-def _minimised(family: Family, targets: _Targets, solver: Solver, seed: int, watch: Watch) -> tuple[Array, Array]:
-    """Parameters by a minimiser. The offset stays 0, because the output bias of a network includes it."""
-    result = solver.minimise(_Distance(family, targets), family.initial(seed), watch).finished()
-    return result.theta, np.zeros(family.outputs)
 
 
 class _Distance:

@@ -9,16 +9,15 @@ import scipy
 from numpy.typing import NDArray
 
 from orthocas.bases.circle import CircleFamily
-from orthocas.bases.cyclic import over_cyclic_joints
+from orthocas.bases.cyclic import Mobile, anywhere, widen_over_cyclic_joints
 from orthocas.bases.family import CyclicParametrisation, JointSpace, Parametrisation, ReorderableFamily
-from orthocas.bases.mobile import Mobile, anywhere
 from orthocas.bases.registry import warn_unless_savable
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import WorstPoints
 from orthocas.errors import DomainError, Interrupted, InvalidValueError, OrthocasError
 from orthocas.fitting.like import Likeness
-from orthocas.fitting.settings import FitSettings, Precision
+from orthocas.fitting.settings import RULES, FitSettings, Precision
 from orthocas.fitting.stages import Begin, Continuation, FoldSearch, Solution, Stage, StageRunner
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.solvers.protocol import Solver, Status
@@ -31,14 +30,6 @@ from orthocas.tools.checks import Array, require_count
 from orthocas.tools.display import Shown, listed, percent
 from orthocas.tools.interrupts import remembered
 from orthocas.tools.progress import Monitor, silent
-
-_FIRST_SAMPLES = 1000  # seed tag of the samples that scale coordinates; stages use other tags
-_DIGITS = 6  # of gradients at the centre that count for the order: fits end with about as many
-_STEP = 0.05  # of the bounds that are offered
-_FAILS = 0.05  # conditioning below which a chart is of no use; folds have less than 0
-_MOST = 0.9  # share of such points that a bound should leave out
-_LARGEST = 0.25  # bound; charts that fail at larger singular values have other reasons
-_ANY = 1e-12  # bound of a ClearBox that only measures
 
 
 def fit(
@@ -122,7 +113,7 @@ def fit(
         >>> fit.chart.xi([0.6, 0.8, 0.8]).shape
         (1,)
     """
-    settings = FitSettings.checked(
+    settings = FitSettings.check(
         problem, parametrisation, solver, weights, samples, seed, max_mutual_deg, split_idle, precision, like
     )
     if like is not None and align_to is not None:
@@ -140,7 +131,7 @@ def fit_from(
     monitor: Monitor,
 ) -> "Fit":
     """The fit of `fit`, from known coordinates if there are some."""
-    settings = FitSettings.checked(problem, parametrisation, None, weights, None, seed, None)
+    settings = FitSettings.check(problem, parametrisation, None, weights, None, seed, None)
     return _fit(problem, settings, monitor, begin=begin)
 
 
@@ -153,25 +144,28 @@ def _fit(
 ) -> "Fit":
     """Fit with settings that are checked."""
     start = time.perf_counter()
+    # the domain that the family asks for, and whether the task can be regular there
     warn_unless_savable(settings.parametrisation)
     problem = _choose_domain(problem, settings)
     with remembered() as pressed:
         problem_check = check(problem, seed=settings.seed)
-        samples = sample_problem(problem, 200, (settings.seed, _FIRST_SAMPLES))
+        samples = sample_problem(problem, RULES.first, (settings.seed, RULES.first_tag))
+        # closed forms need no minimisation; others run the stages of `orthocas.fitting.stages`
         if settings.parametrisation.closed_form is not None:
             solution = Solution((), settings.parametrisation, None)
             coordinates = _evaluate_closed_form(problem, settings.parametrisation, samples)
         else:
             solution, coordinates = _solve(problem, settings, monitor, samples, align_to, begin)
+        # the chart, with what a reader of the fit asks first: idle joints, worst points, a smaller domain
         joints = [i for i in coordinates.idle if i not in problem.robot.tree.floating]
         result = Fit(
-            chart=Chart(problem, coordinates, _notes(solution, settings)),
+            chart=Chart(problem, coordinates, _write_notes(solution, settings)),
             stages=solution.stages,
             problem_check=problem_check,
             idle_joints=tuple(problem.robot.joint_names[i] for i in joints),
             worst=solution.worst,
             seconds=time.perf_counter() - start,
-            like={} if settings.like is None else settings.like.distances(problem, coordinates, settings.seed),
+            like={} if settings.like is None else settings.like.measure_distances(problem, coordinates, settings.seed),
             clear_part=offer_clear_part(problem, problem_check, solution.worst),
         )
         if result.status is Status.INTERRUPTED or pressed():
@@ -187,7 +181,7 @@ def _choose_domain(problem: Problem, settings: FitSettings) -> Problem:
     """
     parametrisation = settings.parametrisation
     if isinstance(parametrisation, CyclicParametrisation):
-        problem = over_cyclic_joints(problem, tuple(parametrisation.cyclic))
+        problem = widen_over_cyclic_joints(problem, tuple(parametrisation.cyclic))
     if problem.robot.tree.floating and (parametrisation.closed_form is not None or not settings.split_idle):
         expected = "one to fit in the arms' joints, such as Polynomial(1), with split_idle: the base floats"
         raise InvalidValueError("parametrisation", parametrisation.label, expected)
@@ -220,16 +214,18 @@ def _solve(
         none = np.zeros(0)
         coordinates = Coordinates(settings.parametrisation, space, idle, none, none, none)
         return Solution((), settings.parametrisation, None), coordinates
+    # coordinates are fitted in the joints that move the task; quantities to follow are one more term of the loss
     active = [i for i in range(problem.n) if i not in idle]
-    like = None if settings.like is None else settings.like.term(problem, active)
-    settings = settings if like is None else settings.with_term(like)
+    like = None if settings.like is None else settings.like.build_term(problem, active)
+    settings = settings if like is None else settings.add_term(like)
     folds = FoldSearch(problem, active, settings.fold_weight(problem))
     runner = StageRunner(problem, settings, active, monitor, folds, like)
     solution = Continuation(runner, r, begin).run()
+    # angles leave free where xi is zero, how long its gradient is, the order and the signs
     raw = Coordinates(solution.parametrisation, space, idle, solution.theta, np.zeros(r), np.ones(r))
     coordinates = normalise(raw, problem.domain.centre, samples)
     if settings.like is not None:
-        return solution, settings.like.named(coordinates, problem)
+        return solution, settings.like.name_units(coordinates, problem)
     if align_to is not None:
         return solution, align(coordinates, align_to, samples)
     return solution, fix_gauge(coordinates, problem.domain.centre)
@@ -242,7 +238,8 @@ def normalise(raw: Coordinates, origin: Array, samples: Samples) -> Coordinates:
         OrthocasError: if the gradient of a coordinate vanishes on the domain.
     """
     r = len(raw.offset)
-    if isinstance(raw.family, CircleFamily):  # an angle keeps its period
+    # angles keep their period, so they are turned instead of scaled
+    if isinstance(raw.family, CircleFamily):
         return replace(raw, theta=raw.family.turned(raw.theta, raw.once("xi", origin[None, :])[0, :r]))
     lengths = np.linalg.norm(raw.once("jacobian", samples.points)[:, :r], axis=2).mean(axis=0)
     if not lengths.min() > 0:
@@ -258,12 +255,14 @@ def fix_gauge(coordinates: Coordinates, centre: Array) -> Coordinates:
     the positive direction. Coordinates that change places in the arm's mirror have the same mean; the one that moves
     the first joint on which they differ further comes first. Idle joints stay last.
     """
+    # the mean index of the joints that a coordinate moves, and the sign of its largest entry
     g = coordinates.once("jacobian", centre[None, :])[0, : len(coordinates.offset)]
     size = (g**2).sum(axis=1)
-    moved = (g**2 @ np.arange(g.shape[1])) / np.where(size > 0, size, 1.0)  # g = 0: a fold at the centre
+    # lengths of 0 belong to folds at the centre
+    moved = (g**2 @ np.arange(g.shape[1])) / np.where(size > 0, size, 1.0)
     largest = np.take_along_axis(g, np.abs(g).argmax(axis=1)[:, None], axis=1)[:, 0]
     signs = np.where(largest < 0, -1.0, 1.0)
-    keys = np.round(np.column_stack([moved, -signs[:, None] * g]), _DIGITS)
+    keys = np.round(np.column_stack([moved, -signs[:, None] * g]), RULES.digits)
     return _reorder(coordinates, np.lexsort(keys.T[::-1]), signs)
 
 
@@ -287,6 +286,7 @@ def align(coordinates: Coordinates, chart: Chart, samples: Samples) -> Coordinat
         for J in (coordinates.jacobian(samples.points)[:, :fitted], chart.coordinates.jacobian(samples.points))
     )
     parallel = np.einsum("sin,sjn->ij", ours, theirs[:, :fitted]) / len(samples)
+    # the assignment of coordinates whose gradients are most parallel in the mean
     theirs_in_order, order = scipy.optimize.linear_sum_assignment(-np.abs(parallel.T))
     signs = np.sign(parallel.T[theirs_in_order, order])
     back = np.empty(fitted)
@@ -314,7 +314,7 @@ def _reorder(coordinates: Coordinates, order: NDArray[np.int_], signs: Array) ->
     )
 
 
-def _notes(solution: Solution, settings: FitSettings) -> dict[str, str | float]:
+def _write_notes(solution: Solution, settings: FitSettings) -> dict[str, str | float]:
     """Notes of the chart: how it was made."""
     weights, stages, worst = settings.weights, solution.stages, solution.worst
     searched = {} if worst is None else {"least conditioning": worst.least}
@@ -345,17 +345,17 @@ def offer_clear_part(problem: Problem, check: ProblemCheck, worst: WorstPoints |
         The offer; None if nothing is wrong, if charts fail elsewhere too, or if the centre itself would be left out.
     """
     domain = problem.domain
-    failed = np.zeros((0, problem.n)) if worst is None else worst.below(_FAILS)
+    failed = np.zeros((0, problem.n)) if worst is None else worst.below(RULES.failed)
     clear = domain.singular_bound
     if not (isinstance(domain, Box) and (domain.is_box or clear)) or not (len(failed) or check.singular_samples):
         return None
     try:
-        measured = clear or ClearBox(domain, problem.task, _ANY)
+        measured = clear or ClearBox(domain, problem.task, RULES.any_bound)
         values = measured.singular_values(failed)
-        target = float(np.quantile(values, _MOST)) if len(failed) else 0.0
-        if not target <= _LARGEST:
+        target = float(np.quantile(values, RULES.failed_fraction)) if len(failed) else 0.0
+        if not target <= RULES.largest_bound:
             return None
-        bound = round(_STEP * (1 + target // _STEP), 2)
+        bound = round(RULES.bound_step * (1 + target // RULES.bound_step), 2)
         return ClearPart(bound, ClearBox(domain, problem.task, bound, measured.scale, measured.rows).share)
     except DomainError:  # the centre is not clear
         return None

@@ -11,9 +11,9 @@ from orthocas.bases.products import Polynomial, ProductFamily
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import in_the_metric, worst_points
-from orthocas.fitting.basis_gradients import gradients_of
+from orthocas.fitting.basis_gradients import build_gradients
 from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.fitting.starts import spectral_start
+from orthocas.fitting.starts import find_spectral_start
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Weights
 from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.lbfgs import QuasiNewton
@@ -31,14 +31,48 @@ from orthocas.tools.batch import one_blas_thread
 from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import deferred
 
-_DEGREE = 2  # its conditioning is that of degree 4, its leak about a fifth larger
-_TRAINING, _HEAVY, _JUDGES = 700, 300, 3000  # numbers of samples: even, near faces and corners, and of a verdict
-_MANY = 6  # coordinates from which fits and their matrices take seconds
-_OTHER = 2.0  # factor of a half-width from which the matrix of another box steers no more
-_SEED = 0
-_TINY = 1e-4
+
+@dataclass(frozen=True, slots=True)
+class SuggestRules:
+    """Numbers of the search for a domain, and of the trial charts that it evaluates."""
+
+    leak_deg: float = 8.0  #: asked by default
+    conditioning: float = 0.2  #: asked by default
+    margin: float = 1.25  #: trial charts keep a higher conditioning, since a fit is evaluated at more points
+
+    degree: int = 2  #: of trial charts: its conditioning is that of degree 4, its leak about a fifth larger
+    training: int = 700  #: even samples of a trial chart
+    near_faces: int = 300  #: further samples near faces and corners
+    held_out: int = 3000  #: samples that evaluate a trial chart
+    many: int = 6  #: coordinates from which fits and their matrices take seconds
+    other: float = 2.0  #: factor of a half-width from which the matrix of another box steers no more
+    seed: int = 0
+    tiny: float = 1e-4  #: conditioning or singular value that counts as zero
+
+    start: float = 0.5  #: first scale of the box
+    step: float = 1.6  #: factor to the next scale while the boundary is unknown
+    close: float = 1.06  #: the boundary is found within this factor
+    smallest: float = 1e-3  #: scale of a box that is too small to be of use
+    exchanged: int = 28  #: joints that exchanges of width look at in all: five of five joints, one of many
+    least_step: float = 0.25  #: of an exchange; after one without gain, the next has half its step
+    wider: float = 1.2  #: factor by which one joint alone is widened
+    largest_exchange: float = float(np.log(1.5))
+    farthest: float = float(np.pi)  #: largest half-width of a revolute joint [rad]: a full turn
+    longest: float = 1.0  #: largest half-width of a prismatic joint without limits [m]
+
+    checked: int = 200  #: samples for whether the task can be regular at all, and which joints are idle
+    confirmed: int = 30_000  #: samples that evaluate the fit
+    shrink: float = 0.92  #: after a fit that misses a bound
+    tries: int = 12
+    descent: float = 0.5  #: fraction of the bound on the conditioning that descents from the worst samples keep, too
+
+    first_time: int = 24  #: of a first scale, in trials without a fit
+    next_time: int = 14  #: of a next one
+    growth_time: int = 5  #: of a joint's growth
+    trials: int = 6  #: of a scale, about
 
 
+RULES = SuggestRules()
 Miss = Literal["leak", "conditioning", "singularity", "half a turn"]  #: bounds that a box may miss
 
 
@@ -51,7 +85,7 @@ class Bounds:
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
+class Quality:
     """Quality of coordinates on a box."""
 
     leak_deg: float  #: root mean square over uniform samples and coordinates [deg]
@@ -68,9 +102,9 @@ class Verdict:
         """
         ratios: dict[Miss, float] = {
             "leak": self.leak_deg / bounds.leak_deg,
-            "conditioning": bounds.conditioning / max(self.conditioning, _TINY),
-            "singularity": NEAR_SINGULAR / max(self.task_value, _TINY),
-            "half a turn": NEAR_HALF_A_TURN / max(self.turn_value, _TINY),
+            "conditioning": bounds.conditioning / max(self.conditioning, RULES.tiny),
+            "singularity": NEAR_SINGULAR / max(self.task_value, RULES.tiny),
+            "half a turn": NEAR_HALF_A_TURN / max(self.turn_value, RULES.tiny),
         }
         return dict(sorted(ratios.items(), key=lambda pair: -pair[1]))
 
@@ -83,14 +117,14 @@ class Verdict:
         trial, most, least = "a trial chart", bounds.leak_deg, f"a conditioning of at least {bounds.conditioning:.3g}"
         words: dict[Miss, str] = {
             "leak": f"{trial} has a leak of {self.leak_deg:.3g} deg, expected at most {most:.3g}",
-            "conditioning": f"{trial} {conditioning_in_words(self.conditioning)}, expected {least}",
+            "conditioning": f"{trial} {describe_conditioning(self.conditioning)}, expected {least}",
             "singularity": f"the task's relative singular value is {self.task_value:.3g}, expected {NEAR_SINGULAR:g}",
             "half a turn": "the tool turns by half a turn from the reference, expected less",
         }
         return words[miss]
 
 
-def conditioning_in_words(signed: float) -> str:
+def describe_conditioning(signed: float) -> str:
     """The least conditioning of a chart, which is negative where det J has the other sign, in words."""
     return f"has a conditioning of {signed:.3g}" if signed >= 0 else "folds over (det J changes its sign)"
 
@@ -153,34 +187,35 @@ class Prober:
         """Number of coordinates to fit."""
         return len(self.active) - self.problem.m
 
-    def verdict(self, box: Box, enough: Bounds | None = None, leap: bool = False) -> Verdict:
-        """Fit and judge on a box.
+    def evaluate(self, box: Box, enough: Bounds | None = None, leap: bool = False) -> Quality:
+        """Fit on a box, and evaluate.
 
         Args:
             box: the box.
-            enough: if the coordinates of an earlier box keep these bounds, they are judged without a fit.
-            leap: whether to judge the coordinates of an earlier box without a fit, if there are some.
+            enough: if the coordinates of an earlier box keep these bounds, they are evaluated without a fit.
+            leap: whether to evaluate the coordinates of an earlier box without a fit, if there are some.
 
         Raises:
             KeyboardInterrupt: after Ctrl-C.
         """
         problem = Problem(self.problem.robot, self.problem.task, self.problem.metric, box)
         if self.outputs == 0:
-            return self._judged(problem, lambda points: np.zeros((len(points), 0, len(self.active))))
+            return self._evaluate(problem, lambda points: np.zeros((len(points), 0, len(self.active))))
         space = JointSpace.of(problem).restricted_to(self.active)
-        family = Polynomial(_DEGREE, self.cyclic).family(space, self.outputs)
+        family = Polynomial(RULES.degree, self.cyclic).family(space, self.outputs)
+        # the coordinates of an earlier box may do; if not, a fit begins from them
         with one_blas_thread():
             if self._start is not None and (enough is not None or leap):
-                found = self._judged(problem, self._gradients(family, self._start.on(family)))
-                if leap or found.keeps(enough):
-                    self._kept = self._start if found.keeps(enough) else self._kept
-                    return found
-            theta = self._fitted(problem, family)
-            found = self._judged(problem, self._gradients(family, theta))
-        if found.conditioning > 0:
+                quality = self._evaluate(problem, self._gradients(family, self._start.on(family)))
+                if leap or quality.keeps(enough):
+                    self._kept = self._start if quality.keeps(enough) else self._kept
+                    return quality
+            theta = self._fit(problem, family)
+            quality = self._evaluate(problem, self._gradients(family, theta))
+        if quality.conditioning > 0:
             self._start = _Start(space.half_width, theta)
-            self._kept = self._start if found.keeps(enough) else self._kept
-        return found
+            self._kept = self._start if quality.keeps(enough) else self._kept
+        return quality
 
     def go_back(self) -> None:
         """Start from the coordinates that kept their bounds last, if there are any."""
@@ -190,76 +225,78 @@ class Prober:
         """Coefficients (size,) of the last coordinates without folds in a family of other degrees on another box."""
         if self._start is None:
             return None
-        quadratic = Polynomial(_DEGREE, self.cyclic).family(family.space, self.outputs)
+        quadratic = Polynomial(RULES.degree, self.cyclic).family(family.space, self.outputs)
         return family.embed(self._start.on(quadratic), quadratic)
 
     def least(self, problem: Problem, seed: int) -> float:
         """Least conditioning of the last coordinates on another domain, by descent; 1 if a fit finds it as soon."""
-        if self._start is None or self.outputs < _MANY:
+        if self._start is None or self.outputs < RULES.many:
             return 1.0
-        parametrisation = Polynomial(_DEGREE, self.cyclic)
+        parametrisation = Polynomial(RULES.degree, self.cyclic)
         family = parametrisation.family(JointSpace.of(problem).restricted_to(self.active), self.outputs)
         idle = tuple(k for k in range(problem.n) if k not in self.active)
         zeros, ones = np.zeros(self.outputs), np.ones(self.outputs)
         theta = self._start.on(family)
-        found = Coordinates(parametrisation, JointSpace.of(problem), idle, theta, zeros, ones)
-        return worst_points(problem, found, seed, thorough=True).least
+        coordinates = Coordinates(parametrisation, JointSpace.of(problem), idle, theta, zeros, ones)
+        return worst_points(problem, coordinates, seed, thorough=True).least
 
-    def _judged(self, problem: Problem, jacobian: Callable[[Array], Array]) -> Verdict:
-        return judged(problem, sample_boundary_weighted(problem.domain, _JUDGES, _SEED), jacobian, self.active)
+    def _evaluate(self, problem: Problem, jacobian: Callable[[Array], Array]) -> Quality:
+        points = sample_boundary_weighted(problem.domain, RULES.held_out, RULES.seed)
+        return evaluate_at(problem, points, jacobian, self.active)
 
     def _gradients(self, family: ProductFamily, theta: Array) -> Callable[[Array], Array]:
         """Points (N, n) -> gradients in the active joints, (N, r, active)."""
         C = theta.reshape(self.outputs, family.width)
 
         def jacobian(points: Array) -> Array:
-            basis = gradients_of(family, len(self.active))
-            G = basis.dense(basis.at(points[:, self.active]), len(points))
+            basis = build_gradients(family, len(self.active))
+            G = basis.expand(basis.at(points[:, self.active]), len(points))
             J: Array = (G @ C.T).transpose(0, 2, 1)
             return J
 
         return jacobian
 
-    def _fitted(self, problem: Problem, family: ProductFamily) -> Array:
+    def _fit(self, problem: Problem, family: ProductFamily) -> Array:
         """Parameters, (size,)."""
-        even = sample_evenly(problem.domain, _TRAINING, _SEED)
-        heavy = sample_boundary_weighted(problem.domain, _HEAVY, _SEED + 1)
+        even = sample_evenly(problem.domain, RULES.training, RULES.seed)
+        heavy = sample_boundary_weighted(problem.domain, RULES.near_faces, RULES.seed + 1)
         samples = evaluate_samples(problem, np.vstack([even, heavy])).restricted_to(self.active)
         with deferred():
             fresh = self._start is None
-            start = spectral_start(family, samples[: len(even)]) if self._start is None else self._start.on(family)
-            objective = self._loss(problem, family, samples, start)
-        result = self._minimised(objective, start, fresh, family.space.half_width)
+            start = find_spectral_start(family, samples[: len(even)]) if self._start is None else self._start.on(family)
+            objective = self._build_loss(problem, family, samples, start)
+        result = self._minimise(objective, start, fresh, family.space.half_width)
         if result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         theta: Array = result.theta
         return theta
 
-    def _minimised(self, objective: BasisObjective, start: Array, fresh: bool, half_width: Array) -> SolveResult:
-        if self.outputs < _MANY:
+    def _minimise(self, objective: BasisObjective, start: Array, fresh: bool, half_width: Array) -> SolveResult:
+        if self.outputs < RULES.many:
             return GaussNewton().coarser().minimise(objective, start)
         solver = QuasiNewton().coarser()
         if fresh:
             return solver.minimise(objective, start)
-        known = self._steered
-        if known is None or np.abs(np.log(half_width / known.half_width)).max() > np.log(_OTHER):
+        # the matrix of a similar box is nearly that of this one
+        steered = self._steered
+        if steered is None or np.abs(np.log(half_width / steered.half_width)).max() > np.log(RULES.other):
             self._steered = _Steered(objective, half_width, objective.curvature_estimate(start))
         else:
-            self._steered = replace(known, loss=objective)
+            self._steered = replace(steered, loss=objective)
         return solver.minimise(self._steered, start)
 
-    def _loss(self, problem: Problem, family: ProductFamily, samples: Samples, start: Array) -> BasisObjective:
+    def _build_loss(self, problem: Problem, family: ProductFamily, samples: Samples, start: Array) -> BasisObjective:
         """The loss of the fit that confirms the box."""
-        known = self._objective
-        if known is None:
+        objective = self._objective
+        if objective is None:
             weights = replace(self.weights.for_problem(problem), length=0.0, extra={})
             self._objective = BasisObjective(family, samples, weights, start, lambda count, seed: samples)
         else:
-            self._objective = known.moved(gradients_of(family, len(self.active)), samples, start)
+            self._objective = objective.move_to(build_gradients(family, len(self.active)), samples, start)
         return self._objective
 
 
-def judged_chart(chart: Chart, samples: int, seed: int) -> Verdict:
+def evaluate_chart(chart: Chart, samples: int, seed: int) -> Quality:
     """Quality of a fitted chart, without its idle joints, on samples of its domain, many near faces and corners."""
     coordinates = chart.coordinates
     assert isinstance(coordinates, Coordinates)
@@ -269,10 +306,10 @@ def judged_chart(chart: Chart, samples: int, seed: int) -> Verdict:
         J: Array = coordinates.jacobian(points)[:, :fitted, active]
         return J
 
-    return judged(chart.problem, sample_boundary_weighted(chart.problem.domain, samples, seed), jacobian, active)
+    return evaluate_at(chart.problem, sample_boundary_weighted(chart.problem.domain, samples, seed), jacobian, active)
 
 
-def judged(problem: Problem, points: Array, jacobian: Callable[[Array], Array], active: list[int]) -> Verdict:
+def evaluate_at(problem: Problem, points: Array, jacobian: Callable[[Array], Array], active: list[int]) -> Quality:
     """Quality at the result of `sample_boundary_weighted`.
 
     Without fitted coordinates, such as where all are idle joints, nothing leaks, and det J has another sign where a
@@ -285,19 +322,20 @@ def judged(problem: Problem, points: Array, jacobian: Callable[[Array], Array], 
         active: the active joints.
     """
     samples = evaluate_samples(problem, points)
+    # leaks count at uniform samples, conditioning at all of them
     J, own = jacobian(samples.points), samples.restricted_to(active)
     uniform = len(samples) - 2 * (len(samples) // 3)
-    leaks, conditioning = leak_and_conditioning(own, J)
+    leaks, conditioning = compute_leak_and_conditioning(own, J)
     worst = int(np.argmin(conditioning))
     task_value = float(relative_singular_values(problem, points).min())
     turn_value = float(measure_half_turn_distance(problem, points).min())
     if J.shape[1] == 0:
-        return Verdict(0.0, 1.0, samples.points[worst], task_value if conditioning[worst] > 0 else 0.0, turn_value)
+        return Quality(0.0, 1.0, samples.points[worst], task_value if conditioning[worst] > 0 else 0.0, turn_value)
     leak = float(np.degrees(np.sqrt(np.mean(leaks[:uniform] ** 2))))
-    return Verdict(leak, float(conditioning[worst]), samples.points[worst], task_value, turn_value)
+    return Quality(leak, float(conditioning[worst]), samples.points[worst], task_value, turn_value)
 
 
-def leak_and_conditioning(samples: Samples, J: Array) -> tuple[Array, Array]:
+def compute_leak_and_conditioning(samples: Samples, J: Array) -> tuple[Array, Array]:
     """Leaks (N, r) [rad] and signed conditioning (N,) of coordinates with gradients J (N, r, n).
 
     The leak of a coordinate is the angle, in the metric, between its gradient and the space orthogonal to the task. The

@@ -8,10 +8,11 @@ import numpy as np
 from orthocas.bases.family import GradedParametrisation, Parametrisation
 from orthocas.bases.products import Polynomial
 from orthocas.errors import InvalidValueError
-from orthocas.fitting.like import WEIGHT, Like, Likeness, LikeTerm
+from orthocas.fitting.like import RULES as LIKE_RULES
+from orthocas.fitting.like import Like, Likeness, LikeTerm
 from orthocas.fitting.terms import WeightNumbers, Weights, register_loss_term
+from orthocas.solvers.casadi_solvers import Ipopt
 from orthocas.solvers.gauss_newton import GaussNewton
-from orthocas.solvers.ipopt import Ipopt
 from orthocas.solvers.lbfgs import LBFGS, QuasiNewton
 from orthocas.solvers.protocol import Solver
 from orthocas.tasks.problem import Problem
@@ -19,10 +20,42 @@ from orthocas.tools.checks import as_number, require_count, require_kind, requir
 
 Precision = Literal["double", "single"]
 PRECISIONS: tuple[Precision, ...] = ("double", "single")  #: of the large products of a fit
-_MANY_JOINTS = 8  # with more, coordinates are many as well, and the matrix grows with their square
-_DEGREES = ((8, 4), (9, 3), (12, 2))  # joints from which the default degree is lower
-_MANY_TERMS = 300  # where a Gauss-Newton matrix takes longer than ten gradients: degree 4 for seven joints
-_LEAST_BOUND = 1e-6  # deg; rounding hides smaller angles
+
+
+@dataclass(frozen=True, slots=True)
+class FitRules:
+    """Numbers of fits. Chosen on the planar arms and the iiwa, held on the arms of docs/which_tool.md."""
+
+    default_degree: int = 5
+    degree_with_bound: int = 4  #: with a bound on mutual angles
+    lower_degrees: tuple[tuple[int, int], ...] = ((8, 4), (9, 3), (12, 2))  #: joints, and the degree from there on
+    many_joints: int = 8  #: with more, coordinates are many as well, and the matrix grows with their square
+    many_terms: int = 300  #: where a Gauss-Newton matrix takes longer than ten gradients: degree 4 for seven joints
+    least_bound_deg: float = 1e-6  #: on mutual angles; rounding hides smaller ones
+
+    least_samples: int = 1000  #: of bases
+    residuals: int = 140  #: per coefficient, for which samples are drawn beyond these
+    network_samples: int = 2000  #: of families that are not linear in their parameters
+    first: int = 200  #: samples that scale coordinates
+    first_tag: int = 1000  #: their seed tag; stages use other tags
+    fresh_tag: int = 2000  #: seed tag of samples drawn while a solver runs
+    start_seed: int = 0  #: of the samples of spectral starts, the same for all fits
+    trial_degree: int = 3  #: of the trial that chooses among symmetric coordinates
+
+    searched: int = 3  #: degree from which worst points are searched: those of lower degrees differ from the last ones
+    rounds: int = 4  #: of the last degree, with the worst points
+    least_gain: float = 0.01  #: of the conditioning in a round
+    collected: float = 1.5 * 0.2  #: conditioning below which points are collected, before they become worse
+    digits: int = 6  #: of gradients at the centre that count for the order: fits end with about as many
+
+    bound_step: float = 0.05  #: of the bounds on the relative singular value that are offered
+    failed: float = 0.05  #: conditioning below which a chart is of no use; folds have less than 0
+    failed_fraction: float = 0.9  #: of such points that a bound should leave out
+    largest_bound: float = 0.25  #: charts that fail at larger singular values have other reasons
+    any_bound: float = 1e-12  #: of a ClearBox that only measures
+
+
+RULES = FitRules()
 
 
 @dataclass(frozen=True)
@@ -40,7 +73,7 @@ class FitSettings:
     like: Like | None = None
 
     @classmethod
-    def checked(
+    def check(
         cls,
         problem: Problem,
         parametrisation: Parametrisation | None,
@@ -58,15 +91,17 @@ class FitSettings:
         Raises:
             InvalidValueError, ShapeError: if a setting is invalid, or contradicts another one.
         """
+        # the family, for this problem
         require_kind("problem", problem, Problem)
         if parametrisation is None:
-            parametrisation = default_parametrisation(problem, bounded=max_mutual_deg is not None)
+            parametrisation = choose_parametrisation(problem, bounded=max_mutual_deg is not None)
         require_parametrisation(parametrisation)
         bound = parametrisation.for_problem(problem)
         if max_mutual_deg is not None:
             _require_bound(bound, max_mutual_deg)
+        # the solver; only Ipopt knows bounds
         if solver is None:
-            solver = default_solver(bound, problem) if max_mutual_deg is None else Ipopt()
+            solver = choose_solver(bound, problem) if max_mutual_deg is None else Ipopt()
         require_solver(solver)
         if max_mutual_deg is not None and not isinstance(solver, Ipopt):
             raise InvalidValueError("solver", solver.name, "ipopt, the only solver that supports max_mutual_deg")
@@ -80,13 +115,13 @@ class FitSettings:
         if like is not None and (max_mutual_deg is not None or bound.closed_form is not None):
             other = bound.label if max_mutual_deg is None else "max_mutual_deg"
             raise InvalidValueError("like", f"given with {other}", "a fit of the weighted loss")
-        known = None if like is None else Like.of(problem, like)
-        return cls(bound, solver, loss, count, tag, max_mutual_deg, split_idle, precision, known)
+        quantities = None if like is None else Like.of(problem, like)
+        return cls(bound, solver, loss, count, tag, max_mutual_deg, split_idle, precision, quantities)
 
-    def with_term(self, term: LikeTerm) -> Self:
+    def add_term(self, term: LikeTerm) -> Self:
         """The settings with the term that holds coordinates to quantities among the weights."""
         register_loss_term(term)
-        return replace(self, weights=replace(self.weights, extra={**self.weights.extra, term.name: WEIGHT}))
+        return replace(self, weights=replace(self.weights, extra={**self.weights.extra, term.name: LIKE_RULES.weight}))
 
     @property
     def single(self) -> bool:
@@ -104,18 +139,20 @@ class FitSettings:
         return self.weights.folds if free else 0.0
 
 
-def default_parametrisation(problem: Problem, bounded: bool) -> Polynomial:
+def choose_parametrisation(problem: Problem, bounded: bool) -> Polynomial:
     """Polynomials of degree 5; of 4 with a bound or 8 joints, of 3 with more, of 2 from 12: terms grow too many."""
-    fewer = [degree for joints, degree in _DEGREES if problem.n >= joints]
-    return Polynomial(degree=min(4 if bounded else 5, *fewer, 5))
+    fewer = [degree for joints, degree in RULES.lower_degrees if problem.n >= joints]
+    return Polynomial(
+        degree=min(RULES.degree_with_bound if bounded else RULES.default_degree, *fewer, RULES.default_degree)
+    )
 
 
-def default_solver(parametrisation: Parametrisation, problem: Problem) -> Solver:
+def choose_solver(parametrisation: Parametrisation, problem: Problem) -> Solver:
     """Gauss-Newton for families linear in their parameters, with fewer matrices if these are large; else L-BFGS."""
     if not parametrisation.linear:
         return LBFGS()
     terms = parametrisation.term_count(problem.n) if isinstance(parametrisation, GradedParametrisation) else 0
-    many = terms > _MANY_TERMS or (terms and problem.n > _MANY_JOINTS)
+    many = terms > RULES.many_terms or (terms and problem.n > RULES.many_joints)
     return QuasiNewton() if many else GaussNewton()
 
 
@@ -134,5 +171,7 @@ def require_solver(value: object) -> None:
 def _require_bound(parametrisation: Parametrisation, max_mutual_deg: float) -> None:
     if parametrisation.closed_form is not None:
         raise InvalidValueError("max_mutual_deg", f"given with {parametrisation.label}", "a parametrisation to fit")
-    if not _LEAST_BOUND <= as_number("max_mutual_deg", max_mutual_deg) < 90:
-        raise InvalidValueError("max_mutual_deg", max_mutual_deg, f"an angle from {_LEAST_BOUND:g} to below 90 degrees")
+    if not RULES.least_bound_deg <= as_number("max_mutual_deg", max_mutual_deg) < 90:
+        raise InvalidValueError(
+            "max_mutual_deg", max_mutual_deg, f"an angle from {RULES.least_bound_deg:g} to below 90 degrees"
+        )

@@ -9,25 +9,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.bases.family import JointSpace, LinearFamily
-from orthocas.fitting.basis_gradients import BasisGradients, gradients_of
-from orthocas.fitting.residuals import Pairs, coordinates_of
+from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
+from orthocas.fitting.terms import Pairs, coordinates_of
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import Samples, compute_directions
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 
-_MUTUAL_WEIGHT = 1.0
-_MIXING_ANGLE = np.radians(10)
-_EXACT = 1e-12  # squared sine of a leak; functions of an exact coordinate are exact, too
-_RIDGE = 1e-10  # relative; keeps the pencil definite if basis functions coincide on the samples
-_TOLERANCE = 1e-6  # robot files give angles with ten decimals; a symmetry broken by less costs nothing
-_MOST_JOINTS = 12  # 4,096 choices of the joints that turn round
-_POINTS = 16
-_MOST_CHOICES = 8
-_SEED = 0
+
+@dataclass(frozen=True, slots=True)
+class StartRules:
+    """Numbers of starts and of the search for a mirror."""
+
+    mutual_weight: float = 1.0  #: of coordinates that are found already, beside the task
+    mixing_angle: float = float(np.radians(10))  #: by which neighbours are mixed [rad]
+    exact: float = 1e-12  #: squared sine of a leak; functions of an exact coordinate are exact, too
+    ridge: float = 1e-10  #: relative; keeps the pencil definite if basis functions coincide on the samples
+    tolerance: float = 1e-6  #: robot files give angles with ten decimals; a symmetry broken by less costs nothing
+    most_joints: int = 12  #: 4,096 choices of the joints that turn round
+    points: int = 16  #: at which a symmetry is tested
+    most_choices: int = 8  #: of what changes places in a mirror
+    seed: int = 0
 
 
-def spectral_start(
+RULES = StartRules()
+
+
+def find_spectral_start(
     family: LinearFamily,
     samples: Samples,
     kept: NDArray[np.bool_] | None = None,
@@ -49,50 +57,54 @@ def spectral_start(
     Source:
         ours, docs/explanation/derivations_fits.md#spectral-start.
     """
-    basis = gradients_of(family, samples.points.shape[1]) if gradients is None else gradients
-    G = basis.dense(basis.at(samples.points), len(samples)).astype(np.float64, copy=False)  # (N, n, K)
+    # the pencil: S is the mean square along the task, T the mean square of the gradient, both in the metric
+    basis = build_gradients(family, samples.points.shape[1]) if gradients is None else gradients
+    G = basis.expand(basis.at(samples.points), len(samples)).astype(np.float64, copy=False)  # (N, n, K)
     N, _, K = G.shape
-    along_task = (samples.task_basis @ G).reshape(-1, K)  # e_i^T d psi, the components along the task gradients
+    # components e_i^T d psi along the task gradients
+    along_task = (samples.task_basis @ G).reshape(-1, K)
     S = along_task.T @ along_task / N
     raised = G if samples.metric_inverse is None else samples.metric_inverse @ G
     T = G.reshape(-1, K).T @ raised.reshape(-1, K) / N
-    T += _RIDGE * np.trace(T) / K * np.eye(K)
+    T += RULES.ridge * np.trace(T) / K * np.eye(K)
     middle = G.mean(axis=0)
-    V = G.reshape(-1, K).T @ G.reshape(-1, K) / N - middle.T @ middle  # variance of the gradients
+    # variance of the gradients
+    V = G.reshape(-1, K).T @ G.reshape(-1, K) / N - middle.T @ middle
     allowed = np.ones((family.outputs, K), dtype=bool) if kept is None else kept
     C, left = np.zeros(allowed.shape), list(range(family.outputs))
     while left:
-        classes = {
-            allowed[j].tobytes(): j for j in reversed(left)
-        }.values()  # one coordinate for all that allow the same
-        j, c = min(((j, _smallest(S, T, V, allowed[j])) for j in classes), key=lambda pair: pair[1] @ S @ pair[1])
+        # one coordinate for all that allow the same coefficients
+        classes = {allowed[j].tobytes(): j for j in reversed(left)}.values()
+        j, c = min(((j, _find_smallest(S, T, V, allowed[j])) for j in classes), key=lambda pair: pair[1] @ S @ pair[1])
         left.remove(j)
         C[j] = c
+        # functions of this coordinate cost as much as what lies along the task
         gradient = raised @ c  # (N, n)
         length = np.sqrt(np.maximum(np.einsum("sn,sn->s", gradient, G @ c), 1e-300))
         along = np.einsum("sn,snk->sk", gradient / length[:, None], G)
-        S = S + _MUTUAL_WEIGHT * along.T @ along / N
-    return _mixed(C, G, allowed).ravel()
+        S = S + RULES.mutual_weight * along.T @ along / N
+    return _mix(C, G, allowed).ravel()
 
 
-def _smallest(S: Array, T: Array, V: Array, free: NDArray[np.bool_]) -> Array:
+def _find_smallest(S: Array, T: Array, V: Array, free: NDArray[np.bool_]) -> Array:
     """The c with c^T T c = 1 and the smallest c^T S c, zero where it is not free, (K,). Of exact ones that of V."""
     block = np.ix_(free, free)
-    whitening = np.linalg.inv(np.linalg.cholesky(T[block])).T  # W^T T W = I
+    # whitening W with W^T T W = I
+    whitening = np.linalg.inv(np.linalg.cholesky(T[block])).T
     values, vectors = np.linalg.eigh(whitening.T @ S[block] @ whitening)
-    equal = whitening @ vectors[:, : max(1, np.count_nonzero(values < _EXACT))]
+    equal = whitening @ vectors[:, : max(1, np.count_nonzero(values < RULES.exact))]
     c = np.zeros(len(free))
     c[free] = equal @ np.linalg.eigh(equal.T @ V[block] @ equal)[1][:, 0]
     return c
 
 
-def _mixed(C: Array, G: Array, allowed: NDArray[np.bool_]) -> Array:
+def _mix(C: Array, G: Array, allowed: NDArray[np.bool_]) -> Array:
     """Scale coordinates to a mean gradient length of 1, and mix neighbours slightly that allow the same coefficients.
 
     The spectral solution inherits the symmetries of the problem, and a symmetric point is often a saddle of the loss.
     """
     C = C / np.linalg.norm(G @ C.T, axis=1).mean(axis=0)[:, None]
-    c, s = np.cos(_MIXING_ANGLE), np.sin(_MIXING_ANGLE)
+    c, s = np.cos(RULES.mixing_angle), np.sin(RULES.mixing_angle)
     for j in np.flatnonzero((allowed[1:] == allowed[:-1]).all(axis=1)):
         C[j], C[j + 1] = c * C[j] + s * C[j + 1], c * C[j + 1] - s * C[j]
     return C
@@ -113,7 +125,7 @@ class Mirror:
     parities: Array  #: p of the components, (r,): as many +1 and -1 as the null space has on the mirror, where S q = q
     exchanged: Pairs = ()  #: pairs of an odd and an even component, from which two coordinates are made
 
-    def choices(self) -> list["Mirror"]:
+    def list_choices(self) -> list["Mirror"]:
         """Mirrors with the same reflection and all choices of what changes places, up to a number of them."""
         odd, even = (np.flatnonzero(self.parities == sign).tolist() for sign in (-1, 1))
         most = min(len(odd), len(even))
@@ -123,7 +135,7 @@ class Mirror:
             for some in combinations(odd, count)
             for others in permutations(even, count)
         ]
-        return [replace(self, exchanged=chosen) for chosen in pairs[:_MOST_CHOICES]]
+        return [replace(self, exchanged=chosen) for chosen in pairs[: RULES.most_choices]]
 
     def coordinates(self, theta: Array) -> Array:
         """Coefficients of the coordinates, (r K,), from those of the components."""
@@ -139,7 +151,7 @@ class Mirror:
     def kept(self, family: LinearFamily) -> NDArray[np.bool_] | None:
         """The coefficients (r, K) that the components may have; None if a basis function is neither even nor odd."""
         if family not in self._kept:
-            self._kept[family] = self._allowed(family)
+            self._kept[family] = self._find_allowed(family)
         return self._kept[family]
 
     @cached_property
@@ -147,16 +159,16 @@ class Mirror:
         """Results of `kept` so far."""
         return {}
 
-    def _allowed(self, family: LinearFamily) -> NDArray[np.bool_] | None:
+    def _find_allowed(self, family: LinearFamily) -> NDArray[np.bool_] | None:
         q = ca.SX.sym("q", self.space.n)
         basis = ca.Function("basis", [q], [ca.densify(family.basis(q))])
-        u = np.random.default_rng(_SEED).uniform(-1.0, 1.0, (self.space.n, _POINTS))
+        u = np.random.default_rng(RULES.seed).uniform(-1.0, 1.0, (self.space.n, RULES.points))
         here, there = (
             np.array(basis(self.space.centre[:, None] + self.space.half_width[:, None] * side))
             for side in (u, self.signs[:, None] * u)
         )
         size = np.abs(here).max(axis=1)
-        even, odd = (np.abs(there - sign * here).max(axis=1) <= _TOLERANCE * size for sign in (1, -1))
+        even, odd = (np.abs(there - sign * here).max(axis=1) <= RULES.tolerance * size for sign in (1, -1))
         allowed: NDArray[np.bool_] = np.where(even, 1, -1) == self.parities[:, None]
         return allowed if (even | odd).all() else None
 
@@ -164,44 +176,45 @@ class Mirror:
 def find_mirror(problem: Problem, active: list[int]) -> Mirror | None:
     """The first mirror symmetry of a problem in its active joints, or None."""
     space = JointSpace.of(problem).restricted_to(active)
-    if space.n > _MOST_JOINTS:
+    if space.n > RULES.most_joints:
         return None
-    u = np.random.default_rng(_SEED).uniform(-1.0, 1.0, (_POINTS, space.n))
+    # one point excludes most choices of signs, the others the rest
+    u = np.random.default_rng(RULES.seed).uniform(-1.0, 1.0, (RULES.points, space.n))
     left = [np.array(signs) for signs in product((1.0, -1.0), repeat=space.n)][1:]
     for points in (u[:1], u[1:]):
-        left = _symmetric(problem, active, points, left)
+        left = _keep_symmetric(problem, active, points, left)
     for signs in left:
-        parities = _parities(problem, active, signs, u)
+        parities = _find_parities(problem, active, signs, u)
         if parities is not None:
             return Mirror(space, signs, parities)
     return None
 
 
-def _symmetric(problem: Problem, active: list[int], u: Array, choices: Sequence[Array]) -> list[Array]:
+def _keep_symmetric(problem: Problem, active: list[int], u: Array, choices: Sequence[Array]) -> list[Array]:
     """The choices of signs for which task directions and metric at S u are the mirror images of those at u."""
     images = np.concatenate([u, *(signs * u for signs in choices)])
-    tensors = _tensors(problem, active, images)
+    tensors = _evaluate_tensors(problem, active, images)
     here, *there = tensors.reshape(1 + len(choices), len(u), *tensors.shape[1:])
     return [
         signs
         for signs, image in zip(choices, there, strict=True)
-        if np.abs(image - signs[:, None] * here * signs).max() <= _TOLERANCE
+        if np.abs(image - signs[:, None] * here * signs).max() <= RULES.tolerance
     ]
 
 
-def _tensors(problem: Problem, active: list[int], u: Array) -> Array:
+def _evaluate_tensors(problem: Problem, active: list[int], u: Array) -> Array:
     """The `compute_directions` at points of the cube (N, n)."""
     domain = problem.domain
     return compute_directions(problem, active, domain.centre[active] + domain.half_width[active] * u)
 
 
-def _parities(problem: Problem, active: list[int], signs: Array, u: Array) -> Array | None:
+def _find_parities(problem: Problem, active: list[int], signs: Array, u: Array) -> Array | None:
     """Parities of r coordinates, odd ones first; None if the null space has other parities elsewhere on the mirror.
 
     The null space of J_x is mapped to itself where S q = q, and trace(S) on it is the number of even coordinates less
     that of odd ones.
     """
-    tensors = _tensors(problem, active, np.where(signs > 0, u, 0.0))
+    tensors = _evaluate_tensors(problem, active, np.where(signs > 0, u, 0.0))
     inverse, projector = tensors[:, 0], tensors[:, 1]
     along_task = np.einsum("sii,i->s", np.linalg.solve(inverse, projector.transpose(0, 2, 1)), signs)
     differences = signs.sum() - along_task

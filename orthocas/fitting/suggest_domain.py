@@ -13,8 +13,8 @@ from orthocas.bases.family import Parametrisation
 from orthocas.charts.point_quality import worst_points
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.fit import Fit, fit_from
-from orthocas.fitting.probe import Bounds, Miss, Prober, Verdict, conditioning_in_words, judged_chart
-from orthocas.fitting.settings import default_parametrisation, require_parametrisation
+from orthocas.fitting.probe import RULES, Bounds, Miss, Prober, Quality, describe_conditioning, evaluate_chart
+from orthocas.fitting.settings import choose_parametrisation, require_parametrisation
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM, require_driven
@@ -29,29 +29,13 @@ from orthocas.tools.display import Shown, listed, number_list
 from orthocas.tools.json import collect_attributes
 from orthocas.tools.progress import Monitor, Progress, silent
 
-JUDGES = 30_000  #: samples that judge the fit
-_START, _STEP = 0.5, 1.6  # first scale of the box, and factor to the next while the boundary is unknown
-_CLOSE = 1.06  # the boundary is found within this factor
-_SMALLEST = 1e-3  # scale of a box that is too small to be of use
-_EXCHANGED = 28  # joints that exchanges of width look at in all: five exchanges of five joints, one of many
-_LEAST_STEP = 0.25  # share of an exchange; after one without gain, the next has half its step
-_WIDER = 1.2  # factor by which one joint alone is widened
-_LARGEST_EXCHANGE = np.log(1.5)
 _STAGE = "suggest a domain"
-_FIRST, _NEXT, _GROWTH = 24, 14, 5  # time of a first scale, a next one and a joint's growth, in trials without a fit
-_TRIALS = 6  # of a scale, about
 #: what helps if no box keeps the bounds
 REMEDIES = (
     "another home (home=..., --centre or --home), another metric (metric=..., --metric), a larger leak_deg "
     "(--leak-deg) or a smaller conditioning (--conditioning) may help"
 )
-LEAK_DEG, CONDITIONING = 8.0, 0.2  #: what is asked by default
-_MARGIN = 1.25  # trial charts keep a higher conditioning, since a fit is judged at more points
-_FARTHEST = np.pi  # largest half-width of a revolute joint [rad]: a full turn
-_LONGEST = 1.0  # largest half-width of a prismatic joint without limits [m]
-_CHECKED = 200  # samples for whether the task can be regular at all, and which joints are idle
-_SHRINK, _TRIES = 0.92, 12  # after a fit that misses a bound
-_DESCENT = 0.5  # share of the bound on the conditioning that descents from the worst samples keep, too
+LEAK_DEG, CONDITIONING = RULES.leak_deg, RULES.conditioning  #: what is asked by default
 
 Reason = Literal["joint limit", "unlimited", "idle", "cyclic", "leak", "conditioning", "singularity", "half a turn"]
 _WORDS: dict[Reason, str] = {
@@ -64,6 +48,338 @@ _WORDS: dict[Reason, str] = {
     "singularity": "ended by singularity",
     "half a turn": "ended by half a turn",
 }
+
+
+def suggest_domain(
+    robot: Robot,
+    task: Task,
+    home: ArrayLike | str | None = None,
+    metric: Metric | MetricSpec = "euclidean",
+    *,
+    leak_deg: float = LEAK_DEG,
+    conditioning: float = CONDITIONING,
+    parametrisation: Parametrisation | None = None,
+    weights: Weights | WeightNumbers = DEFAULT_WEIGHTS,
+    seed: int = 0,
+    monitor: Monitor = silent,
+) -> "DomainSuggestion":
+    """The widest box around a posture, inside the joint limits, on which a chart has the quality that is asked.
+
+    Quadratic charts on trial boxes give leak and conditioning in a fraction of a second. A search over the half-widths
+    of the joints takes the box with the largest volume that keeps both bounds, and a fit confirms it: if the fit misses
+    a bound, or has less than half of the conditioning anywhere that descents reach, the box shrinks by 8 %. Idle and
+    cyclic joints take their whole range. The result is deterministic.
+
+    Args:
+        robot: the robot.
+        task: a task of that robot. A missing reference orientation is taken at the home.
+        home: centre of the box, (n,) [rad] or [m], or the name of a posture of the robot's files. Default: the first
+            named posture that is regular and away from the limits, otherwise the most regular bent posture.
+        metric: as in `Problem`.
+        leak_deg: largest leak: the root mean square angle, in the metric, between the gradients of the fitted
+            coordinates and the space orthogonal to the task [deg]. 8 degrees couple accelerations by sin 8 = 14 %.
+        conditioning: smallest conditioning, at samples of which two thirds lie near faces and corners; 0 to 1.
+        parametrisation: the family of the fit. Default: Polynomial(degree=4); of degree 3 for more
+            than 8 joints, and of degree 2 from 12.
+        weights: weights of the fits, as in `fit`.
+        seed: seed of the fit.
+        monitor: called with progress.
+
+    Raises:
+        DomainError: if the home lies at a joint limit, or no box around it keeps the bounds. The message says which
+            bound breaks, and what may help.
+        SingularTaskError: if the task is singular everywhere.
+        UnknownNameError: if there is no posture of that name.
+        InvalidValueError, NotRedundantError: if an argument is invalid.
+        KeyboardInterrupt: after Ctrl-C; `Interrupted` with the fit on the box found, if it comes during a fit.
+
+    Source:
+        ours, docs/explanation/domains.md.
+
+    Example:
+        >>> import orthocas as oc
+        >>> robot = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
+        >>> found = oc.suggest_domain(robot, oc.Task.position(robot, "xy"), [0.6, 0.8, 0.8])
+        >>> [joint.reason for joint in found.joints][0]
+        'cyclic'
+        >>> found.leak_deg < 8.0, found.conditioning > 0.2
+        (True, True)
+    """
+    start = time.perf_counter()
+    bounds, loss = _check_bounds(robot, task, leak_deg, conditioning, seed), Weights.of(weights)
+    if parametrisation is not None:
+        require_parametrisation(parametrisation)
+    # the problem around the home, and the joints whose half-widths are searched
+    posture = find_home(robot, task, home)
+    room = np.minimum(_measure_room(robot, posture.q), _bound_widths(robot))
+    problem = Problem(robot, task, metric, Box(posture.q, np.minimum(_propose_widths(robot), room)))
+    check(problem, RULES.checked)
+    joints = _Joints.of(problem)
+    prober = Prober(problem, joints.active, joints.cyclic, loss)
+    stricter = replace(bounds, conditioning=min(1.0, RULES.margin * bounds.conditioning))
+    # the widest box for trial charts, then a fit that confirms it
+    widths, broken = WidestBox(prober, posture.q, room, joints.free, stricter, monitor).search(_propose_widths(robot))
+    family = choose_parametrisation(problem, bounded=True) if parametrisation is None else parametrisation
+    fit, quality = _confirm(prober, family, joints, widths, bounds, seed, monitor)
+    return DomainSuggestion(
+        fit=fit,
+        home=posture.q,
+        home_source=posture.source,
+        joints=joints.describe(fit.chart.problem, broken),
+        asked=bounds,
+        leak_deg=quality.leak_deg,
+        conditioning=quality.conditioning,
+        worst_point=tuple(quality.worst_point.tolist()),
+        seconds=time.perf_counter() - start,
+    )
+
+
+def _check_bounds(robot: Robot, task: Task, leak_deg: float, conditioning: float, seed: int) -> Bounds:
+    require_kind("robot", robot, Robot)
+    require_driven("suggesting a domain", robot.tree)
+    require_kind("task", task, Task)
+    require_count("seed", seed, least=0)
+    if not 0 < as_number("leak_deg", leak_deg) < 90:
+        raise InvalidValueError("leak_deg", leak_deg, "an angle between 0 and 90 degrees")
+    if not 0 < as_number("conditioning", conditioning) < 1:
+        raise InvalidValueError("conditioning", conditioning, "a number between 0 and 1")
+    return Bounds(float(leak_deg), float(conditioning))
+
+
+@dataclass(frozen=True)
+class _Joints:
+    """The roles of the joints: idle and cyclic ones take their whole range, the others are free."""
+
+    names: tuple[str, ...]
+    idle: tuple[int, ...]
+    cyclic: tuple[str, ...]
+
+    @classmethod
+    def of(cls, problem: Problem) -> "_Joints":
+        idle = find_idle_joints(problem, sample_problem(problem, RULES.checked, 0))[-problem.r :]
+        return cls(problem.robot.joint_names, tuple(idle), cyclic_joints(problem))
+
+    @property
+    def active(self) -> list[int]:
+        """Joints that coordinates are fitted in."""
+        return [k for k in range(len(self.names)) if k not in self.idle]
+
+    @property
+    def free(self) -> list[int]:
+        """Joints whose half-widths are searched."""
+        return [k for k in self.active if self.names[k] not in self.cyclic]
+
+    def describe(self, problem: Problem, broken: Mapping[int, list[Miss]]) -> "tuple[JointWidth, ...]":
+        """Half-widths of the problem's domain, with what ends them.
+
+        Args:
+            problem: the problem on the suggested domain.
+            broken: the bounds that break if a joint moves further; none for joints that have no room.
+        """
+        robot, domain = problem.robot, problem.domain
+        limited = _measure_room(robot, domain.centre) <= _bound_widths(robot)
+        widths = []
+        for k, name in enumerate(self.names):
+            reason: Reason = "joint limit" if limited[k] else "unlimited"
+            if broken.get(k):
+                reason = broken[k][0]
+            if k not in self.free:
+                reason = "idle" if k in self.idle else "cyclic"
+            widths.append(JointWidth(name, float(domain.half_width[k]), reason))
+        return tuple(widths)
+
+
+def _propose_widths(robot: Robot) -> Array:
+    """Half-widths whose proportions a search starts from, (n,)."""
+    return np.where(robot.tree.prismatic, PRISMATIC_ROOM, REVOLUTE_ROOM)
+
+
+def _measure_room(robot: Robot, q: Array) -> Array:
+    """Distances of a posture from the nearest joint limits, (n,)."""
+    room: Array = np.minimum(q - robot.lower, robot.upper - q)
+    return room
+
+
+def _bound_widths(robot: Robot) -> Array:
+    """Largest half-widths that a search tries, (n,): a full turn, the joint's own range, or 1 m."""
+    endless = np.isinf(robot.lower) | np.isinf(robot.upper)
+    return np.where(robot.tree.prismatic, np.where(endless, RULES.longest, np.inf), RULES.farthest)
+
+
+@dataclass(eq=False)
+class WidestBox:
+    """Search for the half-widths with the largest product that keep the bounds.
+
+    From a common scale, rounds of exchange follow: joints whose widening costs little become wider, the others
+    narrower, and the scale returns to the bounds. At the optimum all joints that are free cost the same.
+
+    Args:
+        prober: fits on trial boxes and evaluates them.
+        home: centre of the boxes, (n,).
+        room: largest half-widths, (n,).
+        free: joints to widen. The others have their full room.
+        bounds: what is asked.
+        monitor: called with progress.
+    """
+
+    prober: Prober
+    home: Array
+    room: Array
+    free: list[int]
+    bounds: Bounds
+    monitor: Monitor
+    probes: int = 0
+    _fraction: float = 0.0  #: of the time of the search, about
+    _next: tuple[float, int] = (0.0, 1)  #: the fraction after some more trials, and about how many they are
+
+    def search(self, unit: Array) -> tuple[Array, dict[int, list[Miss]]]:
+        """Half-widths (n,), and for every free joint the bounds that break if it alone becomes a fifth wider.
+
+        The list of a joint is empty if no bound breaks because the joint has no room.
+
+        Args:
+            unit: half-widths to start from, (n,); only their proportions count.
+
+        Raises:
+            DomainError: if no box around the home keeps the bounds.
+        """
+        if not self.free:
+            return self.room.copy(), {}
+        # fractions of the search, for the monitor: the first scale, then each round of exchange, then growth
+        count, rounds = len(self.free), max(1, RULES.exchanged // len(self.free))
+        times = [RULES.first_time, *[count + RULES.next_time] * rounds]
+        ends = np.cumsum(times) / (sum(times) + RULES.growth_time * count)
+        self._next = ends[0], RULES.trials
+        return self._grow(self._exchange_widths(self._scale_to_boundary(unit, RULES.start), ends[1:]))
+
+    def _exchange_widths(self, widths: Array, ends: Array) -> Array:
+        """Half-widths after rounds of exchange, each of which ends at a fraction of the search."""
+        exchange, step = None, 1.0
+        for end in ends:
+            self._next = end, len(self.free) + RULES.trials
+            exchange = self._compute_exchange(widths) if exchange is None else exchange
+            trial = self._scale_to_boundary(widths * np.exp(-step * exchange), 1.0)
+            if np.log(trial[self.free]).sum() > np.log(widths[self.free]).sum():
+                widths, exchange = trial, None
+                continue
+            step /= 2
+            if step < RULES.least_step:
+                break
+        return widths
+
+    def evaluate(self, widths: Array, enough: Bounds | None = None, leap: bool = False) -> Quality:
+        """Fit and evaluate on the box of the given half-widths, see `Prober.evaluate`."""
+        self.probes += 1
+        detail = f"trial {self.probes}: mean half-width {widths[self.free].mean():.3g}"
+        until, trials = self._next
+        self._fraction += (until - self._fraction) / max(2, trials)
+        self._next = until, trials - 1
+        self.monitor(Progress(_STAGE, self._fraction, detail))
+        return self.prober.evaluate(Box(self.home, widths), enough, leap)
+
+    def _clip(self, widths: Array) -> Array:
+        clipped = self.room.copy()
+        clipped[self.free] = np.minimum(widths, self.room)[self.free]
+        return clipped
+
+    def _measure_excess(self, widths: Array) -> float:
+        return max(self.evaluate(widths, leap=True).excess(self.bounds).values())
+
+    def _explain_refusal(self, widths: Array) -> DomainError:
+        """Which bound breaks even on a box of these half-widths (n,), and what may help."""
+        quality = self.evaluate(widths)
+        miss = next(iter(quality.excess(self.bounds)))
+        return DomainError(
+            f"no box around the home {np.round(self.home, 4).tolist()} keeps the bounds: with half-widths of "
+            f"{widths[self.free].max():.1g} {quality.explained(miss, self.bounds)}; {REMEDIES}"
+        )
+
+    def _scale_to_boundary(self, unit: Array, scale: float) -> Array:
+        """The widest multiple of half-widths that keeps the bounds."""
+        low, high = 0.0, np.inf
+        while high > RULES.close * low:
+            widths = self._clip(scale * unit)
+            if self.evaluate(widths, self.bounds).keeps(self.bounds):
+                low = scale
+                if np.array_equal(widths, self.room):
+                    break
+            else:
+                high = scale
+            if high < RULES.smallest:
+                raise self._explain_refusal(widths)
+            scale = (
+                low * RULES.step if np.isinf(high) else high / RULES.step if low == 0 else float(np.sqrt(low * high))
+            )
+        self.prober.go_back()
+        return self._clip(low * unit)
+
+    def _compute_exchange(self, widths: Array) -> Array:
+        """How much narrower each joint becomes, as logarithms of factors, (n,): its cost above the mean cost."""
+        costs, here = np.zeros(len(widths)), self._measure_excess(widths)
+        open_joints = [k for k in self.free if widths[k] < self.room[k]]
+        for k in open_joints:
+            costs[k] = np.log(self._measure_excess(self._widen(widths, k)) / here) / np.log(RULES.wider)
+        if open_joints:
+            costs[open_joints] -= costs[open_joints].mean()
+        return np.clip(costs, -RULES.largest_exchange, RULES.largest_exchange)
+
+    def _grow(self, widths: Array) -> tuple[Array, dict[int, list[Miss]]]:
+        """Widen each joint alone while the bounds are kept, and say what breaks then. Its first step may need a fit."""
+        broken: dict[int, list[Miss]] = {k: [] for k in self.free}
+        begin = self._fraction
+        for done, k in enumerate(self.free, 1):
+            self._next = begin + (1 - begin) * done / len(self.free), 2
+            before, factor = widths[k], RULES.wider
+            while widths[k] < self.room[k]:
+                wider = self._widen(widths, k, factor)
+                ratios = self.evaluate(wider, self.bounds, leap=widths[k] > before).excess(self.bounds)
+                misses = [name for name, ratio in ratios.items() if ratio > 1]
+                if misses and factor == RULES.wider:
+                    broken[k] = misses
+                    break
+                widths = widths if misses else wider
+                factor = RULES.wider if misses else factor**2
+        self.prober.go_back()
+        return widths, broken
+
+    def _widen(self, widths: Array, k: int, factor: float = RULES.wider) -> Array:
+        wider = widths.copy()
+        wider[k] = min(factor * widths[k], self.room[k])
+        return wider
+
+
+def _confirm(
+    prober: Prober,
+    parametrisation: Parametrisation,
+    joints: _Joints,
+    widths: Array,
+    bounds: Bounds,
+    seed: int,
+    monitor: Monitor,
+) -> tuple[Fit, Quality]:
+    """A fit that keeps the bounds, and its quality. The box shrinks until there is one."""
+    problem, robot = prober.problem, prober.problem.robot
+    unbounded = [k for k in joints.idle if np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
+    factors = np.where(np.isin(np.arange(robot.n), joints.free), RULES.shrink, 1.0)
+    last, enough = "has too small a conditioning", RULES.descent * bounds.conditioning
+    for shrinkings in range(RULES.tries):
+        box = Box(problem.domain.centre, widths * factors**shrinkings, unbounded)
+        trial = Problem(robot, problem.task, problem.metric, box, problem.name)
+        # a fit would take ten times as long to find that
+        # descents see what samples miss
+        if not prober.least(trial, seed + 1) >= enough:
+            continue
+        fit = fit_from(prober.start_on, trial, parametrisation, prober.weights, seed, monitor)
+        quality = evaluate_chart(fit.chart, RULES.confirmed, seed + 1)
+        least = worst_points(fit.chart.problem, fit.chart.coordinates, seed + 1, thorough=True).least
+        if least >= enough and quality.keeps(bounds):
+            return fit, quality
+        worst = describe_conditioning(min(least, quality.conditioning))
+        last = f"has a leak of {quality.leak_deg:.3g} deg and {worst}"
+    raise DomainError(
+        f"{parametrisation.label} misses the bounds on {RULES.tries} ever smaller boxes around the home: the last one "
+        f"{last}; {REMEDIES}"
+    )
 
 
 @dataclass(frozen=True)
@@ -114,7 +430,7 @@ class DomainSuggestion(Shown):
         reasons = dict.fromkeys(joint.reason for joint in self.joints)
         ends = {_WORDS[why]: listed(joint.joint for joint in self.joints if joint.reason == why) for why in reasons}
         label = self.fit.chart.coordinates.label
-        worst = f"{self.conditioning:.3g} at {JUDGES} samples, most near faces and corners"
+        worst = f"{self.conditioning:.3g} at {RULES.confirmed} samples, most near faces and corners"
         return {
             "suggestion": f"half-width {number_list(self.domain.half_width)}, {self.seconds:.3g} s",
             "home": f"{number_list(self.home)} ({self.home_source})",
@@ -127,327 +443,3 @@ class DomainSuggestion(Shown):
         """Plain data for JSON."""
         quality = ("leak_deg", "conditioning", "worst_point", "asked", "seconds")
         return collect_attributes(self, "home", "home_source", "joints", *quality)
-
-
-@dataclass(eq=False)
-class WidestBox:
-    """Search for the half-widths with the largest product that keep the bounds.
-
-    From a common scale, rounds of exchange follow: joints whose widening costs little become wider, the others
-    narrower, and the scale returns to the bounds. At the optimum all joints that are free cost the same.
-
-    Args:
-        prober: fits and judges trial boxes.
-        home: centre of the boxes, (n,).
-        room: largest half-widths, (n,).
-        free: joints to widen. The others have their full room.
-        bounds: what is asked.
-        monitor: called with progress.
-    """
-
-    prober: Prober
-    home: Array
-    room: Array
-    free: list[int]
-    bounds: Bounds
-    monitor: Monitor
-    probes: int = 0
-    _fraction: float = 0.0  #: of the time of the search, about
-    _next: tuple[float, int] = (0.0, 1)  #: the fraction after some more trials, and about how many they are
-
-    def found(self, unit: Array) -> tuple[Array, dict[int, list[Miss]]]:
-        """Half-widths (n,), and for every free joint the bounds that break if it alone becomes a fifth wider.
-
-        The list of a joint is empty if no bound breaks because the joint has no room.
-
-        Args:
-            unit: half-widths to start from, (n,); only their proportions count.
-
-        Raises:
-            DomainError: if no box around the home keeps the bounds.
-        """
-        if not self.free:
-            return self.room.copy(), {}
-        count, rounds = len(self.free), max(1, _EXCHANGED // len(self.free))
-        ends = np.cumsum([_FIRST, *[count + _NEXT] * rounds]) / (_FIRST + rounds * (count + _NEXT) + _GROWTH * count)
-        self._next = ends[0], _TRIALS
-        return self._grown(self._exchanged(self._to_boundary(unit, _START), ends[1:]))
-
-    def _exchanged(self, widths: Array, ends: Array) -> Array:
-        """Half-widths after rounds of exchange, each of which ends at a fraction of the search."""
-        exchange, step = None, 1.0
-        for end in ends:
-            self._next = end, len(self.free) + _TRIALS
-            exchange = self._exchange(widths) if exchange is None else exchange
-            trial = self._to_boundary(widths * np.exp(-step * exchange), 1.0)
-            if np.log(trial[self.free]).sum() > np.log(widths[self.free]).sum():
-                widths, exchange = trial, None
-                continue
-            step /= 2
-            if step < _LEAST_STEP:
-                break
-        return widths
-
-    def verdict(self, widths: Array, enough: Bounds | None = None, leap: bool = False) -> Verdict:
-        """Fit and judge the box of the given half-widths, see `Prober.verdict`."""
-        self.probes += 1
-        detail = f"trial {self.probes}: mean half-width {widths[self.free].mean():.3g}"
-        until, trials = self._next
-        self._fraction += (until - self._fraction) / max(2, trials)
-        self._next = until, trials - 1
-        self.monitor(Progress(_STAGE, self._fraction, detail))
-        return self.prober.verdict(Box(self.home, widths), enough, leap)
-
-    def _clipped(self, widths: Array) -> Array:
-        clipped = self.room.copy()
-        clipped[self.free] = np.minimum(widths, self.room)[self.free]
-        return clipped
-
-    def _excess(self, widths: Array) -> float:
-        return max(self.verdict(widths, leap=True).excess(self.bounds).values())
-
-    def _refusal(self, widths: Array) -> DomainError:
-        """Which bound breaks even on a box of these half-widths (n,), and what may help."""
-        found = self.verdict(widths)
-        miss = next(iter(found.excess(self.bounds)))
-        return DomainError(
-            f"no box around the home {np.round(self.home, 4).tolist()} keeps the bounds: with half-widths of "
-            f"{widths[self.free].max():.1g} {found.explained(miss, self.bounds)}; {REMEDIES}"
-        )
-
-    def _to_boundary(self, unit: Array, scale: float) -> Array:
-        """The widest multiple of half-widths that keeps the bounds."""
-        low, high = 0.0, np.inf
-        while high > _CLOSE * low:
-            widths = self._clipped(scale * unit)
-            if self.verdict(widths, self.bounds).keeps(self.bounds):
-                low = scale
-                if np.array_equal(widths, self.room):
-                    break
-            else:
-                high = scale
-            if high < _SMALLEST:
-                raise self._refusal(widths)
-            scale = low * _STEP if np.isinf(high) else high / _STEP if low == 0 else float(np.sqrt(low * high))
-        self.prober.go_back()
-        return self._clipped(low * unit)
-
-    def _exchange(self, widths: Array) -> Array:
-        """How much narrower each joint becomes, as logarithms of factors, (n,): its cost above the mean cost."""
-        costs, here = np.zeros(len(widths)), self._excess(widths)
-        open_joints = [k for k in self.free if widths[k] < self.room[k]]
-        for k in open_joints:
-            costs[k] = np.log(self._excess(self._widened(widths, k)) / here) / np.log(_WIDER)
-        if open_joints:
-            costs[open_joints] -= costs[open_joints].mean()
-        return np.clip(costs, -_LARGEST_EXCHANGE, _LARGEST_EXCHANGE)
-
-    def _grown(self, widths: Array) -> tuple[Array, dict[int, list[Miss]]]:
-        """Widen each joint alone while the bounds are kept, and say what breaks then. Its first step may need a fit."""
-        broken: dict[int, list[Miss]] = {k: [] for k in self.free}
-        begin = self._fraction
-        for done, k in enumerate(self.free, 1):
-            self._next = begin + (1 - begin) * done / len(self.free), 2
-            before, factor = widths[k], _WIDER
-            while widths[k] < self.room[k]:
-                wider = self._widened(widths, k, factor)
-                found = self.verdict(wider, self.bounds, leap=widths[k] > before).excess(self.bounds)
-                misses = [name for name, ratio in found.items() if ratio > 1]
-                if misses and factor == _WIDER:
-                    broken[k] = misses
-                    break
-                widths = widths if misses else wider
-                factor = _WIDER if misses else factor**2
-        self.prober.go_back()
-        return widths, broken
-
-    def _widened(self, widths: Array, k: int, factor: float = _WIDER) -> Array:
-        wider = widths.copy()
-        wider[k] = min(factor * widths[k], self.room[k])
-        return wider
-
-
-def suggest_domain(
-    robot: Robot,
-    task: Task,
-    home: ArrayLike | str | None = None,
-    metric: Metric | MetricSpec = "euclidean",
-    *,
-    leak_deg: float = LEAK_DEG,
-    conditioning: float = CONDITIONING,
-    parametrisation: Parametrisation | None = None,
-    weights: Weights | WeightNumbers = DEFAULT_WEIGHTS,
-    seed: int = 0,
-    monitor: Monitor = silent,
-) -> DomainSuggestion:
-    """The widest box around a posture, inside the joint limits, on which a chart has the quality that is asked.
-
-    Quadratic charts on trial boxes give leak and conditioning in a fraction of a second. A search over the half-widths
-    of the joints takes the box with the largest volume that keeps both bounds, and a fit confirms it: if the fit misses
-    a bound, or has less than half of the conditioning anywhere that descents reach, the box shrinks by 8 %. Idle and
-    cyclic joints take their whole range. The result is deterministic.
-
-    Args:
-        robot: the robot.
-        task: a task of that robot. A missing reference orientation is taken at the home.
-        home: centre of the box, (n,) [rad] or [m], or the name of a posture of the robot's files. Default: the first
-            named posture that is regular and away from the limits, otherwise the most regular bent posture.
-        metric: as in `Problem`.
-        leak_deg: largest leak: the root mean square angle, in the metric, between the gradients of the fitted
-            coordinates and the space orthogonal to the task [deg]. 8 degrees couple accelerations by sin 8 = 14 %.
-        conditioning: smallest conditioning, at samples of which two thirds lie near faces and corners; 0 to 1.
-        parametrisation: the family of the fit. Default: Polynomial(degree=4); of degree 3 for more
-            than 8 joints, and of degree 2 from 12.
-        weights: weights of the fits, as in `fit`.
-        seed: seed of the fit.
-        monitor: called with progress.
-
-    Raises:
-        DomainError: if the home lies at a joint limit, or no box around it keeps the bounds. The message says which
-            bound breaks, and what may help.
-        SingularTaskError: if the task is singular everywhere.
-        UnknownNameError: if there is no posture of that name.
-        InvalidValueError, NotRedundantError: if an argument is invalid.
-        KeyboardInterrupt: after Ctrl-C; `Interrupted` with the fit on the box found, if it comes during a fit.
-
-    Source:
-        ours, docs/explanation/domains.md.
-
-    Example:
-        >>> import orthocas as oc
-        >>> robot = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
-        >>> found = oc.suggest_domain(robot, oc.Task.position(robot, "xy"), [0.6, 0.8, 0.8])
-        >>> [joint.reason for joint in found.joints][0]
-        'cyclic'
-        >>> found.leak_deg < 8.0, found.conditioning > 0.2
-        (True, True)
-    """
-    start = time.perf_counter()
-    bounds, loss = _checked(robot, task, leak_deg, conditioning, seed), Weights.of(weights)
-    if parametrisation is not None:
-        require_parametrisation(parametrisation)
-    posture = find_home(robot, task, home)
-    room = np.minimum(_room(robot, posture.q), _farthest(robot))
-    problem = Problem(robot, task, metric, Box(posture.q, np.minimum(_unit(robot), room)))
-    check(problem, _CHECKED)
-    joints = _Joints.of(problem)
-    prober = Prober(problem, joints.active, joints.cyclic, loss)
-    stricter = replace(bounds, conditioning=min(1.0, _MARGIN * bounds.conditioning))
-    widths, broken = WidestBox(prober, posture.q, room, joints.free, stricter, monitor).found(_unit(robot))
-    wanted = default_parametrisation(problem, bounded=True) if parametrisation is None else parametrisation
-    found, verdict = _confirmed(prober, wanted, joints, widths, bounds, seed, monitor)
-    return DomainSuggestion(
-        fit=found,
-        home=posture.q,
-        home_source=posture.source,
-        joints=joints.described(found.chart.problem, broken),
-        asked=bounds,
-        leak_deg=verdict.leak_deg,
-        conditioning=verdict.conditioning,
-        worst_point=tuple(verdict.worst_point.tolist()),
-        seconds=time.perf_counter() - start,
-    )
-
-
-@dataclass(frozen=True)
-class _Joints:
-    """The roles of the joints: idle and cyclic ones take their whole range, the others are free."""
-
-    names: tuple[str, ...]
-    idle: tuple[int, ...]
-    cyclic: tuple[str, ...]
-
-    @classmethod
-    def of(cls, problem: Problem) -> "_Joints":
-        idle = find_idle_joints(problem, sample_problem(problem, _CHECKED, 0))[-problem.r :]
-        return cls(problem.robot.joint_names, tuple(idle), cyclic_joints(problem))
-
-    @property
-    def active(self) -> list[int]:
-        """Joints that coordinates are fitted in."""
-        return [k for k in range(len(self.names)) if k not in self.idle]
-
-    @property
-    def free(self) -> list[int]:
-        """Joints whose half-widths are searched."""
-        return [k for k in self.active if self.names[k] not in self.cyclic]
-
-    def described(self, problem: Problem, broken: Mapping[int, list[Miss]]) -> tuple[JointWidth, ...]:
-        """Half-widths of the problem's domain, with what ends them.
-
-        Args:
-            problem: the problem on the suggested domain.
-            broken: the bounds that break if a joint moves further; none for joints that have no room.
-        """
-        robot, domain = problem.robot, problem.domain
-        limited = _room(robot, domain.centre) <= _farthest(robot)
-        found = []
-        for k, name in enumerate(self.names):
-            reason: Reason = "joint limit" if limited[k] else "unlimited"
-            if broken.get(k):
-                reason = broken[k][0]
-            if k not in self.free:
-                reason = "idle" if k in self.idle else "cyclic"
-            found.append(JointWidth(name, float(domain.half_width[k]), reason))
-        return tuple(found)
-
-
-def _checked(robot: Robot, task: Task, leak_deg: float, conditioning: float, seed: int) -> Bounds:
-    require_kind("robot", robot, Robot)
-    require_driven("suggesting a domain", robot.tree)
-    require_kind("task", task, Task)
-    require_count("seed", seed, least=0)
-    if not 0 < as_number("leak_deg", leak_deg) < 90:
-        raise InvalidValueError("leak_deg", leak_deg, "an angle between 0 and 90 degrees")
-    if not 0 < as_number("conditioning", conditioning) < 1:
-        raise InvalidValueError("conditioning", conditioning, "a number between 0 and 1")
-    return Bounds(float(leak_deg), float(conditioning))
-
-
-def _unit(robot: Robot) -> Array:
-    """Half-widths whose proportions a search starts from, (n,)."""
-    return np.where(robot.tree.prismatic, PRISMATIC_ROOM, REVOLUTE_ROOM)
-
-
-def _room(robot: Robot, q: Array) -> Array:
-    """Distances of a posture from the nearest joint limits, (n,)."""
-    room: Array = np.minimum(q - robot.lower, robot.upper - q)
-    return room
-
-
-def _farthest(robot: Robot) -> Array:
-    """Largest half-widths that a search tries, (n,): a full turn, the joint's own range, or 1 m."""
-    endless = np.isinf(robot.lower) | np.isinf(robot.upper)
-    return np.where(robot.tree.prismatic, np.where(endless, _LONGEST, np.inf), _FARTHEST)
-
-
-def _confirmed(
-    prober: Prober,
-    parametrisation: Parametrisation,
-    joints: _Joints,
-    widths: Array,
-    bounds: Bounds,
-    seed: int,
-    monitor: Monitor,
-) -> tuple[Fit, Verdict]:
-    """A fit that keeps the bounds, and its quality. The box shrinks until there is one."""
-    problem, robot = prober.problem, prober.problem.robot
-    unbounded = [k for k in joints.idle if np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
-    factors = np.where(np.isin(np.arange(robot.n), joints.free), _SHRINK, 1.0)
-    last, enough = "has too small a conditioning", _DESCENT * bounds.conditioning
-    for shrinkings in range(_TRIES):
-        box = Box(problem.domain.centre, widths * factors**shrinkings, unbounded)
-        trial = Problem(robot, problem.task, problem.metric, box, problem.name)
-        if not prober.least(trial, seed + 1) >= enough:  # a fit would take ten times as long to find that
-            continue
-        found = fit_from(prober.start_on, trial, parametrisation, prober.weights, seed, monitor)
-        verdict = judged_chart(found.chart, JUDGES, seed + 1)
-        least = worst_points(found.chart.problem, found.chart.coordinates, seed + 1, thorough=True).least
-        if least >= enough and verdict.keeps(bounds):
-            return found, verdict
-        worst = conditioning_in_words(min(least, verdict.conditioning))
-        last = f"has a leak of {verdict.leak_deg:.3g} deg and {worst}"
-    raise DomainError(
-        f"{parametrisation.label} misses the bounds on {_TRIES} ever smaller boxes around the home: the last one "
-        f"{last}; {REMEDIES}"
-    )

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import casadi as ca
 import numpy as np
@@ -10,13 +10,26 @@ import numpy as np
 from orthocas.charts.angles import pairs
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.tasks.problem import Problem
-from orthocas.tools.checks import Array, as_float_array, as_number, require_kind, require_known, require_shape
+from orthocas.tools.checks import Array, as_float_array, as_number, require_kind, require_known
 from orthocas.tools.expressions import MOST_ROWS, compute_determinant
 
-REGULAR_VOLUME = 0.9  #: volume of the gradients below which the regularity term acts
-LEAST_CONDITIONING = 0.2  #: that fits aim at on the whole domain
-_NEARLY_FOLDED = 1e-4  # volume below which an inverse loses digits
-_FOLD_VOLUME = 1.6 * LEAST_CONDITIONING  # enough for it: det D <= sqrt(e) times the conditioning
+
+@dataclass(frozen=True, slots=True)
+class LossRules:
+    """Numbers of the terms of the loss."""
+
+    least_conditioning: float = 0.2  #: that fits aim at on the whole domain
+    regular_volume: float = 0.9  #: volume of the gradients below which the regularity term acts
+    fold_volume: float = 1.6 * 0.2  #: the same at the worst points: enough, as det D <= sqrt(e) times the conditioning
+    wide_volume: float = 0.5  #: volume that a wide fit asks for at its first samples
+    worst_volume: float = 0.3  #: the same once the worst samples have joined, and for networks
+    least_volume: float = 0.05  #: over r: bound of the domain of a wide chart, in the identity metric
+    beyond: float = 1.2  #: over that bound: the volume in the identity metric that is enough beside another metric
+    nearly_folded: float = 1e-4  #: volume below which an inverse loses digits
+    shortest: float = 1e-12  #: length of a gradient that counts as zero
+
+
+RULES = LossRules()
 Angles = Literal["paper", "metric"]
 ANGLES: tuple[Angles, ...] = ("paper", "metric")  #: kinds of angles in the loss
 
@@ -67,55 +80,28 @@ class LossTerm(Protocol):
         ...
 
 
+Pairs = tuple[tuple[int, int], ...]  #: rows of J_xi
+
+
+def coordinates_of(rows: Sequence[Any], exchanged: Pairs) -> list[Any]:
+    """Rows with (a + b) / sqrt 2 and (b - a) / sqrt 2 in place of the rows a, b of each pair: a rotation."""
+    turned = list(rows)
+    for i, j in exchanged:
+        turned[i], turned[j] = (rows[i] + rows[j]) * 0.5**0.5, (rows[j] - rows[i]) * 0.5**0.5
+    return turned
+
+
 def require_sample_data(name: str) -> None:
     """Raise UnknownNameError unless samples have this data."""
     require_known("data of a sample", name, SAMPLE_DATA)
 
 
-def task_cosines(unit_task_gradients: ca.SX, coordinate_jacobian: ca.SX) -> ca.SX:
-    """Cosines between task gradients and coordinate gradients, (m, r).
-
-    c_ij = v_x,i^T A^-1 v_xi,j / (|A^-1 v_x,i| |v_xi,j|), Euclidean norms.
-
-    Args:
-        unit_task_gradients: rows A^-1 v_x,i / |A^-1 v_x,i|, (m, n).
-        coordinate_jacobian: J_xi with rows v_xi,j, (r, n).
-
-    Returns:
-        Cosines in [-1, 1]; NaN where a coordinate gradient vanishes.
-
-    Source:
-        [AS2023] eq. (24), first sum.
-    """
-    n = unit_task_gradients.shape[1]
-    require_shape("coordinate_jacobian", coordinate_jacobian.shape, (None, n))
-    lengths = ca.sqrt(ca.sum2(coordinate_jacobian**2))
-    products: ca.SX = unit_task_gradients @ coordinate_jacobian.T
-    return products / ca.repmat(lengths.T, unit_task_gradients.shape[0], 1)
-
-
-def mutual_cosines(coordinate_jacobian: ca.SX, metric_inverse: ca.SX | None) -> ca.SX:
-    """Cosines between the gradients of two coordinates, one per pair i > j of `pairs(r)`, (r (r - 1) / 2, 1).
-
-    c_ij = v_xi,i^T A^-1 v_xi,j / (|A^-1 v_xi,i| |v_xi,j|), Euclidean norms.
-
-    Args:
-        coordinate_jacobian: J_xi, (r, n).
-        metric_inverse: A^-1, (n, n); None for the identity.
-
-    Source:
-        [AS2023] eq. (24), second sum.
-    """
-    J = coordinate_jacobian
-    raised = J if metric_inverse is None else J @ metric_inverse
-    lengths, raised_lengths = ca.sqrt(ca.sum2(J**2)), ca.sqrt(ca.sum2(raised**2))
-    cosines = [ca.dot(raised[i, :], J[j, :]) / (raised_lengths[i] * lengths[j]) for i, j in pairs(J.shape[0])]
-    return ca.vertcat(*cosines) if cosines else ca.SX(0, 1)
-
-
 @dataclass(frozen=True)
 class TaskTerm:
-    """Mean over task components and coordinates of the squared `task_cosines`."""
+    """Mean over task components i and coordinates j of the squared cosines of [AS2023] eq. (24), first sum.
+
+    c_ij = v_x,i^T A^-1 v_xi,j / (|A^-1 v_x,i| |v_xi,j|), Euclidean norms; NaN where a coordinate gradient vanishes.
+    """
 
     name: str = "task"
     data: tuple[str, ...] = ("unit_task_gradients",)
@@ -123,14 +109,18 @@ class TaskTerm:
 
     def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
         """Cosines, coordinate by coordinate, over sqrt(m r), (m r, 1)."""
-        cosines = ca.vec(task_cosines(data["unit_task_gradients"], coordinate_jacobian))
-        rho: ca.SX = (1 / (sizes.m * sizes.r)) ** 0.5 * cosines
+        lengths = ca.sqrt(ca.sum2(coordinate_jacobian**2))
+        cosines = data["unit_task_gradients"] @ coordinate_jacobian.T / ca.repmat(lengths.T, sizes.m, 1)
+        rho: ca.SX = (1 / (sizes.m * sizes.r)) ** 0.5 * ca.vec(cosines)
         return rho
 
 
 @dataclass(frozen=True)
 class MutualTerm:
-    """Mean over pairs of coordinates of the squared `mutual_cosines`. It is empty for r = 1."""
+    """Mean over pairs of coordinates of the squared cosines of [AS2023] eq. (24), second sum. It is empty for r = 1.
+
+    c_ij = v_xi,i^T A^-1 v_xi,j / (|A^-1 v_xi,i| |v_xi,j|), Euclidean norms, i > j.
+    """
 
     name: str = "mutual"
     data: tuple[str, ...] = ("metric_inverse",)
@@ -138,25 +128,21 @@ class MutualTerm:
 
     def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
         """Cosines over the square root of the number of pairs, (r (r - 1) / 2, 1)."""
-        count = max(1, len(pairs(sizes.r)))
-        rho: ca.SX = (1 / count) ** 0.5 * mutual_cosines(coordinate_jacobian, data.get("metric_inverse"))
-        return rho
+        J, raised = coordinate_jacobian, raise_gradients(coordinate_jacobian, data.get("metric_inverse"))
+        long, own = ca.sqrt(ca.sum2(raised**2)), ca.sqrt(ca.sum2(J**2))
+        cosines = [ca.dot(raised[i, :], J[j, :]) / (long[i] * own[j]) for i, j in pairs(sizes.r)]
+        return average_pairs(cosines)
 
 
-def log_lengths(coordinate_jacobian: ca.SX) -> ca.SX:
-    """Logarithms of the lengths of the coordinate gradients, (r, 1).
+@dataclass(frozen=True)
+class LengthTerm:
+    """Mean over coordinates of log^2 |dxi_j|, Euclidean norms.
 
     Angles do not fix how fast a coordinate grows along itself: xi^7 is as orthogonal as xi, but flat at 0.
 
     Source:
         ours, docs/explanation/derivations_fits.md#lengths.
     """
-    return ca.log(ca.sum2(coordinate_jacobian**2)) / 2
-
-
-@dataclass(frozen=True)
-class LengthTerm:
-    """Mean over coordinates of the squared `log_lengths`."""
 
     name: str = "length"
     data: tuple[str, ...] = ()
@@ -164,63 +150,34 @@ class LengthTerm:
 
     def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
         """Logarithms over sqrt(r), (r, 1)."""
-        rho: ca.SX = (1 / sizes.r) ** 0.5 * log_lengths(coordinate_jacobian)
+        rho: ca.SX = (1 / sizes.r) ** 0.5 * (ca.log(ca.sum2(coordinate_jacobian**2)) / 2)
         return rho
 
 
-def leak_sines(task_basis: ca.SX, coordinate_jacobian: ca.SX, metric_inverse: ca.SX | None) -> ca.SX:
-    """Components of the unit coordinate gradients along an orthonormal basis of the task gradients, (m, r).
+@dataclass(frozen=True)
+class MetricLengthTerm:
+    """Sum over coordinates of log^2 |dxi_j| with the lengths of the metric: xi is a similar motion everywhere."""
 
-    s_aj = e_a . v_xi,j / |v_xi,j|_A^-1. The squares of column j add up to sin^2 of the leak of coordinate j, which
-    depends neither on the basis nor on the task coordinates.
+    name: str = "metric length"
+    data: tuple[str, ...] = ("metric_inverse",)
+    hinge: bool = False
 
-    Args:
-        task_basis: rows e_1..e_m, an A-orthonormal basis of span{grad_A h_i}, (m, n).
-        coordinate_jacobian: J_xi with rows v_xi,j, (r, n).
-        metric_inverse: A^-1, (n, n); None for the identity.
-
-    Returns:
-        Components in [-1, 1]; NaN where a coordinate gradient vanishes.
-
-    Source:
-        ours, docs/explanation/angles.md.
-    """
-    J = coordinate_jacobian
-    require_shape("coordinate_jacobian", J.shape, (None, task_basis.shape[1]))
-    lengths = metric_lengths(J, metric_inverse)
-    products: ca.SX = task_basis @ J.T
-    return products / ca.repmat(lengths.T, task_basis.shape[0], 1)
-
-
-def metric_mutual_cosines(coordinate_jacobian: ca.SX, metric_inverse: ca.SX | None) -> ca.SX:
-    """Cosines in the metric between the gradients of two coordinates, in the order of `pairs(r)`, (r (r - 1) / 2, 1).
-
-    c_ij = v_xi,i^T A^-1 v_xi,j / (|v_xi,i|_A^-1 |v_xi,j|_A^-1).
-
-    Args:
-        coordinate_jacobian: J_xi, (r, n).
-        metric_inverse: A^-1, (n, n); None for the identity.
-
-    Source:
-        ours, docs/explanation/angles.md.
-    """
-    J = coordinate_jacobian
-    raised = J if metric_inverse is None else J @ metric_inverse
-    lengths = metric_lengths(J, metric_inverse)
-    cosines = [ca.dot(raised[i, :], J[j, :]) / (lengths[i] * lengths[j]) for i, j in pairs(J.shape[0])]
-    return ca.vertcat(*cosines) if cosines else ca.SX(0, 1)
-
-
-def metric_lengths(coordinate_jacobian: ca.SX, metric_inverse: ca.SX | None) -> ca.SX:
-    """Lengths |v_xi,j|_A^-1 of the coordinate gradients in the metric, (r, 1)."""
-    raised = coordinate_jacobian if metric_inverse is None else coordinate_jacobian @ metric_inverse
-    lengths: ca.SX = ca.sqrt(ca.sum2(raised * coordinate_jacobian))
-    return lengths
+    def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
+        """Logarithms, (r, 1)."""
+        rho: ca.SX = ca.log(metric_lengths(coordinate_jacobian, data.get("metric_inverse")))
+        return rho
 
 
 @dataclass(frozen=True)
 class MetricTaskTerm:
-    """Mean over basis vectors and coordinates of the squared `leak_sines`."""
+    """Mean over a basis of the task gradients and over coordinates of the squared sines of leaks.
+
+    With an A-orthonormal basis e_1..e_m of span{grad_A h_i}, s_aj = e_a . v_xi,j / |v_xi,j|_A^-1. The squares of column
+    j add up to sin^2 of the leak of coordinate j, which depends neither on the basis nor on the task coordinates.
+
+    Source:
+        ours, docs/explanation/angles.md.
+    """
 
     name: str = "metric task"
     data: tuple[str, ...] = ("metric_inverse", "task_basis")
@@ -228,14 +185,21 @@ class MetricTaskTerm:
 
     def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
         """Sines, coordinate by coordinate, over sqrt(m r), (m r, 1)."""
-        sines = ca.vec(leak_sines(data["task_basis"], coordinate_jacobian, data.get("metric_inverse")))
-        rho: ca.SX = (1 / (sizes.m * sizes.r)) ** 0.5 * sines
+        lengths = metric_lengths(coordinate_jacobian, data.get("metric_inverse"))
+        sines = data["task_basis"] @ coordinate_jacobian.T / ca.repmat(lengths.T, sizes.m, 1)
+        rho: ca.SX = (1 / (sizes.m * sizes.r)) ** 0.5 * ca.vec(sines)
         return rho
 
 
 @dataclass(frozen=True)
 class MetricMutualTerm:
-    """Mean over pairs of coordinates of the squared `metric_mutual_cosines`. It is empty for r = 1."""
+    """Mean over pairs of coordinates of the squared cosines in the metric. It is empty for r = 1.
+
+    c_ij = v_xi,i^T A^-1 v_xi,j / (|v_xi,i|_A^-1 |v_xi,j|_A^-1), i > j.
+
+    Source:
+        ours, docs/explanation/angles.md.
+    """
 
     name: str = "metric mutual"
     data: tuple[str, ...] = ("metric_inverse",)
@@ -243,9 +207,27 @@ class MetricMutualTerm:
 
     def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
         """Cosines over the square root of the number of pairs, (r (r - 1) / 2, 1)."""
-        count = max(1, len(pairs(sizes.r)))
-        rho: ca.SX = (1 / count) ** 0.5 * metric_mutual_cosines(coordinate_jacobian, data.get("metric_inverse"))
-        return rho
+        J, inverse = coordinate_jacobian, data.get("metric_inverse")
+        raised, lengths = raise_gradients(J, inverse), metric_lengths(J, inverse)
+        return average_pairs([ca.dot(raised[i, :], J[j, :]) / (lengths[i] * lengths[j]) for i, j in pairs(sizes.r)])
+
+
+def raise_gradients(coordinate_jacobian: ca.SX, metric_inverse: ca.SX | None) -> ca.SX:
+    """Gradients in the metric, rows v^T A^-1, (r, n)."""
+    raised: ca.SX = coordinate_jacobian if metric_inverse is None else coordinate_jacobian @ metric_inverse
+    return raised
+
+
+def metric_lengths(coordinate_jacobian: ca.SX, metric_inverse: ca.SX | None) -> ca.SX:
+    """Lengths |v_xi,j|_A^-1 of the coordinate gradients in the metric, (r, 1)."""
+    lengths: ca.SX = ca.sqrt(ca.sum2(raise_gradients(coordinate_jacobian, metric_inverse) * coordinate_jacobian))
+    return lengths
+
+
+def average_pairs(cosines: Sequence[ca.SX]) -> ca.SX:
+    """Residuals whose squares add up to the mean of squares, (pairs, 1)."""
+    rho: ca.SX = (1 / max(1, len(cosines))) ** 0.5 * (ca.vertcat(*cosines) if cosines else ca.SX(0, 1))
+    return rho
 
 
 def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_inverse: ca.SX | None) -> ca.SX:
@@ -266,14 +248,12 @@ def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_invers
         ours, docs/explanation/derivations_fits.md#regularity.
     """
     if coordinate_jacobian.shape[0] > MOST_ROWS:
-        wanted = (
+        expected = (
             f"at most {MOST_ROWS} with the terms regularity and folds; weights of 0 leave these out, locked joints help"
         )
-        raise InvalidValueError("number of extra coordinates r", coordinate_jacobian.shape[0], wanted)
-    J = coordinate_jacobian
-    raised = J if metric_inverse is None else J @ metric_inverse
-    lengths = ca.sqrt(ca.sum2(raised * J))
-    return compute_determinant((J @ null_basis) / ca.repmat(lengths, 1, J.shape[0]))
+        raise InvalidValueError("number of extra coordinates r", coordinate_jacobian.shape[0], expected)
+    lengths = metric_lengths(coordinate_jacobian, metric_inverse)
+    return compute_determinant((coordinate_jacobian @ null_basis) / ca.repmat(lengths, 1, coordinate_jacobian.shape[0]))
 
 
 def volume_hinges(J: Array, null_basis: Array, metric_inverse: Array | None, bound: float) -> tuple[Array, Array]:
@@ -300,7 +280,7 @@ def volume_hinges(J: Array, null_basis: Array, metric_inverse: Array | None, bou
 
 def _cofactors(D: Array, volume: Array) -> Array:
     """Cofactors of matrices (N, r, r) with these determinants: det D D^-T, or by singular values next to folds."""
-    cofactors, folded = np.empty(D.shape), np.abs(volume) < _NEARLY_FOLDED
+    cofactors, folded = np.empty(D.shape), np.abs(volume) < RULES.nearly_folded
     cofactors[~folded] = volume[~folded, None, None] * np.linalg.inv(D[~folded]).transpose(0, 2, 1)
     U, s, Vt = np.linalg.svd(D[folded])
     sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
@@ -311,21 +291,41 @@ def _cofactors(D: Array, volume: Array) -> Array:
 
 @dataclass(frozen=True)
 class RegularityTerm:
-    """max(bound - det D, 0)^2, where det D is the `gradient_volume`."""
+    """max(bound - det D, 0)^2, where det D is the `gradient_volume`.
+
+    Coordinates that are orthogonal in the inertia may be nearly parallel otherwise. A Euclidean term takes the volume
+    in the identity metric, and its bound is over r.
+    """
 
     name: str = "regularity"
-    bound: float = REGULAR_VOLUME
+    bound: float = RULES.regular_volume
     data: tuple[str, ...] = ("metric_inverse", "null_basis")
     hinge: bool = True
+    euclidean: bool = False
+
+    def bound_for(self, r: int) -> float:
+        """The bound for r coordinates."""
+        return self.bound / r if self.euclidean else self.bound
 
     def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
         """One residual, (1, 1)."""
-        volume = gradient_volume(coordinate_jacobian, data["null_basis"], data.get("metric_inverse"))
-        hinge: ca.SX = ca.fmax(self.bound - volume, 0)
+        Z, metric_inverse = data["null_basis"], data.get("metric_inverse")
+        if self.euclidean and metric_inverse is not None:
+            # a basis with the volume of an orthonormal one
+            columns = [Z[:, 0] / ca.sqrt(compute_determinant(Z.T @ Z)), *(Z[:, k] for k in range(1, sizes.r))]
+            Z, metric_inverse = ca.horzcat(*columns), None
+        hinge: ca.SX = ca.fmax(self.bound_for(sizes.r) - gradient_volume(coordinate_jacobian, Z, metric_inverse), 0)
         return hinge
 
+    def hinges(self, J: Array, null_basis: Array, metric_inverse: Array | None) -> tuple[Array, Array]:
+        """The residual (N,) and its derivative with respect to J_xi (N, r, n), by LAPACK; see `volume_hinges`."""
+        if self.euclidean and metric_inverse is not None:
+            null_basis, metric_inverse = null_basis.copy(), None
+            null_basis[:, :, 0] /= np.sqrt(np.linalg.det(null_basis.transpose(0, 2, 1) @ null_basis))[:, None]
+        return volume_hinges(J, null_basis, metric_inverse, self.bound_for(J.shape[1]))
 
-FOLD_TERM = RegularityTerm("folds", _FOLD_VOLUME)  #: for the worst points of the domain only
+
+FOLD_TERM = RegularityTerm("folds", RULES.fold_volume)  #: for the worst points of the domain only
 
 _TERMS: dict[str, LossTerm] = {}
 
@@ -364,7 +364,7 @@ def register_loss_term(term: LossTerm) -> None:
     _TERMS[term.name] = term
 
 
-def term_of(name: str) -> LossTerm:
+def find_term(name: str) -> LossTerm:
     """The term with this name.
 
     Raises:
@@ -374,8 +374,14 @@ def term_of(name: str) -> LossTerm:
     return _TERMS[name]
 
 
+_OF_WIDE_FITS = (
+    RegularityTerm("volume", RULES.wide_volume),
+    RegularityTerm("volume with the worst", RULES.worst_volume),
+    RegularityTerm("euclidean volume", RULES.beyond * RULES.least_volume, euclidean=True),
+    MetricLengthTerm(),
+)
 _OURS = (MetricTaskTerm(), MetricMutualTerm(), LengthTerm(), RegularityTerm(), FOLD_TERM)
-for _term in (TaskTerm(), MutualTerm(), *_OURS):
+for _term in (TaskTerm(), MutualTerm(), *_OURS, *_OF_WIDE_FITS):
     register_loss_term(_term)
 
 WeightNumbers = Sequence[float]  #: two to five numbers: task, mutual, regularity, length, folds

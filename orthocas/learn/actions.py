@@ -25,11 +25,7 @@ except ImportError:
     raise MissingExtraError("orthocas.learn", "gymnasium", "learn") from None
 
 
-_MOST_POSITIONS = 2**31  # of an environment
-_MOST_STEPS = 20  # of the tracker, for an action
-
-
-def _positions(env: Any) -> Array:
+def _read_positions(env: Any) -> Array:
     """Joint positions of a MuJoCo environment."""
     return np.array(env.unwrapped.data.qpos)
 
@@ -62,7 +58,7 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
         chart: Chart,
         step: ArrayLike,
         joints: ArrayLike | None = None,
-        positions: Callable[[Any], Array] = _positions,
+        positions: Callable[[Any], Array] = _read_positions,
     ) -> None:
         require_kind("env", env, gymnasium.Env)
         super().__init__(env)
@@ -76,21 +72,21 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
             raise InvalidValueError("positions", repr(positions)[:80], "a function of an environment")
         self.chart, self._positions = chart, positions
         places = range(chart.n) if joints is None else joints
-        self._joints = freeze_indices("joints", places, (chart.n,), _MOST_POSITIONS)
+        self._joints = freeze_indices("joints", places, (chart.n,), 2**31)
         sizes = as_float_array("step", step)
         if sizes.shape not in ((), (chart.n,)) or not ((sizes > 0) & np.isfinite(sizes)).all():
             raise InvalidValueError("step", sizes.tolist(), f"one finite number or {chart.n}, > 0")
         self._step = np.broadcast_to(sizes, chart.n)
         self._tracker: Tracker | None = None
-        more, (low, high) = np.full(chart.r + 1, np.inf), _ends(outer)
+        more, (low, high) = np.full(chart.r + 1, np.inf), _read_bounds(outer)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (chart.n,), np.float64)
         self.observation_space = gymnasium.spaces.Box(np.append(low, -more), np.append(high, more), dtype=np.float64)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Start again, where the environment puts the arm; seed and options are for that."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._tracker = self.chart.tracker(self._here(), nearest=True)
-        return self._observed(observation), info
+        self._tracker = self.chart.tracker(self._read_joints(), nearest=True)
+        return self._extend(observation), info
 
     def step(self, action: Array) -> tuple[Array, Any, bool, bool, dict[str, Any]]:
         """Move phi. `info["tracker"]` has the status of the tracker: OK, NEAREST, or NEARER after 20 steps.
@@ -101,16 +97,16 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
             raise gymnasium.error.ResetNeeded("step before reset, expected reset first")
         change = as_float_array("action", action)
         require_shape("action", change.shape, (self.chart.n,))
-        target = self._wanted(self._tracker.q, self._step * np.clip(change, -1.0, 1.0))
-        for _ in range(_MOST_STEPS):
+        target = self._compute_target(self._tracker.q, self._step * np.clip(change, -1.0, 1.0))
+        for _ in range(20):
             self._tracker.step(target)
             if self._tracker.status != TrackerStatus.NEARER:
                 break
         status = self._tracker.status
         observation, reward, terminated, truncated, info = self.env.step(self._tracker.q)
-        return self._observed(observation), reward, terminated, truncated, info | {"tracker": status}
+        return self._extend(observation), reward, terminated, truncated, info | {"tracker": status}
 
-    def _wanted(self, q: Array, change: Array) -> Array:
+    def _compute_target(self, q: Array, change: Array) -> Array:
         """phi at a change from q."""
         phi, m = self.chart.phi(q), self.chart.m
         wanted = np.array(phi + change)
@@ -119,21 +115,23 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
             wanted[:m] = np.array(self.chart.parts.relative.moved(phi[:m], change[:m], phi[:m], none, none)[0]).ravel()
         return wanted
 
-    def _here(self) -> Array:
-        found = as_float_array("positions", self._positions(self.env))
-        if found.ndim != 1 or len(found) <= self._joints.max():
-            raise InvalidValueError("positions", f"of shape {found.shape}", f"a row with place {self._joints.max()}")
-        return np.asarray(found[self._joints])
+    def _read_joints(self) -> Array:
+        positions = as_float_array("positions", self._positions(self.env))
+        if positions.ndim != 1 or len(positions) <= self._joints.max():
+            raise InvalidValueError(
+                "positions", f"of shape {positions.shape}", f"a row with place {self._joints.max()}"
+            )
+        return np.asarray(positions[self._joints])
 
-    def _observed(self, observation: Array) -> Array:
+    def _extend(self, observation: Array) -> Array:
         """An observation with xi and the distance to the boundary."""
-        q = self._here()
+        q = self._read_joints()
         low, high = self.chart.problem.domain.bounds
         distance = np.minimum(q - low, high - q).min()
         return np.asarray(np.concatenate([observation, self.chart.xi(q), [distance]]))
 
 
-def _ends(space: Any) -> tuple[Array, Array]:
+def _read_bounds(space: Any) -> tuple[Array, Array]:
     return np.asarray(space.low, dtype=float), np.asarray(space.high, dtype=float)
 
 

@@ -1,9 +1,11 @@
 """One chart for a whole path of postures: the corridor around the path, and the chart that is fitted there."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.bases.cyclic import cyclic_joints, over_cyclic_joints
+from orthocas.bases.cyclic import cyclic_joints, widen_over_cyclic_joints
 from orthocas.bases.products import Polynomial
 from orthocas.charts.chart import Chart
 from orthocas.errors import DomainError, InvalidValueError
@@ -16,10 +18,19 @@ from orthocas.tasks.samples import find_idle_joints, sample_problem
 from orthocas.tools.checks import Array, as_number, as_point_set, require_kind
 
 RADIUS = 0.2  #: [rad]
-_DEGREE = 3  # of the polynomial, with an angle for each cyclic joint
-_THINNED = 0.5  # of the radius, between postures that are kept
-_PRISMATIC = 0.25  # [m] that count like 1 rad
-_SAMPLES, _SEED = 200, 0
+
+
+@dataclass(frozen=True, slots=True)
+class CorridorRules:
+    """Numbers of charts along paths."""
+
+    degree: int = 3  #: of the polynomial, with an angle for each cyclic joint; more terms gain little there
+    spacing: float = 0.5  #: of the postures that are kept, in radii
+    prismatic: float = 0.25  #: length that counts like 1 rad [m]
+    samples: int = 200  #: that tell idle joints
+
+
+RULES = CorridorRules()
 
 
 def chart_along(problem: Problem, postures: ArrayLike, radius: float = RADIUS) -> Chart:
@@ -52,7 +63,7 @@ def chart_along(problem: Problem, postures: ArrayLike, radius: float = RADIUS) -
         >>> bool(np.abs(motion.q[-1] - q).max() < 1e-6)
         True
     """
-    return fit(corridor_problem(problem, postures, radius), Polynomial(_DEGREE, "auto")).chart
+    return fit(corridor_problem(problem, postures, radius), Polynomial(RULES.degree, "auto")).chart
 
 
 def corridor_problem(problem: Problem, postures: ArrayLike, radius: float = RADIUS, margin_deg: float = 0.0) -> Problem:
@@ -86,29 +97,32 @@ def corridor_problem(problem: Problem, postures: ArrayLike, radius: float = RADI
     if not 0 < size < np.pi:
         raise InvalidValueError("radius", radius, "a positive number below pi")
     prismatic = np.array(problem.robot.tree.prismatic)
-    sizes = np.where(prismatic, _PRISMATIC * size, size)
+    sizes = np.where(prismatic, RULES.prismatic * size, size)
     whole = find_joint_range(problem.robot, margin_deg)
-    path = path[_thinned(path / sizes)]
-    narrow = Problem(problem.robot, problem.task, problem.metric, _around(whole, path, sizes), problem.name)
+    path = path[_thin_out(path / sizes)]
+
+    # Which joints only turn the whole task, or do not move it, is asked in the narrow corridor.
+    narrow = Problem(problem.robot, problem.task, problem.metric, _build_corridor(whole, path, sizes), problem.name)
     names = problem.robot.joint_names
     cyclic = cyclic_joints(narrow)
-    idle = find_idle_joints(narrow, sample_problem(narrow, _SAMPLES, _SEED))
+    idle = find_idle_joints(narrow, sample_problem(narrow, RULES.samples, 0))
+    # These may take their whole range.
     for k in {*idle, *map(names.index, cyclic)}:
         sizes[k] = np.inf
-    free = Problem(problem.robot, problem.task, problem.metric, _around(whole, path, sizes), problem.name)
-    return over_cyclic_joints(free, cyclic)
+    free = Problem(problem.robot, problem.task, problem.metric, _build_corridor(whole, path, sizes), problem.name)
+    return widen_over_cyclic_joints(free, cyclic)
 
 
-def _thinned(z: Array) -> list[int]:
+def _thin_out(z: Array) -> list[int]:
     """Rows of a path (N, n) that are at least so far apart, and the last one."""
     kept = [0]
     for k in range(1, len(z)):
-        if np.linalg.norm(z[k] - z[kept[-1]]) >= _THINNED:
+        if np.linalg.norm(z[k] - z[kept[-1]]) >= RULES.spacing:
             kept.append(k)
     return kept if kept[-1] == len(z) - 1 else [*kept, len(z) - 1]
 
 
-def _around(whole: Box, path: Array, sizes: Array) -> Corridor:
+def _build_corridor(whole: Box, path: Array, sizes: Array) -> Corridor:
     """The corridor in its bounding box; joints with an infinite size have their whole range."""
     low = np.maximum(path.min(axis=0) - sizes, whole.centre - whole.half_width)
     high = np.minimum(path.max(axis=0) + sizes, whole.centre + whole.half_width)

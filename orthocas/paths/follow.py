@@ -15,7 +15,7 @@ from orthocas.charts.self_motion import Walls, xi_range
 from orthocas.errors import InvalidValueError, PathError, SolveError
 from orthocas.paths.joint_curve import JointCurve, Lost, Solver, TimeLaw, fastest, list_places
 from orthocas.paths.joint_motion import JointMotion, Margins
-from orthocas.paths.plan import Plan
+from orthocas.paths.tool_path import RULES, ToolPath
 from orthocas.robots.obstacles import LinkDistances, Obstacle
 from orthocas.robots.tree import require_driven
 from orthocas.tasks.clear_box import compute_row_scale
@@ -25,21 +25,6 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind
 from orthocas.tools.columns import BlockedFunction
 
-_SAMPLES = 256  # of the domain, for the scale of the rows
-_INSIDE = 0.97  # share of the half-width beyond which the residual of a joint is a straight line
-_REGULAR, _NEARLY_SINGULAR = 0.1, 0.02  # relative singular values: scale of the residual, and where its line begins
-_AWAY, _TOO_NEAR = 0.02, 0.004  # the same for distances from obstacles [m]
-_STEPS = 3  # at each place
-_LONGEST = 0.1  # of a step [rad] or [m]
-_WALK_DAMPING = 1e-2
-_LEAST, _MOST = 20, 60  # pieces of the spline
-_DENSITY = 10  # pieces on a path as long as x moves over the domain
-_PLACES = 8  # where costs count, on every piece
-_SPEED, _BEND = 2e-2, 1e-4  # weights of the squares of xi' and xi''
-_ITERATIONS = 40
-_GAIN = 1e-3  # relative decrease of the cost that ends the iterations
-_DAMPING = 1e-2  # at first
-_MOST_DAMPING = 1e8
 HOLD = "hold"
 OBJECTIVE = "objective"
 _TO_FULL_SPEED = 0.5  # [s] that a joint takes to its velocity limit with the default acceleration limits
@@ -384,16 +369,19 @@ def follow(
     """
     require_kind("chart", chart, Chart)
     require_driven("following a path", chart.problem.robot.tree)
-    chart.function("second_derivative")  # raises for grown charts
+    # Raises for grown charts.
+    chart.function("second_derivative")
     start = chart.problem.domain.centre if q_start is None else as_point("q_start", q_start, chart.n)
     distances = LinkDistances(chart.problem.robot, obstacles, link_radius)
-    limits = _limits(chart, velocity_limits, acceleration_limits, distances, clearance)
+    limits = _read_limits(chart, velocity_limits, acceleration_limits, distances, clearance)
     stamp = as_number("period", period)
     if not 1e-5 <= stamp <= 10:
         raise InvalidValueError("period", period, "a time from 1e-5 to 10 s")
-    plan = _plan(chart, tool_path, xi, start)
-    solver = Solver(chart)
-    curve = JointCurve.along(solver, plan.phi, start)
+
+    # phi(s) of the tool path, and q(s) with phi(q(s)) = phi(s).
+    path = _read_tool_path(chart, tool_path, xi, start)
+    solver = PhiSolver(chart)
+    curve = JointCurve.trace(solver, path.phi, start)
     if isinstance(xi, str) and xi == OBJECTIVE:
         plan, curve = _chosen(solver, plan, curve, limits, start)
     if isinstance(curve, Lost):
@@ -406,48 +394,48 @@ def follow(
     return _on_stamps(plan, curve, law, limits, stamp)
 
 
-def _plan(chart: Chart, tool_path: Any, xi: Any, start: Array) -> Plan:
+def _read_tool_path(chart: Chart, tool_path: Any, xi: Any, start: Array) -> ToolPath:
     """The tool path with scheduled coordinates, or with those of the start."""
     if not isinstance(xi, str):
-        return Plan.scheduled(chart, tool_path, xi)
+        return ToolPath.schedule(chart, tool_path, xi)
     if xi not in (HOLD, OBJECTIVE):
         raise InvalidValueError("xi", repr(xi)[:80], f"'{HOLD}', '{OBJECTIVE}', an array or a function")
-    return Plan.held(chart, tool_path, chart.xi(start))
+    return ToolPath.hold(chart, tool_path, chart.xi(start))
 
 
-def _chosen(
-    solver: Solver, plan: Plan, held: JointCurve | Lost, limits: Limits, start: Array
-) -> tuple[Plan, JointCurve | Lost]:
+def _choose_xi(
+    solver: PhiSolver, path: ToolPath, held: JointCurve | LostCurve, limits: "MotionLimits", start: Array
+) -> tuple[ToolPath, JointCurve | LostCurve]:
     """The path with coordinates by objective, from those that are held, or from a walk where that is not possible."""
     costs = Costs(limits)
-    choice = XiChoice(plan, costs, solver)
-    q = walk(solver.chart, costs, plan.x(choice.s), start) if isinstance(held, Lost) else held.q(choice.s)
-    chosen = choice.best(q)
-    return chosen, JointCurve.along(solver, chosen.phi, q[0])
+    choice = XiChoice(path, costs, solver)
+    q = walk(solver.chart, costs, path.x(choice.s), start) if isinstance(held, LostCurve) else held.q(choice.s)
+    chosen = choice.optimise(q)
+    return chosen, JointCurve.trace(solver, chosen.phi, q[0])
 
 
-def _limits(
+def _read_limits(
     chart: Chart,
     velocity: ArrayLike | None,
     acceleration: ArrayLike | None,
     distances: LinkDistances,
     clearance: float,
-) -> Limits:
+) -> "MotionLimits":
     """Limits of all joints, > 0 and finite."""
     most = chart.problem.robot.velocity_limits if velocity is None else velocity
-    speeds = _of_joints(chart, "velocity_limits", most)
-    given = speeds / _TO_FULL_SPEED if acceleration is None else acceleration
+    speeds = _spread_limits(chart, "velocity_limits", most)
+    accelerations = speeds / RULES.to_full_speed if acceleration is None else acceleration
     gap = as_number("clearance", clearance)
     if not 0 <= gap < np.inf:
         raise InvalidValueError("clearance", clearance, "a length >= 0 [m]")
-    return Limits(chart, speeds, _of_joints(chart, "acceleration_limits", given), distances, gap)
+    return MotionLimits(chart, speeds, _spread_limits(chart, "acceleration_limits", accelerations), distances, gap)
 
 
-def _of_joints(chart: Chart, name: str, value: ArrayLike) -> Array:
-    given = as_float_array(name, value)
-    if given.shape not in ((), (chart.n,)):
-        raise InvalidValueError(name, f"an array of shape {given.shape}", f"one number, or {chart.n}")
-    limits = np.broadcast_to(given, (chart.n,))
+def _spread_limits(chart: Chart, name: str, value: ArrayLike) -> Array:
+    values = as_float_array(name, value)
+    if values.shape not in ((), (chart.n,)):
+        raise InvalidValueError(name, f"an array of shape {values.shape}", f"one number, or {chart.n}")
+    limits = np.broadcast_to(values, (chart.n,))
     bad = np.flatnonzero(~((limits > 0) & np.isfinite(limits)))
     if bad.size:
         joint = chart.problem.robot.joint_names[bad[0]]
@@ -455,37 +443,326 @@ def _of_joints(chart: Chart, name: str, value: ArrayLike) -> Array:
     return limits
 
 
-def _on_stamps(plan: Plan, curve: JointCurve, law: TimeLaw, limits: Limits, period: float) -> JointMotion:
+def _sample_on_stamps(
+    path: ToolPath, curve: JointCurve, law: TimeLaw, limits: "MotionLimits", period: float
+) -> JointMotion:
     """The motion at multiples of the period, slower until these and other instants keep the limits."""
-    law = _slowed(law, limits, *_motion(curve, law, np.linspace(0.0, law.duration, _INSTANTS))[2:])
-    for _ in range(_STRETCHES):
+    law = _slow_down(law, limits, *_evaluate_motion(curve, law, np.linspace(0.0, law.duration, RULES.instants))[2:])
+    for _ in range(RULES.stretches):
         stamps = max(4, int(np.ceil(law.duration / period - 1e-9)))
-        if stamps > _MOST_STAMPS:
-            raise InvalidValueError("period", period, f"at most {_MOST_STAMPS} time stamps in {law.duration:.3g} s")
-        law = law.stretched(stamps * period)
+        if stamps > RULES.most_stamps:
+            raise InvalidValueError(
+                "period", period, f"at most {RULES.most_stamps} time stamps in {law.duration:.3g} s"
+            )
+        law = law.stretch(stamps * period)
         times = period * np.arange(stamps + 1, dtype=float)
-        s, q, dq, ddq = _motion(curve, law, times)
-        slower = _slowed(law, limits, dq, ddq)
+        s, q, dq, ddq = _evaluate_motion(curve, law, times)
+        # Stamps may fall on corners between the other instants.
+        slower = _slow_down(law, limits, dq, ddq)
         if slower is law:
             break
         law = slower
     else:
         raise SolveError("no speed along the path keeps the limits at all time stamps")
-    x, xi = plan.x(s), plan.xi(s)
+    x, xi = path.x(s), path.xi(s)
     names = limits.chart.labels, limits.chart.problem.robot.joint_names
-    over = limits.chart.left_over(q[0], q[-1], _RETURNS)
-    return JointMotion(*names, times, q, dq, ddq, x, xi, s, over, limits.margins(q, dq, ddq))
+    over = limits.chart.left_over(q[0], q[-1], RULES.returns)
+    return JointMotion(*names, times, q, dq, ddq, x, xi, s, over, limits.measure_margins(q, dq, ddq))
 
 
-def _motion(curve: JointCurve, law: TimeLaw, times: Array) -> tuple[Array, Array, Array, Array]:
+def _evaluate_motion(curve: JointCurve, law: TimeLaw, times: Array) -> tuple[Array, Array, Array, Array]:
     """s (N,), and q, dq, ddq (N, n) at times (N,)."""
-    s, speed, rate = law.at(times)
-    q, first, second = curve.at(s)
+    s, speed, rate = law.evaluate(times)
+    q, first, second = curve.evaluate(s)
     dq, ddq = first * speed[:, None], second * speed[:, None] ** 2 + first * rate[:, None]
     return s, q, np.asarray(dq, dtype=float), np.asarray(ddq, dtype=float)
 
 
-def _slowed(law: TimeLaw, limits: Limits, dq: Array, ddq: Array) -> TimeLaw:
+def _slow_down(law: TimeLaw, limits: "MotionLimits", dq: Array, ddq: Array) -> TimeLaw:
     """The law, or a slower one if velocities or accelerations (N, n) exceed their limits."""
     used = max((np.abs(dq) / limits.velocity).max(), np.sqrt((np.abs(ddq) / limits.acceleration).max()))
-    return law if used <= 1 else law.stretched(law.duration * float(used) * _MARGIN)
+    return law if used <= 1 else law.stretch(law.duration * float(used) * RULES.stretch_margin)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionLimits:
+    """What a motion has to keep."""
+
+    chart: "Chart"
+    velocity: Array  #: (n,) [rad/s] or [m/s]
+    acceleration: Array  #: (n,) [rad/s^2] or [m/s^2]
+    distances: LinkDistances
+    clearance: float  #: smallest distance from obstacles to allow [m]
+
+    @property
+    def rows(self) -> ca.Function:
+        """q (n, 1) -> the rows J (m, n) whose singular values measure the distance to singular positions."""
+        clear, task = self.chart.problem.domain.singular_bound, self.chart.problem.task
+        return task.frame_jacobian_function if clear is None else clear.jacobian_function
+
+    @cached_property
+    def scale(self) -> Array:
+        """The scale of these rows, (m,); see `orthocas.ClearBox`."""
+        domain = self.chart.problem.domain
+        if domain.singular_bound is not None:
+            return domain.singular_bound.scale
+        J = self._compute_jacobian(sample_uniform(domain, RULES.scale_samples, 0))
+        return compute_row_scale(J[np.isfinite(J).all(axis=(1, 2))], self.chart.problem.task.units)
+
+    def compute_scaled_jacobian(self, q: Array) -> Array:
+        """D^-1 J at joint positions (P, n), (P, m, n)."""
+        J: Array = self._compute_jacobian(q) / self.scale[:, None]
+        return J
+
+    def _compute_jacobian(self, q: Array) -> Array:
+        J: Array = self._batched_jacobian(q)[0].reshape(-1, self.chart.m, self.chart.n)
+        return J
+
+    @cached_property
+    def _batched_jacobian(self) -> BlockedFunction:
+        return BlockedFunction(self.rows)
+
+    def check_kept(self, path: ToolPath, s: Array, q: Array) -> None:
+        """Raise PathError at the first place (P,) whose joint position (P, n) is lost, outside, or at an obstacle."""
+        finite = np.flatnonzero(np.isfinite(q).all(axis=1))
+        free = (self.distances(q[finite]) >= self.clearance).all(axis=1)
+        kept = finite[self.chart.problem.domain.contains(q[finite]) & free]
+        if len(kept) < len(q):
+            raise self._build_error(path, s, q, int(np.setdiff1d(np.arange(len(q)), kept)[0]))
+
+    def _build_error(self, path: ToolPath, s: Array, q: Array, k: int) -> PathError:
+        """What is wrong with the k-th joint position."""
+        last = max(k - 1, 0)
+        if not np.isfinite(q[k]).all():
+            return self.build_lost_error(path, LostCurve(s[:k], q[:k], float(s[k])))
+        where = path.describe_place(float(s[k]), self.chart.labels)
+        if not self.chart.problem.domain.contains(q[k]):
+            reason = f"it leaves the domain, stopped by {Walls(self.chart.problem).worst(q[k])}"
+            return PathError(f"the path cannot be followed {where}: {reason}{self._describe_reach(q[last])}")
+        # Neither lost nor outside: an obstacle.
+        distance = self.distances(q[k])
+        pair = self.distances.pairs[int(np.argmin(distance))]
+        least = float(distance.min())
+        gap = f"are {least:.3g} m apart" if least >= 0 else f"overlap by {-least:.3g} m"
+        return PathError(
+            f"the path cannot be followed {where}: {pair} {gap}, "
+            f"expected a distance of at least clearance = {self.clearance:g} m"
+        )
+
+    def build_lost_error(self, path: ToolPath, end: LostCurve) -> PathError:
+        """The error for a path that ends before s = 1."""
+        where = path.describe_place(end.beyond, self.chart.labels)
+        return PathError(
+            f"the path cannot be reached {where}: no joint position near the one before it has this x and xi, "
+            f"so x is out of reach or the chart is singular{self._describe_reach(end.q[-1]) if len(end.q) else ''}"
+        )
+
+    def _describe_reach(self, q: Array) -> str:
+        """How far the coordinates reach at a joint position before the end, if it lies inside the domain."""
+        try:
+            reach = xi_range(self.chart, q)
+        except InvalidValueError:
+            return ""
+        ranges = ", ".join(f"{part.label} in [{part.low:.4g}, {part.high:.4g}]" for part in reach)
+        return f"; just before, the coordinates reach {ranges} one at a time"
+
+    def measure_margins(self, q: Array, dq: Array, ddq: Array) -> Margins:
+        """What a motion leaves, at its time stamps."""
+        low, high = self.chart.problem.domain.bounds
+        room = np.minimum(q - low, high - q) / self.chart.problem.domain.half_width
+        worst = int(np.argmin(room.min(axis=0)))
+        bounded = bool(np.isfinite(room).any())
+        values = np.linalg.svd(self.compute_scaled_jacobian(q), compute_uv=False)
+        distances = self.distances(q)
+        pair = int(np.argmin(distances.min(axis=0))) if distances.size else -1
+        return Margins(
+            float(room.min()),
+            self.chart.problem.robot.joint_names[worst] if bounded else "",
+            float((np.abs(dq) / self.velocity).max()),
+            float((np.abs(ddq) / self.acceleration).max()),
+            float(values[:, -1].min()),
+            float(distances.min()) if distances.size else np.inf,
+            self.distances.pairs[pair] if distances.size else "",
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Costs:
+    """Residuals of joint positions, and their gradients."""
+
+    limits: MotionLimits
+
+    def __call__(self, q: Array) -> tuple[Array, Array]:
+        """Residuals (P, k) and gradients (P, k, n) at joint positions (P, n)."""
+        parts = [self._evaluate_boundaries(q), self._evaluate_task(q)]
+        if self.limits.distances.obstacles:
+            values, gradients = self.limits.distances.evaluate_gradients(q)
+            residuals, slopes = _evaluate_inverse(values - self.limits.clearance, RULES.away, RULES.too_near)
+            parts.append((residuals, slopes[..., None] * gradients))
+        return np.concatenate([part[0] for part in parts], axis=1), np.concatenate([part[1] for part in parts], axis=1)
+
+    def _evaluate_boundaries(self, q: Array) -> tuple[Array, Array]:
+        domain = self.limits.chart.problem.domain
+        bounded = np.flatnonzero(np.isfinite(domain.bounds[0]))
+        u = ((q - domain.centre) / domain.half_width)[:, bounded]
+        # u / sqrt(1 - u^2) in half-widths, and a straight line where that grows too steep.
+        near = np.clip(u, -RULES.inside, RULES.inside)
+        slopes = (1 - near**2) ** -1.5
+        residuals = near / np.sqrt(1 - near**2) + (u - near) * slopes
+        gradients = np.zeros((len(q), len(bounded), q.shape[1]))
+        gradients[:, np.arange(len(bounded)), bounded] = slopes / domain.half_width[bounded]
+        return residuals, gradients
+
+    def _evaluate_task(self, q: Array) -> tuple[Array, Array]:
+        left, values, right = np.linalg.svd(self.limits.compute_scaled_jacobian(q), full_matrices=False)
+        clear = self.limits.chart.problem.domain.singular_bound
+        bound = 0.0 if clear is None else clear.least_singular_value
+        residuals, slopes = _evaluate_inverse(values[:, -1:] - bound, RULES.regular, RULES.nearly_singular)
+        gradients = self._turning(q, left[:, :, -1] / self.limits.scale, right[:, -1])[0]
+        return residuals, slopes[..., None] * gradients[:, None]
+
+    @cached_property
+    def _turning(self) -> Batched:
+        """q, u, v -> the gradient (n, 1) of u^T J(q) v: with singular vectors, that of the singular value."""
+        chart = self.limits.chart
+        q, v, u = ca.SX.sym("q", chart.n), ca.SX.sym("v", chart.n), ca.SX.sym("u", chart.m)
+        product = ca.dot(u, self.limits.rows(q) @ v)
+        return Batched(dense_function("turning", [q, u, v], [ca.cse(ca.gradient(product, q))]))
+
+
+def _evaluate_inverse(room: Array, scale: float, least: float) -> tuple[Array, Array]:
+    """scale / room and its derivative; a straight line where room is below `least`."""
+    far = np.maximum(room, least)
+    slopes = -scale / far**2
+    return scale / far + (room - far) * slopes, slopes
+
+
+def walk(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
+    """Joint positions (P, n) near task values x (P, m), from q (n,).
+
+    At every place, steps of least norm towards x, and Gauss-Newton steps within the null space of J_x that lower the
+    costs, as in resolved-rate control with gradient projection.
+    """
+    points = []
+    for target in x:
+        for _ in range(RULES.walk_steps):
+            q = q + _compute_step(chart, costs, target, q)
+        points.append(q)
+    return np.array(points)
+
+
+def _compute_step(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
+    J = chart.relative.batched_rates(q[None])[0].reshape(chart.m, chart.n)
+    inner = np.linalg.svd(J)[2][chart.m :].T  # (n, r)
+    # Within the null space a damped Gauss-Newton step, towards x the step of least norm.
+    residuals, gradients = (part[0] for part in costs(q[None]))
+    G = gradients @ inner
+    along = -inner @ np.linalg.solve(G.T @ G + RULES.walk_damping * np.eye(chart.r), G.T @ residuals)
+    task = np.linalg.pinv(J, rcond=1e-3) @ chart.relative.difference(x, chart.task(q))
+    return _limit_step(task) + _limit_step(along)
+
+
+def _limit_step(step: Array) -> Array:
+    return np.asarray(step * min(1.0, RULES.walk_step / max(float(np.abs(step).max()), 1e-300)))
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Values of the spline, and what follows from them."""
+
+    values: Array  #: (K, r)
+    q: Array  #: (P, n)
+    residuals: Array  #: (P, k)
+    gradients: Array  #: (P, k, n)
+    cost: float
+
+
+class XiChoice:
+    """The problem for one tool path.
+
+    Args:
+        plan: the tool path.
+        costs: of joint positions.
+        solver: solves for them.
+    """
+
+    def __init__(self, path: ToolPath, costs: Costs, solver: PhiSolver) -> None:
+        self.path, self.costs, self.solver, self.chart = path, costs, solver, solver.chart
+        pieces = _count_pieces(path)
+        self.s = np.linspace(0.0, 1.0, RULES.cost_places * pieces + 1)
+        self.nodes = np.linspace(0.0, 1.0, pieces + 1)
+        # Closed paths have the same value at both ends.
+        unit = np.eye(pieces + 1)
+        if path.closed:
+            unit = np.vstack([unit[:pieces, :pieces], unit[:1, :pieces]])
+        self._unit = unit
+        basis = self._build_spline(unit)
+        self._basis = basis(self.s)
+        # Little motion: the squares of xi' and xi'', as a quadratic form of the values.
+        slopes, bends = basis(self.s, 1), basis(self.s, 2)
+        self._smooth = (RULES.speed_weight * slopes.T @ slopes + RULES.bend_weight * bends.T @ bends) / len(self.s)
+
+    def optimise(self, first: Array) -> ToolPath:
+        """The tool path with chosen coordinates, from joint positions near it at the places `s`, (P, n)."""
+        state = self._find_first_state(first)
+        if state is None:
+            return self.path
+        damping = RULES.damping
+        for _ in range(RULES.iterations):
+            hessian, gradient = self._build_model(state)
+            # Levenberg-Marquardt: more damping until a step lowers the cost.
+            better = None
+            while better is None and damping < RULES.most_damping:
+                better = self._try_step(state, hessian, gradient, damping)
+                damping *= 8 if better is None else 0.3
+            if better is None:
+                break
+            gain, state = state.cost - better.cost, better
+            if gain < RULES.least_gain * state.cost:
+                break
+        return self.path.replace_xi(self._build_spline(self._unit @ state.values))
+
+    def _find_first_state(self, q: Array) -> _State | None:
+        """The spline through the coordinates of joint positions, or through their mean where that has no solution."""
+        xi = counted_on(self.chart.xi(q), self.chart.turns[self.chart.m :])
+        values = np.linalg.lstsq(self._basis, xi, rcond=None)[0]
+        return self._evaluate_state(values, q) or self._evaluate_state(np.tile(xi.mean(axis=0), (len(values), 1)), q)
+
+    def _build_spline(self, values: Array) -> CubicSpline:
+        return CubicSpline(self.nodes, values, bc_type="periodic" if self.path.closed else "not-a-knot")
+
+    def _evaluate_state(self, values: Array, near: Array) -> _State | None:
+        """The state of values (K, r), with joint positions near others; None where Newton's method fails."""
+        goals = np.hstack([self.path.x(self.s), self._basis @ values])
+        q = self.solver.solve(near, goals)
+        if not np.isfinite(q).all():
+            return None
+        smooth = float(np.einsum("kr,kl,lr->", values, self._smooth, values))
+        residuals, gradients = self.costs(q)
+        return _State(values, q, residuals, gradients, float((residuals**2).sum() / len(q)) + smooth)
+
+    def _build_model(self, state: _State) -> tuple[Array, Array]:
+        """Gauss-Newton Hessian (K r, K r) and half the gradient (K r,) of the cost."""
+        r, m, B = self.chart.r, self.chart.m, self._basis
+        # Gradients with respect to xi: q moves by J^-1 [0; dxi].
+        G = state.gradients @ np.linalg.inv(self.solver.jacobian(state.q))[:, :, m:] / np.sqrt(len(B))
+        squares = np.einsum("pka,pkb->pab", G, G)
+        hessian = np.einsum("pi,pj,pab->iajb", B, B, squares, optimize=True)
+        hessian += np.einsum("ij,ab->iajb", self._smooth, np.eye(r))
+        slope = np.einsum("pi,pka,pk->ia", B, G, state.residuals / np.sqrt(len(B)), optimize=True)
+        slope += self._smooth @ state.values
+        size = B.shape[1] * r
+        return hessian.reshape(size, size), slope.ravel()
+
+    def _try_step(self, state: _State, hessian: Array, gradient: Array, damping: float) -> _State | None:
+        """A damped step, if it lowers the cost."""
+        scaled = hessian + damping * np.diag(np.diag(hessian) + 1e-9)
+        change = -np.linalg.solve(scaled, gradient).reshape(state.values.shape)
+        new = self._evaluate_state(state.values + change, state.q)
+        return new if new is not None and new.cost < state.cost else None
+
+
+def _count_pieces(path: ToolPath) -> int:
+    """Pieces of the spline: more on longer paths."""
+    length = np.linalg.norm(path.steps, axis=1).sum()
+    return int(np.clip(np.ceil(RULES.piece_density * length), RULES.fewest_pieces, RULES.most_pieces))

@@ -100,7 +100,7 @@ class JointMotion(Shown):
 
     def plot(self) -> "Figure":
         """Joints, speeds, task values and coordinates over time, as a matplotlib figure."""
-        return _figure(self)
+        return _draw_figure(self)
 
     def save_csv(self, path: str | Path, force: bool = False) -> None:
         """Write a CSV file: time_s, then q, dq and ddq of each joint, task values, and coordinates.
@@ -113,12 +113,13 @@ class JointMotion(Shown):
         target = as_path("path", path)
         require_place(target, force)
         with publish(target.parent) as drafts:
-            (drafts / target.name).write_text(self._text(), encoding="utf-8", newline="")
+            (drafts / target.name).write_text(self._format_text(), encoding="utf-8", newline="")
 
-    def _text(self) -> str:
+    def _format_text(self) -> str:
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         names = self.joint_names
+        # q, then dq, then ddq of all joints; x and xi last.
         rates = [f"{order}_{name}" for order in ("d", "dd") for name in names]
         writer.writerow([_HEAD, *names, *rates, *self.labels])
         table = np.column_stack([self.times, self.q, self.dq, self.ddq, self.x, self.xi])
@@ -145,7 +146,7 @@ def _is_ours(path: Path) -> bool:
         return False
 
 
-def _figure(motion: JointMotion) -> "Figure":
+def _draw_figure(motion: JointMotion) -> "Figure":
     """Joint positions and speeds on the left, task values and coordinates on the right, all over time."""
     from orthocas.tools.picture import Picture  # matplotlib takes a third of a second
 

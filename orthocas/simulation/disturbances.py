@@ -19,14 +19,29 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, freeze_array, require_count, require_known, require_shape
 from orthocas.tools.json import Reader
 
-_STICTION_SPEED = 0.01  # [rad/s] or [m/s]: above twice this speed, Coulomb friction is nearly at its full value
-
 Link = str | int | None  #: a link, by the joint that moves it (name or index), or a frame by its name; None: the tip
-_MOST_INSTANTS = 1e6
-_LONGEST = 200  # most characters of the names of joints in an error
-_SHORTEST = 1e-3  # time between points, and length of a run or a push [s]
 _WITH_STEPS = ("steps", "duration", "start", "natural_frequency", "damping_ratio", "pushes")
 _WITH_POINTS = ("points", "start", "pushes")
+
+
+@dataclass(frozen=True, slots=True)
+class SimulationRules:
+    """Numbers of simulations."""
+
+    tolerance: float = 1e-8  #: relative and absolute, of the integrators
+    outputs: int = 25  #: instants a call of an integrator: one integrator serves all, and Ctrl-C waits for one call
+    ticks: int = 50  #: a call, for the same reason
+    same_time: float = 1e-9  #: events closer than this differ only by rounding [s]
+    most_ticks: float = 1e7  #: of a sampled run
+    most_instants: float = 1e6  #: of a run that is read from a file
+    shortest: float = 1e-3  #: time between points, and length of a run or a push [s]
+    stiction_speed: float = 0.01  #: above twice this, Coulomb friction is nearly at its full value [rad/s] or [m/s]
+    beyond: float = 1e-3  #: a joint limit: stops give way a little [rad] or [m]
+    lasting: float = 0.1  #: at the limit, from which on the storage must not rise [s]
+    no_step: float = 1e-9  #: smaller differences of targets are rounding
+
+
+RULES = SimulationRules()
 
 
 class Place(NamedTuple):
@@ -142,7 +157,7 @@ class Friction:
     def torque(dq: ca.SX, numbers: ca.SX) -> ca.SX:
         """Friction torque, to be subtracted from the joint torque, (n, 1), for `numbers` as a column (2 n, 1)."""
         n = dq.shape[0]
-        friction: ca.SX = numbers[:n] * dq + numbers[n:] * ca.tanh(dq / _STICTION_SPEED)
+        friction: ca.SX = numbers[:n] * dq + numbers[n:] * ca.tanh(dq / RULES.stiction_speed)
         return friction
 
 
@@ -210,13 +225,13 @@ class Loads:
     def __init__(self, tree: KinematicTree, pushes: Sequence[Push] = ()) -> None:
         self.pushes = tuple(pushes)
         self._tree = tree
-        self._of_push = [place_of(tree, push.link, push.point) for push in self.pushes]
+        self._places_of_pushes = [place_of(tree, push.link, push.point) for push in self.pushes]
         self._rows  # noqa: B018 (refuses torques of other robots at once)
 
     @cached_property
     def places(self) -> tuple[Place, ...]:
         """The different places where forces act."""
-        return tuple(dict.fromkeys(self._of_push))
+        return tuple(dict.fromkeys(self._places_of_pushes))
 
     @property
     def size(self) -> int:
@@ -251,7 +266,7 @@ class Loads:
     def _rows(self) -> Array:
         """The row of each push while it acts, (pushes, 3 P + n)."""
         rows = np.zeros((len(self.pushes), self.size))
-        for row, push, place in zip(rows, self.pushes, self._of_push, strict=True):
+        for row, push, place in zip(rows, self.pushes, self._places_of_pushes, strict=True):
             load, k = push.load(self._tree.n), self.places.index(place)
             row[3 * k : 3 * k + 3], row[3 * len(self.places) :] = load[:3], load[3:]
         return rows
@@ -283,17 +298,21 @@ def read_steps(path: str | Path, chart: Chart) -> Plan:
     has_steps = "steps" in data
     where = "the object with 'steps'" if has_steps else "the object with 'points'"
     reader.fields(data, where, _WITH_STEPS if has_steps else _WITH_POINTS)
+    # The motion begins at the centre of the domain, or where the file says.
     q_start = chart.problem.domain.centre
     if "start" in data:
         q_start = reader.numbers(data["start"], "start", chart.n)
     try:
-        reference = (_steps if has_steps else _points)(reader, data, chart.labels, chart.phi(q_start))
+        reference = (_read_step_reference if has_steps else _read_point_reference)(
+            reader, data, chart.labels, chart.phi(q_start)
+        )
+        # A file may ask for more than a computer has room for.
         instants = reference.duration / reference.spacing
-        if instants > _MOST_INSTANTS:
+        if instants > RULES.most_instants:
             raise reader.fault(
-                f"the run needs {instants:.3g} instants to show every swing, expected at most {_MOST_INSTANTS:g}"
+                f"the run needs {instants:.3g} instants to show every swing, expected at most {RULES.most_instants:g}"
             )
-        pushes = _pushes(reader, data.get("pushes", []), chart.problem.robot.joint_names, reference.duration)
+        pushes = _read_pushes(reader, data.get("pushes", []), chart.problem.robot.joint_names, reference.duration)
     except StepsFileError:
         raise
     except OrthocasError as error:
@@ -301,14 +320,14 @@ def read_steps(path: str | Path, chart: Chart) -> Plan:
     return Plan(reference, q_start, pushes, has_steps)
 
 
-def _steps(reader: Reader, data: Mapping[str, Any], labels: tuple[str, ...], start: Array) -> Reference:
-    duration = reader.number(data.get("duration"), "duration", least=_SHORTEST)
+def _read_step_reference(reader: Reader, data: Mapping[str, Any], labels: tuple[str, ...], start: Array) -> Reference:
+    duration = reader.number(data.get("duration"), "duration", least=RULES.shortest)
     frequency = reader.number(data.get("natural_frequency", NATURAL_FREQUENCY), "natural_frequency", above=0.0)
     ratio = reader.number(data.get("damping_ratio", DAMPING_RATIO), "damping_ratio", least=0.0)
     changes, before = [], 0.0
     targets = dict(zip(labels, start.tolist(), strict=True))
     for k, entry in enumerate(reader.items(data["steps"], "steps")):
-        time, targets = _change(reader, entry, f"steps[{k}]", targets)
+        time, targets = _read_change(reader, entry, f"steps[{k}]", targets)
         if not before <= time < duration:
             raise reader.wrong(f"steps[{k}].time", time, f"from {before:g} to below the duration {duration:g}")
         if not (entry.get("move") or entry.get("to")):
@@ -318,12 +337,12 @@ def _steps(reader: Reader, data: Mapping[str, Any], labels: tuple[str, ...], sta
     return Reference.steps(labels, start, changes, duration, frequency, ratio)
 
 
-def _points(reader: Reader, data: Mapping[str, Any], labels: tuple[str, ...], start: Array) -> Reference:
+def _read_point_reference(reader: Reader, data: Mapping[str, Any], labels: tuple[str, ...], start: Array) -> Reference:
     times, targets = [0.0], [dict(zip(labels, start.tolist(), strict=True))]
     for k, entry in enumerate(reader.items(data["points"], "points")):
-        time, values = _change(reader, entry, f"points[{k}]", targets[-1])
-        if time < times[-1] + _SHORTEST:
-            want = f"at least {times[-1] + _SHORTEST:g}, because the start is the point at 0"
+        time, values = _read_change(reader, entry, f"points[{k}]", targets[-1])
+        if time < times[-1] + RULES.shortest:
+            want = f"at least {times[-1] + RULES.shortest:g}, because the start is the point at 0"
             raise reader.wrong(f"points[{k}].time", time, want)
         times.append(time)
         targets.append(values)
@@ -332,7 +351,9 @@ def _points(reader: Reader, data: Mapping[str, Any], labels: tuple[str, ...], st
     return Reference.through(labels, times, np.array([list(values.values()) for values in targets]))
 
 
-def _change(reader: Reader, data: object, where: str, before: Mapping[str, float]) -> tuple[float, dict[str, float]]:
+def _read_change(
+    reader: Reader, data: object, where: str, before: Mapping[str, float]
+) -> tuple[float, dict[str, float]]:
     """Time and targets of one step or point. Quantities that it does not name keep their previous targets."""
     entry = reader.fields(data, where, ("time", "move", "to"))
     targets, named = dict(before), set()
@@ -345,7 +366,7 @@ def _change(reader: Reader, data: object, where: str, before: Mapping[str, float
     return reader.number(entry.get("time"), f"{where}.time", least=0.0), targets
 
 
-def _pushes(reader: Reader, data: object, joint_names: tuple[str, ...], run_ends: float) -> tuple[Push, ...]:
+def _read_pushes(reader: Reader, data: object, joint_names: tuple[str, ...], run_ends: float) -> tuple[Push, ...]:
     pushes = []
     for k, item in enumerate(reader.items(data, "pushes")):
         where = f"pushes[{k}]"
@@ -355,14 +376,14 @@ def _pushes(reader: Reader, data: object, joint_names: tuple[str, ...], run_ends
         start = reader.number(entry.get("start"), f"{where}.start", least=0.0)
         if start >= run_ends:
             raise reader.wrong(f"{where}.start", start, f"below the end of the run at {run_ends:g}")
-        duration = reader.number(entry.get("duration"), f"{where}.duration", least=_SHORTEST)
+        duration = reader.number(entry.get("duration"), f"{where}.duration", least=RULES.shortest)
         force = reader.numbers(entry.get("force", [0.0] * 3), f"{where}.force", 3)
         torque = reader.numbers(entry.get("torque", [0.0] * len(joint_names)), f"{where}.torque", len(joint_names))
-        pushes.append(Push(start, duration, force, torque, *_place(reader, entry, where, joint_names)))
+        pushes.append(Push(start, duration, force, torque, *_read_place(reader, entry, where, joint_names)))
     return tuple(pushes)
 
 
-def _place(
+def _read_place(
     reader: Reader, entry: Mapping[str, Any], where: str, joint_names: tuple[str, ...]
 ) -> tuple[str | int | None, Array]:
     """Where the force of a push acts: a link (None: the tip), and a point (3,) in its frame."""
@@ -372,6 +393,6 @@ def _place(
     link = entry.get("link")
     whole = isinstance(link, int) and not isinstance(link, bool) and 0 <= link < len(joint_names)
     if "link" in entry and not whole and link not in joint_names:
-        names = ", ".join(joint_names)[:_LONGEST]
+        names = ", ".join(joint_names)[:200]
         raise reader.wrong(f"{where}.link", link, f"the index of a joint from 0, or a name: {names}")
     return link, reader.numbers(entry.get("point", [0.0] * 3), f"{where}.point", 3)

@@ -5,6 +5,7 @@ import subprocess
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -28,20 +29,30 @@ if TYPE_CHECKING:
     from orthocas.simulation.trajectory import Trajectory
 
 ACTUAL, FALLBACK = "#3d85c6", "#d62728"
-_WANTED, _STORAGE = "#222222", "#1b9e77"
-_SMALL = 8.0  # font size [pt]
-_NARROWEST = 1e-2  # smallest range of a panel, relative to the widest, so that a quantity at rest looks at rest
+_REFERENCE, _STORAGE = "#222222", "#1b9e77"
 _ARM, _TRAIL, _TARGET, _SHADOW = "#444c56", ACTUAL, FALLBACK, "#cfcfcf"
 _LEGEND: dict[str, Any] = {"fontsize": 8, "ncols": 2, "frameon": False}
-_WIDTH, _DPI = 8.6, 100  # [inch], [dots/inch]
-_PANEL = 0.66  # height of a quantity's panel [inch]
-_MARGIN = 0.08  # around the arm, as a share of the widest range
-_FLAT = 1e-9  # range of a coordinate of a planar arm [m]
 FORMATS = ("gif", "mp4")
-_RATE = 20  # frames per second
-_MOST = 400  # frames; longer runs play faster than real time
-_COLOURS = 128
 Frame = NDArray[np.uint8]  #: (height, width, 3)
+
+
+@dataclass(frozen=True, slots=True)
+class PictureRules:
+    """Numbers of figures and animations of runs."""
+
+    font: float = 8.0  #: [pt]
+    narrowest: float = 1e-2  #: range of a panel, relative to the widest, so that a quantity at rest looks at rest
+    width: float = 8.6  #: of an animation [inch]
+    dpi: int = 100
+    panel: float = 0.66  #: height of a quantity's panel [inch]
+    margin: float = 0.08  #: around the arm, as a fraction of the widest range
+    flat: float = 1e-9  #: range of a coordinate of a planar arm [m]
+    rate: int = 20  #: frames per second
+    most_frames: int = 400  #: longer runs play faster than real time
+    colours: int = 128
+
+
+RULES = PictureRules()
 
 
 def units_of(problem: Problem) -> dict[str, str]:
@@ -68,7 +79,7 @@ def trajectory_figure(trajectory: "Trajectory", units: Mapping[str, str] | None 
     draw_quantities(quantities, trajectory, units)
     for axes, label, worst in zip(quantities, trajectory.labels, trajectory.tracking_error, strict=True):
         axes.set_title(f"largest error {worst:.2g} {units.get(label, '')}", loc="right", fontsize=7.5, pad=2)
-    quantities[0].legend(fontsize=_SMALL, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False)
+    quantities[0].legend(fontsize=RULES.font, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False)
     others = right.subplots(2 + (trajectory.kind == "torque"), 1, sharex=True)
     _draw_others(others, trajectory, units)
     for axes in (*quantities, *others):
@@ -77,7 +88,7 @@ def trajectory_figure(trajectory: "Trajectory", units: Mapping[str, str] | None 
         axes.set_xlabel("time [s]", fontsize=9)
     for column in (left, right):
         column.align_ylabels()
-    figure.suptitle(_title(trajectory), fontsize=10.5)
+    figure.suptitle(_build_title(trajectory), fontsize=10.5)
     return figure
 
 
@@ -88,16 +99,16 @@ def draw_quantities(panels: Array, trajectory: "Trajectory", units: Mapping[str,
         [trajectory.value[good], trajectory.reference]
     )  # chart coordinates are meaningless outside the domain
     lows, highs = seen.min(axis=0), seen.max(axis=0)
-    spans = np.maximum(highs - lows, max(_NARROWEST * (highs - lows).max(), 1e-9))
+    spans = np.maximum(highs - lows, max(RULES.narrowest * (highs - lows).max(), 1e-9))
     middles = (lows + highs) / 2
     for i, (axes, label) in enumerate(zip(panels, trajectory.labels, strict=True)):
         if drawn:
             axes.plot(trajectory.times, trajectory.value[:, i], color=ACTUAL, linewidth=2.2, label="actual")
-        axes.plot(trajectory.times, trajectory.reference[:, i], "--", color=_WANTED, linewidth=1, label="reference")
+        axes.plot(trajectory.times, trajectory.reference[:, i], "--", color=_REFERENCE, linewidth=1, label="reference")
         axes.set_ylim(middles[i] - 0.58 * spans[i], middles[i] + 0.58 * spans[i])
         unit = f" [{units[label]}]" if label in units else ""
-        axes.set_ylabel(f"{_in_mathematics(label)}{unit}", fontsize=9)
-        _style(axes, trajectory)
+        axes.set_ylabel(f"{_format_label(label)}{unit}", fontsize=9)
+        _set_style(axes, trajectory)
 
 
 def shade_fallback(axes: Axes, trajectory: "Trajectory") -> None:
@@ -126,34 +137,34 @@ def _draw_others(panels: Array, trajectory: "Trajectory", units: Mapping[str, st
         panels[2].plot(trajectory.times, storage, color=_STORAGE, linewidth=1.3)
         panels[2].set_ylabel("storage V [J]", fontsize=9)
     for axes in panels:
-        _style(axes, trajectory)
+        _set_style(axes, trajectory)
 
 
-def _style(axes: Axes, trajectory: "Trajectory") -> None:
+def _set_style(axes: Axes, trajectory: "Trajectory") -> None:
     axes.set_xlim(trajectory.times[0], max(trajectory.times[-1], 1e-9))
     axes.ticklabel_format(useOffset=False)
-    axes.tick_params(labelsize=_SMALL)
+    axes.tick_params(labelsize=RULES.font)
     axes.grid(alpha=0.3)
 
 
-def _title(trajectory: "Trajectory") -> str:
+def _build_title(trajectory: "Trajectory") -> str:
     text = f"{trajectory.controller}, {trajectory.times[-1]:.4g} s"
     if trajectory.outcome.value != "complete":
         text += f": {trajectory.outcome.value}, {trajectory.reason or 'run ended early'}"
     lasting = trajectory.seconds_in_status
     cut, red = ([status for status in lasting if (status in FROM_THE_LAW) == kind] for kind in (True, False))
     if red:
-        text += f"\nred: {'catcher' if trajectory.catches else 'fallback'}, {_durations(lasting, red)}"
+        text += f"\nred: {'catcher' if trajectory.catches else 'fallback'}, {_format_durations(lasting, red)}"
     if cut := [status for status in cut if status is not ControlStatus.OK]:
-        text += f"\n{_durations(lasting, cut)}"
+        text += f"\n{_format_durations(lasting, cut)}"
     return text
 
 
-def _durations(lasting: Mapping[ControlStatus, float], chosen: Sequence[ControlStatus]) -> str:
+def _format_durations(lasting: Mapping[ControlStatus, float], chosen: Sequence[ControlStatus]) -> str:
     return ", ".join(f"{status.words} {lasting[status]:.3g} s" for status in chosen)
 
 
-def _in_mathematics(label: str) -> str:
+def _format_label(label: str) -> str:
     """A label such as xi1 as a mathematical symbol; other labels unchanged."""
     number = label.removeprefix("xi")
     return rf"$\xi_{{{number}}}$" if label.startswith("xi") and number.isdigit() else label
@@ -170,8 +181,10 @@ class MovingPicture:
 
     def __init__(self, trajectory: "Trajectory", problem: Problem, speed: float = 1.0) -> None:
         k = len(trajectory.labels)
-        height = max(4.2, _PANEL * k + 0.8)
-        figure = Figure(figsize=(_WIDTH, round(height * _DPI / 2) * 2 / _DPI), dpi=_DPI)  # even height: MP4 needs it
+        height = max(4.2, RULES.panel * k + 0.8)
+        figure = Figure(
+            figsize=(RULES.width, round(height * RULES.dpi / 2) * 2 / RULES.dpi), dpi=RULES.dpi
+        )  # even height: MP4 needs it
         self._canvas = cast(Any, FigureCanvasAgg(figure))
         self._times, self._values = trajectory.times, trajectory.value
         self._arm = _Arm(figure, trajectory, problem)
@@ -199,11 +212,11 @@ class MovingPicture:
         """Frames of the run at the given instants, by index."""
         for index in instants:
             self._canvas.restore_region(self._background)
-            for artist in self._moved(int(index)):
+            for artist in self._move(int(index)):
                 self._canvas.figure.draw_artist(artist)
             yield np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
-    def _moved(self, index: int) -> list[Artist]:
+    def _move(self, index: int) -> list[Artist]:
         """All moving artists, placed as they are at an instant."""
         now = self._times[index]
         for i in range(self._values.shape[1]):
@@ -220,10 +233,10 @@ class _Arm:
     def __init__(self, figure: Figure, trajectory: "Trajectory", problem: Problem) -> None:
         points = problem.robot.joint_points(trajectory.q)  # (N, points, 3)
         low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
-        flat = np.flatnonzero(high - low < _FLAT)
+        flat = np.flatnonzero(high - low < RULES.flat)
         shown = np.delete(np.arange(3), flat[-1]) if flat.size else np.arange(3)
-        axes = _axes_around(figure, low[shown], high[shown], ["xyz"[i] for i in shown])
-        self._points, self._targets = points[..., shown], _tip_targets(trajectory, problem)[:, shown]
+        axes = _build_axes(figure, low[shown], high[shown], ["xyz"[i] for i in shown])
+        self._points, self._targets = points[..., shown], _compute_tip_targets(trajectory, problem)[:, shown]
         zero = np.zeros((len(shown), 0))
         axes.plot(*self._points[0, :1].T, "s", color=_ARM, markersize=9)
         self._lines: list[Any] = [
@@ -254,7 +267,7 @@ class _Arm:
         return [*self._shadow, *self._lines]
 
 
-def _tip_targets(trajectory: "Trajectory", problem: Problem) -> Array:
+def _compute_tip_targets(trajectory: "Trajectory", problem: Problem) -> Array:
     """Target of the tip, (N, 3). Axes that the task leaves free follow the tip; NaN if the task is not its position."""
     if not problem.task.of_tip or not problem.task.name.startswith("position:"):
         return np.full((len(trajectory.times), 3), np.nan)
@@ -264,10 +277,10 @@ def _tip_targets(trajectory: "Trajectory", problem: Problem) -> Array:
     return target
 
 
-def _axes_around(figure: Figure, low: Array, high: Array, names: list[str]) -> Any:
+def _build_axes(figure: Figure, low: Array, high: Array, names: list[str]) -> Any:
     """Axes for the arm, with the same scale in all directions."""
     longest = (high - low).max()
-    middle, extent = (low + high) / 2, high - low + 2 * _MARGIN * longest
+    centres, extent = (low + high) / 2, high - low + 2 * RULES.margin * longest
     if len(names) == 2:
         axes: Any = figure.add_axes((0.075, 0.17, 0.445, 0.74))
         shape = figure.get_size_inches() * axes.get_position().size
@@ -279,7 +292,7 @@ def _axes_around(figure: Figure, low: Array, high: Array, names: list[str]) -> A
         axes.set_box_aspect(extent, zoom=0.95)
         axes.view_init(elev=22, azim=-60)
         axes.locator_params(nbins=4)
-    for letter, name, centre, length in zip("xyz", names, middle, extent, strict=False):
+    for letter, name, centre, length in zip("xyz", names, centres, extent, strict=False):
         getattr(axes, f"set_{letter}lim")(centre - length / 2, centre + length / 2)
         getattr(axes, f"set_{letter}label")(f"{name} [m]", fontsize=9)
     axes.tick_params(labelsize=8)
@@ -322,49 +335,46 @@ def save_animation(
     require_format(target.suffix.removeprefix("."))
     require_writable(target, ArchiveError)
     require_replaceable_files(target.parent, [target.name], force)
-    instants, speed = _chosen(trajectory.times)
+    # Frames at instants of the run, which plays faster than real time if it is long.
+    times = trajectory.times
+    speed = max(1.0, float(times[-1] - times[0]) * RULES.rate / RULES.most_frames)
+    shown = np.arange(times[0], times[-1] + 1e-9, speed / RULES.rate)
+    instants = np.clip(np.searchsorted(times, shown - 1e-9), 0, len(times) - 1)
     film = MovingPicture(trajectory, problem, speed)
     samples = np.vstack(list(film.pictures(instants[[0, -1]])))
-    pictures = _watched(film.pictures(instants), len(instants), monitor)
+
+    def draw() -> Iterator[Frame]:
+        for k, picture in enumerate(film.pictures(instants), start=1):
+            yield picture
+            monitor(Progress("draw animation", k / len(instants), f"frame {k} of {len(instants)}"))
+
     with publish(target.parent, listed=True, force=force) as folder:
         draft = folder / target.name
         if target.suffix == ".gif":
-            _write_gif(draft, pictures, samples)
+            _write_gif(draft, draw(), samples)
         else:
-            _write_mp4(draft, pictures, (len(samples) // 2, samples.shape[1]))
-
-
-def _chosen(times: NDArray[np.float64]) -> tuple[NDArray[np.int_], float]:
-    """Indices of the instants to show, and the factor by which they play faster than real time."""
-    length = float(times[-1] - times[0])
-    speed = max(1.0, length * _RATE / _MOST)
-    wanted = np.arange(times[0], times[-1] + 1e-9, speed / _RATE)
-    return np.clip(np.searchsorted(times, wanted - 1e-9), 0, len(times) - 1), speed
-
-
-def _watched(pictures: Iterator[Frame], count: int, monitor: Monitor) -> Iterator[Frame]:
-    for k, picture in enumerate(pictures, start=1):
-        yield picture
-        monitor(Progress("draw animation", k / count, f"frame {k} of {count}"))
+            _write_mp4(draft, draw(), (len(samples) // 2, samples.shape[1]))
 
 
 def _write_gif(path: Path, pictures: Iterator[Frame], samples: Frame) -> None:
     """Write frames in the palette of the samples; each frame stores only what changes."""
-    palette = Image.fromarray(samples).quantize(_COLOURS)
+    palette = Image.fromarray(samples).quantize(RULES.colours)
     frames = (Image.fromarray(p).quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures)
     first = next(frames)
-    with path.open("wb") as file:  # unlike a file that Pillow opens, this one is closed even after Ctrl-C
-        first.save(file, "GIF", save_all=True, append_images=frames, duration=1000 // _RATE, loop=0, optimize=True)
+    # Unlike a file that Pillow opens, this one is closed even after Ctrl-C.
+    with path.open("wb") as file:
+        first.save(file, "GIF", save_all=True, append_images=frames, duration=1000 // RULES.rate, loop=0, optimize=True)
 
 
 def _write_mp4(path: Path, pictures: Iterator[Frame], size: tuple[int, int]) -> None:
     """Send raw frames of size (height, width) to ffmpeg through a pipe."""
-    come = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[1]}x{size[0]}", "-r", str(_RATE), "-i", "-"]
+    come = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[1]}x{size[0]}", "-r", str(RULES.rate), "-i", "-"]
     command = ["ffmpeg", "-loglevel", "error", "-y", *come, "-pix_fmt", "yuv420p", str(path)]
     with tempfile.TemporaryFile() as said:
         ffmpeg = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=said, stderr=said)
         try:
-            with suppress(BrokenPipeError), ffmpeg:  # if ffmpeg gives up, its messages say why
+            # If ffmpeg gives up, its messages say why.
+            with suppress(BrokenPipeError), ffmpeg:
                 assert ffmpeg.stdin is not None
                 for picture in pictures:
                     ffmpeg.stdin.write(picture.tobytes())

@@ -14,16 +14,13 @@ from orthocas.control.reference import Reference
 from orthocas.errors import SimulationError
 from orthocas.robots import dynamics
 from orthocas.robots.robot import Robot
-from orthocas.simulation.disturbances import Friction, Loads, Noise, Push, Stops
+from orthocas.simulation.disturbances import RULES, Friction, Loads, Noise, Push, Stops
 from orthocas.tools.cached import building, cached_property
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import expand_scalars
 from orthocas.tools.interrupts import deferred
 
 KEPT = 32  #: functions of each kind that a process remembers
-_OUTPUTS = 25  # instants per integrator call: one integrator serves all calls, and Ctrl-C waits for one call at most
-_SAME = 1e-9  # [s]: events closer than this differ only by rounding
-_TICKS = 50  # ticks per integrator call
 #: span [s], start of the reference's segment [s], its parameters, load, state -> states at 25 equally spaced instants
 Integrator = Callable[[tuple[float, float], float, Array, Array, Array], Array]
 #: state; references with derivatives (N, 3 k), noise and loads of N ticks -> states after them, commands, status (N, 1)
@@ -63,7 +60,7 @@ class ClosedLoop:
     @cached_property
     def plant_rate(self) -> ca.Function:
         """state, command (n, 1), load (`Loads.size`, 1) -> rate of the state."""
-        plant = _plant_of_numbers(Keyed(self.plant_key, self))
+        plant = _build_plant(Keyed(self.plant_key, self))
         state, command, load, _ = plant.sx_in()
         rate = plant.call([state, command, load, ca.SX(ca.DM(self.plant_numbers))])
         return ca.Function("plant", [state, command, load], rate)
@@ -78,6 +75,7 @@ class ClosedLoop:
         numbers = ca.SX.sym("numbers", len(self.plant_numbers))
         if not self.torque:
             return ca.Function("plant", [q, command, load, numbers], [command])
+        # M ddq + C dq + g = command + loads + stops - friction
         torque = command + self.loads.joint_torques(q, load)
         if self.stops is not None:
             torque += self.stops.torque(self.plant.tree, q, dq)
@@ -127,7 +125,7 @@ class ClosedLoop:
         """
         gains = tuple(gain.tobytes() for gain in self.controller.gains.values())
         plant = (self.plant_key, self.plant_numbers.tobytes())
-        return _rate(Keyed((self.controller.function, gains, plant), self), reference.profile)
+        return _build_rate(Keyed((self.controller.function, gains, plant), self), reference.profile)
 
 
 @dataclass(frozen=True)
@@ -139,12 +137,12 @@ class Keyed:
 
 
 @lru_cache(KEPT)
-def _plant_of_numbers(keyed: Keyed) -> ca.Function:
+def _build_plant(keyed: Keyed) -> ca.Function:
     return keyed.loop.plant_of_numbers
 
 
 @lru_cache(KEPT)
-def _rate(keyed: Keyed, profile: ca.Function) -> ca.Function:
+def _build_rate(keyed: Keyed, profile: ca.Function) -> ca.Function:
     loop = keyed.loop
     state = ca.MX.sym("state", loop.size)
     t, parameters = ca.MX.sym("t"), ca.MX.sym("parameters", profile.size1_in(1))
@@ -210,26 +208,28 @@ class CompiledLoop:
     """
 
     def __init__(self, loop: ClosedLoop, reference: Reference) -> None:
-        with deferred(), building:  # CasADi may lose Ctrl-C while it builds functions
-            self._law = _law(loop.controller)
-            self._plant = _plant(Keyed(loop.plant_key, loop))
-            self._profile = _profile(reference.profile)
+        # CasADi may lose Ctrl-C while it builds functions.
+        with deferred(), building:
+            law = loop.controller
+            self._law = _compile_law(law.graph, law.measured, law.energy_graph)
+            self._plant = _compile_plant(Keyed(loop.plant_key, loop))
+            self._profile = _compile_profile(reference.profile)
         self._loop, self._gains = loop, list(loop.controller.gains.values())
 
     def continuous(self, step: float, tolerance: float, outputs: int) -> Callable[..., Array]:
         """What `integrate` calls, for one thread; the first step has the given length [s]."""
-        return partial(self._integrator(step, tolerance).continuous, outputs)
+        return partial(self._build_integrator(step, tolerance).continuous, outputs)
 
     def ticks(self, period: float, tolerance: float) -> Callable[..., tuple[Array, Array, Array]]:
         """What `run_ticks` calls, for one thread, for ticks of a length [s]."""
-        return partial(self._integrator(period, tolerance).ticks, period)
+        return partial(self._build_integrator(period, tolerance).ticks, period)
 
     def rows(self, name: str, *arguments: Array) -> list[Array]:
         """`command`, `energy` or `measured` of the law for N rows of arguments; gains are added."""
         gains = [] if name == "measured" else self._gains
         return list(self._law.rows(name, *arguments, *gains))
 
-    def _integrator(self, step: float, tolerance: float) -> Any:
+    def _build_integrator(self, step: float, tolerance: float) -> Any:
         from orthocas.codegen import compiled  # few runs need a code generator and a compiler
 
         loop, none = self._loop, [None] * 5
@@ -242,40 +242,33 @@ class CompiledLoop:
         return compiled.Integrator(kernels, sizes, tolerance, step)
 
 
-def _law(controller: Controller) -> Any:
+@lru_cache(KEPT)
+def _compile_law(graph: ca.Function, measured: ca.Function, energy: ca.Function | None) -> Any:
     """`command`, `measured` and `energy` of a law, compiled."""
-    return _law_of(controller.graph, controller.measured, controller.energy_graph)
-
-
-@lru_cache(KEPT)
-def _law_of(graph: ca.Function, measured: ca.Function, energy: ca.Function | None) -> Any:
     functions = {"command": graph, "measured": measured, **({} if energy is None else {"energy": energy})}
-    return _compiled([_renamed(name, function) for name, function in functions.items()])
+    return _compile([_rename(name, function) for name, function in functions.items()])
 
 
 @lru_cache(KEPT)
-def _plant(keyed: Keyed) -> Any:
-    return _compiled([_with_shared_parts(keyed.loop.plant_of_numbers)])
+def _compile_plant(keyed: Keyed) -> Any:
+    function = keyed.loop.plant_of_numbers
+    return _compile([expand_scalars(_rename(function.name(), function))])
 
 
 @lru_cache(KEPT)
-def _profile(profile: ca.Function) -> Any:
-    return _compiled([_renamed("profile", profile)])
+def _compile_profile(profile: ca.Function) -> Any:
+    return _compile([_rename("profile", profile)])
 
 
-def _compiled(functions: Sequence[ca.Function]) -> Any:
+def _compile(functions: Sequence[ca.Function]) -> Any:
     from orthocas.codegen.compiled import CompiledFunctions  # few runs need a code generator and a compiler
 
     return CompiledFunctions(functions)
 
 
-def _renamed(name: str, function: ca.Function) -> ca.Function:
+def _rename(name: str, function: ca.Function) -> ca.Function:
     inputs = function.mx_in()
     return ca.Function(name, inputs, [ca.densify(out) for out in function.call(inputs)])
-
-
-def _with_shared_parts(function: ca.Function) -> ca.Function:
-    return expand_scalars(_renamed(function.name(), function))
 
 
 def integrate(
@@ -292,26 +285,29 @@ def integrate(
         SimulationError: if the integrator gives up.
     """
     run: Integrator = (
-        _continuous_by_cvodes(loop, reference, tolerance)
+        _build_continuous(loop, reference, tolerance)
         if compiled is None
-        else compiled.continuous(step, tolerance, outputs=_OUTPUTS)
+        else compiled.continuous(step, tolerance, outputs=RULES.outputs)
     )
     state = start
     try:
-        for begin, end in _pieces(reference, loop.loads.pushes, step * _OUTPUTS):
-            middle = np.array([(begin + end) / 2])
-            segment, load = int(reference.segment(middle)[0]), loop.loads.at(middle)[0]
+        for begin, end in _cut_pieces(reference, loop.loads.pushes, step * RULES.outputs):
+            centre = np.array([(begin + end) / 2])
+            segment, load = int(reference.segment(centre)[0]), loop.loads.at(centre)[0]
+            # Reference and loads do not change their formula within a piece.
             states = run((begin, end), reference.times[segment], reference.parameters[segment], load, state)
             state = states[-1]
-            yield Piece(begin + (end - begin) * np.arange(1, _OUTPUTS + 1) / _OUTPUTS, states)
+            yield Piece(begin + (end - begin) * np.arange(1, RULES.outputs + 1) / RULES.outputs, states)
     finally:
-        with building:  # its expressions share nodes with those that other threads build
+        # Its expressions share nodes with those that other threads build.
+        with building:
             del run
 
 
-def _continuous_by_cvodes(loop: ClosedLoop, reference: Reference, tolerance: float) -> Integrator:
-    with deferred(), building:  # CasADi may lose Ctrl-C while it builds functions
-        integrator = _integrator(loop, reference, tolerance)
+def _build_continuous(loop: ClosedLoop, reference: Reference, tolerance: float) -> Integrator:
+    # CasADi may lose Ctrl-C while it builds functions.
+    with deferred(), building:
+        integrator = _build_integrator(loop, reference, tolerance)
 
     def run(span: tuple[float, float], since: float, parameters: Array, load: Array, state: Array) -> Array:
         p = np.concatenate([[span[1] - span[0], span[0] - since], parameters, load])
@@ -320,18 +316,19 @@ def _continuous_by_cvodes(loop: ClosedLoop, reference: Reference, tolerance: flo
     return run
 
 
-def _pieces(reference: Reference, pushes: tuple[Push, ...], longest: float) -> Iterator[tuple[float, float]]:
+def _cut_pieces(reference: Reference, pushes: tuple[Push, ...], longest: float) -> Iterator[tuple[float, float]]:
     """Intervals of at most the given length, without a step of the reference or a change of load inside."""
+    # Steps of the reference, and starts and ends of pushes.
     edges = np.array([*reference.times, *(t for push in pushes for t in (push.start, push.end))])
     boundaries = np.unique(edges[edges <= reference.duration])
-    boundaries = boundaries[np.diff(boundaries, prepend=-1.0) > _SAME]
+    boundaries = boundaries[np.diff(boundaries, prepend=-1.0) > RULES.same_time]
     for begin, end in pairwise(boundaries):
         count = max(1, int(np.ceil((end - begin) / longest - 1e-9)))
         cuts = np.linspace(begin, end, count + 1)
         yield from pairwise(cuts)
 
 
-def _integrator(loop: ClosedLoop, reference: Reference, tolerance: float) -> ca.Function:
+def _build_integrator(loop: ClosedLoop, reference: Reference, tolerance: float) -> ca.Function:
     """x0, p = [length; time since segment start; parameters; load] -> states at 25 equally spaced instants."""
     rate = loop.rate(reference)
     state_size, _, p_size, load_size = (rate.size1_in(i) for i in range(4))
@@ -340,7 +337,7 @@ def _integrator(loop: ClosedLoop, reference: Reference, tolerance: float) -> ca.
     p = kind.sym("p", 2 + p_size + load_size)
     length, since, parameters, load = p[0], p[1], p[2 : 2 + p_size], p[2 + p_size :]
     ode = length * rate(x, since + s * length, parameters, load)
-    grid = np.arange(1, _OUTPUTS + 1) / _OUTPUTS
+    grid = np.arange(1, RULES.outputs + 1) / RULES.outputs
     return ca.integrator(
         "closed_loop",
         "cvodes",
@@ -365,7 +362,8 @@ def run_ticks(
     Raises:
         SimulationError: if the integrator gives up.
     """
-    ticks = int(np.floor(reference.duration * rate + 1e-9))  # whole ticks: the reference ends with its last segment
+    # Whole ticks: the reference ends with its last segment.
+    ticks = int(np.floor(reference.duration * rate + 1e-9))
     times = np.arange(ticks) / rate
     columns = (
         np.hstack(reference.sample(times)),
@@ -373,20 +371,21 @@ def run_ticks(
         loop.loads.mean(times, 1 / rate),
     )
     k, period = len(reference.labels), 1 / rate
-    run = _ticks_by_cvodes(loop, period, k, tolerance) if compiled is None else compiled.ticks(period, tolerance)
+    run = _build_ticks(loop, period, k, tolerance) if compiled is None else compiled.ticks(period, tolerance)
     state = start
     try:
-        for first in range(0, ticks, _TICKS):
-            part = slice(first, min(first + _TICKS, ticks))
+        for first in range(0, ticks, RULES.ticks):
+            part = slice(first, min(first + RULES.ticks, ticks))
             states, commands, status = run(state, *(column[part] for column in columns))
             state = states[-1]
             yield Piece(times[part] + period, states, Held(commands, status[:, 0], 0 * status[:, 0]))
     finally:
-        with building:  # its expressions share nodes with those that other threads build
+        # Its expressions share nodes with those that other threads build.
+        with building:
             del run
 
 
-def pieces(tick: Callable[[int], Array], times: Array, period: float, size: int) -> Iterator[Piece]:
+def yield_pieces(tick: Callable[[int], Array], times: Array, period: float, size: int) -> Iterator[Piece]:
     """Yield pieces of 50 ticks for a plant that is driven tick by tick.
 
     Args:
@@ -395,12 +394,12 @@ def pieces(tick: Callable[[int], Array], times: Array, period: float, size: int)
         period: their length [s].
         size: of a state.
     """
-    for first in range(0, len(times), _TICKS):
-        held = range(first, min(first + _TICKS, len(times)))
+    for first in range(0, len(times), RULES.ticks):
+        held = range(first, min(first + RULES.ticks, len(times)))
         with deferred():
             rows = np.array([tick(k) for k in held])
-        states, commands, known = np.split(rows, [size, rows.shape[1] - 2], axis=1)
-        yield Piece(times[held] + period, states, Held(commands, known[:, 0], known[:, 1]))
+        states, commands, reports = np.split(rows, [size, rows.shape[1] - 2], axis=1)
+        yield Piece(times[held] + period, states, Held(commands, reports[:, 0], reports[:, 1]))
 
 
 def build_held_plant(loop: ClosedLoop, length: float, tolerance: float) -> ca.Function:
@@ -410,12 +409,15 @@ def build_held_plant(loop: ClosedLoop, length: float, tolerance: float) -> ca.Fu
     return ca.integrator("plant", "cvodes", ode, 0.0, length, list_cvodes_options(tolerance, loop.stiff))
 
 
-def _ticks_by_cvodes(loop: ClosedLoop, period: float, k: int, tolerance: float) -> Ticks:
-    with deferred(), building:  # CasADi may lose Ctrl-C while it builds functions
-        ticks = _tick(loop, period, k, tolerance).mapaccum(_TICKS)
+def _build_ticks(loop: ClosedLoop, period: float, k: int, tolerance: float) -> Ticks:
+    # CasADi may lose Ctrl-C while it builds functions.
+    with deferred(), building:
+        ticks = _build_tick(loop, period, k, tolerance).mapaccum(RULES.ticks)
 
     def run(state: Array, *columns: Array) -> tuple[Array, Array, Array]:
-        inputs = [ca.DM(_filled(column).T) for column in columns]
+        # The last row is repeated until there are as many rows as one call takes.
+        missing = RULES.ticks - len(columns[0])
+        inputs = [ca.DM(np.vstack([column, np.repeat(column[-1:], missing, axis=0)]).T) for column in columns]
         outputs = run_compiled(ticks, ca.DM(state), *inputs)
         states, commands, status = (np.asarray(out).T[: len(columns[0])] for out in outputs)
         return states, commands, status
@@ -423,12 +425,7 @@ def _ticks_by_cvodes(loop: ClosedLoop, period: float, k: int, tolerance: float) 
     return run
 
 
-def _filled(rows: Array) -> Array:
-    """Repeat the last row until there are as many rows as one call takes."""
-    return np.vstack([rows, np.repeat(rows[-1:], _TICKS - len(rows), axis=0)])
-
-
-def _tick(loop: ClosedLoop, length: float, k: int, tolerance: float) -> ca.Function:
+def _build_tick(loop: ClosedLoop, length: float, k: int, tolerance: float) -> ca.Function:
     """state, reference with derivatives (3 k, 1), noise, load -> state after the tick, command, status."""
     size = loop.plant_rate.size1_in(0)
     plant = build_held_plant(loop, length, tolerance)

@@ -19,19 +19,29 @@ from orthocas.tools.checks import Array, as_number, as_point, freeze_array, impo
 from orthocas.tools.display import Shown
 
 MUJOCO = "mujoco"  #: name of this plant
-TIMESTEP = 1e-3  #: longest step of the physics [s]
-
-_TIMESTEPS = (1e-6, 1e-2)  # [s] shortest and longest
 TIP = "tip"  #: name of the body at the tip frame; it carries the payload
 HAND = "hand"  #: name of the geom at the tip that touches the wall
-_STOP_TIME = 0.004  # [s] time constant of the stops, critically damped; MuJoCo's is 0.02 ...
-_STOP_IMPEDANCE = (0.99, 0.999)  # ... and 0.9 to 0.95, which lets a motor press a light wrist 0.1 rad beyond its stop
-_FRICTION_IMPEDANCE = (0.999, 0.999)  # with MuJoCo's, a light wrist creeps at 0.4 rad/s below its friction
-_FAR = 1e9  # [rad] or [m]: MuJoCo's ranges have two ends
-_MOST_PARTS = 8  # of the longest step, for RK4
-_LARGEST = 1e10  # [N m] or [N]
-_MOST_STEPS = 100_000  # of the physics in a tick, about 5 s of computing
-_RUNAWAY = 1e6  # [rad/s] or [m/s]
+
+
+@dataclass(frozen=True, slots=True)
+class MuJoCoRules:
+    """Numbers of MuJoCo as plant."""
+
+    timestep: float = 1e-3  #: longest step of the physics [s]
+    timesteps: tuple[float, float] = (1e-6, 1e-2)  #: shortest and longest of these [s]
+    stop_time: float = 0.004  #: time constant of the stops, critically damped; MuJoCo's is 0.02 [s]
+    #: MuJoCo's 0.9 to 0.95 lets a motor press a light wrist 0.1 rad beyond its stop.
+    stop_impedance: tuple[float, float] = (0.99, 0.999)
+    #: With MuJoCo's, a light wrist creeps at 0.4 rad/s below its friction.
+    friction_impedance: tuple[float, float] = (0.999, 0.999)
+    far: float = 1e9  #: MuJoCo's ranges have two ends [rad] or [m]
+    most_parts: int = 8  #: of the longest step, for RK4
+    largest: float = 1e10  #: torque [N m] or [N]
+    most_steps: int = 100_000  #: of the physics in a tick, about 5 s of computing
+    runaway: float = 1e6  #: velocity [rad/s] or [m/s]
+
+
+RULES = MuJoCoRules()
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +126,8 @@ class Elasticity:
         Raises:
             ShapeError, InvalidValueError: for other shapes and values.
         """
-        found = [positive_gains(f"{name} of elasticity", getattr(self, name), n) for name in ("stiffness", "inertia")]
-        return found[0], found[1], non_negative_gains("damping of elasticity", self.damping, n)
+        gains = [positive_gains(f"{name} of elasticity", getattr(self, name), n) for name in ("stiffness", "inertia")]
+        return gains[0], gains[1], non_negative_gains("damping of elasticity", self.damping, n)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +152,7 @@ class MuJoCo:
     effort_limits: bool = True
     payload: Payload | None = None
     wall: Wall | None = None
-    timestep: float = TIMESTEP
+    timestep: float = RULES.timestep
     elasticity: Elasticity | None = None
 
     def __post_init__(self) -> None:
@@ -151,7 +161,7 @@ class MuJoCo:
                 require_kind(name, getattr(self, name), kind)
         require_kind("stops", self.stops, bool)
         require_kind("effort_limits", self.effort_limits, bool)
-        shortest, longest = _TIMESTEPS
+        shortest, longest = RULES.timesteps
         if not shortest <= as_number("timestep", self.timestep) <= longest:
             raise InvalidValueError("timestep", self.timestep, f"a number from {shortest:g} to {longest:g}")
 
@@ -201,7 +211,9 @@ def mujoco_model(tree: KinematicTree, scene: MuJoCo, viscous: Array, coulomb: Ar
     spec = mj.MjSpec()
     spec.compiler.degree = False
     spec.option.gravity = tree.gravity
-    spec.option.disableflags |= mj.mjtDisableBit.mjDSBL_AUTORESET  # a run that diverges must say so
+    # A run that diverges must say so.
+    spec.option.disableflags |= mj.mjtDisableBit.mjDSBL_AUTORESET
+    # One body for each joint, with a massless handle where pushes act, and a motor.
     bodies: list[Any] = []
     for i, parent in enumerate(tree.parents):
         carrier = bodies[parent] if parent >= 0 else spec.worldbody
@@ -209,8 +221,13 @@ def mujoco_model(tree: KinematicTree, scene: MuJoCo, viscous: Array, coulomb: Ar
         _place_inertia(bodies[i].add_body(name=handle_name(i)), 0.0)
         joint = _add_joint(mj, bodies[i], tree, i, scene.stops)
         moved = joint if scene.elasticity is None else _add_rotor(mj, spec, joint, i, scene.elasticity.numbers(tree.n))
-        _add_friction(moved, viscous[i], coulomb[i])
-        _add_motor(mj, spec, moved.name, i, tree.effort_limits[i] if scene.effort_limits else np.inf)
+        moved.damping[0], moved.frictionloss = viscous[i], coulomb[i]
+        moved.solimp_friction[:2] = RULES.friction_impedance
+        motor = spec.add_actuator(name=f"motor{i}", target=moved.name, trntype=mj.mjtTrn.mjTRN_JOINT)
+        motor.set_to_motor()
+        if scene.effort_limits and np.isfinite(limit := tree.effort_limits[i]):
+            motor.forcelimited, motor.forcerange = mj.mjtLimited.mjLIMITED_TRUE, (-limit, limit)
+    # The tip carries the payload and touches the wall.
     carrier = bodies[tree.tip_parent] if tree.tip_parent >= 0 else spec.worldbody
     tip = _add_body(mj, carrier, TIP, tree.tip_translation, tree.tip_rotation)
     if scene.wall is not None:
@@ -225,7 +242,7 @@ def mujoco_model(tree: KinematicTree, scene: MuJoCo, viscous: Array, coulomb: Ar
 
 def _add_body(mj: ModuleType, carrier: Any, name: str, position: Array, rotation: Array) -> Any:
     """A body whose inertia is `_set_inertias`'s to write."""
-    body = carrier.add_body(name=name, pos=position, quat=_quaternion(mj, rotation))
+    body = carrier.add_body(name=name, pos=position, quat=_compute_quaternion(mj, rotation))
     _place_inertia(body, 1.0)
     return body
 
@@ -244,8 +261,8 @@ def _add_joint(mj: ModuleType, body: Any, tree: KinematicTree, i: int, stops: bo
     limited = stops and bool(np.isfinite(ends).any())
     joint.limited = mj.mjtLimited.mjLIMITED_TRUE if limited else mj.mjtLimited.mjLIMITED_FALSE
     if limited:
-        joint.range, joint.solref_limit = np.clip(ends, -_FAR, _FAR), (_STOP_TIME, 1.0)
-        joint.solimp_limit[:2] = _STOP_IMPEDANCE
+        joint.range, joint.solref_limit = np.clip(ends, -RULES.far, RULES.far), (RULES.stop_time, 1.0)
+        joint.solimp_limit[:2] = RULES.stop_impedance
     return joint
 
 
@@ -265,25 +282,13 @@ def _add_rotor(mj: ModuleType, spec: Any, joint: Any, i: int, numbers: tuple[Arr
     return rotor
 
 
-def _add_friction(joint: Any, viscous: float, coulomb: float) -> None:
-    joint.damping[0], joint.frictionloss = viscous, coulomb
-    joint.solimp_friction[:2] = _FRICTION_IMPEDANCE
-
-
-def _add_motor(mj: ModuleType, spec: Any, target: str, i: int, limit: float) -> None:
-    motor = spec.add_actuator(name=f"motor{i}", target=target, trntype=mj.mjtTrn.mjTRN_JOINT)
-    motor.set_to_motor()
-    if np.isfinite(limit):
-        motor.forcelimited, motor.forcerange = mj.mjtLimited.mjLIMITED_TRUE, (-limit, limit)
-
-
 def _add_wall(mj: ModuleType, spec: Any, tip: Any, wall: Wall) -> None:
     """A sphere at the tip and a fixed box; nothing else touches anything."""
     half = np.array([wall.size / 2, wall.size / 2, wall.thickness / 2])
     centre = wall.point - wall.normal * half[2]
     solref = (wall.time_constant, 1.0)
     box = spec.worldbody.add_geom(type=mj.mjtGeom.mjGEOM_BOX, size=half, pos=centre, name="wall", solref=solref)
-    box.quat = _quaternion(mj, rotate_z_to(wall.normal))
+    box.quat = _compute_quaternion(mj, rotate_z_to(wall.normal))
     size = (wall.tip_radius, 0, 0)
     tip.add_geom(type=mj.mjtGeom.mjGEOM_SPHERE, size=size, mass=0, name=HAND, solref=solref)
 
@@ -295,14 +300,15 @@ def _set_inertias(mj: ModuleType, model: Any, tree: KinematicTree, payload: Payl
     bodies[TIP] = nothing if payload is None else (payload.mass, payload.centre, payload.inertia)
     for name, (mass, centre, inertia) in bodies.items():
         moments, axes = np.linalg.eigh((inertia + inertia.T) / 2)
-        axes[:, 2] *= np.linalg.det(axes)  # +-1: a rotation
+        # +-1: a rotation.
+        axes[:, 2] *= np.linalg.det(axes)
         k = model.body(name).id
         model.body_mass[k], model.body_ipos[k], model.body_inertia[k] = mass, centre, moments
-        model.body_iquat[k] = _quaternion(mj, axes)
+        model.body_iquat[k] = _compute_quaternion(mj, axes)
     mj.mj_setConst(model, mj.MjData(model))
 
 
-def _quaternion(mj: ModuleType, rotation: Array) -> Array:
+def _compute_quaternion(mj: ModuleType, rotation: Array) -> Array:
     quaternion = np.zeros(4)
     mj.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation, dtype=float).ravel())
     return quaternion
@@ -353,7 +359,7 @@ class MuJoCoPlant(Shown):
         effort_limits: bool = True,
         payload: Payload | None = None,
         wall: Wall | None = None,
-        timestep: float = TIMESTEP,
+        timestep: float = RULES.timestep,
         elasticity: Elasticity | None = None,
     ) -> None:
         require_kind("robot", robot, Robot)
@@ -369,9 +375,9 @@ class MuJoCoPlant(Shown):
         self.data: Any = mujoco().MjData(self.model)
         self._step = mujoco().mj_step
         self._timestep = float(timestep)
-        self._dofs = self._numbers(robot.joint_names)
+        self._dofs = self._find_dofs(robot.joint_names)
         #: joints that the motors move: those of the robot, or their rotors
-        self._motors = self._dofs if elasticity is None else self._numbers(map(rotor_name, robot.joint_names))
+        self._motors = self._dofs if elasticity is None else self._find_dofs(map(rotor_name, robot.joint_names))
         self._handles = [int(self.model.body(handle_name(i)).id) for i in range(robot.n)]
         self.reset(np.zeros(robot.n))
 
@@ -423,7 +429,8 @@ class MuJoCoPlant(Shown):
         for k in range(self.data.ncon):
             mujoco().mj_contactForce(self.model, self.data, k, wrench)
             contact = self.data.contact[k]
-            sign = 1.0 if contact.geom[1] == self.model.geom(HAND).id else -1.0  # the force acts on the second geom
+            # The force acts on the second geom.
+            sign = 1.0 if contact.geom[1] == self.model.geom(HAND).id else -1.0
             total += sign * np.reshape(contact.frame, (3, 3)).T @ wrench[:3]
         return total
 
@@ -439,7 +446,8 @@ class MuJoCoPlant(Shown):
         dq = np.zeros(self.robot.n) if dq is None else as_point("dq", dq, self.robot.n)
         mujoco().mj_resetData(self.model, self.data)
         for warning in self.data.warning:
-            warning.number = 1  # MuJoCo prints and logs the first one: `step` raises an error instead
+            # MuJoCo prints and logs the first one: `step` raises an error instead.
+            warning.number = 1
         if self.elasticity is not None:
             sag = np.asarray(self.robot.gravity(q), dtype=float) / self.elasticity.numbers(self.robot.n)[0]
             self.data.qpos[self._motors], self.data.qvel[self._motors] = q + sag, dq
@@ -456,17 +464,21 @@ class MuJoCoPlant(Shown):
         """
         M = np.zeros((self.model.nv,) * 2)
         mujoco().mj_fullM(self.model, self.data, M)
-        damped, squared = (self._timestep * _largest_eigenvalue(M, part) for part in self._dampers_and_springs())
-        parts = max(min(ceil(min(damped, _MOST_PARTS + 1)), _MOST_PARTS), ceil(sqrt(self._timestep * squared)), 1)
+        damped, squared = (
+            self._timestep * _compute_largest_eigenvalue(M, part) for part in self._compute_dampers_and_springs()
+        )
+        parts = max(
+            min(ceil(min(damped, RULES.most_parts + 1)), RULES.most_parts), ceil(sqrt(self._timestep * squared)), 1
+        )
         kinds = mujoco().mjtIntegrator
-        self.model.opt.integrator = kinds.mjINT_RK4 if damped <= _MOST_PARTS else kinds.mjINT_IMPLICITFAST
+        self.model.opt.integrator = kinds.mjINT_RK4 if damped <= RULES.most_parts else kinds.mjINT_IMPLICITFAST
         self._longest = self._timestep / parts
 
-    def _numbers(self, names: Iterable[str]) -> NDArray[np.intp]:
+    def _find_dofs(self, names: Iterable[str]) -> NDArray[np.intp]:
         """Where joints stand among all."""
         return np.array([self.model.joint(name).dofadr[0] for name in names])
 
-    def _dampers_and_springs(self) -> tuple[Array, Array]:
+    def _compute_dampers_and_springs(self) -> tuple[Array, Array]:
         """D and K of all joints and rotors."""
         D = np.diag(self.model.dof_damping)
         K = np.zeros_like(D)
@@ -493,12 +505,15 @@ class MuJoCoPlant(Shown):
         force = freeze_array("force", force, (3,))
         body, at = place_of(self.robot.tree, link, freeze_array("point", point, (3,)))
         if body < 0:
-            return  # what carries the tip does not move
+            # What carries the tip does not move.
+            return
         handle = self._handles[body]
         applied = self.data.xfrc_applied[handle]
         if not applied.any():
-            self.model.body_ipos[handle] = at  # the handle has no mass: its centre may be anywhere
-        else:  # another push at this link: the same force, and the torque between the two points
+            # The handle has no mass: its centre may be anywhere.
+            self.model.body_ipos[handle] = at
+        else:
+            # Another push at this link: the same force, and the torque between the two points.
             mujoco().mj_kinematics(self.model, self.data)
             rotation = np.reshape(self.data.xmat[handle], (3, 3))
             applied[3:] += np.cross(rotation @ (at - self.model.body_ipos[handle]), force)
@@ -521,30 +536,31 @@ class MuJoCoPlant(Shown):
             SimulationError: if the state has diverged.
         """
         data = self.data
-        data.ctrl[:] = self._checked("torque", torque)
-        data.qfrc_applied[self._dofs] = 0.0 if loads is None else self._checked("loads", loads)
-        self._step(self.model, data, self._divided(seconds))
-        if not data.qvel @ data.qvel < _RUNAWAY**2:
-            raise SimulationError(f"MuJoCo gave up at {self.time:g} s: joint velocities beyond {_RUNAWAY:g}")
+        data.ctrl[:] = self._check("torque", torque)
+        data.qfrc_applied[self._dofs] = 0.0 if loads is None else self._check("loads", loads)
+        self._step(self.model, data, self._divide(seconds))
+        if not data.qvel @ data.qvel < RULES.runaway**2:
+            raise SimulationError(f"MuJoCo gave up at {self.time:g} s: joint velocities beyond {RULES.runaway:g}")
 
-    def _checked(self, name: str, value: ArrayLike) -> Array:
+    def _check(self, name: str, value: ArrayLike) -> Array:
         """Joint torques (n,). MuJoCo would take 0 in place of NaN and of larger ones."""
         if type(value) is not np.ndarray or value.shape != (self.robot.n,) or value.dtype != float:
             value = as_point(name, value, self.robot.n)
-        if not np.abs(value).max() < _LARGEST:
-            raise InvalidValueError(name, value.tolist(), f"numbers up to {_LARGEST:g}")
+        if not np.abs(value).max() < RULES.largest:
+            raise InvalidValueError(name, value.tolist(), f"numbers up to {RULES.largest:g}")
         return value
 
-    def _divided(self, seconds: float) -> int:
+    def _divide(self, seconds: float) -> int:
         """Into how many steps of the physics a tick is divided; sets their length."""
+        # A tick that is a whole number of steps, but for rounding, gets no further one.
         count = as_number("seconds", seconds) / self._longest - 1e-9
-        if not -1e-9 < count <= _MOST_STEPS:
-            raise InvalidValueError("seconds", seconds, f"a number > 0, at most {_MOST_STEPS * self._longest:g}")
+        if not -1e-9 < count <= RULES.most_steps:
+            raise InvalidValueError("seconds", seconds, f"a number > 0, at most {RULES.most_steps * self._longest:g}")
         steps = max(1, ceil(count))
         self.model.opt.timestep = seconds / steps
         return steps
 
 
-def _largest_eigenvalue(M: Array, K: Array) -> float:
+def _compute_largest_eigenvalue(M: Array, K: Array) -> float:
     """Of M^-1 K, for symmetric M > 0 and K >= 0."""
     return float(np.linalg.eigvals(np.linalg.solve(M, K)).real.max()) if K.any() else 0.0

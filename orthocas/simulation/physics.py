@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from orthocas.control.controller import Controller, ControlStatus
-from orthocas.control.memory import Remembering, memory_of
+from orthocas.control.memory import Remembering
 from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
 from orthocas.errors import InvalidValueError
@@ -21,8 +21,6 @@ from orthocas.tools.interrupts import deferred
 
 if TYPE_CHECKING:
     from orthocas.codegen.library import Supervisor
-
-_CATCHER = 1  # `mode` of the state in C
 
 
 class SupervisedLaw:
@@ -49,7 +47,7 @@ class SupervisedLaw:
         if controller.chart is None:
             raise InvalidValueError("safety", "given", f"none with {controller.name} without a chart")
         self._resume_after, self._period, self._caught_for = resume_after, period, 0.0
-        self._law = _compiled(controller, safety)
+        self._law = _compile(controller, safety)
 
     def start(self, q: Array) -> None:
         """Begin at joint positions (n,)."""
@@ -58,7 +56,8 @@ class SupervisedLaw:
 
     def tick(self, q: Array, dq: Array, reference: Array) -> Array:
         """[command; status; why the catcher took over last], (n + 2,), for a reference with two derivatives (3 k,)."""
-        self._caught_for = self._caught_for + self._period if self._law.mode == _CATCHER else 0.0
+        # Mode 1 of the state in C is the catcher.
+        self._caught_for = self._caught_for + self._period if self._law.mode == 1 else 0.0
         if self._caught_for > self._resume_after:
             self._law.resume()
         command, status = self._law.step(q, dq, reference, self._period)
@@ -86,16 +85,12 @@ class LawWithMemory:
         return np.concatenate([command, [status, ControlStatus.OK]])
 
 
-def law_in_ticks(controller: Controller, period: float) -> LawWithMemory | None:
-    """What runs a law that has a memory; None for others, which are functions."""
-    return None if memory_of(controller) is None else LawWithMemory(controller, period)
-
-
-def _compiled(controller: Controller, safety: Safety) -> "Supervisor":
+def _compile(controller: Controller, safety: Safety) -> "Supervisor":
     """The supervised law in C. It stays loaded when its folder is gone."""
     from orthocas import codegen  # few runs need a code generator and a compiler
 
-    chart: Any = controller.chart  # laws without one have no supervised form, and were refused before
+    # Laws without one have no supervised form, and were refused before.
+    chart: Any = controller.chart
     with open_draft_folder() as folder:
         generated = codegen.generate_c(chart, folder / "law", controller, "law", safety=safety)
         library = codegen.compile_shared(generated, generated.folder)
@@ -130,12 +125,13 @@ def run_supervised(
 
     def tick(k: int) -> Array:
         nonlocal state, sent
-        dq = state[n:] if loop.torque else sent[:n]  # a velocity controller's robot follows its command
-        sent = law.tick(state[:n] + errors[k, :n], dq + errors[k, n:], wanted[k])
+        # A velocity controller's robot follows its command.
+        dq = state[n:] if loop.torque else sent[:n]
+        sent = law.tick(state[:n] + errors[k, :n], dq + errors[k, n:], target[k])
         state = run_compiled(plant, x0=ca.DM(state), p=ca.DM(np.concatenate([sent[:n], loads[k]])))["xf"].full().ravel()
         return np.concatenate([state, sent])
 
-    yield from pieces(tick, times, 1 / rate, size)
+    yield from yield_pieces(tick, times, 1 / rate, size)
 
 
 def run_physics(
@@ -165,7 +161,7 @@ def run_physics(
     plant.reset(start[: loop.n], start[loop.n :])
     ticks = int(np.floor(reference.duration * rate + 1e-9))
     times = np.arange(ticks) / rate
-    wanted, errors = np.hstack(reference.sample(times)), noise.sample(ticks, loop.n)
+    target, errors = np.hstack(reference.sample(times)), noise.sample(ticks, loop.n)
     shares = loop.loads.shares(times, 1 / rate)
     with deferred(), building:
         law = _law(loop, len(reference.labels)) if supervised is None else supervised.tick
@@ -174,11 +170,11 @@ def run_physics(
 
     def tick(k: int) -> Array:
         q, dq = np.split(np.concatenate([plant.q, plant.dq]) + errors[k], 2)
-        sent = law(q, dq, wanted[k])
+        sent = law(q, dq, target[k])
         plant.step(sent[: loop.n], 1 / rate, apply_pushes(plant, loop.loads, shares[k]))
         return np.concatenate([plant.q, plant.dq, sent])
 
-    yield from pieces(tick, times, 1 / rate, 2 * loop.n)
+    yield from yield_pieces(tick, times, 1 / rate, 2 * loop.n)
 
 
 def apply_pushes(plant: MuJoCoPlant, loads: Loads, shares: Array) -> Array | None:
@@ -199,4 +195,4 @@ def _law(loop: ClosedLoop, k: int) -> Callable[[Array, Array, Array], Array]:
     state, reference = ca.MX.sym("state", 2 * loop.n), ca.MX.sym("reference", 3 * k)
     sent = ca.vertcat(*loop.commanded(state, (reference[:k], reference[k : 2 * k], reference[2 * k :])), 0)
     law = ca.Function("law", [state, reference], [sent])
-    return lambda q, dq, wanted: np.asarray(law(np.concatenate([q, dq]), wanted).full().ravel())
+    return lambda q, dq, target: np.asarray(law(np.concatenate([q, dq]), target).full().ravel())

@@ -16,295 +16,17 @@ from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
 from orthocas.errors import Interrupted, InvalidValueError, SimulationError
 from orthocas.robots.robot import Robot
-from orthocas.simulation.disturbances import Friction, Loads, Noise, Push, Stops
-from orthocas.simulation.ends import why_lost
+from orthocas.simulation.disturbances import RULES, Friction, Loads, Noise, Push, Stops
 from orthocas.simulation.loops import ClosedLoop, CompiledLoop, Piece, integrate, run_ticks
 from orthocas.simulation.mujoco_plant import MUJOCO, MuJoCo
-from orthocas.simulation.physics import LawWithMemory, SupervisedLaw, law_in_ticks, run_physics, run_supervised
-from orthocas.simulation.trajectory import Outcome, Trajectory
+from orthocas.simulation.physics import LawWithMemory, SupervisedLaw, run_physics, run_supervised
+from orthocas.simulation.trajectory import Outcome, Trajectory, find_loss
 from orthocas.tools.batch import THREADS, Batched
 from orthocas.tools.checks import Array, as_number, as_point, require_executor, require_kind, require_known
 from orthocas.tools.expressions import wrap_shortest
 from orthocas.tools.progress import Monitor, Progress, silent
 
-_MOST_TICKS = 1e7  # of a sampled run
-TOLERANCE = 1e-8  #: relative and absolute, of the integrator
-_POSITIONAL = ("controller", "reference", "q_start")
-
 Plant = Robot | MuJoCo | Literal["mujoco"] | None  #: the true robot, or MuJoCo with it; None: the controller's model
-
-
-def plant_of(plant: Plant, controller: Controller) -> tuple[Robot, MuJoCo | None]:
-    """The true robot, and the scene if MuJoCo simulates it.
-
-    Raises:
-        InvalidValueError: if the plant is something else.
-    """
-    model = controller.problem.robot
-    scene = MuJoCo() if isinstance(plant, str) and plant == MUJOCO else plant
-    if scene is None or isinstance(scene, Robot):
-        return scene or model, None
-    if isinstance(scene, MuJoCo):
-        return scene.robot or model, scene
-    given = repr(plant)[:80] if isinstance(plant, str | int | float) else f"a {type(plant).__name__}"
-    raise InvalidValueError("plant", given, f"a Robot, '{MUJOCO}' or a MuJoCo")
-
-
-def require_kinds(
-    controller: Controller, reference: Reference, pushes: Sequence[Push], optional: Mapping[type, object]
-) -> None:
-    """Raise InvalidValueError for objects of the wrong class."""
-    require_controller(controller)
-    require_kind("reference", reference, Reference)
-    for kind, value in optional.items():
-        if value is not None:
-            require_kind(kind.__name__.lower(), value, kind)
-    require_kind("pushes", pushes, Sequence)
-    for push in pushes:
-        require_kind("an entry of pushes", push, Push)
-
-
-def require_fitting(
-    loop: ClosedLoop,
-    reference: Reference,
-    friction: Friction | None,
-    noise: Noise | None,
-    control_rate: float | None,
-    in_mujoco: bool,
-    safety: Safety | None,
-) -> None:
-    """Raise InvalidValueError for arguments that would be ignored, or fail later with a less clear message."""
-    controller = loop.controller
-    if reference.labels != controller.labels:
-        raise InvalidValueError(
-            "labels of the reference", reference.labels, f"those of the controller {controller.labels}"
-        )
-    if loop.n != controller.problem.n:
-        raise InvalidValueError("joints of the plant", loop.n, f"{controller.problem.n}, as in the controller's robot")
-    forces = loop.loads.pushes or friction is not None or loop.stops is not None
-    if not loop.torque and (forces or loop.plant is not controller.problem.robot):
-        raise InvalidValueError(
-            "pushes, friction, stops or plant",
-            "given",
-            "none of them, because forces do not affect a velocity controller",
-        )
-    late = [push.start for push in loop.loads.pushes if push.start >= reference.duration]
-    if late:
-        raise InvalidValueError("start of a push", late[0], f"a time before the end at {reference.duration:g} s")
-    if control_rate is not None and as_number("control_rate", control_rate) * reference.duration < 1:
-        raise InvalidValueError("control_rate", control_rate, f"at least one tick in {reference.duration:g} s")
-    if control_rate is not None and as_number("control_rate", control_rate) * reference.duration > _MOST_TICKS:
-        raise InvalidValueError(
-            "control_rate", control_rate, f"at most {_MOST_TICKS:g} ticks in {reference.duration:g} s"
-        )
-    if noise is not None and control_rate is None:
-        raise InvalidValueError(
-            "noise", noise, "no noise without control_rate, because white noise needs control ticks"
-        )
-    if safety is not None and control_rate is None:
-        raise InvalidValueError("control_rate", None, "a number, because a supervised law runs tick by tick")
-    if in_mujoco:
-        _require_for_mujoco(loop, control_rate)
-
-
-def _require_for_mujoco(loop: ClosedLoop, control_rate: float | None) -> None:
-    """Raise InvalidValueError for what MuJoCo does not simulate."""
-    if control_rate is None:
-        raise InvalidValueError("control_rate", None, "a number, because MuJoCo runs with a sampled controller")
-    if not loop.torque:
-        raise InvalidValueError("plant", MUJOCO, "no MuJoCo with a velocity controller, which commands no torques")
-    if loop.stops is not None:
-        raise InvalidValueError("stops", "given", "none with MuJoCo, which has its own: MuJoCo(stops=True)")
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Settings:
-    """The keyword arguments of `simulate`."""
-
-    dq_start: ArrayLike | None
-    step: float
-    control_rate: float | None
-    plant: Plant
-    pushes: Sequence[Push]
-    friction: Friction | None
-    stops: Stops | None
-    noise: Noise | None
-    safety: Safety | None
-    resume_after: float
-    must_be_reachable: bool
-    tolerance: float
-    compiled: bool
-
-    def require_numbers(self) -> None:
-        """Raise InvalidValueError unless step, tolerance and rate are finite and positive."""
-        rate = 1.0 if self.control_rate is None else self.control_rate
-        for name, value in (("step", self.step), ("tolerance", self.tolerance), ("control_rate", rate)):
-            if not 0 < as_number(name, value) < np.inf:
-                raise InvalidValueError(name, value, "a finite number > 0")
-
-
-def prepare(controller: Controller, reference: Reference, q_start: ArrayLike, settings: Settings) -> "Prepared":
-    """Check the arguments of `simulate`, and build what the run needs."""
-    friction, noise, rate = settings.friction, settings.noise, settings.control_rate
-    require_kinds(controller, reference, settings.pushes, {Friction: friction, Stops: settings.stops, Noise: noise})
-    robot, scene = plant_of(settings.plant, controller)
-    loop = ClosedLoop(controller, robot, friction or Friction(), Loads(robot.tree, settings.pushes), settings.stops)
-    settings.require_numbers()
-    require_fitting(loop, reference, friction, noise, rate, scene is not None, settings.safety)
-    _require_compilable(settings, scene)
-    if memory_of(controller) is not None and (rate is None or settings.compiled):
-        what = "control_rate" if rate is None else "compiled"
-        raise InvalidValueError(what, getattr(settings, what), f"{_FOR_MEMORY[what]} for a law with a memory")
-    start = _start_state(loop, q_start, settings.dq_start)
-    if settings.must_be_reachable:
-        controller.require_reachable(reference, start[: loop.n])
-    compiled = CompiledLoop(loop, reference) if settings.compiled else None
-    if rate is None:
-        pieces = partial(integrate, step=settings.step, tolerance=settings.tolerance, compiled=compiled)
-    else:
-        law: SupervisedLaw | LawWithMemory | None = law_in_ticks(controller, 1 / rate)
-        if settings.safety is not None:
-            law = SupervisedLaw(controller, settings.safety, settings.resume_after, 1 / rate)
-        ticks = _ticks(scene, settings.tolerance, law, compiled)
-        pieces = partial(ticks, rate=rate, noise=noise or Noise())
-    return Prepared(loop, reference, start, pieces, compiled, settings.safety is not None)
-
-
-_FOR_MEMORY = {"control_rate": "a rate, such as 1000.0,", "compiled": "False"}
-
-
-def _require_compilable(settings: Settings, scene: MuJoCo | None) -> None:
-    """Raise InvalidValueError where a compiled run is asked of something else."""
-    require_kind("compiled", settings.compiled, bool)
-    if settings.compiled and (scene is not None or settings.safety is not None):
-        what = "safety" if scene is None else "MuJoCo"
-        raise InvalidValueError("compiled", True, f"False with {what}, which runs tick by tick from Python")
-
-
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """A closed loop that is ready to run, once."""
-
-    loop: ClosedLoop
-    reference: Reference
-    start: Array  #: state at t = 0
-    pieces: Callable[[ClosedLoop, Reference, Array], Iterator[Piece]]
-    compiled: CompiledLoop | None
-    supervised: bool
-
-    def run(self, monitor: Monitor) -> Trajectory:
-        """Simulate.
-
-        Raises:
-            Interrupted: after Ctrl-C; its `result` is the trajectory up to there, with outcome INTERRUPTED.
-        """
-        pieces: list[Piece] = []
-        outcome = Outcome.COMPLETE
-        try:
-            for piece in self.pieces(self.loop, self.reference, self.start):
-                pieces.append(piece)
-                monitor(_progress(self.loop.controller.name, piece.times[-1], self.reference.duration))
-        except KeyboardInterrupt:
-            outcome = Outcome.INTERRUPTED
-        except SimulationError:
-            outcome = Outcome.DIVERGED
-        try:
-            run = self._trajectory(pieces, outcome)
-        except KeyboardInterrupt:  # keep the run up to here
-            run = self._trajectory(pieces, Outcome.INTERRUPTED)
-        if run.outcome is Outcome.INTERRUPTED:
-            raise Interrupted(run)
-        return run
-
-    def _trajectory(self, pieces: Sequence[Piece], outcome: Outcome) -> Trajectory:
-        """Join the pieces, and add what follows from the states and the reference."""
-        loop, controller, n = self.loop, self.loop.controller, self.loop.n
-        times = np.concatenate([[0.0], *(piece.times for piece in pieces)])
-        states = np.vstack([self.start, *(piece.states for piece in pieces)])
-        q = states[:, :n]
-        wanted = self.reference.sample(np.minimum(times, self.reference.duration))
-        dq = states[:, n:] if loop.torque else np.zeros_like(q)
-        command, status, cause = self._commands(pieces, q, dq, *wanted)
-        energy = controller.energy if self.compiled is None else controller.energy_graph
-        unknown = [np.full((len(times), 1), np.nan)] * 2
-        storage, power = unknown if energy is None else self._rows("energy", q, dq, *wanted)
-        run = Trajectory(
-            controller=controller.name,
-            kind=controller.command,
-            outcome=outcome,
-            labels=controller.labels,
-            joint_names=loop.plant.joint_names,
-            times=times,
-            q=q,
-            dq=dq if loop.torque else command,
-            command=command,
-            status=status.ravel().astype(int),
-            value=_near(controller, self._rows("measured", q)[0], wanted[0]),
-            reference=wanted[0],
-            reference_velocity=wanted[1],
-            reference_acceleration=wanted[2],
-            storage=storage[:, 0],
-            dissipated_power=power[:, 0],
-            cause=cause.astype(int),
-        )
-        reason = why_lost(run, controller, loop.loads.pushes, self.supervised) if outcome is Outcome.COMPLETE else ""
-        return replace(run, outcome=Outcome.LOST, reason=reason) if reason else run
-
-    def _commands(self, pieces: Sequence[Piece], *arguments: Array) -> tuple[Array, Array, Array]:
-        """Commands, status and causes: those that were held, the last one also for the end, or those of the law."""
-        held = [piece.held for piece in pieces if piece.held is not None]
-        if not held:
-            command, status = self._rows("command", *arguments)
-            return command, status, np.zeros(len(command))
-        columns = ([part.commands for part in held], [part.status for part in held], [part.cause for part in held])
-        command, status, cause = (np.concatenate([*parts, parts[-1][-1:]]) for parts in columns)
-        return command, status, cause
-
-    def _rows(self, name: str, *arguments: Array) -> list[Array]:
-        """`command`, `energy` or `measured` of the law for N rows of arguments."""
-        if self.compiled is not None:
-            return self.compiled.rows(name, *arguments)
-        controller = self.loop.controller
-        if name == "measured":
-            return Batched(controller.measured)(*arguments)
-        function = get_counted_function(controller, "function" if name == "command" else "energy")
-        assert function is not None
-        gains = [np.tile(gain, (len(arguments[0]), 1)) for gain in controller.gains.values()]
-        return Batched(function)(*arguments, *gains)
-
-
-def _ticks(
-    scene: MuJoCo | None, tolerance: float, law: SupervisedLaw | LawWithMemory | None, compiled: CompiledLoop | None
-) -> Callable[..., Iterator[Piece]]:
-    """What runs a sampled controller: MuJoCo, CVODES or compiled C, with the law alone or the supervised one."""
-    if scene is not None:
-        return partial(run_physics, scene=scene, supervised=law)
-    if law is not None:
-        return partial(run_supervised, tolerance=tolerance, law=law)
-    return partial(run_ticks, tolerance=tolerance, compiled=compiled)
-
-
-def _progress(name: str, time: float, duration: float) -> Progress:
-    return Progress(f"simulate {name}", time / duration, f"{time:.1f} s")
-
-
-def _start_state(loop: ClosedLoop, q_start: ArrayLike, dq_start: ArrayLike | None) -> Array:
-    q = as_point("q_start", q_start, loop.n)
-    if not loop.torque:
-        if dq_start is not None:
-            raise InvalidValueError(
-                "dq_start", dq_start, "None, because velocity is not a state with a velocity controller"
-            )
-        return q
-    return np.concatenate([q, np.zeros(loop.n) if dq_start is None else as_point("dq_start", dq_start, loop.n)])
-
-
-def _near(controller: Controller, value: Array, wanted: Array) -> Array:
-    """Measured quantities (N, k), circle-valued ones with the whole turns that bring them nearest to the reference."""
-    chart = controller.chart
-    if chart is None or controller.labels != chart.labels:
-        return value
-    return np.asarray(wanted + wrap_shortest(value - wanted, chart.turns)) if chart.turns.any() else value
 
 
 def simulate(
@@ -323,7 +45,7 @@ def simulate(
     safety: Safety | None = None,
     resume_after: float = 1.0,
     must_be_reachable: bool = True,
-    tolerance: float = TOLERANCE,
+    tolerance: float = RULES.tolerance,
     compiled: bool = False,
     monitor: Monitor = silent,
 ) -> Trajectory:
@@ -360,7 +82,7 @@ def simulate(
 
     Returns:
         The trajectory. Its outcome says whether it ended early because the integrator gave up, or whether the law lost
-        the arm: LOST with a `reason`, see `orthocas.simulation.ends.why_lost`.
+        the arm: LOST with a `reason`, see `orthocas.simulation.trajectory.find_loss`.
 
     Raises:
         UnreachableReferenceError: if the reference leaves the domain.
@@ -399,6 +121,271 @@ def simulate(
     return prepare(controller, reference, q_start, settings).run(monitor)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Settings:
+    """The keyword arguments of `simulate`."""
+
+    dq_start: ArrayLike | None
+    step: float
+    control_rate: float | None
+    plant: Plant
+    pushes: Sequence[Push]
+    friction: Friction | None
+    stops: Stops | None
+    noise: Noise | None
+    safety: Safety | None
+    resume_after: float
+    must_be_reachable: bool
+    tolerance: float
+    compiled: bool
+
+
+def prepare(controller: Controller, reference: Reference, q_start: ArrayLike, settings: Settings) -> "Prepared":
+    """Check the arguments of `simulate`, and build what the run needs."""
+    friction, noise, rate = settings.friction, settings.noise, settings.control_rate
+    _check_kinds(controller, reference, settings)
+    robot, scene = _read_plant(settings.plant, controller)
+    loop = ClosedLoop(controller, robot, friction or Friction(), Loads(robot.tree, settings.pushes), settings.stops)
+    _check_settings(loop, reference, settings, scene)
+    start = _build_start(loop, q_start, settings.dq_start)
+    if settings.must_be_reachable:
+        controller.require_reachable(reference, start[: loop.n])
+    compiled = CompiledLoop(loop, reference) if settings.compiled else None
+
+    # What runs the loop: in continuous time, or tick by tick in MuJoCo, in CVODES or in compiled C.
+    run: Callable[..., Iterator[Piece]]
+    if rate is None:
+        run = partial(integrate, step=settings.step, tolerance=settings.tolerance, compiled=compiled)
+    else:
+        law: SupervisedLaw | LawWithMemory | None = None
+        if settings.safety is not None:
+            law = SupervisedLaw(controller, settings.safety, settings.resume_after, 1 / rate)
+        elif memory_of(controller) is not None:
+            law = LawWithMemory(controller, 1 / rate)
+        if scene is not None:
+            run = partial(run_physics, scene=scene, supervised=law)
+        elif law is not None:
+            run = partial(run_supervised, tolerance=settings.tolerance, law=law)
+        else:
+            run = partial(run_ticks, tolerance=settings.tolerance, compiled=compiled)
+        run = partial(run, rate=rate, noise=noise or Noise())
+    return Prepared(loop, reference, start, run, compiled, settings.safety is not None)
+
+
+def _check_kinds(controller: Controller, reference: Reference, settings: Settings) -> None:
+    """Raise InvalidValueError for objects of the wrong class."""
+    require_controller(controller)
+    require_kind("reference", reference, Reference)
+    for kind, value in ((Friction, settings.friction), (Stops, settings.stops), (Noise, settings.noise)):
+        if value is not None:
+            require_kind(kind.__name__.lower(), value, kind)
+    require_kind("pushes", settings.pushes, Sequence)
+    for push in settings.pushes:
+        require_kind("an entry of pushes", push, Push)
+
+
+def _read_plant(plant: Plant, controller: Controller) -> tuple[Robot, MuJoCo | None]:
+    """The true robot, and the scene if MuJoCo simulates it.
+
+    Raises:
+        InvalidValueError: if the plant is something else.
+    """
+    model = controller.problem.robot
+    scene = MuJoCo() if isinstance(plant, str) and plant == MUJOCO else plant
+    if scene is None or isinstance(scene, Robot):
+        return scene or model, None
+    if isinstance(scene, MuJoCo):
+        return scene.robot or model, scene
+    received = repr(plant)[:80] if isinstance(plant, str | int | float) else f"a {type(plant).__name__}"
+    raise InvalidValueError("plant", received, f"a Robot, '{MUJOCO}' or a MuJoCo")
+
+
+def _check_settings(loop: ClosedLoop, reference: Reference, settings: Settings, scene: MuJoCo | None) -> None:
+    """Raise InvalidValueError for arguments that would be ignored, or fail later with a less clear message."""
+    rate, end, law = settings.control_rate, reference.duration, loop.controller
+    for name, value in (("step", settings.step), ("tolerance", settings.tolerance), ("control_rate", rate)):
+        if value is not None and not 0 < as_number(name, value) < np.inf:
+            raise InvalidValueError(name, value, "a finite number > 0")
+    require_kind("compiled", settings.compiled, bool)
+    sampled, in_mujoco, remembers = rate is not None, scene is not None, memory_of(law) is not None
+    forces = bool(loop.loads.pushes) or settings.friction is not None or loop.stops is not None
+    forces = forces or loop.plant is not law.problem.robot
+    last_push = max((push.start for push in loop.loads.pushes), default=0.0)
+    ticks = (rate or 0.0) * end
+    in_python = "MuJoCo" if in_mujoco else "safety"
+    faults = (
+        # What does not fit together.
+        (
+            reference.labels != law.labels,
+            "labels of the reference",
+            reference.labels,
+            f"those of the controller {law.labels}",
+        ),
+        (loop.n != law.problem.n, "joints of the plant", loop.n, f"{law.problem.n}, as in the controller's robot"),
+        (
+            not loop.torque and forces,
+            "pushes, friction, stops or plant",
+            "given",
+            "none of them, because forces do not affect a velocity controller",
+        ),
+        (last_push >= end, "start of a push", last_push, f"a time before the end at {end:g} s"),
+        (sampled and ticks < 1, "control_rate", rate, f"at least one tick in {end:g} s"),
+        (ticks > RULES.most_ticks, "control_rate", rate, f"at most {RULES.most_ticks:g} ticks in {end:g} s"),
+        # What needs ticks.
+        (
+            settings.noise is not None and not sampled,
+            "noise",
+            settings.noise,
+            "no noise without control_rate, because white noise needs control ticks",
+        ),
+        (
+            settings.safety is not None and not sampled,
+            "control_rate",
+            None,
+            "a number, because a supervised law runs tick by tick",
+        ),
+        (in_mujoco and not sampled, "control_rate", None, "a number, because MuJoCo runs with a sampled controller"),
+        (remembers and not sampled, "control_rate", None, "a rate, such as 1000.0, for a law with a memory"),
+        # What MuJoCo and compiled C do not go with.
+        (
+            in_mujoco and not loop.torque,
+            "plant",
+            MUJOCO,
+            "no MuJoCo with a velocity controller, which commands no torques",
+        ),
+        (
+            in_mujoco and loop.stops is not None,
+            "stops",
+            "given",
+            "none with MuJoCo, which has its own: MuJoCo(stops=True)",
+        ),
+        (
+            settings.compiled and (in_mujoco or settings.safety is not None),
+            "compiled",
+            True,
+            f"False with {in_python}, which runs tick by tick from Python",
+        ),
+        (settings.compiled and remembers, "compiled", True, "False for a law with a memory"),
+    )
+    for wrong, argument, received, expected in faults:
+        if wrong:
+            raise InvalidValueError(argument, received, expected)
+
+
+def _build_start(loop: ClosedLoop, q_start: ArrayLike, dq_start: ArrayLike | None) -> Array:
+    q = as_point("q_start", q_start, loop.n)
+    if not loop.torque:
+        if dq_start is not None:
+            raise InvalidValueError(
+                "dq_start", dq_start, "None, because velocity is not a state with a velocity controller"
+            )
+        return q
+    return np.concatenate([q, np.zeros(loop.n) if dq_start is None else as_point("dq_start", dq_start, loop.n)])
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A closed loop that is ready to run, once."""
+
+    loop: ClosedLoop
+    reference: Reference
+    start: Array  #: state at t = 0
+    pieces: Callable[[ClosedLoop, Reference, Array], Iterator[Piece]]
+    compiled: CompiledLoop | None
+    supervised: bool
+
+    def run(self, monitor: Monitor) -> Trajectory:
+        """Simulate.
+
+        Raises:
+            Interrupted: after Ctrl-C; its `result` is the trajectory up to there, with outcome INTERRUPTED.
+        """
+        # A run that ends early is a result, too.
+        pieces: list[Piece] = []
+        outcome = Outcome.COMPLETE
+        try:
+            for piece in self.pieces(self.loop, self.reference, self.start):
+                pieces.append(piece)
+                time = piece.times[-1]
+                name = f"simulate {self.loop.controller.name}"
+                monitor(Progress(name, time / self.reference.duration, f"{time:.1f} s"))
+        except KeyboardInterrupt:
+            outcome = Outcome.INTERRUPTED
+        except SimulationError:
+            outcome = Outcome.DIVERGED
+        try:
+            run = self._build_trajectory(pieces, outcome)
+        except KeyboardInterrupt:
+            # Keep the run up to here.
+            run = self._build_trajectory(pieces, Outcome.INTERRUPTED)
+        if run.outcome is Outcome.INTERRUPTED:
+            raise Interrupted(run)
+        return run
+
+    def _build_trajectory(self, pieces: Sequence[Piece], outcome: Outcome) -> Trajectory:
+        """Join the pieces, and add what follows from the states and the reference."""
+        loop, controller, n = self.loop, self.loop.controller, self.loop.n
+        # The state at t = 0, then those at the ends of all steps.
+        times = np.concatenate([[0.0], *(piece.times for piece in pieces)])
+        states = np.vstack([self.start, *(piece.states for piece in pieces)])
+        q = states[:, :n]
+        target = self.reference.sample(np.minimum(times, self.reference.duration))
+        dq = states[:, n:] if loop.torque else np.zeros_like(q)
+        command, status, cause = self._read_commands(pieces, q, dq, *target)
+        energy = controller.energy if self.compiled is None else controller.energy_graph
+        unknown = [np.full((len(times), 1), np.nan)] * 2
+        storage, power = unknown if energy is None else self._evaluate("energy", q, dq, *target)
+        value, chart = self._evaluate("measured", q)[0], controller.chart
+        if chart is not None and controller.labels == chart.labels and chart.turns.any():
+            # Circle-valued quantities with the whole turns that bring them nearest to the reference.
+            value = np.asarray(target[0] + wrap_shortest(value - target[0], chart.turns))
+        run = Trajectory(
+            controller=controller.name,
+            kind=controller.command,
+            outcome=outcome,
+            labels=controller.labels,
+            joint_names=loop.plant.joint_names,
+            times=times,
+            q=q,
+            dq=dq if loop.torque else command,
+            command=command,
+            status=status.ravel().astype(int),
+            value=value,
+            reference=target[0],
+            reference_velocity=target[1],
+            reference_acceleration=target[2],
+            storage=storage[:, 0],
+            dissipated_power=power[:, 0],
+            cause=cause.astype(int),
+        )
+        # A law may keep running and have lost its arm.
+        reason = find_loss(run, controller, loop.loads.pushes, self.supervised) if outcome is Outcome.COMPLETE else ""
+        return replace(run, outcome=Outcome.LOST, reason=reason) if reason else run
+
+    def _read_commands(self, pieces: Sequence[Piece], *arguments: Array) -> tuple[Array, Array, Array]:
+        """Commands, status and causes: those that were held, the last one also for the end, or those of the law."""
+        held = [piece.held for piece in pieces if piece.held is not None]
+        if not held:
+            command, status = self._evaluate("command", *arguments)
+            return command, status, np.zeros(len(command))
+        columns = ([part.commands for part in held], [part.status for part in held], [part.cause for part in held])
+        command, status, cause = (np.concatenate([*parts, parts[-1][-1:]]) for parts in columns)
+        return command, status, cause
+
+    def _evaluate(self, name: str, *arguments: Array) -> list[Array]:
+        """`command`, `energy` or `measured` of the law for N rows of arguments."""
+        if self.compiled is not None:
+            return self.compiled.rows(name, *arguments)
+        controller = self.loop.controller
+        if name == "measured":
+            return Batched(controller.measured)(*arguments)
+        function = get_counted_function(controller, "function" if name == "command" else "energy")
+        assert function is not None
+        gains = [np.tile(gain, (len(arguments[0]), 1)) for gain in controller.gains.values()]
+        return Batched(function)(*arguments, *gains)
+
+
+_POSITIONAL = ("controller", "reference", "q_start")
 _DEFAULTS = {
     name: parameter.default
     for name, parameter in inspect.signature(simulate).parameters.items()
@@ -451,34 +438,25 @@ def simulate_many(
         [False, True]
     """
     require_executor(executor)
-    common = {"controller": controller, "reference": reference, "q_start": q_start, **settings}
-    calls = _calls(common, changes)
-    if executor is not None:
-        return _shared(executor, [partial(simulate, **call) for call in calls], monitor)
-    ready = [partial(_prepared(call).run, silent) for call in calls]  # CasADi must not build functions in threads
-    if THREADS > 1 and all(call.get("compiled") for call in calls):
-        with ThreadPoolExecutor(THREADS) as pool:
-            return _shared(pool, ready, monitor)
-    return _one_by_one(ready, monitor)
-
-
-def _calls(common: Mapping[str, Any], changes: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Arguments of `simulate` for each run."""
     require_kind("changes", changes, Sequence)
+    common = {"controller": controller, "reference": reference, "q_start": q_start, **settings}
     for k, change in enumerate(changes):
         require_kind(f"changes[{k}]", change, Mapping)
         for name in (*common, *change):
             require_known("argument of simulate", name, (*_POSITIONAL, *_DEFAULTS))
-    return [{**common, **change} for change in changes]
+    calls = [{**common, **change} for change in changes]
+    if executor is not None:
+        return _share_runs(executor, [partial(simulate, **call) for call in calls], monitor)
 
-
-def _prepared(call: Mapping[str, Any]) -> Prepared:
-    given = {**_DEFAULTS, **call}
-    controller, reference, q_start = (given.pop(name) for name in _POSITIONAL)
-    return prepare(controller, reference, q_start, Settings(**given))
-
-
-def _one_by_one(runs: Sequence[Callable[[], Trajectory]], monitor: Monitor) -> tuple[Trajectory, ...]:
+    # CasADi must not build functions in threads.
+    runs = []
+    for call in calls:
+        named = {**_DEFAULTS, **call}
+        law, path, start = (named.pop(name) for name in _POSITIONAL)
+        runs.append(partial(prepare(law, path, start, Settings(**named)).run, silent))
+    if THREADS > 1 and all(call.get("compiled") for call in calls):
+        with ThreadPoolExecutor(THREADS) as pool:
+            return _share_runs(pool, runs, monitor)
     done: list[Trajectory] = []
     try:
         for run in runs:
@@ -489,11 +467,14 @@ def _one_by_one(runs: Sequence[Callable[[], Trajectory]], monitor: Monitor) -> t
     return tuple(done)
 
 
-def _shared(executor: Executor, runs: Sequence[Callable[[], Trajectory]], monitor: Monitor) -> tuple[Trajectory, ...]:
+def _share_runs(
+    executor: Executor, runs: Sequence[Callable[[], Trajectory]], monitor: Monitor
+) -> tuple[Trajectory, ...]:
     futures = [executor.submit(run) for run in runs]
     try:
         for done, future in enumerate(as_completed(futures), start=1):
-            future.result()  # a run that fails ends all
+            # A run that fails ends all.
+            future.result()
             _report(monitor, done, len(runs))
         return tuple(future.result() for future in futures)
     except KeyboardInterrupt:

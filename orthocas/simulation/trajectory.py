@@ -1,7 +1,7 @@
 """The result of a simulation: arrays over time with names and units, stored in NPZ files."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from enum import Enum
 from pathlib import Path
@@ -13,9 +13,10 @@ import scipy
 from numpy.typing import NDArray
 
 from orthocas.charts.chart import Chart
-from orthocas.control.controller import FROM_THE_LAW, ControlStatus
+from orthocas.control.controller import FROM_THE_LAW, Controller, ControlStatus
 from orthocas.control.reference import Reference
 from orthocas.errors import InvalidValueError, OrthocasError, TrajectoryFileError
+from orthocas.simulation.disturbances import RULES, Push
 from orthocas.tools.archive import Stored, open_archive, read_npy
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import building
@@ -57,7 +58,6 @@ _LATER = ("cause",)  #: arrays that older files do not have
 _SINGLE = ("times", "status", "storage", "dissipated_power", "cause")  #: one number at each instant
 _OF_JOINTS = ("q", "dq", "command")  #: one number for every joint; the others for every label
 _REQUIRED = tuple(name for name in _ARRAYS if name not in _LATER)
-_NO_STEP = 1e-9  # smaller differences of targets are rounding
 
 
 def read_run_file(
@@ -79,8 +79,8 @@ def read_run_file(
                 raise
             raise TrajectoryFileError(f"{path} contains an array or a header that cannot be read: {error}") from None
     if not isinstance(header, dict) or header.get("version") != version:
-        found = header.get("version") if isinstance(header, dict) else None
-        raise TrajectoryFileError(f"{path} has version {found}, this orthocas reads {version}")
+        saved = header.get("version") if isinstance(header, dict) else None
+        raise TrajectoryFileError(f"{path} has version {saved}, this orthocas reads {version}")
     return header, stored
 
 
@@ -226,11 +226,11 @@ class Trajectory(Shown):
         header, arrays = read_run_file(path, _VERSION, _REQUIRED, _LATER)
         try:
             names: dict[str, Any] = {name: tuple(get_part(header, name, list)) for name in ("labels", "joint_names")}
-            _require_names(names)
+            _check_names(names)
             require_known("kind of command", get_part(header, "kind", str), ("torque", "velocity"))
             require_known("outcome", get_part(header, "outcome", str), [outcome.value for outcome in Outcome])
             controller = require_text("controller", get_part(header, "controller", str))
-            checked = _checked_arrays(arrays, len(names["joint_names"]), len(names["labels"]))
+            checked = _check_arrays(arrays, len(names["joint_names"]), len(names["labels"]))
             own: dict[str, Any] = {
                 "controller": controller,
                 "kind": header["kind"],
@@ -242,7 +242,7 @@ class Trajectory(Shown):
             raise TrajectoryFileError(f"{path} is inconsistent: {error}") from None
 
 
-def _require_names(names: Mapping[str, tuple[str, ...]]) -> None:
+def _check_names(names: Mapping[str, tuple[str, ...]]) -> None:
     """Raise InvalidValueError unless there are names, all of them printable."""
     for what, texts in names.items():
         for k, text in enumerate(texts):
@@ -251,7 +251,7 @@ def _require_names(names: Mapping[str, tuple[str, ...]]) -> None:
             raise InvalidValueError(what, "empty", "at least one name")
 
 
-def _checked_arrays(arrays: Mapping[str, Any], n: int, k: int) -> dict[str, Any]:
+def _check_arrays(arrays: Mapping[str, Any], n: int, k: int) -> dict[str, Any]:
     """The arrays of a run of n joints and k quantities, with shapes that fit and instants that increase."""
     N = arrays["times"].size
     checked: dict[str, Any] = {}
@@ -268,6 +268,59 @@ def _checked_arrays(arrays: Mapping[str, Any], n: int, k: int) -> dict[str, Any]
 
 
 assert set(_ARRAYS) < {field.name for field in fields(Trajectory)}
+
+
+def find_loss(run: Trajectory, controller: Controller, pushes: Sequence[Push], supervised: bool) -> str:
+    """Why a law lost its arm in a run, in words; empty if it kept it.
+
+    It lost the arm where the arm left the domain of the law's chart, in which alone the law commands; with a law
+    without a chart, where it left the joint limits. A supervised law may leave them and come back, and its catcher may
+    hold the arm outside.
+
+    It also lost the arm where motors were at their limit for a time, and the storage V, the energy of springs
+    and motion, was larger after that time than before. This counts at the end of the run, and where the catcher of a
+    supervised law had to take over meanwhile, without a push.
+
+    Args:
+        run: the run, in the quantities of the law.
+        controller: the law.
+        pushes: that acted on the arm.
+        supervised: whether its supervised form ran.
+    """
+    outside, what = _find_outside(run, controller)
+    held = supervised and run.status[-1] in (ControlStatus.CAUGHT, ControlStatus.RETURNING)
+    if (outside[-1] and not held) or (outside.any() and not supervised):
+        first, _ = next(_find_stretches(outside))
+        left = "was outside" if first == 0 else "left"
+        return f"the arm {left} {what} at t = {run.times[first]:.4g} s"
+
+    # Inside, but the motors are at their limit and the errors grow.
+    at_limit = np.abs(run.command) >= controller.gains["limit"]
+    for first, last in _find_stretches(np.asarray(at_limit.any(axis=1))):
+        since, until = run.times[[first, last]]
+        pushed = any(push.start < until and push.end > since for push in pushes)
+        caught = (run.status[first : last + 1] == ControlStatus.CAUGHT).any() and not pushed
+        growing = run.storage[last] > run.storage[first]
+        if (caught or last == len(run.times) - 1) and until - since > RULES.lasting and growing:
+            joint = run.joint_names[int(np.argmax(at_limit[first : last + 1].sum(axis=0)))]
+            return f"from t = {since:.4g} s to {until:.4g} s joint '{joint}' was at its limit, and errors grew"
+    return ""
+
+
+def _find_outside(run: Trajectory, controller: Controller) -> tuple[NDArray[np.bool_], str]:
+    """At which instants the arm is outside what the law respects, (N,), and what that is."""
+    if controller.chart is not None:
+        return np.asarray(~controller.problem.domain.contains(run.q)), "the domain of the chart"
+    robot = controller.problem.robot
+    beyond = (run.q < robot.lower - RULES.beyond) | (run.q > robot.upper + RULES.beyond)
+    return np.asarray(beyond.any(axis=1)), "the joint limits"
+
+
+def _find_stretches(true: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """First and last index of every run of true entries."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], true, [False]]).astype(int)))
+    for first, end in edges.reshape(-1, 2).tolist():
+        yield first, end - 1
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -314,10 +367,11 @@ def coupling_index(chart: Chart, reference: Reference, trajectory: Trajectory) -
         raise InvalidValueError("labels of the reference", reference.labels, f"those of the chart {chart.labels}")
     wanted = reference.sample(np.minimum(trajectory.times, reference.duration))[0]
     away = np.abs(wrap_shortest(chart.phi(trajectory.q) - wanted, chart.turns))
+    # Between two steps of the reference, only the commanded coordinates should move.
     steps = np.diff(np.vstack([reference.start, reference.targets]), axis=0)
     index = np.full((chart.n, chart.n), np.nan)
     for segment, step in enumerate(steps):
-        moved = np.flatnonzero(np.abs(step) > _NO_STEP)
+        moved = np.flatnonzero(np.abs(step) > RULES.no_step)
         begin, end = reference.times[segment : segment + 2]
         inside = (trajectory.times >= begin) & (trajectory.times <= end)
         if len(moved) == 1 and inside.any():
@@ -359,16 +413,18 @@ def task_acceleration_breakdown(chart: Chart, trajectory: Trajectory) -> Breakdo
     require_kind("trajectory", trajectory, Trajectory)
     if trajectory.kind != "torque":
         raise InvalidValueError("trajectory", f"a run of '{trajectory.controller}'", "a run of a torque controller")
-    with deferred(), building:  # threads share the chart
-        function = _parts(chart)
+    # Threads share the chart.
+    with deferred(), building:
+        function = _build_parts(chart)
     parts = Batched(function)(trajectory.q, trajectory.dq, trajectory.command)
     return Breakdown(chart.problem.task.labels, *parts)
 
 
-def _parts(chart: Chart) -> ca.Function:
+def _build_parts(chart: Chart) -> ca.Function:
     n, m, robot = chart.n, chart.m, chart.problem.robot
     q, dq, tau = (ca.MX.sym(name, n) for name in ("q", "dq", "tau"))
     J = chart.function("jacobian")(q)
+    # Forces f_phi = J^-T (tau - g), and dd_x = J_x M^-1 (J^T f - C dq) + dJ_x/dt dq.
     f = ca.solve(J.T, tau - robot.gravity(q))
     mobility = ca.solve(robot.mass_matrix(q), J[:m, :].T).T  # J_x M^-1
     own, error = mobility @ J[:m, :].T @ f[:m], mobility @ J[m:, :].T @ f[m:]

@@ -44,7 +44,8 @@ def deferred() -> Iterator[None]:
         yield
         return
     note = _Note()
-    numbers = (signal.SIGINT, *_ENDING) if _ends else (signal.SIGINT,)  # others are not held; asking takes its time
+    # Others are not held; asking takes its time.
+    numbers = (signal.SIGINT, *_ENDING) if _ends else (signal.SIGINT,)
     handlers = {number: _signal.getsignal(number) for number in numbers}
     before = {number: handler for number, handler in handlers.items() if _held(number, handler)}
     for number in before:
@@ -57,9 +58,11 @@ def deferred() -> Iterator[None]:
         for number, handler in before.items():
             _signal.signal(number, handler)
         if note.number is not None:
-            for outer in _notes:  # compiled code around this one may not pass the exception on
+            # Compiled code around this one may not pass the exception on.
+            for outer in _notes:
                 outer.number = outer.number or note.number
-            _raise(note.number)  # also instead of what compiled code made of it
+            # Also instead of what compiled code made of it.
+            _raise(note.number)
 
 
 def check() -> None:
@@ -139,7 +142,8 @@ def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
 
 def _end(number: int, frame: FrameType | None) -> NoReturn:
     for each in _ENDING:
-        signal.signal(each, signal.SIG_IGN)  # the end is not to be disturbed
+        # The end is not to be disturbed.
+        signal.signal(each, signal.SIG_IGN)
     _raise(number)
 
 

@@ -14,72 +14,15 @@ from contextlib import contextmanager
 from importlib import import_module
 from multiprocessing import current_process, get_context, parent_process, resource_tracker
 from multiprocessing.connection import wait
-from multiprocessing.synchronize import Event
 from typing import Any
 
 from orthocas.errors import ArchiveError, CompileError, SchedulerError
 from orthocas.tools.interrupts import deferred
 
 _PR_SET_PDEATHSIG = 1  # of prctl(2)
-_PARENT = "ORTHOCAS_PARENT"  # environment variable with the process id of a worker's parent, until the worker reads it
-_SPAWNED = "--multiprocessing-fork"  # on the command line of processes that multiprocessing starts
+_SPAWN = get_context("spawn")  # new interpreters: forked ones inherit the locks of threads that no longer run
 ATTEMPTS = 3  #: at work whose process dies each time
 _log = logging.getLogger(__name__)
-_SPAWN = get_context("spawn")  # new interpreters: forked ones inherit the locks of threads that no longer run
-
-
-def worker_pool(size: int, begin: Callable[..., object], *arguments: object) -> ProcessPoolExecutor:
-    """An executor whose processes call `begin(*arguments)` first; they start in blocks of `starting_workers`.
-
-    A script without a main guard would call this in its workers again, while they import it: they end with one line.
-
-    Raises:
-        ArchiveError: if the system's shared memory is full.
-    """
-    if getattr(current_process(), "_inheriting", False):
-        raise SystemExit("orthocas: a script that starts processes needs `if __name__ == '__main__':` around its calls")
-    with _shared_memory_named():
-        return ProcessPoolExecutor(size, _SPAWN, begin, arguments)
-
-
-def shared_event() -> Event:
-    """An event for such processes; see `worker_pool`."""
-    with _shared_memory_named():
-        return _SPAWN.Event()
-
-
-@contextmanager
-def _shared_memory_named() -> Iterator[None]:
-    """Name the shared memory in errors, and let the process of multiprocessing that frees it outlive a hang-up."""
-    try:
-        if hasattr(signal, "SIGHUP"):
-            with _blocked(signal.SIGHUP):  # which that process inherits, for ever
-                resource_tracker.ensure_running()
-        yield
-    except OSError as error:  # which names no file
-        raise ArchiveError(f"cannot share memory with processes: {error.strerror}, expected room in /dev/shm") from None
-
-
-@contextmanager
-def starting_workers() -> Iterator[None]:
-    """For the block in which an executor starts processes, that is, around its first calls of `submit`.
-
-    The processes use one thread each, so that they do not compete for cores. They end with this one from the moment
-    when they import orthocas. Ctrl-C never comes there, imports included. Here all signals wait until the end of the
-    block: half a start leaves a process that nobody knows, or one that complains that its input ends.
-    """
-    given = {"OMP_NUM_THREADS": "1", _PARENT: str(os.getpid())}
-    before = {name: os.environ.get(name) for name in given}
-    os.environ.update(given)
-    try:
-        with deferred(), _blocked(signal.SIGINT):
-            yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 class Processes(Executor):
@@ -89,11 +32,19 @@ class Processes(Executor):
         size: number of processes.
         begin: called first in each, with the arguments; calls `begin_worker`.
         arguments: of `begin`.
+
+    Raises:
+        ArchiveError: if the system's shared memory is full.
+        SystemExit: in its own processes, which import a script without a main guard and would call it again.
     """
 
     def __init__(self, size: int, begin: Callable[..., object], *arguments: object) -> None:
+        if getattr(current_process(), "_inheriting", False):
+            raise SystemExit(
+                "orthocas: a script that starts processes needs `if __name__ == '__main__':` around its calls"
+            )
         self._begin = begin, arguments
-        self._pools = [self._pool() for _ in range(size)]
+        self._pools = [self._build_pool() for _ in range(size)]
         self._pending: list[set[Future[Any]]] = [set() for _ in range(size)]
 
     def submit(self, work: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
@@ -102,29 +53,60 @@ class Processes(Executor):
             pending -= {future for future in pending if future.done()}
         slot = min(range(len(self._pools)), key=lambda k: len(self._pending[k]))
         try:
-            future = self._started(slot, work, *arguments, **named)
-        except (BrokenExecutor, BrokenPipeError):  # a pipe: it died before it had its arguments
+            future = self._submit_to(slot, work, *arguments, **named)
+        except (BrokenExecutor, BrokenPipeError):
+            # A pipe: it died before it had its arguments.
             _log.warning("a worker process died, killed or out of memory: another one takes its place")
             self._pools[slot].shutdown(wait=False)
-            self._pools[slot] = self._pool()
-            future = self._started(slot, work, *arguments, **named)
+            self._pools[slot] = self._build_pool()
+            future = self._submit_to(slot, work, *arguments, **named)
         self._pending[slot].add(future)
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes at once: what they have not handed over is lost."""
         for pool in self._pools:
-            for process in list((pool._processes or {}).values()):  # a pool would wait for running work
+            # A pool would wait for running work.
+            for process in list((pool._processes or {}).values()):
                 process.kill()
             pool.shutdown(wait=wait, cancel_futures=True)
 
-    def _started(self, slot: int, work: Callable[..., Any], *arguments: Any, **named: Any) -> Future[Any]:
+    def _submit_to(self, slot: int, work: Callable[..., Any], *arguments: Any, **named: Any) -> Future[Any]:
         with starting_workers():
             return self._pools[slot].submit(work, *arguments, **named)
 
-    def _pool(self) -> ProcessPoolExecutor:
-        begin, arguments = self._begin
-        return worker_pool(1, begin, *arguments)
+    def _build_pool(self) -> ProcessPoolExecutor:
+        try:
+            # The process of multiprocessing that frees shared memory inherits what is blocked, and outlives a hang-up.
+            if hasattr(signal, "SIGHUP"):
+                with _block(signal.SIGHUP):
+                    resource_tracker.ensure_running()
+            return ProcessPoolExecutor(1, _SPAWN, *self._begin)
+        except OSError as error:
+            # It names no file.
+            raise ArchiveError(
+                f"cannot share memory with processes: {error.strerror}, expected room in /dev/shm"
+            ) from None
+
+
+@contextmanager
+def starting_workers() -> Iterator[None]:
+    """For the block in which an executor starts processes, that is, around its first calls of `submit`.
+
+    The processes use one thread each, so that they do not compete for cores. Ctrl-C never comes there, imports
+    included. Here all signals wait until the end of the block: half a start leaves a process that nobody knows, or one
+    that complains that its input ends.
+    """
+    before = os.environ.get("OMP_NUM_THREADS")
+    os.environ["OMP_NUM_THREADS"] = "1"
+    try:
+        with deferred(), _block(signal.SIGINT):
+            yield
+    finally:
+        if before is None:
+            del os.environ["OMP_NUM_THREADS"]
+        else:
+            os.environ["OMP_NUM_THREADS"] = before
 
 
 def worker_died(future: Future[Any]) -> bool:
@@ -149,35 +131,21 @@ def in_order(executor: Executor, work: Callable[..., Any], *columns: Sequence[An
             future.cancel()
 
 
-def end_early_with_parent() -> None:
-    """End with the parent already while Python imports what a worker needs; `orthocas` calls it first of all.
-
-    Other processes than those of `starting_workers` only forget about it, as does what they start.
-    """
-    parent = os.environ.pop(_PARENT)
-    if _SPAWNED in sys.orig_argv:
-        _end_with(int(parent))
-
-
 def begin_worker(parent: int) -> None:
     """Initialise a worker process: Ctrl-C is for its parent, and it ends with it, however that comes about.
 
     On Linux the kernel sees to it at once. Elsewhere a thread waits for the parent, and ends the process as soon as
-    compiled code lets it run.
+    compiled code lets it run. A worker whose parent ends before this call ends here, after its imports.
 
     Args:
         parent: process id of the parent, which may have ended already.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _end_with(parent)
-    threading.Thread(target=_wait_for_parent, daemon=True).start()
-
-
-def _end_with(parent: int) -> None:
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
+    threading.Thread(target=_wait_for_parent, daemon=True).start()
 
 
 def _wait_for_parent() -> None:
@@ -188,7 +156,7 @@ def _wait_for_parent() -> None:
 
 
 @contextmanager
-def _blocked(number: signal.Signals) -> Iterator[None]:
+def _block(number: signal.Signals) -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

@@ -3,13 +3,13 @@
 import html
 import sys
 import time
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, TextIO
 
-_PAUSE = 0.1  # [s] between pictures
-_BAR = 24  # characters
+_PAUSE = 0.1  # [s] between pictures in notebooks
 _KERNELS = ("ZMQInteractiveShell", "Shell")  #: of Jupyter and Colab
 
 
@@ -48,15 +48,17 @@ UNWATCHED = Watch()
 def progress() -> Monitor:
     """A monitor that draws: `oc.fit(problem, monitor=oc.progress())`.
 
-    In a Jupyter notebook it shows one bar for each stage below the cell, elsewhere one line for each stage on standard
-    error. It needs no widgets. Use a new one for each call.
+    In a Jupyter notebook it shows one bar for each stage below the cell, in a terminal one line for each stage on
+    standard error, and elsewhere nothing. It needs no widgets. Use a new one for each call.
 
     Example:
         >>> import orthocas as oc
         >>> from orthocas import problems
         >>> fit = oc.fit(problems.get("planar_3r_xy"), oc.Linear(), monitor=oc.progress())
     """
-    return NotebookBars() if in_notebook() else TerminalLines(sys.stderr)
+    if in_notebook():
+        return NotebookBars()
+    return TerminalBars(sys.stderr) if sys.stderr.isatty() else silent
 
 
 def in_notebook() -> bool:
@@ -88,34 +90,60 @@ class NotebookBars:
             self._handle.update(picture)
 
 
-class TerminalLines:
-    """One line for each stage, rewritten in place on terminals and left out elsewhere."""
+class TerminalBars:
+    """One bar of rich for each stage. It ends with its stage, by `close`, or when nothing refers to this monitor.
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream, self._stage, self._drawn = stream, "", 0.0
-        self._seen = stream.isatty()
+    Args:
+        stream: a terminal.
+        transient: whether bars vanish at their end.
+    """
+
+    def __init__(self, stream: TextIO, transient: bool = False) -> None:
+        self._stream, self._transient = stream, transient
+        self._stage = ""
+        self._bar: Any = None
+        self._stop: Callable[[], object] | None = None
 
     def __call__(self, progress: Progress) -> None:
-        """Write, at most ten times a second."""
-        new = progress.stage != self._stage
-        if not self._seen or (not new and progress.fraction < 1 and time.monotonic() < self._drawn + _PAUSE):
-            return
-        full = int(_BAR * min(max(progress.fraction, 0.0), 1.0))
-        start = "\n" if new and self._stage else "\r"
-        end = "\n" if progress.fraction >= 1 else ""
-        bar = "=" * full + " " * (_BAR - full)
-        self._stream.write(f"{start}{progress.stage:<28.28} [{bar}] {progress.detail:<40.40}{end}")
-        self._stream.flush()
-        self._stage, self._drawn = "" if end else progress.stage, time.monotonic()
+        """Show a report."""
+        if self._stop is None or progress.stage != self._stage:
+            # The stage before is complete.
+            if self._stop is not None:
+                self._bar.update(self._bar.task_ids[0], completed=1.0)
+            self.close()
+            self._start(progress.stage)
+        self._bar.update(self._bar.task_ids[0], completed=progress.fraction, detail=progress.detail)
+        if progress.fraction >= 1:
+            self.close()
+
+    def close(self) -> None:
+        """End the bar of the last stage."""
+        if self._stop is not None:
+            self._stop()
+            self._stop = None
+
+    def _start(self, stage: str) -> None:
+        from rich import progress as rich  # takes longer to import than all the rest, and few processes draw bars
+        from rich.console import Console
+
+        text, detail = (
+            rich.TextColumn(field, markup=False) for field in ("{task.description}", "{task.fields[detail]}")
+        )
+        columns = (text, rich.BarColumn(), rich.TimeElapsedColumn(), detail)
+        self._stage = stage
+        self._bar = rich.Progress(*columns, console=Console(file=self._stream), transient=self._transient)
+        self._bar.add_task(stage, total=1.0, detail="")
+        self._stop = weakref.finalize(self, self._bar.stop)
+        self._bar.start()
 
 
 def as_bars(stages: dict[str, Progress]) -> str:
     """A table with a bar for each stage; all but the last are complete."""
     rows = []
     for k, (name, progress) in enumerate(stages.items(), 1):
-        share = 1.0 if k < len(stages) else min(max(progress.fraction, 0.0), 1.0)
+        fraction = 1.0 if k < len(stages) else min(max(progress.fraction, 0.0), 1.0)
         rows.append(
-            f"<tr><td style='text-align:left'>{html.escape(name)}</td><td><progress value='{share:.3f}' max='1' "
+            f"<tr><td style='text-align:left'>{html.escape(name)}</td><td><progress value='{fraction:.3f}' max='1' "
             f"style='width:16em'></progress></td><td style='text-align:left'>{html.escape(progress.detail)}</td></tr>"
         )
     return f"<table>{''.join(rows)}</table>"

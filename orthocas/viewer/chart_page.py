@@ -11,16 +11,11 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.self_motion import Fan, fan_along
 from orthocas.tasks.branches import branches
 from orthocas.tools.checks import Array
-from orthocas.viewer.looks import GHOSTS, Arm, Ghosts, Look, chain_length
+from orthocas.viewer.looks import RULES, Arm, Ghosts, Look, compute_chain_length
 from orthocas.viewer.panel import ChartPanel
 from orthocas.viewer.session import Session
-from orthocas.viewer.window import Loop, place_camera, place_floor, place_lights, place_panels, show_error
+from orthocas.viewer.window import Loop, place_panels, place_scene, show_error
 
-_STEP = 1e-3  # of the sliders
-_SWEEP = 6.0  # [s] there and back
-_TOLD = 0.1  # [s] between readings in a sweep: pages that are written for every picture take more than the picture
-_CALM = 0.97  # share of the range that a sweep uses
-_HANDLE = 0.17  # size, as a share of the length of the arm
 _NONE = "none"
 
 
@@ -31,14 +26,12 @@ class ChartPage:
         self.session = session
         self._server = server
         self._panel = ChartPanel(session.chart, session.place)
-        self._loop = Loop(self._settle, self._failed)
+        self._loop = Loop(self._settle, self._show_failure)
         self._gesture = self._dragging = self._sweeping = False
         self._fans: list[Fan] = []
         robot = session.chart.problem.robot
         self._arm, self._ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
-        place_floor(server, robot)
-        place_lights(server, robot)
-        place_camera(server, robot, self.session.home[None])
+        place_scene(server, robot, self.session.home[None])
         self._handle = self._add_handle()
         self._readings = place_panels(server)
         self._sliders = self._add_sliders()
@@ -63,53 +56,54 @@ class ChartPage:
         with gui.add_folder("Coordinates: the task stays"):
             for label, name, value in zip(chart.labels[m:], chart.named_coordinates, phi[m:].tolist(), strict=True):
                 hint = f"Moves the joints along {label}, and keeps the task and the other coordinates."
-                sliders[label] = self._slider(name, value, 0.5, hint, label)
+                sliders[label] = self._add_slider(name, value, 0.5, hint, label)
         with gui.add_folder("Task: the coordinates stay"):
             units = chart.problem.task.units
             for label, unit, value, size in zip(chart.labels[:m], units, phi[:m].tolist(), sizes[:m], strict=True):
                 name = f"{label} [{unit}]" if unit else label
-                sliders[label] = self._slider(
+                sliders[label] = self._add_slider(
                     name, value, float(size), "Moves the task, and keeps all coordinates.", label
                 )
         return sliders
 
-    def _slider(self, name: str, value: float, reach: float, hint: str, label: str = "") -> Any:
+    def _add_slider(self, name: str, value: float, reach: float, hint: str, label: str = "") -> Any:
         low, high, shown = round(value - reach, 3), round(value + reach, 3), round(value, 3)
-        slider = self._server.gui.add_slider(name, low, high, _STEP, min(max(shown, low), high), hint=hint)
+        slider = self._server.gui.add_slider(name, low, high, RULES.slider_step, min(max(shown, low), high), hint=hint)
         what = label or name
 
         async def moved(event: Any) -> None:
-            if event.client is not None:  # otherwise the page itself moved it
-                given = float(event.target.value)
-                self._loop.ask(what, lambda: self._wish({what: given}))
+            # Otherwise the page itself moved it.
+            if event.client is not None:
+                value = float(event.target.value)
+                self._loop.ask(what, lambda: self._move_towards({what: value}))
 
         slider.on_update(moved)
         return slider
 
     def _add_buttons(self) -> None:
         gui = self._server.gui
-        self._button("Home", "home", self._go_home)
-        self._undo = self._button("Undo", "arrow-back-up", self._undone)
+        self._add_button("Home", "home", self._go_home)
+        self._undo = self._add_button("Undo", "arrow-back-up", self._undo_move)
         with gui.add_folder("What a coordinate reaches"):
             labels = self._chart.labels[self._chart.m :]
-            self._chosen = gui.add_dropdown("coordinate", (*labels, _NONE), initial_value=self._widest())
-            self._sweep = self._button("Sweep", "repeat", self._swept)
+            self._chosen = gui.add_dropdown("coordinate", (*labels, _NONE), initial_value=self._find_widest())
+            self._sweep = self._add_button("Sweep", "repeat", self._toggle_sweep)
         if self._chart.problem.domain.room_to_fold is not None:
             self._branches = gui.add_folder("Other branches: the tip stays")
             with self._branches:
-                self._search = self._button("Search", "arrows-split", self._find_branches)
-        self._chosen.on_update(self._another)
+                self._search = self._add_button("Search", "arrows-split", self._find_branches)
+        self._chosen.on_update(self._choose_coordinate)
 
-    async def _another(self, event: Any) -> None:
+    async def _choose_coordinate(self, event: Any) -> None:
         self._loop.ask("fan", self._show_fan)
 
-    def _widest(self) -> str:
+    def _find_widest(self) -> str:
         """The coordinate that moves the joints farthest."""
         robot = self._chart.problem.robot
         self._fans = [fan_along(self._chart, self.session.q, k) for k in range(self._chart.r)]
         return max(self._fans, key=lambda fan: float(np.ptp(robot.joint_points(fan.spread(5)), axis=0).max())).label
 
-    def _button(self, label: str, icon: str, job: Callable[[], None]) -> Any:
+    def _add_button(self, label: str, icon: str, job: Callable[[], None]) -> Any:
         button = self._server.gui.add_button(label, icon=icon)
 
         async def clicked(event: Any) -> None:
@@ -122,12 +116,12 @@ class ChartPage:
         """Search the branches of the robot, which takes seconds, and offer those beyond a mirror."""
         self._search.label, self._search.disabled = "Searching ...", True
         problem = self._chart.problem
-        found = self.session.branches = branches(problem.robot, problem.task)
+        branching = self.session.branches = branches(problem.robot, problem.task)
         self._search.remove()
         with self._branches:
-            for cut in found.mirrors:
-                self._button(f"Flip the {found.cuts[cut].part}", "arrows-left-right", partial(self._flip, cut))
-            if not found.mirrors:
+            for cut in branching.mirrors:
+                self._add_button(f"Flip the {branching.cuts[cut].part}", "arrows-left-right", partial(self._flip, cut))
+            if not branching.mirrors:
                 self._server.gui.add_markdown("No mirror image of this arm has the same pose of its tip.")
 
     def _flip(self, cut: int) -> None:
@@ -142,7 +136,7 @@ class ChartPage:
         axes = tuple(kind.startswith(("position", "pose")) and axis in chart.labels[: chart.m] for axis in "xyz")
         if not any(axes) or not chart.problem.task.of_tip:
             return None
-        size = _HANDLE * chain_length(chart.problem.robot.tree)
+        size = RULES.handle * compute_chain_length(chart.problem.robot.tree)
         handle = self._server.scene.add_transform_controls(
             "/tool", scale=size, active_axes=axes, disable_rotations=True, depth_test=False, opacity=0.8
         )
@@ -151,12 +145,12 @@ class ChartPage:
         async def dragged(event: Any) -> None:
             place = dict(zip("xyz", map(float, event.target.position), strict=True))
             self._dragging = event.phase != "end"
-            self._loop.ask("tool", lambda: self._wish({axis: place[axis] for axis in moved}))
+            self._loop.ask("tool", lambda: self._move_towards({axis: place[axis] for axis in moved}))
 
         handle.on_update(dragged)
         return handle
 
-    def _wish(self, values: dict[str, float]) -> None:
+    def _move_towards(self, values: dict[str, float]) -> None:
         """Move towards what the user wishes, as the first or a later part of a gesture."""
         self._rest()
         self._begin()
@@ -175,33 +169,34 @@ class ChartPage:
         self.session.go_home()
         self._show()
 
-    def _undone(self) -> None:
+    def _undo_move(self) -> None:
         self._rest()
         self.session.undo()
         self._show()
 
-    def _swept(self) -> None:
+    def _toggle_sweep(self) -> None:
         """Move the chosen coordinate to its ends and back, until something else is wished for; or end that."""
-        fan = self._fan()
+        fan = self._find_fan()
         if self._sweeping or fan is None:
             self._rest()
             return
         self._begin()
         self._sweeping, self._sweep.label = True, "Stop"
-        middle, half = (fan.xi[-1] + fan.xi[0]) / 2, _CALM * (fan.xi[-1] - fan.xi[0]) / 2
+        centre, half = (fan.xi[-1] + fan.xi[0]) / 2, RULES.sweep_range * (fan.xi[-1] - fan.xi[0]) / 2
+        # A sine through the present value, over nearly the whole range.
         here = float(self.session.readings.xi[self._chart.labels.index(fan.label) - self._chart.m])
-        phase = np.arcsin(np.clip((here - middle) / max(half, 1e-9), -1, 1))
+        phase = np.arcsin(np.clip((here - centre) / max(half, 1e-9), -1, 1))
 
-        told = -_TOLD
+        last_reading = -RULES.reading_pause
 
         def tick(seconds: float) -> bool:
-            nonlocal told
-            self.session.wish({fan.label: float(middle + half * np.sin(2 * np.pi * seconds / _SWEEP + phase))})
+            nonlocal last_reading
+            self.session.wish({fan.label: float(centre + half * np.sin(2 * np.pi * seconds / RULES.sweep + phase))})
             self.session.follow()
-            if seconds - told < _TOLD:
+            if seconds - last_reading < RULES.reading_pause:
                 self._show_arm(self.session.q)
             else:
-                told = seconds
+                last_reading = seconds
                 self._show()
             return True
 
@@ -221,8 +216,8 @@ class ChartPage:
             self._panel = ChartPanel(self._chart, place, mirrored=bool(self.session.flips))
         with self._server.atomic():
             self._show_arm(readings.q)
-            shown = replace(readings, q=self.session.shown(readings.q[None])[0])
-            self._readings.content = self._panel.html(shown)
+            shown = replace(readings, q=self.session.mirror(readings.q[None])[0])
+            self._readings.content = self._panel.format_html(shown)
             for label, value in zip(self._chart.labels, np.concatenate([readings.x, readings.xi]), strict=True):
                 if label not in moved:
                     self._set(self._sliders[label], float(value))
@@ -231,7 +226,7 @@ class ChartPage:
     def _show_arm(self, q: Array) -> None:
         """Draw the arm and its handle, for a position of the chart (n,)."""
         with self._server.atomic():
-            self._arm.show(self.session.shown(q[None])[0])
+            self._arm.show(self.session.mirror(q[None])[0])
             if self._handle is not None and not self._dragging:
                 self._handle.position = tuple(self._chart.problem.robot.tip_position(q))
 
@@ -245,29 +240,32 @@ class ChartPage:
         self._fans = [fan_along(self._chart, self.session.q, k) for k in range(self._chart.r)]
         for fan in self._fans:
             slider = self._sliders[fan.label]
-            low, high = np.ceil(fan.xi[0] / _STEP) * _STEP, np.floor(fan.xi[-1] / _STEP) * _STEP
+            low, high = (
+                np.ceil(fan.xi[0] / RULES.slider_step) * RULES.slider_step,
+                np.floor(fan.xi[-1] / RULES.slider_step) * RULES.slider_step,
+            )
             if np.isfinite([low, high]).all():
                 slider.min, slider.max = round(float(min(low, high)), 3), round(float(max(low, high)), 3)
         self._show()
         self._show_fan()
 
-    def _fan(self) -> Fan | None:
+    def _find_fan(self) -> Fan | None:
         """The fan of the chosen coordinate."""
         return next((fan for fan in self._fans if fan.label == self._chosen.value), None)
 
     def _show_fan(self) -> None:
-        fan = self._fan()
+        fan = self._find_fan()
         with self._server.atomic():
             if fan is None:
                 self._ghosts.hide()
             else:
-                few, many = (self._shown(fan.spread(count)) for count in (GHOSTS, 4 * GHOSTS))
+                few, many = (self._filter_allowed(fan.spread(count)) for count in (RULES.ghosts, 4 * RULES.ghosts))
                 self._ghosts.show(few, many)
 
-    def _shown(self, q: Array) -> Array:
+    def _filter_allowed(self, q: Array) -> Array:
         """What the arm can have of positions of the chart (N, n)."""
-        return self.session.shown(q[self.session.allowed(q)])
+        return self.session.mirror(q[self.session.find_allowed(q)])
 
-    def _failed(self, error: Exception) -> None:
+    def _show_failure(self, error: Exception) -> None:
         self._rest()
         show_error(self._server, error)

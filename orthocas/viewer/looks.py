@@ -25,20 +25,82 @@ from orthocas.robots.urdf import read_urdf, read_xml
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array, Indices
 
-FINE, COARSE = 16, 6  #: facets around an axis
-SHELL, JOINT, TOOL = (226, 229, 233), (72, 80, 92), (214, 96, 20)
-_THICK = 0.042  # radius of the first rod, as a share of the length of the chain
-_TAPER = 0.45  # share of the radius that is lost on the way to the tip
-_SHORT = 0.35  # radii below which a rod is left out
-_SAME = 1e-6  # [m] between the joints of two files of one robot
-ENOUGH, _FEW = 20_000, 500  # triangles of an arm for a picture, and of a mesh at least
-_MOST_TRIANGLES = 3_000_000  # of all meshes, more is slow to send and to draw
-
 Colour = tuple[int, int, int]  #: red, green, blue, 0 to 255
-GHOSTS = 7  #: arms of a fan
-_SLIM = 0.32  # thickness of a ghost, as a share of the arm's
-_LOW, _MIDDLE, _HIGH = (24, 92, 214), (64, 168, 116), (245, 118, 10)  # colours along a coordinate
-_TRACE = 0.004  # thickness of a line, as a share of the size of the arm
+
+
+@dataclass(frozen=True, slots=True)
+class ViewRules:
+    """Numbers of views. Sizes without a unit are fractions of the length of the arm."""
+
+    facets: int = 16  #: around an axis
+    ghost_facets: int = 6
+    shell: Colour = (226, 229, 233)
+    joint: Colour = (72, 80, 92)
+    tool: Colour = (214, 96, 20)
+    rod: float = 0.042  #: radius of the first rod
+    taper: float = 0.45  #: fraction of the radius that is lost on the way to the tip
+    shortest_rod: float = 0.35  #: in radii; shorter ones are left out
+    same_place: float = 1e-6  #: between the joints of two files of one robot [m]
+    triangles: int = 20_000  #: of an arm for a picture
+    mesh_triangles: int = 500  #: of a mesh at least
+    most_triangles: int = 3_000_000  #: of all meshes, more is slow to send and to draw
+    ghosts: int = 7  #: arms of a fan
+    ghost_thickness: float = 0.32  #: fraction of the arm's
+    low: Colour = (24, 92, 214)  #: colours along a coordinate
+    centre: Colour = (64, 168, 116)
+    high: Colour = (245, 118, 10)
+    trace: float = 0.004  #: thickness of a line
+
+    most_instants: int = 1_000_000  #: of a motion in a file
+    cycle: float = 5.0  #: of a closed path [s]
+    cycle_points: int = 250
+    most_cycles: int = 20
+    circle: float = 0.6  #: radius of the default path, as a fraction of how far the task moves over the domain
+    smallest_circle: float = 1e-3
+    corrections: int = 2  #: of the pseudo-inverse at each point
+    same_ends: float = 1e-9  #: of closed paths, relative to the sizes of the task
+
+    tracker_steps: int = 200  #: towards one target
+    shortest_step: float = 1e-4  #: fraction of the way to a target below which there is no way on
+    reached: float = 1e-10  #: of the sizes of the components
+    most_undone: int = 100
+
+    small_angle: float = 0.001  #: [deg]
+    slider_step: float = 1e-3
+    endless: float = float(np.pi)  #: half of a slider without limits [rad] or [m]
+    handle: float = 0.17
+    sweep: float = 6.0  #: there and back [s]
+    sweep_range: float = 0.97  #: fraction of the range that a sweep uses
+    reading_pause: float = 0.1  #: between readings in a sweep, which take longer than a picture [s]
+
+    path_colours: tuple[Colour, ...] = ((31, 95, 168), (217, 95, 2), (27, 158, 119))
+    path_points: int = 2000  #: of a tool path, at most
+    apart: float = 0.9  #: distance of arms that are side by side
+    time_step: float = 0.01  #: of the time slider [s]
+    rate: int = 30  #: recorded pictures a second
+    recorded_sweep: float = 5.0  #: of one coordinate [s]
+    recorded_length: float = 120.0  #: longer motions are recorded faster [s]
+
+    brand: Colour = (31, 95, 168)
+    panel_widths: tuple[int, int] = (320, 300)  #: of readings and sliders [px]
+    view_angle: float = 0.7  #: of the camera [rad]
+    room: float = 1.15  #: around the arms in the picture
+    camera_slack: float = 1e-3  #: fraction of its distance within which a camera stands where it was placed
+    camera_pause: float = 0.5  #: that a camera may be elsewhere before it is where it was placed [s]
+    flat: float = 1e-9  #: of planar arms, and no gravity
+    floor: float = 1.5  #: radius
+    fade: float = 0.5  #: where the lines of the floor begin to fade, as a fraction of its radius
+    line: float = 0.002  #: thickness of these lines
+    grid: tuple[Colour, Colour] = ((205, 210, 217), (228, 231, 235))  #: every fifth line, and the others
+
+    tick: float = 1 / 30  #: of animations; browsers without a graphics card fall behind more [s]
+    quiet: float = 0.25  #: without jobs, after which the page settles [s]
+    silence: float = 1.0  #: of a connection that asks for nothing, before it is dropped [s]
+    largest_message: int = 2**20  #: from a browser; sliders and cameras need hundreds [bytes]
+    message_length: int = 80  #: of a report [characters]
+
+
+RULES = ViewRules()
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,39 +111,41 @@ class Solid:
     faces: Indices  #: (F, 3) rows of vertices, counterclockwise from outside
     colour: Colour
 
-    def moved(self, rotation: Array, translation: Array) -> "Solid":
+    def move(self, rotation: Array, translation: Array) -> "Solid":
         """The solid turned by a rotation (3, 3), then shifted by a translation (3,)."""
         return replace(self, vertices=self.vertices @ rotation.T + translation)
 
 
-def joined(solids: Sequence[Solid], colour: Colour) -> Solid:
+def join_solids(solids: Sequence[Solid], colour: Colour) -> Solid:
     """All triangles of some solids as one, in one colour."""
     first = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
     faces = [solid.faces + start for solid, start in zip(solids, first, strict=False)]
     return Solid(np.concatenate([solid.vertices for solid in solids]), np.concatenate(faces), colour)
 
 
-def capsule(start: Array, end: Array, radii: tuple[float, float], colour: Colour, facets: int = FINE) -> Solid:
+def build_capsule(
+    start: Array, end: Array, radii: tuple[float, float], colour: Colour, facets: int = RULES.facets
+) -> Solid:
     """A rod with round ends from one point (3,) to another, with a radius at each end [m]."""
     length = float(np.linalg.norm(end - start))
     low, high = (
-        _arc(radii[0], -np.pi / 2, 0.0, facets),
-        _arc(radii[1], 0.0, np.pi / 2, facets) + np.array([0.0, length]),
+        _build_arc(radii[0], -np.pi / 2, 0.0, facets),
+        _build_arc(radii[1], 0.0, np.pi / 2, facets) + np.array([0.0, length]),
     )
     axis = np.array([0.0, 0.0, 1.0]) if length == 0 else (end - start) / length
-    return _revolved(np.concatenate([low, high]), colour, facets).moved(rotate_z_to(axis), start)
+    return _revolve(np.concatenate([low, high]), colour, facets).move(rotate_z_to(axis), start)
 
 
-def drum(radius: float, half_height: float, colour: Colour, facets: int = FINE) -> Solid:
+def build_drum(radius: float, half_height: float, colour: Colour, facets: int = RULES.facets) -> Solid:
     """A cylinder with rounded edges about the z axis, with its middle at the origin."""
     edge = 0.25 * min(radius, half_height)
-    lower, upper = _arc(edge, -np.pi / 2, 0.0, facets), _arc(edge, 0.0, np.pi / 2, facets)
+    lower, upper = _build_arc(edge, -np.pi / 2, 0.0, facets), _build_arc(edge, 0.0, np.pi / 2, facets)
     shift = np.array([radius - edge, half_height - edge])
     rim = np.concatenate([lower + shift * [1, -1], upper + shift])
-    return _revolved(np.concatenate([[[0.0, -half_height]], rim, [[0.0, half_height]]]), colour, facets)
+    return _revolve(np.concatenate([[[0.0, -half_height]], rim, [[0.0, half_height]]]), colour, facets)
 
 
-def block(size: Array, colour: Colour) -> Solid:
+def build_block(size: Array, colour: Colour) -> Solid:
     """A box of a size (3,) [m] with its middle at the origin. Faces share no vertices, so that edges look sharp."""
     vertices: list[Array] = []
     faces: list[list[int]] = []
@@ -94,19 +158,19 @@ def block(size: Array, colour: Colour) -> Solid:
     return Solid(np.concatenate(vertices) * np.asarray(size) / 2, np.array(faces), colour)
 
 
-def ball(radius: float, colour: Colour, facets: int = FINE) -> Solid:
+def build_ball(radius: float, colour: Colour, facets: int = RULES.facets) -> Solid:
     """A sphere about the origin."""
-    return _revolved(_arc(radius, -np.pi / 2, np.pi / 2, facets), colour, facets)
+    return _revolve(_build_arc(radius, -np.pi / 2, np.pi / 2, facets), colour, facets)
 
 
-def _arc(radius: float, start: float, end: float, facets: int) -> Array:
+def _build_arc(radius: float, start: float, end: float, facets: int) -> Array:
     """Points (r, z) on an arc about the origin."""
     count = max(round(facets * (end - start) / (2.5 * np.pi)), 1) + 1
     angle = np.linspace(start, end, count)
     return radius * np.column_stack([np.cos(angle), np.sin(angle)])
 
 
-def _revolved(profile: Array, colour: Colour, facets: int) -> Solid:
+def _revolve(profile: Array, colour: Colour, facets: int) -> Solid:
     """A profile of points (r, z), from bottom to top, turned about the z axis."""
     angle = np.linspace(0.0, 2 * np.pi, facets, endpoint=False)
     r, z = profile.T
@@ -121,7 +185,7 @@ def _revolved(profile: Array, colour: Colour, facets: int) -> Solid:
 Look = list[list[Solid]]  #: what each frame of `BodyPoses` carries: base, bodies, tip
 
 
-def decimated(look: Look, most: int = ENOUGH) -> Look:
+def decimate(look: Look, most: int = RULES.triangles) -> Look:
     """The same look with about so many triangles, or fewer; small solids stay as they are.
 
     By the quadric error metric (package fast-simplification, through trimesh). Without that package, all stay.
@@ -129,10 +193,13 @@ def decimated(look: Look, most: int = ENOUGH) -> Look:
     share = most / max(sum(len(solid.faces) for solids in look for solid in solids), 1)
     if share >= 1 or find_spec("fast_simplification") is None:
         return look
-    return [[_decimated(solid, max(int(share * len(solid.faces)), _FEW)) for solid in solids] for solids in look]
+    return [
+        [_decimate(solid, max(int(share * len(solid.faces)), RULES.mesh_triangles)) for solid in solids]
+        for solids in look
+    ]
 
 
-def _decimated(solid: Solid, count: int) -> Solid:
+def _decimate(solid: Solid, count: int) -> Solid:
     """A solid with about so many triangles."""
     import trimesh  # half a second, for meshes of robot files only
 
@@ -142,27 +209,27 @@ def _decimated(solid: Solid, count: int) -> Solid:
     return replace(solid, vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces, dtype=np.intp))
 
 
-def stick_arm(tree: KinematicTree, thickness: float = 1.0, facets: int = FINE) -> Look:
+def build_stick_arm(tree: KinematicTree, thickness: float = 1.0, facets: int = RULES.facets) -> Look:
     """Drums about the joint axes and tapered rods between the frames, thinner or thicker than usual by a factor."""
     look: Look = [[] for _ in range(tree.n + 2)]
-    radii = thickness * _radii(tree)
+    radii = thickness * _compute_radii(tree)
     for i, parent in enumerate(tree.parents):
         r = radii[i + 1]
-        look[i + 1].append(_joint(tree, i, r, facets))
+        look[i + 1].append(_build_joint(tree, i, r, facets))
         _add_rod(look[parent + 1], tree.translations[i], (radii[parent + 1], r), facets)
     r = radii[tree.tip_parent + 1]
     _add_rod(look[tree.tip_parent + 1], tree.tip_translation, (r, 0.75 * r), facets)
-    look[-1].append(ball(0.55 * r, TOOL, facets))
+    look[-1].append(build_ball(0.55 * r, RULES.tool, facets))
     for frame in map(tree.frame, tree.tips):  # further hands
         r = radii[frame.parent + 1]
         _add_rod(look[frame.parent + 1], frame.translation, (r, 0.75 * r), facets)
-        look[frame.parent + 1].append(ball(0.55 * r, TOOL, facets).moved(np.eye(3), frame.translation))
+        look[frame.parent + 1].append(build_ball(0.55 * r, RULES.tool, facets).move(np.eye(3), frame.translation))
     if np.linalg.norm(tree.translations[0]) > radii[0]:
-        look[0].append(drum(1.7 * radii[0], 0.35 * radii[0], JOINT, facets))
+        look[0].append(build_drum(1.7 * radii[0], 0.35 * radii[0], RULES.joint, facets))
     return look
 
 
-def chain_length(tree: KinematicTree) -> float:
+def compute_chain_length(tree: KinematicTree) -> float:
     """Length of the longest chain from the base to a tip, through all joint frames [m]."""
     lengths = [1e-3]
     for frame in (tree.tip, *map(tree.frame, tree.tips)):
@@ -171,26 +238,26 @@ def chain_length(tree: KinematicTree) -> float:
     return max(lengths)
 
 
-def _radii(tree: KinematicTree) -> Array:
+def _compute_radii(tree: KinematicTree) -> Array:
     """Radius of the rods that begin at the base and at each body, (n + 1,)."""
-    total = chain_length(tree)
+    total = compute_chain_length(tree)
     run = np.zeros(tree.n + 1)
     for i, parent in enumerate(tree.parents):
         run[i + 1] = run[parent + 1] + np.linalg.norm(tree.translations[i])
-    return np.asarray(_THICK * total * (1 - _TAPER * np.clip(run / total, 0.0, 1.0)))
+    return np.asarray(RULES.rod * total * (1 - RULES.taper * np.clip(run / total, 0.0, 1.0)))
 
 
-def _joint(tree: KinematicTree, i: int, r: float, facets: int) -> Solid:
+def _build_joint(tree: KinematicTree, i: int, r: float, facets: int) -> Solid:
     """A drum about the axis of a revolute joint, or a slim rail along that of a prismatic one."""
     if tree.prismatic[i]:
-        return drum(0.8 * r, 2.2 * r, JOINT, facets)
-    return drum(1.18 * r, 1.3 * r, JOINT, facets)
+        return build_drum(0.8 * r, 2.2 * r, RULES.joint, facets)
+    return build_drum(1.18 * r, 1.3 * r, RULES.joint, facets)
 
 
 def _add_rod(solids: list[Solid], end: Array, radii: tuple[float, float], facets: int) -> None:
     """A rod from the origin of a body to a point of it, unless it is hidden in the drums."""
-    if np.linalg.norm(end) > _SHORT * radii[0]:
-        solids.append(capsule(np.zeros(3), end, radii, SHELL, facets))
+    if np.linalg.norm(end) > RULES.shortest_rod * radii[0]:
+        solids.append(build_capsule(np.zeros(3), end, radii, RULES.shell, facets))
 
 
 @dataclass(frozen=True)
@@ -201,7 +268,7 @@ class UrdfLook:
     missing: tuple[str, ...]  #: mesh files that cannot be found or read
 
 
-def urdf_look(path: Path, tree: KinematicTree, locked: Mapping[str, float] | None = None) -> UrdfLook:
+def read_urdf_look(path: Path, tree: KinematicTree, locked: Mapping[str, float] | None = None) -> UrdfLook:
     """Solids of all links of a URDF file, carried by the bodies of a robot that was built from it.
 
     Joints off the chain to the tip are locked as in `Robot.from_urdf`, so their links are shown too.
@@ -217,85 +284,90 @@ def urdf_look(path: Path, tree: KinematicTree, locked: Mapping[str, float] | Non
     root = read_xml(path, "URDF", "robot")
     tips = (tree.tip_name, *tree.tips)
     model = lock_off_chain(lock_joints(read_urdf(path, tips, locked), locked or {}), *tips)
-    _require_same(path, model, tree)
+    _check_same(path, model, tree)
+    # Frames of our tree have the joint's axis as z; Pinocchio's have those of the file.
     turns = [np.eye(3), *(rotate_z_to(find_axis(model, i)[1]) for i in range(1, model.njoints))]
-    colours = _materials(root)
+    colours = _read_materials(root)
     look: Look = [[] for _ in range(tree.n + 2)]
     missing: list[str] = []
     for link in root.findall("link"):
         frame = model.frames[find_frame(model, link.get("name", ""))]
         body = frame.parentJoint
         for visual in link.findall("visual"):
-            solid = _solid(path, visual, colours, missing)
+            solid = _build_solid(path, visual, colours, missing)
             if solid is not None:
-                place = frame.placement * _pose(visual)
-                look[body].append(solid.moved(turns[body].T @ place.rotation, turns[body].T @ place.translation))
+                place = frame.placement * _read_pose(visual)
+                look[body].append(solid.move(turns[body].T @ place.rotation, turns[body].T @ place.translation))
     triangles = sum(len(solid.faces) for solids in look for solid in solids)
-    if triangles > _MOST_TRIANGLES:
-        raise RobotError(f"{path} shows {triangles:,} triangles, expected at most {_MOST_TRIANGLES:,}")
+    if triangles > RULES.most_triangles:
+        raise RobotError(f"{path} shows {triangles:,} triangles, expected at most {RULES.most_triangles:,}")
     return UrdfLook(look, tuple(missing))
 
 
-def _require_same(path: Path, model: pin.Model, tree: KinematicTree) -> None:
+def _check_same(path: Path, model: pin.Model, tree: KinematicTree) -> None:
     """Raise RobotError unless a model has the joints of a tree at the same places."""
     names = tuple(model.names)[1:]
     if names != tree.joint_names:
         raise RobotError(f"{path} has the joints {', '.join(names)}, expected {', '.join(tree.joint_names)}")
     lengths = np.array([np.linalg.norm(model.jointPlacements[i + 1].translation) for i in range(tree.n)])
     apart = np.abs(lengths - np.linalg.norm(tree.translations, axis=1))
-    if apart.max() > _SAME:
+    if apart.max() > RULES.same_place:
         joint = names[int(np.argmax(apart))]
         raise RobotError(f"{path} places joint '{joint}' elsewhere, expected the robot file that the chart was made of")
 
 
-def _materials(root: ElementTree.Element) -> dict[str, Colour]:
+def _read_materials(root: ElementTree.Element) -> dict[str, Colour]:
     """Colours of the named materials of a file."""
-    found = {}
+    colours = {}
     for material in root.iter("material"):
-        colour = _colour_of(material)
+        colour = _read_colour(material)
         if colour is not None and material.get("name"):
-            found[material.get("name", "")] = colour
-    return found
+            colours[material.get("name", "")] = colour
+    return colours
 
 
-def _colour_of(material: ElementTree.Element) -> Colour | None:
+def _read_colour(material: ElementTree.Element) -> Colour | None:
     """The colour that a material defines itself."""
     element = material.find("color")
     if element is None:
         return None
-    red, green, blue, *_ = (round(255 * value) for value in np.clip(_numbers(element, "rgba", 4, (1, 1, 1, 1)), 0, 1))
+    red, green, blue, *_ = (
+        round(255 * value) for value in np.clip(_read_numbers(element, "rgba", 4, (1, 1, 1, 1)), 0, 1)
+    )
     return red, green, blue
 
 
-def _solid(path: Path, visual: ElementTree.Element, colours: Mapping[str, Colour], missing: list[str]) -> Solid | None:
+def _build_solid(
+    path: Path, visual: ElementTree.Element, colours: Mapping[str, Colour], missing: list[str]
+) -> Solid | None:
     """The geometry of a visual element in its own frame; None if there is none to show."""
     material = visual.find("material")
-    colour = SHELL
+    colour = RULES.shell
     if material is not None:
-        colour = _colour_of(material) or colours.get(material.get("name", ""), SHELL)
+        colour = _read_colour(material) or colours.get(material.get("name", ""), RULES.shell)
     shape = next(iter(visual.find("geometry") if visual.find("geometry") is not None else ()), None)  # type: ignore[arg-type]
     if shape is None:
         return None
     if shape.tag == "box":
-        return block(_numbers(shape, "size", 3, (0.1, 0.1, 0.1)), colour)
+        return build_block(_read_numbers(shape, "size", 3, (0.1, 0.1, 0.1)), colour)
     if shape.tag == "sphere":
-        return ball(float(_numbers(shape, "radius", 1, (0.1,))[0]), colour)
+        return build_ball(float(_read_numbers(shape, "radius", 1, (0.1,))[0]), colour)
     if shape.tag == "cylinder":
-        radius, length = (float(_numbers(shape, name, 1, (0.1,))[0]) for name in ("radius", "length"))
-        return drum(radius, length / 2, colour)
+        radius, length = (float(_read_numbers(shape, name, 1, (0.1,))[0]) for name in ("radius", "length"))
+        return build_drum(radius, length / 2, colour)
     if shape.tag == "mesh":
-        return _mesh(path, shape, colour, missing)
+        return _load_mesh(path, shape, colour, missing)
     return None
 
 
-def _mesh(path: Path, shape: ElementTree.Element, colour: Colour, missing: list[str]) -> Solid | None:
+def _load_mesh(path: Path, shape: ElementTree.Element, colour: Colour, missing: list[str]) -> Solid | None:
     """The triangles of a mesh file; None if it cannot be found or read."""
     name = shape.get("filename", "")
-    file = _located(path, name)
+    file = _locate(path, name)
     try:
         if file is None:
             raise ValueError("not found")
-        mesh: Any = coal.MeshLoader().load(str(file), _numbers(shape, "scale", 3, (1, 1, 1)))
+        mesh: Any = coal.MeshLoader().load(str(file), _read_numbers(shape, "scale", 3, (1, 1, 1)))
         vertices = np.array(mesh.vertices(), dtype=float).reshape(-1, 3)
         faces = np.array([[t[0], t[1], t[2]] for t in map(mesh.tri_indices, range(mesh.num_tris))], dtype=np.intp)
         if not (len(faces) and np.isfinite(vertices).all()):
@@ -306,7 +378,7 @@ def _mesh(path: Path, shape: ElementTree.Element, colour: Colour, missing: list[
     return Solid(vertices, faces, colour)
 
 
-def _located(path: Path, name: str) -> Path | None:
+def _locate(path: Path, name: str) -> Path | None:
     """The mesh file that a URDF file names: beside it, absolute, or in a package above it or on ROS_PACKAGE_PATH."""
     name = unquote(name)
     scheme, _, rest = name.rpartition("://")
@@ -321,16 +393,16 @@ def _located(path: Path, name: str) -> Path | None:
     return next((place for place in places if place.is_file()), None)
 
 
-def _pose(visual: ElementTree.Element) -> Any:
+def _read_pose(visual: ElementTree.Element) -> Any:
     """The pose of a visual element in the frame of its link."""
     origin = visual.find("origin")
     if origin is None:
         return pin.SE3.Identity()
-    roll, pitch, yaw = _numbers(origin, "rpy", 3, (0, 0, 0))
-    return pin.SE3(pin.rpy.rpyToMatrix(roll, pitch, yaw), _numbers(origin, "xyz", 3, (0, 0, 0)))
+    roll, pitch, yaw = _read_numbers(origin, "rpy", 3, (0, 0, 0))
+    return pin.SE3(pin.rpy.rpyToMatrix(roll, pitch, yaw), _read_numbers(origin, "xyz", 3, (0, 0, 0)))
 
 
-def _numbers(element: ElementTree.Element, name: str, count: int, default: tuple[float, ...]) -> Array:
+def _read_numbers(element: ElementTree.Element, name: str, count: int, default: tuple[float, ...]) -> Array:
     """Numbers of an attribute; the default if it is missing or is not that many finite numbers."""
     try:
         values = np.array([float(word) for word in element.get(name, "").split()])
@@ -375,17 +447,18 @@ class Arm:
         self._poses = BodyPoses(robot.tree)
         self.shift = np.zeros(3) if shift is None else shift
         scene.add_frame(name, show_axes=False, position=tuple(self.shift))
-        self._bones: list[tuple[int, Any]] = []  # a body, and a bone that moves with it
+        # A body, and a bone that moves with it.
+        self._bones: list[tuple[int, Any]] = []
         colours = dict.fromkeys(solid.colour for solids in look for solid in solids)
         for k, colour in enumerate(colours):
             parts = {i: [solid for solid in solids if solid.colour == colour] for i, solids in enumerate(look)}
             bodies = [i for i, solids in parts.items() if solids]
-            self._bones += zip(bodies, self._skinned(scene, f"{name}/{k}", [parts[i] for i in bodies]), strict=True)
+            self._bones += zip(bodies, self._add_skin(scene, f"{name}/{k}", [parts[i] for i in bodies]), strict=True)
 
-    def _skinned(self, scene: Any, name: str, parts: Look) -> Any:
+    def _add_skin(self, scene: Any, name: str, parts: Look) -> Any:
         """A mesh of the solids of some bodies in one colour; its bones, one for each body."""
-        solids = [joined(part, part[0].colour) for part in parts]
-        mesh = joined(solids, solids[0].colour)
+        solids = [join_solids(part, part[0].colour) for part in parts]
+        mesh = join_solids(solids, solids[0].colour)
         weights = np.repeat(np.eye(len(solids)), [len(solid.vertices) for solid in solids], axis=0)
         handle = scene.add_mesh_skinned(
             name, mesh.vertices, mesh.faces, skin_weights=weights, color=mesh.colour, side="double",
@@ -407,17 +480,17 @@ class Ghosts:
     def __init__(self, scene: Any, name: str, robot: Robot) -> None:
         self._scene, self._name, self._robot = scene, name, robot
         self._poses = BodyPoses(robot.tree)
-        self._look = stick_arm(robot.tree, _SLIM, COARSE)[1:]
+        self._look = build_stick_arm(robot.tree, RULES.ghost_thickness, RULES.ghost_facets)[1:]
         self._nodes: list[Any] = []
 
     def show(self, q: Array, curve: Array) -> None:
         """Show arms at joint positions (N, n), and the way of their joints along a curve (M, n)."""
         self.hide()
         positions, quaternions = self._poses(q)
-        for k, colour in enumerate(shades(len(q)).tolist()):
+        for k, colour in enumerate(compute_shades(len(q)).tolist()):
             turns = scipy.spatial.transform.Rotation.from_quat(quaternions[k, 1:], scalar_first=True).as_matrix()
             places = zip(self._look, turns, positions[k, 1:], strict=True)
-            ghost = joined([solid.moved(R, p) for solids, R, p in places for solid in solids], tuple(colour))
+            ghost = join_solids([solid.move(R, p) for solids, R, p in places for solid in solids], tuple(colour))
             node = self._scene.add_mesh_simple(
                 f"{self._name}/{k}", ghost.vertices, ghost.faces, color=ghost.colour, opacity=0.55, side="front",
                 flat_shading=False, cast_shadow=False, receive_shadow=False,
@@ -438,16 +511,16 @@ class Ghosts:
         moving = points[:, np.ptp(points, axis=0).max(axis=1) > 0.03 * size]
         if not moving.size:
             return
-        colours = np.repeat(shades(len(curve))[:, None], moving.shape[1], axis=1)
+        colours = np.repeat(compute_shades(len(curve))[:, None], moving.shape[1], axis=1)
         ends = np.stack([moving[:-1], moving[1:]], axis=2).reshape(-1, 2, 3)
         shade = np.stack([colours[:-1], colours[1:]], axis=2).reshape(-1, 2, 3)
-        thickness = _TRACE * max(size, 1e-3)
+        thickness = RULES.trace * max(size, 1e-3)
         self._nodes.append(self._scene.add_line_segments(f"{self._name}/traces", ends, shade, thickness=thickness))
 
 
-def shades(count: int) -> Array:
+def compute_shades(count: int) -> Array:
     """Colours from low to high values of a coordinate, (count, 3), 0 to 255."""
     share = np.linspace(0.0, 1.0, count)
     return np.column_stack(
-        [np.interp(share, [0, 0.5, 1], channel) for channel in zip(_LOW, _MIDDLE, _HIGH, strict=True)]
+        [np.interp(share, [0, 0.5, 1], channel) for channel in zip(RULES.low, RULES.centre, RULES.high, strict=True)]
     ).astype(np.uint8)

@@ -10,6 +10,7 @@ import numpy as np
 from orthocas.charts.chart import Chart
 from orthocas.robots.robot import Robot
 from orthocas.tools.checks import Array
+from orthocas.viewer.looks import RULES
 from orthocas.viewer.motion import Motion
 
 GOOD, FAIR, POOR = "#2f9e62", "#e0a100", "#d64545"
@@ -28,7 +29,6 @@ padding:8px 10px;margin-top:10px}
 .oc .held b{font-size:17px;font-weight:650;color:#1f5fa8;font-variant-numeric:tabular-nums}
 .oc .stop{margin-top:10px;padding:7px 10px;border-radius:8px;background:#fff3e6;color:#8a4b08;font-size:12px}
 </style>"""
-_LEAST_ANGLE = 0.001  # [deg] below which an angle is small
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class Readers:
         self._free = ~np.isfinite(low) | ~np.isfinite(high)
         self._middle, self._half_width = domain.centre, domain.half_width
 
-    def at(self, q: Array, held: Array, stop: str = "") -> Readings:
+    def read(self, q: Array, held: Array, stop: str = "") -> Readings:
         """Readings at a joint position (n,), with the task value (m,) that should not change."""
         chart = self._chart
         phi = chart.phi(q)
@@ -99,27 +99,26 @@ class ChartPanel:
         lines += [f"task {task}; {chart.r} coordinate{'s' if chart.r > 1 else ''}"]
         self._head = f'<div class="name">{escape(problem.name)}</div><div class="about">{"<br>".join(lines)}</div>'
 
-    def html(self, readings: Readings) -> str:
+    def format_html(self, readings: Readings) -> str:
         """The page."""
         m = len(readings.x)
         stop = f'<div class="stop">stopped by {escape(readings.stop)}</div>' if readings.stop else ""
         leaks = [
-            bar(label, degrees / 15, f"{degrees:.2f}°", grade(-degrees, -2, -6), value=degrees)
+            format_bar(label, degrees / 15, f"{degrees:.2f}°", choose_colour(-degrees, -2, -6), value=degrees)
             for label, degrees in zip(self._labels[m:], readings.leak_deg.tolist(), strict=True)
         ]
-        joint, share = readings.nearest, readings.boundary / self._half_width
-        boundary = bar(
-            f"boundary {self._joints.shown[joint]}" if np.isfinite(readings.boundary) else "boundary", share,
-            self._joints.text(joint, readings.boundary), grade(share, 0.15, 0.04), readings.boundary, "boundary",
-        )  # fmt: skip
+        joint, fraction = readings.nearest, readings.boundary / self._half_width
+        label = f"boundary {self._joints.shown[joint]}" if np.isfinite(readings.boundary) else "boundary"
+        text, colour = self._joints.format_value(joint, readings.boundary), choose_colour(fraction, 0.15, 0.04)
+        boundary = format_bar(label, fraction, text, colour, readings.boundary, "boundary")
         level = readings.conditioning
-        conditioning = bar("conditioning", level, f"{level:.3f}", grade(level, 0.4, 0.15), value=level)
-        drift = number("drift", float(readings.drift.max()), held(readings.drift, self._units))
+        conditioning = format_bar("conditioning", level, f"{level:.3f}", choose_colour(level, 0.4, 0.15), value=level)
+        drift = format_number("drift", float(readings.drift.max()), format_drift(readings.drift, self._units))
         parts = [
             STYLE, '<div class="oc">', self._head, f'<div class="held"><span>task moved by</span>{drift}</div>',
             stop, "<h4>leak of the coordinates</h4>", *leaks,
             "<h4>chart</h4>", conditioning, boundary,
-            "<h4>joints</h4>", self._joints.html(readings.q), "</div>",
+            "<h4>joints</h4>", self._joints.format_html(readings.q), "</div>",
         ]  # fmt: skip
         return "".join(parts)
 
@@ -135,20 +134,22 @@ class JointBars:
         tops = np.where(np.isfinite(upper), upper, np.where(np.isfinite(high), high, np.pi))
         spans = np.maximum(tops - ends, 1e-9)
         bands = np.clip(np.column_stack([low - ends, high - ends]) / spans[:, None], 0, 1)
-        self.shown = without_shared_words(names)
+        self.shown = strip_shared_words(names)
         self._slides = tuple(prismatic)
         places = zip(ends.tolist(), spans.tolist(), bands.tolist(), strict=True)
         self._joints = list(zip(names, self.shown, range(len(self.shown)), places, strict=True))
 
-    def html(self, q: Array) -> str:
+    def format_html(self, q: Array) -> str:
         """The bars at a joint position (n,)."""
-        return "".join(self._bar(*joint, value) for joint, value in zip(self._joints, q.tolist(), strict=True))
+        return "".join(self._format_bar(*joint, value) for joint, value in zip(self._joints, q.tolist(), strict=True))
 
-    def text(self, i: int, value: float) -> str:
+    def format_value(self, i: int, value: float) -> str:
         """A position of the i-th joint, or a way of it, with its unit."""
         return f"{value:.3f} m" if self._slides[i] else f"{round(np.degrees(value), 1) + 0.0:.1f}°"
 
-    def _bar(self, name: str, shown_name: str, i: int, track: tuple[float, float, list[float]], value: float) -> str:
+    def _format_bar(
+        self, name: str, shown_name: str, i: int, track: tuple[float, float, list[float]], value: float
+    ) -> str:
         end, span, band = track
         place = (value - end) / span if np.isfinite(value) else 0.0
         shown = place % 1 if not 0 <= place <= 1 else place
@@ -156,50 +157,53 @@ class JointBars:
         return (
             f'<div class="row"><span title="{escape(name)}">{escape(shown_name)}</span><div class="bar">'
             f'<i style="left:{100 * band[0]:.1f}%;right:{100 - 100 * band[1]:.1f}%;background:#c9d3df"></i>'
-            f'<u style="left:{100 * shown:.2f}%;background:{grade(near, 0.03, 0.005)}"></u></div>'
-            f"{number(name, value, self.text(i, value))}</div>"
+            f'<u style="left:{100 * shown:.2f}%;background:{choose_colour(near, 0.03, 0.005)}"></u></div>'
+            f"{format_number(name, value, self.format_value(i, value))}</div>"
         )
 
 
-def without_shared_words(names: Sequence[str]) -> list[str]:
+def strip_shared_words(names: Sequence[str]) -> list[str]:
     """Names without the words before a "_" that all of them begin with, as in panda_joint1, panda_joint2."""
     words = [name.split("_") for name in names]
     shared = len(list(takewhile(lambda same: len(set(same)) == 1, zip(*(each[:-1] for each in words), strict=False))))
     return ["_".join(each[shared if len(names) > 1 else 0 :]) for each in words]
 
 
-def bar(label: str, share: float, text: str, colour: str, value: float, name: str = "") -> str:
+def format_bar(label: str, fraction: float, text: str, colour: str, value: float, name: str = "") -> str:
     """A row with a label, a bar that fills a share of its width, and a number with a name, by default the label."""
-    width = 100 * float(np.clip(share if np.isfinite(share) else 0.0, 0, 1))
+    width = 100 * float(np.clip(fraction if np.isfinite(fraction) else 0.0, 0, 1))
+    number = format_number(name or label, value, text)
     return (
         f'<div class="row"><span title="{escape(label)}">{escape(label)}</span><div class="bar">'
-        f'<i style="left:0;width:{width:.1f}%;background:{colour}"></i></div>{number(name or label, value, text)}</div>'
+        f'<i style="left:0;width:{width:.1f}%;background:{colour}"></i></div>{number}</div>'
     )
 
 
-def number(name: str, value: float, text: str) -> str:
+def format_number(name: str, value: float, text: str) -> str:
     """A number as text, a dash if it is none; its exact value is in `data-value`, for programs that read the page."""
     shown = "∞" if value == np.inf else text if np.isfinite(value) else "-"
     return f'<b data-oc="{escape(name)}" data-value="{value!r}">{escape(shown)}</b>'
 
 
-def grade(value: float, good: float, fair: float) -> str:
+def choose_colour(value: float, good: float, fair: float) -> str:
     """Colour of a value that is better the larger it is."""
     return GOOD if value >= good else FAIR if value >= fair else POOR
 
 
-def held(drift: Array, units: Sequence[str]) -> str:
+def format_drift(drift: Array, units: Sequence[str]) -> str:
     """How far the components of a task have moved (m,): lengths and angles, in words of a scale that people know."""
-    parts = [_scaled(unit, [d for d, u in zip(drift.tolist(), units, strict=True) if u == unit]) for unit in units]
+    parts = [
+        _format_scaled(unit, [d for d, u in zip(drift.tolist(), units, strict=True) if u == unit]) for unit in units
+    ]
     return ", ".join(dict.fromkeys(parts))
 
 
-def _scaled(unit: str, drifts: Sequence[float]) -> str:
+def _format_scaled(unit: str, drifts: Sequence[float]) -> str:
     """The largest of some differences in a unit."""
     drift = max(drifts)
     if unit == "rad":
         degrees = float(np.degrees(drift))
-        return f"{degrees:.3g}°" if degrees >= _LEAST_ANGLE else f"< {_LEAST_ANGLE}°"
+        return f"{degrees:.3g}°" if degrees >= RULES.small_angle else f"< {RULES.small_angle}°"
     if unit != "m":
         return f"{drift:.0e} {unit}".rstrip()
     scales = ((1e-3, "mm"), (1e-6, "µm"), (1e-9, "nm"))
@@ -220,18 +224,18 @@ class RobotPanel:
             f'<div class="about">{robot.n} joints, {robot.tree.masses.sum():.4g} kg</div>'
         )
 
-    def html(self, q: Array) -> str:
+    def format_html(self, q: Array) -> str:
         """The page at a joint position (n,)."""
         tip = zip("xyz", self._robot.tip_position(q).tolist(), strict=True)
-        rows = [plain_row(f"{axis} [m]", value) for axis, value in tip]
+        rows = [format_row(f"{axis} [m]", value) for axis, value in tip]
         return "".join([STYLE, '<div class="oc">', self._head, "<h4>tip</h4>", *rows, "<h4>joints</h4>",
-                        self._joints.html(q), "</div>"])  # fmt: skip
+                        self._joints.format_html(q), "</div>"])  # fmt: skip
 
 
-def plain_row(label: str, value: float, note: str = "") -> str:
+def format_row(label: str, value: float, note: str = "") -> str:
     """A row with a name and a number, and perhaps a note between them."""
     name = f'<span title="{escape(label)}">{escape(label)}</span><span class="about">{escape(note)}</span>'
-    return f'<div class="row">{name}{number(label, value, f"{value:.4f}")}</div>'
+    return f'<div class="row">{name}{format_number(label, value, f"{value:.4f}")}</div>'
 
 
 class PlayerPanel:
@@ -245,37 +249,40 @@ class PlayerPanel:
             robot.joint_names, robot.tree.prismatic, robot.lower, robot.upper, -endless, endless
         )  # fmt: skip
 
-    def html(self, seconds: float) -> str:
+    def format_html(self, seconds: float) -> str:
         """The page some seconds after the start."""
         several = len(self._motions) > 1
-        parts = [self._away(motion, seconds) if several else self._alone(motion, seconds) for motion in self._motions]
+        parts = [
+            self._format_distance(motion, seconds) if several else self._format_alone(motion, seconds)
+            for motion in self._motions
+        ]
         return "".join([STYLE, '<div class="oc">', f'<div class="about">{seconds:.2f} s</div>', *parts, "</div>"])
 
-    def _alone(self, motion: Motion, seconds: float) -> str:
+    def _format_alone(self, motion: Motion, seconds: float) -> str:
         k = motion.index(seconds)
         rows = []
         for i, label in enumerate(motion.labels):
             note = "" if motion.references is None else f"reference {motion.references[k, i]:.4f}"
-            rows.append(plain_row(label, float(motion.values[k, i]), note))
+            rows.append(format_row(label, float(motion.values[k, i]), note))
         marked = motion.marked is not None and motion.marked[k]
         stop = '<div class="stop">the controller uses its fallback</div>' if marked else ""
         head = f'<div class="name">{escape(motion.name)}</div>'
         return "".join(
-            [head, stop, "<h4>quantities</h4>", *rows, "<h4>joints</h4>", self._joints.html(motion.at(seconds))]
+            [head, stop, "<h4>quantities</h4>", *rows, "<h4>joints</h4>", self._joints.format_html(motion.at(seconds))]
         )
 
-    def _away(self, motion: Motion, seconds: float) -> str:
+    def _format_distance(self, motion: Motion, seconds: float) -> str:
         away = motion.at(seconds) - motion.q[0]
         name = f"{motion.name}: joints from their start"
         turned = float(np.degrees(np.abs(np.where(self._prismatic, 0.0, away)).max()))
-        shown = number(name, turned, f"{turned:.2f}°")
+        shown = format_number(name, turned, f"{turned:.2f}°")
         ends = [
             f'<div class="row"><span>after {k}</span><span class="about">{"cycles" if k > 1 else "cycle"}</span>'
-            f"{number(f'{motion.name} after {k}', degrees, f'{degrees:.2f}°')}</div>"
+            f"{format_number(f'{motion.name} after {k}', degrees, f'{degrees:.2f}°')}</div>"
             for k, degrees in motion.returns(seconds)
         ]
         return (
             f'<h4></h4><div class="name">{escape(motion.name)}</div>'
             f'<div class="held"><span>joints from their start</span>{shown}</div>'
-            f"{''.join(ends)}{self._joints.html(motion.at(seconds))}"
+            f"{''.join(ends)}{self._joints.format_html(motion.at(seconds))}"
         )

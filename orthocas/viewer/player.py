@@ -11,34 +11,23 @@ from orthocas.charts.self_motion import Fan, fan_along
 from orthocas.errors import InvalidValueError
 from orthocas.robots.robot import Robot
 from orthocas.tools.checks import Array
-from orthocas.viewer.looks import GHOSTS, Arm, Ghosts, Look, chain_length
+from orthocas.viewer.looks import RULES, Arm, Ghosts, Look, compute_chain_length
 from orthocas.viewer.motion import Motion
 from orthocas.viewer.panel import PlayerPanel, RobotPanel
 from orthocas.viewer.window import (
     LOCAL,
     Loop,
+    build_page,
     close_window,
-    direction_of_camera,
-    named_page,
+    compute_camera_direction,
+    compute_up,
     open_window,
-    place_camera,
-    place_floor,
-    place_lights,
     place_panels,
+    place_scene,
     show_error,
-    up_of,
 )
 
-PATHS = ((31, 95, 168), (217, 95, 2), (27, 158, 119))  #: colours of the tool paths
-_APART = 0.9  # of arms that are side by side, as a share of their length
 _SPEEDS = ("0.25x", "0.5x", "1x", "2x", "4x")
-_MOST_POINTS = 2000  # of a tool path
-_TICK = 0.01  # [s] of the time slider
-_ENDLESS = np.pi  # [rad] or [m] of a slider without limits
-_STEP = 1e-3
-_RATE = 30  # pictures a second
-_SWEEP = 5.0  # [s] of one coordinate
-_LONGEST = 120.0  # [s]; longer motions are recorded faster
 Scene = Callable[
     [Any], tuple[float, Callable[[float], None]]
 ]  #: builds a scene -> its length [s], what shows an instant
@@ -49,17 +38,19 @@ class Stage:
 
     def __init__(self, scene: Any, robot: Robot, look: Look, motions: Sequence[Motion]) -> None:
         self.motions = motions
-        self.shifts = side_by_side(robot, len(motions))
+        self.shifts = place_side_by_side(robot, len(motions))
         self._arms = []
-        size = chain_length(robot.tree)
+        size = compute_chain_length(robot.tree)
         for k, (motion, shift) in enumerate(zip(motions, self.shifts, strict=True)):
             self._arms.append(Arm(scene, f"/arm{k}", robot, look, shift))
-            rows = np.unique(np.linspace(0, len(motion.q) - 1, _MOST_POINTS).astype(int))
+            rows = np.unique(np.linspace(0, len(motion.q) - 1, RULES.path_points).astype(int))
             ways = [robot.frame_position(motion.q[rows], tip) + shift for tip in robot.tips]
             ends = np.concatenate([np.stack([way[:-1], way[1:]], axis=1) for way in ways])
-            scene.add_line_segments(f"/path{k}", ends, PATHS[k % len(PATHS)], thickness=0.005 * size)
+            scene.add_line_segments(
+                f"/path{k}", ends, RULES.path_colours[k % len(RULES.path_colours)], thickness=0.005 * size
+            )
             if len(motions) > 1:
-                place = shift + 1.25 * size * up_of(robot) * 0.55
+                place = shift + 1.25 * size * compute_up(robot) * 0.55
                 scene.add_label(f"/name{k}", motion.name, position=tuple(place), anchor="bottom-center")
 
     @property
@@ -80,11 +71,9 @@ class PlayerPage:
         self._server = server
         self._stage = Stage(server.scene, robot, look, motions)
         self._panel = PlayerPanel(robot, motions)
-        self._loop = Loop(lambda: None, self._failed)
+        self._loop = Loop(lambda: None, self._show_failure)
         self._now = 0.0
-        place_floor(server, robot)
-        place_lights(server, robot)
-        place_camera(server, robot, np.concatenate([few(motion.q) for motion in motions]), self._stage.shifts)
+        place_scene(server, robot, np.concatenate([pick_few(motion.q) for motion in motions]), self._stage.shifts)
         self._readings = place_panels(server)
         self._add_controls()
         self._show(0.0)
@@ -97,20 +86,23 @@ class PlayerPage:
     def _add_controls(self) -> None:
         gui = self._server.gui
         self._play = gui.add_button("Play", icon="player-play")
-        self._time = gui.add_slider("time [s]", 0.0, max(round(self._stage.duration, 2), _TICK), _TICK, 0.0)
+        self._time = gui.add_slider(
+            "time [s]", 0.0, max(round(self._stage.duration, 2), RULES.time_step), RULES.time_step, 0.0
+        )
         self._speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1x")
         self._again = gui.add_checkbox("repeat", initial_value=True)
         self._playing = False
-        self._play.on_click(self._clicked)
-        self._time.on_update(self._slid)
+        self._play.on_click(self._start_or_stop)
+        self._time.on_update(self._slide)
 
-    async def _clicked(self, event: Any) -> None:
+    async def _start_or_stop(self, event: Any) -> None:
         self._loop.ask("play", self._toggle)
 
-    async def _slid(self, event: Any) -> None:
-        if event.client is not None:  # otherwise the page itself moved it
-            wanted = float(event.target.value)
-            self._loop.ask("time", lambda: self._jump(wanted))
+    async def _slide(self, event: Any) -> None:
+        # Otherwise the page itself moved it.
+        if event.client is not None:
+            target = float(event.target.value)
+            self._loop.ask("time", lambda: self._jump(target))
 
     def _toggle(self) -> None:
         """Play from where the slider is, or stop."""
@@ -143,11 +135,12 @@ class PlayerPage:
     def _jump(self, seconds: float) -> None:
         self._pause()
         if not np.isfinite(seconds):
-            self._show(self._now)  # moves the slider back
+            # Moves the slider back.
+            self._show(self._now)
             raise InvalidValueError("time", seconds, "a finite number of seconds")
         self._show(min(max(seconds, 0.0), self._stage.duration), slide=False)
 
-    def _failed(self, error: Exception) -> None:
+    def _show_failure(self, error: Exception) -> None:
         self._pause()
         show_error(self._server, error)
 
@@ -155,18 +148,18 @@ class PlayerPage:
         self._now = seconds
         with self._server.atomic():
             self._stage.show(seconds)
-            self._readings.content = self._panel.html(seconds)
+            self._readings.content = self._panel.format_html(seconds)
             if slide:
                 self._time.value = min(round(seconds, 2), self._time.max)
 
 
-def side_by_side(robot: Robot, count: int) -> Array:
+def place_side_by_side(robot: Robot, count: int) -> Array:
     """Where arms stand, (count, 3) [m]: in a row from left to right for the camera."""
-    places = (np.arange(count) - (count - 1) / 2) * _APART * chain_length(robot.tree)
-    return np.outer(places, np.cross(up_of(robot), direction_of_camera(robot)))
+    places = (np.arange(count) - (count - 1) / 2) * RULES.apart * compute_chain_length(robot.tree)
+    return np.outer(places, np.cross(compute_up(robot), compute_camera_direction(robot)))
 
 
-def few(q: Array) -> Array:
+def pick_few(q: Array) -> Array:
     """Some of the joint positions (N, n), from first to last."""
     rows: Array = q[np.unique(np.linspace(0, len(q) - 1, 20).astype(int))]
     return rows
@@ -181,12 +174,10 @@ class RobotPage:
         self._home = robot.tree.centre_posture
         self._robot, self._q = robot, self._home
         self._loop = Loop(lambda: None, partial(show_error, server))
-        place_floor(server, robot)
-        place_lights(server, robot)
-        place_camera(server, robot, self._home[None])
+        place_scene(server, robot, self._home[None])
         self._readings = place_panels(server)
         with server.gui.add_folder("Joints"):
-            self._sliders = [self._slider(i) for i in range(robot.n)]
+            self._sliders = [self._add_slider(i) for i in range(robot.n)]
         home = server.gui.add_button("Home", icon="home")
 
         home.on_click(self._go_home)
@@ -197,19 +188,19 @@ class RobotPage:
         """End the thread of the page."""
         self._loop.stop()
 
-    def _slider(self, i: int) -> Any:
-        robot, middle = self._robot, float(self._home[i])
-        low, high = np.clip([robot.lower[i], robot.upper[i]], middle - _ENDLESS, middle + _ENDLESS).tolist()
+    def _add_slider(self, i: int) -> Any:
+        robot, centre = self._robot, float(self._home[i])
+        low, high = np.clip([robot.lower[i], robot.upper[i]], centre - RULES.endless, centre + RULES.endless).tolist()
         low, high = round(low + 4.9e-4, 3), round(high - 4.9e-4, 3)
         high = max(low, high)
         slider = self._server.gui.add_slider(
-            robot.joint_names[i], low, high, _STEP, min(max(round(middle, 3), low), high)
+            robot.joint_names[i], low, high, RULES.slider_step, min(max(round(centre, 3), low), high)
         )
 
-        slider.on_update(self._moved)
+        slider.on_update(self._move)
         return slider
 
-    async def _moved(self, event: Any) -> None:
+    async def _move(self, event: Any) -> None:
         self._loop.ask("joints", self._show)
 
     async def _go_home(self, event: Any) -> None:
@@ -225,95 +216,75 @@ class RobotPage:
         self._q = np.where(good, q, self._q)
         with self._server.atomic():
             self._arm.show(self._q)
-            self._readings.content = self._panel.html(self._q)
+            self._readings.content = self._panel.format_html(self._q)
         if not good.all():
             name = self._robot.joint_names[int(np.argmin(good))]
             raise InvalidValueError(name, q[np.argmin(good)], "a finite joint position")
 
 
-def recorded(build: Scene) -> str:
+def record_scene(build: Scene) -> str:
     """The HTML of a scene and its motion. It is built on a server whose address is given to nobody."""
     server, _ = open_window(LOCAL, 0, "orthocas")
     try:
         duration, show = build(server)
         show(0.0)
         serializer = server.get_scene_serializer()
-        for t in np.linspace(0.0, duration, round(_RATE * duration) + 1)[: None if duration else 0]:
+        for t in np.linspace(0.0, duration, round(RULES.rate * duration) + 1)[: None if duration else 0]:
             show(float(t))
-            serializer.insert_sleep(1 / _RATE)
-        return named_page(str(serializer.as_html()).encode()).decode()
+            serializer.insert_sleep(1 / RULES.rate)
+        return build_page(str(serializer.as_html()).encode()).decode()
     finally:
         close_window(server)
 
 
-def chart_scene(chart: Chart, look: Look) -> Scene:
-    """Each coordinate in turn, from its lowest to its highest value and back, with the task held."""
+def show_chart(chart: Chart, look: Look, server: Any) -> tuple[float, Callable[[float], None]]:
+    """Each coordinate in turn, from its lowest to its highest value and back, with the task held; a `Scene`."""
+    robot, home = chart.problem.robot, chart.problem.domain.centre
+    fans = [fan_along(chart, home, k) for k in range(chart.r)]
+    arm, ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
+    place_scene(server, robot, np.concatenate([fan.spread(5) for fan in fans]))
+    above = robot.joint_points(home).max(axis=0) @ compute_up(robot) + 0.12 * compute_chain_length(robot.tree)
+    label = server.scene.add_label("/label", "", position=tuple(above * compute_up(robot)), anchor="bottom-center")
+    task, drawn = ", ".join(chart.labels[: chart.m]), -1
 
-    def build(server: Any) -> tuple[float, Callable[[float], None]]:
-        robot, home = chart.problem.robot, chart.problem.domain.centre
-        fans = [fan_along(chart, home, k) for k in range(chart.r)]
-        arm, ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
-        place_floor(server, robot)
-        place_lights(server, robot)
-        place_camera(server, robot, np.concatenate([fan.spread(5) for fan in fans]))
-        above = robot.joint_points(home).max(axis=0) @ up_of(robot) + 0.12 * chain_length(robot.tree)
-        label = server.scene.add_label("/label", "", position=tuple(above * up_of(robot)), anchor="bottom-center")
-        shown = -1
+    def show(seconds: float) -> None:
+        nonlocal drawn
+        k = min(int(seconds / RULES.recorded_sweep), chart.r - 1)
+        if k != drawn:
+            ghosts.show(fans[k].spread(RULES.ghosts), fans[k].spread(4 * RULES.ghosts))
+            drawn = k
+        q = _find_position(chart, fans[k], seconds / RULES.recorded_sweep - k)
+        arm.show(q)
+        label.text = f"{fans[k].label} = {chart.xi(q)[k]:+.3f}   {task} held"
 
-        def show(seconds: float) -> None:
-            nonlocal shown
-            k = min(int(seconds / _SWEEP), chart.r - 1)
-            if k != shown:
-                ghosts.show(fans[k].spread(GHOSTS), fans[k].spread(4 * GHOSTS))
-                shown = k
-            q = _on_the_way(chart, fans[k], seconds / _SWEEP - k)
-            arm.show(q)
-            label.text = f"{fans[k].label} = {chart.xi(q)[k]:+.3f}   {_held(chart)} held"
-
-        return _SWEEP * chart.r, show
-
-    return build
+    return RULES.recorded_sweep * chart.r, show
 
 
-def motion_scene(robot: Robot, look: Look, motions: Sequence[Motion]) -> Scene:
-    """Motions side by side."""
-
-    def build(server: Any) -> tuple[float, Callable[[float], None]]:
-        stage = Stage(server.scene, robot, look, motions)
-        place_floor(server, robot)
-        place_lights(server, robot)
-        place_camera(server, robot, np.concatenate([few(motion.q) for motion in motions]), stage.shifts)
-        speed = max(1.0, stage.duration / _LONGEST)
-        return stage.duration / speed, lambda seconds: stage.show(speed * seconds)
-
-    return build
+def show_motions(
+    robot: Robot, look: Look, motions: Sequence[Motion], server: Any
+) -> tuple[float, Callable[[float], None]]:
+    """Motions side by side; a `Scene`."""
+    stage = Stage(server.scene, robot, look, motions)
+    place_scene(server, robot, np.concatenate([pick_few(motion.q) for motion in motions]), stage.shifts)
+    speed = max(1.0, stage.duration / RULES.recorded_length)
+    return stage.duration / speed, lambda seconds: stage.show(speed * seconds)
 
 
-def robot_scene(robot: Robot, look: Look) -> Scene:
-    """A robot that stands still."""
-
-    def build(server: Any) -> tuple[float, Callable[[float], None]]:
-        arm = Arm(server.scene, "/arm", robot, look)
-        place_floor(server, robot)
-        place_lights(server, robot)
-        place_camera(server, robot, robot.tree.centre_posture[None])
-        return 0.0, lambda seconds: arm.show(robot.tree.centre_posture)
-
-    return build
+def show_robot(robot: Robot, look: Look, server: Any) -> tuple[float, Callable[[float], None]]:
+    """A robot that stands still; a `Scene`."""
+    arm = Arm(server.scene, "/arm", robot, look)
+    place_scene(server, robot, robot.tree.centre_posture[None])
+    return 0.0, lambda seconds: arm.show(robot.tree.centre_posture)
 
 
-def _on_the_way(chart: Chart, fan: Fan, share: float) -> Array:
-    """The joint position (n,) after a share of a sweep, exactly on the curve: from home to both ends and back."""
+def _find_position(chart: Chart, fan: Fan, fraction: float) -> Array:
+    """The joint position (n,) after a fraction of a sweep, exactly on the curve: from home to both ends and back."""
     here = np.interp(0.0, fan.arc_length, fan.xi)
-    middle, half = (fan.xi[-1] + fan.xi[0]) / 2, (fan.xi[-1] - fan.xi[0]) / 2
-    phase = np.arcsin(np.clip((here - middle) / max(half, 1e-12), -1, 1))
-    wanted = middle + 0.99 * half * np.sin(2 * np.pi * share + phase)
+    centre, half = (fan.xi[-1] + fan.xi[0]) / 2, (fan.xi[-1] - fan.xi[0]) / 2
+    phase = np.arcsin(np.clip((here - centre) / max(half, 1e-12), -1, 1))
+    target = centre + 0.99 * half * np.sin(2 * np.pi * fraction + phase)
     order = np.argsort(fan.xi)
-    near = np.array([np.interp(wanted, fan.xi[order], column[order]) for column in fan.q.T])
+    near = np.array([np.interp(target, fan.xi[order], column[order]) for column in fan.q.T])
     phi = chart.phi(chart.problem.domain.centre)
-    phi[list(chart.labels).index(fan.label)] = wanted
+    phi[list(chart.labels).index(fan.label)] = target
     return chart.inverse(phi, near)
-
-
-def _held(chart: Chart) -> str:
-    return ", ".join(chart.labels[: chart.m])

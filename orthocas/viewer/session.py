@@ -13,15 +13,11 @@ from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import Branches
 from orthocas.tasks.domains import StopKind
 from orthocas.tools.checks import Array, as_number, as_point, require_kind, require_known
+from orthocas.viewer.looks import RULES
 from orthocas.viewer.panel import Readers, Readings
 
-_MOST_STEPS = 200  # of the tracker towards one wish
-_SHORTEST = 1e-4  # share of the way to a wish below which there is no way on
-_REACHED = 1e-10  # of the sizes of the components
-_MOST_UNDONE = 100
 
-
-def told(stop: Stop, robot: Robot) -> str:
+def describe_stop(stop: Stop, robot: Robot) -> str:
     """What ends a motion; a joint's position with its unit."""
     if stop.kind is not StopKind.JOINT:
         return str(stop)
@@ -53,11 +49,12 @@ class Session:
         require_kind("chart", chart, Chart)
         self.home: Array = chart.problem.domain.centre if q is None else as_point("q", q, chart.n)
         self._past: list[tuple[Array, tuple[int, ...]]] = []
-        self._limited = False  # whether a joint limit of the mirrored arm stopped it
+        # Whether a joint limit of the mirrored arm stopped it.
+        self._limited = False
         self.chart = chart
         self._tracker = chart.tracker(self.home)
         self._readers, self._walls = Readers(chart), Walls(chart.problem)
-        self._wished: Array = chart.phi(self.home)  # (n,)
+        self._target: Array = chart.phi(self.home)  # (n,)
         self.stop = ""  #: what stopped the last motion, or ""
 
     @property
@@ -65,8 +62,8 @@ class Session:
         """The branch of a mirrored arm."""
         if not (self.branches and self.flips):
             return ""
-        found = self.branches.of(self.shown(self.q[None])[0])
-        return f"mirrored: branch {found.name if found else 'without a name'}"
+        branch = self.branches.of(self.mirror(self.q[None])[0])
+        return f"mirrored: branch {branch.name if branch else 'without a name'}"
 
     @property
     def q(self) -> Array:
@@ -76,18 +73,18 @@ class Session:
     @property
     def readings(self) -> Readings:
         """What the page shows about q; the task should have the value that was last wished for."""
-        return self._readers.at(self.q, self._wished[: self.chart.m], self.stop)
+        return self._readers.read(self.q, self._target[: self.chart.m], self.stop)
 
-    def shown(self, q: Array) -> Array:
+    def mirror(self, q: Array) -> Array:
         """The arm at positions of the chart (N, n), mirrored at `flips`: other joints, the same pose of the tip."""
         for cut in self.flips:
             assert self.branches is not None
             q = np.array([self.branches.mirrored(point, cut) for point in q])
         return q
 
-    def allowed(self, q: Array) -> NDArray[np.bool_]:
+    def find_allowed(self, q: Array) -> NDArray[np.bool_]:
         """Whether the arm at positions of the chart (N, n) is within its joint limits when it is mirrored, (N,)."""
-        robot, shown = self.chart.problem.robot, self.shown(q)
+        robot, shown = self.chart.problem.robot, self.mirror(q)
         return np.asarray(((shown >= robot.lower) & (shown <= robot.upper)).all(axis=1)) | (not self.flips)
 
     def flip(self, cut: int) -> None:
@@ -101,13 +98,14 @@ class Session:
         """
         self.remember()
         before, self.flips = self.flips, tuple(sorted({*self.flips} ^ {cut}))
+        # The nearest position on the self-motions that the joint limits of the mirrored arm allow.
         curves = [fan_along(self.chart, self.q, k).q for k in range(self.chart.r)]
         places = np.concatenate([self.q[None], *curves])
-        good = places[self.allowed(places)]
+        good = places[self.find_allowed(places)]
         if not len(good):
             self.flips = before
             raise InvalidValueError("the mirrored arm", "beyond its joint limits", "another pose of the tip")
-        self._place(good[np.argmin(np.linalg.norm(good - self.q, axis=1))])
+        self._move_to(good[np.argmin(np.linalg.norm(good - self.q, axis=1))])
 
     @property
     def can_undo(self) -> bool:
@@ -121,24 +119,26 @@ class Session:
             UnknownNameError, InvalidValueError: if there is no such component, or a value is not finite.
         """
         require_kind("values", values, Mapping)
-        wished = self._wished.copy()
+        wished = self._target.copy()
         for label, value in values.items():
             require_known("component of phi", str(label), self.chart.labels)
             number = as_number(f"wish for {label}", value)
             if not np.isfinite(number):
                 raise InvalidValueError(f"wish for {label}", value, "a finite number")
             wished[self.chart.labels.index(label)] = number
-        self._wished = wished
+        self._target = wished
 
-    def follow(self, most_steps: int = _MOST_STEPS) -> bool:
+    def follow(self, most_steps: int = RULES.tracker_steps) -> bool:
         """Move towards the wish. Returns whether q has moved; afterwards the wish is met, given up, or still ahead."""
         moved = False
         for _ in range(most_steps):
             here = self.chart.phi(self.q)
-            if not self._far(here).any():
+            if not self._find_far(here).any():
                 break
             if not self._step(here):
-                self._give_up(here)
+                # Aim at what there is in place of what cannot be, and say what is in the way.
+                self.stop = self._find_reason()
+                self._target = np.where(self._find_far(here), here, self._target)
                 break
             moved, self.stop = True, ""
         return moved
@@ -146,7 +146,7 @@ class Session:
     def remember(self) -> None:
         """Keep the joint position, for `undo`."""
         if not self._past or not self._is_here(*self._past[-1]):
-            self._past = [*self._past[-_MOST_UNDONE:], (self.q, self.flips)]
+            self._past = [*self._past[-RULES.most_undone :], (self.q, self.flips)]
 
     def undo(self) -> None:
         """Return to the last joint position that was remembered and is another one."""
@@ -154,14 +154,14 @@ class Session:
             before, flips = self._past.pop()
             if not self._is_here(before, flips):
                 self.flips = flips
-                self._place(before)
+                self._move_to(before)
                 return
 
     def go_home(self) -> None:
         """Return to where the session began."""
         self.remember()
         self.flips = ()
-        self._place(self.home)
+        self._move_to(self.home)
 
     def _is_here(self, q: Array, flips: tuple[int, ...]) -> bool:
         """Whether the arm is there."""
@@ -169,34 +169,29 @@ class Session:
 
     def _step(self, here: Array) -> bool:
         """Step as far along the line as the tracker allows. Returns whether it allows any step."""
-        share, before, self._limited = 1.0, self.q, False
-        while share >= _SHORTEST:
-            self._tracker.step(here + share * (self._wished - here))
+        fraction, before, self._limited = 1.0, self.q, False
+        while fraction >= RULES.shortest_step:
+            self._tracker.step(here + fraction * (self._target - here))
             if self._tracker.status is TrackerStatus.OK:
-                if self.allowed(self.q[None])[0]:
+                if self.find_allowed(self.q[None])[0]:
                     return True
                 self._tracker.reset(before)
                 self._limited = True
-            share /= 2
+            fraction /= 2
         return False
 
-    def _give_up(self, here: Array) -> None:
-        """Wish for what there is in place of what cannot be, and say what is in the way."""
-        self.stop = self._reason()
-        self._wished = np.where(self._far(here), here, self._wished)
-
-    def _far(self, here: Array) -> NDArray[np.bool_]:
+    def _find_far(self, here: Array) -> NDArray[np.bool_]:
         """Which components of phi are not yet what is wished for, (n,)."""
-        return np.asarray(np.abs((self._wished - here) / self.chart.phi_sizes) > _REACHED)
+        return np.asarray(np.abs((self._target - here) / self.chart.phi_sizes) > RULES.reached)
 
-    def _reason(self) -> str:
+    def _find_reason(self) -> str:
         if self._limited:
             return "a joint limit of the mirrored arm"
         if self._tracker.status is not TrackerStatus.OUTSIDE_DOMAIN:
             return "a fold of the chart or a singular position"
-        return told(self._walls.worst(self.q), self.chart.problem.robot)
+        return describe_stop(self._walls.worst(self.q), self.chart.problem.robot)
 
-    def _place(self, q: Array) -> None:
+    def _move_to(self, q: Array) -> None:
         self._tracker.reset(q)
-        self._wished = self.chart.phi(q)
+        self._target = self.chart.phi(q)
         self.stop = ""

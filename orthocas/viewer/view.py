@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,9 +15,9 @@ from orthocas.simulation.trajectory import Trajectory
 from orthocas.tools.checks import as_path, suggest_attribute
 from orthocas.tools.files import publish, require_replaceable, require_writable
 from orthocas.viewer.chart_page import ChartPage
-from orthocas.viewer.looks import Look, decimated, stick_arm, urdf_look
+from orthocas.viewer.looks import Look, build_stick_arm, decimate, read_urdf_look
 from orthocas.viewer.motion import Motion, require_joints
-from orthocas.viewer.player import PlayerPage, RobotPage, Scene, chart_scene, motion_scene, recorded, robot_scene
+from orthocas.viewer.player import PlayerPage, RobotPage, Scene, record_scene, show_chart, show_motions, show_robot
 from orthocas.viewer.session import Session
 from orthocas.viewer.window import LOCAL, close_window, open_window
 
@@ -97,8 +98,8 @@ def view(
         NoExpressionError: for grown charts.
         RobotError: if the robot file is another robot's.
     """
-    arm, motions = subject(shown, robot)
-    shape = shape_of(arm, robot_file, locked)
+    arm, motions = read_subject(shown, robot)
+    shape = build_shape(arm, robot_file, locked)
     server, url = open_window(host, port, "orthocas")
     try:
         page: ChartPage | RobotPage | PlayerPage
@@ -140,16 +141,16 @@ def export_page(
     """
     target = as_path("path", path)
     require_page(target, force)
-    arm, motions = subject(shown, robot)
-    shape = shape_of(arm, robot_file, locked)
+    arm, motions = read_subject(shown, robot)
+    shape = build_shape(arm, robot_file, locked)
     scene: Scene
     if motions:
-        scene = motion_scene(arm, shape.look, motions)
+        scene = partial(show_motions, arm, shape.look, motions)
     elif isinstance(shown, Chart):
-        scene = chart_scene(shown, shape.look)
+        scene = partial(show_chart, shown, shape.look)
     else:
-        scene = robot_scene(arm, shape.look)
-    page = recorded(scene)
+        scene = partial(show_robot, arm, shape.look)
+    page = record_scene(scene)
     with publish(target.parent) as drafts:
         (drafts / target.name).write_bytes(page.encode() + _OURS)
     return shape
@@ -166,7 +167,7 @@ def require_page(path: Path, force: bool) -> None:
     require_replaceable(path, ours, force)
 
 
-def subject(shown: Any, robot: Robot | Chart | None) -> tuple[Robot, Sequence[Motion]]:
+def read_subject(shown: Any, robot: Robot | Chart | None) -> tuple[Robot, Sequence[Motion]]:
     """The robot to draw, and what moves it; no motions for a chart and a robot."""
     if isinstance(shown, GrownChart):
         raise NoExpressionError("a view needs coordinates with a CasADi expression; received grown coordinates")
@@ -174,7 +175,7 @@ def subject(shown: Any, robot: Robot | Chart | None) -> tuple[Robot, Sequence[Mo
         return shown.problem.robot, ()
     if isinstance(shown, Robot):
         return shown, ()
-    motions = _motions(shown)
+    motions = _read_motions(shown)
     if not isinstance(robot, Robot | Chart):
         raise InvalidValueError("robot", repr(robot)[:80], "the robot that moved, or a chart of it")
     arm = robot if isinstance(robot, Robot) else robot.problem.robot
@@ -183,7 +184,7 @@ def subject(shown: Any, robot: Robot | Chart | None) -> tuple[Robot, Sequence[Mo
     return arm, motions
 
 
-def _motions(shown: Any) -> tuple[Motion, ...]:
+def _read_motions(shown: Any) -> tuple[Motion, ...]:
     """A motion, or several."""
     if isinstance(shown, Trajectory):
         return (Motion.of_run(shown),)
@@ -196,12 +197,12 @@ def _motions(shown: Any) -> tuple[Motion, ...]:
     return tuple(several)
 
 
-def shape_of(robot: Robot, robot_file: str | Path | None, locked: Mapping[str, float] | None) -> Shape:
+def build_shape(robot: Robot, robot_file: str | Path | None, locked: Mapping[str, float] | None) -> Shape:
     """How a robot looks: as its file says, or drums and rods where that shows nothing."""
-    sticks = stick_arm(robot.tree)
+    sticks = build_stick_arm(robot.tree)
     if robot_file is None:
         return Shape(sticks)
-    found = urdf_look(as_path("robot_file", robot_file), robot.tree, locked)
-    bare = bool(found.missing) or not any(found.look)
-    look = [part or (sticks[i] if bare else []) for i, part in enumerate(found.look)]
-    return Shape(decimated([*look[:-1], sticks[-1]]), found.missing)
+    read = read_urdf_look(as_path("robot_file", robot_file), robot.tree, locked)
+    bare = bool(read.missing) or not any(read.look)
+    look = [part or (sticks[i] if bare else []) for i, part in enumerate(read.look)]
+    return Shape(decimate([*look[:-1], sticks[-1]]), read.missing)

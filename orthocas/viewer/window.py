@@ -31,7 +31,7 @@ from orthocas.errors import InvalidValueError, OrthocasError, ViewError
 from orthocas.robots.robot import Robot
 from orthocas.robots.spatial import rotate_z_to
 from orthocas.tools.checks import Array, import_extra, require_count
-from orthocas.viewer.looks import chain_length
+from orthocas.viewer.looks import RULES, compute_chain_length
 
 _INPUT, _CAMERA = "GuiUpdateMessage", "ViewerCameraMessage"
 _HANDLE = {
@@ -50,31 +50,13 @@ _CAMERA_NUMBERS = {
     "image_height": 0,
     "image_width": 0,
 }
-_LONGEST = 80  # characters of a report
 _log = logging.getLogger(__name__)
 #: websockets' own log, in which an error takes one line
 connections = logging.getLogger(f"{__name__}.connections")
-_FRAME = 1 / 30  # [s] between ticks; browsers without a graphics card fall behind more
-_QUIET = 0.25  # [s] without jobs, after which the page settles
-_SILENT = 1.0  # [s] that a connection may say nothing
-_LARGEST = 2**20  # bytes of a message from a browser; sliders and cameras need hundreds
 _HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[0-9a-z._-]+)(?::\d{1,5})?")
 LOCAL = "127.0.0.1"
 TITLES = ("<title>Viser</title>", "<title>orthocas</title>")  #: of the page: viser's and ours
-BRAND = (31, 95, 168)
 _SCRIPT = Path(__file__).with_name("page.js")
-_ON_ITS_WAY = 0.5  # [s] that a camera may be somewhere else before it is where it was placed
-_PANELS = 320, 300  # [px] widths of readings and sliders
-_VIEW_ANGLE = 0.7  # [rad] of the camera
-_ROOM = 1.15  # around the arms in the picture
-_NEAR = 1e-3  # share of the distance of a camera within which it stands where it was placed
-_FLAT = 1e-9
-_FLOOR, _FADE, _LINE = (
-    1.5,
-    0.5,
-    0.002,
-)  # radius of the floor and thickness of its lines, as shares of the arm; where they fade
-_GRID = (205, 210, 217), (228, 231, 235)  # colours of every fifth line, and of the others
 Job = Callable[[], None]
 Tick = Callable[[float], bool]  #: seconds since it began -> whether it goes on
 _starting = Lock()
@@ -86,113 +68,116 @@ class Inbox:
     def __init__(self) -> None:
         self.input_of: Callable[[str], Any] = lambda uuid: None  #: the handle of an input, or None
 
-    def fault(self, raw: object) -> str | None:
+    def find_fault(self, raw: object) -> str | None:
         """What is wrong with a message, in a few words; None if it may pass."""
         try:
-            given = import_module("msgspec").msgpack.decode(raw)
-        except Exception as error:  # text, or bytes of many kinds
+            message = import_module("msgspec").msgpack.decode(raw)
+        except Exception as error:
+            # Text, or bytes of many kinds.
             return f"it cannot be read ({type(error).__name__})"
-        kind = given.pop("type", None) if isinstance(given, dict) else None
+        kind = message.pop("type", None) if isinstance(message, dict) else None
         if not isinstance(kind, str) or kind not in (_CAMERA, _INPUT, *_HANDLE):
-            return f"pages send no {_shown(kind)}"
-        return _fault_in_fields(given, kind) or self._fault_in_content(given, kind)
+            return f"pages send no {_shorten(kind)}"
+        return _check_fields(message, kind) or self._check_content(message, kind)
 
-    def _fault_in_content(self, given: dict[str, Any], kind: str) -> str | None:
+    def _check_content(self, message: dict[str, Any], kind: str) -> str | None:
         if kind == _CAMERA:
-            return _fault_in_numbers(given, _CAMERA_NUMBERS)
+            return _check_numbers(message, _CAMERA_NUMBERS)
         if kind == _INPUT:
-            return _fault_in_words(given, "uuid") or self._fault_in_updates(given["uuid"], given["updates"])
-        return _fault_in_words(given, "name", "owner") or _fault_in_numbers(given, _HANDLE[kind])
+            return _check_words(message, "uuid") or self._check_updates(message["uuid"], message["updates"])
+        return _check_words(message, "name", "owner") or _check_numbers(message, _HANDLE[kind])
 
-    def _fault_in_updates(self, uuid: str, updates: Any) -> str | None:
+    def _check_updates(self, uuid: str, updates: Any) -> str | None:
         """Browsers change the value of an input, and nothing else about it."""
         if not isinstance(updates, dict) or set(updates) != {"value"}:
-            return f"it changes {_shown(updates)}, expected a value"
+            return f"it changes {_shorten(updates)}, expected a value"
         handle = self.input_of(uuid)
-        return None if handle is None else _fault_in_value(handle, updates["value"])  # viser drops what is gone
+        # Viser drops what is gone.
+        return None if handle is None else _check_value(handle, updates["value"])
 
-    def sorted(self, receive: Callable[[], Awaitable[Any]]) -> Callable[[], Awaitable[Any]]:
+    def filter_messages(self, receive: Callable[[], Awaitable[Any]]) -> Callable[[], Awaitable[Any]]:
         """`receive`, which passes over messages that have a fault."""
 
         async def receive_good() -> Any:
-            while (fault := self.fault(raw := await receive())) is not None:
+            while (fault := self.find_fault(raw := await receive())) is not None:
                 _log.warning("view: a message from a browser was dropped: %s", fault)
             return raw
 
         return receive_good
 
-    def guarded(self, handler: Callable[[Any], Awaitable[None]]) -> Callable[[Any], Awaitable[None]]:
+    def guard_handler(self, handler: Callable[[Any], Awaitable[None]]) -> Callable[[Any], Awaitable[None]]:
         """viser's handler of a connection, with sorted messages, and with one line for what fails nevertheless."""
 
         async def handle(connection: Any) -> None:
             asyncio.get_running_loop().set_exception_handler(_report)
-            connection.recv = self.sorted(connection.recv)
+            connection.recv = self.filter_messages(connection.recv)
             await handler(connection)
 
         return handle
 
 
-def _fault_in_fields(given: dict[Any, Any], kind: str) -> str | None:
+def _check_fields(message: dict[Any, Any], kind: str) -> str | None:
     """viser ends a connection at fields that it does not know, and at those that are missing."""
-    known = fields(getattr(import_module("viser._messages"), kind))
-    needed = {field.name for field in known if field.default is MISSING}
-    if needed <= set(given) <= {field.name for field in known}:
+    names = fields(getattr(import_module("viser._messages"), kind))
+    needed = {field.name for field in names if field.default is MISSING}
+    if needed <= set(message) <= {field.name for field in names}:
         return None
-    return f"its fields are {_shown(list(given))}, expected {', '.join(sorted(needed))}"
+    return f"its fields are {_shorten(list(message))}, expected {', '.join(sorted(needed))}"
 
 
-def _fault_in_words(given: dict[str, Any], *names: str) -> str | None:
-    wrong = next((name for name in names if not isinstance(given.get(name, ""), str)), None)
-    return None if wrong is None else f"{wrong} is {_shown(given[wrong])}, expected text"
+def _check_words(message: dict[str, Any], *names: str) -> str | None:
+    wrong = next((name for name in names if not isinstance(message.get(name, ""), str)), None)
+    return None if wrong is None else f"{wrong} is {_shorten(message[wrong])}, expected text"
 
 
-def _fault_in_numbers(given: dict[str, Any], sizes: dict[str, int]) -> str | None:
+def _check_numbers(message: dict[str, Any], sizes: dict[str, int]) -> str | None:
     """Size 0 stands for one number."""
     for name, size in sizes.items():
-        numbers = given[name] if size else [given[name]]
+        numbers = message[name] if size else [message[name]]
         if not isinstance(numbers, list | tuple) or len(numbers) != (size or 1) or not all(map(_is_number, numbers)):
-            return f"{name} is {_shown(given[name])}, expected {size or 1} finite numbers"
+            return f"{name} is {_shorten(message[name])}, expected {size or 1} finite numbers"
     return None
 
 
-def _fault_in_value(handle: Any, value: Any) -> str | None:
+def _check_value(handle: Any, value: Any) -> str | None:
     """A value is of the kind that the input has, and one that it offers."""
     if isinstance(handle.value, str):
-        wanted = f"one of {', '.join(handle.options)}"
+        expected = f"one of {', '.join(handle.options)}"
         good = isinstance(value, str) and value in handle.options
     elif isinstance(handle.value, bool):
-        wanted, good = "true or false", isinstance(value, bool)
+        expected, good = "true or false", isinstance(value, bool)
     else:
-        slack = handle.max - handle.min  # limits move while somebody slides
-        wanted = f"a number from {handle.min} to {handle.max}"
+        # Limits move while somebody slides.
+        slack = handle.max - handle.min
+        expected = f"a number from {handle.min} to {handle.max}"
         good = _is_number(value) and handle.min - slack <= value <= handle.max + slack
-    return None if good else f"a value is {_shown(value)}, expected {wanted}"
+    return None if good else f"a value is {_shorten(value)}, expected {expected}"
 
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
 
 
-def _shown(value: object) -> str:
+def _shorten(value: object) -> str:
     """A value in a line: escaped and short."""
-    return ascii(value)[:_LONGEST]
+    return ascii(value)[: RULES.message_length]
 
 
 def _report(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     """One line for an error in a task of the server."""
     error = context.get("exception")
-    _log.warning("view: %s: %s", context["message"], _shown(error))
+    _log.warning("view: %s: %s", context["message"], _shorten(error))
     _log.debug("in the server of the view", exc_info=error)
 
 
-def _in_one_line(record: logging.LogRecord) -> bool:
+def _shorten_record(record: logging.LogRecord) -> bool:
     if record.exc_info:
-        record.msg, record.args = f"view: {record.getMessage()}: {_shown(record.exc_info[1])}", ()
+        record.msg, record.args = f"view: {record.getMessage()}: {_shorten(record.exc_info[1])}", ()
         record.exc_info = None
     return True
 
 
-connections.addFilter(_in_one_line)
+connections.addFilter(_shorten_record)
 
 
 _VISER = "viser.infra._infra"  # the module that starts the server
@@ -244,7 +229,7 @@ class Loop:
     def _run(self) -> None:
         settled = True
         while self._running:
-            jobs, tick = self._next(settled)
+            jobs, tick = self._take_next(settled)
             if not jobs and tick is None and not settled:
                 jobs, settled = [self._settle], True
             elif jobs or tick is not None:
@@ -254,17 +239,18 @@ class Loop:
             if tick is not None:
                 self._do(lambda tick=tick: self._advance(tick))  # type: ignore[misc]
 
-    def _next(self, settled: bool) -> tuple[list[Job], Tick | None]:
+    def _take_next(self, settled: bool) -> tuple[list[Job], Tick | None]:
         """What to do now; waits until there is something."""
         with self._wake:
             if not self._jobs and self._running:
-                self._wake.wait(_FRAME if self._tick else None if settled else _QUIET)
+                self._wake.wait(RULES.tick if self._tick else None if settled else RULES.quiet)
             jobs, self._jobs = list(self._jobs.values()), {}
             return jobs, self._tick
 
     def _advance(self, tick: Tick) -> None:
         """One tick of an animation."""
-        goes_on = False  # an error ends it, too
+        # An error ends it, too.
+        goes_on = False
         try:
             goes_on = tick(time.monotonic() - self._begun)
         finally:
@@ -274,7 +260,8 @@ class Loop:
     def _do(self, job: Job) -> None:
         try:
             job()
-        except Exception as error:  # a page shows an error and goes on
+        except Exception as error:
+            # A page shows an error and goes on.
             _log.debug("a job of the view failed", exc_info=True)
             self._failed(error)
 
@@ -294,7 +281,7 @@ class Guard:
     seen: list[bool] = field(default_factory=list)  #: not empty once a server is guarded
     inbox: Inbox = field(default_factory=Inbox)  #: judges what comes through a websocket
 
-    def admitted(self, path: str, hosts: list[str], origins: list[str]) -> str | None:
+    def admit(self, path: str, hosts: list[str], origins: list[str]) -> str | None:
         """The path of a request behind the token; None if the request is refused.
 
         Args:
@@ -302,11 +289,12 @@ class Guard:
             hosts: all headers `Host`.
             origins: all headers `Origin`; programs that are no browsers, and browsers that open a page, send none.
         """
+        # The token must be right, and the browser's page this server's own.
         place, mark, query = path.partition("?")
         first, _, rest = place.removeprefix("/").partition("/")
-        known = hmac.compare_digest(first.encode(errors="replace"), self.token.encode())
+        right_token = hmac.compare_digest(first.encode(errors="replace"), self.token.encode())
         own = len(hosts) == 1 and self._is_own(hosts[0]) and origins in ([], [f"http://{hosts[0]}"])
-        return f"/{rest}{mark}{query}" if known and own else None
+        return f"/{rest}{mark}{query}" if right_token and own else None
 
     def _is_own(self, host: str) -> bool:
         """Whether a header `Host` can name this server. Any port can: tunnels change it.
@@ -314,10 +302,10 @@ class Guard:
         A server that other machines reach has addresses that it does not know, behind routers and in containers. So it
         takes all that are numbers: no name of somebody else can lead to them.
         """
-        found = _HOST.fullmatch(host.lower())
-        if found is None:
+        match = _HOST.fullmatch(host.lower())
+        if match is None:
             return False
-        name = found["name"].strip("[]")
+        name = match["name"].strip("[]")
         own = is_local(self.host)
         if name in ("localhost", self.host.lower()):
             return True
@@ -336,7 +324,7 @@ def is_local(host: str) -> bool:
 
 
 @contextmanager
-def guarded(host: str) -> Iterator[Guard]:
+def guard_server(host: str) -> Iterator[Guard]:
     """Guard the server that viser starts within the block.
 
     viser has no option for that. It looks `serve` of the package websockets up when it starts, so another function
@@ -344,33 +332,33 @@ def guarded(host: str) -> Iterator[Guard]:
 
     A later viser may start it in another way: then `Guard.seen` stays empty.
     """
-    guard, module = Guard(host), _serving()
+    guard, module = Guard(host), _import_server()
     with _starting:
         serve = module.serve
-        module.serve = _with_guard(serve, guard)
+        module.serve = _add_guard(serve, guard)
         try:
             yield guard
         finally:
             module.serve = serve
 
 
-def _serving() -> Any:
+def _import_server() -> Any:
     """The module whose function `serve` is looked up."""
     return import_module("websockets.asyncio.server")
 
 
-def _with_guard(serve: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
+def _add_guard(serve: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
     """`serve`, which asks the guard before anything else; servers that are not viser's stay as they are."""
     answer_of = import_module("websockets.http11").Response
     headers_of = import_module("websockets.datastructures").Headers
 
-    class Attentive(_serving().ServerConnection):  # type: ignore[misc]
+    class Attentive(_import_server().ServerConnection):  # type: ignore[misc]
         """A connection that is dropped if it asks for nothing: browsers keep some, and closing waited 6 s for them."""
 
         async def handshake(self, *arguments: Any, **options: Any) -> None:
-            told = [self.request_rcvd, self.connection_lost_waiter]
-            await asyncio.wait(told, timeout=_SILENT, return_when=asyncio.FIRST_COMPLETED)
-            if any(future.done() for future in told):
+            events = [self.request_rcvd, self.connection_lost_waiter]
+            await asyncio.wait(events, timeout=RULES.silence, return_when=asyncio.FIRST_COMPLETED)
+            if any(future.done() for future in events):
                 await super().handshake(*arguments, **options)
 
     def serve_guarded(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
@@ -380,32 +368,33 @@ def _with_guard(serve: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
 
         def judge(connection: Any, request: Any) -> Any:
             headers = request.headers
-            path = guard.admitted(request.path, headers.get_all("Host"), headers.get_all("Origin"))
+            path = guard.admit(request.path, headers.get_all("Host"), headers.get_all("Origin"))
             if path is None:
                 text = b"Open the whole address that orthocas printed.\n"
-                told = headers_of({"Content-Type": "text/plain", "Content-Length": str(len(text))})
-                return answer_of(HTTPStatus.FORBIDDEN, "Forbidden", told, text)
-            return titled(process_request(connection, replace(request, path=path)))
+                fields = headers_of({"Content-Type": "text/plain", "Content-Length": str(len(text))})
+                return answer_of(HTTPStatus.FORBIDDEN, "Forbidden", fields, text)
+            return rename_page(process_request(connection, replace(request, path=path)))
 
-        limits = {"max_size": _LARGEST, "logger": connections, "create_connection": Attentive}
-        return serve(guard.inbox.guarded(handler), *arguments, process_request=judge, **{**options, **limits})
+        limits = {"max_size": RULES.largest_message, "logger": connections, "create_connection": Attentive}
+        return serve(guard.inbox.guard_handler(handler), *arguments, process_request=judge, **{**options, **limits})
 
     return serve_guarded
 
 
-def titled(answer: Any) -> Any:
+def rename_page(answer: Any) -> Any:
     """An answer with viser's page, named after us; other answers stay as they are."""
     if answer is None or "html" not in answer.headers.get("Content-Type", ""):
         return answer
-    body = named_page(answer.body, answer.headers.get("Content-Encoding") == "gzip")
+    body = build_page(answer.body, answer.headers.get("Content-Encoding") == "gzip")
     headers = answer.headers.copy()
-    del headers["Content-Length"]  # or there would be two
+    # Or there would be two.
+    del headers["Content-Length"]
     headers["Content-Length"] = str(len(body))
     return replace(answer, headers=headers, body=body)
 
 
 @lru_cache(maxsize=2)
-def named_page(body: bytes, packed: bool = False) -> bytes:
+def build_page(body: bytes, packed: bool = False) -> bytes:
     """viser's page with our title and our script, before its own."""
     page = (gzip.decompress(body) if packed else body).replace(TITLES[0].encode(), TITLES[1].encode(), 1)
     page = page.replace(b"<head>", b"<head><script>" + _SCRIPT.read_bytes() + b"</script>", 1)
@@ -430,21 +419,26 @@ def open_window(host: str, port: int, title: str) -> tuple[Any, str]:
     """
     package = viser()
     require_free(host, port)
-    with guarded(host) as guard, contextlib.redirect_stdout(io.StringIO()):  # it announces itself
+    # It announces itself.
+    # viser starts its server with our guard before it.
+    with guard_server(host) as guard, contextlib.redirect_stdout(io.StringIO()):
         server = package.ViserServer(host=host, port=port, label=title, verbose=False)
     inputs = getattr(server.gui, "_gui_input_handle_from_uuid", None)
     if not guard.seen or inputs is None:
         close_window(server)
         raise ViewError("this version of viser starts its server in another way, expected one that can be guarded")
-    if port not in (0, server.get_port()):  # somebody else was faster
+    # Somebody else was faster.
+    if port not in (0, server.get_port()):
         close_window(server)
-        raise _taken(host, port)
+        raise _build_taken_error(host, port)
+    # Nobody but this machine, unless the host says so: no sharing through a server of others.
     guard.inbox.input_of = inputs.get
-    server.request_share_url = _not_shared
-    server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=BRAND)
+    server.request_share_url = _refuse_sharing
+    server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=RULES.brand)
     server.scene.configure_environment_map(None)
-    server.scene.configure_default_lights(False)  # `place_lights` has lights without shadows
-    return server, f"{url_of(host, server.get_port())}/{guard.token}"
+    # `place_lights` has lights without shadows.
+    server.scene.configure_default_lights(False)
+    return server, f"{build_url(host, server.get_port())}/{guard.token}"
 
 
 def show_error(server: Any, error: Exception) -> None:
@@ -471,7 +465,8 @@ def require_free(host: str, port: int) -> None:
     if not isinstance(host, str) or not host:
         raise InvalidValueError("host", repr(host)[:80], "an address of this machine, such as 127.0.0.1")
     try:
-        numeric = 0 if host == "localhost" else socket.AI_NUMERICHOST  # no questions to other machines
+        # No questions to other machines.
+        numeric = 0 if host == "localhost" else socket.AI_NUMERICHOST
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=numeric)[0]
     except (OSError, UnicodeError):
         raise ViewError(f"host is {host[:80]!r}, expected an address of this machine, such as {LOCAL}") from None
@@ -480,13 +475,20 @@ def require_free(host: str, port: int) -> None:
         try:
             trial.bind(address)
         except OSError as error:
-            raise _refused(host, port, error) from None
+            raise _build_refusal(host, port, error) from None
 
 
-def url_of(host: str, port: int) -> str:
+def build_url(host: str, port: int) -> str:
     """The address for a browser, without its token."""
     shown = LOCAL if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
     return f"http://{shown}:{port}"
+
+
+def place_scene(server: Any, robot: Robot, q: Array, shift: Array | None = None) -> None:
+    """A floor, lights, and a camera; see `place_camera`."""
+    place_floor(server, robot)
+    place_lights(server, robot)
+    place_camera(server, robot, q, shift)
 
 
 def place_camera(server: Any, robot: Robot, q: Array, shift: Array | None = None) -> None:
@@ -498,16 +500,20 @@ def place_camera(server: Any, robot: Robot, q: Array, shift: Array | None = None
         q: joint positions (N, n) that should be in the picture.
         shift: places of further arms, (k, 3) [m].
     """
+    # A sphere around all arms in all positions that should be seen.
     points = robot.joint_points(q).reshape(-1, 3)
     points = np.concatenate([points, *(points + other for other in ([] if shift is None else shift))])
     low, high = points.min(axis=0), points.max(axis=0)
-    middle, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 0.4 * chain_length(robot.tree))
-    up = up_of(robot)
+    centre, radius = (
+        (low + high) / 2,
+        max(float(np.linalg.norm(high - low)) / 2, 0.4 * compute_chain_length(robot.tree)),
+    )
+    up = compute_up(robot)
     server.scene.set_up_direction(tuple(up))
-    frame = Framing(middle, direction_of_camera(robot), _ROOM * radius / np.sin(_VIEW_ANGLE / 2))
+    frame = Framing(centre, compute_camera_direction(robot), RULES.room * radius / np.sin(RULES.view_angle / 2))
     camera = server.initial_camera
-    camera.fov = _VIEW_ANGLE
-    position, look_at = frame.seen_from(1, 1)
+    camera.fov = RULES.view_angle
+    position, look_at = frame.compute_view(1, 1)
     camera.position, camera.look_at = tuple(position), tuple(look_at)
     server.on_client_connect(frame.keep)
 
@@ -516,13 +522,13 @@ def place_camera(server: Any, robot: Robot, q: Array, shift: Array | None = None
 class Framing:
     """Keeps arms in the pictures of browsers of any shape, until somebody turns the scene."""
 
-    middle: Array  #: of the arms (3,) [m]
+    centre: Array  #: of the arms (3,) [m]
     direction: Array  #: unit vector to the camera (3,)
     distance: float  #: of the camera for a picture that is as wide as high, or wider [m]
 
-    def seen_from(self, width: float, height: float) -> tuple[Array, Array]:
+    def compute_view(self, width: float, height: float) -> tuple[Array, Array]:
         """Position of the camera and the point that it looks at (3,) [m], for a picture of a size in pixels."""
-        return self.middle + self.distance * height / min(width, height) * self.direction, self.middle
+        return self.centre + self.distance * height / min(width, height) * self.direction, self.centre
 
     def keep(self, client: Any) -> None:
         """Place the camera of a browser anew when its picture changes its shape."""
@@ -532,15 +538,18 @@ class Framing:
             nonlocal size, elsewhere
             if min(camera.image_width, camera.image_height) < 1 or np.allclose(camera.look_at, camera.position):
                 return  # no picture
-            if not any(np.allclose(camera.position, place, atol=_NEAR * self.distance) for place in places):
+            if not any(
+                np.allclose(camera.position, place, atol=RULES.camera_slack * self.distance) for place in places
+            ):
                 elsewhere = min(elsewhere, time.monotonic())
-                if time.monotonic() - elsewhere > _ON_ITS_WAY:
-                    places.clear()  # somebody has turned the scene
+                if time.monotonic() - elsewhere > RULES.camera_pause:
+                    # Somebody has turned the scene.
+                    places.clear()
                 return
             elsewhere = float("inf")
             if size != (camera.image_width, camera.image_height):
                 size = camera.image_width, camera.image_height
-                position, look_at = self.seen_from(*size)
+                position, look_at = self.compute_view(*size)
                 places.append(position)
                 with client.atomic():
                     camera.position = position
@@ -553,12 +562,12 @@ class Framing:
 def place_panels(server: Any) -> Any:
     """Sliders on the right and readings on the left, with the scene between them; returns the HTML of the readings."""
     server.gui.main_panel.dock_right()
-    server.gui.main_panel.set_width(_PANELS[1])
+    server.gui.main_panel.set_width(RULES.panel_widths[1])
     panel = server.gui.add_panel()
     with panel.add_tab("Readings", "gauge"):
         html = server.gui.add_html("")
     panel.dock_left()
-    panel.set_width(_PANELS[0])
+    panel.set_width(RULES.panel_widths[0])
     return html
 
 
@@ -567,21 +576,23 @@ def place_floor(server: Any, robot: Robot) -> None:
 
     Lines, because viser's own grid computes every point of the floor, which takes long without a graphics card.
     """
-    size = chain_length(robot.tree)
-    radius = _FLOOR * size
+    size = compute_chain_length(robot.tree)
+    radius = RULES.floor * size
     decade = 10.0 ** np.floor(np.log10(size / 5))
     cell = decade * max(part for part in (1, 2, 5) if part * decade <= size / 5)
     numbers = np.arange(-int(radius / cell), int(radius / cell) + 1)
     half = np.sqrt(radius**2 - (cell * numbers) ** 2)
-    along = np.outer(half, [-1.0, -_FADE, _FADE, 1.0])  # (lines, 4)
+    # Lines of equal distance, cut off by the circle, in four points each: they fade towards both ends.
+    along = np.outer(half, [-1.0, -RULES.fade, RULES.fade, 1.0])  # (lines, 4)
     across = np.repeat(cell * numbers[:, None], 4, axis=1)
     points = np.stack([along, across, 0 * along], axis=2)
-    shade = np.where((numbers % 5 == 0)[:, None], *_GRID)
-    fade = np.stack([0 * shade + 255, shade, shade, 0 * shade + 255], axis=1)  # into the white of the background
+    shade = np.where((numbers % 5 == 0)[:, None], *RULES.grid)
+    # Into the white of the background.
+    fade = np.stack([0 * shade + 255, shade, shade, 0 * shade + 255], axis=1)
     lines, colours = np.concatenate([points, points[..., [1, 0, 2]]]), np.concatenate([fade, fade])
-    lines = lines - [0.0, 0.0, 0.15 * size] if is_planar(robot) else lines @ rotate_z_to(up_of(robot)).T
-    ends, shades = (np.stack([rows[:, :-1], rows[:, 1:]], axis=2).reshape(-1, 2, 3) for rows in (lines, colours))
-    server.scene.add_line_segments("/floor", ends, shades.astype(np.uint8), thickness=_LINE * size)
+    lines = lines - [0.0, 0.0, 0.15 * size] if is_planar(robot) else lines @ rotate_z_to(compute_up(robot)).T
+    ends, tones = (np.stack([rows[:, :-1], rows[:, 1:]], axis=2).reshape(-1, 2, 3) for rows in (lines, colours))
+    server.scene.add_line_segments("/floor", ends, tones.astype(np.uint8), thickness=RULES.line * size)
 
 
 def place_lights(server: Any, robot: Robot) -> None:
@@ -589,7 +600,7 @@ def place_lights(server: Any, robot: Robot) -> None:
 
     There are no shadows and no environment map: without a graphics card, they take most of the time of a picture.
     """
-    scene, up, ahead = server.scene, up_of(robot), direction_of_camera(robot)
+    scene, up, ahead = server.scene, compute_up(robot), compute_camera_direction(robot)
     left = np.cross(ahead, up)
     scene.add_light_hemisphere(
         "/lights/sky", sky_color=(255, 255, 255), ground_color=(150, 156, 166), intensity=2.1, position=tuple(up)
@@ -602,39 +613,40 @@ def is_planar(robot: Robot) -> bool:
     """Whether an arm moves in the x-y plane."""
     tree = robot.tree
     return bool(
-        np.abs(tree.rotations[:, 2] - [0, 0, 1]).max() < _FLAT and np.abs(tree.translations[:, 2]).max() < _FLAT
+        np.abs(tree.rotations[:, 2] - [0, 0, 1]).max() < RULES.flat
+        and np.abs(tree.translations[:, 2]).max() < RULES.flat
     )
 
 
-def direction_of_camera(robot: Robot) -> Array:
+def compute_camera_direction(robot: Robot) -> Array:
     """Unit vector to the camera: from the front, the side and above, or from where a plane is seen."""
     if is_planar(robot):
         return np.array([0.0, 0.0, 1.0])
-    up = up_of(robot)
+    up = compute_up(robot)
     ahead = np.eye(3)[int(np.argmin(np.abs(up)))]
     ahead = ahead - (ahead @ up) * up
     direction = ahead / np.linalg.norm(ahead) - 1.25 * np.cross(up, ahead) + 0.55 * up
     return np.asarray(direction / np.linalg.norm(direction))
 
 
-def up_of(robot: Robot) -> Array:
+def compute_up(robot: Robot) -> Array:
     """Against gravity; z without gravity."""
     gravity = robot.tree.gravity
     strength = float(np.linalg.norm(gravity))
-    return np.array([0.0, 0.0, 1.0]) if strength < _FLAT else -gravity / strength
+    return np.array([0.0, 0.0, 1.0]) if strength < RULES.flat else -gravity / strength
 
 
-def _not_shared(verbose: bool = True) -> None:
+def _refuse_sharing(verbose: bool = True) -> None:
     """In place of viser's tunnel to a server of others, which any page in the browser could ask for."""
 
 
-def _refused(host: str, port: int, error: OSError) -> ViewError:
+def _build_refusal(host: str, port: int, error: OSError) -> ViewError:
     if error.errno == errno.EADDRINUSE:
-        return _taken(host, port)
+        return _build_taken_error(host, port)
     if error.errno == errno.EACCES:
         return ViewError(f"port is {port}, which this user may not open; expected one from 1024 on")
     return ViewError(f"host is {host[:80]!r}, expected an address of this machine, such as {LOCAL}")
 
 
-def _taken(host: str, port: int) -> ViewError:
+def _build_taken_error(host: str, port: int) -> ViewError:
     return ViewError(f"port {port} of {host} is taken, expected a free one; 0 finds one")

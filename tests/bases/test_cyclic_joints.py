@@ -17,7 +17,7 @@ from orthocas.codegen.check import check_c
 from orthocas.control import ControlStatus, Kinematic, PDPlus
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.fit import Fit
-from orthocas.fitting.probe import judged_chart, leak_and_conditioning
+from orthocas.fitting.probe import compute_leak_and_conditioning, evaluate_chart
 from orthocas.tasks.samples import evaluate_samples, sample_boundary_weighted, sample_uniform
 from orthocas.tools.archive import read_archive
 from orthocas.tools.batch import Batched
@@ -94,7 +94,8 @@ def test_chart_holds_over_the_full_turn_of_the_first_axis(cyclic_fit: Fit) -> No
     there = here.copy()
     there[:, 0] = FULL_TURN
     found = [
-        leak_and_conditioning(evaluate_samples(chart.problem, q), chart.coordinates.jacobian(q)) for q in (here, there)
+        compute_leak_and_conditioning(evaluate_samples(chart.problem, q), chart.coordinates.jacobian(q))
+        for q in (here, there)
     ]
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-7)
@@ -109,7 +110,7 @@ def test_free_fit_leaks_more_at_other_angles(cyclic_fit: Fit, iiwa_fit: Fit) -> 
     """The reason for the option: a chart of the cube does not know other angles of A1."""
     cube = iiwa_fit.chart
     outside = oc.Chart(cyclic_fit.chart.problem, cube.coordinates)
-    assert judged_chart(outside, 5000, 1).leak_deg > 1.5 * judged_chart(cyclic_fit.chart, 5000, 1).leak_deg
+    assert evaluate_chart(outside, 5000, 1).leak_deg > 1.5 * evaluate_chart(cyclic_fit.chart, 5000, 1).leak_deg
 
 
 def test_joint_without_limits_becomes_unbounded(endless: oc.Chart) -> None:

@@ -11,7 +11,7 @@ from conftest import Run, robot_data
 
 import orthocas as oc
 from orthocas.errors import BranchWarning
-from orthocas.fitting.probe import Bounds, Verdict
+from orthocas.fitting.probe import Bounds, Quality
 from orthocas.tasks.samples import NEGLIGIBLE
 
 TASK = "position+axis:z"
@@ -92,10 +92,10 @@ def test_info_names_them(run: Run, tmp_path: Path) -> None:
 
 
 def test_folds_are_no_negative_conditioning() -> None:
-    verdict = Verdict(1.0, -0.395, np.zeros(2), 1.0, 1.0)
+    quality = Quality(1.0, -0.395, np.zeros(2), 1.0, 1.0)
     bounds = Bounds(8.0, 0.2)
-    assert next(iter(verdict.excess(bounds))) == "conditioning"
-    words = verdict.explained("conditioning", bounds)
+    assert next(iter(quality.excess(bounds))) == "conditioning"
+    words = quality.explained("conditioning", bounds)
     assert words == "a trial chart folds over (det J changes its sign), expected a conditioning of at least 0.2"
-    kept = Verdict(1.0, 0.1, np.zeros(2), 1.0, 1.0).explained("conditioning", bounds)
+    kept = Quality(1.0, 0.1, np.zeros(2), 1.0, 1.0).explained("conditioning", bounds)
     assert kept == "a trial chart has a conditioning of 0.1, expected a conditioning of at least 0.2"

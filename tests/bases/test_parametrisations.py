@@ -155,7 +155,7 @@ def test_basis_gradients_match_differences_of_the_basis(form: type[BasisGradient
     point = np.array([0.2, 0.1, -0.1])
     q = ca.SX.sym("q", 3)
     psi = ca.Function("psi", [q], [family.basis(q)])
-    G = gradients.dense(gradients.at(point[None]), 1)[0]  # (n, K)
+    G = gradients.expand(gradients.at(point[None]), 1)[0]  # (n, K)
     step = 1e-6
     want = [np.array(psi(point + step * e) - psi(point - step * e)).ravel() / (2 * step) for e in np.eye(3)]
     np.testing.assert_allclose(G, want, atol=1e-7)
@@ -172,19 +172,19 @@ def test_products_with_basis_gradients_are_those_with_all_entries(
     points = rng.uniform(-0.5, 0.5, (300, 3))
     gradients = form(family, 3)
     X, C = gradients.at(points), rng.normal(size=(2, family.width))
-    G = gradients.dense(X, 300)  # (N, n, K)
-    J = split_by_sample((gradients.table(C) @ X).reshape(len(X), 3, 2, -1), 300)
+    G = gradients.expand(X, 300)  # (N, n, K)
+    J = split_by_sample((gradients.build_table(C) @ X).reshape(len(X), 3, 2, -1), 300)
     np.testing.assert_allclose(J, C @ G.transpose(0, 2, 1), atol=1e-12)
     slopes = np.zeros((len(X) * COLUMNS, 6))  # dL/dJ_xi, joint by joint
     slopes[:300] = rng.normal(size=(300, 6))
-    by_block = slopes.reshape(len(X), COLUMNS, *gradients.table(C).shape[:2]).transpose(0, 2, 3, 1)
-    found = gradients.collected((by_block @ X.transpose(0, 1, 3, 2)).sum(axis=0))
+    by_block = slopes.reshape(len(X), COLUMNS, *gradients.build_table(C).shape[:2]).transpose(0, 2, 3, 1)
+    found = gradients.collect((by_block @ X.transpose(0, 1, 3, 2)).sum(axis=0))
     np.testing.assert_allclose(found, np.einsum("snr,snk->rk", slopes[:300].reshape(300, 3, 2), G), atol=1e-11)
     kept = rng.uniform(size=family.width) < 0.6
-    some = gradients.dense_part(X, 300, kept, 4, np.float32)
+    some = gradients.expand_part(X, 300, kept, 4, np.float32)
     assert some.dtype == np.float32
     np.testing.assert_allclose(some, G[::4][:, :, kept], rtol=1e-6, atol=1e-6)
-    assert gradients.dense(X[:1, :, :, :0], 0).shape == (0, 3, family.width)  # no hinge of a fold acts
+    assert gradients.expand(X[:1, :, :, :0], 0).shape == (0, 3, family.width)  # no hinge of a fold acts
 
 
 def test_linear_normals_of_the_paper() -> None:

@@ -12,7 +12,7 @@ from conftest import ROBOTS, robot_data
 import orthocas as oc
 from orthocas import problems
 from orthocas.bases import JointSpace, Parametrisation
-from orthocas.bases.cyclic import leaves_stay
+from orthocas.bases.cyclic import keeps_self_motions
 from orthocas.certificates.certify import cover_domain
 from orthocas.charts.certificate import ELIMINATION, PROVED, Certificate, Subdivision
 from orthocas.charts.chart_file import fingerprint
@@ -164,8 +164,8 @@ def test_leaves_are_proved_to_stay_where_finite_motions_say_so(kind: str, wanted
         moved = q + 0.5 * np.eye(robot.n)[k]
         stays = np.abs(projectors(moved) - projectors(q)).max() < 1e-7
         if name in wanted:
-            assert leaves_stay(problem, k)
-        if leaves_stay(problem, k):
+            assert keeps_self_motions(problem, k)
+        if keeps_self_motions(problem, k):
             assert stays, name
 
 
@@ -173,5 +173,9 @@ def test_metrics_that_feel_a_joint_refute_a_proof() -> None:
     known = problems.get("planar_3r_xy")
     heavy = oc.Problem(known.robot, known.task, lambda q: ca.diag(2 + ca.cos(q)), known.domain)
     moving = oc.Problem(known.robot, known.task, "inertia", known.domain)
-    assert [leaves_stay(heavy, 0), leaves_stay(moving, 0), leaves_stay(known, 0)] == [False, True, True]
-    assert not any(leaves_stay(problem, 1) for problem in (heavy, moving, known))
+    assert [keeps_self_motions(heavy, 0), keeps_self_motions(moving, 0), keeps_self_motions(known, 0)] == [
+        False,
+        True,
+        True,
+    ]
+    assert not any(keeps_self_motions(problem, 1) for problem in (heavy, moving, known))

@@ -8,7 +8,7 @@ from orthocas import problems, solvers
 from orthocas.bases import JointSpace
 from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
 from orthocas.fitting.basis_objective import BasisObjective, BoundedMutual
-from orthocas.fitting.stages import missed_bound
+from orthocas.fitting.stages import explain_missed_bound
 from orthocas.fitting.terms import Weights
 from orthocas.solvers.protocol import SolveResult, Status
 from orthocas.tasks.samples import sample_problem
@@ -48,7 +48,7 @@ def test_hessian_of_the_lagrangian_matches_its_gradients(bounded: BoundedMutual)
 
 
 def test_gauge_makes_the_mean_squared_gradient_length_one(bounded: BoundedMutual) -> None:
-    theta = bounded.in_gauge(theta_of(bounded))
+    theta = bounded.normalise_gradients(theta_of(bounded))
     np.testing.assert_allclose(bounded.constraints(theta)[0][1:], 1.0, rtol=1e-12)
     J = bounded._task.coordinate_jacobians(theta)
     np.testing.assert_allclose((J**2).sum(axis=2).mean(axis=0), 1.0, rtol=1e-12)
@@ -87,7 +87,7 @@ def test_status_decides_between_infeasible_and_not_found(bounded: BoundedMutual)
         (Status.ITERATION_LIMIT, SolveError, "found in 7 iterations"),
     ):
         result = SolveResult(theta_of(bounded), np.inf, status, 7, 7, 0.0)
-        found = missed_bound("polynomial:2", 0.05, bounded, result)
+        found = explain_missed_bound("polynomial:2", 0.05, bounded, result)
         assert type(found) is error
         assert words in str(found)
         assert "within 2.865 deg" in str(found)

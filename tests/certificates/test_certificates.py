@@ -18,7 +18,7 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.charts.certificate import OPEN, PROVED, Subdivision
 from orthocas.charts.coordinates import Coordinates
-from orthocas.cli.commands import app_for
+from orthocas.cli.commands import build_app
 from orthocas.errors import CertifyError, ChartFileError, Interrupted, InvalidValueError, SchedulerError
 from orthocas.tools.progress import Progress
 
@@ -205,7 +205,7 @@ def test_boxes_that_processes_die_over_stay_unproved(caplog: pytest.LogCaptureFi
 
 
 def command(*words: Any) -> Any:
-    return CliRunner().invoke(app_for(list(map(str, words))), [str(word) for word in words])
+    return CliRunner().invoke(build_app(list(map(str, words))), [str(word) for word in words])
 
 
 @pytest.mark.slow
@@ -316,6 +316,6 @@ def test_dask_shares_the_work() -> None:
 
 def test_the_command_names_a_missing_scheduler(tmp_path: Path) -> None:
     chart().save(tmp_path / "a.chart")
-    done = command("certify", tmp_path / "a.chart", "--scheduler", "tcp://127.0.0.1:1")
+    done = command("certify", tmp_path / "a.chart", "--workers", "tcp://127.0.0.1:1")
     assert done.exit_code != 0
     assert isinstance(done.exception, SchedulerError)

@@ -14,7 +14,7 @@ from orthocas import problems, solvers
 from orthocas.bases import JointSpace, Parametrisation
 from orthocas.errors import UnknownNameError
 from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.fitting.dense_objectives import GraphObjective
+from orthocas.fitting.network_objective import GraphObjective
 from orthocas.fitting.terms import Weights
 from orthocas.tasks.samples import Samples, sample_evenly, sample_problem
 

@@ -14,7 +14,7 @@ from public_objects import clear
 import orthocas as oc
 from orthocas.errors import PathFileError
 from orthocas.paths import joint_motion
-from orthocas.paths.plan import read_path
+from orthocas.paths.tool_path import read_path
 
 LIMITS = ("--velocity-limit", "1,1.5,2", "--acceleration-limit", "4")
 
@@ -59,7 +59,8 @@ def test_schedules_objectives_and_obstacles(run: Run, chart: oc.Chart) -> None:
     Path("s.csv").write_text("xi1,y,x\n" + "\n".join(rows))
     report = json.loads(run("follow", "a.orthocas", "s.csv", *LIMITS, "--out", "q.csv", "--json")[1])
     assert report["xi"]["xi1"] == pytest.approx([xi - 0.02, xi + 0.02], abs=2e-3)
-    words = ("--xi", "objective", "--sphere", "0,3,0,0.1", "--capsule", "0,3,0,1,3,0,0.1", "--plane", "0,1,0,0,-1,0")
+    obstacles = ("sphere:0,3,0,0.1", "capsule:0,3,0,1,3,0,0.1", "plane:0,1,0,0,-1,0")
+    words = ("--xi", "objective", *(word for text in obstacles for word in ("--obstacle", text)))
     code, out, err = run(
         "follow", "a.orthocas", "p.csv", *LIMITS, *words, "--out", "q.csv", "--link-radius", "0.05", "--json"
     )
@@ -72,14 +73,16 @@ def test_schedules_objectives_and_obstacles(run: Run, chart: oc.Chart) -> None:
     [
         (["--xi", "best"], "unknown choice of --xi 'best', known: hold, schedule, objective"),
         (["--xi", "schedule"], "--xi is schedule, expected columns xi1 in p.csv with schedule"),
-        (["--sphere", "1,2"], "--sphere is '1,2', expected 4 numbers"),
-        (["--plane", "0,0,0,0,0,0"], "normal is [0.0, 0.0, 0.0], expected a direction"),
+        (["--obstacle", "sphere:1,2"], "--obstacle sphere is '1,2', expected 4 numbers"),
+        (["--obstacle", "cone:1,2"], "unknown kind of --obstacle 'cone', known: sphere, capsule, plane"),
+        (["--sphere", "1,2,3,1"], "no such option: --sphere; use --obstacle sphere:X,Y,Z,RADIUS"),
+        (["--obstacle", "plane:0,0,0,0,0,0"], "normal is [0.0, 0.0, 0.0], expected a direction"),
         (["--start", "1,2"], "q_start has shape (2,), expected (3,)"),
         (["--period", "often"], "received 'often', expected a number"),
         (["--velocity-limit", "-1"], "velocity_limits of joint 'q1' is -1.0"),
         (["--out", "no/q.csv"], "folder no does not exist"),
         (["--out", "a.orthocas"], "orthocas did not write the file"),
-        (["--sphere", "1,1.5,0,3"], "cannot be followed at waypoint 0"),
+        (["--obstacle", "sphere:1,1.5,0,3"], "cannot be followed at waypoint 0"),
     ],
 )
 def test_refusals(run: Run, chart: oc.Chart, words: list[str], message: str) -> None:
@@ -132,7 +135,7 @@ def test_ctrl_c_leaves_nothing_half_written(run: Run, chart: oc.Chart, monkeypat
         os.kill(os.getpid(), signal.SIGINT)
         return "half"
 
-    monkeypatch.setattr(joint_motion.JointMotion, "_text", pressed)
+    monkeypatch.setattr(joint_motion.JointMotion, "_format_text", pressed)
     code, _, err = run("follow", "a.orthocas", "p.csv", *LIMITS, "--out", "q.csv")
     assert (code, err) == (130, "orthocas: interrupted\n")
     assert sorted(file.name for file in Path().iterdir()) == ["a.orthocas", "p.csv"]

@@ -12,7 +12,7 @@ from scipy.linalg import eigvalsh
 from simulate_command import FILES, report_of, written
 
 import orthocas as oc
-from orthocas.cli.controller_argument import build_controller
+from orthocas.cli.codegen import build_controller
 from orthocas.control import ControlStatus, matched_stiffness
 from orthocas.fitting.fit import Fit
 from orthocas.simulation import Trajectory
@@ -120,11 +120,11 @@ def test_a_wrong_model_friction_and_noise_cost_accuracy(run_simulate: Run) -> No
 @pytest.mark.slow
 @pytest.mark.usefixtures("blank_pictures")
 def test_compiled_runs_are_the_same(run_simulate: Run) -> None:
-    plain, compiled = (
+    clean, compiled = (
         report_of(run_simulate, "pd_plus", "--mass-factor", "1.1", *words) for words in ((), ("--compiled",))
     )
     for name in ("tracking_error", "largest_command"):
-        assert compiled[name] == pytest.approx(plain[name], rel=1e-4)
+        assert compiled[name] == pytest.approx(clean[name], rel=1e-4)
 
 
 @pytest.mark.slow

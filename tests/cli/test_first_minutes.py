@@ -8,7 +8,7 @@ from conftest import robot_data
 from programs import Run, python
 
 import orthocas as oc
-from orthocas.cli import demo
+from orthocas.cli import compare as comparing
 from orthocas.cli.output import lines_of_progress
 from orthocas.control import PDPlus, Reference
 from orthocas.errors import (
@@ -142,7 +142,9 @@ def test_commands_print_how_far_coordinates_reach(run: Run, monkeypatch: pytest.
     numbers = dict.fromkeys(
         ("task_std_deg", "mutual_std_deg", "conditioning_mean", "conditioning_min", "conditioning_p01", "seconds"), 1.0
     )
-    monkeypatch.setattr(demo, "made", lambda out, force: (fit, numbers))  # tests/pages/test_examples.py makes it
+    monkeypatch.setattr(
+        comparing, "fit_demo", lambda out, force: (fit, numbers)
+    )  # tests/pages/test_examples.py makes it
     code, printed, _ = run("demo", "--out", "shown")
     assert code == 0
     assert "task angles    std 1.00 deg" in printed

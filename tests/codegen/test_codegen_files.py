@@ -222,7 +222,7 @@ def test_command_chooses_the_model_at_run_time_and_prints_remarks(planar_xy: oc.
     header = Path("c/arm.h").read_text()
     assert "double payload[10];" in header
     assert "double damping_stiffness[3];" in header
-    code, _, err = run(*words, "--model", "given", "--gravity", "robot")
+    code, _, err = run(*words, "--model", "given", "--gravity-compensation", "robot")
     assert code == 0
     assert "pass mass matrix and torques in every tick" in err
     assert "its fallback is zero torque" in err

@@ -1,6 +1,5 @@
 """Gravity in the axes of the base: dynamics, laws, C, runs, MuJoCo and chart files, against Pinocchio."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -127,10 +126,17 @@ def test_what_is_no_gravity_is_refused() -> None:
 
 def test_command_line_takes_it_with_robot_files_only(run: Run) -> None:
     file = str(robot_data(PANDA))
-    code, out, _ = run("info", file, "--gravity", "-9.81,0,0", "--json")
-    assert (code, json.loads(out)["gravity"]) == (0, [-9.81, 0, 0])
-    assert run("info", file, "--gravity", "9.81")[::2] == (2, "orthocas: gravity has shape (1,), expected (3,)\n")
-    assert (
-        "the named problem 'iiwa' has its own robot: leave out --gravity"
-        in run("info", "iiwa", "--gravity", "0,0,0")[2]
-    )
+    words = ("fit", file, "--tip", "panda_hand", "--param", "linear", "--samples", "50", "--out", "a.orthocas")
+    assert run(*words, "--gravity", "-9.81,0,0")[0] == 0
+    assert oc.load("a.orthocas").problem.robot.tree.gravity.tolist() == [-9.81, 0, 0]
+    words = (*words, "--force")
+    assert run(*words, "--gravity", "9.81")[::2] == (2, "orthocas: gravity has shape (1,), expected (3,)\n")
+    message = "the named problem 'iiwa' has its own robot: leave out --gravity"
+    assert message in run("fit", "iiwa", "--gravity", "0,0,0")[2]
+
+
+def test_the_gravity_of_a_law_has_its_own_option(run: Run) -> None:
+    code, _, err = run("codegen", "a.orthocas", "--controller", "pd_plus", "--out", "c", "--gravity", "robot")
+    assert code == 2
+    assert err.startswith("orthocas: no such option: --gravity; ")
+    assert "codegen --gravity-compensation law or robot" in err

@@ -16,7 +16,7 @@ from scipy.linalg import inv, sqrtm
 import orthocas as oc
 from orthocas import problems
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
-from orthocas.problems.iiwa import urdf_path
+from orthocas.problems.arms import urdf_path
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array

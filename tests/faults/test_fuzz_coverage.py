@@ -19,7 +19,7 @@ from fuzz.good_calls import good_calls
 
 import orthocas as oc
 from orthocas import learn
-from orthocas.cli.commands import app_for
+from orthocas.cli.commands import build_app
 
 _READS = re.compile(r"(read|load)_?\w*|loaded|from_(file|urdf|mjcf)|urdf_look")
 
@@ -40,13 +40,13 @@ def commands_of(app: typer.Typer, before: str = "") -> set[str]:
 
 def test_every_command_belongs_to_the_campaign_of_commands() -> None:
     tested = {" ".join(word for word in line.split() if not word.startswith("-")) for line in _COMMANDS}
-    missing = commands_of(app_for([]))
+    missing = commands_of(build_app([]))
     missing -= {name for name in missing if any(line == name or line.startswith(f"{name} ") for line in tested)}
     assert missing == set()
 
 
 def test_every_command_is_stopped_by_signals() -> None:
-    assert commands_of(app_for([])) <= {words[0] for words in signals.COMMANDS.values()}
+    assert commands_of(build_app([])) <= {words[0] for words in signals.COMMANDS.values()}
 
 
 @pytest.mark.slow

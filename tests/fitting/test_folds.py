@@ -11,10 +11,10 @@ from orthocas.bases import JointSpace
 from orthocas.charts.point_quality import Judged, least_in_domain, worst_points
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.fit import Fit
-from orthocas.fitting.residuals import Loss, sample_loss
+from orthocas.fitting.loss import Loss, build_sample_loss
 from orthocas.fitting.stages import FoldSearch
 from orthocas.fitting.starts import Mirror, find_mirror
-from orthocas.fitting.terms import LEAST_CONDITIONING, Sizes, Weights
+from orthocas.fitting.terms import RULES, Sizes, Weights
 from orthocas.tasks.samples import sample_boundary_weighted, sample_problem
 
 ACTIVE = list(range(6))
@@ -66,7 +66,7 @@ def test_coordinates_that_change_places_come_from_components_and_back() -> None:
 
 def test_choices_are_parities_alone_or_pairs_of_an_odd_and_an_even_component() -> None:
     mirror = Mirror(SPACE, np.ones(2), np.array([-1.0, -1.0, 1.0]))
-    assert [choice.exchanged for choice in mirror.choices()] == [(), ((0, 2),), ((1, 2),)]
+    assert [choice.exchanged for choice in mirror.list_choices()] == [(), ((0, 2),), ((1, 2),)]
 
 
 def test_the_loss_of_components_is_that_of_the_coordinates_made_of_them() -> None:
@@ -75,7 +75,9 @@ def test_the_loss_of_components_is_that_of_the_coordinates_made_of_them() -> Non
     J = rng.normal(size=(3, 4))
     turned = np.array([(J[0] + J[2]) / 2**0.5, J[1], (J[2] - J[0]) / 2**0.5])
     data = [rng.normal(size=symbol.shape) for symbol in coordinates.symbols()]
-    assert float(sample_loss(components)(J, *data)) == pytest.approx(float(sample_loss(coordinates)(turned, *data)))
+    assert float(build_sample_loss(components)(J, *data)) == pytest.approx(
+        float(build_sample_loss(coordinates)(turned, *data))
+    )
 
 
 @pytest.mark.slow
@@ -117,12 +119,12 @@ def test_fold_term_acts_at_collected_points_with_its_exact_gradient(iiwa: oc.Pro
     unsafe = oc.fit(iiwa, oc.Polynomial(2), weights=Weights(folds=0))
     folds = FoldSearch(iiwa, ACTIVE, 1000.0)
     folds.search(unsafe.stages[-1], oc.Polynomial(2), 0, lambda progress: None)
-    assert folds.least < LEAST_CONDITIONING
+    assert folds.least < RULES.least_conditioning
     family = unsafe.chart.coordinates.family
     theta = unsafe.stages[-1].result.theta
     samples = sample_problem(iiwa, 300, 4).restricted_to(ACTIVE)
     plain = BasisObjective(family, samples, Weights(), theta, lambda count, seed: samples)
-    both = folds.added_to(plain)
+    both = folds.add_to(plain)
     assert both.value(theta) > plain.value(theta)
     direction = np.random.default_rng(0).normal(size=theta.size)
     slope = both.value_and_gradient(theta)[1] @ direction
@@ -130,7 +132,7 @@ def test_fold_term_acts_at_collected_points_with_its_exact_gradient(iiwa: oc.Pro
     central = (both.value(theta + step * direction) - both.value(theta - step * direction)) / (2 * step)
     assert slope == pytest.approx(central, rel=1e-5)
     folds.give_up()
-    assert folds.added_to(plain) is plain
+    assert folds.add_to(plain) is plain
 
 
 @pytest.mark.slow

@@ -96,14 +96,14 @@ def test_a_task_without_reference_has_that_of_the_centre() -> None:
     problem = oc.Problem(known.robot, known.task, domain=turned)
     like = Like.of(problem, oc.Task.named(known.robot, "orientation"))
     np.testing.assert_allclose(np.asarray(like.function(turned.centre)), 0, atol=1e-12)
-    moved = like.slopes(turned.centre[None])[0]
+    moved = like.differentiate(turned.centre[None])[0]
     np.testing.assert_allclose(np.linalg.norm(moved, axis=0), 1, atol=1e-9)  # every joint turns the tip by its angle
 
 
 def test_the_term_vanishes_for_the_projected_gradient() -> None:
     problem = problems.get("iiwa")
     like = Like.of(problem, ["A3", "A1"])
-    term = like.term(problem, list(range(7)))
+    term = like.build_term(problem, list(range(7)))
     samples = sample_problem(problem, 3, 4)
     J, Z = ca.SX.sym("J", 4, 7), ca.SX.sym("Z", 7, 4)
     q = ca.SX.sym("q", 7)

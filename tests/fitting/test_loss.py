@@ -8,31 +8,22 @@ import pytest
 
 import orthocas as oc
 from orthocas.bases import JointSpace
-from orthocas.cli.problem_argument import parse_weights
-from orthocas.errors import InvalidValueError, ShapeError
-from orthocas.fitting import dense_objectives
-from orthocas.fitting.basis_gradients import gradients_of
-from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.fitting.dense_objectives import ArrayObjective, GraphObjective
-from orthocas.fitting.residuals import (
+from orthocas.cli.options import parse_weights
+from orthocas.errors import InvalidValueError
+from orthocas.fitting import network_objective
+from orthocas.fitting.basis_gradients import build_gradients
+from orthocas.fitting.basis_objective import BasisObjective, ObjectiveRules
+from orthocas.fitting.loss import (
     Loss,
-    loss_columns,
-    loss_with_slopes,
-    residual_columns,
-    sample_loss,
-    value_columns,
+    build_loss_columns,
+    build_loss_with_slopes,
+    build_residual_columns,
+    build_sample_loss,
+    build_value_columns,
 )
-from orthocas.fitting.starts import spectral_start
-from orthocas.fitting.terms import (
-    REGULAR_VOLUME,
-    Sizes,
-    Weights,
-    gradient_volume,
-    mutual_cosines,
-    pairs,
-    task_cosines,
-    volume_hinges,
-)
+from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
+from orthocas.fitting.starts import find_spectral_start
+from orthocas.fitting.terms import RULES, MutualTerm, Sizes, TaskTerm, Weights, gradient_volume, pairs, volume_hinges
 from orthocas.tasks.samples import Draw, Samples, evaluate_samples, sample_problem
 from orthocas.tools import columns
 from orthocas.tools.expressions import compute_determinant
@@ -60,7 +51,7 @@ def loss_by_hand(J_x: np.ndarray, J_xi: np.ndarray, B: np.ndarray, weights: Weig
     across[-1] *= np.sign(np.linalg.det(np.vstack([white_task, across])))
     volume = sign * np.linalg.det(white @ across.T)
     total += weights.length / (2 * r) * (np.log(np.linalg.norm(J_xi, axis=1)) ** 2).sum()
-    return float(total + weights.regularity / 2 * max(REGULAR_VOLUME - volume, 0) ** 2)
+    return float(total + weights.regularity / 2 * max(RULES.regular_volume - volume, 0) ** 2)
 
 
 def draw_from(problem: oc.Problem) -> Draw:
@@ -116,7 +107,7 @@ def test_hessian_is_the_derivative_of_the_gradient(problem: oc.Problem) -> None:
 def test_weights_split_the_loss_into_its_terms(problem: oc.Problem) -> None:
     linear, _, _ = objectives(problem, oc.Polynomial(2), REGULAR)
     theta = linear.family.initial(3)
-    terms = [linear.reweighted(Weights(*w)) for w in ((1000.0, 0.0, 0.0), (0.0, 30.0, 0.0), (1000.0, 0.0, 120.0))]
+    terms = [linear.reweigh(Weights(*w)) for w in ((1000.0, 0.0, 0.0), (0.0, 30.0, 0.0), (1000.0, 0.0, 120.0))]
     task, mutual, regular = (term.value(theta) for term in terms)
     np.testing.assert_allclose(regular + mutual, linear.value(theta), rtol=1e-12)
     assert task < regular
@@ -139,7 +130,9 @@ def test_graph_cut_into_blocks_gives_the_same_loss(planar_x: oc.Problem, monkeyp
     family = oc.MLP((6, 5)).family(JointSpace.of(planar_x), 2)
     settings = (family, sample_problem(planar_x, 50, 2), REGULAR, family.initial(1), draw_from(planar_x))
     value, gradient = GraphObjective(*settings).value_and_gradient(family.initial(1))
-    monkeypatch.setattr(dense_objectives, "_CHUNK_ENTRIES", 7 * 2 * family.width)  # blocks of 7, 1 left over
+    monkeypatch.setattr(
+        network_objective, "RULES", ObjectiveRules(graph=7 * 2 * family.width)
+    )  # blocks of 7, 1 left over
     blocked = GraphObjective(*settings)
     assert len(blocked._blocks) == 8
     np.testing.assert_allclose(blocked.value_and_gradient(family.initial(1))[0], value, rtol=1e-13)
@@ -172,7 +165,7 @@ def test_arrays_of_prismatic_joints_agree_with_their_graph() -> None:
 
 def test_single_precision_of_a_basis_changes_the_last_digits(problem: oc.Problem) -> None:
     family = oc.Polynomial(3).family(JointSpace.of(problem), problem.r)
-    theta, gradients = family.initial(3), gradients_of(family, problem.n, np.float32)
+    theta, gradients = family.initial(3), build_gradients(family, problem.n, np.float32)
     settings = (family, sample_problem(problem, 300, 9), EVEN, theta, draw_from(problem))
     double, single = BasisObjective(*settings), BasisObjective(*settings, gradients=gradients)
     assert 2 * single.X.nbytes == double.X.nbytes
@@ -197,9 +190,8 @@ def test_taylor_remainder_falls_with_the_square_of_the_step(planar_x: oc.Problem
 
 
 def test_gauss_newton_matrix_is_that_of_the_residuals(planar_x: oc.Problem) -> None:
-    twice = evaluate_samples(
-        planar_x, np.repeat(sample_problem(planar_x, 40, 9).points, 2, axis=0)
-    )  # every second is used
+    # every second is used
+    twice = evaluate_samples(planar_x, np.repeat(sample_problem(planar_x, 40, 9).points, 2, axis=0))
     family = oc.Polynomial(2).family(JointSpace.of(planar_x), 2)
     theta = family.initial(3)
     objective = BasisObjective(family, twice, REGULAR, theta, draw_from(planar_x))
@@ -233,9 +225,10 @@ def test_cosines_vanish_for_hand_derived_coordinate_of_planar_2r() -> None:
     """At q1 = pi/2, x = cos q1 + cos(q1 + q2) has J_x = -(1 + cos q2, cos q2): orthogonal to (cos q2, -1 - cos q2)."""
     c = np.cos(0.7)
     task = ca.SX(ca.DM([[-(1 + c), -c]]) / np.hypot(1 + c, c))
-    cosines = task_cosines(task, ca.SX(ca.DM([[c, -(1 + c)]])))
+    data, sizes = {"unit_task_gradients": task}, Sizes(2, 1, 1, True)
+    cosines = TaskTerm().residuals(ca.SX(ca.DM([[c, -(1 + c)]])), data, sizes)
     np.testing.assert_allclose(float(ca.evalf(cosines)), 0, atol=1e-15)
-    np.testing.assert_allclose(float(ca.evalf(task_cosines(task, task * 3))), 1.0)
+    np.testing.assert_allclose(float(ca.evalf(TaskTerm().residuals(task * 3, data, sizes))), 1.0)
 
 
 def test_pairs_are_ordered_like_the_paper_sum() -> None:
@@ -244,15 +237,13 @@ def test_pairs_are_ordered_like_the_paper_sum() -> None:
 
 
 def test_single_coordinate_has_no_mutual_cosine() -> None:
-    assert mutual_cosines(ca.SX.ones(1, 3), None).shape == (0, 1)
+    assert MutualTerm().residuals(ca.SX.ones(1, 3), {}, Sizes(3, 2, 1, True)).shape == (0, 1)
 
 
-def test_bad_weights_and_shapes_are_refused(planar_x: oc.Problem) -> None:
+def test_bad_weights_are_refused(planar_x: oc.Problem) -> None:
     for weights in ((0.0, 1.0), (-1.0, 1.0), (1.0, float("nan")), (1.0, -2.0)):
         with pytest.raises(InvalidValueError, match="lambda"):
             oc.fit(planar_x, oc.Polynomial(1), weights=weights)
-    with pytest.raises(ShapeError, match="coordinate_jacobian"):
-        task_cosines(ca.SX.ones(1, 3), ca.SX.ones(2, 4))
 
 
 @pytest.mark.slow
@@ -273,7 +264,7 @@ def test_spectral_start_finds_an_exact_linear_coordinate() -> None:
     task = oc.Task.custom(robot, "sum", lambda q: q[0] + 2 * q[1])
     problem = oc.Problem(robot, task, domain=oc.Box([0.0, 0.0], 1.0))
     family = oc.Polynomial(2).family(JointSpace.of(problem), 1)
-    theta = spectral_start(family, sample_problem(problem, 100, 0))
+    theta = find_spectral_start(family, sample_problem(problem, 100, 0))
     objective = BasisObjective(family, sample_problem(problem, 100, 1), WEIGHTS, theta, draw_from(problem))
     directions = objective.coordinate_jacobians(theta)[:, 0]
     np.testing.assert_allclose(directions @ np.array([1.0, 2.0]), 0, atol=1e-6 * np.abs(directions).max())
@@ -291,7 +282,7 @@ def test_batches_share_out_what_is_left_of_dropped_samples() -> None:
         parts = list(objective.batches(20, 4, (seed,)))
         assert len(parts) == 4
         assert all(np.isfinite(part.value(theta)) for part in parts)
-    assert set(objective._graphs.known) <= {20, len(sample_problem(problem, 64, 1))}
+    assert set(objective._graphs.built) <= {20, len(sample_problem(problem, 64, 1))}
 
 
 def test_weights_of_a_command_line_have_terms_by_name() -> None:
@@ -341,7 +332,7 @@ def test_expressions_of_too_many_coordinates_name_the_size() -> None:
     with pytest.raises(
         InvalidValueError, match="number of extra coordinates r is 13, expected at most 12 with the terms"
     ):
-        sample_loss(loss)
+        build_sample_loss(loss)
 
 
 @pytest.mark.parametrize("identity", [True, False])
@@ -379,13 +370,13 @@ def test_loss_with_volumes_is_the_loss() -> None:
     place = loss.data.index("metric_inverse")
     data[place] = data[place] @ data[place].transpose(0, 2, 1) + np.eye(sizes.n)
     inputs = [columns.arrange_blocks(rng.normal(size=(N, sizes.r, sizes.n))), *map(columns.arrange_blocks, data)]
-    value, slopes = loss_with_slopes(loss)(*inputs)
-    for found, wanted in zip(loss_columns(loss)(*inputs), (value, slopes), strict=True):
+    value, slopes = build_loss_with_slopes(loss)(*inputs)
+    for found, wanted in zip(build_loss_columns(loss)(*inputs), (value, slopes), strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-11, atol=1e-13 * np.abs(wanted).max())
-    np.testing.assert_allclose(value_columns(loss)(*inputs)[0], value, rtol=1e-11)
-    *rows, first, _, second, _ = residual_columns(loss)(*inputs)
+    np.testing.assert_allclose(build_value_columns(loss)(*inputs)[0], value, rtol=1e-11)
+    *rows, first, _, second, _ = build_residual_columns(loss)(*inputs)
     assert len(rows) == sizes.r
     only = Loss.of(sizes, {"regularity": 5.0, "folds": 7.0}, ((1, 4),))
-    (volumes,) = value_columns(only)(inputs[0], *(inputs[1 + loss.data.index(name)] for name in only.data))
+    (volumes,) = build_value_columns(only)(inputs[0], *(inputs[1 + loss.data.index(name)] for name in only.data))
     np.testing.assert_allclose((first**2 + second**2) / 2, volumes, rtol=1e-12)
     assert volumes.max() > 0

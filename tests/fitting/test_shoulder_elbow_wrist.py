@@ -13,8 +13,7 @@ from conftest import robot_data
 import orthocas as oc
 from orthocas.bases.given import SEW_KINDS, sew_angle
 from orthocas.errors import RobotError, UnknownNameError
-from orthocas.problems.iiwa import CENTRE, urdf_path
-from orthocas.problems.iiwa import robot as iiwa_robot
+from orthocas.problems.arms import CENTRE, iiwa_robot, urdf_path
 from orthocas.robots import pinocchio_model, urdf
 
 Z = np.array([0.0, 0.0, 1.0])

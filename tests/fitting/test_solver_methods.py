@@ -11,7 +11,7 @@ from orthocas import problems, solvers
 from orthocas.bases import JointSpace
 from orthocas.errors import InvalidValueError, SolveError
 from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.fitting.starts import spectral_start
+from orthocas.fitting.starts import find_spectral_start
 from orthocas.solvers.protocol import ConstrainedObjective, Objective, Solver, Status
 from orthocas.tasks.samples import sample_problem
 
@@ -143,7 +143,7 @@ def test_quasi_newton_meets_gauss_newton_with_few_matrices() -> None:
 
     family = oc.Polynomial(1).family(JointSpace.of(problem), problem.r)
     samples = sample_problem(problem, 500, (3,))
-    start = spectral_start(family, samples)
+    start = find_spectral_start(family, samples)
     objective = Counted(family, samples, oc.Weights(regularity=0, folds=0), start, lambda *_: samples)
     quasi = solvers.QuasiNewton(tolerance=1e-12).minimise(objective, start)
     gauss = solvers.GaussNewton(tolerance=1e-12).minimise(objective, start)

@@ -15,7 +15,7 @@ from orthocas import problems
 from orthocas.bases.family import JointSpace
 from orthocas.charts.quality import evaluate
 from orthocas.errors import DomainError, InvalidValueError, NotRedundantError, SingularTaskError, UnknownNameError
-from orthocas.fitting.probe import Prober, judged_chart, leak_and_conditioning
+from orthocas.fitting.probe import Prober, compute_leak_and_conditioning, evaluate_chart
 from orthocas.tasks.regular_box import find_home
 from orthocas.tasks.samples import evaluate_samples, sample_boundary_weighted
 from orthocas.tools.progress import Progress
@@ -43,7 +43,7 @@ def test_leak_and_conditioning_are_those_of_their_definitions() -> None:
     problem = oc.Problem(known.robot, known.task, "inertia", known.domain)
     samples = evaluate_samples(problem, sample_boundary_weighted(known.domain, 20, 3))
     J = np.random.default_rng(1).normal(size=(20, 1, 3))
-    leaks, conditioning = leak_and_conditioning(samples, J)
+    leaks, conditioning = compute_leak_and_conditioning(samples, J)
     for k, q in enumerate(samples.points):
         L = np.linalg.cholesky(np.linalg.inv(known.robot.mass_matrix(q)))
         task = np.linalg.qr((samples.task_jacobian[k] @ L).T)[0].T
@@ -79,12 +79,12 @@ def test_every_joint_has_a_reason_and_one_fifth_more_breaks_the_bound() -> None:
     found = suggestion()
     assert [joint.reason for joint in found.joints] == ["cyclic", "conditioning", "conditioning"]
     prober = Prober(found.problem, [0, 1, 2], ("q1",))
-    here = prober.verdict(oc.Box(HOME, found.domain.half_width))
+    here = prober.evaluate(oc.Box(HOME, found.domain.half_width))
     assert max(here.excess(dataclasses.replace(found.asked, conditioning=0.25)).values()) <= 1
     for k in (1, 2):
         wider = found.domain.half_width.copy()
         wider[k] *= 1.2
-        assert prober.verdict(oc.Box(HOME, wider)).excess(found.asked)["conditioning"] > 1
+        assert prober.evaluate(oc.Box(HOME, wider)).excess(found.asked)["conditioning"] > 1
 
 
 def test_cyclic_joint_takes_its_whole_range() -> None:
@@ -136,8 +136,8 @@ def test_trial_charts_are_as_good_as_fits_of_their_degree(metric: str) -> None:
     task = oc.Task.position(robot)
     box = oc.Box(find_home(robot, task).q, [0.5, *[0.25] * 5])
     problem = oc.Problem(robot, task, metric, box)
-    trial = Prober(problem, list(range(6))).verdict(box)
-    fitted = judged_chart(oc.fit(problem, oc.Polynomial(2), split_idle=False).chart, 3000, 0)
+    trial = Prober(problem, list(range(6))).evaluate(box)
+    fitted = evaluate_chart(oc.fit(problem, oc.Polynomial(2), split_idle=False).chart, 3000, 0)
     assert trial.leak_deg < 1.15 * fitted.leak_deg
     assert trial.conditioning > 0.5 * fitted.conditioning
 
@@ -211,7 +211,7 @@ def test_boxes_of_light_wrists_do_not_depend_on_the_luck_of_single_trials() -> N
     )
     free = [joint.half_width for joint in found.joints if joint.reason != "cyclic"]
     assert np.exp(np.mean(np.log(free))) > 0.35
-    assert judged_chart(found.fit.chart, 50_000, 11).conditioning > 0.15
+    assert evaluate_chart(found.fit.chart, 50_000, 11).conditioning > 0.15
 
 
 @pytest.mark.slow
@@ -221,7 +221,7 @@ def test_coordinates_are_continued_to_another_box() -> None:
     problem = oc.Problem(robot, oc.Task.position(robot, "xy"), domain=oc.Box([0.3] * 8, 0.1))
     prober = Prober(problem, list(range(8)), ("q1",))
     assert prober.start_on(family_of(problem, 0.1)) is None
-    prober.verdict(problem.domain)
+    prober.evaluate(problem.domain)
     widths = np.linspace(0.05, 0.4, 8)
     small, large = family_of(problem, 0.1), family_of(problem, widths)
     q = sample_boundary_weighted(oc.Box([0.3] * 8, 0.5), 30, 1).T

@@ -10,7 +10,7 @@ import orthocas as oc
 from orthocas.bases import JointSpace, Parametrisation
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.fitting.dense_objectives import GraphObjective
+from orthocas.fitting.network_objective import GraphObjective
 from orthocas.tasks.samples import evaluate_samples, sample_evenly
 
 EVERY_TERM = oc.Weights(length=3.0, angles="paper")

@@ -3,7 +3,7 @@
 import json
 import re
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,12 @@ from programs import Run, needs_c
 
 import orthocas as oc
 from orthocas import control
-from orthocas.bases.family import JointSpace
+from orthocas.bases.family import JointSpace, LinearFamily, component_gradients
 from orthocas.bases.given import sew_angle
 from orthocas.charts.certificate import PROVED
 from orthocas.charts.coordinates import Coordinates
-from orthocas.cli.fit import _rows
-from orthocas.cli.output import report_rows
+from orthocas.cli.fit import _format_fit
+from orthocas.cli.output import format_report_rows
 from orthocas.codegen import check_c
 from orthocas.errors import (
     BranchWarning,
@@ -31,21 +31,23 @@ from orthocas.errors import (
     DomainError,
     Interrupted,
     InvalidValueError,
+    NotSavableWarning,
     ShapeError,
     UnknownNameError,
 )
-from orthocas.fitting.basis_gradients import gradients_of
-from orthocas.fitting.meaning import Wish
-from orthocas.fitting.regular_search import BasisSearch, NetworkSearch, Search
-from orthocas.fitting.volume_loss import BasisField, BasisShortfall, NetworkField, NetworkShortfall
-from orthocas.fitting.wide import _run
+from orthocas.fitting.basis_gradients import build_gradients
+from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.like import QuadraticTerm
+from orthocas.fitting.network_objective import ArrayObjective
+from orthocas.fitting.stages import Resampled
+from orthocas.fitting.wide_search import Search, WideSettings, sample_frames, search_families
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.branches import _Arm
 from orthocas.tasks.domains import StopKind
 from orthocas.tasks.regular_box import find_joint_range
 from orthocas.tasks.samples import sample_boundary_weighted, sample_uniform
 from orthocas.tools.display import number_list, percent
-from orthocas.tools.progress import Progress, silent
+from orthocas.tools.progress import Progress
 
 Numbers = NDArray[np.float64]
 BENT = oc.Box([0.0, 1.3, 1.3], [3.0, 1.2, 1.2])  # of the planar arm, which has no branches
@@ -390,9 +392,9 @@ def test_a_tool_that_turns_alone_is_on_one_side_of_singular_positions() -> None:
     domain = fit.chart.problem.domain
     whole = oc.Box(domain.centre, domain.half_width)
     problem = oc.Problem(robot, fit.chart.problem.task, domain=whole, least_singular_value=0.1)
-    searches = [BasisSearch(problem, oc.Polynomial(1), 2, seed, silent, None, None) for seed in range(20)]
-    with pytest.raises(InvalidValueError, match="samples is 2, expected more: none lies on the middle's side"):
-        [search._points(2, 0) for search in searches]
+    searches = [Search(problem, oc.Polynomial(1), WideSettings(2, seed)) for seed in range(20)]
+    with pytest.raises(InvalidValueError, match="samples is 2, expected more: none lies on the centre's side"):
+        [search.sample(2, 0) for search in searches]
     q = np.vstack([domain.centre, sample_uniform(whole, 4000, 3)])
     moved = geometric_jacobians(robot, q)
     axis = robot.tip_rotation(q)[:, :, 0]
@@ -508,14 +510,19 @@ def test_the_loss_has_volumes_and_lengths_and_its_slopes_are_differences(metric:
         oc.Problem(robot, oc.Task.position(robot, "xy"), metric, oc.Box(np.full(4, 0.7), 0.6)),
         np.random.default_rng(0),
     )
-    basis = gradients_of(oc.Polynomial(2).family(JointSpace.of(problem), 2), 4)
+    search = Search(problem, oc.Polynomial(2), WideSettings())
+    basis, C = search._basis, rng.normal(size=(2, 14))
     q = [sample_uniform(problem.domain, count, seed) for seed, count in enumerate((300, 700))]
-    fields, C = [BasisField(problem, points, basis) for points in q], rng.normal(size=(2, 14))
-    wish = Wish(np.diag(rng.uniform(size=14)), rng.normal(size=14), 0.3)
-    factor = np.linalg.cholesky(fields[0].energy() + 1e-6 * np.eye(14))
-    loss = BasisShortfall(fields, 0.4, -1.0, factor, [wish], C)
-    theta = loss.variables(C)
-    np.testing.assert_allclose(loss.coefficients(theta), C, atol=1e-12)
+    held = QuadraticTerm(np.diag(rng.uniform(size=14)), rng.normal(size=14), 0.3)
+    search._samples = [sample_frames(problem, q[0])]
+    search._start_linear()  # takes the mean of products of gradients
+    factor = search._factor
+    search._likeness, search._last, search._sign = [held], C.ravel(), -1.0
+    search._build_in_basis("volume with the worst")
+    search._samples.append(sample_frames(problem, q[1]))
+    loss = search._build_in_basis("volume with the worst")
+    theta = loss.variables(C.ravel())
+    np.testing.assert_allclose(loss.parameters(theta), C.ravel(), atol=1e-12)
     value, slopes = loss.value_and_gradient(theta)
     parts = []
     for points in q:
@@ -530,14 +537,14 @@ def test_the_loss_has_volumes_and_lengths_and_its_slopes_are_differences(metric:
             else np.broadcast_to(np.eye(4), (len(points), 4, 4))
         )
         rows, losses = np.concatenate([J, G], axis=1), np.zeros(len(points))
-        for B, bound in ((np.eye(4), 0.03), (A, 0.4)) if metric == "inertia" else ((A, 0.4),):
+        for B, bound in ((np.eye(4), 0.03), (A, 0.3)) if metric == "inertia" else ((A, 0.3),):
             gram = rows @ np.linalg.inv(B) @ rows.transpose(0, 2, 1)
             lengths = np.linalg.det(gram[:, :2, :2]) * gram[:, 2, 2] * gram[:, 3, 3]
             v = -np.sign(np.linalg.det(rows)) * np.sqrt(np.linalg.det(gram) / lengths)
             losses += np.maximum(0.0, 1 - v / bound) ** 2
         uneven = np.log(gram[:, [2, 3], [2, 3]] / np.einsum("ki,ij,kj->k", C, factor @ factor.T, C)) / 2
         parts.append(losses + 0.03 * (uneven**2).sum(axis=1))
-    assert abs(value - np.concatenate(parts).mean() - (C[0] @ wish.E @ C[0] - 2 * wish.g @ C[0] + 0.3)) < 1e-6
+    assert abs(value - np.concatenate(parts).mean() - (C[0] @ held.E @ C[0] - 2 * held.g @ C[0] + 0.3)) < 1e-6
     moved = rng.normal(size=(6, len(theta)))
     ends = [[loss.value(theta + side * 1e-6 * a) for side in (-1, 1)] for a in moved]
     np.testing.assert_allclose(np.diff(ends, axis=1)[:, 0] / 2e-6, moved @ slopes, rtol=1e-5)
@@ -549,22 +556,20 @@ def test_the_loss_of_networks_is_that_of_bases(metric: Any) -> None:
     robot, rng = oc.Robot.planar([1.0, 0.8, 0.6, 0.5], [3.0, 2.0, 2.0, 1.0]), np.random.default_rng(2)
     problem = oc.Problem(robot, oc.Task.position(robot, "xy"), metric, oc.Box(np.full(4, 0.7), 0.6))
     family = oc.MLP((4,), raw=True).family(JointSpace.of(problem), 2)
-    points, C, wanted, small = (
-        sample_uniform(problem.domain, 500, 0),
-        rng.normal(size=(2, 4)),
-        np.array([1.0, 2.0]),
-        1e-2,
-    )
+    samples, C, small = sample_frames(problem, sample_uniform(problem.domain, 500, 0)), rng.normal(size=(2, 4)), 1e-2
     theta = np.concatenate([small * np.eye(4).ravel(), np.zeros(4), (C / small).ravel(order="F"), np.zeros(2)])
-    field = NetworkField(problem, points, family)
-    basis = gradients_of(oc.Polynomial(1).family(JointSpace.of(problem), 2), 4)
-    D = basis.jacobian(basis.at(points[:1]), np.eye(4), 1)[0]
-    same = BasisField(problem, points, basis).shortfall(C @ np.linalg.inv(D), 0.4, -1.0, wanted)
-    found, known = field.shortfall(theta, 0.4, -1.0, wanted)[0], same[0]
+    linear = Search(problem, oc.Polynomial(1), WideSettings())
+    D = linear._basis.jacobian(linear._basis.at(samples.points[:1]), np.eye(4), 1)[0]
+    weights = linear._choose_weights("volume")
+    start = (C @ np.linalg.inv(D)).ravel()
+    assert isinstance(linear.family, LinearFamily)
+    basis = BasisObjective(linear.family, samples, weights, start, linear._draw, orientation=-1.0)
+    whole = ArrayObjective(family, samples, weights, theta, linear._draw, single=True, orientation=-1.0)
+    found, known = whole.value(theta), basis.value(start)
     assert abs(found - known) < 2e-3 * known
-    loss = NetworkShortfall(field, 0.4, -1.0, wanted)
+    loss = Resampled(whole, np.arange(500), 500)
     parts = list(loss.batches(100, 200, (3,)))
-    assert abs(np.mean([part.value(theta) for part in parts]) - found / 500) < 0.05 * found / 500
+    assert abs(np.mean([part.value(theta) for part in parts]) - found) < 0.05 * found
     theta = family.initial(0)
     moved = rng.normal(size=(4, len(theta)))
     ends = [[loss.value(theta + side * 1e-3 * a) for side in (-1, 1)] for a in moved]
@@ -577,19 +582,16 @@ def test_derivatives_along_directions_are_those_of_coordinates(parametrisation: 
     problem, rng = oc.problems.get("planar_3r_xy"), np.random.default_rng(1)
     family = parametrisation.for_problem(problem).family(JointSpace.of(problem), 2)
     q, a, C = rng.normal(size=(1500, 3)), rng.normal(size=(1500, 3)), rng.normal(size=(2, family.width))
-    basis = gradients_of(family, 3)
+    basis = build_gradients(family, 3)
     known = basis.at(q)
     own = Coordinates(
         parametrisation.for_problem(problem), JointSpace.of(problem), (), C.ravel(), np.zeros(2), np.ones(2)
     )
     moved = (own.once("xi", q + 1e-6 * a) - own.once("xi", q - 1e-6 * a)) / 2e-6
-    np.testing.assert_allclose(basis.along(known, a) @ C.T, moved, atol=1e-7 * np.abs(moved).max())
+    np.testing.assert_allclose(basis.differentiate_along(known, a) @ C.T, moved, atol=1e-7 * np.abs(moved).max())
     np.testing.assert_allclose(
         np.einsum("sri,si->sr", basis.jacobian(known, C, 1500), a), moved, atol=1e-7 * np.abs(moved).max()
     )
-    slopes = rng.normal(size=(1500, 2, 3))
-    pulled = (basis.pullback(known, slopes) * C).sum()
-    np.testing.assert_allclose(pulled, (slopes * basis.jacobian(known, C, 1500)).sum(), rtol=1e-9)
 
 
 @needs_c
@@ -650,24 +652,22 @@ def test_command_fits_a_branch(run: Run) -> None:
         "iiwa",
         "--task",
         "pose",
-        "--domain",
-        "branch",
         "--param",
         "polynomial:3:cyclic=A1,A7",
         "--out",
         "a",
     )
-    code, out, err = run(*words, "--branch", "shoulder+ elbow- wrist+", "--samples", "3000", "--json")
+    code, out, err = run(*words, "--domain", "branch:shoulder+ elbow- wrist+", "--samples", "3000", "--json")
     assert (code, err) == (0, "")
     assert json.loads(out)["branch"] == "shoulder+ elbow- wrist+"
-    code, out, _ = run(*words, "--branch", "shoulder+ elbow- wrist+", "--samples", "3000", "--force")
+    code, out, _ = run(*words, "--domain", "branch:shoulder+ elbow- wrist+", "--samples", "3000", "--force")
     assert code == 0
     assert ": xi1, like swivel at home [rad]" in out
-    assert run(*words, "--solver", "lbfgs")[::2] == (
-        2,
-        "orthocas: --domain branch has a solver of its own: leave out --solver\n",
-    )
-    assert run("fit", "iiwa", "--branch", "up")[::2] == (2, "orthocas: --branch requires --domain branch\n")
+    for option, value in (("--solver", "lbfgs"), ("--weights", "1,1"), ("--angles", "paper")):
+        message = f"orthocas: --domain branch has a solver and a loss of its own: leave out {option}\n"
+        assert run(*words, "--domain", "branch", option, value)[::2] == (2, message)
+    message = "orthocas: no such option: --branch; the branch is named by --domain branch:NAME\n"
+    assert run("fit", "iiwa", "--branch", "up")[::2] == (2, message)
 
 
 def test_command_notes_what_a_chart_leaves_out_of_its_branch(run: Run) -> None:
@@ -687,8 +687,8 @@ def test_command_notes_what_a_chart_leaves_out_of_its_branch(run: Run) -> None:
 
 def test_command_gives_no_advice_that_wide_fits_refuse() -> None:
     uneven = replace(oc.evaluate(wide_plane().chart, 500), length_ratio=50.0)
-    assert "--weights" in report_rows(uneven)["lengths"]
-    assert "--weights" not in _rows(wide_plane(), uneven, Path("a.orthocas"))["lengths"]
+    assert "--weights" in format_report_rows(uneven)["lengths"]
+    assert "--weights" not in _format_fit(wide_plane(), uneven, Path("a.orthocas"))["lengths"]
 
 
 @pytest.mark.slow
@@ -722,13 +722,13 @@ def test_interrupted_fits_keep_the_best_so_far() -> None:
 def test_coordinates_of_the_other_sense_in_the_middle_miss_it() -> None:
     known = oc.problems.get("planar_3r_xy")
     problem = oc.Problem(known.robot, known.task, domain=BENT, least_singular_value=0.1)
-    search = BasisSearch(problem, oc.Polynomial(1), 500, 0, silent, None, None)
+    search = Search(problem, oc.Polynomial(1), WideSettings(500))
     search.begin("linear")
     (missed, *_), C = search.rank, search.best
     assert not missed
     assert C is not None
     search.best = None
-    search._take("mirrored", search.stages[0].result, -C, 500)
+    search._take("mirrored", replace(search.stages[0].result, theta=-C), 500)
     assert search.rank[0]
 
 
@@ -781,24 +781,18 @@ def test_poor_results_ask_for_another_polynomial_and_very_poor_ones_for_a_networ
         def go_on(self) -> None:
             went_on.append(searches.index(self))
 
-    class KnownBasis(Known, BasisSearch):
-        pass
-
-    class KnownNetwork(Known, NetworkSearch):
-        pass
-
-    searches: list[Search] = [KnownBasis(problem, oc.Polynomial(1), 9, 0, silent, None, None) for _ in range(2)]
-    searches.append(KnownNetwork(problem, oc.MLP((4,)), 9, 0, silent))
-    _run(searches)
+    families = (oc.Polynomial(1), oc.Polynomial(1), oc.MLP((4,)))
+    searches: list[Search] = [Known(problem, family, WideSettings(9)) for family in families]
+    search_families(searches)
     assert (tried, went_on) == (begun, [kept])
 
 
 def test_ctrl_c_before_a_network_has_a_middle_is_no_error_of_the_domain(monkeypatch: pytest.MonkeyPatch) -> None:
-    def pressed(self: NetworkShortfall, size: int, count: int, seed: tuple[int, ...]) -> Any:
+    def pressed(self: Resampled, size: int, count: int, seed: tuple[int, ...]) -> Any:
         raise KeyboardInterrupt
 
     known, ends = oc.problems.get("planar_3r_xy"), set[type]()
-    monkeypatch.setattr(NetworkShortfall, "batches", pressed)
+    monkeypatch.setattr(Resampled, "batches", pressed)
     for seed in range(6):  # random networks have either sign in the middle
         with pytest.raises((KeyboardInterrupt, Interrupted)) as stopped:
             oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.MLP((4,), raw=True), samples=500, seed=seed)
@@ -819,6 +813,88 @@ def test_slivers_join_one_neighbour(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_Arm, "_measure_slice", sizes)
     found = arm.find_cuts(3)
     assert [(cut.value, cut.singular) for cut in found] == [(pytest.approx(-0.4, abs=1e-3), False)]
+
+
+@dataclass(frozen=True)
+class Evenness:
+    """A term of a user: coordinates should not depend on the second joint."""
+
+    name: str = "second joint"
+    data: tuple[str, ...] = ()
+    hinge: bool = False
+
+    def residuals(self, coordinate_jacobian: ca.SX, data: Any, sizes: Any) -> ca.SX:
+        return coordinate_jacobian[:, 1]
+
+
+def test_terms_and_weights_of_users_reach_wide_fits() -> None:
+    known = oc.problems.get("planar_3r_xy")
+    oc.register_loss_term(Evenness())
+    oc.register_loss_term(Evenness())
+
+    def fit(**settings: Any) -> oc.WideFit:
+        return oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.Polynomial(3), samples=2000, **settings)
+
+    def share(chart: oc.Chart) -> float:
+        """Of the second joint in the gradients."""
+        J = chart.coordinates.jacobian(sample_uniform(chart.problem.domain, 500, 1))[:, 0]
+        return float((J[:, 1] ** 2).mean() / (J**2).sum(axis=1).mean())
+
+    plain, less = fit(), fit(weights={"second joint": 3.0})
+    assert share(less.chart) < 0.5 * share(plain.chart)
+    assert less.regular_share > 0.95
+    assert less.chart.notes["weight of second joint"] == 3.0
+    aligned = fit(weights=oc.Weights(task=3.0, mutual=0.0, regularity=0.0))
+    leaks = [oc.evaluate(item.chart, 1000).leak.rms for item in (plain, aligned)]
+    assert leaks[1] < leaks[0] - 5.0, leaks
+    assert aligned.regular_share > 0.99
+    with pytest.raises(UnknownNameError, match="unknown loss term 'third joint'"):
+        fit(weights={"third joint": 1.0})
+
+
+def test_families_of_users_reach_wide_fits() -> None:
+    """One with no more than expressions, not linear in its parameters."""
+
+    @dataclass(frozen=True)
+    class Bent:
+        label: str = "bent"
+        linear: bool = False
+        closed_form: None = None
+
+        def for_problem(self, problem: oc.Problem) -> "Bent":
+            return self
+
+        def family(self, space: JointSpace, outputs: int) -> "BentFamily":
+            return BentFamily(space, outputs)
+
+    @dataclass(frozen=True, eq=False)
+    class BentFamily:
+        """xi = sum_k a_k q_k + b_k sin(c_k q_k)."""
+
+        space: JointSpace
+        outputs: int
+        as_matrices: bool = True
+        width: int = 4
+
+        @property
+        def size(self) -> int:
+            return 3 * self.space.n
+
+        def expression(self, q: Any, theta: Any) -> Any:
+            a, b, c = ca.vertsplit(ca.reshape(theta, self.space.n, 3).T)
+            return a @ q + b @ ca.sin(q * ca.repmat(c.T, 1, q.shape[1]))
+
+        def jacobian(self, q: Any, theta: Any) -> list[Any]:
+            return component_gradients(self.expression(q, theta), q)
+
+        def initial(self, seed: int) -> Numbers:
+            return np.random.default_rng(seed).normal(size=self.size)
+
+    known, box = oc.problems.get("planar_3r_xy"), oc.Box([0.0, 1.3, 1.3], [1.0, 0.6, 0.6])
+    with pytest.warns(NotSavableWarning):
+        fit = oc.fit_wide(known.robot, known.task, box, parametrisation=Bent(), samples=2000)
+    assert fit.chart.notes["solver"] == "adam"
+    assert fit.regular_share > 0.9
 
 
 def test_bad_settings_are_named() -> None:

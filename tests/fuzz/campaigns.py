@@ -47,7 +47,7 @@ READERS = {  #: functions that read files, by module and name, with the campaign
     "charts.chart_file.read_chart": "charts",
     "charts.ready.load": "calls",
     "codegen.compiled.loaded": "libraries",
-    "paths.plan.read_path": "paths",
+    "paths.tool_path.read_path": "paths",
     "tasks.corridor.read_postures": "postures",
     "robots.urdf.read_srdf_postures": "robots",
     "robots.robot.from_file": "robots",
@@ -61,7 +61,7 @@ READERS = {  #: functions that read files, by module and name, with the campaign
     "tools.archive.read_archive": "charts",
     "tools.files.read_table": "paths",
     "tools.files.read_list": "lists",
-    "viewer.looks.urdf_look": "robots",
+    "viewer.looks.read_urdf_look": "robots",
     "viewer.motion.read_joint_motion": "motions",
     "viewer.motion.read_run": "runs",
 }

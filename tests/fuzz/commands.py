@@ -49,6 +49,7 @@ _SOLVERS = (
     "ipopt",
     "newton",
 )  # Adam takes the paper's 10,000 steps, 20 s, for any fit
+_OBSTACLES = ("sphere:0,0,5,0.1", "capsule:0,0,5,0,0,6,0.1", "plane:0,0,1,0,0,-5", "plane:0,0,5,0.1")
 _LAWS = ("impedance", "pd_plus", "kinematic", "none", "pid")
 _COUNTS = ("0", "1", "2", "-1", "20", "99999999999999999999", "1.5", "")
 _VALUES: dict[str, tuple[str, ...]] = {
@@ -58,18 +59,24 @@ _VALUES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("--stiffness", "--damping-ratio", "--feedback", "--limit"), _LISTS),
     "--damping-stiffness": _LISTS,
     "--model": ("own", "given", "", "x"),
-    "--gravity": ("law", "robot", "", "9.81"),
+    "--gravity-compensation": ("law", "robot", "", "9.81"),
     "--inputs": ("payload", "payload,wrench,extra_torque", "payload,payload", ",", "", "mass"),
     **dict.fromkeys(("--bound", "--seconds"), (*NUMBERS, "0.1")),
-    "--workers": ("0", "-1", "1", "1.5", ""),
+    "--workers": ("0", "-1", "1", "1.5", "", "tcp:/", "x://"),
     **dict.fromkeys(("--seed", "--seeds", "--samples", "--held-out", "--jobs"), _COUNTS),
     **dict.fromkeys(("--rate", "--mass-factor", "--max-mutual-deg"), (*NUMBERS, "50", "10")),
     **dict.fromkeys(("--period", "--link-radius", "--clearance"), (*NUMBERS, "0.01")),
     **dict.fromkeys(("--start", "--velocity-limit", "--acceleration-limit"), _LISTS),
-    **dict.fromkeys(("--sphere", "--capsule", "--plane"), (*_LISTS, "0,0,5,0.1", "0,0,5,0,0,6,0.1", "0,0,1,0,0,-5")),
+    "--obstacle": (
+        "",
+        "sphere:",
+        "cube:1,2,3",
+        *_OBSTACLES,
+        *(f"sphere:{numbers}" for numbers in _LISTS),
+    ),
     "--xi": ("hold", "schedule", "objective", "best", ""),
     **dict.fromkeys(("--leak-deg", "--conditioning"), (*NUMBERS, "5", "0.3")),
-    "--domain": ("auto", "box", "branch", ""),
+    "--domain": ("auto", "box", "branch", "branch:", "branch:whole", "branch:x", "auto:x", ""),
     "--like": ("swivel", "q1", "nothing", ""),
     **dict.fromkeys(("--share", "--margin-deg"), (*NUMBERS, "0.001")),
     **dict.fromkeys(("--splits", "--degree"), _COUNTS),
@@ -79,7 +86,6 @@ _VALUES: dict[str, tuple[str, ...]] = {
     "--metric": ("euclidean", "inertia", "identity"),
     "--param": _WORDS,
     **dict.fromkeys(("--corridor",), ("postures.csv", "path.csv", "nothing.csv", "steps.json", "")),
-    "--radius": (*NUMBERS, "0.2"),
     "--log": ("path.csv", "nothing.csv", "steps.json", ""),
     "--chart": (*_FILES, "grown.orthocas", "cut.orthocas"),
     "--solver": _SOLVERS,
@@ -91,7 +97,6 @@ _VALUES: dict[str, tuple[str, ...]] = {
     "--port": ("0", "-1", "99999", "1.5", ""),
     "--path": _FILES,
     "--robot": ("arm.urdf", "nothing.urdf", "chart.orthocas"),
-    "--cycles": ("0", "1", "99999", ""),
     "--to": ("numpy", "torch", "jax", "", "tensorflow"),
     "--name": ("arm", "int", "1arm", "a b", "math", "é", "x" * 200, "main"),
 }
@@ -126,7 +131,7 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
     "fit --corridor postures.csv": (
         ("planar_3r_xy", *_PROBLEMS),
         {"--param": "polynomial:1", "--samples": "30", "--out": "new.orthocas"},
-        (*_PROBLEM_OPTIONS, *_DOMAIN_OPTIONS, *_AUTO_OPTIONS, "--corridor", "--radius"),
+        (*_PROBLEM_OPTIONS, *_DOMAIN_OPTIONS, *_AUTO_OPTIONS, "--corridor"),
     ),
     "fit --domain branch": (
         ("planar_3r_xy", *_PROBLEMS),
@@ -141,7 +146,7 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
     "compare": (
         _PROBLEMS,
         {"--param": "polynomial:1", "--samples": "30", "--held-out": "50", "--jobs": "0"},
-        (*_PROBLEM_OPTIONS, *_DOMAIN_OPTIONS, "--solver", "--seeds", "--weights", "--out"),
+        ("--solver", "--seeds", "--weights", "--out"),
     ),
     "simulate": (
         _FILES,
@@ -154,19 +159,19 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
         _FILES,
         {"--out": "q.csv", "--velocity-limit": "1", "--period": "0.05"},
         (
-            *("--xi", "--start", "--acceleration-limit", "--sphere", "--capsule", "--plane"),
+            *("--xi", "--start", "--acceleration-limit", "--obstacle"),
             *("--link-radius", "--clearance"),
         ),
     ),
     "view": (
         (*_FILES, "q.csv"),
         {"--export": "page.html"},
-        ("--chart", "--path", "--robot", "--cycles", "--host", "--port", *_PROBLEM_OPTIONS),
+        ("--chart", "--path", "--robot", "--host", "--port", "--tip", "--lock"),
     ),
     "codegen": (
         _FILES,
         {"--controller": "pd_plus", "--out": "out"},
-        (*_LAW_OPTIONS, "--name", "--model", "--gravity", "--inputs"),
+        (*_LAW_OPTIONS, "--name", "--model", "--gravity-compensation", "--inputs"),
     ),
 }
 

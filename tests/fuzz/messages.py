@@ -86,14 +86,14 @@ def _mutant(rng: Rng) -> object:
 def _send(rng: Rng) -> None:
     server, inputs, inbox, moved = page()
     encode = import_module("msgspec").msgpack.encode
-    assert inbox.fault(encode(good(rng))) is None, "a good message is dropped"
+    assert inbox.find_fault(encode(good(rng))) is None, "a good message is dropped"
     try:
         raw = encode(_mutant(rng))
     except (OverflowError, UnicodeEncodeError):  # no such message can be made
         return
     if rng.integers(8) == 0:
         raw = raw[: int(rng.integers(len(raw)))] + bytes(rng.integers(0, 256, 3).tolist())
-    if inbox.fault(raw) is not None:
+    if inbox.find_fault(raw) is not None:
         return
     message = import_module("viser._messages").Message.deserialize(raw)
     asyncio.run(server._websock_server._handle_incoming_message(0, message))

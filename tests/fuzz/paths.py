@@ -10,7 +10,7 @@ from paper.joint_log import read_joint_log
 from fuzz.child import Finding, run
 from fuzz.mutants import TEXTS, Rng, flipped, pick
 from fuzz.sealed_files import judged
-from orthocas.paths.plan import read_path
+from orthocas.paths.tool_path import read_path
 from orthocas.tasks.corridor import read_postures
 
 _CELLS = (

@@ -31,10 +31,10 @@ def judge(seed: int) -> str | None:
 def _ask(rng: Rng) -> None:
     guard = Guard(pick(rng, HOSTS))
     own = pick(rng, OWN)
-    assert guard.admitted(f"/{guard.token}/a?b=/c", [own], [f"http://{own}"]) == "/a?b=/c"
+    assert guard.admit(f"/{guard.token}/a?b=/c", [own], [f"http://{own}"]) == "/a?b=/c"
     hosts, origins = _headers(rng, own), _headers(rng, f"http://{own}")
     path = f"/{guard.token}" if rng.integers(4) else f"/{_spoiled(rng, guard.token)}"
-    if guard.admitted(path, hosts, origins) is None:
+    if guard.admit(path, hosts, origins) is None:
         return
     assert path.startswith(f"/{guard.token}"), "without the token"
     assert len(hosts) == 1, "no address, or several"

@@ -189,7 +189,7 @@ def test_solver_minimises(tmp_path: Path) -> None:
 
 TAKEN = (
     "oc.register_parametrisation('linear', oc.Polynomial)",
-    "oc.register_loss_term(replace(term_of('task'), data=('points',)))",
+    "oc.register_loss_term(replace(find_term('task'), data=('points',)))",
     "oc.control.register(SimpleNamespace(name='pd_plus'))",
 )
 
@@ -200,7 +200,7 @@ def test_names_are_taken_once() -> None:
 from dataclasses import replace
 from types import SimpleNamespace
 import orthocas as oc
-from orthocas.fitting.terms import term_of
+from orthocas.fitting.terms import find_term
 for registered in ({", ".join(f"lambda: {call}" for call in TAKEN)}):
     try:
         registered()

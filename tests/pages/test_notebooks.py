@@ -11,7 +11,7 @@ import pytest
 from public_objects import comparison, fitted, joint_motion, trajectory
 
 import orthocas as oc
-from orthocas.tools.progress import NotebookBars, Progress, TerminalLines, as_bars, in_notebook
+from orthocas.tools.progress import NotebookBars, Progress, TerminalBars, as_bars, in_notebook, silent
 
 EVIL = "<img src=x>"
 
@@ -85,20 +85,24 @@ def test_bars_escape_names_and_fill_earlier_stages() -> None:
     assert "value='0.250'" in page
 
 
-def test_terminals_get_lines_and_files_nothing() -> None:
-    stream = io.StringIO()
+def test_terminals_get_bars_and_files_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not in_notebook()
-    TerminalLines(stream)(Progress("a", 1.0, "done"))
-    assert stream.getvalue() == ""
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    assert oc.progress() is silent
     stream.isatty = lambda: True  # type: ignore[method-assign]
-    lines = TerminalLines(stream)
-    for stage, fraction in (("a", 0.5), ("a", 0.6), ("a", 1.0), ("b", 0.0), ("c", 0.0)):
-        lines(Progress(stage, fraction, "x"))
-    shown = stream.getvalue()
-    assert shown.startswith("\ra ")
-    assert shown.count("\n") == 2  # after the end of a, and where c takes over from b
-    assert "0.6" not in shown
-    assert shown.split("\r")[2].count("=") == 24
+    monkeypatch.setenv("TERM", "xterm")
+    bars = oc.progress()
+    assert isinstance(bars, TerminalBars)
+    for stage, fraction, detail in (("a", 0.5, "[x]"), ("a", 1.0, "done"), ("b", 0.0, ""), ("c", 0.0, "")):
+        bars(Progress(stage, fraction, detail))
+    before = stream.getvalue()
+    assert before.count("\n") >= 2  # after the end of a, and where c takes over from b
+    assert "done" in before
+    assert before.endswith("\x1b[?25l") or before.count("\x1b[?25l") == before.count("\x1b[?25h") + 1
+    del bars
+    after = stream.getvalue()
+    assert after.count("\x1b[?25l") == after.count("\x1b[?25h") == 3  # the cursor comes back
 
 
 @pytest.mark.slow

@@ -9,14 +9,14 @@ import wide_film
 from PIL import Image
 from rendering import Camera, Layer, on_white, render
 
-from orthocas.viewer.looks import Solid, ball
+from orthocas.viewer.looks import Solid, build_ball
 
 CAMERA = Camera((5.0, 0.0, 0.0), (0.0, 0.0, 0.0), 60.0)
 RED, BLUE = (200, 20, 20), (20, 20, 200)
 
 
 def ball_at(x: float, radius: float, colour: tuple[int, int, int]) -> Solid:
-    return ball(radius, colour).moved(np.eye(3), np.array([x, 0.0, 0.0]))
+    return build_ball(radius, colour).move(np.eye(3), np.array([x, 0.0, 0.0]))
 
 
 def middle_of(*layers: Layer) -> np.ndarray:
@@ -49,7 +49,7 @@ def test_layers_above_are_seen_through_everything() -> None:
 
 
 def test_shadows_fall_on_the_floor() -> None:
-    above = ball_at(0.0, 0.5, RED).moved(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    above = ball_at(0.0, 0.5, RED).move(np.eye(3), np.array([0.0, 0.0, 1.0]))
     camera = Camera((3.0, 0.0, 3.0), (0.0, 0.0, 0.0), 60.0)
     picture = on_white(render([Layer([above])], camera, 60, 40, floor=0.0))
     greys = (np.ptp(picture.astype(int), axis=2) == 0) & (picture[..., 0] < 230)

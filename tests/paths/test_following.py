@@ -17,9 +17,9 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.errors import InvalidValueError, NoExpressionError, PathError, PathFileError, ShapeError
 from orthocas.paths import JointMotion
-from orthocas.paths.follow import Costs, Limits, XiChoice, walk
-from orthocas.paths.joint_curve import JointCurve, Solver
-from orthocas.paths.plan import Plan
+from orthocas.paths.follow import Costs, MotionLimits, XiChoice, walk
+from orthocas.paths.joint_curve import JointCurve, PhiSolver
+from orthocas.paths.tool_path import ToolPath
 from orthocas.robots.obstacles import LinkDistances, Sphere
 from orthocas.tools.checks import Array
 
@@ -199,7 +199,7 @@ def test_costs_have_the_gradients_of_finite_differences(bound: float | None) -> 
     problem = oc.Problem(known.robot, known.task, domain=oc.Box(START, 0.7), least_singular_value=bound)
     chart = oc.fit(problem, oc.Linear()).chart
     distances = LinkDistances(known.robot, [Sphere([0.5, 1.2, 0.0], 0.2)], 0.1)
-    costs = Costs(Limits(chart, np.ones(3), np.ones(3), distances, 0.01))
+    costs = Costs(MotionLimits(chart, np.ones(3), np.ones(3), distances, 0.01))
     q = START + np.random.default_rng(8).uniform(-0.8, 0.8, (30, 3))  # also outside
     residuals, gradients = costs(q)
     assert (residuals[:, -3:] > 1).any()  # near the ball
@@ -214,35 +214,35 @@ def test_objective_is_that_of_ipopt() -> None:
     """The second method: the same problem with q and the spline as unknowns, costs in CasADi, by Ipopt."""
     chart, limits = planar(), _limits(planar())
     other = START + np.array([0.3, -0.4, 0.3])
-    plan = Plan.held(chart, chart.task(other) + loop(chart, 0.1) - loop(chart, 0.1)[0], chart.xi(other))
-    curve = JointCurve.along(solver := Solver(chart), plan.phi, other)
+    path = ToolPath.hold(chart, chart.task(other) + loop(chart, 0.1) - loop(chart, 0.1)[0], chart.xi(other))
+    curve = JointCurve.trace(solver := PhiSolver(chart), path.phi, other)
     assert isinstance(curve, JointCurve)
-    choice = XiChoice(plan, Costs(limits), solver)
-    values = choice.best(curve.q(choice.s)).xi(choice.nodes[:-1])
+    choice = XiChoice(path, Costs(limits), solver)
+    values = choice.optimise(curve.q(choice.s)).xi(choice.nodes[:-1])
     expected = by_ipopt(choice, limits, curve.q(choice.s))
     np.testing.assert_allclose(values, expected, atol=0.02)
     assert cost(choice, values) < cost(choice, expected) * 1.001
     assert cost(choice, values) < 0.5 * cost(choice, np.tile(chart.xi(other), (len(values), 1)))
 
 
-def _limits(chart: oc.Chart) -> Limits:
-    return Limits(chart, np.ones(chart.n), np.ones(chart.n), LinkDistances(chart.problem.robot, []), 0.0)
+def _limits(chart: oc.Chart) -> MotionLimits:
+    return MotionLimits(chart, np.ones(chart.n), np.ones(chart.n), LinkDistances(chart.problem.robot, []), 0.0)
 
 
 def cost(choice: XiChoice, values: Array) -> float:
-    state = choice._state(values, np.tile(START, (len(choice.s), 1)))
+    state = choice._evaluate_state(values, np.tile(START, (len(choice.s), 1)))
     assert state is not None
     return state.cost
 
 
-def by_ipopt(choice: XiChoice, limits: Limits, first: Array) -> Array:
+def by_ipopt(choice: XiChoice, limits: MotionLimits, first: Array) -> Array:
     """Values of the spline (K, 1)."""
     chart, P, scale = choice.chart, len(choice.s), limits.scale
     opti = ca.Opti()
     q, values = opti.variable(3, P), opti.variable(choice._basis.shape[1])
     xi, total = ca.DM(choice._basis) @ values, ca.MX(0)
     for k in range(P):
-        goal = ca.vertcat(ca.DM(choice.plan.x(choice.s[k])), xi[k])
+        goal = ca.vertcat(ca.DM(choice.path.x(choice.s[k])), xi[k])
         opti.subject_to(chart.function("phi")(q[:, k]) == goal)
         u = (q[:, k] - START) / 0.7
         J = chart.problem.task.jacobian_function(q[:, k]) / ca.repmat(ca.DM(scale), 1, 3)

@@ -26,7 +26,7 @@ from orthocas.certificates.taylor import Variables
 from orthocas.charts.certificate import Subdivision
 from orthocas.cli import entry
 from orthocas.errors import Interrupted
-from orthocas.fitting.grid import run_cells
+from orthocas.fitting.compare import run_cells
 from orthocas.solvers.protocol import BestPoint, Status
 from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import deferred, ended_in_order, remembered
@@ -269,16 +269,11 @@ def test_ignored_signals_stay_ignored() -> None:
 
 
 def test_only_the_command_line_watches_its_imports() -> None:
-    assert not oc._is_command_line()
-    for words, yes in (
-        (["python", "-m", "orthocas", "info"], True),
-        (["python", "-X", "dev", "-m", "orthocas"], True),
-        (["python", "/usr/bin/orthocas", "info"], True),
-        (["python", "-m", "pytest", "orthocas"], False),
-        (["python", "-c", "from multiprocessing.spawn import spawn_main"], False),
-    ):
-        with patch.object(sys, "orig_argv", words), patch.object(sys, "argv", ["/usr/bin/orthocas"]):
-            assert oc._is_command_line() is yes
+    code = "import orthocas, orthocas.cli.entry, orthocas.cli.commands, signal, sys"
+    assert python(f"{code}; print(signal.getsignal(signal.SIGINT).__name__, sys.excepthook.__name__)").split() == [
+        "default_int_handler",
+        "excepthook",
+    ]
 
 
 _CTRL_C_AT = """
@@ -296,14 +291,13 @@ sys.meta_path.insert(0, Finder())
 """
 
 
-@pytest.mark.parametrize(
-    "module", ["orthocas.cli.entry", "orthocas.version", "orthocas.__main__", "orthocas.cli.commands"]
-)
-def test_ctrl_c_before_our_handlers_is_one_line(module: str, tmp_path: Path) -> None:
-    """Sent at a moment that a campaign of random times meets once in three hundred kills."""
+@pytest.mark.parametrize("module", ["orthocas.cli.entry", "orthocas.version", "orthocas.cli.commands"])
+@pytest.mark.parametrize("start", [("-m", "orthocas"), ("-c", "from orthocas.cli import main; main()")])
+def test_ctrl_c_before_our_handlers_is_one_line(module: str, start: tuple[str, str], tmp_path: Path) -> None:
+    """Sent at a moment that a campaign of random times meets once in three hundred kills; `-c` as the script does."""
     (tmp_path / "sitecustomize.py").write_text(_CTRL_C_AT.format(module=module))
     done = subprocess.run(
-        [sys.executable, "-m", "orthocas", "info", "planar_3r_x"],
+        [sys.executable, *start, "info", "planar_3r_x"],
         env={**os.environ, "PYTHONPATH": str(tmp_path)},
         capture_output=True,
         text=True,
@@ -380,39 +374,6 @@ def test_hang_up_ends_a_comparison_without_a_traceback(tmp_path: Path) -> None:
     assert (process.returncode, err) == (128 + signal.SIGHUP, b"")
     wait_until(lambda: not session_of(process.pid), 5)
     assert not list((tmp_path / "tmp").iterdir())
-
-
-_SLOW_IMPORTS = """
-import time
-import orthocas as oc
-if __name__ == "__mp_main__":  # in a worker, before anything of ours has begun
-    open("began", "w").close()
-    time.sleep(60)
-elif __name__ == "__main__":
-    oc.compare(oc.problems.get("planar_3r_x"), [oc.Linear()], jobs=1, samples=50, held_out=50)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_workers_that_still_import_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
-    (tmp_path / "grid.py").write_text(_SLOW_IMPORTS)
-    (tmp_path / "tmp").mkdir()
-    environment = os.environ | {"TMPDIR": str(tmp_path / "tmp")}
-    process = subprocess.Popen(
-        [sys.executable, "grid.py"], cwd=tmp_path, env=environment, start_new_session=True, stderr=subprocess.DEVNULL
-    )
-    wait_until((tmp_path / "began").exists, 60)
-    process.kill()
-    process.wait()
-    wait_until(lambda: not session_of(process.pid), 5)
-
-
-def test_only_workers_end_with_the_process_that_a_variable_names(tmp_path: Path) -> None:
-    """A program that happens to start while workers do inherits the variable; it lives on, and passes nothing on."""
-    code = "import orthocas, os; print('ORTHOCAS_PARENT' in os.environ)"
-    with patch.dict(os.environ, {"ORTHOCAS_PARENT": "1"}):
-        assert python(code).strip() == "False"
 
 
 def wait_until(condition: Callable[[], bool], seconds: float) -> None:

@@ -18,7 +18,7 @@ from orthocas.control import ControlStatus, Kinematic, PDPlus, Reference
 from orthocas.errors import ArchiveError, InvalidValueError, UnknownNameError
 from orthocas.fitting.fit import Fit
 from orthocas.simulation import Outcome, Trajectory, figure
-from orthocas.simulation.figure import ACTUAL, MovingPicture, save_animation, trajectory_figure, units_of
+from orthocas.simulation.figure import ACTUAL, RULES, MovingPicture, save_animation, trajectory_figure, units_of
 from orthocas.tools.files import LIST, publish
 from orthocas.tools.progress import Progress
 
@@ -150,7 +150,7 @@ def test_gif_plays_in_real_time(planar_run: Trajectory, planar_fit: Fit, tmp_pat
 def test_long_runs_are_shown_faster(
     planar_run: Trajectory, planar_fit: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("orthocas.simulation.figure._MOST", 10)
+    monkeypatch.setattr("orthocas.simulation.figure.RULES", replace(RULES, most_frames=10))
     save_animation(tmp_path / "a.gif", planar_run, planar_fit.chart.problem)
     with Image.open(tmp_path / "a.gif") as film:
         assert film.n_frames == 11  # type: ignore[attr-defined]
@@ -243,7 +243,7 @@ def test_targets_are_drawn_for_positions_of_the_first_tip_only() -> None:
     for task, drawn in ((own, True), (other, False), (oc.Task.stack(own, other), False)):
         problem = oc.Problem(robot, task, domain=oc.Box(robot.tree.centre_posture, 0.1))
         run: Any = SimpleNamespace(times=np.arange(3.0), q=q, reference=np.tile(task.batched(q[:1])[0], (3, 1)))
-        targets = figure._tip_targets(run, problem)
+        targets = figure._compute_tip_targets(run, problem)
         assert np.isfinite(targets).all() == drawn
         if drawn:
             np.testing.assert_allclose(targets, robot.tip_position(q), atol=1e-12)

@@ -15,7 +15,7 @@ from programs import Run, needs_c
 
 import orthocas as oc
 from orthocas import control
-from orthocas.bases.cyclic import over_cyclic_joints
+from orthocas.bases.cyclic import widen_over_cyclic_joints
 from orthocas.certificates.certify import check_certificate
 from orthocas.charts.point_quality import worst_points
 from orthocas.codegen import CompiledLibrary, check_c, compile_shared
@@ -216,7 +216,7 @@ def test_laws_work_on_where_x_ends(iiwa: oc.Problem) -> None:
 
 
 def test_cyclic_joints_keep_the_condition(problem: oc.Problem) -> None:
-    wider = over_cyclic_joints(problem, ("q1",)).domain
+    wider = widen_over_cyclic_joints(problem, ("q1",)).domain
     assert isinstance(wider, oc.ClearBox)
     np.testing.assert_array_equal(wider.scale, problem.domain.scale)  # type: ignore[union-attr]
     assert wider.contains([50.0, 0.8, 0.8])

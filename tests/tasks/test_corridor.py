@@ -189,7 +189,7 @@ def test_wrong_corridors_are_refused() -> None:
 def test_command_line_fits_along_postures(run: Run) -> None:
     np.savetxt("path.csv", PATH, delimiter=",", header="q1,q2,q3", comments="")
     words = ("fit", "planar_3r_xy", "--corridor", "path.csv", "--samples", "200", "--out", "a.orthocas", "--json")
-    code, out, err = run(*words, "--radius", "0.25")
+    code, out, err = run(*words, "--half-width", "0.25")
     assert (code, err) == (0, "")
     assert json.loads(out)["parametrisation"] == "polynomial:3:cyclic=q1"
     domain = oc.load("a.orthocas").problem.domain
@@ -197,16 +197,16 @@ def test_command_line_fits_along_postures(run: Run) -> None:
     assert domain.radius.tolist() == [np.inf, 0.25, 0.25]
     assert domain.contains(PATH).all()
     for others, word in (
-        (("--half-width", "0.4"), "--corridor is a domain: leave out"),
+        (("--centre", "0,0,0"), "--corridor is a domain: leave out --centre"),
         (("--domain", "auto"), "--corridor is a domain: leave out"),
-        (("--radius", "-1"), "radius"),
+        (("--half-width", "-1"), "radius"),
+        (("--half-width", "1,1,1"), "expected one number: the radius of the corridor"),
     ):
         code, out, err = run(*words, "--force", *others)
         assert (code, out) == (2, "")
         assert word in err
     code, _, err = run("fit", "planar_3r_xy", "--radius", "0.2")
-    assert code == 2
-    assert "--radius requires --corridor" in err
+    assert (code, err) == (2, "orthocas: no such option: --radius; the radius of a corridor is --half-width\n")
 
 
 @pytest.mark.slow

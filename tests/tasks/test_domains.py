@@ -8,7 +8,7 @@ from conftest import robot_data
 
 import orthocas as oc
 from orthocas.errors import DomainError, InvalidValueError, ShapeError
-from orthocas.tasks.domains import Box, contains, default_box, require_within_limits
+from orthocas.tasks.domains import Box, default_box, require_within_limits
 from orthocas.tasks.samples import sample_evenly, sample_uniform
 
 
@@ -153,6 +153,6 @@ def test_boundaries_of_small_boxes_far_out_belong_to_them() -> None:
     for half_width in (1e-6, 1e-4, 1.0):
         for centre in rng.uniform(-3, 3, (200, 2)):
             box = Box(centre, half_width)
-            assert contains(box, centre - half_width)
-            assert contains(box, centre + half_width)
-            assert not contains(box, centre + half_width * (1 + 1e-8))
+            assert box.contains(centre - half_width)
+            assert box.contains(centre + half_width)
+            assert not box.contains(centre + half_width * (1 + 1e-8))

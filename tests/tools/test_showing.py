@@ -15,7 +15,7 @@ from public_objects import CONTROLLERS, OBJECTS, comparison, fitted, impedance, 
 import orthocas as oc
 from orthocas import control, problems
 from orthocas.charts.quality import AngleStatistics, Conditioning
-from orthocas.cli.output import report_rows
+from orthocas.cli.output import format_report_rows
 from orthocas.tools.display import Shown, as_html, as_text, listed, number_list, percent
 
 EVIL = "<b>&'\"\n</td>"  # a text that a file of others may hold
@@ -119,7 +119,7 @@ def test_numbers_shown_are_those_of_the_object() -> None:
 def test_the_command_line_shows_the_facts_of_a_report() -> None:
     report = oc.evaluate(fitted().chart, 500)
     assert report.length_ratio > 30
-    advised = report_rows(report)
+    advised = format_report_rows(report)
     assert advised.pop("lengths").startswith(report.facts()["lengths"])
     assert advised == {name: text for name, text in report.facts().items() if name != "lengths"}
 

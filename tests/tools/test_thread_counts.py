@@ -81,7 +81,7 @@ def test_normal_blocks_are_sums_of_products() -> None:
     found = []
     for count in (1, 2, 5):
         with use_threads(count):
-            found.append(basis_objective.normal_matrix(derivatives, gradients, [(1, 0, 2, 1)]))
+            found.append(basis_objective.build_normal_matrix(derivatives, gradients, [(1, 0, 2, 1)]))
     for j, part in enumerate((slice(K), slice(K, None))):
         np.testing.assert_allclose(found[0][part, part], np.einsum("srk,srl->kl", X[j], X[j]), rtol=0, atol=5e-2)
     np.testing.assert_allclose(found[0][K:, :K], X[1][:, 2].T @ X[0][:, 1], rtol=0, atol=5e-2)  # of sums near 1e4

@@ -55,43 +55,43 @@ FOREIGN_HOSTS = (
 
 @pytest.mark.parametrize("origin", FOREIGN)
 def test_foreign_origins_are_refused(origin: str) -> None:
-    assert Guard("127.0.0.1", TOKEN[1:]).admitted(TOKEN, ["127.0.0.1:8080"], [origin]) is None
+    assert Guard("127.0.0.1", TOKEN[1:]).admit(TOKEN, ["127.0.0.1:8080"], [origin]) is None
 
 
 @pytest.mark.parametrize("host", FOREIGN_HOSTS)
 def test_foreign_hosts_are_refused(host: str) -> None:
     for origins in ([], [f"http://{host}"]):
-        assert Guard("127.0.0.1", TOKEN[1:]).admitted(TOKEN, [host], origins) is None
+        assert Guard("127.0.0.1", TOKEN[1:]).admit(TOKEN, [host], origins) is None
 
 
 @pytest.mark.parametrize("path", ["", "/", "/secre", "/secrets", "//secret", "/?/secret", "/%73ecret", "/\udcff", "/é"])
 def test_paths_without_the_token_are_refused(path: str) -> None:
-    assert Guard("127.0.0.1", TOKEN[1:]).admitted(path, ["127.0.0.1:8080"], []) is None
+    assert Guard("127.0.0.1", TOKEN[1:]).admit(path, ["127.0.0.1:8080"], []) is None
 
 
 def test_doubled_and_missing_headers_are_refused() -> None:
     guard, own = Guard("127.0.0.1", TOKEN[1:]), "127.0.0.1:8080"
-    assert guard.admitted(TOKEN, [], []) is None
-    assert guard.admitted(TOKEN, [own, own], []) is None
-    assert guard.admitted(TOKEN, [own], [f"http://{own}", "http://evil.example"]) is None
+    assert guard.admit(TOKEN, [], []) is None
+    assert guard.admit(TOKEN, [own, own], []) is None
+    assert guard.admit(TOKEN, [own], [f"http://{own}", "http://evil.example"]) is None
 
 
 @pytest.mark.parametrize("host", ["localhost:8080", "LocalHost", "127.0.0.1:8080", "127.0.0.2", "[::1]:8080", "[::1]"])
 def test_addresses_of_this_machine_are_let_in(host: str) -> None:
     guard = Guard("127.0.0.1", TOKEN[1:])
-    assert guard.admitted(TOKEN, [host], []) == "/"
-    assert guard.admitted(f"{TOKEN}/?fixedDpr=0.3", [host], [f"http://{host}"]) == "/?fixedDpr=0.3"
-    assert guard.admitted(f"{TOKEN}?websocket=ws://{host}{TOKEN}", [host], []) == f"/?websocket=ws://{host}{TOKEN}"
+    assert guard.admit(TOKEN, [host], []) == "/"
+    assert guard.admit(f"{TOKEN}/?fixedDpr=0.3", [host], [f"http://{host}"]) == "/?fixedDpr=0.3"
+    assert guard.admit(f"{TOKEN}?websocket=ws://{host}{TOKEN}", [host], []) == f"/?websocket=ws://{host}{TOKEN}"
 
 
 def test_a_server_that_others_reach_takes_its_addresses_but_no_foreign_name() -> None:
     guard = Guard("0.0.0.0", TOKEN[1:])  # the point
     for host in ("192.0.2.7:8080", "[2001:db8::7]:8080", "localhost:8080", f"{socket.gethostname()}:8080"):
-        assert guard.admitted(TOKEN, [host], [f"http://{host}"]) == "/"
+        assert guard.admit(TOKEN, [host], [f"http://{host}"]) == "/"
     for host in ("evil.example:8080", "localhost.evil.example:8080", "192.0.2.7.evil.example"):
-        assert guard.admitted(TOKEN, [host], [f"http://{host}"]) is None
-    assert guard.admitted(TOKEN, ["192.0.2.7:8080"], ["http://192.0.2.8:8080"]) is None
-    assert Guard("192.0.2.7", TOKEN[1:]).admitted(TOKEN, ["192.0.2.7:8080"], []) == "/"
+        assert guard.admit(TOKEN, [host], [f"http://{host}"]) is None
+    assert guard.admit(TOKEN, ["192.0.2.7:8080"], ["http://192.0.2.8:8080"]) is None
+    assert Guard("192.0.2.7", TOKEN[1:]).admit(TOKEN, ["192.0.2.7:8080"], []) == "/"
 
 
 def test_tokens_differ_and_cannot_be_guessed() -> None:

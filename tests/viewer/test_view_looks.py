@@ -12,13 +12,21 @@ import pytest
 from conftest import robot_data
 
 import orthocas as oc
-from orthocas.errors import (
-    RobotError,
-)
+from orthocas.errors import RobotError
 from orthocas.robots.pinocchio_model import lock_off_chain
 from orthocas.robots.urdf import read_urdf
-from orthocas.viewer.looks import TOOL, BodyPoses, ball, block, capsule, decimated, drum, stick_arm, urdf_look
-from orthocas.viewer.view import shape_of
+from orthocas.viewer.looks import (
+    RULES,
+    BodyPoses,
+    build_ball,
+    build_block,
+    build_capsule,
+    build_drum,
+    build_stick_arm,
+    decimate,
+    read_urdf_look,
+)
+from orthocas.viewer.view import build_shape
 
 
 def test_body_poses_are_those_of_pinocchio() -> None:
@@ -36,7 +44,7 @@ def test_body_poses_are_those_of_pinocchio() -> None:
 def test_meshes_are_where_pinocchio_places_them() -> None:
     path = robot_data("panda_description/urdf/panda.urdf")
     robot = oc.Robot.from_urdf(path, "panda_hand")
-    found = urdf_look(path, robot.tree)
+    found = read_urdf_look(path, robot.tree)
     assert found.missing == ()
     q = np.array([0.3, -0.4, 0.5, -1.2, 0.2, 1.0, -0.7])
     positions, quaternions = BodyPoses(robot.tree)(q[None])
@@ -66,8 +74,8 @@ def test_decimated_meshes_keep_their_surface() -> None:
     """A seventh of the triangles; 99 of 100 corners are within 4 mm of the whole mesh, and the other way around."""
     pytest.importorskip("fast_simplification")
     path = robot_data("panda_description/urdf/panda.urdf")
-    whole = urdf_look(path, oc.Robot.from_urdf(path, "panda_hand").tree).look
-    fewer = decimated(whole, 20_000)
+    whole = read_urdf_look(path, oc.Robot.from_urdf(path, "panda_hand").tree).look
+    fewer = decimate(whole, 20_000)
     before, after = ([solid for solids in look for solid in solids] for look in (whole, fewer))
     assert sum(len(solid.faces) for solid in before) > 130_000
     assert sum(len(solid.faces) for solid in after) < 21_000
@@ -75,7 +83,7 @@ def test_decimated_meshes_keep_their_surface() -> None:
         for corners, surface in ((a.vertices, b), (b.vertices, a)):
             distances = igl.point_mesh_squared_distance(corners, surface.vertices, surface.faces)[0]
             assert np.sqrt(np.percentile(distances, 99)) < 4e-3
-    assert decimated(whole, 10**6) is whole
+    assert decimate(whole, 10**6) is whole
 
 
 def test_all_tips_are_drawn() -> None:
@@ -86,9 +94,9 @@ def test_all_tips_are_drawn() -> None:
     q = robot.tree.centre_posture
     positions, quaternions = BodyPoses(robot.tree)(q[None])
     balls = []
-    for i, solids in enumerate(stick_arm(robot.tree)):
+    for i, solids in enumerate(build_stick_arm(robot.tree)):
         turn = pin.Quaternion(*quaternions[0, i]).matrix()
-        balls += [(s.vertices @ turn.T + positions[0, i]).mean(axis=0) for s in solids if s.colour == TOOL]
+        balls += [(s.vertices @ turn.T + positions[0, i]).mean(axis=0) for s in solids if s.colour == RULES.tool]
     model = lock_off_chain(read_urdf(path), *tips)
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
@@ -103,10 +111,10 @@ def test_rods_stand_for_links_whose_meshes_are_missing(tmp_path: Path) -> None:
     lonely = tmp_path / "panda.urdf"
     shutil.copy(whole, lonely)
     robot = oc.Robot.from_urdf(lonely, "panda_hand")
-    shape = shape_of(robot, lonely, None)
+    shape = build_shape(robot, lonely, None)
     assert len(shape.missing) > 8
     assert shape.missing[0].endswith(".dae")
-    assert [len(part) for part in shape.look] == [len(part) for part in stick_arm(robot.tree)]
+    assert [len(part) for part in shape.look] == [len(part) for part in build_stick_arm(robot.tree)]
 
 
 def test_shapes_of_urdf_are_drawn_at_their_origins(tmp_path: Path) -> None:
@@ -120,7 +128,7 @@ def test_shapes_of_urdf_are_drawn_at_their_origins(tmp_path: Path) -> None:
     path = tmp_path / "r.urdf"
     path.write_text(text)
     robot = oc.Robot.from_urdf(path)
-    look = urdf_look(path, robot.tree).look
+    look = read_urdf_look(path, robot.tree).look
     np.testing.assert_allclose(np.ptp(look[0][0].vertices, axis=0), [1, 2, 3])
     sphere, cylinder = look[1]
     assert sphere.colour == (0, 0, 255)
@@ -130,12 +138,12 @@ def test_shapes_of_urdf_are_drawn_at_their_origins(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.ptp(cylinder.vertices @ R.T, axis=0), [0.2, 0.2, 2], atol=1e-3)
     other = oc.Robot.planar([1, 1], [1, 1])
     with pytest.raises(RobotError, match=r"has the joints j, expected q1, q2|unknown frame"):
-        urdf_look(path, replace(other.tree, tip_name="b"))
+        read_urdf_look(path, replace(other.tree, tip_name="b"))
 
 
 @pytest.mark.parametrize(
-    "solid", [drum(0.3, 0.2, (0, 0, 0)), ball(0.5, (0, 0, 0)), block([1, 2, 3], (0, 0, 0)),
-              capsule(np.ones(3), np.array([1.0, 2, 0]), (0.2, 0.1), (0, 0, 0))]
+    "solid", [build_drum(0.3, 0.2, (0, 0, 0)), build_ball(0.5, (0, 0, 0)), build_block([1, 2, 3], (0, 0, 0)),
+              build_capsule(np.ones(3), np.array([1.0, 2, 0]), (0.2, 0.1), (0, 0, 0))]
 )  # fmt: skip
 def test_solids_are_closed_and_seen_from_outside(solid: object) -> None:
     """The volume that the triangles enclose is positive, and close to that of the shape."""

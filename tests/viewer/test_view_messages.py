@@ -107,7 +107,7 @@ def test_uploads_stay_out_of_memory(view: oc.viewer.View, link: Any) -> None:
 def test_what_pages_send_is_let_through() -> None:
     inbox, rng = page()[2], np.random.default_rng(7)
     for _ in range(100):
-        assert inbox.fault(encoded(good(rng))) is None
+        assert inbox.find_fault(encoded(good(rng))) is None
 
 
 @pytest.mark.slow
@@ -177,7 +177,7 @@ def test_a_player_shows_the_error_of_a_nan_and_plays_on() -> None:
         wait(lambda: page._now == 0.01)
         asyncio.run(page._play._impl.update_cb[0](SimpleNamespace(client=object(), target=page._play)))
         wait(lambda: page._now > 0.05)
-        page._panel.html = lambda seconds: 1 / 0  # an error in a tick
+        page._panel.format_html = lambda seconds: 1 / 0  # an error in a tick
         wait(lambda: any(isinstance(error, ZeroDivisionError) for error in errors))
         wait(lambda: page._play.label == "Play")
         count = len(errors)

@@ -8,15 +8,11 @@ import pytest
 from public_objects import fitted, joint_motion, trajectory
 
 from orthocas import problems
-from orthocas.errors import (
-    InvalidValueError,
-    PathError,
-    PathFileError,
-)
+from orthocas.errors import InvalidValueError, PathError, PathFileError
 from orthocas.fitting.fit import Fit
 from orthocas.viewer import cyclic_motions
 from orthocas.viewer.motion import read_joint_motion, read_run
-from orthocas.viewer.view import subject
+from orthocas.viewer.view import read_subject
 
 
 def test_runs_and_paths_are_played_from_their_files(tmp_path: Path) -> None:
@@ -75,8 +71,8 @@ def test_constant_coordinates_return_and_the_pseudo_inverse_drifts(iiwa_fit: Fit
 
 
 def test_motions_belong_to_their_robot() -> None:
-    arm, motions = subject(trajectory(), fitted().chart)
+    arm, motions = read_subject(trajectory(), fitted().chart)
     assert arm is fitted().chart.problem.robot
     assert len(motions) == 1
     with pytest.raises(InvalidValueError, match="joints of the motion is q1, q2, q3, expected"):
-        subject(trajectory(), problems.get("iiwa").robot)
+        read_subject(trajectory(), problems.get("iiwa").robot)

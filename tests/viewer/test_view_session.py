@@ -8,11 +8,7 @@ from public_objects import circle, clear, cyclic, fitted
 
 import orthocas as oc
 from orthocas.charts.self_motion import fan_along
-from orthocas.errors import (
-    InvalidValueError,
-    NoExpressionError,
-    UnknownNameError,
-)
+from orthocas.errors import InvalidValueError, NoExpressionError, UnknownNameError
 from orthocas.fitting.fit import Fit
 from orthocas.viewer.session import Session
 
@@ -110,7 +106,7 @@ def test_a_mirrored_arm_holds_the_pose_within_its_joint_limits() -> None:
     session.flip(shoulder)
 
     def arm() -> np.ndarray:
-        return np.asarray(session.shown(session.q[None])[0])
+        return np.asarray(session.mirror(session.q[None])[0])
 
     assert (robot.lower <= arm()).all()
     assert (arm() <= robot.upper).all()

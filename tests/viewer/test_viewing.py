@@ -15,15 +15,10 @@ from public_objects import circle, fitted, joint_motion, trajectory
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.errors import (
-    InvalidValueError,
-    MissingExtraError,
-    NoExpressionError,
-    ViewError,
-)
+from orthocas.errors import InvalidValueError, MissingExtraError, NoExpressionError, ViewError
 from orthocas.tools import checks
 from orthocas.viewer import Motion, export_page, window
-from orthocas.viewer.panel import ChartPanel, PlayerPanel, RobotPanel, held
+from orthocas.viewer.panel import ChartPanel, PlayerPanel, RobotPanel, format_drift
 from orthocas.viewer.session import Session
 from orthocas.viewer.window import Loop, is_local
 
@@ -39,15 +34,15 @@ def test_panels_hold_the_numbers_and_escape_names() -> None:
         evil, np.arange(2.0), np.zeros((2, 3)), (evil,), np.zeros((2, 1)), np.ones((2, 1)), np.array([True] * 2)
     )
     pages = [
-        ChartPanel(hostile).html(replace(readings, stop=evil)),
-        RobotPanel(robot).html(readings.q),
-        PlayerPanel(robot, [motion]).html(0.5),
-        PlayerPanel(robot, [motion, replace(motion, cycles=(0.5,))]).html(0.5),
+        ChartPanel(hostile).format_html(replace(readings, stop=evil)),
+        RobotPanel(robot).format_html(readings.q),
+        PlayerPanel(robot, [motion]).format_html(0.5),
+        PlayerPanel(robot, [motion, replace(motion, cycles=(0.5,))]).format_html(0.5),
     ]
     for page in pages:
         assert "<img" not in page
     session = Session(chart)
-    page = ChartPanel(chart).html(session.readings)
+    page = ChartPanel(chart).format_html(session.readings)
     shown = dict(re.findall(r'data-oc="([^"]+)" data-value="([^"]+)"', page))
     assert float(shown["drift"]) < 1e-12
     assert [float(shown[name]) for name in ("q1", "q2", "q3")] == session.q.tolist()
@@ -59,7 +54,7 @@ def test_panels_hold_the_numbers_and_escape_names() -> None:
 
 def test_panels_of_charts_without_boundaries() -> None:
     chart = linear_on_the_torus()
-    page = ChartPanel(chart).html(Session(chart, np.array([0.6, 0.8, 0.8])).readings)
+    page = ChartPanel(chart).format_html(Session(chart, np.array([0.6, 0.8, 0.8])).readings)
     assert 'data-oc="boundary" data-value="inf"' in page
 
 
@@ -67,16 +62,16 @@ def test_panels_show_a_dash_for_what_has_no_value_and_units_with_the_rest() -> N
     chart = fitted().chart
     readings = Session(chart).readings
     bare = replace(readings, q=np.full(3, np.nan), leak_deg=np.full(2, np.nan), conditioning=np.nan)
-    page = ChartPanel(chart).html(bare)
+    page = ChartPanel(chart).format_html(bare)
     assert page.count(">-</b>") == 6
     assert "nan%" not in page
-    page = ChartPanel(chart).html(readings)
+    page = ChartPanel(chart).format_html(readings)
     low = chart.problem.domain.half_width - np.abs(readings.q - chart.problem.domain.centre)
     assert f">{np.degrees(low.min()):.1f}°</b>" in page
     assert f"boundary q{np.argmin(low) + 1}" in page
-    assert held(np.array([3e-4, 2e-4, np.radians(0.5)]), ("m", "m", "rad")) == "300 µm, 0.5°"
-    assert held(np.array([0.0, 0.0]), ("m", "rad")) == "< 1 nm, < 0.001°"
-    assert held(np.array([0.02]), ("px",)) == "2e-02 px"
+    assert format_drift(np.array([3e-4, 2e-4, np.radians(0.5)]), ("m", "m", "rad")) == "300 µm, 0.5°"
+    assert format_drift(np.array([0.0, 0.0]), ("m", "rad")) == "< 1 nm, < 0.001°"
+    assert format_drift(np.array([0.02]), ("px",)) == "2e-02 px"
 
 
 @pytest.mark.slow
@@ -125,8 +120,8 @@ def test_addresses_that_cannot_be_opened_are_refused() -> None:
     with pytest.raises(InvalidValueError, match="port"):
         window.require_free("127.0.0.1", 70000)
     assert [is_local(host) for host in ("127.0.0.1", "::1", "localhost", "0.0.0.0")] == [True, True, True, False]
-    assert window.url_of("0.0.0.0", 80) == "http://127.0.0.1:80"
-    assert window.url_of("::1", 80) == "http://[::1]:80"
+    assert window.build_url("0.0.0.0", 80) == "http://127.0.0.1:80"
+    assert window.build_url("::1", 80) == "http://[::1]:80"
 
 
 def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -186,13 +181,13 @@ def test_cameras_see_the_arm_in_pictures_of_every_shape() -> None:
     """The ball around the arm, projected by hand, is within the picture."""
     middle, radius = np.array([0.2, -0.1, 0.5]), 0.7
     direction, up = np.array([2.0, -2.0, 1.0]) / 3, np.array([0.0, 0.0, 1.0])
-    frame = window.Framing(middle, direction, window._ROOM * radius / np.sin(window._VIEW_ANGLE / 2))
+    frame = window.Framing(middle, direction, window.RULES.room * radius / np.sin(window.RULES.view_angle / 2))
     for width, height in ((1180, 900), (736, 768), (472, 800), (390, 422)):
-        position, look_at = frame.seen_from(width, height)
+        position, look_at = frame.compute_view(width, height)
         ahead = (look_at - position) / np.linalg.norm(look_at - position)
         right = np.cross(ahead, up) / np.linalg.norm(np.cross(ahead, up))
         axes = np.stack([right, np.cross(right, ahead), ahead])
         points = np.random.default_rng(7).normal(size=(500, 3))
         seen = (middle + radius * points / np.linalg.norm(points, axis=1)[:, None] - position) @ axes.T
-        pixels = height / 2 / np.tan(window._VIEW_ANGLE / 2) * seen[:, :2] / seen[:, 2:]
+        pixels = height / 2 / np.tan(window.RULES.view_angle / 2) * seen[:, :2] / seen[:, 2:]
         assert (np.abs(pixels) < np.array([width, height]) / 2).all()

@@ -8,9 +8,11 @@ from typing import NamedTuple, Self
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocas.bases.family import ArrayFamily, ArrayMemory, Family, Memories
-from orthocas.fitting.residuals import Loss, loss_columns, loss_with_slopes, value_columns
+from orthocas.fitting.basis_objective import RULES
+from orthocas.fitting.loss import Loss, build_loss_columns, build_loss_with_slopes, build_value_columns
 from orthocas.fitting.terms import Sizes, Weights
 from orthocas.tasks.samples import Draw, Samples, split_samples
 from orthocas.tools.batch import count_threads, run_in_threads, run_in_threads_with
@@ -19,11 +21,6 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import Run, arrange_blocks, build_weights, split_by_sample
 from orthocas.tools.expressions import replay
-
-_ORIENTING = 200  # samples that determine the orientation of the start
-_ENTRIES = 2**18  # of the largest array of a piece of samples; larger ones leave the cache
-_LEAST = 100  # samples in a piece; smaller products waste time
-_CHUNK_ENTRIES = 2**20  # entries of the largest matrix in a graph; larger ones leave the cache
 
 
 class _Piece(NamedTuple):
@@ -48,6 +45,7 @@ class ArrayObjective:
         start: parameters, (size,), whose orientation the regularity term keeps.
         draw: draws fresh samples.
         single: whether the products of the network are computed in single precision.
+        orientation: sign of the volume of the coordinates that the regularity term keeps. Default: that of the start.
     """
 
     def __init__(
@@ -58,29 +56,31 @@ class ArrayObjective:
         start: Array,
         draw: Draw,
         single: bool = False,
+        orientation: float | None = None,
     ) -> None:
         m, self.n = samples.task_jacobian.shape[1:]
         self.r, self._family, self._draw = family.outputs, family, draw
         self._single = single
         self._memories = Memories()
         self._loss = Loss.of(Sizes(self.n, m, self.r, samples.metric_inverse is None), weights.by_name)
-        self._orientation: float | None = None
-        if self._loss.oriented or weights.folds > 0:
-            some = samples[:_ORIENTING]
+        self._orientation = orientation
+        if orientation is None and (self._loss.oriented or weights.folds > 0):
+            some = samples[: RULES.orienting]
             self._orientation = some.orientation(family.pullback(some.points, start)[0])
         self._put(samples)
 
     def value(self, theta: Array) -> float:
         """L(theta)."""
-        small = self._rounded(theta)
+        small = self._round(theta)
         J = run_in_threads(lambda piece: arrange_blocks(self._family.pullback(piece.points, small)[0]), self._pieces)
-        columns = value_columns(self._loss)
+        columns = build_value_columns(self._loss)
         parts = zip(J, self._pieces, strict=True)
         return sum(float(np.vdot(columns(own, *piece.data)[0][:, 0], piece.shares)) for own, piece in parts)
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """L(theta) and dL/dtheta."""
-        small, columns = self._rounded(theta), loss_columns(self._loss)
+        # each piece: gradients of the network, loss and slopes by CasADi, slopes back to theta
+        small, columns = self._round(theta), build_loss_columns(self._loss)
 
         def part(tools: tuple[Run, ArrayMemory], work: tuple[_Piece, Array]) -> float:
             (run, memory), (piece, result) = tools, work
@@ -123,20 +123,29 @@ class ArrayObjective:
         other._put(samples)
         return other
 
-    def _rounded(self, theta: Array) -> Array:
+    def part(self, places: NDArray[np.int_]) -> Self:
+        """The same loss on some of its samples, which may repeat."""
+        other = copy(self)
+        other._divide(self._points[places], [array[places] for array in self._described])
+        return other
+
+    def _round(self, theta: Array) -> Array:
         """Parameters with numbers of the type of the products."""
         return theta.astype(np.float32 if self._single else np.float64)
 
     def _put(self, samples: Samples) -> None:
+        self._divide(samples.points, samples.collect_data(self._loss.data, self._orientation))
+
+    def _divide(self, points: Array, data: list[Array]) -> None:
         """Use these samples, in pieces of nearly equal size."""
-        N, most = len(samples), max(_LEAST, _ENTRIES // (self.r * self._family.width))
+        self._points, self._described = points, data
+        N, most = len(points), max(RULES.least_piece, RULES.piece // (self.r * self._family.width))
         size = ceil(N / ceil(N / most))
-        data = samples.collect_data(self._loss.data, self._orientation)
         self._pieces = []
         for k in range(0, N, size):
-            points = samples.points[k : k + size]
             blocks = [arrange_blocks(array[k : k + size]) for array in data]
-            self._pieces.append(_Piece(points, blocks, build_weights(len(points)) * (len(points) / N)))
+            own = points[k : k + size]
+            self._pieces.append(_Piece(own, blocks, build_weights(len(own)) * (len(own) / N)))
 
 
 class GraphObjective:
@@ -148,14 +157,23 @@ class GraphObjective:
         weights: weights of the loss.
         start: parameters, (size,), whose orientation the regularity term keeps.
         draw: draws fresh samples.
+        orientation: sign of the volume of the coordinates that the regularity term keeps. Default: that of the start.
     """
 
-    def __init__(self, family: Family, samples: Samples, weights: Weights, start: Array, draw: Draw) -> None:
+    def __init__(
+        self,
+        family: Family,
+        samples: Samples,
+        weights: Weights,
+        start: Array,
+        draw: Draw,
+        orientation: float | None = None,
+    ) -> None:
         m, n = samples.task_jacobian.shape[1:]
         loss = Loss.of(Sizes(n, m, family.outputs, samples.metric_inverse is None), weights.by_name)
-        oriented = loss.oriented or weights.folds > 0
-        self._graphs, self._draw = _Graphs(family, loss), draw
-        self._orientation = _orientation(family, start, samples[:_ORIENTING]) if oriented else None
+        self._graphs, self._draw, self._orientation = _Graphs(family, loss), draw, orientation
+        if orientation is None and (loss.oriented or weights.folds > 0):
+            self._orientation = _orientation(family, start, samples[: RULES.orienting])
         self._put(samples, len(samples))
 
     def value(self, theta: Array) -> float:
@@ -186,13 +204,23 @@ class GraphObjective:
         other._put(samples, len(samples))
         return other
 
+    def part(self, places: NDArray[np.int_]) -> Self:
+        """The same loss on some of its samples, which may repeat."""
+        other = copy(self)
+        other._divide(self._points[places], self._entries[places], len(places))
+        return other
+
     def _put(self, samples: Samples, room: int) -> None:
+        described = samples.collect_data(self._graphs.loss.data, self._orientation)
+        self._divide(samples.points, _entries(described, len(samples)), room)
+
+    def _divide(self, points: Array, entries: Array, room: int) -> None:
         """Use these samples. Graphs are built for `room` samples, so that smaller sets share them."""
-        entries = _entries(samples.collect_data(self._graphs.loss.data, self._orientation), len(samples))
+        self._points, self._entries = points, entries
         graph = self._graphs.of_size(room)
         self._blocks = [
-            _Block.filled(graph, samples.points[k : k + graph.columns], entries[k : k + graph.columns], len(samples))
-            for k in range(0, len(samples), graph.columns)
+            _Block.filled(graph, points[k : k + graph.columns], entries[k : k + graph.columns], len(points))
+            for k in range(0, len(points), graph.columns)
         ]
 
 
@@ -202,15 +230,15 @@ class _Graphs:
 
     family: Family
     loss: Loss
-    known: dict[int, "_LossGraph"] = field(default_factory=dict)
+    built: dict[int, "_LossGraph"] = field(default_factory=dict)
 
     def of_size(self, samples: int) -> "_LossGraph":
         """The graph for a set of samples: for all at once, or for as many as stay in the cache."""
-        most = max(1, _CHUNK_ENTRIES // (self.family.outputs * self.family.width))
+        most = max(1, RULES.graph // (self.family.outputs * self.family.width))
         columns = ceil(samples / ceil(samples / most))
-        if columns not in self.known:
-            self.known[columns] = _LossGraph(self.family, self.loss, columns)
-        return self.known[columns]
+        if columns not in self.built:
+            self.built[columns] = _LossGraph(self.family, self.loss, columns)
+        return self.built[columns]
 
 
 class _LossGraph:
@@ -218,14 +246,18 @@ class _LossGraph:
 
     def __init__(self, family: Family, loss: Loss, columns: int) -> None:
         self.columns = columns
+        # the graph of one sample's loss, replayed on columns of samples
         theta, q = ca.MX.sym("theta", family.size), ca.MX.sym("q", loss.sizes.n, columns)
         data = ca.MX.sym("data", columns, sum(symbol.numel() for symbol in loss.symbols()))
         share = ca.MX.sym("share", columns)
         gradients = family.jacobian(q, theta)
-        by_component = [ca.horzsplit(gradient.T) for gradient in gradients]  # r times n columns of samples
+        # r times n columns of samples
+        by_component = [ca.horzsplit(gradient.T) for gradient in gradients]
         entries = [column for by_joint in zip(*by_component, strict=True) for column in by_joint]
         r = loss.sizes.r
-        values, *slopes = replay(loss_with_slopes(loss).tape, [*entries, *(ca.horzsplit(data) if loss.data else [])])
+        values, *slopes = replay(
+            build_loss_with_slopes(loss).tape, [*entries, *(ca.horzsplit(data) if loss.data else [])]
+        )
         weighted = [ca.horzcat(*(share * slope for slope in slopes[j::r])) for j in range(r)]
         # chain rule, split at J_xi: the derivatives of the loss are one sample's graph, replayed on columns
         by_theta = ca.jtimes(ca.horzcat(*gradients), theta, ca.horzcat(*(part.T for part in weighted)), True)

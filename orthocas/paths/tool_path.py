@@ -19,20 +19,70 @@ from orthocas.tools.checks import Array, as_float_array, freeze_array
 from orthocas.tools.files import RULES as FILE_RULES
 from orthocas.tools.files import find_columns, read_table
 
-_SAMPLES = 501  # of a path that is given as a function
-_SAME = 1e-9  # relative distance of the ends of closed paths
 MOST_WAYPOINTS = 100_000
 
 
-def sampled(name: str, given: Any, size: int, labels: tuple[str, ...]) -> Array:
+@dataclass(frozen=True, slots=True)
+class PathRules:
+    """Numbers of tool paths and the motions along them."""
+
+    samples: int = 501  #: of a path that is given as a function
+    same_ends: float = 1e-9  #: distance of the ends of closed paths, relative to the sizes of the task
+
+    residual: float = 1e-10  #: of phi at all positions of a motion, relative to `Chart.phi_sizes`
+    curve_step: float = 0.15  #: longest step of q along the path [rad] or [m]
+    first_step: float = 0.01  #: of s
+    shortest_step: float = 1e-6  #: of s, below which the path is lost
+
+    law_degree: int = 3  #: of the spline z(s), the square of the speed
+    law_pieces: int = 60  #: of that spline
+    parts: int = 300  #: of the path in which the limits count, where a joint turns most
+    part_places: int = 8  #: of each part
+    turning_slope: float = 0.01  #: fraction of its largest slope that a joint counts with where the path turns back
+    time_steps: int = 6000  #: of the integration of time
+    least_square: float = 1e-9  #: smallest z inside the path, relative to its largest value
+
+    to_full_speed: float = 0.5  #: time to the velocity limit with the default acceleration limits [s]
+    instants: int = 2001  #: at which the limits are kept besides the time stamps
+    stretches: int = 20  #: of time, at most, until the stamps keep the limits
+    stretch_margin: float = 1.001  #: a little more than needed
+    most_stamps: int = 1_000_000
+    returns: float = 1e-8  #: of phi, relative to its sizes: a path ends where it began
+
+    scale_samples: int = 256  #: of the domain, for the scale of the task Jacobian
+    inside: float = 0.97  #: fraction of the half-width beyond which the residual of a joint is a straight line
+    regular: float = 0.1  #: relative singular value: scale of its residual
+    nearly_singular: float = 0.02  #: where the line of that residual begins
+    away: float = 0.02  #: distance from obstacles: scale of its residual [m]
+    too_near: float = 0.004  #: where the line of that residual begins [m]
+
+    walk_steps: int = 3  #: at each place
+    walk_step: float = 0.1  #: longest [rad] or [m]
+    walk_damping: float = 1e-2
+    fewest_pieces: int = 20  #: of the spline xi(s)
+    most_pieces: int = 60
+    piece_density: float = 10  #: pieces on a path as long as x moves over the domain
+    cost_places: int = 8  #: where costs count, on every piece
+    speed_weight: float = 2e-2  #: of the square of xi'
+    bend_weight: float = 1e-4  #: of the square of xi''
+    iterations: int = 40
+    least_gain: float = 1e-3  #: relative decrease of the cost that ends the iterations
+    damping: float = 1e-2  #: at first
+    most_damping: float = 1e8
+
+
+RULES = PathRules()
+
+
+def sample_path(name: str, path: Any, size: int, labels: tuple[str, ...]) -> Array:
     """The points (N, size) of a path: an array, or 501 values of a function of s in [0, 1].
 
     Raises:
         InvalidValueError, ShapeError: for anything else. The message names the first bad entry.
     """
-    if callable(given):
-        return np.array([_value(name, given, s, size) for s in np.linspace(0, 1, _SAMPLES)])
-    points = as_float_array(name, given)
+    if callable(path):
+        return np.array([_evaluate_function(name, path, s, size) for s in np.linspace(0, 1, RULES.samples)])
+    points = as_float_array(name, path)
     if points.ndim != 2 or points.shape[1] != size:
         raise ShapeError(f"{name} ({', '.join(labels)})", points.shape, (None, size))
     if not 2 <= len(points) <= MOST_WAYPOINTS:
@@ -59,18 +109,21 @@ class TaskSpline:
     def __init__(self, relative: Relative, s: Array, points: Array, sizes: Array) -> None:
         self._relative, self._s = relative, s
         rows = points
+        # Orientations as quaternions with signs that leave no jump.
         if relative.turned:
-            p = continued(Batched(relative.task.quaternion_function)(points)[0])
+            p = continue_signs(Batched(relative.task.quaternion_function)(points)[0])
             rows = np.hstack([points[:, : relative.first], p])
             sizes = np.concatenate([sizes[: relative.first], np.ones(4)])
         away = np.abs(rows[-1] - rows[0])
-        self.returns = bool((away <= _SAME * sizes).all()) and len(rows) > 2  #: to its first point, without a full turn
+        self.returns = (
+            bool((away <= RULES.same_ends * sizes).all()) and len(rows) > 2
+        )  #: to its first point, without a full turn
         self._rows = rows
-        self._curve = spline(s, rows, False)
+        self._curve = build_spline(s, rows, False)
 
-    def closed(self) -> "TaskSpline":
+    def close(self) -> "TaskSpline":
         """The same, periodic."""
-        self._curve = spline(self._s, self._rows, True)
+        self._curve = build_spline(self._s, self._rows, True)
         return self
 
     def __call__(self, s: ArrayLike) -> Array:
@@ -83,36 +136,37 @@ class TaskSpline:
         x = np.hstack([first, Batched(self._relative.task.components_function)(R)[0]])
         return np.asarray(x.reshape(*rows.shape[:-1], -1))
 
-    def rates(self, s: ArrayLike, order: int) -> Array:
+    def evaluate_rates(self, s: ArrayLike, order: int) -> Array:
         """The first or second derivative: with `Relative.rates` J, J q' and J q'' + dJ/ds q' of joints that follow."""
         rows = [np.asarray(self._curve(s, k)) for k in range(order + 1)]
         if not self._relative.turned:
             return rows[order]
         first = self._relative.first
+        # omega = 2 conj(p) p' / |p|^2, and its derivative, in the tip's axes.
         p, *slopes = (row[..., first:] for row in rows)
         square = (p**2).sum(axis=-1, keepdims=True)
-        omega = 2 * _across(p, slopes[0]) / square
+        omega = 2 * _multiply_conjugate(p, slopes[0]) / square
         if order == 2:
             growth = 2 * (p * slopes[0]).sum(axis=-1, keepdims=True) / square
-            omega = 2 * _across(p, slopes[1]) / square - growth * omega
+            omega = 2 * _multiply_conjugate(p, slopes[1]) / square - growth * omega
         assert self._relative.task.turn is not None
         return np.concatenate([rows[order][..., :first], omega @ self._relative.task.turn.order.T], axis=-1)
 
 
-def continued(quaternions: Array) -> Array:
+def continue_signs(quaternions: Array) -> Array:
     """Quaternions (N, 4) with signs such that each is nearer to the one before than its opposite is."""
     turns = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     signed: Array = quaternions * np.concatenate([[1.0], np.cumprod(turns)])[:, None]
     return signed
 
 
-def _across(a: Array, b: Array) -> Array:
+def _multiply_conjugate(a: Array, b: Array) -> Array:
     """The vector part of conj(a) b, (..., 3)."""
-    found: Array = a[..., :1] * b[..., 1:] - b[..., :1] * a[..., 1:] - np.cross(a[..., 1:], b[..., 1:])
-    return found
+    product: Array = a[..., :1] * b[..., 1:] - b[..., :1] * a[..., 1:] - np.cross(a[..., 1:], b[..., 1:])
+    return product
 
 
-def places(steps: Array) -> Array:
+def place_waypoints(steps: Array) -> Array:
     """Parameters s (N,) of points from 0 to 1, in proportion to the lengths of the chords (N - 1, k) between them.
 
     Raises:
@@ -127,14 +181,14 @@ def places(steps: Array) -> Array:
     return np.asarray(s / s[-1])
 
 
-def spline(s: Array, points: Array, closed: bool) -> CubicSpline:
+def build_spline(s: Array, points: Array, closed: bool) -> CubicSpline:
     """The spline through points (N, k) at parameters s (N,)."""
     if closed:
         points = np.vstack([points[:-1], points[:1]])
     return CubicSpline(s, points, bc_type="periodic" if closed else "not-a-knot")
 
 
-def _value(name: str, function: Callable[[float], Any], s: float, size: int) -> Array:
+def _evaluate_function(name: str, function: Callable[[float], Any], s: float, size: int) -> Array:
     try:
         value = function(float(s))
     except Exception as error:
@@ -143,7 +197,7 @@ def _value(name: str, function: Callable[[float], Any], s: float, size: int) -> 
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class ToolPath:
     """A path of the tool, and one of the extra coordinates."""
 
     x: TaskSpline  #: s -> (m,)
@@ -155,22 +209,22 @@ class Plan:
     closed: bool
 
     @classmethod
-    def held(cls, chart: "Chart", tool_path: Any, xi: Array) -> "Plan":
+    def hold(cls, chart: "Chart", tool_path: Any, xi: Array) -> "ToolPath":
         """A tool path with constant coordinates (r,)."""
-        return cls._through(chart, tool_path, np.tile(xi, (2, 1)), np.array([0.0, 1.0]))
+        return cls._build(chart, tool_path, np.tile(xi, (2, 1)), np.array([0.0, 1.0]))
 
     @classmethod
-    def scheduled(cls, chart: "Chart", tool_path: Any, xi: Any) -> "Plan":
+    def schedule(cls, chart: "Chart", tool_path: Any, xi: Any) -> "ToolPath":
         """A tool path with a schedule: coordinates at the waypoints (N, r), or a function of s."""
-        values = counted_on(sampled("xi", xi, chart.r, chart.labels[chart.m :]), chart.turns[chart.m :])
+        values = counted_on(sample_path("xi", xi, chart.r, chart.labels[chart.m :]), chart.turns[chart.m :])
         if callable(xi) or callable(tool_path):
-            return cls._through(chart, tool_path, values, np.linspace(0.0, 1.0, len(values)))
-        return cls._through(chart, tool_path, values, None)
+            return cls._build(chart, tool_path, values, np.linspace(0.0, 1.0, len(values)))
+        return cls._build(chart, tool_path, values, None)
 
     @classmethod
-    def _through(cls, chart: "Chart", tool_path: Any, xi: Array, s_xi: Array | None) -> "Plan":
+    def _build(cls, chart: "Chart", tool_path: Any, xi: Array, s_xi: Array | None) -> "ToolPath":
         """Splines; the coordinates are at parameters of their own, or at those of the waypoints (None)."""
-        x = sampled("tool_path", tool_path, chart.m, chart.labels[: chart.m])
+        x = sample_path("tool_path", tool_path, chart.m, chart.labels[: chart.m])
         if s_xi is None and len(xi) != len(x):
             raise InvalidValueError("number of rows of xi", len(xi), f"{len(x)}, as of tool_path")
         steps = chart.parts.relative.difference(x[1:], x[:-1]) / chart.phi_sizes[: chart.m]
@@ -180,22 +234,22 @@ class Plan:
             s = places(np.hstack([steps, np.diff(xi, axis=0)]) if s_xi is None else steps)
         path = TaskSpline(chart.parts.relative, s, x, chart.phi_sizes[: chart.m])
         closed = path.returns and bool(np.abs(xi[-1] - xi[0]).max() < 1e-9)
-        curve = spline(s if s_xi is None else s_xi, xi, closed and len(xi) > 2)
-        return cls(path.closed() if closed else path, curve, s, x, steps, callable(tool_path), closed)
+        curve = build_spline(s if s_xi is None else s_xi, xi, closed and len(xi) > 2)
+        return cls(path.close() if closed else path, curve, s, x, steps, callable(tool_path), closed)
 
     def replace_xi(self, xi: CubicSpline) -> "Plan":
         """The same tool path with other coordinates."""
         return replace(self, xi=xi)
 
     def phi(self, s: Array, order: int = 0) -> Array:
-        """phi, or derivatives as rates, at parameters (N,), (N, n); at one number (n,). See `TaskSpline.rates`."""
-        return np.concatenate([self.x.rates(s, order) if order else self.x(s), self.xi(s, order)], axis=-1)
+        """phi (N, n) at parameters (N,), (n,) at one number; or its derivatives, see `TaskSpline.evaluate_rates`."""
+        return np.concatenate([self.x.evaluate_rates(s, order) if order else self.x(s), self.xi(s, order)], axis=-1)
 
-    def checked(self) -> Array:
+    def list_checks(self) -> Array:
         """Parameters (P,) at which the path is checked: the waypoints, and between them."""
         return np.union1d(self.s, np.linspace(0.0, 1.0, 1001))
 
-    def explained(self, s: float, labels: tuple[str, ...]) -> str:
+    def describe_place(self, s: float, labels: tuple[str, ...]) -> str:
         """A place on the path in words."""
         x = ", ".join(f"{label} = {value:.4g}" for label, value in zip(labels, self.x(s), strict=False))
         if self.is_function:
@@ -213,16 +267,16 @@ def read_path(path: str | Path, chart: Chart) -> tuple[Array, Array | None]:
     Raises:
         PathFileError: names the file, the line, and what is wrong there.
     """
-    values = read_table(path, "path file", "waypoints", MOST_WAYPOINTS, lambda names: _columns(names, chart))
+    values = read_table(path, "path file", "waypoints", MOST_WAYPOINTS, lambda names: _find_columns(names, chart))
     return values[:, : chart.m], values[:, chart.m :] if values.shape[1] > chart.m else None
 
 
-def _columns(names: Sequence[str], chart: Chart) -> list[int]:
+def _find_columns(names: Sequence[str], chart: Chart) -> list[int]:
     """The columns in the order of the chart's labels, without those of the coordinates if there are none."""
     task, extra = chart.labels[: chart.m], chart.labels[chart.m :]
-    wanted = (*task, *extra) if set(extra) & set(names) else task
+    columns = (*task, *extra) if set(extra) & set(names) else task
     for name in names:
         if name not in chart.labels:
-            known = f"{', '.join(task)}, and if the path has a schedule {', '.join(extra)}"
-            raise ValueError(f"line 1: unknown column {name[: FILE_RULES.cell]!r}, expected {known}")
-    return find_columns(names, wanted)
+            expected = f"{', '.join(task)}, and if the path has a schedule {', '.join(extra)}"
+            raise ValueError(f"line 1: unknown column {name[: FILE_RULES.cell]!r}, expected {expected}")
+    return find_columns(names, columns)

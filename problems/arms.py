@@ -1,4 +1,8 @@
-"""The planar arms of [AS2023] (Fig. 5): links of 1 m and 3 kg with uniform mass (lengths are ours)."""
+"""The arms of [AS2023]: planar ones (links of 1 m and 3 kg are ours), and the KUKA LBR iiwa 7 R800."""
+
+from contextlib import AbstractContextManager
+from importlib.resources import as_file, files
+from pathlib import Path
 
 import numpy as np
 
@@ -7,7 +11,8 @@ from orthocas.tasks.domains import Box, Torus
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.task import Task
 
-_BENT = Box((0.6, 0.8, 0.8), np.pi / 8)  # [rad]; neither task is singular here
+# [rad]; neither task is singular here
+_BENT = Box((0.6, 0.8, 0.8), np.pi / 8)
 
 
 def _arm(joints: int) -> Robot:
@@ -34,3 +39,24 @@ def planar_3r_xy() -> Problem:
     """Three joints, task (x, y) of the tip, A = M. No exact coordinates exist. Same box as planar_3r_x (ours)."""
     robot = _arm(3)
     return Problem(robot, Task.position(robot, "xy"), "inertia", _BENT, "planar_3r_xy")
+
+
+CENTRE = (0.0, 0.52, 0.0, -1.05, 0.0, 0.79, 0.0)  #: q0 [rad]
+HALF_WIDTH = np.pi / 4  #: [rad]
+
+
+def urdf_path() -> AbstractContextManager[Path]:
+    """The path of the arm's URDF file, valid while the context is open."""
+    return as_file(files(__package__) / "data" / "iiwa7_r800.urdf")
+
+
+def iiwa_robot() -> Robot:
+    """The arm with its tip at the flange (link_ee)."""
+    with urdf_path() as path:
+        return Robot.from_urdf(path, tip="link_ee")
+
+
+def iiwa() -> Problem:
+    """Seven joints, flange position, A = I, hypercube with edges of pi/2 around q0."""
+    arm = iiwa_robot()
+    return Problem(arm, Task.position(arm), "euclidean", Box(CENTRE, HALF_WIDTH), "iiwa")

@@ -1,4 +1,4 @@
-"""The loss of one sample as least squares in J_xi, and its derivatives on columns of samples."""
+"""The loss of a fit: as one CasADi expression of the parameters, and of one sample, as least squares in J_xi."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -8,14 +8,136 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
-from orthocas.fitting.terms import SAMPLE_DATA, LossTerm, RegularityTerm, Sizes, term_of, volume_hinges
+from orthocas.bases.family import Family, JointSpace, LinearFamily, Parametrisation
+from orthocas.fitting.settings import require_parametrisation
+from orthocas.fitting.starts import find_spectral_start
+from orthocas.fitting.terms import (
+    DEFAULT_WEIGHTS,
+    SAMPLE_DATA,
+    LossTerm,
+    Pairs,
+    RegularityTerm,
+    Sizes,
+    WeightNumbers,
+    Weights,
+    coordinates_of,
+    find_term,
+)
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import Samples, evaluate_samples, sample_evenly
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array
+from orthocas.tools.checks import Array, as_point_set, freeze_array, require_count, require_kind
 from orthocas.tools.columns import COLUMNS, ColumnFunction, Run
 
-Pairs = tuple[tuple[int, int], ...]
-_BY_LAPACK = 8  # coordinates from which determinants of numbers are faster than written-out ones
+# coordinates from which determinants of numbers are faster than written-out ones
+_BY_LAPACK = 8
+
+
+def loss(
+    problem: Problem,
+    parametrisation: Parametrisation,
+    *,
+    weights: Weights | WeightNumbers = DEFAULT_WEIGHTS,
+    samples: int | ArrayLike = 500,
+    seed: int = 0,
+    start: ArrayLike | None = None,
+) -> ca.Function:
+    """L(theta), the mean loss (25) of [AS2023] on given samples, for `ca.nlpsol`, `ca.gradient` and `ca.hessian`.
+
+    The function is a graph of plain operations without callbacks, so it can be differentiated any number of times.
+    `fit` evaluates the same numbers faster. All r coordinates depend on all joints: idle joints are not split off,
+    and no mirror symmetry is used. The fold term is left out, because it acts at points that only a fit searches.
+
+    Args:
+        problem: robot, task, metric and domain.
+        parametrisation: the family with parameters theta (size, 1). For bases they are the coefficients row by row.
+        weights: weights of the terms, and the kind of angles; see `Weights`.
+        samples: number of samples to draw, or joint positions (N, n) [rad] or [m].
+        seed: seed of drawn samples, and of the start of a network.
+        start: parameters (size,) whose orientation the regularity term keeps. Default: where `fit` starts.
+
+    Returns:
+        A function `loss` with input `theta` (size, 1) and output `loss` (1, 1).
+
+    Raises:
+        InvalidValueError, ShapeError: if an argument is invalid.
+
+    Example:
+        >>> import casadi as ca
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> L = oc.loss(problems.get("planar_3r_xy"), oc.Polynomial(2), samples=50)
+        >>> theta = ca.MX.sym("theta", L.size1_in(0))
+        >>> H = ca.hessian(L(theta), theta)[0]
+        >>> H.shape
+        (9, 9)
+    """
+    require_kind("problem", problem, Problem)
+    require_parametrisation(parametrisation)
+    family = parametrisation.for_problem(problem).family(JointSpace.of(problem), problem.r)
+    drawn = _draw(problem, samples, seed)
+    theta0 = _start(family, drawn, seed) if start is None else freeze_array("start", start, (family.size,))
+    # J_xi of all samples as expressions of theta, then the loss of one sample on each column
+    theta = ca.MX.sym("theta", family.size)
+    J = _build_jacobians(family, drawn.points, theta)  # (r n, N), each J_xi column by column
+    identity = drawn.metric_inverse is None
+    chosen = Weights.of(weights).for_problem(problem)
+    of_sample = Loss.of(Sizes(problem.n, problem.m, problem.r, identity), chosen.by_name)
+    orientation = _orientation(drawn, ca.Function("J", [theta], [J])(theta0).full(), problem.r)
+    data = [_columns(part) for part in drawn.collect_data(of_sample.data, orientation)]
+    mean = ca.sum2(_map_loss(of_sample, len(drawn))(J, *data)) / len(drawn)
+    return ca.Function("loss", [theta], [mean], ["theta"], ["loss"])
+
+
+def _draw(problem: Problem, samples: int | ArrayLike, seed: int) -> Samples:
+    if isinstance(samples, int | np.integer):
+        count = require_count("samples", int(samples))
+        return evaluate_samples(problem, sample_evenly(problem.domain, count, require_count("seed", seed, least=0)))
+    return evaluate_samples(problem, as_point_set("samples", samples, problem.n)[0])
+
+
+def _start(family: Family, samples: Samples, seed: int) -> Array:
+    return find_spectral_start(family, samples) if isinstance(family, LinearFamily) else family.initial(seed)
+
+
+def _build_jacobians(family: Family, points: Array, theta: ca.MX) -> ca.MX:
+    """J_xi of every sample column by column, (r n, N)."""
+    N, n = points.shape
+    if isinstance(family, LinearFamily):
+        q = ca.SX.sym("q", n)
+        slopes = ca.Function("slopes", [q], [ca.densify(ca.jacobian(family.basis(q), q))])  # (K, n)
+        G = slopes.map(N)(ca.DM(points.T))  # (K, n N)
+        C = ca.reshape(theta, family.width, family.outputs).T
+        linear: ca.MX = ca.reshape(C @ G, family.outputs * n, N)
+        return linear
+    place = ca.MX.sym("q", n, N)
+    gradients = ca.Function("gradients", [place, theta], family.jacobian(place, theta))
+    by_component: list[Any] = gradients.call([ca.MX(ca.DM(points.T)), theta])
+    stacked: ca.MX = ca.vertcat(*(gradient[i, :] for i in range(n) for gradient in by_component))
+    return stacked
+
+
+def _map_loss(loss_of: "Loss", count: int) -> ca.Function:
+    """The loss of `count` samples side by side: J_xi (r n, N) and data as columns -> (1, N)."""
+    one = build_sample_loss(loss_of)
+    J = ca.SX.sym("J", loss_of.sizes.r * loss_of.sizes.n)
+    data = [ca.SX.sym(name, one.numel_in(1 + k)) for k, name in enumerate(loss_of.data)]
+    shaped = [ca.reshape(part, *one.size_in(1 + k)) for k, part in enumerate(data)]
+    value = one(ca.reshape(J, loss_of.sizes.r, loss_of.sizes.n), *shaped)
+    return ca.Function("losses", [J, *data], [value]).map(count)
+
+
+def _columns(part: Array) -> ca.DM:
+    """Data of samples (N, rows, columns) or (N, rows) as columns (entries, N), matrices column by column."""
+    flat = (part.transpose(0, 2, 1) if part.ndim == 3 else part).reshape(len(part), -1)
+    return ca.DM(flat.T)
+
+
+def _orientation(samples: Samples, J: Array, r: int) -> float:
+    """Orientation of coordinates with gradients J_xi, (r n, N)."""
+    return samples.orientation(J.T.reshape(len(samples), -1, r).transpose(0, 2, 1))
 
 
 @dataclass(frozen=True)
@@ -36,14 +158,14 @@ class Loss:
         Raises:
             UnknownNameError: if there is no term for a weight.
         """
-        positive = tuple((name, weight) for name, weight in weights.items() if weight > 0 and term_of(name))
+        positive = tuple((name, weight) for name, weight in weights.items() if weight > 0 and find_term(name))
         return cls(sizes, positive, exchanged)
 
     @cached_property
     def terms(self) -> tuple[tuple[LossTerm, float], ...]:
         """Loss terms with their weights, smooth ones first."""
-        known = [(term_of(name), weight) for name, weight in self.weights]
-        return tuple(sorted(known, key=lambda pair: pair[0].hinge))
+        terms = [(find_term(name), weight) for name, weight in self.weights]
+        return tuple(sorted(terms, key=lambda pair: pair[0].hinge))
 
     @cached_property
     def data(self) -> tuple[str, ...]:
@@ -118,6 +240,7 @@ class Loss:
         """The coordinates that each row of `written_out` depends on."""
         if self.volume_terms:
             return self.written_out._touched
+        # a row depends on the coordinates whose entries of J_xi are in its sparsity pattern
         J, data = self.arguments()
         by_entry = ca.jacobian(self.residuals(J, data), ca.vec(J)).sparsity()
         touched: list[set[int]] = [set() for _ in range(by_entry.size1())]
@@ -130,59 +253,52 @@ class Loss:
         return ca.SX.sym("J", self.sizes.r, self.sizes.n), self.symbols()
 
 
-def coordinates_of(rows: Sequence[Any], exchanged: Pairs) -> list[Any]:
-    """Rows with (a + b) / sqrt 2 and (b - a) / sqrt 2 in place of the rows a, b of each pair: a rotation."""
-    turned = list(rows)
-    for i, j in exchanged:
-        turned[i], turned[j] = (rows[i] + rows[j]) * 0.5**0.5, (rows[j] - rows[i]) * 0.5**0.5
-    return turned
-
-
 @cache
-def sample_loss(loss: Loss) -> ca.Function:
+def build_sample_loss(loss: Loss) -> ca.Function:
     """Loss of one sample (1, 1) as a function of J_xi (r, n) and the data in `Loss.symbols`."""
     J, data = loss.arguments()
-    return ca.Function("sample_loss", [J, *data], [ca.sumsqr(loss.residuals(J, data)) / 2])
+    return ca.Function("build_sample_loss", [J, *data], [ca.sumsqr(loss.residuals(J, data)) / 2])
 
 
 @cache
-def loss_with_slopes(loss: Loss) -> ColumnFunction:
-    """Loss of one sample (1, 1) and its derivative dL/dJ_xi (r, n), with the inputs of `sample_loss`."""
+def build_loss_with_slopes(loss: Loss) -> ColumnFunction:
+    """Loss of one sample (1, 1) and its derivative dL/dJ_xi (r, n), with the inputs of `build_sample_loss`."""
     J, data = loss.arguments()
     value = ca.sumsqr(loss.residuals(J, data)) / 2
     return ColumnFunction(ca.Function("loss", [J, *data], [value, ca.gradient(value, J)]))
 
 
 @cache
-def loss_columns(loss: Loss) -> "ColumnFunction | LossWithVolumes":
-    """Like `loss_with_slopes`, with volumes of many gradients by LAPACK."""
-    return LossWithVolumes(loss, loss_with_slopes) if loss.volume_terms else loss_with_slopes(loss)
+def build_loss_columns(loss: Loss) -> "ColumnFunction | LossWithVolumes":
+    """Like `build_loss_with_slopes`, with volumes of many gradients by LAPACK."""
+    return LossWithVolumes(loss, build_loss_with_slopes) if loss.volume_terms else build_loss_with_slopes(loss)
 
 
 @cache
-def value_columns(loss: Loss) -> "ColumnFunction | LossWithVolumes":
-    """Loss of one sample, with the inputs of `sample_loss`."""
+def build_value_columns(loss: Loss) -> "ColumnFunction | LossWithVolumes":
+    """Loss of one sample, with the inputs of `build_sample_loss`."""
 
     def written(part: Loss) -> ColumnFunction:
-        return ColumnFunction(sample_loss(part))
+        return ColumnFunction(build_sample_loss(part))
 
     return LossWithVolumes(loss, written, slopes=False) if loss.volume_terms else written(loss)
 
 
 @cache
-def residual_columns(loss: Loss) -> Callable[..., list[Array]]:
+def build_residual_columns(loss: Loss) -> Callable[..., list[Array]]:
     """Derivatives of the residuals of one sample with respect to J_xi, for the Gauss-Newton matrix.
 
-    The inputs are those of `sample_loss`. The outputs are, for every coordinate j, the derivative of `smooth_rows[j]`
-    with respect to row j of J_xi, (rows, n); then, for every hinge row and every volume term, the residual (1, 1) and
-    its derivative with respect to J_xi, (r, n).
+    The inputs are those of `build_sample_loss`. The outputs are, for every coordinate j, the derivative of
+    `smooth_rows[j]` with respect to row j of J_xi, (rows, n); then, for every hinge row and every volume term, the
+    residual (1, 1) and its derivative with respect to J_xi, (r, n).
     """
     if loss.volume_terms:
-        return LossWithVolumes(loss, residual_columns).residuals
+        return LossWithVolumes(loss, build_residual_columns).residuals
     J, data = loss.arguments()
     r, n = loss.sizes.r, loss.sizes.n
     rho = loss.residuals(J, data)
-    by_entry = ca.jacobian(rho, ca.vec(J))  # its columns are the entries of J_xi, column by column
+    # its columns are the entries of J_xi, column by column
+    by_entry = ca.jacobian(rho, ca.vec(J))
     outputs = [by_entry[list(loss.smooth_rows[j]), j::r] for j in range(r)]
     for row in loss.hinge_rows:
         outputs += [rho[row], ca.reshape(by_entry[row, :], r, n)]
@@ -190,14 +306,14 @@ def residual_columns(loss: Loss) -> Callable[..., list[Array]]:
 
 
 @cache
-def curvature_columns(loss: Loss) -> ColumnFunction:
+def build_curvature_columns(loss: Loss) -> ColumnFunction:
     """Second derivatives of the loss of one sample with respect to J_xi column by column, (n r, n r).
 
-    The inputs are those of `sample_loss`.
+    The inputs are those of `build_sample_loss`.
     """
     J, data = loss.arguments()
     column = ca.SX.sym("v", loss.sizes.r * loss.sizes.n)
-    value = sample_loss(loss)(ca.reshape(column, loss.sizes.r, loss.sizes.n), *data)
+    value = build_sample_loss(loss)(ca.reshape(column, loss.sizes.r, loss.sizes.n), *data)
     second = ca.Function("second", [column, *data], [ca.hessian(value, column)[0]])
     return ColumnFunction(ca.Function("curvature", [J, *data], [second(ca.vec(J), *data)]))
 
@@ -236,16 +352,16 @@ class LossWithVolumes:
             yield [self._run(own) for own in written]
 
     def residuals(self, J: Array, *data: Array) -> list[Array]:
-        """The outputs of `residual_columns`."""
+        """The outputs of `build_residual_columns`."""
         if self._written is None:
-            found = [np.empty((len(J), 0, COLUMNS)) for _ in range(self._loss.sizes.r)]
+            results = [np.empty((len(J), 0, COLUMNS)) for _ in range(self._loss.sizes.r)]
         else:
-            found = self._written(J, *(data[k] for k in self._places))
+            results = self._written(J, *(data[k] for k in self._places))
         for weight, term in self._loss.volume_terms:
             parts = [self._of_block(term, J[b], [array[b] for array in data]) for b in range(len(J))]
-            found.append(weight**0.5 * np.stack([rho[None] for rho, _ in parts]))
-            found.append(weight**0.5 * np.stack([slopes for _, slopes in parts]))
-        return found
+            results.append(weight**0.5 * np.stack([rho[None] for rho, _ in parts]))
+            results.append(weight**0.5 * np.stack([slopes for _, slopes in parts]))
+        return results
 
     def _run(self, written: Run | None) -> Run:
         def run(arguments: Sequence[Array], results: Sequence[Array]) -> None:
@@ -266,11 +382,12 @@ class LossWithVolumes:
         """Residuals (c,) of one block (n r, c), and their derivatives (n r, c)."""
         sizes, pairs = self._loss.sizes, self._loss.exchanged
         named = dict(zip(self._loss.data, data, strict=True))
-        rows = list(J.reshape(sizes.n, sizes.r, -1).transpose(1, 2, 0))  # r times (c, n)
+        # r times (c, n)
+        rows = list(J.reshape(sizes.n, sizes.r, -1).transpose(1, 2, 0))
         Z = named["null_basis"].reshape(sizes.r, sizes.n, -1).transpose(2, 1, 0)
         A = named.get("metric_inverse")
         metric_inverse = None if A is None else A.reshape(sizes.n, sizes.n, -1).transpose(2, 1, 0)
         turned = np.stack(coordinates_of(rows, pairs), axis=1)
-        rho, slopes = volume_hinges(turned, Z, metric_inverse, term.bound)
+        rho, slopes = term.hinges(turned, Z, metric_inverse)
         back = coordinates_of(list(slopes.transpose(1, 0, 2)), tuple((j, i) for i, j in pairs))
         return rho, np.ascontiguousarray(np.stack(back).transpose(2, 0, 1)).reshape(J.shape)

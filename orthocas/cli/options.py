@@ -1,0 +1,302 @@
+"""The options of all commands in one table, and what commands build from them: numbers, robots, problems, weights."""
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import astuple, dataclass, replace
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any, cast
+
+import numpy as np
+import typer
+
+from orthocas.errors import InvalidValueError, OptionError, UnknownNameError
+from orthocas.fitting.terms import DEFAULT_WEIGHTS, Angles, Weights
+from orthocas.robots.robot import Robot
+from orthocas.tasks.domains import default_box
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.regular_box import regular_box
+from orthocas.tasks.task import Task, list_task_kinds
+from orthocas.tools.checks import Array
+
+
+def parse_whole_number(text: str) -> int:
+    """Parse the value of an option that takes a whole number."""
+    try:
+        return int(text)
+    except ValueError:
+        raise typer.BadParameter(f"received {text!r}, expected a whole number") from None
+
+
+def parse_number(text: str) -> float:
+    """Parse the value of an option that takes a number."""
+    try:
+        return float(text)
+    except ValueError:
+        raise typer.BadParameter(f"received {text!r}, expected a number") from None
+
+
+# Options of several commands. An option of one command stands in its signature.
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace files of the same names that orthocas did not write.")]
+ChartPath = Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")]
+ProblemName = Annotated[str, typer.Argument(metavar="PROBLEM|FILE.urdf", help="A named problem or a URDF file.")]
+SampleCount = Annotated[
+    int | None,
+    typer.Option(
+        "--samples", parser=parse_whole_number, help="Number of training samples; default: from the problem size."
+    ),
+]
+WeightsText = Annotated[
+    str, typer.Option("--weights", help='"lambda1,lambda2", up to lambda5; "NAME=WEIGHT" for terms of your own.')
+]
+Limit = Annotated[
+    str | None,
+    typer.Option(
+        "--limit", help='Largest torque or speed, "50" or "50,40,..." per joint; default: the limits of the robot.'
+    ),
+]
+
+# Options that describe a robot and a problem: the fields of `ProblemOptions`. Commands say which of them they take.
+
+ROBOT = ("tip", "lock", "tool", "base", "gravity")
+CHAIN = (*ROBOT, "task", "metric")
+DOMAIN = ("centre", "home", "half_width", "least_singular_value")
+_PROBLEM_OPTIONS: dict[str, Any] = {
+    "tip": Annotated[
+        str | None,
+        typer.Option("--tip", help="Tip frame of a robot file, or LEFT,RIGHT; default: the end of its chain."),
+    ],
+    "lock": Annotated[
+        list[str] | None,
+        typer.Option(
+            "--lock", metavar="JOINT=VALUE", help="Lock a joint of a robot file at a value [rad or m]; repeat for more."
+        ),
+    ],
+    "tool": Annotated[
+        str | None,
+        typer.Option("--tool", help='Pose of a tool on the tip, "x,y,z" or "x,y,z,roll,pitch,yaw" [m, rad].'),
+    ],
+    "base": Annotated[
+        str | None, typer.Option("--base", help="Moving base of a robot file: planar, rail:x, floating, ...")
+    ],
+    "gravity": Annotated[
+        str | None,
+        typer.Option(
+            "--gravity",
+            help='Gravity in the axes of the base of a robot file, "x,y,z" [m/s^2]; default: that of an MJCF file, '
+            "or 0,0,-9.81.",
+        ),
+    ],
+    "task": Annotated[
+        str | None,
+        typer.Option("--task", help=f"Task: {', '.join(list_task_kinds())}; AXES such as xy, AXIS x, y or z."),
+    ],
+    "metric": Annotated[str | None, typer.Option("--metric", help="Metric: euclidean or inertia.")],
+    "centre": Annotated[str | None, typer.Option("--centre", help='Centre of the domain, "0,0.5,..." [rad or m].')],
+    "home": Annotated[
+        str | None,
+        typer.Option(
+            "--home", help="Named posture as centre of the domain, from an MJCF file or the SRDF beside a URDF."
+        ),
+    ],
+    "half_width": Annotated[
+        str | None,
+        typer.Option(
+            "--half-width", help='Half-width of the domain, "0.4" or one per joint [rad or m]; radius of a corridor.'
+        ),
+    ],
+    "least_singular_value": Annotated[
+        float | None,
+        typer.Option(
+            "--least-singular-value",
+            parser=parse_number,
+            help="Leave positions out of the domain where the task's relative singular value is smaller, such as 0.1.",
+        ),
+    ],
+}
+
+# Options of earlier versions, and what says the same now. Commands refuse them with these words.
+
+FORMER = {
+    "--branch": "the branch is named by --domain branch:NAME",
+    "--radius": "the radius of a corridor is --half-width",
+    "--precision": "the precision is set in Python: oc.fit(precision='single')",
+    "--scheduler": "the address of a scheduler is a value of --workers",
+    "--sphere": "use --obstacle sphere:X,Y,Z,RADIUS",
+    "--capsule": "use --obstacle capsule:X,Y,Z,X,Y,Z,RADIUS",
+    "--plane": "use --obstacle plane:NORMAL,POINT, with three numbers each",
+    "--gravity": "the gravity of a robot is an option of fit; whether a law compensates gravity: "
+    "codegen --gravity-compensation law or robot",
+    "--cycles": "a comparison has three cycles; oc.viewer.cyclic_motions takes their number",
+}
+
+
+@dataclass(frozen=True)
+class ProblemOptions:
+    """The command-line options that describe a problem."""
+
+    tip: str | None = None
+    lock: tuple[str, ...] = ()
+    tool: str | None = None
+    base: str | None = None
+    gravity: str | None = None
+    task: str | None = None
+    metric: str | None = None
+    centre: str | None = None
+    home: str | None = None
+    half_width: str | None = None
+    least_singular_value: float | None = None
+
+    def require_none(self, names: tuple[str, ...], reason: str) -> None:
+        """Raise OptionError with the reason if one of these options was given."""
+        for name in names:
+            if getattr(self, name) not in (None, ()):
+                raise OptionError(f"{reason}: leave out --{name.replace('_', '-')}")
+
+    def require_no_robot(self, owner: str) -> None:
+        """Raise OptionError if an option describes a robot, because `owner` has its own."""
+        self.require_none(ROBOT, f"{owner} has its own robot")
+
+    def build_robot(self, path: str) -> Robot:
+        """Build the joints of a robot file. Those that move no tip are locked.
+
+        Raises:
+            OrthocasError: if anything does not fit together.
+        """
+        tool = None if self.tool is None else parse_numbers("--tool", self.tool)
+        gravity = None if self.gravity is None else parse_numbers("--gravity", self.gravity)
+        tips = [name.strip() for name in (self.tip or "").split(",") if name.strip()]
+        return Robot.from_file(path, None, self.parse_locks(), tool, tips=tips, base=self.base, gravity=gravity)
+
+    def build_problem(self, name: str) -> Problem:
+        """Build the problem of a name, or of a robot file.
+
+        Raises:
+            UnknownNameError: if `name` is neither a named problem nor a robot file.
+            OrthocasError: if anything does not fit together.
+        """
+        from orthocas import problems  # builds arms, which commands on charts do not need
+
+        if is_robot_file(name):
+            robot = self.build_robot(name)
+            task = Task.named(robot, self.task or "position")
+            centre = self.find_centre(robot)
+            centre = regular_box(robot, task).centre if centre is None else centre
+            box = default_box(robot, centre, self.parse_half_width())
+            return Problem(robot, task, self.metric or "euclidean", box, Path(name).stem, self.least_singular_value)
+        if name not in problems.names():
+            raise UnknownNameError("problem", name, (*problems.names(), "or a FILE.urdf"))
+        base: Problem = problems.get(name)
+        if all(value in (None, ()) for value in astuple(self)):
+            return base
+        self.require_no_robot(f"the named problem '{name}'")
+        centre, parse_half_width, domain = self.find_centre(base.robot), self.parse_half_width(), base.domain
+        if centre is not None or parse_half_width is not None:
+            domain = default_box(base.robot, base.domain.centre if centre is None else centre, parse_half_width)
+        task = base.task if self.task is None else Task.named(base.robot, self.task)
+        metric = base.metric if self.metric is None else self.metric
+        return Problem(base.robot, task, metric, domain, name, self.least_singular_value)
+
+    def parse_locks(self) -> dict[str, float]:
+        """The joints and values of --lock."""
+        locked = {}
+        for word in self.lock:
+            joint, equals, value = word.rpartition("=")
+            if not (joint and equals):
+                raise InvalidValueError("--lock", word, "JOINT=VALUE")
+            locked[joint] = float(parse_numbers(f"--lock {joint}", value)[0])
+        return locked
+
+    def find_centre(self, robot: Robot) -> Array | None:
+        """The centre that --centre or --home gives; None without either."""
+        if self.home is None:
+            return None if self.centre is None else parse_numbers("--centre", self.centre)
+        if self.centre is not None:
+            raise OptionError("--home and --centre both give the centre of the domain: leave out one")
+        return robot.home(self.home)
+
+    def parse_half_width(self) -> Array | float | None:
+        """One number for all joints, or one per joint."""
+        return None if self.half_width is None else parse_one_or_all("--half-width", self.half_width)
+
+
+def is_robot_file(name: str) -> bool:
+    """Whether a PROBLEM argument means a robot file."""
+    return Path(name).suffix.lower() in (".urdf", ".xml", ".xacro")
+
+
+def add_problem_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """A decorator of commands: options of these names take the place of the parameter `words`, a `ProblemOptions`."""
+    options = {name: _PROBLEM_OPTIONS[name] for name in names}
+    return spread_options(
+        "words", options, lambda values: ProblemOptions(**{**values, "lock": tuple(values.get("lock") or ())})
+    )
+
+
+def spread_options(
+    parameter: str, options: Mapping[str, Any], build: Callable[[dict[str, Any]], Any]
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """A decorator of commands: options take the place of one parameter.
+
+    Args:
+        parameter: its name.
+        options: annotations of the options, by name; they are optional.
+        build: makes the parameter of the values of the options.
+    """
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        parameters: list[inspect.Parameter] = []
+        for part in inspect.signature(command).parameters.values():
+            if part.name != parameter:
+                parameters.append(part.replace(kind=part.KEYWORD_ONLY))
+                continue
+            for name, annotation in options.items():
+                parameters.append(inspect.Parameter(name, part.KEYWORD_ONLY, default=None, annotation=annotation))
+
+        @wraps(command)
+        def call(**values: Any) -> None:
+            own = {name: values.pop(name) for name in options}
+            command(**{parameter: build(own)}, **values)
+
+        # typer reads both
+        vars(call)["__signature__"] = inspect.Signature(parameters)
+        call.__annotations__ = {part.name: part.annotation for part in parameters}
+        return call
+
+    return decorate
+
+
+def parse_numbers(option: str, text: str, count: int | None = None) -> Array:
+    """Parse "0,0.5,...", with so many numbers if a count is given."""
+    words = [part.strip() for part in text.split(",")]
+    try:
+        numbers = np.array([float(word) for word in words])
+    except ValueError:
+        raise InvalidValueError(option, words, "an array of numbers") from None
+    if count is not None and len(numbers) != count:
+        raise InvalidValueError(option, repr(text)[:80], f"{'two' if count == 2 else count} numbers")
+    return numbers
+
+
+def parse_one_or_all(option: str, text: str) -> Array | float:
+    """Read "100" as a number, "100,50" as an array."""
+    numbers = parse_numbers(option, text)
+    return float(numbers[0]) if len(numbers) == 1 else numbers
+
+
+_WEIGHTS = ("task", "mutual", "regularity", "length", "folds")
+WEIGHTS_TEXT = ",".join(f"{getattr(DEFAULT_WEIGHTS, name):g}" for name in _WEIGHTS)
+
+
+def parse_weights(text: str, angles: str | None) -> Weights:
+    """Read two to five numbers and terms by name, such as "1000,30,quiet=5", with the kind of angles."""
+    words = [word.strip() for word in text.split(",")]
+    numbers = [float(value) for word in words if "=" not in word for value in parse_numbers("--weights", word)]
+    if not (2 <= len(numbers) <= 5 or (not numbers and text)):
+        raise InvalidValueError("--weights", repr(text), "two to five numbers, and NAME=NUMBER for terms of your own")
+    extra = {}
+    for name, _, value in (word.partition("=") for word in words if "=" in word):
+        extra[name.strip()] = float(parse_numbers(f"--weights {name}", value)[0])
+    return replace(Weights.of(numbers) if numbers else Weights(), extra=extra, angles=cast(Angles | None, angles))

@@ -1,0 +1,487 @@
+"""The stages of a wide fit: in each family a first descent, then rounds with the worst samples in the best one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from orthocas.bases.family import ArrayFamily, CombinableFamily, JointSpace, LinearFamily, Parametrisation
+from orthocas.charts.coordinates import Coordinates
+from orthocas.errors import InvalidValueError
+from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
+from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.like import Like, Meaning, QuadraticTerm, find_self_motion
+from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
+from orthocas.fitting.stages import Resampled, Stage, WeightedSum
+from orthocas.fitting.terms import RULES as LOSS
+from orthocas.fitting.terms import Weights
+from orthocas.solvers.adam import Adam
+from orthocas.solvers.lbfgs import LBFGS
+from orthocas.solvers.protocol import Objective, Solver, SolveResult
+from orthocas.tasks.domains import Box
+from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import NEGLIGIBLE, Samples, sample_boundary_weighted, sample_uniform
+from orthocas.tools.batch import one_blas_thread
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array
+from orthocas.tools.interrupts import deferred
+from orthocas.tools.progress import Monitor, Watch, silent
+
+
+@dataclass(frozen=True, slots=True)
+class WideRules:
+    """Numbers of wide fits. Chosen on iiwa and panda, held on eight arms."""
+
+    clearance: float = 0.1  #: default least relative singular value of the task
+    degree: int = 6  #: of polynomials that are linear in base and tool joints
+    degree_of_all: int = 5  #: of polynomials in which these count like all others
+    network: tuple[int, ...] = (64, 64, 64)  #: layers where polynomials leave out much
+
+    evenness: float = 0.03  #: weight of the mean squared logarithm of the lengths of gradients
+    uniform: float = 0.5  #: fraction of samples that are uniform; the others are boundary-weighted
+    per_term: int = 30  #: samples for each basis function
+    least_samples: int = 5000
+    most_samples: int = 20_000
+    network_samples: int = 100_000
+    near: float = 0.03  #: fraction of samples of networks that lie near the centre, and of the half-widths there
+    watched: int = 5000  #: samples on which the loss of a network is watched
+
+    iterations: int = 100  #: of the first descent
+    further: int = 60  #: iterations of each round with the worst samples
+    tolerance: float = 1e-6  #: of L-BFGS
+    ridge: float = 1e-8  #: of the matrix of mean products of gradients, relative
+    every: int = 4  #: steps through the samples that give this matrix
+    every_of_networks: int = 50  #: the same for the mean lengths of gradients of networks
+    rounds: int = 3  #: with the worst samples
+    fresh: int = 50_000  #: samples of which the worst join
+    worst: int = 5000
+    fresh_of_networks: int = 200_000
+    worst_of_networks: int = 30_000
+
+    held_out: int = 20_000  #: samples that evaluate coordinates
+    enough: float = 5e-4  #: fraction of bad positions, many near limits, that is as good as none
+    well: float = 0.28  #: over r, volume of all but 1 % of positions that is enough: a conditioning of 0.2
+    poor: float = 1e-3  #: fraction of bad positions above which another family is tried
+    poor_of_several: float = 4e-3  #: the same with r > 1
+    very_poor: float = 2e-2  #: fraction above which it is a network at once
+    still_poor: float = 6e-3  #: fraction above which it is a network after polynomials in all joints
+
+    first: int = 200  #: samples that scale coordinates
+    first_tag: int = 1000  #: their seed tag
+    tag: int = 3000  #: seed tag of the samples of a descent
+    uniform_tag: int = 1  #: of uniform samples, within tags
+    centre_tag: int = 2  #: of samples near the centre, within tags
+    held_out_tag: int = 3001
+    fresh_tag: int = 3002
+    counted_tag: int = 3003  #: of the positions of the branch that count for its share
+
+
+RULES = WideRules()
+_ADAM = Adam(epochs=8, steps=500, batch=512, learning_rate=1e-2)
+# Adam once the worst of fresh samples have joined
+_SLOWER = replace(_ADAM, learning_rate=5e-3)
+# the names of first stages begin with it
+_STAGE = "whole branch"
+
+
+@dataclass(frozen=True, eq=False)
+class WideSettings:
+    """What determines the result of a wide fit beside the problem and the families."""
+
+    samples: int | None = None  #: default: by the kind of family
+    seed: int = 0
+    monitor: Monitor = silent
+    weights: Weights | None = None  #: of terms that join the loss
+    meaning: Meaning | None = None  #: what xi means, for r = 1
+    quantities: Like | None = None  #: what the first coordinates follow, for r > 1
+
+
+@dataclass(frozen=True, eq=False)
+class WideSolution:
+    """Coordinates of one family, and how they were found."""
+
+    problem: Problem
+    coordinates: Coordinates  #: not normalised
+    solver: str  #: name of the minimiser, for the notes of the chart
+    samples: int
+    stages: tuple[Stage, ...]
+    misses_centre: bool = False  #: whether coordinates are not regular at the centre with the sign of the rest
+
+
+def search_families(searches: Sequence["Search"]) -> "Search":
+    """Search in the first family and, as long as results are poor, in others, then go on in the best one."""
+    first, *others = searches
+    first.begin(_STAGE)
+    missed, bad, _ = first.rank
+    if missed or bad > (RULES.poor if first.problem.r == 1 else RULES.poor_of_several):
+        networks = [search for search in others if not search.linear]
+        polynomials = [search for search in others if search.linear]
+        for search in (*networks, *polynomials) if bad > RULES.very_poor else (*polynomials, *networks):
+            search.begin(f"{_STAGE}, all joints" if search.linear else f"{_STAGE}, network")
+            missed, bad, _ = search.rank
+            if not missed and (not search.linear or bad <= RULES.still_poor):
+                break
+    best = find_best(searches)
+    best.go_on()
+    return best
+
+
+def find_best(searches: Sequence["Search"]) -> "Search":
+    """The search with the best coordinates so far."""
+    return min((search for search in searches if search.best is not None), key=lambda search: search.rank)
+
+
+class Search:
+    """A search for regular coordinates of one family on the nonsingular part of a branch.
+
+    The loss is that of `fit`, with the terms "volume" and "metric length" in place of angles::
+
+        L = mean_q [ max(0, 1 - v(q) / t)^2 + 0.03 sum_j log^2(l_j(q) / L_j) + terms of the user ] + meaning
+
+    Families that are linear in their parameters descend with L-BFGS from linear coordinates, in variables in which the
+    basis functions have orthonormal gradients in the mean. All others descend with Adam from a random start.
+
+    Args:
+        problem: the problem, on the nonsingular part of a branch.
+        parametrisation: the family.
+        settings: the rest.
+    """
+
+    def __init__(self, problem: Problem, parametrisation: Parametrisation, settings: WideSettings) -> None:
+        self.problem, self.parametrisation, self.settings = problem, parametrisation, settings
+        self.family = parametrisation.family(JointSpace.of(problem), problem.r)
+        self.linear = isinstance(self.family, LinearFamily)
+        wide = int(np.clip(RULES.per_term * self.family.width, RULES.least_samples, RULES.most_samples))
+        self.samples = settings.samples or (wide if self.linear else RULES.network_samples)
+        self.solver: Solver = LBFGS(RULES.iterations, RULES.tolerance) if self.linear else _ADAM
+        self.best: Array | None = None  #: parameters, (size,)
+        #: of the best: whether they miss the centre, fraction of bad positions, if too many, and minus their 1 % volume
+        self.rank = (True, np.inf, np.inf)
+        self.stages: list[Stage] = []
+        self._sign = 1.0  # of the volumes
+        # done: coordinates are as regular as they need to be
+        self._done = False
+
+    def begin(self, name: str) -> None:
+        """Look for coordinates, in a stage of some name."""
+        points = self.sample(self.samples, RULES.tag)
+        if self.linear:
+            self._samples = [sample_frames(self.problem, points)]
+            self._last = self._start_linear()
+            self._sign = 1.0 if self._evaluate_volumes(self._last, self._centre)[0] > 0 else -1.0
+            self._descend(name, "volume", self.solver)
+        else:
+            self._samples = [sample_frames(self.problem, np.vstack([points, self._sample_near_centre()]))]
+            self._last = self._start_at_random()
+            self._descend(name, "volume with the worst", self.solver)
+
+    def go_on(self) -> None:
+        """Descend with the worst of fresh samples, as long as coordinates are not regular enough and get better."""
+        if not self.linear:
+            if not self._done:
+                assert self.best is not None
+                self._last = self.best
+                self._add_worst(RULES.fresh_of_networks, RULES.worst_of_networks, RULES.fresh_tag)
+                self._descend("worst samples", "volume with the worst", _SLOWER)
+            return
+        for turn in range(1, 1 + RULES.rounds):
+            if self._done or self._last is not self.best:
+                return
+            self._add_worst(RULES.fresh, RULES.worst, RULES.fresh_tag + turn)
+            name = f"worst samples, round {turn} of {RULES.rounds}"
+            self._descend(name, "volume with the worst", LBFGS(RULES.further, RULES.tolerance))
+
+    @property
+    def solution(self) -> WideSolution:
+        """The best coordinates so far."""
+        assert self.best is not None
+        coordinates, stages = self.coordinates(self.best), tuple(self.stages)
+        return WideSolution(self.problem, coordinates, self.solver.name, self.samples, stages, self.rank[0])
+
+    def coordinates(self, theta: Array) -> Coordinates:
+        """Coordinates of parameters (size,), not normalised."""
+        r, space = self.problem.r, JointSpace.of(self.problem)
+        return Coordinates(self.parametrisation, space, (), theta, np.zeros(r), np.ones(r))
+
+    def sample(self, count: int, tag: int) -> Array:
+        """Samples: some uniform, like positions that count for the share, the others boundary-weighted."""
+        domain, seed, even = self.problem.domain, self.settings.seed, int(RULES.uniform * count)
+        uniform = sample_uniform(domain, even, (seed, tag, RULES.uniform_tag))
+        points = np.vstack([uniform, sample_boundary_weighted(domain, count - even, (seed, tag))])
+        points = points[is_on_side_of_centre(self.problem, points)]
+        if not len(points):
+            raise InvalidValueError("samples", count, "more: none lies on the centre's side of singular positions")
+        return points
+
+    def _sample_near_centre(self) -> Array:
+        """Nonsingular samples near the centre of the domain, whose sign decides which part of it is kept."""
+        domain = self.problem.domain
+        near, count = Box(domain.centre, RULES.near * domain.half_width), max(2, int(RULES.near * self.samples))
+        points = sample_uniform(near, count, (self.settings.seed, RULES.tag, RULES.centre_tag))
+        return np.asarray(points[domain.contains(points)])
+
+    def _start_linear(self) -> Array:
+        """The functions nearest to a^T q, with orthonormal a across the task at the centre, (size,).
+
+        The first ones are those of the gradients of quantities that coordinates follow.
+        """
+        problem, centre, some = self.problem, self.problem.domain.centre, self._samples[0][:: RULES.every]
+        X = self._basis.at(some.points)
+        # mean of dpsi_i/dq A^-1 dpsi_j/dq, (K, K)
+        inverse = np.eye(problem.n)[None] if some.metric_inverse is None else some.metric_inverse
+        root = np.broadcast_to(np.linalg.cholesky(inverse), (len(some), problem.n, problem.n))
+        parts = (self._basis.differentiate_along(X, root[:, :, i]) for i in range(problem.n))
+        energy = sum((G.T @ G for G in parts), start=np.zeros(())) / len(some)
+        self._factor = np.linalg.cholesky(energy + RULES.ridge * np.trace(energy) / len(energy) * np.eye(len(energy)))
+        # directions across the task at the centre; quantities to follow turn them
+        directions = scipy.linalg.null_space(self._centre.task_jacobian[0]).T
+        meaning, quantities, self._likeness = self.settings.meaning, self.settings.quantities, list[QuadraticTerm]()
+        if quantities is not None:
+            across = quantities.differentiate(centre[None])[0] @ directions.T  # (k, r)
+            Q, R = np.linalg.qr(np.vstack([across, np.eye(problem.r)]).T)
+            directions = (Q * np.where(R.diagonal() < 0, -1.0, 1.0)).T @ directions
+            self._likeness = quantities.hold(some, lambda a: self._basis.differentiate_along(X, a))
+        if meaning is not None:
+            directions = meaning.slope * find_self_motion(problem, centre)[None]
+            assert isinstance(self.family, LinearFamily)
+            self._likeness = [meaning.hold(self.family)] if meaning.fitted else []
+        # the combination of functions whose gradients are nearest to them in the mean
+        sides = [
+            self._basis.differentiate_along(X, np.broadcast_to(a, some.points.shape)).mean(axis=0) for a in directions
+        ]
+        return np.asarray(scipy.linalg.cho_solve((self._factor, True), np.array(sides).T).T.ravel())
+
+    def _start_at_random(self) -> Array:
+        """A random start, with gradients of length 1 in the mean as far as the family can scale them, (size,)."""
+        start, some = self.family.initial(self.settings.seed), self._samples[0][:: RULES.every_of_networks]
+        if not isinstance(self.family, CombinableFamily):
+            return start
+        J = self.coordinates(start).jacobian(some.points)
+        lengths = np.sqrt(np.einsum("srn,srn->sr", J, some.compute_metric_gradients(J)).mean(axis=0))
+        return self.family.combined(start, np.diag(1 / lengths))
+
+    def _add_worst(self, fresh: int, worst: int, tag: int) -> None:
+        """Let those of fresh samples join at which the last coordinates have the least volumes."""
+        points = self.sample(fresh, tag)
+        # matrices of all would take a gigabyte
+        parts = [sample_frames(self.problem, part) for part in np.array_split(points, -(-fresh // RULES.held_out))]
+        volumes = np.concatenate([self._sign * self._evaluate_volumes(self._last, part) for part in parts])
+        self._samples.append(sample_frames(self.problem, points[np.argsort(volumes)[:worst]]))
+
+    def _descend(self, name: str, volume: str, solver: Solver) -> None:
+        """Minimise from the last parameters, and keep the result if it is the best so far."""
+        count = sum(len(samples) for samples in self._samples)
+        with one_blas_thread():
+            if self.linear:
+                with deferred():
+                    objective = self._build_in_basis(volume)
+                start = objective.variables(self._last)
+                result = solver.minimise(objective, start, Watch(self.settings.monitor, name))
+                self._last = objective.parameters(result.theta)
+            else:
+                with deferred():
+                    resampled = self._build_resampled(self._choose_weights(volume))
+                result = solver.minimise(resampled, self._last, Watch(self.settings.monitor, name))
+                self._last = result.theta
+        self._take(name, replace(result, theta=self._last), count)
+
+    def _weigh_regularity(self, volume: str) -> dict[str, float]:
+        """Weights of our own terms, with the name of that of the volume. Terms add weight |rho|^2 / 2."""
+        target = LOSS.wide_volume if volume == "volume" else LOSS.worst_volume
+        weights = {volume: 2 / target**2, "metric length": 2 * RULES.evenness}
+        if not self.problem.metric.is_identity:
+            weights["euclidean volume"] = 2 / (LOSS.beyond * LOSS.least_volume / self.problem.r) ** 2
+        return weights
+
+    def _choose_weights(self, volume: str) -> Weights:
+        """Weights of all terms."""
+        own, users = self._weigh_regularity(volume), self.settings.weights
+        if users is None:
+            return Weights(0.0, 0.0, 0.0, 0.0, 0.0, own)
+        return replace(users, folds=0.0, extra={**own, **users.extra}).for_problem(self.problem)
+
+    def _build_in_basis(self, volume: str) -> "Orthonormal":
+        """The loss of a family that is linear in its parameters, on all samples so far, with terms of what xi means.
+
+        Terms of the user are means over the first samples. The worst ones only ask for regular coordinates.
+        """
+        weights = self._choose_weights(volume)
+        assert isinstance(self.family, LinearFamily)
+        # the mean loss over all samples: first ones and worst ones by their number
+        lengths = np.linalg.norm(self._last.reshape(self.problem.r, -1) @ self._factor, axis=1)
+        if len(self._samples) == 1:
+            first = BasisObjective(
+                self.family,
+                self._samples[0],
+                weights,
+                self._last,
+                self._draw,
+                gradients=self._basis,
+                orientation=self._sign,
+            )
+            self._objectives = [first]
+        else:
+            first, own = self._objectives[0].reweigh(weights), self._weigh_regularity(volume)
+            self._objectives = [first, *self._objectives[1:], first.elsewhere(self._samples[-1], own)]
+        count = sum(len(samples) for samples in self._samples)
+        parts: list[tuple[float, Objective]] = [
+            (len(samples) / count, objective)
+            for samples, objective in zip(self._samples, self._objectives, strict=True)
+        ]
+        if self._likeness:
+            parts.append((1.0, Likenesses(self._likeness, lengths)))
+        return Orthonormal(WeightedSum(parts), self._factor, lengths)
+
+    def _build_resampled(self, weights: Weights) -> Resampled:
+        """The loss of any other family, on samples drawn from all so far."""
+        samples = join_samples(self._samples)
+        self._samples = [samples]
+        whole: ArrayObjective | GraphObjective
+        common = samples, weights, self._last, self._draw
+        if isinstance(self.family, ArrayFamily):
+            whole = ArrayObjective(self.family, *common, single=True, orientation=self._sign)
+        else:
+            whole = GraphObjective(self.family, *common, orientation=self._sign)
+        return Resampled(whole, np.arange(0, len(samples), max(1, len(samples) // RULES.watched)), len(samples))
+
+    def _draw(self, count: int, seed: tuple[int, ...]) -> Samples:
+        points = sample_uniform(self.problem.domain, count, (self.settings.seed, RULES.tag, *seed))
+        return sample_frames(self.problem, points)
+
+    def _take(self, name: str, result: SolveResult, samples: int) -> None:
+        """Take the result of a stage, and keep its parameters if they are the best so far."""
+        theta, bound = result.theta, LOSS.least_volume / self.problem.r
+        self.stages.append(Stage(name, theta.size, samples, result))
+        # regular at the centre, and at all but few of other samples
+        at_centre, volumes = (
+            self._sign * self._evaluate_volumes(theta, samples) for samples in (self._centre, self._held_out)
+        )
+        missed, bad = bool(at_centre[0] <= bound), float(np.mean(volumes <= bound))
+        low = float(np.quantile(volumes, 0.01))
+        rank = missed, max(bad, RULES.enough), -low
+        if self.best is None or rank < self.rank:
+            self.best, self.rank = theta, rank
+        self._done = bad <= RULES.enough and low >= RULES.well / self.problem.r
+        result.require_finished()
+
+    def _evaluate_volumes(self, theta: Array, samples: Samples) -> Array:
+        """The volumes of `RegularPart` in the identity metric, (N,)."""
+        if self.linear:
+            C = theta.reshape(self.problem.r, -1)
+            J = self._basis.jacobian(self._basis.at(samples.points), C, len(samples))
+        else:
+            J = self.coordinates(theta).jacobian(samples.points)
+        # det of orthonormal task rows and unit gradients, by a basis across the task
+        unit = J / np.maximum(np.linalg.norm(J, axis=2, keepdims=True), LOSS.shortest)
+        Z = samples.null_basis
+        volumes = np.linalg.det(unit @ Z)
+        if samples.metric_inverse is not None:
+            volumes /= np.sqrt(np.linalg.det(Z.transpose(0, 2, 1) @ Z))
+        return np.asarray(volumes)
+
+    @cached_property
+    # built when this family is tried, and not before
+    def _basis(self) -> BasisGradients:
+        assert isinstance(self.family, LinearFamily)
+        return build_gradients(self.family, self.problem.n)
+
+    @cached_property
+    def _centre(self) -> Samples:
+        """The centre of the domain."""
+        return sample_frames(self.problem, self.problem.domain.centre[None])
+
+    @cached_property
+    def _held_out(self) -> Samples:
+        """Samples that evaluate coordinates."""
+        return sample_frames(self.problem, self.sample(RULES.held_out, RULES.held_out_tag))
+
+
+def is_on_side_of_centre(problem: Problem, points: Array) -> NDArray[np.bool_]:
+    """Whether points (N, n) are on the centre's side of singular positions, (N,), if r joints do not move the task."""
+    q, task = np.vstack([problem.domain.centre, points]), problem.task
+    J = task.batched_frame_jacobian(q)[0].reshape(len(q), task.m, problem.n)
+    moving = np.abs(J).max(axis=(0, 1)) > NEGLIGIBLE * np.abs(J).max()
+    if moving.sum() != task.m:
+        return np.ones(len(points), bool)
+    sides = np.linalg.det(J[:, :, moving]) > 0
+    return np.asarray(sides[1:] == sides[0])
+
+
+def sample_frames(problem: Problem, points: Array) -> Samples:
+    """Samples with the frame Jacobian, which half a turn of the tool does not spoil."""
+    J = problem.task.batched_frame_jacobian(points)[0].reshape(len(points), problem.task.m, problem.n)
+    inverse = None if problem.metric.is_identity else np.linalg.inv(problem.metric.evaluate(points))
+    return Samples(points, J, None if inverse is None else np.asarray(inverse))
+
+
+def join_samples(parts: Sequence[Samples]) -> Samples:
+    """All samples of several sets."""
+    inverses = [part.metric_inverse for part in parts if part.metric_inverse is not None]
+    return Samples(
+        np.concatenate([part.points for part in parts]),
+        np.concatenate([part.task_jacobian for part in parts]),
+        np.concatenate(inverses) if inverses else None,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Likenesses:
+    """The terms of what the first coordinates mean, for coefficients over the lengths of gradients."""
+
+    terms: Sequence[QuadraticTerm]
+    lengths: Array  #: (r,)
+
+    def value(self, theta: Array) -> float:
+        """Sum of the terms."""
+        return self.value_and_gradient(theta)[0]
+
+    def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
+        """The sum, and its derivative (size,)."""
+        C, value = theta.reshape(len(self.lengths), -1), 0.0
+        slopes = np.zeros(C.shape)
+        for k, (E, g, a) in enumerate(self.terms):
+            c, pull = self.lengths[k] * C[k], E @ (self.lengths[k] * C[k])
+            value += float(c @ pull - 2 * g @ c + a)
+            slopes[k] = 2 * self.lengths[k] * (pull - g)
+        return value, slopes.ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class Orthonormal:
+    """A loss of coefficients C (r, K) in variables in which basis functions have orthonormal gradients in the mean.
+
+    Variables are Y = diag(1 / lengths) C L, where L L^T is the mean of products of gradients. The loss is evaluated at
+    diag(1 / lengths) C: with gradients of length 1 in the mean, where the descent begins.
+    """
+
+    loss: Objective
+    factor: Array  #: L, lower triangular, (K, K)
+    lengths: Array  #: (r,)
+
+    def variables(self, theta: Array) -> Array:
+        """Variables of coefficients (size,)."""
+        C = theta.reshape(len(self.lengths), -1)
+        return np.asarray((C @ self.factor / self.lengths[:, None]).ravel())
+
+    def parameters(self, variables: Array) -> Array:
+        """Coefficients of variables (size,)."""
+        return np.asarray((self._coefficients(variables) * self.lengths[:, None]).ravel())
+
+    def value(self, variables: Array) -> float:
+        """The loss."""
+        return self.value_and_gradient(variables)[0]
+
+    def value_and_gradient(self, variables: Array) -> tuple[float, Array]:
+        """The loss and its derivative, (size,)."""
+        value, slopes = self.loss.value_and_gradient(self._coefficients(variables).ravel())
+        columns = slopes.reshape(len(self.lengths), -1).T
+        # numbers that are not finite are for the solver to report
+        solved = scipy.linalg.solve_triangular(self.factor, columns, lower=True, check_finite=False)
+        return value, np.asarray(solved).T.ravel()
+
+    def _coefficients(self, variables: Array) -> Array:
+        columns = variables.reshape(len(self.lengths), -1).T
+        solved = scipy.linalg.solve_triangular(self.factor, columns, lower=True, trans="T", check_finite=False)
+        return np.asarray(solved.T)

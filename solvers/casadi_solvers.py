@@ -1,0 +1,475 @@
+"""Solvers that come with CasADi: Ipopt, the gradient flow by CVODES, and the nodes that call NumPy from them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from orthocas.solvers.protocol import (
+    RULES,
+    BestPoint,
+    ConstrainedObjective,
+    LeastSquaresObjective,
+    Objective,
+    SmoothObjective,
+    SolveResult,
+    Status,
+)
+from orthocas.tools.cached import building
+from orthocas.tools.checks import Array, require_at_least, require_count
+from orthocas.tools.interrupts import check, deferred
+from orthocas.tools.progress import UNWATCHED, Watch
+
+_STATUS = {
+    "Solve_Succeeded": Status.CONVERGED,
+    "Solved_To_Acceptable_Level": Status.CONVERGED,
+    "Search_Direction_Becomes_Too_Small": Status.STALLED,
+    "Restoration_Failed": Status.STALLED,
+    "Maximum_Iterations_Exceeded": Status.ITERATION_LIMIT,
+    "Infeasible_Problem_Detected": Status.INFEASIBLE,
+}
+
+
+@dataclass(frozen=True)
+class Ipopt:
+    """Primal-dual interior-point method [WB2006]: Newton steps on the Lagrangian with a filter line search.
+
+    The Hessian is exact if the objective provides one and has up to 1,500 parameters; otherwise it is a limited-memory
+    approximation.
+
+    Args:
+        max_iterations: largest number of iterations.
+        tolerance: tolerance on the scaled optimality conditions.
+    """
+
+    max_iterations: int = 300
+    tolerance: float = 1e-6
+    name: str = "ipopt"
+
+    def __post_init__(self) -> None:
+        require_count("max_iterations", self.max_iterations)
+        require_at_least("tolerance", self.tolerance, 1e-300)
+
+    def coarser(self) -> "Ipopt":
+        """The same solver with a quarter of the iterations and a looser tolerance."""
+        return replace(self, max_iterations=max(1, self.max_iterations // 4), tolerance=max(1e-3, self.tolerance))
+
+    def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
+        """Minimise from theta0, subject to the objective's constraints if it has any."""
+        return _IpoptRun(self, objective, theta0, watch).result()
+
+
+class _IpoptRun:
+    """One minimisation: CasADi functions around the objective, and their results."""
+
+    def __init__(self, settings: Ipopt, objective: Objective, theta0: Array, watch: Watch) -> None:
+        self.settings, self.objective = settings, objective
+        self.constrained = objective if isinstance(objective, ConstrainedObjective) else None
+        self.best = BestPoint(objective, theta0, watch)
+        self.size = theta0.size
+        self._nodes: list[ArrayNode] = []
+        self._at: tuple[bytes, float, Array] | None = None
+        self._constraints_at: tuple[bytes, Array, Array] | None = None
+        self._count = 0
+        self._current = self.best.theta
+        # violation of the constraints
+        self._least = np.inf, self._current
+
+    def result(self) -> SolveResult:
+        """Minimise. If no point meets the constraints, theta is the point with the smallest violation."""
+        start = {"x0": ca.DM(self._current)}
+        if self.constrained:
+            start |= {name: ca.DM(bound) for name, bound in zip(("lbg", "ubg"), self.constrained.bounds, strict=True)}
+        try:
+            with deferred():
+                with building:
+                    solver = self._solver()
+                solver(**start)
+            for node in self._nodes:
+                node.reraise()
+        except KeyboardInterrupt:
+            if not self.best.found:
+                raise
+            return self.best.result(Status.INTERRUPTED)
+        return self._outcome(_STATUS.get(solver.stats()["return_status"], Status.STALLED))
+
+    def _outcome(self, status: Status) -> SolveResult:
+        if self.best.found or not np.isfinite(self._least[0]):
+            return self.best.result(status)
+        self.best.theta = self._least[1]
+        return replace(self.best.result(Status.INFEASIBLE), status=status)
+
+    def _solver(self) -> ca.Function:
+        x, p = ca.MX.sym("x", self.size), ca.MX.sym("p", 0)
+        value = self._node("f", [self.size], [(1, 1)], lambda theta: [self._evaluate(theta)[0]])
+        both = self._node("grad_f", [self.size], [(1, 1), (self.size, 1)], self._evaluate)
+        problem: dict[str, Any] = {"x": x, "f": value(x)}
+        options: dict[str, Any] = {"grad_f": ca.Function("nlp_grad_f", [x, p], list(both(x)))}
+        if self.constrained:
+            rows = len(self.constrained.bounds[0])
+            constraints, jacobian = (
+                self._node("g", [self.size], [(rows, 1)], lambda theta: [self._constraints(theta)[0]]),
+                self._node("jac_g", [self.size], [(rows, 1), (rows, self.size)], self._constraints),
+            )
+            problem["g"] = constraints(x)
+            options["jac_g"] = ca.Function("nlp_jac_g", [x, p], list(jacobian(x)))
+        options |= self._hessian_options(x, p)
+        options |= {
+            "iteration_callback": self._watcher(),
+            "print_time": False,
+            "error_on_fail": False,
+            "show_eval_warnings": False,
+            "no_nlp_grad": True,
+        }
+        settings = {
+            "print_level": 0,
+            "sb": "yes",
+            "tol": self.settings.tolerance,
+            "mu_init": RULES.barrier,
+            "max_iter": self.settings.max_iterations,
+        }
+        options |= {f"ipopt.{name}": value for name, value in settings.items()}
+        return ca.nlpsol("ipopt", "ipopt", problem, options)
+
+    def _hessian_options(self, x: ca.MX, p: ca.MX) -> dict[str, Any]:
+        """An exact Hessian of the Lagrangian, or the limited-memory approximation."""
+        known = self.constrained or isinstance(self.objective, SmoothObjective)
+        if not known or self.size > RULES.exact_hessian:
+            return {"ipopt.hessian_approximation": "limited-memory", "ipopt.limited_memory_max_history": 20}
+        rows = len(self.constrained.bounds[0]) if self.constrained else 0
+        lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", rows)
+        node = self._node("hessian", [self.size, 1, rows], [(self.size, self.size)], self._hessian)
+        upper = ca.triu(node(x, lam_f, lam_g))
+        return {"hess_lag": ca.Function("nlp_hess_l", [x, p, lam_f, lam_g], [upper])}
+
+    def _node(self, name: str, rows: list[int], shapes: list[tuple[int, int]], compute: Any) -> "ArrayNode":
+        node = ArrayNode(name, rows, shapes, compute)
+        self._nodes.append(node)
+        return node
+
+    def _evaluate(self, theta: Array) -> tuple[float, Array]:
+        """Value and gradient; cached, because Ipopt asks for them one after the other at the same point."""
+        key = theta.tobytes()
+        if self._at is None or self._at[0] != key:
+            value, gradient = self.objective.value_and_gradient(theta)
+            self.best.evaluations += 1
+            self._at, self._current = (key, value, gradient), theta
+            violation = self._violation(theta) if np.isfinite(value) else np.inf
+            if violation < self._least[0]:
+                self._least = violation, theta
+            if violation <= RULES.feasible:
+                self.best.offer(theta, value)
+        return self._at[1], self._at[2]
+
+    def _constraints(self, theta: Array) -> tuple[Array, Array]:
+        """Values and Jacobian; cached, because Ipopt asks for them several times at the same point."""
+        assert self.constrained is not None
+        key = theta.tobytes()
+        if self._constraints_at is None or self._constraints_at[0] != key:
+            self._constraints_at = key, *self.constrained.constraints(theta)
+        return self._constraints_at[1], self._constraints_at[2]
+
+    def _violation(self, theta: Array) -> float:
+        """Largest constraint violation; 0 without constraints."""
+        if self.constrained is None:
+            return 0.0
+        lower, upper = self.constrained.bounds
+        values = self._constraints(theta)[0]
+        return float(np.maximum(np.maximum(lower - values, values - upper), 0).max())
+
+    def _hessian(self, theta: Array, factor: Array, multipliers: Array) -> list[Array]:
+        if self.constrained:
+            return [self.constrained.lagrangian_hessian(theta, float(factor[0]), multipliers)]
+        assert isinstance(self.objective, SmoothObjective)
+        return [factor[0] * self.objective.hessian(theta)]
+
+    def _watcher(self) -> ca.Callback:
+        """A callback that Ipopt calls at the start and after every iteration; an error stops Ipopt."""
+        rows = [ca.nlpsol_out(i) for i in range(ca.nlpsol_n_out())]
+        lengths = {"x": self.size, "f": 1, "g": self._rows(), "lam_x": self.size, "lam_g": self._rows()}
+        node = ArrayNode("watch", [lengths.get(name, 0) for name in rows], [(1, 1)], self._iterated)
+        self._nodes.append(node)
+        return node
+
+    def _rows(self) -> int:
+        return len(self.constrained.bounds[0]) if self.constrained else 0
+
+    def _iterated(self, *_: Array) -> list[float]:
+        if self._count:
+            self.best.next_iteration(self.settings.max_iterations)
+        self._count += 1
+        return [1.0 if any(node.error for node in self._nodes) else 0.0]
+
+
+@dataclass(frozen=True)
+class GradientFlow:
+    """Follows the path of steepest descent: slow, but with the same limit as gradient descent with tiny steps.
+
+    Time is divided into intervals, each twice as long as the previous one. The flow is stiff, so CVODES takes implicit
+    BDF steps. Their Jacobian is the Hessian if the objective has one, or else the Gauss-Newton matrix. If it has
+    neither, as for networks, a Krylov method uses finite differences of the gradient.
+
+    A run ends as STALLED where an interval needs more than `max_steps` steps. In networks that happens long before a
+    minimum: where the loss curves downwards, no step can be longer than the time in which neighbours move apart.
+
+    Args:
+        max_iterations: largest number of intervals.
+        tolerance: stop when the loss falls by less than this fraction in an interval.
+        accuracy: relative tolerance of the integration.
+        max_steps: largest number of steps in an interval. Default: 500 with a matrix; 50 without, where a step takes
+            tens of gradients.
+    """
+
+    max_iterations: int = 60
+    tolerance: float = 1e-3
+    accuracy: float = 1e-3
+    max_steps: int | None = None
+    name: str = "gradient_flow"
+
+    def __post_init__(self) -> None:
+        require_count("max_iterations", self.max_iterations)
+        require_at_least("tolerance", self.tolerance, 0)
+        require_at_least("accuracy", self.accuracy, 1e-14)
+        if self.max_steps is not None:
+            require_count("max_steps", self.max_steps)
+
+    def coarser(self) -> "GradientFlow":
+        """The same solver with ten times the tolerance."""
+        return replace(self, tolerance=10 * self.tolerance)
+
+    def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
+        """Follow the flow from theta0."""
+        run = _Flow(self, objective, theta0, watch)
+        return run.best.run(run.iterate)
+
+
+class _Flow:
+    """State of one flow."""
+
+    def __init__(self, settings: GradientFlow, objective: Objective, theta0: Array, watch: Watch) -> None:
+        self.settings, self.objective = settings, objective
+        self.best = BestPoint(objective, theta0, watch)
+        self.theta = np.array(theta0, dtype=float)
+        self.value, self.stretch = np.nan, 0.0
+        # of the theta that the flow starts from
+        self.scale = float(np.abs(self.theta).max() or 1.0)
+        self.direct = isinstance(objective, SmoothObjective | LeastSquaresObjective)
+        self._last = np.full_like(self.theta, np.nan), self.theta
+        self._kept, self._uses = (self._last[0], np.empty((0, 0))), 0
+
+    def iterate(self) -> Status:
+        best, limit = self.best, self.settings.max_iterations
+        status = self._start()
+        if status is not None:
+            return status
+        with deferred(), building:
+            node = self._flow_node()
+            integrator = self._integrator(node)
+        while best.iterations < limit:
+            if not self._advance(integrator, node):
+                return Status.STALLED
+            before, self.value = self.value, self.objective.value(self.theta)
+            best.evaluations += 1
+            if not np.isfinite(self.value):
+                return Status.STALLED
+            best.offer(self.theta, self.value)
+            self.stretch *= 2
+            converged = before - self.value <= self.settings.tolerance * before and best.iterations >= 5
+            best.next_iteration(limit)
+            if converged:
+                return Status.CONVERGED
+        return Status.ITERATION_LIMIT
+
+    def _start(self) -> Status | None:
+        """Choose the first stretch; a status if there is nowhere to flow."""
+        self.value, gradient = self.best.value_and_gradient(self.theta)
+        if not np.isfinite(self.value):
+            return Status.FAILED
+        if not np.any(gradient):
+            return Status.CONVERGED
+        self.stretch = (
+            RULES.first_interval * max(float(np.linalg.norm(self.theta)), 1e-3) / float(np.linalg.norm(gradient))
+        )
+        return None
+
+    def _advance(self, integrator: ca.Function, node: "ArrayNode") -> bool:
+        """Follow the flow for one interval, and return whether the integrator reached the end."""
+        self._uses = RULES.most_uses  # a new Jacobian
+        try:
+            with deferred():
+                end = integrator(x0=self.theta, p=self.stretch)["xf"]
+        except RuntimeError:
+            node.reraise()
+            return False
+        node.reraise()
+        self.theta = np.asarray(end.nonzeros())
+        return bool(np.isfinite(self.theta).all())
+
+    def _flow_node(self) -> "ArrayNode":
+        """-grad L as a CasADi function, with a Jacobian."""
+        size = self.theta.size
+        if not self.direct:
+            along = ArrayNode("flow_along", [size, size], [(size, 1)], lambda *at: [self._curvature_along(*at)])
+            return ArrayNode("flow", [size], [(size, 1)], lambda theta: [self._descent(theta)], forward=along)
+        jacobian = ArrayNode("flow_jacobian", [size], [(size, size)], lambda theta: [-self._curvature(theta)])
+        return ArrayNode("flow", [size], [(size, 1)], lambda theta: [self._descent(theta)], jacobian=jacobian)
+
+    def _descent(self, theta: Array) -> Array:
+        self._last = theta, -self.best.value_and_gradient(theta)[1]
+        return self._last[1]
+
+    def _curvature(self, theta: Array) -> Array:
+        """The Hessian or the Gauss-Newton matrix at theta, or near it. CVODES asks for it twice in a row."""
+        at, kept = self._kept
+        self._uses += 1
+        if self._uses <= RULES.most_uses and np.linalg.norm(theta - at) <= RULES.moved * np.linalg.norm(theta):
+            return kept
+        objective = self.objective
+        if isinstance(objective, SmoothObjective):
+            matrix = objective.hessian(theta)
+        else:
+            assert isinstance(objective, LeastSquaresObjective)
+            matrix = objective.normal_equations(theta)[2]
+        self._kept, self._uses = (theta, matrix), 0
+        return matrix
+
+    def _curvature_along(self, theta: Array, direction: Array) -> Array:
+        """Change of the descent along a direction, by one finite difference."""
+        length = float(np.linalg.norm(direction))
+        if length == 0:
+            return np.zeros_like(direction)
+        step = RULES.difference * max(float(np.linalg.norm(theta)), 1.0) / length
+        at, here = self._last
+        if not np.array_equal(at, theta):
+            here = -self.best.value_and_gradient(theta)[1]
+        change: Array = (-self.best.value_and_gradient(theta + step * direction)[1] - here) / step
+        return change
+
+    def _integrator(self, node: "ArrayNode") -> ca.Function:
+        x, stretch = ca.MX.sym("x", self.theta.size), ca.MX.sym("stretch")
+        system: dict[str, Any] = {"x": x, "p": stretch, "ode": stretch * node(x)}
+        options: dict[str, Any] = {
+            "reltol": self.settings.accuracy,
+            "abstol": self.settings.accuracy * 1e-2 * self.scale,
+            "newton_scheme": "direct" if self.direct else "gmres",
+            "max_num_steps": self.settings.max_steps or (500 if self.direct else 50),
+            "disable_internal_warnings": True,
+        }
+        if self.direct:
+            options["linear_solver"] = "lapacklu"
+        return ca.integrator("flow", "cvodes", system, 0.0, 1.0, options)
+
+
+class ArrayNode(ca.Callback):
+    """A function of columns whose outputs are computed in NumPy.
+
+    Exceptions, Ctrl-C included, cannot pass through the code of the solver. The node keeps an exception in `error` and
+    fails this evaluation and all later ones, so that the solver soon gives up.
+
+    Args:
+        name: name of the function.
+        rows: length of each input column.
+        shapes: shape of each output.
+        compute: maps arrays (rows,) to one array per output.
+        options: options of the CasADi function.
+        jacobian: derivative of the single output with respect to the single input, for solvers that need it.
+        forward: directional derivative, as a function of input and direction; avoids a dense Jacobian.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        rows: Sequence[int],
+        shapes: Sequence[tuple[int, int]],
+        compute: Callable[..., Sequence[Any]],
+        options: dict[str, Any] | None = None,
+        jacobian: "ArrayNode | None" = None,
+        forward: "ArrayNode | None" = None,
+    ) -> None:
+        ca.Callback.__init__(self)
+        self._rows, self._shapes, self._compute, self._jacobian = tuple(rows), tuple(shapes), compute, jacobian
+        self._forward = forward
+        self.error: BaseException | None = None
+        self.construct(name, options or {})
+
+    def get_n_in(self) -> int:
+        """Number of input columns."""
+        return len(self._rows)
+
+    def get_n_out(self) -> int:
+        """Number of outputs."""
+        return len(self._shapes)
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
+        """Dense columns."""
+        return ca.Sparsity.dense(self._rows[i], 1)
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
+        """Dense."""
+        return ca.Sparsity.dense(*self._shapes[i])
+
+    def has_eval_buffer(self) -> bool:
+        """Whether to use buffers; they avoid a second copy."""
+        return True
+
+    def eval_buffer(self, arg: Sequence[Any], res: Sequence[Any]) -> int:
+        """Evaluate the outputs; the return value 1 means to CasADi that the evaluation failed."""
+        if self.error is not None:
+            return 1
+        try:
+            check()
+            results = self._compute(*(self._array(i, memory) for i, memory in enumerate(arg)))
+            for memory, result in zip(res, results, strict=True):
+                if memory is not None:
+                    np.frombuffer(memory)[:] = np.asarray(result, dtype=float).ravel(order="F")
+        except BaseException as error:
+            self.error = error
+            return 1
+        return 0
+
+    def _array(self, i: int, memory: Any) -> Array:
+        """Input i as an array; CasADi passes None for zeros."""
+        return np.zeros(self._rows[i]) if memory is None else np.frombuffer(memory).copy()
+
+    def has_jacobian(self) -> bool:
+        """Whether a derivative was given."""
+        return self._jacobian is not None
+
+    def get_jacobian(
+        self, name: str, inames: Sequence[str], onames: Sequence[str], opts: Mapping[str, Any]
+    ) -> ca.Function:
+        """The derivative in CasADi's form, as a function of the inputs and an unused output."""
+        if self._jacobian is None:
+            raise NotImplementedError(name)
+        inputs = [ca.MX.sym("x", rows) for rows in self._rows]
+        unused = ca.MX.sym("y", *self._shapes[0])
+        return ca.Function(name, [*inputs, unused], [self._jacobian(*inputs)], list(inames), list(onames), dict(opts))
+
+    def has_forward(self, nfwd: int) -> bool:
+        """Whether a directional derivative was given."""
+        return self._forward is not None and nfwd == 1
+
+    def get_forward(
+        self, nfwd: int, name: str, inames: Sequence[str], onames: Sequence[str], opts: Mapping[str, Any]
+    ) -> ca.Function:
+        """The directional derivative in CasADi's form, as a function of input, an unused output and direction."""
+        if self._forward is None:
+            raise NotImplementedError(name)
+        x, unused, direction = (ca.MX.sym(letter, self._rows[0]) for letter in "xyd")
+        outputs = [self._forward(x, direction)]
+        return ca.Function(name, [x, unused, direction], outputs, list(inames), list(onames), dict(opts))
+
+    def has_jac_sparsity(self, oind: int, iind: int) -> bool:
+        """Whether the sparsity of the Jacobian is known without building the Jacobian."""
+        return self._forward is not None
+
+    def get_jac_sparsity(self, oind: int, iind: int, symmetric: bool) -> ca.Sparsity:
+        """An empty pattern, because a Krylov method uses only products with the Jacobian."""
+        return ca.Sparsity(self._shapes[oind][0], self._rows[iind])
+
+    def reraise(self) -> None:
+        """Raise the exception that stopped an evaluation, if any."""
+        if self.error is not None:
+            raise self.error
