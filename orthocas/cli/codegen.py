@@ -8,8 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from orthocas.charts.chart import Chart
-from orthocas.cli.codegen import CONTROLLERS, Limit, add_law_options, build_controller, require_settings
-from orthocas.cli.output import AsJson, Force, note, print_json, print_rows
+from orthocas.cli.options import AsJson, ChartPath, Force, Limit, parse_one_or_all, spread_options
+from orthocas.cli.output import note, print_json, print_rows
 from orthocas.codegen.check import AgreementCheck, check_c
 from orthocas.codegen.export import LIBRARIES
 from orthocas.codegen.export import export as export_chart
@@ -20,6 +20,35 @@ from orthocas.tools.interrupts import deferred
 
 CONTROLLERS = law_names()
 _NONE = "none"
+
+
+def add_law_options(for_codegen: bool) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """A decorator of commands: the settings of all laws, as options, take the place of the parameter `settings`.
+
+    The command gets those that were given, by name, as texts.
+    """
+    options = {
+        name: Annotated[str | None, typer.Option(_name_option(name, setting), help=_describe_option(name, setting))]
+        for law in map(law_of, law_names())
+        for name, setting in law.options.items()
+        if for_codegen or not setting.codegen_only
+    }
+    return spread_options(
+        "settings", options, lambda values: {name: text for name, text in values.items() if text is not None}
+    )
+
+
+def _name_option(name: str, setting: Setting) -> str:
+    return setting.option or f"--{name.replace('_', '-')}"
+
+
+def _describe_option(name: str, setting: Setting) -> str:
+    takers = _find_laws_with(name)
+    return setting.help + ("" if len(takers) == len(law_names()) else f" For {', '.join(takers)}.")
+
+
+def _find_laws_with(setting: str) -> list[str]:
+    return [law for law in law_names() if setting in law_of(law).options]
 
 
 @add_law_options(for_codegen=True)

@@ -12,20 +12,7 @@ from orthocas.bases.family import Parametrisation
 from orthocas.bases.registry import parse_parametrisation
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.quality import Report, evaluate
-from orthocas.cli.evaluate import build_reach_data, format_reach_rows
-from orthocas.cli.output import (
-    AsJson,
-    Force,
-    format_report_rows,
-    note,
-    number,
-    parse_whole_number,
-    print_json,
-    print_rows,
-    terminal_monitor,
-)
-from orthocas.cli.problem_argument import (
-    BRANCH,
+from orthocas.cli.options import (
     CHAIN,
     DOMAIN,
     WEIGHTS_TEXT,
@@ -40,17 +27,24 @@ from orthocas.cli.problem_argument import (
     parse_number,
     parse_weights,
     parse_whole_number,
-    suggested,
-    wide_fit,
+)
+from orthocas.cli.output import (
+    build_reach_data,
+    format_reach_rows,
+    format_report_rows,
+    note,
+    print_json,
+    print_rows,
+    terminal_monitor,
 )
 from orthocas.control.gains import find_holding_doubts
 from orthocas.errors import BranchWarning, Interrupted, InvalidValueError, OptionError
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
-from orthocas.fitting.probe import Bounds
-from orthocas.fitting.settings import PRECISIONS, Precision, choose_parametrisation
-from orthocas.fitting.suggest_domain import CONDITIONING, LEAK_DEG, DomainSuggestion
-from orthocas.fitting.wide import WideFit
+from orthocas.fitting.settings import choose_parametrisation
+from orthocas.fitting.suggest_domain import CONDITIONING, LEAK_DEG, DomainSuggestion, suggest_domain
+from orthocas.fitting.terms import Weights
+from orthocas.fitting.wide import CLEARANCE, WideFit, fit_wide
 from orthocas.paths.chart_along import RADIUS, corridor_problem
 from orthocas.robots.robot import Robot
 from orthocas.solvers import get as get_solver
@@ -70,7 +64,7 @@ _IN_CORRIDOR = "polynomial:3:cyclic"  # more terms gain little there
 _WIDE_ROWS = ("regular", "left out", "meaning")  # facts of wide fits
 
 
-@parse_whole_number(*CHAIN, *DOMAIN, "least_singular_value")
+@add_problem_options(*CHAIN, *DOMAIN)
 def fit(
     problem: ProblemName,
     words: ProblemOptions,
@@ -334,63 +328,11 @@ def _save_and_report(
         raise typer.Exit(INTERRUPTED)
 
 
-def _require_none(given: dict[str, Any]) -> None:
-    """Raise OptionError for options that wide charts do not have."""
-    for option, value in given.items():
-        if value is not None:
-            raise OptionError(f"--domain branch has a solver of its own: leave out --{option}")
-
-
-def _confirming(
-    suggestion: DomainSuggestion | None, built: Problem, parametrisation: Parametrisation | None
-) -> Fit | None:
-    """The fit that confirmed the domain, if it has the family that is asked for."""
-    default = choose_parametrisation(built, True) == choose_parametrisation(built, False)
-    if suggestion is None or (parametrisation is None and not default):
-        return None
-    return replace(suggestion.fit, chart=replace(suggestion.fit.chart, problem=built))
-
-
-def _corridor_or_box(name: str, options: ProblemOptions, path: Path | None, radius: float | None) -> Problem:
-    """The problem of a command line, near the postures of a file if one is given.
-
-    Raises:
-        OrthocasError: if anything does not fit together.
-    """
-    if path is None:
-        if radius is not None:
-            raise OptionError("--radius requires --corridor")
-        return build_problem(name, options)
-    for option in ("centre", "home", "half_width", "least_singular_value"):
-        value = getattr(options, option)
-        if value is not None:
-            raise OptionError(f"--corridor is a domain: leave out --{option.replace('_', '-')}")
-    known = build_problem(name, options)
-    return corridor_problem(known, read_postures(path, known.robot), RADIUS if radius is None else radius)
-
-
-def _bounds(
-    domain: str | None, leak_deg: float | None, conditioning: float | None, corridor: Path | None
-) -> Bounds | None:
-    """What --domain auto asks for; None without it."""
-    if domain is not None and corridor is not None:
-        raise OptionError("--corridor is a domain: leave out --domain")
-    given = {"--leak-deg": leak_deg, "--conditioning": conditioning}
-    if domain in (None, BRANCH):
-        for option, value in given.items():
-            if value is not None:
-                raise OptionError(f"{option} requires --domain auto")
-        return None
-    if domain != "auto":
-        raise InvalidValueError(
-            "--domain", repr(domain), "auto, branch, or --centre and --half-width for a box of your own"
-        )
-    return Bounds(LEAK_DEG if leak_deg is None else leak_deg, CONDITIONING if conditioning is None else conditioning)
-
-
-def _rows(result: Fit, report: Report, target: Path) -> dict[str, str]:
+def _format_fit(result: Fit, report: Report, target: Path) -> dict[str, str]:
+    """What a fit prints."""
     coordinates, robot = result.chart.coordinates, result.chart.problem.robot
-    rows = report.facts() if isinstance(result, WideFit) else format_report_rows(report)  # wide fits have no --weights
+    # Wide fits have no --weights.
+    rows = report.facts() if isinstance(result, WideFit) else format_report_rows(report)
     rows["robot"] = f"{robot.n} joints, {'tip' if len(robot.tips) == 1 else 'tips'} {listed(robot.tips)}"
     rows["fit"] = f"{coordinates.label}, {result.seconds:.2f} s, {result.status.value}"
     if isinstance(result, WideFit) and result.branch is not None:

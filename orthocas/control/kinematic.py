@@ -20,7 +20,13 @@ from orthocas.control.controller import (
     guarded_graph,
     named_inputs,
 )
-from orthocas.control.gains import FEEDBACK, LIMIT, RULES, command_limit, non_negative_gains
+from orthocas.control.gains import (
+    FEEDBACK,
+    LIMIT,
+    RULES,
+    command_limit,
+    non_negative_gains,
+)
 from orthocas.control.linear_algebra import build_block_inertia, compute_median_volume
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.robots.tree import require_driven

@@ -109,11 +109,11 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
     def _compute_target(self, q: Array, change: Array) -> Array:
         """phi at a change from q."""
         phi, m = self.chart.phi(q), self.chart.m
-        wanted = np.array(phi + change)
+        target = np.array(phi + change)
         if self.chart.parts.relative.turned:
             none = np.zeros(m)
-            wanted[:m] = np.array(self.chart.parts.relative.moved(phi[:m], change[:m], phi[:m], none, none)[0]).ravel()
-        return wanted
+            target[:m] = np.array(self.chart.parts.relative.moved(phi[:m], change[:m], phi[:m], none, none)[0]).ravel()
+        return target
 
     def _read_joints(self) -> Array:
         positions = as_float_array("positions", self._positions(self.env))

@@ -13,7 +13,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.phi import counted_on
 from orthocas.charts.self_motion import Walls, xi_range
 from orthocas.errors import InvalidValueError, PathError, SolveError
-from orthocas.paths.joint_curve import JointCurve, Lost, Solver, TimeLaw, fastest, list_places
+from orthocas.paths.joint_curve import JointCurve, LostCurve, PhiSolver, TimeLaw, compute_fastest_law, list_places
 from orthocas.paths.joint_motion import JointMotion, Margins
 from orthocas.paths.tool_path import RULES, ToolPath
 from orthocas.robots.obstacles import LinkDistances, Obstacle
@@ -27,288 +27,6 @@ from orthocas.tools.columns import BlockedFunction
 
 HOLD = "hold"
 OBJECTIVE = "objective"
-_TO_FULL_SPEED = 0.5  # [s] that a joint takes to its velocity limit with the default acceleration limits
-_STRETCHES, _MARGIN = 20, 1.001  # how often time is stretched, and a little more than needed
-_INSTANTS = 2001  # at which the limits are kept besides
-_MOST_STAMPS = 1_000_000
-_RETURNS = 1e-8  # of phi, relative to its sizes: a path ends where it began
-
-
-@dataclass(frozen=True, eq=False)
-class Limits:
-    """What a motion has to keep."""
-
-    chart: "Chart"
-    velocity: Array  #: (n,) [rad/s] or [m/s]
-    acceleration: Array  #: (n,) [rad/s^2] or [m/s^2]
-    distances: LinkDistances
-    clearance: float  #: smallest distance from obstacles to allow [m]
-
-    @property
-    def rows(self) -> ca.Function:
-        """q (n, 1) -> the rows J (m, n) whose singular values measure the distance to singular positions."""
-        clear, task = self.chart.problem.domain.singular_bound, self.chart.problem.task
-        return task.frame_jacobian_function if clear is None else clear.jacobian_function
-
-    @cached_property
-    def scale(self) -> Array:
-        """The scale of these rows, (m,); see `orthocas.ClearBox`."""
-        domain = self.chart.problem.domain
-        if domain.singular_bound is not None:
-            return domain.singular_bound.scale
-        J = self._rows_at(sample_uniform(domain, _SAMPLES, 0))
-        return compute_row_scale(J[np.isfinite(J).all(axis=(1, 2))], self.chart.problem.task.units)
-
-    def compute_scaled_jacobian(self, q: Array) -> Array:
-        """D^-1 J at joint positions (P, n), (P, m, n)."""
-        J: Array = self._rows_at(q) / self.scale[:, None]
-        return J
-
-    def _rows_at(self, q: Array) -> Array:
-        J: Array = self._batched_rows(q)[0].reshape(-1, self.chart.m, self.chart.n)
-        return J
-
-    @cached_property
-    def _batched_rows(self) -> BlockedFunction:
-        return BlockedFunction(self.rows)
-
-    def check_kept(self, plan: Plan, s: Array, q: Array) -> None:
-        """Raise PathError at the first place (P,) whose joint position (P, n) is lost, outside, or at an obstacle."""
-        known = np.flatnonzero(np.isfinite(q).all(axis=1))
-        free = (self.distances(q[known]) >= self.clearance).all(axis=1)
-        kept = known[self.chart.problem.domain.contains(q[known]) & free]
-        if len(kept) < len(q):
-            raise self._error(plan, s, q, int(np.setdiff1d(np.arange(len(q)), kept)[0]))
-
-    def _error(self, plan: Plan, s: Array, q: Array, k: int) -> PathError:
-        """What is wrong with the k-th joint position."""
-        last = max(k - 1, 0)
-        if not np.isfinite(q[k]).all():
-            return self.lost(plan, Lost(s[:k], q[:k], float(s[k])))
-        where = plan.explained(float(s[k]), self.chart.labels)
-        if not self.chart.problem.domain.contains(q[k]):
-            reason = f"it leaves the domain, stopped by {Walls(self.chart.problem).worst(q[k])}"
-            return PathError(f"the path cannot be followed {where}: {reason}{self._reach(q[last])}")
-        distance = self.distances(q[k])
-        pair = self.distances.pairs[int(np.argmin(distance))]
-        least = float(distance.min())
-        gap = f"are {least:.3g} m apart" if least >= 0 else f"overlap by {-least:.3g} m"
-        return PathError(
-            f"the path cannot be followed {where}: {pair} {gap}, "
-            f"expected a distance of at least clearance = {self.clearance:g} m"
-        )
-
-    def lost(self, plan: Plan, end: Lost) -> PathError:
-        """The error for a path that ends before s = 1."""
-        where = plan.explained(end.beyond, self.chart.labels)
-        return PathError(
-            f"the path cannot be reached {where}: no joint position near the one before it has this x and xi, "
-            f"so x is out of reach or the chart is singular{self._reach(end.q[-1]) if len(end.q) else ''}"
-        )
-
-    def _reach(self, q: Array) -> str:
-        """How far the coordinates reach at a joint position before the end, if it lies inside the domain."""
-        try:
-            reach = xi_range(self.chart, q)
-        except InvalidValueError:
-            return ""
-        told = ", ".join(f"{part.label} in [{part.low:.4g}, {part.high:.4g}]" for part in reach)
-        return f"; just before, the coordinates reach {told} one at a time"
-
-    def margins(self, q: Array, dq: Array, ddq: Array) -> Margins:
-        """What a motion leaves, at its time stamps."""
-        low, high = self.chart.problem.domain.bounds
-        room = np.minimum(q - low, high - q) / self.chart.problem.domain.half_width
-        worst = int(np.argmin(room.min(axis=0)))
-        bounded = bool(np.isfinite(room).any())
-        values = np.linalg.svd(self.compute_scaled_jacobian(q), compute_uv=False)
-        distances = self.distances(q)
-        pair = int(np.argmin(distances.min(axis=0))) if distances.size else -1
-        return Margins(
-            float(room.min()),
-            self.chart.problem.robot.joint_names[worst] if bounded else "",
-            float((np.abs(dq) / self.velocity).max()),
-            float((np.abs(ddq) / self.acceleration).max()),
-            float(values[:, -1].min()),
-            float(distances.min()) if distances.size else np.inf,
-            self.distances.pairs[pair] if distances.size else "",
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Costs:
-    """Residuals of joint positions, and their gradients."""
-
-    limits: Limits
-
-    def __call__(self, q: Array) -> tuple[Array, Array]:
-        """Residuals (P, k) and gradients (P, k, n) at joint positions (P, n)."""
-        parts = [self._of_boundaries(q), self._of_task(q)]
-        if self.limits.distances.obstacles:
-            values, gradients = self.limits.distances.evaluate_gradients(q)
-            residuals, slopes = _inverse(values - self.limits.clearance, _AWAY, _TOO_NEAR)
-            parts.append((residuals, slopes[..., None] * gradients))
-        return np.concatenate([part[0] for part in parts], axis=1), np.concatenate([part[1] for part in parts], axis=1)
-
-    def _of_boundaries(self, q: Array) -> tuple[Array, Array]:
-        domain = self.limits.chart.problem.domain
-        bounded = np.flatnonzero(np.isfinite(domain.bounds[0]))
-        u = ((q - domain.centre) / domain.half_width)[:, bounded]
-        near = np.clip(u, -_INSIDE, _INSIDE)
-        slopes = (1 - near**2) ** -1.5
-        residuals = near / np.sqrt(1 - near**2) + (u - near) * slopes
-        gradients = np.zeros((len(q), len(bounded), q.shape[1]))
-        gradients[:, np.arange(len(bounded)), bounded] = slopes / domain.half_width[bounded]
-        return residuals, gradients
-
-    def _of_task(self, q: Array) -> tuple[Array, Array]:
-        left, values, right = np.linalg.svd(self.limits.compute_scaled_jacobian(q), full_matrices=False)
-        clear = self.limits.chart.problem.domain.singular_bound
-        bound = 0.0 if clear is None else clear.least_singular_value
-        residuals, slopes = _inverse(values[:, -1:] - bound, _REGULAR, _NEARLY_SINGULAR)
-        gradients = self._turning(q, left[:, :, -1] / self.limits.scale, right[:, -1])[0]
-        return residuals, slopes[..., None] * gradients[:, None]
-
-    @cached_property
-    def _turning(self) -> Batched:
-        """q, u, v -> the gradient (n, 1) of u^T J(q) v: with singular vectors, that of the singular value."""
-        chart = self.limits.chart
-        q, v, u = ca.SX.sym("q", chart.n), ca.SX.sym("v", chart.n), ca.SX.sym("u", chart.m)
-        product = ca.dot(u, self.limits.rows(q) @ v)
-        return Batched(dense_function("turning", [q, u, v], [ca.cse(ca.gradient(product, q))]))
-
-
-def _inverse(room: Array, scale: float, least: float) -> tuple[Array, Array]:
-    """scale / room and its derivative; a straight line where room is below `least`."""
-    far = np.maximum(room, least)
-    slopes = -scale / far**2
-    return scale / far + (room - far) * slopes, slopes
-
-
-def walk(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
-    """Joint positions (P, n) near task values x (P, m), from q (n,).
-
-    At every place, steps of least norm towards x, and Gauss-Newton steps within the null space of J_x that lower the
-    costs, as in resolved-rate control with gradient projection.
-    """
-    points = []
-    for wanted in x:
-        for _ in range(_STEPS):
-            q = q + _step(chart, costs, wanted, q)
-        points.append(q)
-    return np.array(points)
-
-
-def _step(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
-    J = chart.parts.relative.batched_rates(q[None])[0].reshape(chart.m, chart.n)
-    inner = np.linalg.svd(J)[2][chart.m :].T  # (n, r)
-    residuals, gradients = (part[0] for part in costs(q[None]))
-    G = gradients @ inner
-    along = -inner @ np.linalg.solve(G.T @ G + _WALK_DAMPING * np.eye(chart.r), G.T @ residuals)
-    task = np.linalg.pinv(J, rcond=1e-3) @ chart.parts.relative.difference(x, chart.task(q))
-    return _cut(task) + _cut(along)
-
-
-def _cut(step: Array) -> Array:
-    return np.asarray(step * min(1.0, _LONGEST / max(float(np.abs(step).max()), 1e-300)))
-
-
-@dataclass(frozen=True, eq=False)
-class _State:
-    """Values of the spline, and what follows from them."""
-
-    values: Array  #: (K, r)
-    q: Array  #: (P, n)
-    residuals: Array  #: (P, k)
-    gradients: Array  #: (P, k, n)
-    cost: float
-
-
-class XiChoice:
-    """The problem for one tool path.
-
-    Args:
-        plan: the tool path.
-        costs: of joint positions.
-        solver: solves for them.
-    """
-
-    def __init__(self, plan: Plan, costs: Costs, solver: Solver) -> None:
-        self.plan, self.costs, self.solver, self.chart = plan, costs, solver, solver.chart
-        pieces = _pieces(plan)
-        self.s = np.linspace(0.0, 1.0, _PLACES * pieces + 1)
-        self.nodes = np.linspace(0.0, 1.0, pieces + 1)
-        unit = np.eye(pieces + 1)
-        if plan.closed:
-            unit = np.vstack([unit[:pieces, :pieces], unit[:1, :pieces]])
-        self._unit = unit
-        basis = self._spline(unit)
-        self._basis = basis(self.s)
-        slopes, bends = basis(self.s, 1), basis(self.s, 2)
-        self._smooth = (_SPEED * slopes.T @ slopes + _BEND * bends.T @ bends) / len(self.s)
-
-    def best(self, first: Array) -> Plan:
-        """The tool path with chosen coordinates, from joint positions near it at the places `s`, (P, n)."""
-        state = self._first(first)
-        if state is None:
-            return self.plan
-        damping = _DAMPING
-        for _ in range(_ITERATIONS):
-            hessian, gradient = self._model(state)
-            better = None
-            while better is None and damping < _MOST_DAMPING:
-                better = self._stepped(state, hessian, gradient, damping)
-                damping *= 8 if better is None else 0.3
-            if better is None:
-                break
-            gain, state = state.cost - better.cost, better
-            if gain < _GAIN * state.cost:
-                break
-        return self.plan.replace_xi(self._spline(self._unit @ state.values))
-
-    def _first(self, q: Array) -> _State | None:
-        """The spline through the coordinates of joint positions, or through their mean where that has no solution."""
-        xi = counted_on(self.chart.xi(q), self.chart.turns[self.chart.m :])
-        values = np.linalg.lstsq(self._basis, xi, rcond=None)[0]
-        return self._state(values, q) or self._state(np.tile(xi.mean(axis=0), (len(values), 1)), q)
-
-    def _spline(self, values: Array) -> CubicSpline:
-        return CubicSpline(self.nodes, values, bc_type="periodic" if self.plan.closed else "not-a-knot")
-
-    def _state(self, values: Array, near: Array) -> _State | None:
-        """The state of values (K, r), with joint positions near others; None where Newton's method fails."""
-        goals = np.hstack([self.plan.x(self.s), self._basis @ values])
-        q = self.solver.solve(near, goals)
-        if not np.isfinite(q).all():
-            return None
-        smooth = float(np.einsum("kr,kl,lr->", values, self._smooth, values))
-        residuals, gradients = self.costs(q)
-        return _State(values, q, residuals, gradients, float((residuals**2).sum() / len(q)) + smooth)
-
-    def _model(self, state: _State) -> tuple[Array, Array]:
-        """Gauss-Newton Hessian (K r, K r) and half the gradient (K r,) of the cost."""
-        r, m, B = self.chart.r, self.chart.m, self._basis
-        G = state.gradients @ np.linalg.inv(self.solver.jacobian(state.q))[:, :, m:] / np.sqrt(len(B))
-        squares = np.einsum("pka,pkb->pab", G, G)
-        hessian = np.einsum("pi,pj,pab->iajb", B, B, squares, optimize=True)
-        hessian += np.einsum("ij,ab->iajb", self._smooth, np.eye(r))
-        slope = np.einsum("pi,pka,pk->ia", B, G, state.residuals / np.sqrt(len(B)), optimize=True)
-        slope += self._smooth @ state.values
-        size = B.shape[1] * r
-        return hessian.reshape(size, size), slope.ravel()
-
-    def _stepped(self, state: _State, hessian: Array, gradient: Array, damping: float) -> _State | None:
-        """A damped step, if it lowers the cost."""
-        scaled = hessian + damping * np.diag(np.diag(hessian) + 1e-9)
-        change = -np.linalg.solve(scaled, gradient).reshape(state.values.shape)
-        new = self._state(state.values + change, state.q)
-        return new if new is not None and new.cost < state.cost else None
-
-
-def _pieces(plan: Plan) -> int:
-    """Pieces of the spline: more on longer paths."""
-    length = np.linalg.norm(plan.steps, axis=1).sum()
-    return int(np.clip(np.ceil(_DENSITY * length), _LEAST, _MOST))
 
 
 def follow(
@@ -383,15 +101,18 @@ def follow(
     solver = PhiSolver(chart)
     curve = JointCurve.trace(solver, path.phi, start)
     if isinstance(xi, str) and xi == OBJECTIVE:
-        plan, curve = _chosen(solver, plan, curve, limits, start)
-    if isinstance(curve, Lost):
-        limits.check_kept(plan, curve.s, curve.q)
-        raise limits.lost(plan, curve)
-    s = plan.checked()
-    limits.check_kept(plan, s, curve.q(s))
-    _, first, second = curve.at(list_places())
-    law = fastest(first, second, limits.velocity, limits.acceleration)
-    return _on_stamps(plan, curve, law, limits, stamp)
+        path, curve = _choose_xi(solver, path, curve, limits, start)
+    # Where it ends early, leaves the domain or comes too near to an obstacle, an error says why.
+    if isinstance(curve, LostCurve):
+        limits.check_kept(path, curve.s, curve.q)
+        raise limits.build_lost_error(path, curve)
+    s = path.list_checks()
+    limits.check_kept(path, s, curve.q(s))
+
+    # The fastest s(t), then time stamps, slower until they keep the limits.
+    _, first, second = curve.evaluate(list_places())
+    law = compute_fastest_law(first, second, limits.velocity, limits.acceleration)
+    return _sample_on_stamps(path, curve, law, limits, stamp)
 
 
 def _read_tool_path(chart: Chart, tool_path: Any, xi: Any, start: Array) -> ToolPath:
@@ -652,13 +373,13 @@ def walk(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
 
 
 def _compute_step(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
-    J = chart.relative.batched_rates(q[None])[0].reshape(chart.m, chart.n)
+    J = chart.parts.relative.batched_rates(q[None])[0].reshape(chart.m, chart.n)
     inner = np.linalg.svd(J)[2][chart.m :].T  # (n, r)
     # Within the null space a damped Gauss-Newton step, towards x the step of least norm.
     residuals, gradients = (part[0] for part in costs(q[None]))
     G = gradients @ inner
     along = -inner @ np.linalg.solve(G.T @ G + RULES.walk_damping * np.eye(chart.r), G.T @ residuals)
-    task = np.linalg.pinv(J, rcond=1e-3) @ chart.relative.difference(x, chart.task(q))
+    task = np.linalg.pinv(J, rcond=1e-3) @ chart.parts.relative.difference(x, chart.task(q))
     return _limit_step(task) + _limit_step(along)
 
 

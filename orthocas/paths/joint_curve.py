@@ -29,7 +29,8 @@ class PhiSolver:
     def __init__(self, chart: "Chart") -> None:
         self.chart = chart
         self._newton = Newton(chart.parts.phi_map)
-        with deferred(), building:  # threads share the chart
+        # Threads share the chart.
+        with deferred(), building:
             q, v, w = (ca.MX.sym(name, chart.n) for name in ("q", "v", "w"))
             bends = (
                 chart.problem.task.rates_derivative_function(q, v, w),
@@ -165,8 +166,8 @@ class TimeLaw:
 
 
 def list_places() -> Array:
-    """The parameters s at which `fastest` wants q' and q'', (P,)."""
-    return np.linspace(0.0, 1.0, _BINS * _PLACES)
+    """The parameters s at which `compute_fastest_law` wants q' and q'', (P,)."""
+    return np.linspace(0.0, 1.0, RULES.parts * RULES.part_places)
 
 
 def compute_fastest_law(first: Array, second: Array, velocity: Array, acceleration: Array) -> TimeLaw:
@@ -234,6 +235,6 @@ def _find_worst(values: Array) -> Indices:
 
 def _evaluate_basis(k: Indices, knots: Array) -> tuple[coo_array, coo_array]:
     """Values and derivatives of the basis at places k (P,), (P, size) each."""
-    basis = BSpline(knots, np.eye(len(knots) - _DEGREE - 1), _DEGREE)
+    basis = BSpline(knots, np.eye(len(knots) - RULES.law_degree - 1), RULES.law_degree)
     s = list_places()[k]
     return coo_array(np.asarray(basis(s))), coo_array(np.asarray(basis.derivative()(s)))

@@ -227,17 +227,18 @@ class ToolPath:
         x = sample_path("tool_path", tool_path, chart.m, chart.labels[: chart.m])
         if s_xi is None and len(xi) != len(x):
             raise InvalidValueError("number of rows of xi", len(xi), f"{len(x)}, as of tool_path")
+        # s grows with the length of the chords, in units of the sizes of phi.
         steps = chart.parts.relative.difference(x[1:], x[:-1]) / chart.phi_sizes[: chart.m]
         if callable(tool_path):
             s = np.linspace(0.0, 1.0, len(x))
         else:
-            s = places(np.hstack([steps, np.diff(xi, axis=0)]) if s_xi is None else steps)
+            s = place_waypoints(np.hstack([steps, np.diff(xi, axis=0)]) if s_xi is None else steps)
         path = TaskSpline(chart.parts.relative, s, x, chart.phi_sizes[: chart.m])
         closed = path.returns and bool(np.abs(xi[-1] - xi[0]).max() < 1e-9)
         curve = build_spline(s if s_xi is None else s_xi, xi, closed and len(xi) > 2)
         return cls(path.close() if closed else path, curve, s, x, steps, callable(tool_path), closed)
 
-    def replace_xi(self, xi: CubicSpline) -> "Plan":
+    def replace_xi(self, xi: CubicSpline) -> "ToolPath":
         """The same tool path with other coordinates."""
         return replace(self, xi=xi)
 

@@ -12,7 +12,7 @@ from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
 from orthocas.errors import InvalidValueError
 from orthocas.simulation.disturbances import Loads, Noise
-from orthocas.simulation.loops import ClosedLoop, Piece, build_held_plant, pieces, run_compiled
+from orthocas.simulation.loops import ClosedLoop, Piece, build_held_plant, run_compiled, yield_pieces
 from orthocas.simulation.mujoco_plant import MuJoCo, MuJoCoPlant
 from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, as_number, require_kind
@@ -117,9 +117,11 @@ def run_supervised(
     n, size = loop.n, len(start)
     ticks = int(np.floor(reference.duration * rate + 1e-9))
     times = np.arange(ticks) / rate
-    wanted, errors, loads = np.hstack(reference.sample(times)), noise.sample(ticks, n), loop.loads.mean(times, 1 / rate)
-    with deferred(), building:  # CasADi may lose Ctrl-C while it builds functions
+    target, errors, loads = np.hstack(reference.sample(times)), noise.sample(ticks, n), loop.loads.mean(times, 1 / rate)
+    # CasADi may lose Ctrl-C while it builds functions.
+    with deferred(), building:
         plant = build_held_plant(loop, 1 / rate, tolerance)
+    # Each tick: measure, ask the law, hold its command while the plant moves.
     law.start(start[:n] + errors[0, :n])
     state, sent = start, np.zeros(n + 2)
 

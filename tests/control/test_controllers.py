@@ -18,8 +18,11 @@ import orthocas as oc
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared, gain_numbers
 from orthocas.control import ControlStatus, Impedance, Kinematic, PDPlus, Reference
 from orthocas.control.controller import Controller
-from orthocas.errors import NoExpressionError, UnreachableReferenceError
-from orthocas.problems.iiwa import urdf_path
+from orthocas.errors import (
+    NoExpressionError,
+    UnreachableReferenceError,
+)
+from orthocas.problems.arms import urdf_path
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
