@@ -34,7 +34,7 @@ class CyclicRules:
 
 RULES = CyclicRules()
 _AXES = "xyz"
-_WORD = "cyclic"
+_WORD, _WITHOUT = "cyclic", "without"
 
 
 def cyclic_joints(problem: Problem) -> tuple[str, ...]:
@@ -170,14 +170,23 @@ def keeps_self_motions(problem: Problem, joint: int) -> bool:
     )
 
 
+def turns_tool(task: Task, joint: int) -> bool:
+    """Whether the kinematics show that h(q + t e_k) = h(q) g_t: the last joint, under a whole orientation or pose.
+
+    Then neither ker J_x nor the regularity of coordinates without this joint depends on its position.
+    """
+    turn = TipTurn.from_kind(task.recipe["kind"])
+    return task.of_tip and turn is not None and turn.whole and joint == task.robot.tree.tip_parent
+
+
 def _has_motion_of_task(task: Task, joint: int) -> bool:
     """Whether the kinematics show that h(q + t e_k) = g_t(h(q))."""
     tree, kind = task.robot.tree, task.recipe["kind"]
     if not task.of_tip:
         return False
-    turn = TipTurn.from_kind(kind)
-    if turn is not None and turn.whole and joint == tree.tip_parent:
+    if turns_tool(task, joint):
         return True
+    turn = TipTurn.from_kind(kind)
     return _is_turn_of_rest(tree, joint) and (turn is not None or _is_turn_of_components(tree, joint, kind))
 
 
@@ -250,22 +259,38 @@ def check_cyclic(value: Any) -> Cyclic:
     return tuple(value)
 
 
-def suffix(cyclic: Cyclic) -> str:
-    """What a label adds for cyclic joints: '', ':cyclic' for "auto", or ':cyclic=NAME,NAME'."""
-    if not cyclic:
-        return ""
-    return f":{_WORD}" if cyclic == "auto" else f":{_WORD}={','.join(cyclic)}"
+def check_without(names: Any, cyclic: Cyclic) -> tuple[str, ...]:
+    """Names of joints that coordinates do not depend on.
+
+    Raises:
+        InvalidValueError: if they are no different names, or one is cyclic, too.
+    """
+    known = isinstance(names, list | tuple) and all(isinstance(name, str) for name in names)
+    if not known or len(set(names)) != len(names) or (cyclic != "auto" and set(names) & set(cyclic)):
+        raise InvalidValueError("without", repr(names)[:80], "a list of different joint names, none of them cyclic")
+    return tuple(names)
 
 
-def parse_suffix(text: str) -> Cyclic:
-    """Parse what ends a label: '', 'cyclic' or 'cyclic=NAME,NAME'."""
-    word, equals, names = text.partition("=")
-    if not text:
-        return ()
-    if word != _WORD or (equals and not names):
-        wanted = "'joints=2', then 'cyclic' or 'cyclic=JOINT,JOINT' after the degree"
-        raise InvalidValueError("parametrisation", repr(text), wanted)
-    return tuple(names.split(",")) if equals else "auto"
+def suffix(cyclic: Cyclic, without: tuple[str, ...] = ()) -> str:
+    """What a label adds: ':cyclic' for "auto", ':cyclic=NAME,NAME', and ':without=NAME,NAME'."""
+    linear = "" if not cyclic else f":{_WORD}" if cyclic == "auto" else f":{_WORD}={','.join(cyclic)}"
+    return linear + (f":{_WITHOUT}={','.join(without)}" if without else "")
+
+
+def parse_suffix(text: str) -> tuple[Cyclic, tuple[str, ...]]:
+    """Parse what ends a label: '', 'cyclic' or 'cyclic=NAME,NAME', then 'without=NAME,NAME'."""
+    cyclic: Cyclic = ()
+    without: tuple[str, ...] = ()
+    for part in text.split(":") if text else ():
+        word, equals, names = part.partition("=")
+        if word not in (_WORD, _WITHOUT) or (not names if equals else word == _WITHOUT):
+            wanted = "'joints=2', then 'cyclic' or 'cyclic=JOINT,JOINT', then 'without=JOINT' after the degree"
+            raise InvalidValueError("parametrisation", repr(text), wanted)
+        if word == _WORD:
+            cyclic = tuple(names.split(",")) if equals else "auto"
+        else:
+            without = tuple(names.split(","))
+    return cyclic, without
 
 
 def resolved(cyclic: Cyclic, problem: "Problem") -> tuple[str, ...]:

@@ -188,12 +188,14 @@ class Products:
     cyclic: Cyclic = ()
     # others keep their fingerprints
     joints: int | None = field(default=None, metadata={"stored": "if given"})
+    without: tuple[str, ...] = field(default=(), metadata={"stored": "if given"})
     linear = True
     closed_form = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "degree", require_count("degree", self.degree))
         object.__setattr__(self, "cyclic", cyclic_choice.check_cyclic(self.cyclic))
+        object.__setattr__(self, "without", cyclic_choice.check_without(self.without, self.cyclic))
         if self.joints is not None:
             object.__setattr__(self, "joints", require_count("joints", self.joints))
 
@@ -209,10 +211,11 @@ class Products:
     def _settings(self) -> str:
         """The label after its name: 'DEGREE', with the most joints of a product and the cyclic joints if given."""
         most = "" if self.joints is None else f":{JOINTS}={self.joints}"
-        return f"{self.degree}{most}{cyclic_choice.suffix(self.cyclic)}"
+        return f"{self.degree}{most}{cyclic_choice.suffix(self.cyclic, self.without)}"
 
     def _count_terms(self, n: int, functions: int) -> int:
         """Sum over j of C(n, j) C(d, j) f^j without the constant, for f functions of each degree of a joint."""
+        n -= len(self.without)
         linear = min(n, cyclic_choice.count(self.cyclic))
         most = min(n - linear, self.degree, self.degree if self.joints is None else self.joints)
         terms: int = sum(comb(n - linear, j) * comb(self.degree, j) * functions**j for j in range(1, most + 1))
@@ -229,6 +232,8 @@ class Polynomial(Products):
             Charts are then valid for all positions of these joints; see `orthocas.cyclic_joints`.
         joints: most joints in one product, >= 1. Default: all. With 2, terms of three joints and more are left out:
             that is most of them with many joints, and they gain little.
+        without: names of joints that coordinates do not depend on, such as the last one under a pose: xi then stays
+            while the tool turns about its own axis.
 
     Example:
         >>> import orthocas as oc
@@ -267,7 +272,8 @@ class Polynomial(Products):
             values: Array = np.sqrt((2 * a + 1) * (2 * b + 1)) * ((a > b) & ((a - b) % 2 == 1)) / space.half_width[i]
             return values
 
-        degrees = [list(range(self.degree + 1))] * space.n
+        none = cyclic_choice.indices(self.without, space)
+        degrees = [[0] if i in none else list(range(self.degree + 1)) for i in range(space.n)]
         terms = reduce_terms(degrees, self.degree, cyclic_choice.indices(self.cyclic, space), self.joints)
         return build_product_family(space, outputs, terms, legendre, derivatives)
 
@@ -281,6 +287,7 @@ class Fourier(Products):
         cyclic: joints that appear in one linear term each instead of sines and cosines, by name, or "auto" for all
             cyclic joints of the problem; see `orthocas.cyclic_joints`.
         joints: most joints in one product, >= 1. Default: all.
+        without: names of joints that coordinates do not depend on.
 
     Example:
         >>> import orthocas as oc
@@ -325,7 +332,9 @@ class Fourier(Products):
                 D[2 * k - 1, 2 * k], D[2 * k, 2 * k - 1] = -k, k
             return D
 
-        degrees = [[0] + [k for k in range(1, self.degree + 1) for _ in range(2)]] * space.n
+        none = cyclic_choice.indices(self.without, space)
+        of_joint = [0, *(k for k in range(1, self.degree + 1) for _ in range(2))]
+        degrees = [[0] if i in none else of_joint for i in range(space.n)]
         terms = reduce_terms(degrees, self.degree, linear, self.joints)
         return build_product_family(space, outputs, terms, waves, derivatives)
 

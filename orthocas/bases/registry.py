@@ -83,8 +83,8 @@ def warn_unless_savable(parametrisation: Parametrisation) -> None:
 def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
     """Convert a parametrisation to plain data: kind and settings.
 
-    A setting that came later may have the metadata {"stored": "if given"}: data leave it out while it is None, so
-    that charts of before keep their fingerprints.
+    A setting that came later may have the metadata {"stored": "if given"}: data leave it out while it is None or empty,
+    so that charts of before keep their fingerprints.
 
     Raises:
         InvalidValueError: if it is not registered, or its settings are not plain data.
@@ -100,7 +100,7 @@ def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
     inner = {name: parametrisation_to_data(part) for name, part in parts.items() if isinstance(part, Parametrisation)}
     settings = {**asdict(parametrisation), **inner}
     for part in fields(parametrisation):
-        if part.metadata.get("stored") == "if given" and parts[part.name] is None:
+        if part.metadata.get("stored") == "if given" and parts[part.name] in (None, ()):
             del settings[part.name]
     try:
         json.dumps(settings)
@@ -154,13 +154,14 @@ def _parse_whole(text: str) -> int:
         ) from None
 
 
-def _parse_degree(text: str) -> tuple[int, Cyclic, int | None]:
+def _parse_products(text: str) -> tuple[int, Cyclic, int | None, tuple[str, ...]]:
     degree, _, rest = text.partition(":")
     most = None
     if rest.startswith(f"{JOINTS}="):
         number, _, rest = rest.removeprefix(f"{JOINTS}=").partition(":")
         most = _parse_whole(number)
-    return _parse_whole(degree), parse_suffix(rest), most
+    cyclic, without = parse_suffix(rest)
+    return _parse_whole(degree), cyclic, most, without
 
 
 def _parse_mlp(text: str) -> MLP:
@@ -177,8 +178,8 @@ def _parse_linear(text: str) -> Linear:
 
 
 register_parametrisation("linear", Linear, _parse_linear)
-register_parametrisation("polynomial", Polynomial, lambda text: Polynomial(*_parse_degree(text)))
-register_parametrisation("fourier", Fourier, lambda text: Fourier(*_parse_degree(text)))
+register_parametrisation("polynomial", Polynomial, lambda text: Polynomial(*_parse_products(text)))
+register_parametrisation("fourier", Fourier, lambda text: Fourier(*_parse_products(text)))
 register_parametrisation("mlp", MLP, _parse_mlp)
 register_parametrisation("sew", SEW, lambda text: SEW(cast(SEWKind, text or "stereographic")))
 register_parametrisation("circle", Circle, lambda text: Circle(parse_parametrisation(text)))

@@ -24,7 +24,7 @@ class LossRules:
     wide_volume: float = 0.5  #: volume that a wide fit asks for at its first samples
     worst_volume: float = 0.3  #: the same once the worst samples have joined, and for networks
     least_volume: float = 0.05  #: over r: bound of the domain of a wide chart, in the identity metric
-    beyond: float = 1.2  #: over that bound: the volume in the identity metric that is enough beside another metric
+    beyond: float = 2.0  #: over that bound: the volume in the identity metric that is enough beside another metric
     nearly_folded: float = 1e-4  #: volume below which an inverse loses digits
     shortest: float = 1e-12  #: length of a gradient that counts as zero
 

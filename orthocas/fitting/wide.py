@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.bases.cyclic import keeps_self_motions, widen_over_cyclic_joints
+from orthocas.bases.cyclic import keeps_self_motions, turns_tool, widen_over_cyclic_joints
 from orthocas.bases.family import CyclicParametrisation, JointSpace, LinearFamily, Parametrisation
 from orthocas.bases.mlp import MLP
-from orthocas.bases.products import Polynomial
+from orthocas.bases.products import Polynomial, Products
 from orthocas.bases.registry import warn_unless_savable
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
@@ -71,25 +71,31 @@ def fit_wide(
 
     The parameters theta of a family minimise, over samples q of the branch that are clear of singular positions::
 
-        L = mean_q [ max(0, 1 - v / t)^2 + 0.03 sum_j log^2(l_j / L_j) + terms of `weights` ]
+        L = mean_q [ max(0, 1 - v / t)^2 + 0.3 mean_j sin^2 a_j + 0.15 mean_jk cos^2 b_jk
+                     + 0.03 sum_j log^2(l_j / L_j) + terms of `weights` ]
 
-    v(q) is the volume of coordinates: det of an orthonormal basis of the task's gradients and of the unit gradients of
-    xi, all in the metric. Coordinates are regular where v is not zero; for r = 1 it is the cosine between the gradient
-    and the self-motion. With another metric than the identity, the same term for the volume in the identity metric and
-    a small t joins. l_j(q) is the length of the gradient of xi_j, L_j its mean where the descent begins: xi is a
-    similar motion everywhere. Half of the samples are uniform, half boundary-weighted. The numbers are those of
+    a_j(q) is the leak of coordinate j, b_jk the angle between the gradients of two coordinates. v(q) is the volume of
+    coordinates: det of an orthonormal basis of the task's gradients and of the unit gradients of xi, all in the
+    metric. Coordinates are regular where v is not zero; for r = 1 it is the cosine between the gradient and the self-
+    motion. With another metric than the identity, the same term for the volume in the identity metric and a small t
+    joins. The first term keeps coordinates regular, the next ones make them as orthogonal as that permits. l_j(q) is
+    the length of the gradient of xi_j, L_j its mean where the descent begins: xi is a similar motion everywhere. Half
+    of the samples are uniform, half boundary-weighted. The numbers are those of
     `orthocas.fitting.wide_search.WideRules`.
 
     The stages are these:
 
-    1. Polynomials that are linear in each joint on whose position self-motions do not depend, such as the first and the
+    1. Under a whole pose or orientation, polynomials without the last joint: xi stays while the tool turns about its
+       own axis, so full turns of the tool close, and rolling the hand moves no other joint. They are kept if they leave
+       out little of the branch after all rounds of 4.
+    2. Polynomials that are linear in each joint on whose position self-motions do not depend, such as the first and the
        last one, descend with L-BFGS from linear coordinates across the task at the centre of the branch. They are best
        to prove, and hold at any turn of these joints. They ask that self-motions turn base and tool in one direction.
-    2. If these leave out much of the branch, polynomials in all joints are tried, and a network,
+    3. If these leave out much of the branch, polynomials in all joints are tried, and a network,
        MLP((64, 64, 64), raw=True), where both leave out much, or the first ones very much, as on arms whose axes pass
        each other at a distance. A network begins at random and descends with Adam on some of the samples at a time. It
        takes several times as long to evaluate, and is not tried with `like` or with slides without limits.
-    3. The best ones go on: as long as they are not regular enough at other samples, and get better, the worst of many
+    4. The best ones go on: as long as they are not regular enough at other samples, and get better, the worst of many
        fresh samples join.
 
     The best result is kept: regular at the centre, with the fewest bad positions, then with the largest 1 % quantile of
@@ -104,9 +110,10 @@ def fit_wide(
     `regular_share` is of the branch: of all its positions that `branches` counts as clear, the fraction in the domain.
     If the chart leaves out the other side, or can only serve a smaller box, `left_out` and a BranchWarning say so.
 
-    Wide charts hold on most of what the arm reaches without passing a singular position, but their leaks are large, 20
-    to 70 degrees on the arms that were measured. They serve inverse kinematics, closed loops, trackers and laws with
-    the whole inertia; see `fit` for decoupled control. That det J keeps its sign does not mean that phi is one-to-one.
+    Wide charts hold on most of what the arm reaches without passing a singular position, but their leaks are large, 15
+    to 60 degrees on the arms that were measured. They serve inverse kinematics, closed loops, trackers and laws with
+    the whole inertia, best with A = M; see `fit` for decoupled control. That det J keeps its sign does not mean that
+    phi is one-to-one.
 
     Args:
         robot: the robot.
@@ -117,8 +124,7 @@ def fit_wide(
         metric: as in `Problem`.
         clearance: least relative singular value of the task, > 0; see `orthocas.ClearBox`.
         parametrisation: a family, as in `fit`. Those that are not linear in their parameters descend like networks.
-            Default: Polynomial(6), with one linear term for each joint on whose position self-motions do not depend,
-            such as the first and the last one; or another one, see above.
+            Default: Polynomial(6) without the last joint and linear in the first one, or another one, see above.
         home: posture whose branch is meant, (n,) or its name. Default: as for `suggest_domain`.
         like: what coordinates are to be like: a function of an SX column q, the name of a joint, or "swivel", the angle
             of the elbow about the line from shoulder to wrist [rad]. With r = 1, xi then has nearly the values of that
@@ -126,10 +132,10 @@ def fit_wide(
             there. With r > 1, several are allowed, or a task of lower priority: the gradients of the first coordinates
             are held against the parts of theirs that are orthogonal to the task. Default: with shoulder, elbow and
             wrist and r = 1, the scale and the direction of the swivel there.
-        weights: weights of terms that join the loss, by name or as `Weights`, such as `Weights(task=3.0, mutual=0.0,
-            regularity=0.0)` for coordinates that are more orthogonal to the task, or `{"name": 0.1}` for a term of
-            `register_loss_term`. They are means over the first samples; the worst ones of polynomials only ask for
-            regular coordinates. A search for folds has no place here. Default: none.
+        weights: weights of terms that join the loss, such as `{"name": 0.1}` for a term of `register_loss_term`; or
+            `Weights`, which also take the place of those of leaks and mutual angles, such as `Weights(task=10.0,
+            mutual=1.0, regularity=0.0)`. They are means over the first samples; the worst ones of polynomials only ask
+            for regular coordinates. A search for folds has no place here. Default: none.
         samples: number of samples. Default: 30 for each function, 5,000 to 20,000; 100,000 for a network.
         seed: seed of the samples, and of the first network.
         monitor: called with progress.
@@ -197,12 +203,14 @@ def fit_wide(
     return result
 
 
-def _check_weights(weights: Weights | Mapping[str, float]) -> Weights:
+def _check_weights(weights: Weights | Mapping[str, float]) -> Weights | Mapping[str, float]:
     """Weights of terms that join the loss."""
     if isinstance(weights, Weights):
         return weights
     require_kind("weights", weights, Mapping)
-    return Weights(0.0, 0.0, 0.0, 0.0, 0.0, {name: weight for name, weight in weights.items() if find_term(name)})
+    for name in weights:
+        find_term(name)
+    return Weights(extra=weights).extra
 
 
 def _choose_branch(robot: Robot, task: Task, branch: Branch | Box | str | None, home: ArrayLike | str | None) -> Branch:
@@ -247,8 +255,11 @@ def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomia
     free = [k for k in range(robot.n) if keeps_self_motions(problem, k)]
     slides = robot.tree.prismatic
     endless = [k for k in free if slides[k] and np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
-    names, fewer = (tuple(robot.joint_names[k] for k in joints) for joints in (free, endless))
-    families: list[Polynomial | MLP] = [Polynomial(RULES.degree, names)]
+    tool = [k for k in range(robot.n) if turns_tool(problem.task, k)] if like in (None, "swivel") else []
+    base = [k for k in free if k not in tool]
+    names, fewer, of_base, of_tool = (tuple(robot.joint_names[k] for k in part) for part in (free, endless, base, tool))
+    families: list[Polynomial | MLP] = [Polynomial(RULES.degree, of_base, without=of_tool)] if tool else []
+    families.append(Polynomial(RULES.degree, names))
     if names != fewer:
         families.append(Polynomial(RULES.degree_of_all, fewer))
     if like is None and not endless:
@@ -261,13 +272,20 @@ def _prepare(problem: Problem, family: Parametrisation, like: Likeness | None) -
     require_parametrisation(family)
     family = family.for_problem(problem)
     if isinstance(family, CyclicParametrisation):
-        problem = widen_over_cyclic_joints(problem, tuple(family.cyclic))
+        problem = widen_over_cyclic_joints(problem, (*family.cyclic, *_find_tool_turn(problem, family)))
     if family.closed_form is not None:
         raise InvalidValueError("parametrisation", family.label, "one that is fitted, such as a polynomial, or an MLP")
     if like is not None and not isinstance(family.family(JointSpace.of(problem), problem.r), LinearFamily):
         raise InvalidValueError("parametrisation", family.label, "one that is linear in its parameters, for like")
     warn_unless_savable(family)
     return problem, family
+
+
+def _find_tool_turn(problem: Problem, family: Parametrisation) -> tuple[str, ...]:
+    """Joints that turn the tool and that a family does without: it is regular at any turn of them, or at none."""
+    names = problem.robot.joint_names
+    left_out = family.without if isinstance(family, Products) else ()
+    return tuple(name for name in left_out if name in names and turns_tool(problem.task, names.index(name)))
 
 
 def _hold_to_quantities(
@@ -311,7 +329,8 @@ def _finish(
     share = float(domain.contains(counted).mean()) if len(counted) else float("nan")
     error = None if meaning is None else meaning.measure_error(problem, coordinates, seed)
     worst = worst_points(problem, coordinates, seed, thorough=True)
-    users = {} if settings.weights is None else settings.weights.for_problem(clear).by_name
+    terms = settings.weights or {}
+    users = terms.for_problem(clear).by_name if isinstance(terms, Weights) else terms
     notes: dict[str, str | float] = {
         "solver": solution.solver,
         "seed": seed,

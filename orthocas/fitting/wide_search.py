@@ -1,6 +1,6 @@
 """The stages of a wide fit: in each family a first descent, then rounds with the worst samples in the best one."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,6 +8,7 @@ import scipy
 from numpy.typing import NDArray
 
 from orthocas.bases.family import ArrayFamily, CombinableFamily, JointSpace, LinearFamily, Parametrisation
+from orthocas.bases.products import Products
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError
 from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
@@ -39,6 +40,8 @@ class WideRules:
     degree_of_all: int = 5  #: of polynomials in which these count like all others
     network: tuple[int, ...] = (64, 64, 64)  #: layers where polynomials leave out much
 
+    alignment: float = 0.3  #: weight of the mean sin^2 of the leaks
+    mutual: float = 0.15  #: weight of the mean cos^2 between gradients of different coordinates
     evenness: float = 0.03  #: weight of the mean squared logarithm of the lengths of gradients
     uniform: float = 0.5  #: fraction of samples that are uniform; the others are boundary-weighted
     per_term: int = 30  #: samples for each basis function
@@ -65,6 +68,7 @@ class WideRules:
     well: float = 0.28  #: over r, volume of all but 1 % of positions that is enough: a conditioning of 0.2
     poor: float = 1e-3  #: fraction of bad positions above which another family is tried
     poor_of_several: float = 4e-3  #: the same with r > 1
+    poor_of_symmetric: float = 3e-3  #: the same of coordinates that do not know the turn of the tool, after all rounds
     very_poor: float = 2e-2  #: fraction above which it is a network at once
     still_poor: float = 6e-3  #: fraction above which it is a network after polynomials in all joints
 
@@ -93,7 +97,7 @@ class WideSettings:
     samples: int | None = None  #: default: by the kind of family
     seed: int = 0
     monitor: Monitor = silent
-    weights: Weights | None = None  #: of terms that join the loss
+    weights: Weights | Mapping[str, float] | None = None  #: of terms that join the loss; `Weights` also of the angles
     meaning: Meaning | None = None  #: what xi means, for r = 1
     quantities: Like | None = None  #: what the first coordinates follow, for r > 1
 
@@ -114,6 +118,13 @@ def search_families(searches: Sequence["Search"]) -> "Search":
     """Search in the first family and, as long as results are poor, in others, then go on in the best one."""
     first, *others = searches
     first.begin(_STAGE)
+    if first.symmetric:
+        first.go_on()
+        missed, bad, _ = first.rank
+        if not others or not (missed or bad > RULES.poor_of_symmetric):
+            return first
+        first, *others = others
+        first.begin(f"{_STAGE}, tool joint")
     missed, bad, _ = first.rank
     if missed or bad > (RULES.poor if first.problem.r == 1 else RULES.poor_of_several):
         networks = [search for search in others if not search.linear]
@@ -138,8 +149,10 @@ class Search:
 
     The loss is that of `fit`, with the terms "volume" and "metric length" in place of angles::
 
-        L = mean_q [ max(0, 1 - v(q) / t)^2 + 0.03 sum_j log^2(l_j(q) / L_j) + terms of the user ] + meaning
+        L = mean_q [ max(0, 1 - v(q) / t)^2 + 0.3 mean_j sin^2 leak_j(q) + 0.15 mean_jk cos^2(j, k)
+                     + 0.03 sum_j log^2(l_j(q) / L_j) ] + meaning
 
+    Terms of the user join it.
     Families that are linear in their parameters descend with L-BFGS from linear coordinates, in variables in which the
     basis functions have orthonormal gradients in the mean. All others descend with Adam from a random start.
 
@@ -153,6 +166,8 @@ class Search:
         self.problem, self.parametrisation, self.settings = problem, parametrisation, settings
         self.family = parametrisation.family(JointSpace.of(problem), problem.r)
         self.linear = isinstance(self.family, LinearFamily)
+        #: whether coordinates do not depend on some joints
+        self.symmetric = isinstance(parametrisation, Products) and bool(parametrisation.without)
         wide = int(np.clip(RULES.per_term * self.family.width, RULES.least_samples, RULES.most_samples))
         self.samples = settings.samples or (wide if self.linear else RULES.network_samples)
         self.solver: Solver = LBFGS(RULES.iterations, RULES.tolerance) if self.linear else _ADAM
@@ -288,7 +303,10 @@ class Search:
         self._take(name, replace(result, theta=self._last), count)
 
     def _weigh_regularity(self, volume: str) -> dict[str, float]:
-        """Weights of our own terms, with the name of that of the volume. Terms add weight |rho|^2 / 2."""
+        """Weights of the terms that keep coordinates regular, with the name of that of the volume.
+
+        Terms add weight |rho|^2 / 2.
+        """
         target = LOSS.wide_volume if volume == "volume" else LOSS.worst_volume
         weights = {volume: 2 / target**2, "metric length": 2 * RULES.evenness}
         if not self.problem.metric.is_identity:
@@ -296,10 +314,11 @@ class Search:
         return weights
 
     def _choose_weights(self, volume: str) -> Weights:
-        """Weights of all terms."""
+        """Weights of all terms: those of the angles are ours, unless the user gives `Weights`."""
         own, users = self._weigh_regularity(volume), self.settings.weights
-        if users is None:
-            return Weights(0.0, 0.0, 0.0, 0.0, 0.0, own)
+        if not isinstance(users, Weights):
+            angles = 2 * self.problem.m * RULES.alignment, 2 * RULES.mutual
+            users = Weights(*angles, 0.0, 0.0, 0.0, dict(users or {}), "metric")
         return replace(users, folds=0.0, extra={**own, **users.extra}).for_problem(self.problem)
 
     def _build_in_basis(self, volume: str) -> "Orthonormal":

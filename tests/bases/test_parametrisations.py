@@ -211,7 +211,16 @@ def test_linear_normals_at_bad_bases_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    "label", ["linear", "polynomial:4", "polynomial:4:joints=2", "fourier:2:joints=1:cyclic=a,b", "mlp:64x64"]
+    "label",
+    [
+        "linear",
+        "polynomial:4",
+        "polynomial:4:joints=2",
+        "fourier:2:joints=1:cyclic=a,b",
+        "mlp:64x64",
+        "polynomial:4:cyclic=a:without=b,c",
+        "fourier:2:without=c",
+    ],
 )
 def test_labels_are_read_back(label: str) -> None:
     assert parse_parametrisation(label).label == label
@@ -250,3 +259,14 @@ def test_fourier_refuses_a_prismatic_joint_by_name() -> None:
 def test_empty_mlp_is_refused() -> None:
     with pytest.raises(InvalidValueError, match="at least one hidden layer"):
         oc.MLP(())
+
+
+@pytest.mark.parametrize("parametrisation", [oc.Polynomial(3, ["a"], without=["c"]), oc.Fourier(2, without=["c"])])
+def test_joints_that_are_left_out_do_not_enter(parametrisation: oc.Polynomial | oc.Fourier) -> None:
+    space = JointSpace(np.zeros(3), np.ones(3), (False,) * 3, ("a", "b", "c"))
+    family = parametrisation.family(space, 1)
+    assert family.width == parametrisation.term_count(3)
+    q = ca.SX.sym("q", 3)
+    assert ca.which_depends(family.basis(q), q, 1, False) == [True, True, False]
+    with pytest.raises(InvalidValueError, match="none of them cyclic"):
+        oc.Polynomial(2, ["a"], without=["a"])
