@@ -85,9 +85,9 @@ def fit_wide(
 
     The stages are these:
 
-    1. Under a whole pose or orientation, polynomials without the last joint: xi stays while the tool turns about its
-       own axis, so full turns of the tool close, and rolling the hand moves no other joint. They are kept if they leave
-       out little of the branch after all rounds of 4.
+    1. Under a whole pose or orientation, polynomials without the first and the last joint, then with a linear term of
+       the first one: xi stays while base or tool turn about their own axes, so full turns close, and rolling the hand
+       moves no other joint. They are kept if they leave out little of the branch after all rounds of 4.
     2. Polynomials that are linear in each joint on whose position self-motions do not depend, such as the first and the
        last one, descend with L-BFGS from linear coordinates across the task at the centre of the branch. They are best
        to prove, and hold at any turn of these joints. They ask that self-motions turn base and tool in one direction.
@@ -124,7 +124,7 @@ def fit_wide(
         metric: as in `Problem`.
         clearance: least relative singular value of the task, > 0; see `orthocas.ClearBox`.
         parametrisation: a family, as in `fit`. Those that are not linear in their parameters descend like networks.
-            Default: Polynomial(6) without the last joint and linear in the first one, or another one, see above.
+            Default: Polynomial(6) without the first and the last joint, or another one, see above.
         home: posture whose branch is meant, (n,) or its name. Default: as for `suggest_domain`.
         like: what coordinates are to be like: a function of an SX column q, the name of a joint, or "swivel", the angle
             of the elbow about the line from shoulder to wrist [rad]. With r = 1, xi then has nearly the values of that
@@ -259,6 +259,8 @@ def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomia
     base = [k for k in free if k not in tool]
     names, fewer, of_base, of_tool = (tuple(robot.joint_names[k] for k in part) for part in (free, endless, base, tool))
     families: list[Polynomial | MLP] = [Polynomial(RULES.degree, of_base, without=of_tool)] if tool else []
+    if tool and base and len(base) + len(tool) < robot.n - problem.r:
+        families.insert(0, Polynomial(RULES.degree, without=(*of_base, *of_tool)))
     families.append(Polynomial(RULES.degree, names))
     if names != fewer:
         families.append(Polynomial(RULES.degree_of_all, fewer))
@@ -272,7 +274,7 @@ def _prepare(problem: Problem, family: Parametrisation, like: Likeness | None) -
     require_parametrisation(family)
     family = family.for_problem(problem)
     if isinstance(family, CyclicParametrisation):
-        problem = widen_over_cyclic_joints(problem, (*family.cyclic, *_find_tool_turn(problem, family)))
+        problem = widen_over_cyclic_joints(problem, (*family.cyclic, *_find_free_turns(problem, family)))
     if family.closed_form is not None:
         raise InvalidValueError("parametrisation", family.label, "one that is fitted, such as a polynomial, or an MLP")
     if like is not None and not isinstance(family.family(JointSpace.of(problem), problem.r), LinearFamily):
@@ -281,11 +283,12 @@ def _prepare(problem: Problem, family: Parametrisation, like: Likeness | None) -
     return problem, family
 
 
-def _find_tool_turn(problem: Problem, family: Parametrisation) -> tuple[str, ...]:
-    """Joints that turn the tool and that a family does without: it is regular at any turn of them, or at none."""
+def _find_free_turns(problem: Problem, family: Parametrisation) -> tuple[str, ...]:
+    """Joints that turn tool or base and that a family does without: it is regular at any turn of them, or at none."""
     names = problem.robot.joint_names
     left_out = family.without if isinstance(family, Products) else ()
-    return tuple(name for name in left_out if name in names and turns_tool(problem.task, names.index(name)))
+    places = {name: names.index(name) for name in left_out if name in names}
+    return tuple(name for name, k in places.items() if turns_tool(problem.task, k) or keeps_self_motions(problem, k))
 
 
 def _hold_to_quantities(

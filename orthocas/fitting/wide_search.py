@@ -68,7 +68,7 @@ class WideRules:
     well: float = 0.28  #: over r, volume of all but 1 % of positions that is enough: a conditioning of 0.2
     poor: float = 1e-3  #: fraction of bad positions above which another family is tried
     poor_of_several: float = 4e-3  #: the same with r > 1
-    poor_of_symmetric: float = 3e-3  #: the same of coordinates that do not know the turn of the tool, after all rounds
+    poor_of_symmetric: float = 3e-3  #: the same of coordinates without the turns of tool or base, after all rounds
     very_poor: float = 2e-2  #: fraction above which it is a network at once
     still_poor: float = 6e-3  #: fraction above which it is a network after polynomials in all joints
 
@@ -115,16 +115,21 @@ class WideSolution:
 
 
 def search_families(searches: Sequence["Search"]) -> "Search":
-    """Search in the first family and, as long as results are poor, in others, then go on in the best one."""
-    first, *others = searches
+    """Search in the families that leave out joints, one by one, then in others, and go on in the best one.
+
+    A family that leaves out joints is taken if it leaves out little of the branch. Of the others, the first one is
+    taken, or the best of those that follow if it is poor.
+    """
+    symmetric = [search for search in searches if search.symmetric]
+    for search in symmetric:
+        search.begin(f"{_STAGE}, without {search.left_out}")
+        # rounds with the worst samples halve the fraction of bad positions about once
+        if search.is_enough(4 * RULES.poor_of_symmetric):
+            search.go_on()
+        if search.is_enough(RULES.poor_of_symmetric) or len(searches) == 1:
+            return search
+    first, *others = searches[len(symmetric) :]
     first.begin(_STAGE)
-    if first.symmetric:
-        first.go_on()
-        missed, bad, _ = first.rank
-        if not others or not (missed or bad > RULES.poor_of_symmetric):
-            return first
-        first, *others = others
-        first.begin(f"{_STAGE}, tool joint")
     missed, bad, _ = first.rank
     if missed or bad > (RULES.poor if first.problem.r == 1 else RULES.poor_of_several):
         networks = [search for search in others if not search.linear]
@@ -166,8 +171,9 @@ class Search:
         self.problem, self.parametrisation, self.settings = problem, parametrisation, settings
         self.family = parametrisation.family(JointSpace.of(problem), problem.r)
         self.linear = isinstance(self.family, LinearFamily)
-        #: whether coordinates do not depend on some joints
-        self.symmetric = isinstance(parametrisation, Products) and bool(parametrisation.without)
+        #: names of joints that coordinates do not depend on
+        self.left_out = ", ".join(parametrisation.without) if isinstance(parametrisation, Products) else ""
+        self.symmetric = bool(self.left_out)
         wide = int(np.clip(RULES.per_term * self.family.width, RULES.least_samples, RULES.most_samples))
         self.samples = settings.samples or (wide if self.linear else RULES.network_samples)
         self.solver: Solver = LBFGS(RULES.iterations, RULES.tolerance) if self.linear else _ADAM
@@ -207,6 +213,10 @@ class Search:
             self._add_worst(RULES.fresh, RULES.worst, RULES.fresh_tag + turn)
             name = f"worst samples, round {turn} of {RULES.rounds}"
             self._descend(name, "volume with the worst", LBFGS(RULES.further, RULES.tolerance))
+
+    def is_enough(self, bad: float) -> bool:
+        """Whether the best coordinates are regular at the centre, and at most at a fraction of samples not."""
+        return not self.rank[0] and self.rank[1] <= bad
 
     @property
     def solution(self) -> WideSolution:

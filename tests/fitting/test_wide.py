@@ -304,14 +304,12 @@ def test_a_hand_that_rolls_moves_no_other_joint_and_closes_its_turns() -> None:
     q = sample_uniform(chart.problem.domain, 200, 4)
     np.testing.assert_allclose(chart.xi(q + 2 * np.pi * roll), chart.xi(q), atol=1e-12)
     np.testing.assert_array_equal(chart.coordinates.jacobian(q)[:, 0, 6], 0.0)
-    assert "iiwa_joint_7" not in chart.turn_shifts
-    assert "A7" not in chart.turn_shifts
 
 
 @pytest.mark.slow
 def test_coordinates_without_the_roll_are_tried_first(tmp_path: Path) -> None:
     fit = oc.fit_wide(iiwa(), oc.Task.pose(iiwa()), home_branch(), samples=4000)
-    assert fit.chart.coordinates.label == "polynomial:6:cyclic=A1:without=A7"
+    assert fit.chart.coordinates.label == "polynomial:6:without=A1,A7"
     assert fit.regular_share > 0.995
     fit.chart.save(tmp_path / "wide.orthocas")
     q = sample_uniform(fit.chart.problem.domain, 50, 1)
