@@ -63,7 +63,7 @@ def fitted_from_grown(problem: Problem, quick: bool) -> Chart:
     objective = BasisObjective(
         family, evaluate_samples(problem, points), _WEIGHTS, start, partial(sample_problem, problem)
     )
-    theta = GaussNewton().minimise(objective, start).finished().theta
+    theta = GaussNewton().minimise(objective, start).require_finished().theta
     return Chart(problem, Coordinates(series, space, (), theta, np.zeros(1), np.ones(1)))
 
 

@@ -283,18 +283,20 @@ def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:
     path, q, tracker = np.empty((len(times), chart.n)), q_start, _start_tracker(chart, q_start)
     for k, value in enumerate(reference.sample(times)[0]):
         words = ", ".join(f"{label} = {number:.3g}" for label, number in zip(reference.labels, value, strict=True))
-        where, hint = f"at t = {times[k]:.3g} s, at {words}", f"{too_far(chart, q, targets[k, chart.m :])}{_VALUES}"
+        place, failure = f"at t = {times[k]:.3g} s, at {words}", ""
         # A tracker solves phi(q) = value; where it gives up or J is singular, the inverse map takes more care.
         solution = q if tracker is None else tracker.step(value)
         if tracker is None or tracker.status != TrackerStatus.OK:
             try:
                 solution = chart.inverse(value, q, outside=True)
+                tracker = _start_tracker(chart, solution)
             except InverseError as error:
-                raise UnreachableReferenceError(f"the reference cannot be reached {where}: {error}{hint}") from None
-            tracker = _start_tracker(chart, solution)
-        if not chart.problem.domain.contains(solution):
-            reason = _explain_outside(chart, solution)
-            raise UnreachableReferenceError(f"the reference leaves the domain {where}: {reason}{hint}")
+                failure = f"cannot be reached {place}: {error}"
+        if not failure and not chart.problem.domain.contains(solution):
+            failure = f"leaves the domain {place}: {_explain_outside(chart, solution)}"
+        if failure:
+            hint = too_far(chart, q, targets[k, chart.m :])
+            raise UnreachableReferenceError(f"the reference {failure}{hint}{_VALUES}")
         path[k] = q = solution
     return path
 

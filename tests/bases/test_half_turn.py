@@ -209,7 +209,7 @@ def test_paths_of_two_full_turns_are_followed() -> None:
     ]
     for motion, known in zip(motions, (chart(), chart(turned_deg=100.0)), strict=True):
         np.testing.assert_allclose(
-            known.phi_map.difference(known.phi(motion.q), np.hstack([motion.x, motion.xi])), 0, atol=1e-9
+            known.parts.phi_map.difference(known.phi(motion.q), np.hstack([motion.x, motion.xi])), 0, atol=1e-9
         )
         speed = np.gradient(motion.q, motion.times, axis=0, edge_order=2)
         np.testing.assert_allclose(speed[2:-2], motion.dq[2:-2], atol=0.02 * np.abs(motion.dq).max())
@@ -343,7 +343,7 @@ def test_jumps_of_orientations_do_not_lead_the_law(tmp_path: Path) -> None:
     R, position = task.orientation_of(home[:6]), home[:3]
 
     def led(value: np.ndarray) -> np.ndarray:
-        error = np.concatenate([known.relative.difference(value[:6], home[:6]), value[6:] - home[6:]])
+        error = np.concatenate([known.parts.relative.difference(value[:6], home[:6]), value[6:] - home[6:]])
         return error + supervisor.offset
 
     for _ in range(300):  # the law takes over
