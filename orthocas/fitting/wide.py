@@ -133,9 +133,9 @@ def fit_wide(
             are held against the parts of theirs that are orthogonal to the task. Default: with shoulder, elbow and
             wrist and r = 1, the scale and the direction of the swivel there.
         weights: weights of terms that join the loss, such as `{"name": 0.1}` for a term of `register_loss_term`; or
-            `Weights`, which also take the place of those of leaks and mutual angles, such as `Weights(task=10.0,
-            mutual=1.0, regularity=0.0)`. They are means over the first samples; the worst ones of polynomials only ask
-            for regular coordinates. A search for folds has no place here. Default: none.
+            `Weights`, which also take the place of those of leaks and mutual angles: `Weights(task=10.0, mutual=1.0)`.
+            They are means over the first samples; the worst ones of polynomials only ask for regular coordinates. A
+            search for folds has no place here. Default: none.
         samples: number of samples. Default: 30 for each function, 5,000 to 20,000; 100,000 for a network.
         seed: seed of the samples, and of the first network.
         monitor: called with progress.
