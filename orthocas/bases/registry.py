@@ -51,7 +51,7 @@ def register_parametrisation(
         ...     degree: int = 3
         >>> oc.register_parametrisation("cubic", Cubic, parse=lambda text: Cubic())
         >>> oc.bases.parse_parametrisation("cubic")
-        Cubic(degree=3, cyclic=(), joints=None)
+        Cubic(degree=3, cyclic=(), joints=None, without=())
     """
     require_kind("name", name, str)
     known = _REGISTERED.get(name)

@@ -327,7 +327,9 @@ class Search:
         """Weights of all terms: those of the angles are ours, unless the user gives `Weights`."""
         own, users = self._weigh_regularity(volume), self.settings.weights
         if not isinstance(users, Weights):
-            angles = 2 * self.problem.m * RULES.alignment, 2 * RULES.mutual
+            # coordinates that follow quantities have the angles between these
+            mutual = RULES.mutual if self.settings.quantities is None else 0.0
+            angles = 2 * self.problem.m * RULES.alignment, 2 * mutual
             users = Weights(*angles, 0.0, 0.0, 0.0, dict(users or {}), "metric")
         return replace(users, folds=0.0, extra={**own, **users.extra}).for_problem(self.problem)
 
