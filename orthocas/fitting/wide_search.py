@@ -68,7 +68,8 @@ class WideRules:
     well: float = 0.28  #: over r, volume of all but 1 % of positions that is enough: a conditioning of 0.2
     poor: float = 1e-3  #: fraction of bad positions above which another family is tried
     poor_of_several: float = 4e-3  #: the same with r > 1
-    poor_of_symmetric: float = 3e-3  #: the same of coordinates without the turns of tool or base, after all rounds
+    poor_without_turns: float = 3e-3  #: the same of coordinates without the turns of tool and base, after all rounds
+    poor_without_tool: float = 6e-3  #: the same of the last family that leaves out joints: a network takes its place
     very_poor: float = 2e-2  #: fraction above which it is a network at once
     still_poor: float = 6e-3  #: fraction above which it is a network after polynomials in all joints
 
@@ -123,10 +124,11 @@ def search_families(searches: Sequence["Search"]) -> "Search":
     symmetric = [search for search in searches if search.symmetric]
     for search in symmetric:
         search.begin(f"{_STAGE}, without {search.left_out}")
-        # rounds with the worst samples halve the fraction of bad positions about once
-        if search.is_enough(4 * RULES.poor_of_symmetric):
+        most = RULES.poor_without_tool if search is symmetric[-1] else RULES.poor_without_turns
+        # rounds with the worst samples divide the fraction of bad positions by two to four
+        if search.is_enough(4 * most):
             search.go_on()
-        if search.is_enough(RULES.poor_of_symmetric) or len(searches) == 1:
+        if search.is_enough(most) or len(searches) == 1:
             return search
     first, *others = searches[len(symmetric) :]
     first.begin(_STAGE)
