@@ -24,7 +24,8 @@ LAWS = (Kinematic, Impedance, PDPlus)
 def chart() -> oc.Chart:
     """A wide chart whose xi grows with every turn of joints 1 and 7."""
     robot = oc.Robot.from_urdf(ARM, tip="l7")
-    return oc.fit_wide(robot, oc.Task.pose(robot), home=HOME).chart
+    turning = oc.Polynomial(6, ["j1", "j7"])
+    return oc.fit_wide(robot, oc.Task.pose(robot), home=HOME, parametrisation=turning).chart
 
 
 @pytest.fixture(scope="module")
