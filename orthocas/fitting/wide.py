@@ -245,9 +245,10 @@ def _build_problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch
 
 
 def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomial | MLP, ...]:
-    """Polynomials that are linear in the joints on whose position the self-motions do not depend, by proof.
+    """Under a pose, polynomials without the turns of base and tool, then without that of the tool only.
 
-    Then those that are so in such slides without limits only, if there are others: a joint that turns has one turn.
+    Then those that are linear in the joints on whose position the self-motions do not depend, by proof. Then those that
+    are so in such slides without limits only, if there are others: a joint that turns has one turn.
     Then a network, but not for coordinates that are to mean something, nor with slides without limits.
     """
     robot = problem.robot
