@@ -7,15 +7,21 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from orthocas.bases.family import CombinableFamily, Expression, Family, JointSpace, LinearFamily, Parametrisation
+from orthocas.bases.family import (
+    TURN,
+    CombinableFamily,
+    Expression,
+    Family,
+    JointSpace,
+    LinearFamily,
+    Parametrisation,
+)
 from orthocas.errors import InvalidValueError
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 
 if TYPE_CHECKING:
     from orthocas.tasks.problem import Problem
-
-TURN = 2 * np.pi  #: period of the coordinates [rad]
 
 
 @dataclass(frozen=True)
@@ -88,6 +94,11 @@ class CircleFamily:
     def size(self) -> int:
         """Number of parameters."""
         return self.pairs.size + self.constants
+
+    @property
+    def periods(self) -> Array:
+        """2 pi for all, (r,)."""
+        return np.full(self.outputs, TURN)
 
     @property
     def as_matrices(self) -> bool:

@@ -51,6 +51,7 @@ class Memories:
             self._spare.extend(reversed(found))
 
 
+TURN = 2 * np.pi  #: period of coordinates that are angles [rad]
 Expression = TypeVar("Expression", ca.SX, ca.MX)
 Pulled = Callable[[Array, Array], Array]  #: a derivative that is pulled back, and the array that takes the result
 
@@ -155,6 +156,16 @@ class CombinableFamily(Family, Protocol):
 
     def combined(self, theta: Array, B: Array) -> Array:
         """Parameters of B xi, (size,), for a matrix B (r, r)."""
+        ...
+
+
+@runtime_checkable
+class PeriodicFamily(Family, Protocol):
+    """A family with components that are angles and jump by whole turns."""
+
+    @property
+    def periods(self) -> Array:
+        """Periods of the components, (r,): 2 pi for angles, 0 for others."""
         ...
 
 

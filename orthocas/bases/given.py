@@ -7,7 +7,7 @@ from typing import Literal
 import casadi as ca
 import numpy as np
 
-from orthocas.bases.family import ClosedForm, Expression, JointSpace, component_gradients
+from orthocas.bases.family import TURN, ClosedForm, Expression, JointSpace, component_gradients
 from orthocas.errors import InvalidValueError, RobotError
 from orthocas.robots.kinematics import Pose, build_body_poses
 from orthocas.robots.robot import Robot
@@ -115,6 +115,11 @@ class GivenFamily:
         """Number of steps of the tape."""
         return len(self.given.tape["steps"])
 
+    @cached_property
+    def periods(self) -> Array:
+        """2 pi for components that are angles, 0 for others, (r,)."""
+        return find_periods(self.given.tape)
+
     def expression(self, q: Expression, theta: Expression) -> Expression:
         """xi(q), (r, N), for q (n, N)."""
         xi: Expression = ca.vertcat(*replay(self.given.tape, [q[i, :] for i in range(q.shape[0])]))
@@ -129,6 +134,19 @@ class GivenFamily:
         return np.zeros(0)
 
 
+def find_periods(tape: Tape) -> Array:
+    """2 pi for components that are an atan2 themselves, so that they jump by a whole turn, 0 for others, (r,)."""
+    angles, periods = set[int](), np.zeros(tape["rows"])
+    for name, into, *of in tape["steps"]:
+        if name == "output":
+            periods[into] = TURN if of[0] in angles else 0.0
+        elif name == "atan2" or (name == "assign" and of[0] in angles):
+            angles.add(into)
+        else:
+            angles.discard(into)
+    return periods
+
+
 def sew_angle(robot: Robot, kind: str) -> ca.Function:
     """The SEW angle psi(q): the rotation of the elbow about the line from shoulder to wrist.
 
@@ -139,7 +157,8 @@ def sew_angle(robot: Robot, kind: str) -> ca.Function:
 
     This is the right-handed angle about e_SW from the half-plane of k_x to the half-plane of E. If axis 7 also meets W,
     a motion that keeps the tip's pose rotates E about a fixed line, and psi by the same angle. Otherwise W moves with
-    the elbow.
+    the elbow. Where axes pass each other at a distance, as on a Baxter, S is the point of axis 2 nearest to axis 3, and
+    W that of axis 6 nearest to axis 5: they move a little, too.
 
     - conventional: e_t = 0, e_r = z, so that k_x is e_r across e_SW: psi = 0 in the vertical plane of S and W with
       the elbow up. Singular where W is straight above or straight below S: a line, which upright arms reach.
@@ -159,19 +178,18 @@ def sew_angle(robot: Robot, kind: str) -> ca.Function:
 
     Raises:
         UnknownNameError: if there is no such kind.
-        RobotError: if the robot is not a chain of seven revolute joints, or its axes are parallel or do not meet in S
-            and W.
+        RobotError: if the robot is not a chain of seven revolute joints, or neighbouring axes are parallel.
 
     Source:
-        Both angles and their singularities: [EW2024]. The choice of E (the foot of the common normal of axes 3 and 4)
-        and of e_r = -x is ours, and so is the conventional angle as the case e_t = 0.
+        Both angles and their singularities: [EW2024], for axes that meet in S and W. The choice of E (the foot of the
+        common normal of axes 3 and 4), of S and W elsewhere, and of e_r = -x is ours, and so is the conventional angle
+        as the case e_t = 0.
     """
     require_known("SEW angle", kind, SEW_KINDS)
     _require_seven_revolute(robot.tree)
-    shoulder, elbow, wrist = _find_heights(robot.tree)
     q = ca.SX.sym("q", robot.n)
     poses = build_body_poses(robot.tree, q)
-    S, E, W = _project_on_axis(poses[0], shoulder), _project_on_axis(poses[3], elbow), _project_on_axis(poses[4], wrist)
+    S, E, W = (_project_on_axis(poses[k], height) for k, height in _find_points(robot.tree))
     e_t, e_r = (ca.SX(ca.DM(direction)) for direction in _DIRECTIONS[kind])
     return dense_function("sew_angle", [q], [_compute_angle(E - S, W - S, e_t, e_r)])
 
@@ -190,29 +208,19 @@ def _project_on_axis(pose: Pose, height: float) -> ca.SX:
     return p + R[:, 2] * height
 
 
-def _find_heights(tree: KinematicTree) -> tuple[float, float, float]:
-    """Heights [m] of S on axis 1, of E on axis 4 and of W on axis 5, above the origins of bodies 1, 4 and 5.
+def _find_points(tree: KinematicTree) -> tuple[tuple[int, float], ...]:
+    """S, E and W: an axis, and the height [m] on it above the origin of its body.
 
-    The heights do not depend on q, because neighbouring axes are fixed to each other: S is fixed in the base and in
-    bodies 1 to 3, E in bodies 3 and 4, and W in bodies 4 to 6.
+    The heights do not depend on q, because neighbouring axes are fixed to each other. Where axes 1, 2 and 3 meet, S is
+    fixed in the base and in bodies 1 to 3, so it is a point of axis 1; where axes 5 and 6 meet, W is one of axis 5.
     """
-    names = tree.joint_names
     shoulder, on_2, gap_12 = _find_common_normal(tree, 0)
     also_on_2, _, gap_23 = _find_common_normal(tree, 1)
     _, elbow, _ = _find_common_normal(tree, 2)
-    wrist, _, gap_56 = _find_common_normal(tree, 4)
-    for first, gap in ((0, gap_12), (1, gap_23), (4, gap_56)):
-        if gap > RULES.meeting:
-            raise RobotError(
-                f"the axes of joints '{names[first]}' and '{names[first + 1]}' are {gap:.3g} m apart, "
-                f"expected axes that meet within {RULES.meeting:g} m"
-            )
-    if abs(on_2 - also_on_2) > RULES.meeting:
-        raise RobotError(
-            f"the axes of joints '{names[0]}' and '{names[2]}' meet that of '{names[1]}' at points "
-            f"{abs(on_2 - also_on_2):.3g} m apart, expected one point within {RULES.meeting:g} m"
-        )
-    return shoulder, elbow, wrist
+    wrist, on_6, gap_56 = _find_common_normal(tree, 4)
+    meets = max(gap_12, gap_23, abs(on_2 - also_on_2)) <= RULES.meeting
+    S = (0, shoulder) if meets else (1, also_on_2)
+    return S, (3, elbow), (4, wrist) if gap_56 <= RULES.meeting else (5, on_6)
 
 
 def _find_common_normal(tree: KinematicTree, i: int) -> tuple[float, float, float]:

@@ -83,10 +83,11 @@ class Chart(InverseMethods, Shown):
 
     @property
     def named_coordinates(self) -> tuple[str, ...]:
-        """Labels of the coordinates, with what a fit made the first ones like: 'xi1: like swivel at home [rad]'."""
-        labels, meaning = self.labels[self.m :], self.notes.get("meaning")
+        """Labels of the coordinates, with what the first ones are, or are like: 'xi1: like swivel [rad]'."""
+        labels, meaning, exact = self.labels[self.m :], self.notes.get("meaning"), self.notes.get("exact meaning")
         named = meaning.split("; ") if isinstance(meaning, str) else []
         named = [name if name.startswith("like ") else f"like {name}" for name in named]  # older charts only name it
+        named = exact.split("; ") if isinstance(exact, str) else named
         return (*(f"{label}: {name}" for label, name in zip(labels, named, strict=False)), *labels[len(named) :])
 
     def quality(self, q: ArrayLike) -> PointQuality:

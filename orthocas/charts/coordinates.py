@@ -7,7 +7,6 @@ from typing import Any, Protocol, runtime_checkable
 import casadi as ca
 import numpy as np
 
-from orthocas.bases.circle import TURN, CircleFamily
 from orthocas.bases.family import (
     Expression,
     Family,
@@ -15,6 +14,7 @@ from orthocas.bases.family import (
     JointSpace,
     LinearFamily,
     Parametrisation,
+    PeriodicFamily,
     SelfDerivativeFamily,
 )
 from orthocas.tools.batch import Batched, dense_function, one_blas_thread
@@ -249,10 +249,10 @@ class Coordinates:
 
     @property
     def turns(self) -> Array:
-        """Periods of the coordinates, (r,): 2 pi scale for circle-valued ones, 0 for others."""
+        """Periods of the coordinates, (r,): 2 pi scale for those that are angles, 0 for others."""
         fitted = len(self.offset)
-        own = TURN * np.abs(self.scale) if fitted and isinstance(self.family, CircleFamily) else np.zeros(fitted)
-        return np.concatenate([own, np.zeros(len(self.idle))])
+        own = self.family.periods if fitted and isinstance(self.family, PeriodicFamily) else np.zeros(fitted)
+        return np.concatenate([own * np.abs(self.scale), np.zeros(len(self.idle))])
 
     @property
     def as_matrices(self) -> bool:

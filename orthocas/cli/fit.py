@@ -377,7 +377,8 @@ def _format_domain(suggestion: DomainSuggestion) -> dict[str, str]:
 def _describe_wide(result: Fit) -> dict[str, Any]:
     if not isinstance(result, WideFit) or result.branch is None:
         return {}
-    meaning = None if result.meaning is None else {"like": result.chart.notes["meaning"], **asdict(result.meaning)}
+    named = result.chart.named_coordinates[0].partition(": ")[2]
+    meaning = None if result.meaning is None else {"like": named, **asdict(result.meaning)}
     return {
         "branch": result.branch.name,
         **collect_attributes(result, "regular_share", "left_out"),

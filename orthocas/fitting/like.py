@@ -4,14 +4,14 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
+import scipy
 
 from orthocas.bases.family import LinearFamily
-from orthocas.bases.given import sew_angle
+from orthocas.bases.given import Given, find_periods, sew_angle
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError, RobotError
 from orthocas.fitting.basis_gradients import BasisGradients
@@ -25,7 +25,7 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_known, require_shape
 from orthocas.tools.columns import BlockedFunction
 from orthocas.tools.display import percent
-from orthocas.tools.expressions import build_expression, write_tape
+from orthocas.tools.expressions import build_expression, replay, wrap_shortest, write_tape
 
 Quantity = Callable[[ca.SX], ca.SX]  #: a function of an SX column q
 Likeness = Task | Quantity | str | Sequence[Quantity | str]  #: what coordinates may be like
@@ -37,14 +37,12 @@ class LikeRules:
     """Numbers of coordinates that follow quantities."""
 
     weight: float = 300.0  #: of the term of `fit`, between task (1000) and mutual angles (30)
-    weight_of_wide: float = 0.01  #: of the mean squared distance to gradients of quantities in wide fits, with r > 1
-    held_weight: float = 100.0  #: of the mean squared error of a meaning in wide fits, relative to the slope
-    step: float = 0.02  #: of unit self-motions, along which a meaning is taken
-    most_steps: int = 400
-    fewest: int = 5  #: steps of a self-motion that is long enough
+    weight_of_one: float = 1.0  #: of the mean squared distance to the gradient of a quantity in wide fits, with r = 1
+    along_task: float = 0.1  #: of the squares of what gradients have along the task
+    weight_of_several: float = 0.01  #: the same with r > 1
     still: float = 1e-9  #: of the largest projected gradient
-    still_motion: float = 1e-3  #: least change of a quantity for a unit self-motion
-    tiny: float = 1e-12  #: least sum of squares to divide by
+    still_motion: float = 1e-3  #: least change of a quantity for a unit self-motion, over the length of its gradient
+    scaled_against: float = 0.1  #: share of positions against the swivel up to which it gives a scale
     held_out: int = 2000  #: samples of the distances
     held_out_of_meaning: int = 10_000  #: samples of the domain for errors of a meaning
 
@@ -65,12 +63,6 @@ def build_quantity(robot: Robot, like: Quantity | str) -> tuple[str, ca.Function
     require_shape("like", value.shape, (1, 1))
     name = str(getattr(like, "__name__", ""))
     return name if name.isidentifier() else "a function of q", dense_function("like", [q], [value])
-
-
-def label_likeness(name: str, where: str = "") -> str:
-    """What a coordinate means that is not its quantity, but like it: 'like swivel at home [rad]'."""
-    words, bracket, unit = name.rpartition(" [") if name.endswith("]") else (name, "", "")
-    return " ".join(filter(None, ("like", words, where))) + bracket + unit
 
 
 def _require_finite(slopes: Array) -> Array:
@@ -122,10 +114,39 @@ class Like:
         values = ca.vertcat(*(function(q) for _, function in quantities))
         return cls(tuple(name for name, _ in quantities), _require_arms(robot, q, values))
 
+    @classmethod
+    def of_given(cls, given: Given) -> "Like":
+        """Of coordinates in closed form; angles have the unit rad."""
+        q = ca.SX.sym("q", given.n)
+        values = ca.vertcat(*replay(given.tape, ca.vertsplit(q)))
+        several = [""] if values.numel() == 1 else [f" {k + 1}" for k in range(values.numel())]
+        units = [" [rad]" if period else "" for period in find_periods(given.tape)]
+        names = tuple(f"{given.label}{number}{unit}" for number, unit in zip(several, units, strict=True))
+        return cls(names, dense_function("like", [q], [values]))
+
+    @classmethod
+    def by_default(cls, problem: Problem) -> "Like | None":
+        """The angle of the elbow, if the arm has shoulder, elbow and wrist, and r = 1."""
+        try:
+            return cls.of(problem, SWIVEL) if problem.r == 1 else None
+        except RobotError:
+            return None
+
     @property
     def label(self) -> str:
         """What the coordinates mean, for the notes of a chart: 'like q3 [rad]; like height'."""
-        return "; ".join(label_likeness(name) for name in self.names)
+        return "; ".join(f"like {name}" for name in self.names)
+
+    @cached_property
+    def given(self) -> Given:
+        """The quantities as coordinates in closed form."""
+        words = ", ".join(name.partition(" [")[0] for name in self.names)
+        return Given.from_function(words, self.function.numel_in(0), self.function)
+
+    @cached_property
+    def periods(self) -> Array:
+        """2 pi for quantities that jump by whole turns, 0 for others, (k,)."""
+        return find_periods(self.given.tape)
 
     def require_at_most(self, count: int) -> None:
         """Raise InvalidValueError if there are more quantities than coordinates."""
@@ -156,38 +177,117 @@ class Like:
         # functions of a loss are kept by names
         return LikeTerm(f"like {_hash(slopes)}", len(self.names), slopes)
 
-    def hold(self, samples: Samples, along: Callable[[Array], Array]) -> "list[QuadraticTerm]":
-        """0.01 mean |Z^T (dxi_k/dq - g_k)|^2 over mean |Z^T g_k|^2, with gradients g_k and a basis Z of ker J_x.
-
-        Args:
-            samples: N samples of all joints.
-            along: directions a (N, n) -> derivatives of the basis functions along them, (N, K).
+    def project(self, samples: Samples) -> tuple[Array, Array]:
+        """An orthonormal basis (N, n, n), the last r of ker J_x, and gradients of quantities along it, (N, k, n).
 
         Raises:
             InvalidValueError: if the task leaves nothing of a quantity, or what it leaves of some follows from others.
         """
-        N, m = samples.task_jacobian.shape[:2]
-        Z, slopes = np.linalg.svd(samples.task_jacobian)[2][:, m:], self.differentiate(samples.points)
-        left = np.einsum("sji,ski->skj", Z, slopes)
-        gram = np.einsum("ski,sli->kl", left, left) / N
+        m, B = samples.task_jacobian.shape[1], _split_directions(samples)
+        slopes = self.differentiate(samples.points) @ B
+        left = slopes[:, :, m:]
+        gram = np.einsum("skj,slj->kl", left, left) / len(left)
         squares, least = gram.diagonal(), RULES.still_motion**2
-        moving = (squares > least * (slopes**2).sum(axis=2).max(axis=0)).all()
+        moving = (squares > least * (slopes**2).sum(axis=2).mean(axis=0)).all()
         if not moving or np.linalg.eigvalsh(gram / np.sqrt(np.outer(squares, squares)))[0] < least:
             raise InvalidValueError("like", "quantities that the task leaves nothing of", "others, or another task")
-        # the quadratic form of coefficients that the mean square is
-        parts = [along(Z[:, j]) for j in range(Z.shape[1])]
-        E = sum((part.T @ part for part in parts), start=np.zeros(())) / N
-        pulls = sum((part.T @ left[:, :, j] for j, part in enumerate(parts)), start=np.zeros(())) / N
-        weight = RULES.weight_of_wide
-        return [QuadraticTerm(weight / a * E, weight / a * pulls[:, k], weight) for k, a in enumerate(squares)]
+        return B, slopes
 
-    def name_units(self, coordinates: Coordinates, problem: Problem) -> Coordinates:
-        """Coordinates in the units of their quantities, with their values at the centre of the domain."""
-        k, centre = len(self.names), problem.domain.centre
+    def choose_directions(self, samples: Samples, centre: Samples) -> Array:
+        """Orthonormal directions (r, n) across the task at the centre, the first k in those of the quantities.
+
+        With r = 1, it is the one in which self-motions change the quantity at most samples.
+        """
+        m = centre.task_jacobian.shape[1]
+        across = _split_directions(centre)[0, :, m:].T
+        if len(across) == 1:
+            return np.asarray(across * np.sign(np.median(self.project(samples)[1][:, 0, m])))
+        Q, R = np.linalg.qr(np.vstack([self.differentiate(centre.points)[0] @ across.T, np.eye(len(across))]).T)
+        return np.asarray((Q * np.where(R.diagonal() < 0, -1.0, 1.0)).T @ across)
+
+    def hold(self, samples: Samples, along: Callable[[Array], Array]) -> "list[QuadraticTerm]":
+        """The mean squared distances of gradients from those g_k of quantities, above all along self-motions.
+
+        They are w mean (|Z^T d_k|^2 + 0.1 |N^T d_k|^2) / (l_k^2 + |Z^T g_k|^2) with the distance d_k = dxi_k/dq - g_k,
+        an orthonormal basis Z of ker J_x, N of its complement, and the median l_k of |Z^T g_k|. So distances count
+        relative to gradients where these are large, as near positions at which a quantity jumps. With r = 1, a regular
+        xi grows everywhere along z, so positions at which a quantity that grows at most of them falls do not count.
+
+        Args:
+            samples: N samples of all joints.
+            along: directions a (N, n) -> derivatives of the basis functions along them, (N, K).
+        """
+        m = samples.task_jacobian.shape[1]
+        B, slopes = self.project(samples)
+        r = B.shape[2] - m
+        shares = np.repeat([RULES.along_task, 1.0], [m, r])
+        parts = [along(B[:, :, j]) for j in range(m + r)]
+        terms = []
+        for k in range(len(self.names)):
+            squares = (slopes[:, k, m:] ** 2).sum(axis=1)
+            even = 1 / (np.median(squares) + squares)
+            if r == 1:
+                even *= slopes[:, k, m] * np.median(slopes[:, k, m]) > 0
+            even *= (RULES.weight_of_one if r == 1 else RULES.weight_of_several) / even.sum() / np.median(squares)
+            # the quadratic form of coefficients that the mean square is
+            E, pull = np.zeros(()), np.zeros(())
+            for j, part in enumerate(parts):
+                weighted = (shares[j] * even[:, None] * part).T
+                E, pull = E + weighted @ part, pull + weighted @ slopes[:, k, j]
+            terms.append(QuadraticTerm(E, pull, float(even @ (slopes[:, k] ** 2 @ shares))))
+        return terms
+
+    def name_units(self, coordinates: Coordinates, posture: Array) -> Coordinates:
+        """Coordinates in the units of their quantities, with their values at a posture (n,)."""
+        k = len(self.names)
         offset, scale = coordinates.offset.copy(), coordinates.scale.copy()
-        raw = coordinates.once("xi", centre[None])[0, :k] / scale[:k] + offset[:k]
-        offset[:k], scale[:k] = raw - np.array(self.function(centre))[:, 0], 1.0
+        raw = coordinates.once("xi", posture[None])[0, :k] / scale[:k] + offset[:k]
+        offset[:k], scale[:k] = raw - np.array(self.function(posture))[:, 0], 1.0
         return replace(coordinates, offset=offset, scale=scale)
+
+    def scale(self, coordinates: Coordinates, problem: Problem, posture: Array, seed: int) -> Coordinates | None:
+        """A coordinate with the median rate of the quantity along self-motions, and its value at a posture (n,).
+
+        None if it moves against the quantity at too many positions.
+        """
+        samples = sample_problem(problem, RULES.held_out, (seed, RULES.held_out))
+        own, left = self._compare_rates(coordinates, samples)
+        against = np.mean(own * left < 0)
+        if RULES.scaled_against < against < 1 - RULES.scaled_against:
+            return None
+        scale = float(np.median(left / own))
+        offset = float(coordinates.once("xi", posture[None])[0, 0]) - float(self.function(posture)) / scale
+        return replace(
+            coordinates,
+            offset=coordinates.offset + offset / coordinates.scale,
+            scale=coordinates.scale * scale,
+        )
+
+    def measure_error(self, problem: Problem, coordinates: Coordinates, seed: int) -> "MeaningError":
+        """What the first coordinate misses of the first quantity at samples of the domain, where it has a value."""
+        samples = sample_problem(problem, RULES.held_out_of_meaning, (seed, RULES.held_out_of_meaning))
+        value = Batched(self.function)(samples.points)[0].reshape(len(samples), -1)[:, 0]
+        own, left = self._compare_rates(coordinates, samples)
+        finite = np.isfinite(value) & np.isfinite(left)
+        xi, value = coordinates.once("xi", samples.points)[finite, 0], value[finite]
+        period = float(self.periods[0])
+        missed = wrap_shortest((xi - value)[:, None], np.array([period]))[:, 0]
+        value = xi - missed
+        order = np.argsort(xi)
+        monotone = scipy.optimize.isotonic_regression(value[order])
+        return MeaningError(
+            rms=float(np.sqrt(np.mean(missed**2))),
+            undetermined=float(np.sqrt(np.mean((value[order] - monotone.x) ** 2))),
+            correlation=float(np.corrcoef(xi, value)[0, 1]),
+            against=float(np.mean((own * left)[finite] < 0)),
+        )
+
+    def _compare_rates(self, coordinates: Coordinates, samples: Samples) -> tuple[Array, Array]:
+        """How fast self-motions change the first coordinate and the first quantity, (N,) each; z has any sign."""
+        z = samples.null_basis[:, :, 0]
+        slopes = self._slopes(samples.points)[0].reshape(len(samples), len(self.names), -1)[:, 0]
+        J = coordinates.once("jacobian", samples.points)[:, : samples.points.shape[1]]
+        return tuple(np.einsum("sn,sn->s", rows, z) for rows in (J.reshape(len(samples), -1, z.shape[1])[:, 0], slopes))
 
     def measure_distances(self, problem: Problem, coordinates: Coordinates, seed: int) -> dict[str, float]:
         """Root mean square angles between gradients of coordinates and what the task leaves of quantities' [deg]."""
@@ -199,6 +299,15 @@ class Like:
         cosines = np.einsum("skz,skz->sk", J @ Z, left) / np.maximum(lengths, RULES.still)
         angles = np.degrees(np.sqrt((np.arccos(np.clip(cosines, -1, 1)) ** 2).mean(axis=0)))
         return dict(zip(self.names, angles.tolist(), strict=True))
+
+
+def _split_directions(samples: Samples) -> Array:
+    """An orthonormal basis (N, n, n), the last r of ker J_x; with r = 1, det [J_x; z^T] > 0 for that one."""
+    J = samples.task_jacobian
+    B = np.linalg.svd(J)[2].transpose(0, 2, 1)
+    if J.shape[1] == J.shape[2] - 1:
+        B[:, :, -1] *= np.sign(np.linalg.det(np.concatenate([J, B[:, None, :, -1]], axis=1)))[:, None]
+    return np.asarray(B)
 
 
 def _require_arms(robot: Robot, q: ca.SX, values: ca.SX) -> ca.Function:
@@ -264,149 +373,22 @@ class MeaningError:
     """How far a coordinate is from a quantity at samples of the domain, not only at home."""
 
     rms: float  #: root mean square difference, in the unit of the quantity; of angles, the shortest
-    correlation: float  #: of the two; angles are taken within half a turn of their value at home
+    undetermined: float  #: the same after the best monotone map of the coordinate; angles within half a turn of it
+    correlation: float  #: of the two; angles are taken within half a turn of the coordinate
     against: float  #: share of the positions at which self-motions change the two in opposite signs
 
     @property
     def explained(self) -> str:
         """In words."""
+        rest = f"{self.rms:.2g} off (rms), {self.undetermined:.2g} after the best monotone map"
         against = percent(self.against, fault=True)
-        return f"{self.rms:.2g} off (rms), correlation {self.correlation:.2f}, against it on {against} of the domain"
+        return f"{rest}, correlation {self.correlation:.2f}, against it on {against} of the domain"
 
     def write_notes(self) -> dict[str, float]:
         """For the notes of a chart."""
         return {
             "error of its meaning": self.rms,
+            "error after the best monotone map": self.undetermined,
             "correlation with its meaning": self.correlation,
             "share against its meaning": self.against,
         }
-
-
-@dataclass(frozen=True, eq=False)
-class Meaning:
-    """Values that a coordinate is to have along the self-motion of a posture."""
-
-    points: Array  #: (k, n), the posture in the middle
-    values: Array  #: (k,), monotone
-    home: int  #: place of the posture
-    slope: float  #: mean change of the value for a unit self-motion, in the direction of `find_self_motion`
-    name: str  #: with its unit
-    fitted: bool  #: whether coordinates are fitted to the values; otherwise they only get their scale and offset
-    quantity: ca.Function  #: q (n, 1) -> the quantity (1, 1)
-    turns: bool  #: whether it is an angle that jumps by whole turns
-
-    @property
-    def label(self) -> str:
-        """What the coordinate means, for the notes of a chart."""
-        return label_likeness(self.name, "at home")
-
-    @classmethod
-    def by_default(cls, problem: Problem, posture: Array) -> "Meaning | None":
-        """The scale of the angle of the elbow, if the arm has shoulder, elbow and wrist and r = 1."""
-        try:
-            return replace(cls.of(problem, SWIVEL, posture), fitted=False)
-        except (InvalidValueError, RobotError):
-            return None
-
-    @classmethod
-    def of(cls, problem: Problem, like: Likeness, posture: Array) -> "Meaning":
-        """Follow the self-motion of a posture both ways, as long as it is in the domain and the quantity is monotone.
-
-        Raises:
-            InvalidValueError: if there is more than one quantity, or it stands still there.
-        """
-        if isinstance(like, Task) or (isinstance(like, Sequence) and not isinstance(like, str)):
-            several = Like.of(problem, like)
-            if len(several.names) != 1:
-                raise InvalidValueError("like", f"{len(several.names)} quantities", "one, as r = 1")
-            name, quantity = several.names[0], several.function
-        else:
-            name, quantity = build_quantity(problem.robot, like)
-        # the quantity along the self-motion, both ways
-        sides = [_trace_self_motion(problem, posture, sign * RULES.step) for sign in (-1.0, 1.0)]
-        points = np.concatenate([sides[0][:0:-1], sides[1]])
-        middle = len(sides[0]) - 1
-        # angles do not jump
-        values = np.unwrap(Batched(quantity)(points)[0][:, 0])
-        turns = like == SWIVEL
-        if turns:
-            values -= 2 * np.pi * np.round(values[middle] / (2 * np.pi))
-        # the stretch around the posture on which it is monotone
-        steps = np.diff(values)
-        if len(points) < RULES.fewest or not np.isfinite(steps).all():
-            raise InvalidValueError(
-                "like", "of too short a self-motion at the home", "another home, farther from limits"
-            )
-        k = min(middle, len(steps) - 1)
-        same = np.sign(steps) == np.sign(steps[k])
-        low = k - int(np.argmin(same[k::-1])) + 1 if not same[: k + 1].all() else 0
-        high = k + int(np.argmin(same[k:])) if not same[k:].all() else len(steps)
-        slope = (values[high] - values[low]) / (RULES.step * max(1, high - low))
-        if high - low < RULES.fewest or abs(slope) < RULES.still_motion:
-            raise InvalidValueError("like", "a quantity that stands still at the home", "one that self-motions change")
-        along = points[low : high + 1], values[low : high + 1]
-        return cls(*along, middle - low, float(slope), name, True, quantity, turns)
-
-    def hold(self, family: LinearFamily) -> QuadraticTerm:
-        """The mean squared difference from the values, over the squared slope, for coefficients of a family."""
-        q = ca.SX.sym("q", self.points.shape[1])
-        psi = Batched(dense_function("psi", [q], [family.basis(q)]))(self.points)[0].reshape(len(self.points), -1)
-        rows, sides = psi - psi[self.home], self.values - self.values[self.home]
-        weight = RULES.held_weight / len(rows) / self.slope**2
-        return QuadraticTerm(weight * rows.T @ rows, weight * rows.T @ sides, weight * float(sides @ sides))
-
-    def name_units(self, raw: Coordinates) -> Coordinates:
-        """Coordinates in units of the quantity, with its value at the posture.
-
-        The scale is that for which they were fitted, or the best one.
-        """
-        xi, scale = raw.once("xi", self.points)[:, 0], 1.0
-        away, values = xi - xi[self.home], self.values - self.values[self.home]
-        if not self.fitted:
-            scale = float(away @ values / max(away @ away, RULES.tiny))
-        return replace(raw, offset=np.array([xi[self.home] - self.values[self.home] / scale]), scale=np.array([scale]))
-
-    def measure_error(self, problem: Problem, coordinates: Coordinates, seed: int) -> MeaningError:
-        """What coordinates miss of the quantity at held-out samples of the domain, where it has a value."""
-        samples = sample_problem(problem, RULES.held_out_of_meaning, (seed, RULES.held_out_of_meaning))
-        q = ca.SX.sym("q", problem.n)
-        both = dense_function("quantity", [q], [self.quantity(q), ca.jacobian(self.quantity(q), q)])
-        value, slopes = (part.reshape(len(samples), -1) for part in Batched(both)(samples.points))
-        xi, J = coordinates.once("xi", samples.points), coordinates.jacobian(samples.points)[:, 0]
-        z = samples.null_basis[:, :, 0]
-        finite = np.isfinite(value[:, 0]) & np.isfinite(slopes).all(axis=1)
-        xi, value = xi[finite, 0], value[finite, 0]
-        missed, value = xi - value, value - self.values[self.home]
-        if self.turns:
-            missed, value = _wrap(missed), _wrap(value)
-        # self-motions change the two in opposite directions where the signs differ
-        signs = np.einsum("sn,sn->s", J, z) * np.einsum("sn,sn->s", slopes, z)
-        return MeaningError(
-            rms=float(np.sqrt(np.mean(missed**2))),
-            correlation=float(np.corrcoef(xi, value)[0, 1]),
-            against=float(np.mean(signs[finite] < 0)),
-        )
-
-
-def _wrap(angles: Array) -> Array:
-    return np.asarray(angles - 2 * np.pi * np.round(angles / (2 * np.pi)))
-
-
-def _trace_self_motion(problem: Problem, posture: Array, step: float) -> Array:
-    """The self-motion from a posture in steps of unit self-motions, up to the boundary of the domain, (k, n)."""
-    points, slope = [posture], partial(find_self_motion, problem)
-    while len(points) < RULES.most_steps and problem.domain.contains(points[-1]):
-        q = points[-1]
-        middle = q + step / 2 * slope(q)
-        again = q + step / 2 * slope(middle)
-        points.append(q + step / 6 * (slope(q) + 2 * slope(middle) + 2 * slope(again) + slope(q + step * slope(again))))
-    return np.array(points[:-1] if len(points) > 1 else points)
-
-
-def find_self_motion(problem: Problem, q: Array) -> Array:
-    """The unit self-motion z (n,) of a position for r = 1, with z^T A z = 1 and det [J_x; z^T] > 0."""
-    J = problem.task.batched_frame_jacobian(q[None])[0].reshape(problem.m, problem.n)
-    z = np.linalg.svd(J)[2][-1]
-    z = z * np.sign(np.linalg.det(np.vstack([J, z])))
-    square = 1.0 if problem.metric.is_identity else z @ problem.metric.evaluate(q[None])[0] @ z
-    return np.asarray(z / np.sqrt(square))

@@ -4,7 +4,8 @@ import math
 import time
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,8 +20,9 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import worst_points
 from orthocas.charts.regular_part import RegularPart
 from orthocas.errors import BranchWarning, DomainError, Interrupted, InvalidValueError
+from orthocas.fitting.exact_quantity import choose_quantities, take_exactly
 from orthocas.fitting.fit import Fit, fix_gauge, normalise
-from orthocas.fitting.like import Like, Likeness, Meaning, MeaningError
+from orthocas.fitting.like import Like, Likeness, MeaningError
 from orthocas.fitting.settings import require_parametrisation
 from orthocas.fitting.terms import RULES as LOSS_RULES
 from orthocas.fitting.terms import Weights, find_term
@@ -62,6 +64,7 @@ def fit_wide(
     parametrisation: Parametrisation | None = None,
     home: ArrayLike | str | None = None,
     like: Likeness | None = None,
+    exact: bool | None = None,
     weights: Weights | Mapping[str, float] | None = None,
     samples: int | None = None,
     seed: int = 0,
@@ -123,15 +126,20 @@ def fit_wide(
             place, see `left_out`.
         metric: as in `Problem`.
         clearance: least relative singular value of the task, > 0; see `orthocas.ClearBox`.
-        parametrisation: a family, as in `fit`. Those that are not linear in their parameters descend like networks.
+        parametrisation: a family, as in `fit`. Those that are not linear in their parameters descend like networks;
+            those without parameters, such as `SEW` or `Given`, are taken as they are.
             Default: Polynomial(6) without the first and the last joint, or another one, see above.
         home: posture whose branch is meant, (n,) or its name. Default: as for `suggest_domain`.
-        like: what coordinates are to be like: a function of an SX column q, the name of a joint, or "swivel", the angle
-            of the elbow about the line from shoulder to wrist [rad]. With r = 1, xi then has nearly the values of that
-            quantity along the self-motion of the home, or else of the branch's posture, as far as these are monotone
-            there. With r > 1, several are allowed, or a task of lower priority: the gradients of the first coordinates
-            are held against the parts of theirs that are orthogonal to the task. Default: with shoulder, elbow and
-            wrist and r = 1, the scale and the direction of the swivel there.
+        like: what coordinates are to be, or to be like: a function of an SX column q, the name of a joint, or "swivel",
+            the angle of the elbow about the line from shoulder to wrist [rad]; with r > 1, several, or a task of lower
+            priority. r quantities that are regular nearly everywhere are the coordinates themselves, see `exact`.
+            Otherwise the first coordinates follow them: the loss holds their gradients against those of the quantities
+            along self-motions, at all samples. Default: none; with shoulder, elbow and wrist and r = 1, xi gets the
+            scale and the direction of the swivel.
+        exact: whether xi is the quantity itself, xi = y(q), on the part of the branch where it is regular. With True it
+            is, however small the part; with False it never is. Default: where the part has 99.5 % of the nonsingular
+            positions, if no `parametrisation` is given. A parametrisation without parameters, such as `SEW` or
+            `Given`, is a quantity that is taken with True.
         weights: weights of terms that join the loss, such as `{"name": 0.1}` for a term of `register_loss_term`; or
             `Weights`, which also take the place of those of leaks and mutual angles: `Weights(task=10.0, mutual=1.0)`.
             They are means over the first samples; the worst ones of polynomials only ask for regular coordinates. A
@@ -145,7 +153,7 @@ def fit_wide(
 
     Raises:
         DomainError: if no position of the branch is clear by 1.5 times `clearance`, or if coordinates are not regular
-            in the middle with the sign that they have on most of the branch.
+            in the middle with the sign that they have on most of the branch; with `exact`, not in the middle.
         InvalidValueError, UnknownNameError, NotRedundantError: if an argument is invalid.
         Interrupted: after Ctrl-C, once there are coordinates; before that, KeyboardInterrupt.
 
@@ -171,31 +179,28 @@ def fit_wide(
     count = None if samples is None else require_count("samples", samples, least=2)
     terms = None if weights is None else _check_weights(weights)
 
-    # the problem, and families to try; the domain of each covers all positions of its cyclic joints
+    # the problem, and what coordinates are or follow
     chosen = _choose_branch(robot, task, branch, home)
     problem = _build_problem(robot, task, metric, chosen, bound)
-    families = _choose_families(problem, like) if parametrisation is None else (parametrisation,)
-    cases = [_prepare(problem, family, like) for family in families]
-    problem, family = cases[0]
     posture = chosen.posture if home is None else find_home(robot, task, home).q
-    settings = _hold_to_quantities(WideSettings(count, seed, monitor, terms), problem, like, posture)
+    quantities, exact = choose_quantities(problem, like, exact, parametrisation)
+    settings = WideSettings(count, seed, monitor, terms, quantities)
+    counted = sample_nonsingular(robot, task, chosen.box, RULES.held_out, (seed, RULES.counted_tag))
+    finish = partial(_finish, settings=settings, branch=chosen, posture=posture, counted=counted, start=start)
 
-    idle = find_idle_joints(problem, sample_problem(problem, RULES.first, (seed, RULES.first_tag)))[-problem.r :]
     with remembered() as pressed:
-        if len(idle) == problem.r and parametrisation is None and like is None:
-            none = np.zeros(0)
-            joints = Coordinates(family, JointSpace.of(problem), tuple(idle), none, none, none)
-            solution, settings = WideSolution(problem, joints, "none", 0, ()), replace(settings, meaning=None)
-            result = _finish(solution, settings, chosen, start, interrupted=pressed())
+        if (known := _solve_at_once(problem, quantities, parametrisation, exact, counted, seed)) is not None:
+            result = finish(known, interrupted=pressed())
         else:
-            searches = [Search(*case, settings) for case in cases]
+            # families to try; the domain of each covers all positions of its cyclic joints
+            families = _choose_families(problem, like) if parametrisation is None else (parametrisation,)
+            searches = [Search(*_prepare(problem, family, like), settings) for family in families]
             try:
-                best = search_families(searches)
-                result = _finish(best.solution, settings, chosen, start, interrupted=pressed())
+                result = finish(search_families(searches).solution, interrupted=pressed())
             except KeyboardInterrupt:
                 if searches[0].best is None:
                     raise
-                result = _finish(find_best(searches).solution, settings, chosen, start, interrupted=True)
+                result = finish(find_best(searches).solution, interrupted=True)
         if result.status is Status.INTERRUPTED or pressed():
             raise Interrupted(result)
     if result.left_out:
@@ -277,7 +282,8 @@ def _prepare(problem: Problem, family: Parametrisation, like: Likeness | None) -
     if isinstance(family, CyclicParametrisation):
         problem = widen_over_cyclic_joints(problem, (*family.cyclic, *_find_free_turns(problem, family)))
     if family.closed_form is not None:
-        raise InvalidValueError("parametrisation", family.label, "one that is fitted, such as a polynomial, or an MLP")
+        expected = "one that is fitted, such as a polynomial or an MLP, or one without parameters, such as Given"
+        raise InvalidValueError("parametrisation", family.label, expected)
     if like is not None and not isinstance(family.family(JointSpace.of(problem), problem.r), LinearFamily):
         raise InvalidValueError("parametrisation", family.label, "one that is linear in its parameters, for like")
     warn_unless_savable(family)
@@ -292,46 +298,54 @@ def _find_free_turns(problem: Problem, family: Parametrisation) -> tuple[str, ..
     return tuple(name for name, k in places.items() if turns_tool(problem.task, k) or keeps_self_motions(problem, k))
 
 
-def _hold_to_quantities(
-    settings: WideSettings, problem: Problem, like: Likeness | None, posture: Array
-) -> WideSettings:
-    """The settings with what coordinates mean: for r = 1 the values of a quantity along a self-motion."""
-    if problem.r == 1:
-        meaning = Meaning.by_default(problem, posture) if like is None else Meaning.of(problem, like, posture)
-        return replace(settings, meaning=meaning)
-    if like is None:
-        return settings
-    quantities = Like.of(problem, like)
-    quantities.require_at_most(problem.r)
-    return replace(settings, quantities=quantities)
+def _solve_at_once(
+    problem: Problem,
+    quantities: Like | None,
+    parametrisation: Parametrisation | None,
+    exact: bool | None,
+    counted: Array,
+    seed: int,
+) -> WideSolution | None:
+    """Coordinates that need no fit: quantities, or joints that do not move the task; None if there are none."""
+    known: Coordinates | None
+    if quantities is not None:
+        known = take_exactly(problem, quantities, exact, counted)
+    else:
+        idle = find_idle_joints(problem, sample_problem(problem, RULES.first, (seed, RULES.first_tag)))[-problem.r :]
+        if len(idle) < problem.r or parametrisation is not None:
+            return None
+        problem, family = _prepare(problem, _choose_families(problem, None)[0], None)
+        none = np.zeros(0)
+        known = Coordinates(family, JointSpace.of(problem), tuple(idle), none, none, none)
+    return None if known is None else WideSolution(problem, known, "none", 0, ())
 
 
 def _finish(
-    solution: WideSolution, settings: WideSettings, branch: Branch, start: float, *, interrupted: bool
+    solution: WideSolution,
+    *,
+    settings: WideSettings,
+    branch: Branch,
+    posture: Array,
+    counted: Array,
+    start: float,
+    interrupted: bool,
 ) -> "WideFit":
     """The chart of a solution, normalised and evaluated."""
-    clear, raw, seed = solution.problem, solution.coordinates, settings.seed
-    meaning, quantities = settings.meaning, settings.quantities
-    centre, status = clear.domain.centre, Status.INTERRUPTED if interrupted else Status.CONVERGED
+    clear, seed = solution.problem, settings.seed
+    status = Status.INTERRUPTED if interrupted else Status.CONVERGED
     if solution.misses_centre:
         if interrupted:
             raise KeyboardInterrupt
         wrong = f"in the middle of branch '{branch.name}', coordinates fold or have another sign than on most of it"
         raise DomainError(f"{wrong}: give a smaller box as branch, another branch, or another parametrisation")
-    # scale, order and signs: those of the quantities that coordinates follow, or those of `fit`
-    first = sample_problem(clear, RULES.first, (seed, RULES.first_tag))
-    if meaning is not None:
-        coordinates = meaning.name_units(raw)
-    elif quantities is not None:
-        coordinates = quantities.name_units(normalise(raw, centre, first), clear)
-    else:
-        coordinates = fix_gauge(normalise(raw, centre, first), centre) if len(raw.offset) else raw
+    coordinates, quantities, meaning = _name_coordinates(solution, settings, posture)
     # the domain is where coordinates are regular; how much of the branch that is, and how good they are there
     domain = RegularPart(clear.domain, coordinates, LOSS_RULES.least_volume / clear.r)
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
-    counted = sample_nonsingular(clear.robot, clear.task, branch.box, RULES.held_out, (seed, RULES.counted_tag))
     share = float(domain.contains(counted).mean()) if len(counted) else float("nan")
-    error = None if meaning is None else meaning.measure_error(problem, coordinates, seed)
+    measured = quantities is not None and problem.r == 1
+    error = quantities.measure_error(problem, coordinates, seed) if quantities is not None and measured else None
+    followed = settings.quantities is not None and solution.coordinates.size > 0 and not measured
     worst = worst_points(problem, coordinates, seed, thorough=True)
     terms = settings.weights or {}
     users = terms.for_problem(clear).by_name if isinstance(terms, Weights) else terms
@@ -343,8 +357,8 @@ def _finish(
         "branch": branch.name,
         "share of the branch": share,
         "least conditioning": worst.least,
-        **({} if meaning is None or error is None else {"meaning": meaning.label, **error.write_notes()}),
-        **({} if quantities is None else {"meaning": quantities.label}),
+        **meaning,
+        **({} if error is None else error.write_notes()),
         **{f"weight of {name}": weight for name, weight in users.items() if weight},
     }
     return WideFit(
@@ -358,8 +372,29 @@ def _finish(
         regular_share=share,
         left_out=_describe_left_out(clear, branch, counted),
         meaning=error,
-        like={} if quantities is None else quantities.measure_distances(problem, coordinates, seed),
+        like=quantities.measure_distances(problem, coordinates, seed) if quantities is not None and followed else {},
     )
+
+
+def _name_coordinates(
+    solution: WideSolution, settings: WideSettings, posture: Array
+) -> tuple[Coordinates, Like | None, dict[str, str]]:
+    """Coordinates with scale, order and signs; the quantities that they are, or are like; and the note that says so.
+
+    Fitted ones have the units of their quantities, or of the swivel if that suits, or else the gauge of `fit`.
+    """
+    problem, raw, quantities, seed = solution.problem, solution.coordinates, settings.quantities, settings.seed
+    if not raw.size:
+        return raw, quantities, {} if quantities is None else {"exact meaning": "; ".join(quantities.names)}
+    first = sample_problem(problem, RULES.first, (seed, RULES.first_tag))
+    coordinates = normalise(raw, problem.domain.centre, first)
+    if quantities is not None:
+        return quantities.name_units(coordinates, posture), quantities, {"meaning": quantities.label}
+    swivel = Like.by_default(problem)
+    scaled = None if swivel is None else swivel.scale(coordinates, problem, posture, seed)
+    if swivel is None or scaled is None:
+        return fix_gauge(coordinates, problem.domain.centre), None, {}
+    return scaled, swivel, {"meaning": swivel.label}
 
 
 def _describe_left_out(problem: Problem, branch: Branch, counted: Array) -> str:
@@ -390,10 +425,12 @@ class WideFit(Fit):
         facts = super().facts()
         branch = "" if self.branch is None else self.branch.name
         share = percent(self.regular_share, 2)
+        named, exact = self.chart.named_coordinates[0], "exact meaning" in self.chart.notes
+        meaning = "" if self.meaning is None else f"{self.meaning.explained}: {named}"
         own = {
             "branch": branch,
             "regular": f"{share} of the branch's clear positions (samples); the domain is this part",
             **({"left out": self.left_out} if self.left_out else {}),
-            **({"meaning": f"{self.meaning.explained}: xi1, {self.chart.notes['meaning']}"} if self.meaning else {}),
+            **({"meaning": f"{named}, exactly" if exact else meaning} if exact or meaning else {}),
         }
         return {"fit": facts.pop("fit"), "problem": facts.pop("problem"), **own, **facts}

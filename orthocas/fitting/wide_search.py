@@ -13,7 +13,7 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError
 from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
 from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.fitting.like import Like, Meaning, QuadraticTerm, find_self_motion
+from orthocas.fitting.like import Like, QuadraticTerm
 from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
 from orthocas.fitting.stages import Resampled, Stage, WeightedSum
 from orthocas.fitting.terms import RULES as LOSS
@@ -99,8 +99,7 @@ class WideSettings:
     seed: int = 0
     monitor: Monitor = silent
     weights: Weights | Mapping[str, float] | None = None  #: of terms that join the loss; `Weights` also of the angles
-    meaning: Meaning | None = None  #: what xi means, for r = 1
-    quantities: Like | None = None  #: what the first coordinates follow, for r > 1
+    quantities: Like | None = None  #: what the first coordinates follow
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +253,7 @@ class Search:
 
         The first ones are those of the gradients of quantities that coordinates follow.
         """
-        problem, centre, some = self.problem, self.problem.domain.centre, self._samples[0][:: RULES.every]
+        problem, some = self.problem, self._samples[0][:: RULES.every]
         X = self._basis.at(some.points)
         # mean of dpsi_i/dq A^-1 dpsi_j/dq, (K, K)
         inverse = np.eye(problem.n)[None] if some.metric_inverse is None else some.metric_inverse
@@ -264,21 +263,19 @@ class Search:
         self._factor = np.linalg.cholesky(energy + RULES.ridge * np.trace(energy) / len(energy) * np.eye(len(energy)))
         # directions across the task at the centre; quantities to follow turn them
         directions = scipy.linalg.null_space(self._centre.task_jacobian[0]).T
-        meaning, quantities, self._likeness = self.settings.meaning, self.settings.quantities, list[QuadraticTerm]()
+        quantities, self._likeness = self.settings.quantities, list[QuadraticTerm]()
         if quantities is not None:
-            across = quantities.differentiate(centre[None])[0] @ directions.T  # (k, r)
-            Q, R = np.linalg.qr(np.vstack([across, np.eye(problem.r)]).T)
-            directions = (Q * np.where(R.diagonal() < 0, -1.0, 1.0)).T @ directions
+            directions = quantities.choose_directions(some, self._centre)
             self._likeness = quantities.hold(some, lambda a: self._basis.differentiate_along(X, a))
-        if meaning is not None:
-            directions = meaning.slope * find_self_motion(problem, centre)[None]
-            assert isinstance(self.family, LinearFamily)
-            self._likeness = [meaning.hold(self.family)] if meaning.fitted else []
         # the combination of functions whose gradients are nearest to them in the mean
         sides = [
             self._basis.differentiate_along(X, np.broadcast_to(a, some.points.shape)).mean(axis=0) for a in directions
         ]
-        return np.asarray(scipy.linalg.cho_solve((self._factor, True), np.array(sides).T).T.ravel())
+        C = scipy.linalg.cho_solve((self._factor, True), np.array(sides).T).T
+        # gradients of those that follow quantities are as long as theirs
+        for k, (E, _, a) in enumerate(self._likeness):
+            C[k] *= np.sqrt(a / (C[k] @ E @ C[k]))
+        return np.asarray(C.ravel())
 
     def _start_at_random(self) -> Array:
         """A random start, with gradients of length 1 in the mean as far as the family can scale them, (size,)."""
