@@ -98,6 +98,13 @@ def fit(
         str | None,
         typer.Option("--like", help="What the first coordinates are like: a joint or swivel; several: NAME,NAME."),
     ] = None,
+    exact: Annotated[
+        bool,
+        typer.Option(
+            "--exact",
+            help="With --domain branch: they are what --like says itself, on the part of the branch where that can be.",
+        ),
+    ] = False,
     corridor: Annotated[
         Path | None,
         typer.Option(
@@ -147,6 +154,8 @@ def fit(
     """Fit extra coordinates to a problem and save the chart."""
     bounds = {"leak_deg": leak_deg, "conditioning": conditioning}
     kind, branch = _check_domain(domain, corridor, bounds)
+    if exact and (kind != _BRANCH or like is None):
+        raise OptionError("--exact requires --domain branch and --like")
     if kind == _BRANCH:
         loss_text = None if weights == WEIGHTS_TEXT else weights
         _check_none(solver=solver, max_mutual_deg=max_mutual_deg, weights=loss_text, angles=angles)
@@ -169,7 +178,9 @@ def fit(
                 if (minimiser, samples, max_mutual_deg, like) == (None,) * 4:
                     result = _reuse_fit(suggestion, built, parametrisation)
             elif kind == _BRANCH:
-                result = _fit_wide(problem, words, branch, quantities, parametrisation, samples, seed, monitor)
+                result = _fit_wide(
+                    problem, words, branch, quantities, exact or None, parametrisation, samples, seed, monitor
+                )
             if result is None:
                 assert built is not None
                 result = fit_chart(
@@ -270,6 +281,7 @@ def _fit_wide(
     words: ProblemOptions,
     branch: str,
     like: list[str] | None,
+    exact: bool | None,
     parametrisation: Parametrisation | None,
     samples: int | None,
     seed: int,
@@ -292,6 +304,7 @@ def _fit_wide(
             parametrisation=parametrisation,
             home=words.home if base is None else centre,
             like=like[0] if like and len(like) == 1 else like,
+            exact=exact,
             samples=samples,
             seed=seed,
             monitor=monitor,

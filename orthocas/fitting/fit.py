@@ -225,7 +225,7 @@ def _solve(
     raw = Coordinates(solution.parametrisation, space, idle, solution.theta, np.zeros(r), np.ones(r))
     coordinates = normalise(raw, problem.domain.centre, samples)
     if settings.like is not None:
-        return solution, settings.like.name_units(coordinates, problem)
+        return solution, settings.like.name_units(coordinates, problem.domain.centre)
     if align_to is not None:
         return solution, align(coordinates, align_to, samples)
     return solution, fix_gauge(coordinates, problem.domain.centre)

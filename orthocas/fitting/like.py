@@ -45,6 +45,7 @@ class LikeRules:
     scaled_against: float = 0.1  #: share of positions against the swivel up to which it gives a scale
     held_out: int = 2000  #: samples of the distances
     held_out_of_meaning: int = 10_000  #: samples of the domain for errors of a meaning
+    quantiles: tuple[float, float] = (0.05, 0.95)  #: of rates of a meaning
 
 
 RULES = LikeRules()
@@ -273,6 +274,7 @@ class Like:
         period = float(self.periods[0])
         missed = wrap_shortest((xi - value)[:, None], np.array([period]))[:, 0]
         value = xi - missed
+        slow, fast = np.quantile((left / own)[finite], RULES.quantiles)
         order = np.argsort(xi)
         monotone = scipy.optimize.isotonic_regression(value[order])
         return MeaningError(
@@ -280,6 +282,8 @@ class Like:
             undetermined=float(np.sqrt(np.mean((value[order] - monotone.x) ** 2))),
             correlation=float(np.corrcoef(xi, value)[0, 1]),
             against=float(np.mean((own * left)[finite] < 0)),
+            slow=float(slow),
+            fast=float(fast),
         )
 
     def _compare_rates(self, coordinates: Coordinates, samples: Samples) -> tuple[Array, Array]:
@@ -376,13 +380,16 @@ class MeaningError:
     undetermined: float  #: the same after the best monotone map of the coordinate; angles within half a turn of it
     correlation: float  #: of the two; angles are taken within half a turn of the coordinate
     against: float  #: share of the positions at which self-motions change the two in opposite signs
+    slow: float  #: 5 % quantile of how much self-motions change the quantity for a unit change of the coordinate
+    fast: float  #: 95 % quantile of that
 
     @property
     def explained(self) -> str:
         """In words."""
-        rest = f"{self.rms:.2g} off (rms), {self.undetermined:.2g} after the best monotone map"
-        against = percent(self.against, fault=True)
-        return f"{rest}, correlation {self.correlation:.2f}, against it on {against} of the domain"
+        rates = f"moves it by {self.slow:.2g} to {self.fast:.2g} (5 to 95 %) of itself"
+        off = f"{self.rms:.2g} off (rms), {self.undetermined:.2g} after the best monotone map"
+        against = f"against it on {percent(self.against, fault=True)} of the domain, where it turns back"
+        return f"{rates}, {off}, correlation {self.correlation:.2f}, {against}"
 
     def write_notes(self) -> dict[str, float]:
         """For the notes of a chart."""
@@ -391,4 +398,6 @@ class MeaningError:
             "error after the best monotone map": self.undetermined,
             "correlation with its meaning": self.correlation,
             "share against its meaning": self.against,
+            "slow rate of its meaning": self.slow,
+            "fast rate of its meaning": self.fast,
         }

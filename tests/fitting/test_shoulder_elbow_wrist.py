@@ -193,17 +193,33 @@ def test_robots_without_shoulder_elbow_and_wrist_are_refused() -> None:
         sew_angle(changed(iiwa, parents=(-1, 0, 1, 2, 3, 4, 4)), "conventional")
 
 
-def test_axes_that_do_not_meet_are_named_with_their_distance() -> None:
-    torso = urdf.read_urdf(robot_data("tiago_description/robots/tiago.urdf"))
-    arm = pinocchio_model.lock_joints(pinocchio_model.lock_off_chain(torso, "arm_tool_link"), {"torso_lift_joint": 0.1})
-    with pytest.raises(RobotError, match="'arm_1_joint' and 'arm_2_joint' are 0.125 m apart, expected axes that meet"):
-        sew_angle(oc.Robot.from_model(arm, "arm_tool_link"), "conventional")
+def foot(line: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """The point of a line (point, direction) that is nearest to another one."""
+    (p, d), (o, e) = line, other
+    return p + np.linalg.solve(np.column_stack([d, np.cross(d, e), -e]), o - p)[0] * d
+
+
+@pytest.mark.parametrize("kind", SEW_KINDS)
+def test_points_of_axes_that_pass_each_other_are_ends_of_common_normals(kind: str) -> None:
+    """A Baxter: axes 1 and 2 pass at 69 mm, and so do 5 and 6, at 10 mm."""
+    full = urdf.read_urdf(robot_data("baxter_description/urdf/baxter.urdf"))
+    model = pinocchio_model.lock_off_chain(full, "left_gripper")
+    psi = sew_angle(oc.Robot.from_model(model, "left_gripper"), kind)
+    for q in np.random.default_rng(7).uniform(-1.5, 1.5, (20, 7)):
+        J = pin.computeJointJacobians(model, model.createData(), q)
+        axes = [(np.cross(d, moment), d) for moment, d in zip(J[:3].T, J[3:].T, strict=True)]
+        S, E, W = (foot(axes[k], axes[other]) for k, other in ((1, 2), (3, 2), (5, 4)))
+        e_SW = (W - S) / np.linalg.norm(W - S)
+        assert abs(difference(psi(q), angle_about(e_SW, reference_direction(kind, e_SW), E - S))) < 1e-9
+
+
+def test_points_change_steadily_where_axes_part() -> None:
+    """An iiwa whose axes pass at a tenth of a millimetre has nearly the angle of one whose axes meet."""
     iiwa = iiwa_robot()
-    apart = iiwa.tree.translations.copy()
-    apart[2, 2] += 0.03  # axis 3 slides along axis 2
-    with pytest.raises(RobotError, match="'A1' and 'A3' meet that of 'A2' at points 0.03 m apart, expected one point"):
-        sew_angle(changed(iiwa, translations=apart), "stereographic")
-    apart = iiwa.tree.translations.copy()
-    apart[5] += 0.02 * np.cross(iiwa.tree.rotations[5][:, 2], Z)  # across axes 5 and 6
-    with pytest.raises(RobotError, match="'A5' and 'A6' are 0.02 m apart"):
-        sew_angle(changed(iiwa, translations=apart), "stereographic")
+    for joint, way in ((2, Z), (5, np.cross(iiwa.tree.rotations[5][:, 2], Z))):
+        apart = iiwa.tree.translations.copy()
+        apart[joint] += 1e-4 * way
+        changed_psi, psi = (sew_angle(arm, "conventional") for arm in (changed(iiwa, translations=apart), iiwa))
+        for q in np.random.default_rng(7).uniform(-1, 1, (10, 7)) + CENTRE:
+            assert abs(difference(changed_psi(q), psi(q))) < 5e-3
+

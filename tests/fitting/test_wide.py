@@ -453,22 +453,16 @@ def test_a_tool_that_turns_alone_is_on_one_side_of_singular_positions() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("like", ["swivel", "A3"])
-def test_coordinates_mean_what_is_asked(like: str) -> None:
+def test_coordinates_are_near_what_is_asked(like: str) -> None:
+    """What the fit reports of swivel and joint, beside differences along self-motions; and a fit without a wish."""
     task, polynomial = oc.Task.pose(iiwa()), oc.Polynomial(4, ["A1", "A7"])
     fit = oc.fit_wide(iiwa(), task, home_branch(), like=like, parametrisation=polynomial)
-    assert fit.regular_share > 0.995
+    assert fit.regular_share > 0.99
     assert fit.branch is not None
-    q, chart = fit.branch.posture, fit.chart
+    chart = fit.chart
     value = sew_angle(iiwa(), "conventional") if like == "swivel" else lambda q: q[2]
-    assert abs(float(chart.xi(q)[0]) - float(value(q))) < 1e-9
-    tracker, phi = chart.tracker(q), chart.phi(q)
-    for moved in (0.1, 0.2, 0.3):
-        there = tracker.step(phi + np.append(np.zeros(6), moved))
-        assert tracker.status is oc.TrackerStatus.OK
-        assert abs(float(value(there)) - float(value(q)) - moved) < 0.01
-        np.testing.assert_allclose(iiwa().tip_position(there), iiwa().tip_position(q), atol=1e-9)
-    name = "swivel" if like == "swivel" else "A3"
-    assert chart.named_coordinates == (f"xi1: like {name} at home [rad]",)
+    assert abs(float(chart.xi(fit.branch.posture)[0]) - float(value(fit.branch.posture))) < 1e-9
+    assert chart.named_coordinates == (f"xi1: like {like} [rad]",)
     points = sample_uniform(chart.problem.domain, 4000, 21)
     z, step = self_motions(iiwa(), points), 1e-6
     z /= np.linalg.norm(z, axis=1)[:, None]
@@ -476,29 +470,39 @@ def test_coordinates_mean_what_is_asked(like: str) -> None:
     def values(q: Numbers) -> Numbers:
         return np.array(value.map(len(q))(q.T))[0] if like == "swivel" else q[:, 2]
 
-    missed, home = chart.xi(points)[:, 0] - values(points), float(value(fit.branch.posture))
-    theta = values(points) - home
-    if like == "swivel":
-        missed, theta = ((angles + np.pi) % (2 * np.pi) - np.pi for angles in (missed, theta))
-    moved = [of(points + step * z) - of(points - step * z) for of in (lambda q: chart.xi(q)[:, 0], values)]
-    moved[1] = (moved[1] + np.pi) % (2 * np.pi) - np.pi
+    def wrapped(angles: Numbers) -> Numbers:
+        return np.asarray((angles + np.pi) % (2 * np.pi) - np.pi if like == "swivel" else angles)
+
+    missed = wrapped(chart.xi(points)[:, 0] - values(points))
+    theta = chart.xi(points)[:, 0] - missed
+    moved, asked = (
+        wrapped(of(points + step * z) - of(points - step * z)) for of in (lambda q: chart.xi(q)[:, 0], values)
+    )
     assert fit.meaning is not None
     assert fit.meaning.rms == pytest.approx(np.sqrt(np.mean(missed**2)), rel=0.05)
-    assert fit.meaning.rms > 0.3  # 0.001 along the self-motion of the home
+    assert fit.meaning.undetermined < fit.meaning.rms
     assert fit.meaning.correlation == pytest.approx(np.corrcoef(chart.xi(points)[:, 0], theta)[0, 1], abs=0.05)
-    assert fit.meaning.against == pytest.approx(np.mean(moved[0] * moved[1] < 0), abs=0.02)
+    assert fit.meaning.against == pytest.approx(np.mean(moved * asked < 0), abs=0.02)
+    slow, fast = np.quantile(asked / moved, [0.05, 0.95])
+    assert (fit.meaning.slow, fit.meaning.fast) == (pytest.approx(slow, abs=0.1), pytest.approx(fast, abs=0.1))
     assert chart.notes["error of its meaning"] == fit.meaning.rms
     assert f"{fit.meaning.rms:.2g} off (rms)" in fit.facts()["meaning"]
+    other = wide_pose().chart
+    there = sample_uniform(other.problem.domain, 4000, 21)
+    z = self_motions(iiwa(), there)
+    far = [wrapped(of(there + step * z) - of(there - step * z)) for of in (lambda q: other.xi(q)[:, 0], values)]
+    rates = [np.median(np.abs(np.log(np.abs(pair[1] / pair[0])))) for pair in ((moved, asked), far)]
+    assert rates[0] < 0.7 * rates[1]
 
 
 @pytest.mark.slow
 def test_meanings_that_cannot_be_are_refused() -> None:
     task = oc.Task.pose(iiwa())
-    with pytest.raises(InvalidValueError, match="like is a quantity that stands still at the home"):
+    with pytest.raises(InvalidValueError, match="like is quantities that the task leaves nothing of"):
         oc.fit_wide(iiwa(), task, home_branch(), like="A4")  # the elbow bends as the hand is far
     with pytest.raises(UnknownNameError, match="unknown like 'elbow'"):
         oc.fit_wide(iiwa(), task, home_branch(), like="elbow")
-    with pytest.raises(InvalidValueError, match="2 quantities, expected one"):
+    with pytest.raises(InvalidValueError, match="2 quantities, expected at most 1"):
         oc.fit_wide(iiwa(), task, home_branch(), like=["A3", "A1"])
 
 
@@ -706,7 +710,7 @@ def test_command_fits_a_branch(run: Run) -> None:
     assert json.loads(out)["branch"] == "shoulder+ elbow- wrist+"
     code, out, _ = run(*words, "--domain", "branch:shoulder+ elbow- wrist+", "--samples", "3000", "--force")
     assert code == 0
-    assert ": xi1, like swivel at home [rad]" in out
+    assert ": xi1: like swivel [rad]" in out
     for option, value in (("--solver", "lbfgs"), ("--weights", "1,1"), ("--angles", "paper")):
         message = f"orthocas: --domain branch has a solver and a loss of its own: leave out {option}\n"
         assert run(*words, "--domain", "branch", option, value)[::2] == (2, message)
@@ -945,7 +949,7 @@ def test_bad_settings_are_named() -> None:
     known = oc.problems.get("planar_3r_xy")
     with pytest.raises(InvalidValueError, match="clearance"):
         oc.fit_wide(known.robot, known.task, clearance=float("nan"))
-    with pytest.raises(InvalidValueError, match=r"parametrisation is linear.*, expected one that is .*, or an MLP"):
+    with pytest.raises(InvalidValueError, match=r"parametrisation is linear.*, expected one that is fitted.* or one without"):
         oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.Linear())
     with pytest.raises(InvalidValueError, match=r"parametrisation is mlp:4x4, expected .* linear in .*, for like"):
         oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.MLP((4, 4)), like="q3")
