@@ -386,7 +386,7 @@ class MeaningError:
     @property
     def explained(self) -> str:
         """In words."""
-        rates = f"moves it by {self.slow:.2g} to {self.fast:.2g} (5 to 95 %) of itself"
+        rates = f"moves it by {self.slow:.2g} to {self.fast:.2g} (5 to 95 %) for each unit"
         off = f"{self.rms:.2g} off (rms), {self.undetermined:.2g} after the best monotone map"
         against = f"against it on {percent(self.against, fault=True)} of the domain, where it turns back"
         return f"{rates}, {off}, correlation {self.correlation:.2f}, {against}"

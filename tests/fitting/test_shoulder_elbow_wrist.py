@@ -222,4 +222,3 @@ def test_points_change_steadily_where_axes_part() -> None:
         changed_psi, psi = (sew_angle(arm, "conventional") for arm in (changed(iiwa, translations=apart), iiwa))
         for q in np.random.default_rng(7).uniform(-1, 1, (10, 7)) + CENTRE:
             assert abs(difference(changed_psi(q), psi(q))) < 5e-3
-

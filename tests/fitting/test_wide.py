@@ -949,7 +949,9 @@ def test_bad_settings_are_named() -> None:
     known = oc.problems.get("planar_3r_xy")
     with pytest.raises(InvalidValueError, match="clearance"):
         oc.fit_wide(known.robot, known.task, clearance=float("nan"))
-    with pytest.raises(InvalidValueError, match=r"parametrisation is linear.*, expected one that is fitted.* or one without"):
+    with pytest.raises(
+        InvalidValueError, match=r"parametrisation is linear.*, expected one that is fitted.* or one without"
+    ):
         oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.Linear())
     with pytest.raises(InvalidValueError, match=r"parametrisation is mlp:4x4, expected .* linear in .*, for like"):
         oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.MLP((4, 4)), like="q3")

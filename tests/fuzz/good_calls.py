@@ -69,6 +69,10 @@ def _searches() -> dict[str, Call]:
                 "seed": 0,
             },
         ),
+        "fit_wide, exact": (
+            oc.fit_wide,
+            {"robot": robot, "task": task, "branch": problem.domain, "like": "q1", "exact": True},
+        ),
         "chart.nearest_xi": (chart.nearest_xi, {"q_wish": q, "x": chart.task(q), "tolerance": 1e-9}),
         "chart_along": (oc.chart_along, {"problem": problem, "postures": [q, q + 0.1], "radius": 0.2}),
         "compile_inverse": (oc.compile_inverse, {"chart": chart, "folder": "kept"}),

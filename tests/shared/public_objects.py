@@ -105,6 +105,17 @@ def wide() -> oc.WideFit:
     return oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.Polynomial(3, ["q1"]))
 
 
+def hand_direction(q: ca.SX) -> ca.SX:
+    """The angle of the last link, which jumps by whole turns."""
+    return ca.atan2(ca.sin(ca.sum1(q)), ca.cos(ca.sum1(q)))
+
+
+@cache
+def exact() -> oc.WideFit:
+    known = problems.get("planar_3r_xy")
+    return oc.fit_wide(known.robot, known.task, BENT, like=hand_direction, exact=True)
+
+
 @cache
 def suggestion() -> Any:
     known = problems.get("planar_3r_xy")
@@ -210,6 +221,7 @@ CHARTS: dict[str, Callable[[], oc.Chart]] = {
     "cyclic chart": cyclic,
     "chart of a clear box": clear,
     "wide chart": lambda: wide().chart,
+    "wide chart of an exact quantity": lambda: exact().chart,
     "circle chart": circle,
     "disk chart": disk,
     "linear leaf chart": on_planes,
@@ -249,6 +261,8 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "clear box": lambda: clear().problem.domain,
     "regular part": lambda: wide().chart.problem.domain,
     "wide fit": wide,
+    "regular part of an exact quantity": lambda: exact().chart.problem.domain,
+    "wide fit of an exact quantity": exact,
     "branches": branches,
     "branch": lambda: branches()[0],
     "corridor": lambda: oc.Corridor(oc.Box([0.0, 0.9], 0.8), [[0.0, 0.5], [0.3, 1.2]], [np.inf, 0.2]),
