@@ -37,6 +37,7 @@ class CurveRules:
     sagitta: float = 6e-3  #: largest distance of those parts from their chords [rad] or [m]
     halvings: int = 5  #: of chords that pass the box between points outside
     narrow: float = 1e-10  #: [rad] or [m]: brackets of an end of the domain
+    narrowings: int = 100  #: halvings until then at most
     few: int = 64  #: rows up to which all starts are followed at once, though some lie on one curve
     prismatic: float = 1.0  #: half-widths that a sliding joint may leave its range by
 

@@ -370,7 +370,10 @@ class SelfMotionCurves:
         """The last points of the domain between points of curves (M, n) inside and outside."""
         x = targets[:, : self.boxed.m]
         a, b = inside.copy(), outside.copy()
-        while np.abs(b - a).max(initial=0.0) > RULES.narrow:
+        # where a descent got lost on a joint without boundaries, the spacing of numbers is wider than that
+        for _ in range(RULES.narrowings):
+            if np.abs(b - a).max(initial=0.0) <= RULES.narrow:
+                break
             along = b - a
             middle = (a + b) / 2
             t = along / np.linalg.norm(along, axis=1, keepdims=True)

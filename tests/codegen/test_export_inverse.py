@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from public_objects import clear, fitted, network, planar, ring, wide
+from public_objects import clear, exact, fitted, network, planar, ring, wide
 from test_export import array_of, module_of
 
 import orthocas as oc
@@ -71,6 +71,7 @@ CHARTS: dict[str, Callable[[], oc.Chart]] = {
     "network": network,
     "clear box": clear,
     "wide": lambda: wide().chart,
+    "exact quantity": lambda: exact().chart,
     "circle": ring,
     "corridor": in_corridor,
     "a user's domain": in_blob,

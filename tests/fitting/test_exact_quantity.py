@@ -1,6 +1,7 @@
 """Quantities that are coordinates themselves: swivels, joints and functions, from the fit to files, trackers and C."""
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -263,3 +264,19 @@ def test_the_command_takes_quantities_as_they_are(run: Run) -> None:
     assert code == 0
     assert "swivel [rad]" in out
     assert run(*words, "--force")[::2] == (2, "orthocas: --exact requires --domain branch and --like\n")
+
+
+@pytest.mark.slow
+def test_a_swivel_of_joints_without_boundaries() -> None:
+    """Whole turns of base and tool change nothing. The search for one solution did not end: its start was 5e17 rad."""
+    known = robot_of("panda")
+    lower, upper = known.lower.copy(), known.upper.copy()
+    lower[[0, 6]], upper[[0, 6]] = -np.inf, np.inf
+    robot = oc.Robot(replace(known.tree, lower=lower, upper=upper))
+    chart = oc.fit_wide(robot, oc.Task.pose(robot), like="swivel", exact=True).chart
+    q = sample_uniform(chart.problem.domain, 200, 1)
+    turned = q + 2 * np.pi * np.array([2, 0, 0, 0, 0, 0, -1])
+    assert chart.problem.domain.contains(turned).all()
+    np.testing.assert_allclose(chart.xi(turned), chart.xi(q), atol=1e-12)
+    found = chart.solve(chart.phi(q))
+    assert (found.status == oc.InverseStatus.FOUND).all()

@@ -69,7 +69,7 @@ def _searches() -> dict[str, Call]:
                 "seed": 0,
             },
         ),
-        "fit_wide, exact": (
+        "fit_wide, of a quantity": (
             oc.fit_wide,
             {"robot": robot, "task": task, "branch": problem.domain, "like": "q1", "exact": True},
         ),
