@@ -31,6 +31,7 @@ SCRIPTS = (
     "many_joints",
     "priorities",
     "wide_charts",
+    "quantities",
     "choices",
     "elbow_angle",
     "scaling",

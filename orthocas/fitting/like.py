@@ -207,12 +207,13 @@ class Like:
         return np.asarray((Q * np.where(R.diagonal() < 0, -1.0, 1.0)).T @ across)
 
     def hold(self, samples: Samples, along: Callable[[Array], Array]) -> "list[QuadraticTerm]":
-        """The mean squared distances of gradients from those g_k of quantities, above all along self-motions.
+        """Weighted means of squared distances of gradients from those g_k of quantities, above all along self-motions.
 
-        They are w mean (|Z^T d_k|^2 + 0.1 |N^T d_k|^2) / (l_k^2 + |Z^T g_k|^2) with the distance d_k = dxi_k/dq - g_k,
-        an orthonormal basis Z of ker J_x, N of its complement, and the median l_k of |Z^T g_k|. So distances count
-        relative to gradients where these are large, as near positions at which a quantity jumps. With r = 1, a regular
-        xi grows everywhere along z, so positions at which a quantity that grows at most of them falls do not count.
+        They are those of |Z^T d_k|^2 + 0.1 |N^T d_k|^2 with the distance d_k = dxi_k/dq - g_k and orthonormal bases Z
+        of ker J_x and N of its complement. Weights are in proportion to 1 / (l_k^2 + |Z^T g_k|^2), with the median l_k
+        of |Z^T g_k|, and their sum to 1 / l_k^2: distances count relative to gradients where these are large, as near
+        positions at which a quantity jumps. With r = 1, a regular xi grows everywhere along z, so positions at which a
+        quantity that grows at most of them falls do not count.
 
         Args:
             samples: N samples of all joints.
