@@ -38,7 +38,7 @@ from orthocas.errors import (
 from orthocas.fitting import wide as wide_fits
 from orthocas.fitting.basis_gradients import build_gradients
 from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.fitting.like import QuadraticTerm
+from orthocas.fitting.like import Like, QuadraticTerm
 from orthocas.fitting.network_objective import ArrayObjective
 from orthocas.fitting.stages import Resampled
 from orthocas.fitting.wide_search import Search, WideSettings, sample_frames, search_families
@@ -493,6 +493,25 @@ def test_coordinates_are_near_what_is_asked(like: str) -> None:
     far = [wrapped(of(there + step * z) - of(there - step * z)) for of in (lambda q: other.xi(q)[:, 0], values)]
     rates = [np.median(np.abs(np.log(np.abs(pair[1] / pair[0])))) for pair in ((moved, asked), far)]
     assert rates[0] < 0.7 * rates[1]
+
+
+@pytest.mark.slow
+def test_coordinates_have_the_scale_of_the_swivel_by_default() -> None:
+    """Half of the self-motions change the swivel by more than xi, half by less; quantities that turn back give none."""
+    chart, posture = wide_pose().chart, home_branch().posture
+    value = sew_angle(iiwa(), "conventional")
+    assert abs(float(chart.xi(posture)[0]) - float(value(posture))) < 1e-9
+    assert chart.named_coordinates == ("xi1: like swivel [rad]",)
+    q = sample_uniform(chart.problem.domain, 4000, 22)
+    z, step = self_motions(iiwa(), q), 1e-7
+    psi = [np.array(value.map(len(q))((q + sign * step * z).T))[0] for sign in (1, -1)]
+    moved = (psi[0] - psi[1] + np.pi) % (2 * np.pi) - np.pi
+    rates = moved / (chart.xi(q + step * z) - chart.xi(q - step * z))[:, 0]
+    assert np.median(rates) == pytest.approx(1, abs=0.04)
+    scaled = [Like.of(chart.problem, name).scale(chart.coordinates, chart.problem, posture, 0) for name in ("A1", "A3")]
+    assert scaled[0] is None
+    assert isinstance(scaled[1], Coordinates)
+    assert float(scaled[1].xi(posture[None])[0, 0]) == pytest.approx(posture[2], abs=1e-9)
 
 
 @pytest.mark.slow

@@ -31,6 +31,7 @@ import numpy as np
 import paper_network
 import pytest
 import quality_and_time
+import quantities
 import random_walk
 import scaling
 import starts
@@ -369,6 +370,17 @@ def test_the_elbow_angle_leans_farther_into_the_task_than_fitted_coordinates() -
     assert oc.evaluate(chart, points=points).leak.rms == pytest.approx(
         np.sqrt((elbow_angle.leaks(chart, points) ** 2).mean()), rel=1e-6
     )
+
+
+@pytest.mark.slow
+def test_benchmark_of_quantities_has_them_exactly_and_nearly() -> None:
+    exact, near = quantities.main(quick=True)
+    assert [row.split(" | ")[0] for row in (*exact, *near)] == [
+        "| panda, conventional",
+        "| panda, stereographic",
+        "| iiwa, A3",
+    ]
+    assert all(row.count("|") == 4 for row in exact)
 
 
 @pytest.mark.nightly
