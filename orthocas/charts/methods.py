@@ -79,7 +79,7 @@ class InverseMethods(PhiFunctions):
             >>> try:
             ...     chart.inverse(chart.phi(start) + [0.0, 0.0, 2.0], start)
             ... except oc.errors.InverseError as error:
-            ...     bool(oc.contains(chart.problem.domain, error.nearest))
+            ...     bool(chart.problem.domain.contains(error.nearest))
             True
         """
         targets, single = as_point_set("phi", phi, self.n)

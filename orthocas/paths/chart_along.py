@@ -85,8 +85,9 @@ def corridor_problem(problem: Problem, postures: ArrayLike, radius: float = RADI
         >>> import numpy as np
         >>> import orthocas as oc
         >>> from orthocas import problems
+        >>> from orthocas.paths import corridor_problem
         >>> postures = np.linspace([0.0, 0.6, 0.8], [0.8, 1.6, 0.8], 20)
-        >>> problem = oc.corridor_problem(problems.get("planar_3r_xy"), postures)
+        >>> problem = corridor_problem(problems.get("planar_3r_xy"), postures)
         >>> chart = oc.fit(problem, oc.Polynomial(3), samples=500).chart
         >>> bool(oc.evaluate(chart, samples=500).conditioning.min > 0.5)
         True

@@ -24,7 +24,7 @@ from concurrent.futures import ThreadPoolExecutor
 assert [stage.result.status.value for stage in fit.stages] == ["converged"]
 assert fit.chart.notes["solver"] == "gauss_newton"
 assert oc.load("radial.orthocas").coordinates.parametrisation == Radial(60)
-assert oc.bases.parse_parametrisation("radial:7") == Radial(7)
+assert bases.parse_parametrisation("radial:7") == Radial(7)
 points = problem.domain.centre + 0.1 * np.random.default_rng(1).normal(size=(3, 3))
 J = fit.chart.jacobian(points)
 step = 1e-6 * np.eye(3)
@@ -79,7 +79,7 @@ points = np.repeat(sample_evenly(problem.domain, 30, 3), 2, axis=0)  # every sec
 family = oc.Polynomial(2).family(JointSpace.of(problem), 2)
 theta = family.initial(1)
 fast = BasisObjective(family, evaluate_samples(problem, points), weights, theta, None)
-slow = oc.loss(problem, oc.Polynomial(2), weights=weights, samples=points, start=theta)
+slow = loss(problem, oc.Polynomial(2), weights=weights, samples=points, start=theta)
 x = ca.MX.sym("x", family.size)
 H, g, value = ca.hessian(slow(x), x)[0], ca.gradient(slow(x), x), slow(x)
 exact = ca.Function("exact", [x], [value, g, H])
@@ -200,6 +200,8 @@ def test_names_are_taken_once() -> None:
 from dataclasses import replace
 from types import SimpleNamespace
 import orthocas as oc
+from orthocas.fitting.loss import loss
+from orthocas import bases
 from orthocas.fitting.terms import find_term
 for registered in ({", ".join(f"lambda: {call}" for call in TAKEN)}):
     try:
