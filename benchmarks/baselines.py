@@ -79,7 +79,7 @@ class TwoTaskLaw(Shown, ABC):
     @cached_property
     def function(self) -> ca.Function:
         """q, dq (n, 1), reference and its derivatives (m + k_2, 1), gains -> command (n, 1), status (1, 1)."""
-        return self._second.runnable(count_turns_from_centre(self.graph, self.problem))
+        return self._second.parts.runnable(count_turns_from_centre(self.graph, self.problem))
 
     @cached_property
     @abstractmethod
@@ -326,7 +326,7 @@ class Projector(TwoTaskLaw):
     @cached_property
     def energy(self) -> ca.Function:
         """The fast form of `energy_graph`."""
-        return self._second.runnable(count_turns_from_centre(self.energy_graph, self.problem))
+        return self._second.parts.runnable(count_turns_from_centre(self.energy_graph, self.problem))
 
     @cached_property
     def energy_graph(self) -> ca.Function:
@@ -568,11 +568,11 @@ class _ExtraCoordinates:
         return self.chart.coordinates.functions["second_derivative"](q, dq, dq)
 
     def wrap_shortest(self, difference: ca.MX) -> ca.MX:
-        shorter: ca.MX = wrap_shortest(difference, self.chart.turns)
+        shorter: ca.MX = wrap_shortest(difference, self.chart.parts.turns)
         return shorter
 
     def runnable(self, graph: ca.Function) -> ca.Function:
-        return self.chart.runnable(graph)
+        return self.chart.parts.runnable(graph)
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         """Raise UnreachableReferenceError if the motion from q_start along the reference leaves the chart's domain."""

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from orthocas.charts.chart import Chart
+from orthocas.charts.chart import Chart, load
 from orthocas.charts.quality import evaluate
 from orthocas.cli.codegen import CONTROLLERS, add_law_options, build_controller, require_settings
 from orthocas.cli.options import AsJson, ChartPath, Force, Limit, parse_number, parse_numbers, parse_whole_number
@@ -92,7 +92,7 @@ def simulate(
     _check_folder(out, animation, force)
     # CasADi may lose Ctrl-C while it builds functions.
     with deferred():
-        loaded = Chart.load(chart)
+        loaded = load(chart)
         # Raises for grown charts.
         loaded.function("xi")
         plan = read_steps(steps, loaded)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from orthocas import problems
-from orthocas.charts.chart import Chart
+from orthocas.charts.chart import Chart, load
 from orthocas.cli.options import AsJson, Force, ProblemOptions, add_problem_options, is_robot_file, parse_whole_number
 from orthocas.cli.output import note, print_json, print_rows
 from orthocas.errors import OptionError
@@ -100,13 +100,13 @@ def _read_scene(target: str, chart: Path | None, meshes: Path | None, words: Pro
         return _Scene(motion, owner, meshes, locked)
     if chart is not None:
         raise OptionError(f"{target} is a chart: leave out --chart")
-    return _Scene(Chart.load(place), None, meshes, locked)
+    return _Scene(load(place), None, meshes, locked)
 
 
 def _load_owner(chart: Path | None, meshes: Path | None, words: ProblemOptions) -> Robot | Chart:
     """Whose motion it is."""
     if chart is not None:
-        return Chart.load(chart)
+        return load(chart)
     if meshes is None:
         raise OptionError("files of motions hold no robot: give --chart or --robot")
     return words.build_robot(str(meshes))

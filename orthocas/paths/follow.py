@@ -187,7 +187,7 @@ def _sample_on_stamps(
         raise SolveError("no speed along the path keeps the limits at all time stamps")
     x, xi = path.x(s), path.xi(s)
     names = limits.chart.labels, limits.chart.problem.robot.joint_names
-    over = limits.chart.left_over(q[0], q[-1], RULES.returns)
+    over = limits.chart.parts.left_over(q[0], q[-1], RULES.returns)
     return JointMotion(*names, times, q, dq, ddq, x, xi, s, over, limits.measure_margins(q, dq, ddq))
 
 
@@ -445,7 +445,7 @@ class XiChoice:
 
     def _find_first_state(self, q: Array) -> _State | None:
         """The spline through the coordinates of joint positions, or through their mean where that has no solution."""
-        xi = counted_on(self.chart.xi(q), self.chart.turns[self.chart.m :])
+        xi = counted_on(self.chart.xi(q), self.chart.parts.turns[self.chart.m :])
         values = np.linalg.lstsq(self._basis, xi, rcond=None)[0]
         return self._evaluate_state(values, q) or self._evaluate_state(np.tile(xi.mean(axis=0), (len(values), 1)), q)
 

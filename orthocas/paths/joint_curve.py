@@ -37,7 +37,7 @@ class PhiSolver:
                 chart.coordinates.functions["second_derivative"](q, v, w),
             )
             turning = ca.Function("turning", [q, v, w], [ca.densify(ca.vertcat(*bends))])
-        self._turning = Batched(chart.runnable(turning))
+        self._turning = Batched(chart.parts.runnable(turning))
 
     def jacobian(self, q: Array) -> Array:
         """J (N, n, n) at joint positions (N, n), with the rates of orientations."""

@@ -47,7 +47,7 @@ class JointMotion(Shown):
     x: Array  #: (N, m) task values
     xi: Array  #: (N, r)
     s: Array  #: (N,) parameter of the path, from 0 to 1
-    left_over: Array | None  #: (n,) what the path leaves over in the joints, see `Chart.left_over`; None: it is open
+    left_over: Array | None  #: (n,) what the path leaves over in the joints, `ChartParts.left_over`; None: open
     margins: Margins
 
     def __post_init__(self) -> None:

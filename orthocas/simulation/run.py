@@ -336,9 +336,9 @@ class Prepared:
         unknown = [np.full((len(times), 1), np.nan)] * 2
         storage, power = unknown if energy is None else self._evaluate("energy", q, dq, *target)
         value, chart = self._evaluate("measured", q)[0], controller.chart
-        if chart is not None and controller.labels == chart.labels and chart.turns.any():
+        if chart is not None and controller.labels == chart.labels and chart.parts.turns.any():
             # Circle-valued quantities with the whole turns that bring them nearest to the reference.
-            value = np.asarray(target[0] + wrap_shortest(value - target[0], chart.turns))
+            value = np.asarray(target[0] + wrap_shortest(value - target[0], chart.parts.turns))
         run = Trajectory(
             controller=controller.name,
             kind=controller.command,

@@ -366,7 +366,7 @@ def coupling_index(chart: Chart, reference: Reference, trajectory: Trajectory) -
     if reference.labels != chart.labels:
         raise InvalidValueError("labels of the reference", reference.labels, f"those of the chart {chart.labels}")
     wanted = reference.sample(np.minimum(trajectory.times, reference.duration))[0]
-    away = np.abs(wrap_shortest(chart.phi(trajectory.q) - wanted, chart.turns))
+    away = np.abs(wrap_shortest(chart.phi(trajectory.q) - wanted, chart.parts.turns))
     # Between two steps of the reference, only the commanded coordinates should move.
     steps = np.diff(np.vstack([reference.start, reference.targets]), axis=0)
     index = np.full((chart.n, chart.n), np.nan)

@@ -51,10 +51,11 @@ class ChartPage:
     def _add_sliders(self) -> dict[str, Any]:
         """One slider for each component of phi: coordinates first."""
         gui, chart, m = self._server.gui, self._chart, self._chart.m
-        phi, sizes = chart.phi(self.session.home), chart.phi_sizes
+        phi, sizes = chart.phi(self.session.home), chart.parts.phi_sizes
         sliders = {}
         with gui.add_folder("Coordinates: the task stays"):
-            for label, name, value in zip(chart.labels[m:], chart.named_coordinates, phi[m:].tolist(), strict=True):
+            names = chart.parts.named_coordinates
+            for label, name, value in zip(chart.labels[m:], names, phi[m:].tolist(), strict=True):
                 hint = f"Moves the joints along {label}, and keeps the task and the other coordinates."
                 sliders[label] = self._add_slider(name, value, 0.5, hint, label)
         with gui.add_folder("Task: the coordinates stay"):

@@ -161,7 +161,7 @@ def _build_times(cycles: int) -> tuple[Array, Array]:
 def _find_largest_circle(chart: Chart, start: Array, fractions: Array) -> tuple[Place, Array]:
     """A circle in the first two components of the task, or a line in one, as large as the chart can follow."""
     x0, m = chart.task(start), min(chart.m, 2)
-    radius = RULES.circle * float(chart.phi_sizes[:m].min())
+    radius = RULES.circle * float(chart.parts.phi_sizes[:m].min())
     while True:
 
         def along(fraction: Array, radius: float = radius) -> Array:
@@ -173,14 +173,14 @@ def _find_largest_circle(chart: Chart, start: Array, fractions: Array) -> tuple[
             return along, _follow_with_constant_xi(chart, along(fractions), start)
         except PathError:
             radius /= 1.3
-            if radius < RULES.smallest_circle * float(chart.phi_sizes[:m].min()):
+            if radius < RULES.smallest_circle * float(chart.parts.phi_sizes[:m].min()):
                 raise
 
 
 def _build_polygon(chart: Chart, path: Array) -> Place:
     """Straight lines between waypoints."""
     points, _ = as_point_set("path", path, chart.m)
-    sizes = chart.phi_sizes[: chart.m]
+    sizes = chart.parts.phi_sizes[: chart.m]
     if len(points) < 3 or np.abs((points[-1] - points[0]) / sizes).max() > RULES.same_ends:
         raise PathError(f"the path of {len(points)} waypoints is not closed, expected its last to be its first")
     lengths = np.linalg.norm(np.diff(points, axis=0) / sizes, axis=1)

@@ -172,7 +172,7 @@ def test_tasks_that_do_not_turn_with_the_base_are_not_proved_so(robot: oc.Robot)
 @pytest.mark.slow
 def test_files_and_c_are_the_chart(chart: oc.Chart, tmp_path: Path) -> None:
     chart.save(tmp_path / "mobile.orthocas")
-    back = oc.Chart.load(tmp_path / "mobile.orthocas")
+    back = oc.load(tmp_path / "mobile.orthocas")
     q = HOME + 0.1
     np.testing.assert_array_equal(back.phi(q), chart.phi(q))
     law = oc.control.PDPlus(back, stiffness=100.0)

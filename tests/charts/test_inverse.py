@@ -45,7 +45,7 @@ def test_rows_do_not_depend_on_each_other(iiwa_fit: Fit) -> None:
     assert np.isnan(solutions.q[7]).all()
     assert np.isfinite(np.delete(solutions.q, 7, axis=0)).all()
     assert solutions.error[3] == pytest.approx(
-        np.abs((phi[3] - chart.phi(solutions.q[3])) / (chart.phi_sizes + 1e-5 * np.abs(phi[3]))).max()
+        np.abs((phi[3] - chart.phi(solutions.q[3])) / (chart.parts.phi_sizes + 1e-5 * np.abs(phi[3]))).max()
     )
 
 

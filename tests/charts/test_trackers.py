@@ -108,7 +108,7 @@ def wide_chart() -> oc.Chart:
 
 def cost(chart: oc.Chart, phi: np.ndarray, q: np.ndarray) -> float:
     """What a tracker of the nearest x makes small."""
-    e = chart.parts.phi_map.difference(phi, chart.phi(q)) / chart.phi_sizes
+    e = chart.parts.phi_map.difference(phi, chart.phi(q)) / chart.parts.phi_sizes
     return float((e[: chart.m] ** 2).sum() + 9e-8 * (e[chart.m :] ** 2).sum())
 
 
@@ -144,7 +144,7 @@ def metres_nearer(chart: oc.Chart, phi: np.ndarray, q: np.ndarray) -> float:
     )
     if not domain.contains(np.clip(found.x, low, high)) and rooms(found.x).min() < -1e-7:
         return 0.0
-    return float((np.sqrt(cost(chart, phi, q)) - np.sqrt(cost(chart, phi, found.x))) * chart.phi_sizes[0])
+    return float((np.sqrt(cost(chart, phi, q)) - np.sqrt(cost(chart, phi, found.x))) * chart.parts.phi_sizes[0])
 
 
 def led_along_the_border(chart: oc.Chart, away: float, aside: float, ticks: int) -> np.ndarray:

@@ -471,7 +471,7 @@ def test_coordinates_mean_what_is_asked(like: str) -> None:
         assert abs(float(value(there)) - float(value(q)) - moved) < 0.01
         np.testing.assert_allclose(iiwa().tip_position(there), iiwa().tip_position(q), atol=1e-9)
     name = "swivel" if like == "swivel" else "A3"
-    assert chart.named_coordinates == (f"xi1: like {name} at home [rad]",)
+    assert chart.parts.named_coordinates == (f"xi1: like {name} at home [rad]",)
     points = sample_uniform(chart.problem.domain, 4000, 21)
     z, step = self_motions(iiwa(), points), 1e-6
     z /= np.linalg.norm(z, axis=1)[:, None]
@@ -542,7 +542,7 @@ def test_several_coordinates_follow_several_quantities() -> None:
     middle = fits[0].chart.problem.domain.centre
     np.testing.assert_allclose(fits[0].chart.xi(middle)[:2], [middle[2], float(height(ca.DM(middle)))], atol=1e-9)
     assert list(fits[0].like) == ["q3 [rad]", "height"]
-    assert fits[0].chart.named_coordinates == ("xi1: like q3 [rad]", "xi2: like height", "xi3")
+    assert fits[0].chart.parts.named_coordinates == ("xi1: like q3 [rad]", "xi2: like height", "xi3")
 
 
 @pytest.mark.parametrize("metric", ["euclidean", "inertia"])

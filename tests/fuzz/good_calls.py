@@ -318,7 +318,6 @@ def _functions() -> dict[str, Call]:
         "load": (oc.load, {"path": "no.orthocas"}),
         "charts.load": (oc.charts.load, {"name": "ur5-position"}),
         "charts.card": (oc.charts.card, {"name": "ur5-position"}),
-        "Chart.load": (oc.Chart.load, {"path": "no.orthocas"}),
         "loss": (loss, {**box, "weights": (1, 1), "samples": 20, "seed": 0, "start": None}),
         "compare": (
             oc.compare,

@@ -284,7 +284,7 @@ def test_trackers_go_to_the_end_of_a_range_and_stay(kind: str, axes: str) -> Non
 
 def cost(chart: oc.Chart, phi: Array, q: Array) -> Array:
     """What a tracker with `nearest=True` lowers, at points (N, n)."""
-    weights = np.where(np.arange(3) < chart.m, 1 / chart.phi_sizes, RULES.xi_weight)
+    weights = np.where(np.arange(3) < chart.m, 1 / chart.parts.phi_sizes, RULES.xi_weight)
     return np.asarray(((chart.parts.phi_map.difference(phi, chart.phi(q)) * weights) ** 2).sum(axis=1))
 
 
