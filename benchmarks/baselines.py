@@ -79,7 +79,7 @@ class TwoTaskLaw(Shown, ABC):
     @cached_property
     def function(self) -> ca.Function:
         """q, dq (n, 1), reference and its derivatives (m + k_2, 1), gains -> command (n, 1), status (1, 1)."""
-        return self._second.parts.runnable(count_turns_from_centre(self.graph, self.problem))
+        return self._second.runnable(count_turns_from_centre(self.graph, self.problem))
 
     @cached_property
     @abstractmethod
@@ -326,7 +326,7 @@ class Projector(TwoTaskLaw):
     @cached_property
     def energy(self) -> ca.Function:
         """The fast form of `energy_graph`."""
-        return self._second.parts.runnable(count_turns_from_centre(self.energy_graph, self.problem))
+        return self._second.runnable(count_turns_from_centre(self.energy_graph, self.problem))
 
     @cached_property
     def energy_graph(self) -> ca.Function:

@@ -136,7 +136,14 @@ def certify(
         if check:
             holds = certificates.check_certificate(loaded, executor=executor, monitor=monitor)
             assert loaded.certificate is not None
-            _report_check(loaded.certificate, holds, time.monotonic() - start, json)
+            seconds = time.monotonic() - start
+            if json:
+                print_json({"holds": holds, **loaded.certificate.as_dict(), "seconds": seconds})
+            else:
+                verdict = "holds" if holds else "does NOT hold"
+                partly = "" if loaded.certificate.proved or not holds else " for the part that is proved"
+                line = f"the certificate {verdict}{partly}, {seconds:.3g} s"
+                print_rows({"check": line, **loaded.certificate.facts()})
             raise typer.Exit(0 if holds and loaded.certificate.proved else _NOT_PROVED)
         resume = _find_unfinished(loaded, bound)
         try:
@@ -185,12 +192,3 @@ def _find_unfinished(chart: Chart, bound: float | None) -> Certificate | None:
     if saved.proved or saved.fold or (bound is not None and bound != saved.bound):
         return None
     return saved
-
-
-def _report_check(certificate: Certificate, holds: bool, seconds: float, json: bool) -> None:
-    if json:
-        print_json({"holds": holds, **certificate.as_dict(), "seconds": seconds})
-    else:
-        verdict = "holds" if holds else "does NOT hold"
-        partly = "" if certificate.proved or not holds else " for the part that is proved"
-        print_rows({"check": f"the certificate {verdict}{partly}, {seconds:.3g} s", **certificate.facts()})

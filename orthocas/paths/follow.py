@@ -97,11 +97,21 @@ def follow(
         raise InvalidValueError("period", period, "a time from 1e-5 to 10 s")
 
     # phi(s) of the tool path, and q(s) with phi(q(s)) = phi(s).
-    path = _read_tool_path(chart, tool_path, xi, start)
+    if not isinstance(xi, str):
+        path = ToolPath.schedule(chart, tool_path, xi)
+    elif xi in (HOLD, OBJECTIVE):
+        path = ToolPath.hold(chart, tool_path, chart.xi(start))
+    else:
+        raise InvalidValueError("xi", repr(xi)[:80], f"'{HOLD}', '{OBJECTIVE}', an array or a function")
     solver = PhiSolver(chart)
     curve = JointCurve.trace(solver, path.phi, start)
     if isinstance(xi, str) and xi == OBJECTIVE:
-        path, curve = _choose_xi(solver, path, curve, limits, start)
+        # From coordinates that are held, or from a walk where that is not possible.
+        costs = Costs(limits)
+        choice = XiChoice(path, costs, solver)
+        q = walk(chart, costs, path.x(choice.s), start) if isinstance(curve, LostCurve) else curve.q(choice.s)
+        path = choice.optimise(q)
+        curve = JointCurve.trace(solver, path.phi, q[0])
     # Where it ends early, leaves the domain or comes too near to an obstacle, an error says why.
     if isinstance(curve, LostCurve):
         limits.check_kept(path, curve.s, curve.q)
@@ -113,26 +123,6 @@ def follow(
     _, first, second = curve.evaluate(list_places())
     law = compute_fastest_law(first, second, limits.velocity, limits.acceleration)
     return _sample_on_stamps(path, curve, law, limits, stamp)
-
-
-def _read_tool_path(chart: Chart, tool_path: Any, xi: Any, start: Array) -> ToolPath:
-    """The tool path with scheduled coordinates, or with those of the start."""
-    if not isinstance(xi, str):
-        return ToolPath.schedule(chart, tool_path, xi)
-    if xi not in (HOLD, OBJECTIVE):
-        raise InvalidValueError("xi", repr(xi)[:80], f"'{HOLD}', '{OBJECTIVE}', an array or a function")
-    return ToolPath.hold(chart, tool_path, chart.xi(start))
-
-
-def _choose_xi(
-    solver: PhiSolver, path: ToolPath, held: JointCurve | LostCurve, limits: "MotionLimits", start: Array
-) -> tuple[ToolPath, JointCurve | LostCurve]:
-    """The path with coordinates by objective, from those that are held, or from a walk where that is not possible."""
-    costs = Costs(limits)
-    choice = XiChoice(path, costs, solver)
-    q = walk(solver.chart, costs, path.x(choice.s), start) if isinstance(held, LostCurve) else held.q(choice.s)
-    chosen = choice.optimise(q)
-    return chosen, JointCurve.trace(solver, chosen.phi, q[0])
 
 
 def _read_limits(
@@ -409,7 +399,9 @@ class XiChoice:
 
     def __init__(self, path: ToolPath, costs: Costs, solver: PhiSolver) -> None:
         self.path, self.costs, self.solver, self.chart = path, costs, solver, solver.chart
-        pieces = _count_pieces(path)
+        # More pieces of the spline on longer paths.
+        length = np.linalg.norm(path.steps, axis=1).sum()
+        pieces = int(np.clip(np.ceil(RULES.piece_density * length), RULES.fewest_pieces, RULES.most_pieces))
         self.s = np.linspace(0.0, 1.0, RULES.cost_places * pieces + 1)
         self.nodes = np.linspace(0.0, 1.0, pieces + 1)
         # Closed paths have the same value at both ends.
@@ -425,7 +417,11 @@ class XiChoice:
 
     def optimise(self, first: Array) -> ToolPath:
         """The tool path with chosen coordinates, from joint positions near it at the places `s`, (P, n)."""
-        state = self._find_first_state(first)
+        # The spline through the coordinates of these positions, or through their mean where that has no solution.
+        xi = counted_on(self.chart.xi(first), self.chart.parts.turns[self.chart.m :])
+        values = np.linalg.lstsq(self._basis, xi, rcond=None)[0]
+        means = np.tile(xi.mean(axis=0), (len(values), 1))
+        state = self._evaluate_state(values, first) or self._evaluate_state(means, first)
         if state is None:
             return self.path
         damping = RULES.damping
@@ -434,7 +430,10 @@ class XiChoice:
             # Levenberg-Marquardt: more damping until a step lowers the cost.
             better = None
             while better is None and damping < RULES.most_damping:
-                better = self._try_step(state, hessian, gradient, damping)
+                scaled = hessian + damping * np.diag(np.diag(hessian) + 1e-9)
+                change = -np.linalg.solve(scaled, gradient).reshape(state.values.shape)
+                new = self._evaluate_state(state.values + change, state.q)
+                better = new if new is not None and new.cost < state.cost else None
                 damping *= 8 if better is None else 0.3
             if better is None:
                 break
@@ -442,12 +441,6 @@ class XiChoice:
             if gain < RULES.least_gain * state.cost:
                 break
         return self.path.replace_xi(self._build_spline(self._unit @ state.values))
-
-    def _find_first_state(self, q: Array) -> _State | None:
-        """The spline through the coordinates of joint positions, or through their mean where that has no solution."""
-        xi = counted_on(self.chart.xi(q), self.chart.parts.turns[self.chart.m :])
-        values = np.linalg.lstsq(self._basis, xi, rcond=None)[0]
-        return self._evaluate_state(values, q) or self._evaluate_state(np.tile(xi.mean(axis=0), (len(values), 1)), q)
 
     def _build_spline(self, values: Array) -> CubicSpline:
         return CubicSpline(self.nodes, values, bc_type="periodic" if self.path.closed else "not-a-knot")
@@ -474,16 +467,3 @@ class XiChoice:
         slope += self._smooth @ state.values
         size = B.shape[1] * r
         return hessian.reshape(size, size), slope.ravel()
-
-    def _try_step(self, state: _State, hessian: Array, gradient: Array, damping: float) -> _State | None:
-        """A damped step, if it lowers the cost."""
-        scaled = hessian + damping * np.diag(np.diag(hessian) + 1e-9)
-        change = -np.linalg.solve(scaled, gradient).reshape(state.values.shape)
-        new = self._evaluate_state(state.values + change, state.q)
-        return new if new is not None and new.cost < state.cost else None
-
-
-def _count_pieces(path: ToolPath) -> int:
-    """Pieces of the spline: more on longer paths."""
-    length = np.linalg.norm(path.steps, axis=1).sum()
-    return int(np.clip(np.ceil(RULES.piece_density * length), RULES.fewest_pieces, RULES.most_pieces))

@@ -95,9 +95,8 @@ def trajectory_figure(trajectory: "Trajectory", units: Mapping[str, str] | None 
 def draw_quantities(panels: Array, trajectory: "Trajectory", units: Mapping[str, str], drawn: bool = True) -> None:
     """Draw the reference and, if `drawn`, the actual value of each quantity in its own axes."""
     good = ~trajectory.fell_back & np.isfinite(trajectory.value).all(axis=1)
-    seen = np.vstack(
-        [trajectory.value[good], trajectory.reference]
-    )  # chart coordinates are meaningless outside the domain
+    # Chart coordinates are meaningless outside the domain.
+    seen = np.vstack([trajectory.value[good], trajectory.reference])
     lows, highs = seen.min(axis=0), seen.max(axis=0)
     spans = np.maximum(highs - lows, max(RULES.narrowest * (highs - lows).max(), 1e-9))
     middles = (lows + highs) / 2
@@ -107,7 +106,10 @@ def draw_quantities(panels: Array, trajectory: "Trajectory", units: Mapping[str,
         axes.plot(trajectory.times, trajectory.reference[:, i], "--", color=_REFERENCE, linewidth=1, label="reference")
         axes.set_ylim(middles[i] - 0.58 * spans[i], middles[i] + 0.58 * spans[i])
         unit = f" [{units[label]}]" if label in units else ""
-        axes.set_ylabel(f"{_format_label(label)}{unit}", fontsize=9)
+        # xi1 as a mathematical symbol; other labels unchanged.
+        number = label.removeprefix("xi")
+        symbol = rf"$\xi_{{{number}}}$" if label.startswith("xi") and number.isdigit() else label
+        axes.set_ylabel(f"{symbol}{unit}", fontsize=9)
         _set_style(axes, trajectory)
 
 
@@ -162,12 +164,6 @@ def _build_title(trajectory: "Trajectory") -> str:
 
 def _format_durations(lasting: Mapping[ControlStatus, float], chosen: Sequence[ControlStatus]) -> str:
     return ", ".join(f"{status.words} {lasting[status]:.3g} s" for status in chosen)
-
-
-def _format_label(label: str) -> str:
-    """A label such as xi1 as a mathematical symbol; other labels unchanged."""
-    number = label.removeprefix("xi")
-    return rf"$\xi_{{{number}}}$" if label.startswith("xi") and number.isdigit() else label
 
 
 class MovingPicture:

@@ -287,7 +287,13 @@ def find_loss(run: Trajectory, controller: Controller, pushes: Sequence[Push], s
         pushes: that acted on the arm.
         supervised: whether its supervised form ran.
     """
-    outside, what = _find_outside(run, controller)
+    # At which instants the arm is outside what the law respects, (N,).
+    if controller.chart is not None:
+        outside, what = np.asarray(~controller.problem.domain.contains(run.q)), "the domain of the chart"
+    else:
+        robot = controller.problem.robot
+        beyond = (run.q < robot.lower - RULES.beyond) | (run.q > robot.upper + RULES.beyond)
+        outside, what = np.asarray(beyond.any(axis=1)), "the joint limits"
     held = supervised and run.status[-1] in (ControlStatus.CAUGHT, ControlStatus.RETURNING)
     if (outside[-1] and not held) or (outside.any() and not supervised):
         first, _ = next(_find_stretches(outside))
@@ -305,15 +311,6 @@ def find_loss(run: Trajectory, controller: Controller, pushes: Sequence[Push], s
             joint = run.joint_names[int(np.argmax(at_limit[first : last + 1].sum(axis=0)))]
             return f"from t = {since:.4g} s to {until:.4g} s joint '{joint}' was at its limit, and errors grew"
     return ""
-
-
-def _find_outside(run: Trajectory, controller: Controller) -> tuple[NDArray[np.bool_], str]:
-    """At which instants the arm is outside what the law respects, (N,), and what that is."""
-    if controller.chart is not None:
-        return np.asarray(~controller.problem.domain.contains(run.q)), "the domain of the chart"
-    robot = controller.problem.robot
-    beyond = (run.q < robot.lower - RULES.beyond) | (run.q > robot.upper + RULES.beyond)
-    return np.asarray(beyond.any(axis=1)), "the joint limits"
 
 
 def _find_stretches(true: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:

@@ -108,8 +108,11 @@ class ClearBox(Box):
     def heading(self) -> str:
         """The condition in one line, with the lengths by which rows are divided."""
         rows = "J_x" if self.jacobian_function is self.task.jacobian_function else "the frame Jacobian"
-        sizes = f"(rows of {rows} over {_list_sizes(self.scale, self.task.units)})"
-        return f"relative singular value of the task above {self.least_singular_value:g} {sizes}"
+        # For example '0.41 m, 1.53 rad'; one number for each row if units are unknown or their numbers differ.
+        sizes = [f"{size:.3g} {unit}".strip() for size, unit in zip(self.scale, self.task.units, strict=True)]
+        lengths = ", ".join(dict.fromkeys(sizes) if all(self.task.units) else sizes)
+        bound = f"relative singular value of the task above {self.least_singular_value:g}"
+        return f"{bound} (rows of {rows} over {lengths})"
 
     @property
     def condition(self) -> Self:
@@ -277,9 +280,3 @@ def exclude_singular(domain: Domain, task: Task, least_singular_value: float | N
     if isinstance(domain, ClearBox) and domain.task is not task:
         return ClearBox(domain, task, domain.least_singular_value, rows=domain.rows)
     return domain
-
-
-def _list_sizes(scale: Array, units: tuple[str, ...]) -> str:
-    """For example '0.41 m, 1.53 rad'; one number for each row if units are unknown or their numbers differ."""
-    sizes = [f"{size:.3g} {unit}".strip() for size, unit in zip(scale, units, strict=True)]
-    return ", ".join(dict.fromkeys(sizes) if all(units) else sizes)

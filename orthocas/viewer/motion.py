@@ -133,7 +133,11 @@ def cyclic_motions(chart: Chart, path: Array | None = None, cycles: int = 3) -> 
     """
     require_kind("chart", chart, Chart)
     require_count("cycles", cycles, most=RULES.most_cycles)
-    times, fractions = _build_times(cycles)
+    # Instants [s], and the share of a cycle that is done: from rest to rest in each cycle.
+    t = np.linspace(0.0, 1.0, RULES.cycle_points + 1)
+    fraction = t**3 * (10 - 15 * t + 6 * t**2)
+    times = RULES.cycle * np.concatenate([[0.0], *(k + t[1:] for k in range(cycles))])
+    fractions = np.concatenate([[0.0], *(fraction[1:] for _ in range(cycles))])
     start = chart.problem.domain.centre
     if path is None:
         along, q = _find_largest_circle(chart, start, fractions)
@@ -148,14 +152,6 @@ def cyclic_motions(chart: Chart, path: Array | None = None, cycles: int = 3) -> 
         Motion("constant ξ", times, q, labels, x, cycles=ends),
         Motion("pseudo-inverse", times, other, labels, chart.task(other), cycles=ends),
     )
-
-
-def _build_times(cycles: int) -> tuple[Array, Array]:
-    """Instants [s], and the share of a cycle that is done: from rest to rest in each cycle."""
-    t = np.linspace(0.0, 1.0, RULES.cycle_points + 1)
-    fraction = t**3 * (10 - 15 * t + 6 * t**2)
-    times = RULES.cycle * np.concatenate([[0.0], *(k + t[1:] for k in range(cycles))])
-    return times, np.concatenate([[0.0], *(fraction[1:] for _ in range(cycles))])
 
 
 def _find_largest_circle(chart: Chart, start: Array, fractions: Array) -> tuple[Place, Array]:
