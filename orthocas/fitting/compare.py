@@ -436,7 +436,7 @@ class Comparison(Shown):
         }
 
     def plot(self) -> "Figure":
-        """Errors of all fits over what they cost, as a matplotlib figure; see `orthocas.plotting.front_figure`."""
+        """Errors of all fits over what they cost, as a matplotlib figure; see `comparison_figures.front_figure`."""
         from orthocas.fitting.comparison_figures import front_figure  # with matplotlib, which takes long to import
 
         return front_figure(self)

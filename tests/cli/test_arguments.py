@@ -13,7 +13,8 @@ from fuzz.good_calls import good_calls
 from public_objects import CHARTS, circle, fitted, impedance, planar, points_of, steps, trajectory
 
 import orthocas as oc
-from orthocas import control, plotting, problems, simulation, solvers
+from orthocas import control, problems, simulation, solvers
+from orthocas.charts.figures import quality_figure
 from orthocas.charts.singularities import jumps, singular_points
 from orthocas.codegen import check_c
 from orthocas.errors import InvalidValueError, NoExpressionError, OrthocasError, ShapeError, UnknownNameError
@@ -160,7 +161,7 @@ WRONG: dict[str, Callable[[], Any]] = {
     "problem of loss": lambda: loss("iiwa", oc.Linear()),  # type: ignore[arg-type]
     "model of a robot": lambda: oc.Robot.from_model(planar(), "tip"),  # type: ignore[arg-type]
     "coordinates of a chart": lambda: oc.Chart(planar(), planar()),  # type: ignore[arg-type]
-    "report of a figure": lambda: plotting.quality_figure(planar()),  # type: ignore[arg-type]
+    "report of a figure": lambda: quality_figure(planar()),  # type: ignore[arg-type]
     "trajectory of a breakdown": lambda: simulation.task_acceleration_breakdown(fitted().chart, planar()),  # type: ignore[arg-type]
     "labels of a reference": lambda: control.Reference.through(planar(), [0, 1], [[0], [1]]),  # type: ignore[arg-type]
     "chart of check_c": lambda: check_c(None, planar()),  # type: ignore[arg-type]

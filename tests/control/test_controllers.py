@@ -22,7 +22,7 @@ from orthocas.errors import (
     NoExpressionError,
     UnreachableReferenceError,
 )
-from orthocas.problems.arms import urdf_path
+from orthocas.problems import urdf_path
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 

@@ -17,7 +17,7 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
 from orthocas.exact.involutivity import lie_bracket
-from orthocas.problems.arms import urdf_path
+from orthocas.problems import urdf_path
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array

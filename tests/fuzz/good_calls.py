@@ -24,10 +24,11 @@ from public_objects import (
 )
 
 import orthocas as oc
-from orthocas import bases, control, learn, plotting, problems, simulation, solvers, viewer
+from orthocas import bases, control, learn, problems, simulation, solvers, viewer
 from orthocas.bases import cyclic_joints
 from orthocas.certificates import certified_box, check_certificate
 from orthocas.charts.chart import GrownChart
+from orthocas.charts.figures import quality_figure, self_motion_figure
 from orthocas.charts.regular_part import RegularPart
 from orthocas.charts.singularities import jumps, singular_points
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
@@ -139,7 +140,7 @@ def _views() -> dict[str, Call]:
         "cyclic_motions": (viewer.cyclic_motions, {"chart": chart, "path": [x, x + 0.05, x], "cycles": 1}),
         "Session": (Session, {"chart": chart, "q": q}),
         "session.wish": (session.wish, {"values": {"xi1": 0.1}}),
-        "chart.plot": (lambda postures: plotting.self_motion_figure(chart, postures, None), {"postures": 3}),
+        "chart.plot": (lambda postures: self_motion_figure(chart, postures, None), {"postures": 3}),
     }
 
 
@@ -334,8 +335,8 @@ def _functions() -> dict[str, Call]:
         "to data": (bases.parametrisation_to_data, {"parametrisation": oc.Polynomial(2)}),
         "solvers.get": (solvers.get, {"name": "lbfgs"}),
         "problems.get": (problems.get, {"name": "planar_2r"}),
-        "self_motion_figure": (plotting.self_motion_figure, {"chart": chart, "postures": 2, "reach": 0.1}),
-        "quality_figure": (plotting.quality_figure, {"report": None}),
+        "self_motion_figure": (self_motion_figure, {"chart": chart, "postures": 2, "reach": 0.1}),
+        "quality_figure": (quality_figure, {"report": None}),
     }
 
 
