@@ -80,10 +80,27 @@ def view(
             raise OptionError("--compare requires a chart file, whose coordinates are compared")
         points = None if path is None else read_path(path, scene.shown)[0]
         scene = _Scene(cyclic_motions(scene.shown, points), scene.shown, scene.meshes, scene.locked)
+    arm, meshes, locks = scene.robot, scene.meshes, scene.locked
     if export is not None:
-        _export(scene, export, force, json)
-    else:
-        _serve(scene, host, port, browse, json)
+        shape = export_page(scene.shown, export, robot=arm, robot_file=meshes, locked=locks, force=force)
+        _note_missing(shape.missing)
+        size = export.stat().st_size
+        if json:
+            print_json({"page": str(export), "bytes": size, "missing_meshes": list(shape.missing)})
+        else:
+            print_rows({"page": str(export), "size": f"{size / 2**20:.1f} MiB, with all it needs: it works offline"})
+        return
+    with open_view(scene.shown, robot=arm, robot_file=meshes, locked=locks, host=host, port=port) as page:
+        _note_missing(page.missing)
+        local = is_local(host)
+        who = "this machine only (--host opens it to others)" if local else "all who reach it and know this address"
+        if json:
+            print_json({"url": page.url, "host": host, "local": local, "missing_meshes": list(page.missing)})
+        else:
+            print_rows({"page": page.url, "open to": who, "end": "Ctrl-C"})
+        if browse and not webbrowser.open(page.url):
+            note(f"no browser could be opened here; open {page.url} yourself")
+        page.wait()
 
 
 def _read_scene(target: str, chart: Path | None, meshes: Path | None, words: ProblemOptions) -> _Scene:
@@ -107,35 +124,6 @@ def _read_scene(target: str, chart: Path | None, meshes: Path | None, words: Pro
     if chart is not None:
         raise OptionError(f"{target} is a chart: leave out --chart")
     return _Scene(load(place), None, meshes, locked)
-
-
-def _export(scene: _Scene, page: Path, force: bool, json: bool) -> None:
-    shape = export_page(
-        scene.shown, page, robot=scene.robot, robot_file=scene.meshes, locked=scene.locked, force=force
-    )  # fmt: skip
-    _note_missing(shape.missing)
-    size = page.stat().st_size
-    if json:
-        print_json({"page": str(page), "bytes": size, "missing_meshes": list(shape.missing)})
-    else:
-        print_rows({"page": str(page), "size": f"{size / 2**20:.1f} MiB, with all it needs: it works offline"})
-
-
-def _serve(scene: _Scene, host: str, port: int, browse: bool, json: bool) -> None:
-    page = open_view(
-        scene.shown, robot=scene.robot, robot_file=scene.meshes, locked=scene.locked, host=host, port=port
-    )  # fmt: skip
-    with page:
-        _note_missing(page.missing)
-        local = is_local(host)
-        who = "this machine only (--host opens it to others)" if local else "all who reach it and know this address"
-        if json:
-            print_json({"url": page.url, "host": host, "local": local, "missing_meshes": list(page.missing)})
-        else:
-            print_rows({"page": page.url, "open to": who, "end": "Ctrl-C"})
-        if browse and not webbrowser.open(page.url):
-            note(f"no browser could be opened here; open {page.url} yourself")
-        page.wait()
 
 
 def _note_missing(missing: tuple[str, ...]) -> None:

@@ -357,20 +357,16 @@ def walk(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
     points = []
     for target in x:
         for _ in range(RULES.walk_steps):
-            q = q + _compute_step(chart, costs, target, q)
+            J = chart.parts.relative.batched_rates(q[None])[0].reshape(chart.m, chart.n)
+            # Towards x the step of least norm, within the null space (n, r) a damped Gauss-Newton step.
+            toward = np.linalg.pinv(J, rcond=1e-3) @ chart.parts.relative.difference(target, chart.task(q))
+            inner = np.linalg.svd(J)[2][chart.m :].T
+            residuals, gradients = (part[0] for part in costs(q[None]))
+            G = gradients @ inner
+            along = -inner @ np.linalg.solve(G.T @ G + RULES.walk_damping * np.eye(chart.r), G.T @ residuals)
+            q = q + _limit_step(toward) + _limit_step(along)
         points.append(q)
     return np.array(points)
-
-
-def _compute_step(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
-    J = chart.parts.relative.batched_rates(q[None])[0].reshape(chart.m, chart.n)
-    inner = np.linalg.svd(J)[2][chart.m :].T  # (n, r)
-    # Within the null space a damped Gauss-Newton step, towards x the step of least norm.
-    residuals, gradients = (part[0] for part in costs(q[None]))
-    G = gradients @ inner
-    along = -inner @ np.linalg.solve(G.T @ G + RULES.walk_damping * np.eye(chart.r), G.T @ residuals)
-    task = np.linalg.pinv(J, rcond=1e-3) @ chart.parts.relative.difference(x, chart.task(q))
-    return _limit_step(task) + _limit_step(along)
 
 
 def _limit_step(step: Array) -> Array:

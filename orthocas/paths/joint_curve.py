@@ -212,9 +212,8 @@ def compute_fastest_law(first: Array, second: Array, velocity: Array, accelerati
 
 def _integrate_time(z: BSpline) -> TimeLaw:
     """Time along the path: steps of constant acceleration take 2 ds / (speed before + speed after)."""
-    s = (
-        1 - np.cos(np.linspace(0.0, np.pi, RULES.time_steps + 1))
-    ) / 2  # finer near the ends, where the speed changes most
+    # Finer near the ends, where the speed changes most.
+    s = (1 - np.cos(np.linspace(0.0, np.pi, RULES.time_steps + 1))) / 2
     squares = z(s)
     squares = np.maximum(squares, RULES.least_square * squares.max())
     squares[[0, -1]] = 0.0

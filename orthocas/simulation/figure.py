@@ -178,9 +178,9 @@ class MovingPicture:
     def __init__(self, trajectory: "Trajectory", problem: Problem, speed: float = 1.0) -> None:
         k = len(trajectory.labels)
         height = max(4.2, RULES.panel * k + 0.8)
-        figure = Figure(
-            figsize=(RULES.width, round(height * RULES.dpi / 2) * 2 / RULES.dpi), dpi=RULES.dpi
-        )  # even height: MP4 needs it
+        # MP4 needs an even height.
+        size = (RULES.width, round(height * RULES.dpi / 2) * 2 / RULES.dpi)
+        figure = Figure(figsize=size, dpi=RULES.dpi)
         self._canvas = cast(Any, FigureCanvasAgg(figure))
         self._times, self._values = trajectory.times, trajectory.value
         self._arm = _Arm(figure, trajectory, problem)
