@@ -133,18 +133,20 @@ def certify(
     loaded = load_file(chart)
     with _start_workers(processes, workers) as executor, terminal_monitor() as monitor:
         start = time.monotonic()
+        # Check the proof in the file, and end.
         if check:
             holds = certificates.check_certificate(loaded, executor=executor, monitor=monitor)
             assert loaded.certificate is not None
-            seconds = time.monotonic() - start
+            took = time.monotonic() - start
             if json:
-                print_json({"holds": holds, **loaded.certificate.as_dict(), "seconds": seconds})
+                print_json({"holds": holds, **loaded.certificate.as_dict(), "seconds": took})
             else:
                 verdict = "holds" if holds else "does NOT hold"
                 partly = "" if loaded.certificate.proved or not holds else " for the part that is proved"
-                line = f"the certificate {verdict}{partly}, {seconds:.3g} s"
+                line = f"the certificate {verdict}{partly}, {took:.3g} s"
                 print_rows({"check": line, **loaded.certificate.facts()})
             raise typer.Exit(0 if holds and loaded.certificate.proved else _NOT_PROVED)
+        # Prove, from where the file's certificate stopped; Ctrl-C keeps what is proved so far.
         resume = _find_unfinished(loaded, bound)
         try:
             certificate = certificates.certify(

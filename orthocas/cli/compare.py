@@ -68,6 +68,7 @@ def compare(
     json: AsJson = False,
 ) -> None:
     """Fit a grid of parametrisations, solvers and seeds; write tables, pictures and charts."""
+    # A chart file stands for the problem in it.
     is_name = problem in problems.names() or is_robot_file(problem) or not Path(problem).exists()
     built = ProblemOptions().build_problem(problem) if is_name else load(problem).problem
     parametrisations = [parse_parametrisation(name) for name in param or _PARAMETRISATIONS]

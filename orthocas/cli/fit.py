@@ -236,6 +236,7 @@ def _suggest_problem(
     """The problem of `--domain auto`, and the suggestion that its domain comes from."""
     words.require_none(("half_width",), "--domain auto finds the half-width")
     words.require_none(("least_singular_value",), "--domain auto stays clear of singular postures")
+    # A named problem, or what the options describe for a robot file.
     base = None if is_robot_file(name) else words.build_problem(name)
     robot, task, metric = _build_parts(name, words, base)
     home = words.home or (words.find_centre(robot) if base is None else base.domain.centre)

@@ -279,10 +279,12 @@ class MotionLimits:
 
     def measure_margins(self, q: Array, dq: Array, ddq: Array) -> Margins:
         """What a motion leaves, at its time stamps."""
+        # Room to the boundary, relative to the half-widths.
         low, high = self.chart.problem.domain.bounds
         room = np.minimum(q - low, high - q) / self.chart.problem.domain.half_width
         worst = int(np.argmin(room.min(axis=0)))
         bounded = bool(np.isfinite(room).any())
+        # The least singular value, and the obstacle that a link comes nearest to.
         values = np.linalg.svd(self.compute_scaled_jacobian(q), compute_uv=False)
         distances = self.distances(q)
         pair = int(np.argmin(distances.min(axis=0))) if distances.size else -1

@@ -74,12 +74,14 @@ def trajectory_figure(trajectory: "Trajectory", units: Mapping[str, str] | None 
     figure = Picture(figsize=(10.5, max(5.4, 1.05 * k + 0.9)), layout="constrained")
     halves: Any = figure.subfigures(1, 2)
     left, right = halves
+    # On the left, each controlled quantity with its target and its largest error.
     units = units or {}
     quantities = left.subplots(k, 1, sharex=True, squeeze=False)[:, 0]
     draw_quantities(quantities, trajectory, units)
     for axes, label, worst in zip(quantities, trajectory.labels, trajectory.tracking_error, strict=True):
         axes.set_title(f"largest error {worst:.2g} {units.get(label, '')}", loc="right", fontsize=7.5, pad=2)
     quantities[0].legend(fontsize=RULES.font, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False)
+    # On the right joints, commands and, for torques, the storage.
     others = right.subplots(2 + (trajectory.kind == "torque"), 1, sharex=True)
     _draw_others(others, trajectory, units)
     for axes in (*quantities, *others):
@@ -229,10 +231,12 @@ class _Arm:
     def __init__(self, figure: Figure, trajectory: "Trajectory", problem: Problem) -> None:
         points = problem.robot.joint_points(trajectory.q)  # (N, points, 3)
         low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
+        # Planar arms lie in two axes.
         flat = np.flatnonzero(high - low < RULES.flat)
         shown = np.delete(np.arange(3), flat[-1]) if flat.size else np.arange(3)
         axes = _build_axes(figure, low[shown], high[shown], ["xyz"[i] for i in shown])
         self._points, self._targets = points[..., shown], _compute_tip_targets(trajectory, problem)[:, shown]
+        # The base stands still; path, arm and target are placed anew in each picture.
         zero = np.zeros((len(shown), 0))
         axes.plot(*self._points[0, :1].T, "s", color=_ARM, markersize=9)
         self._lines: list[Any] = [
@@ -279,6 +283,7 @@ def _build_axes(figure: Figure, low: Array, high: Array, names: list[str]) -> An
     centres, extent = (low + high) / 2, high - low + 2 * RULES.margin * longest
     if len(names) == 2:
         axes: Any = figure.add_axes((0.075, 0.17, 0.445, 0.74))
+        # One scale for both axes, whatever the shape of the panel.
         shape = figure.get_size_inches() * axes.get_position().size
         extent = (extent / shape).max() * shape
         axes.grid(alpha=0.3)

@@ -336,6 +336,7 @@ def _build_integrator(loop: ClosedLoop, reference: Reference, tolerance: float) 
     x, s = kind.sym("x", state_size), kind.sym("s")
     p = kind.sym("p", 2 + p_size + load_size)
     length, since, parameters, load = p[0], p[1], p[2 : 2 + p_size], p[2 + p_size :]
+    # In s from 0 to 1, so that one integrator serves intervals of all lengths.
     ode = length * rate(x, since + s * length, parameters, load)
     grid = np.arange(1, RULES.outputs + 1) / RULES.outputs
     return ca.integrator(

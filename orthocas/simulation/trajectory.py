@@ -225,6 +225,7 @@ class Trajectory(Shown):
         path = as_path("path", path)
         header, arrays = read_run_file(path, _VERSION, _REQUIRED, _LATER)
         try:
+            # The header first: it says which shapes the arrays must have.
             names: dict[str, Any] = {name: tuple(get_part(header, name, list)) for name in ("labels", "joint_names")}
             _check_names(names)
             require_known("kind of command", get_part(header, "kind", str), ("torque", "velocity"))

@@ -310,7 +310,7 @@ def read_problem(header: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Pro
 def _write_task(task: Task) -> dict[str, Any]:
     """A task as plain data, with the expressions of custom ones."""
     data = _add_tape(task.recipe, task.function)
-    return data | {"parts": [_write_task(get_part) for get_part in task.parts]} if task.parts else data
+    return data | {"parts": [_write_task(part) for part in task.parts]} if task.parts else data
 
 
 def _add_tape(recipe: Mapping[str, Any], function: ca.Function) -> dict[str, Any]:

@@ -81,12 +81,14 @@ def ended_in_order() -> Iterator[Callable[[], int]]:
     if one has come, even if its exception got lost, else 0. Python says nothing of exceptions of signals that it loses
     itself, in callbacks of weak references.
     """
+    # Handlers of the program's own stay.
     memory = _Note()
     _ends.append(memory)
     before = {number: signal.getsignal(number) for number in _ENDING}
     for number, handler in before.items():
         if handler is signal.SIG_DFL:
             signal.signal(number, _end)
+    # Exceptions of signals that Python loses are remembered, and need no complaint.
     complain = sys.unraisablehook
 
     def complain_of_others(lost: Any) -> None:

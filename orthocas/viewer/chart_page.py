@@ -139,6 +139,7 @@ class ChartPage:
         handle = self._server.scene.add_transform_controls(
             "/tool", scale=size, active_axes=axes, disable_rotations=True, depth_test=False, opacity=0.8
         )
+        # Axes that the task leaves free stay where they are.
         moved = [axis for axis, active in zip("xyz", axes, strict=True) if active]
 
         async def dragged(event: Any) -> None:

@@ -325,6 +325,7 @@ def _build_solid(
     path: Path, visual: ElementTree.Element, colours: Mapping[str, Colour], missing: list[str]
 ) -> Solid | None:
     """The geometry of a visual element in its own frame; None if there is none to show."""
+    # A colour of its own, that of a named material, or the default.
     material = visual.find("material")
     colour = RULES.shell
     if material is not None:

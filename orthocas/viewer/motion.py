@@ -156,6 +156,7 @@ def cyclic_motions(chart: Chart, path: Array | None = None, cycles: int = 3) -> 
 
 def _find_largest_circle(chart: Chart, start: Array, fractions: Array) -> tuple[Place, Array]:
     """A circle in the first two components of the task, or a line in one, as large as the chart can follow."""
+    # Smaller and smaller circles, until the chart can follow one.
     x0, m = chart.task(start), min(chart.m, 2)
     radius = RULES.circle * float(chart.parts.phi_sizes[:m].min())
     while True:
