@@ -18,8 +18,7 @@ from orthocas.paths.joint_motion import JointMotion, Margins
 from orthocas.paths.tool_path import RULES, ToolPath
 from orthocas.robots.obstacles import LinkDistances, Obstacle
 from orthocas.robots.tree import require_driven
-from orthocas.tasks.clear_box import compute_row_scale
-from orthocas.tasks.samples import sample_uniform
+from orthocas.tasks.samples import compute_row_scale, sample_uniform
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind

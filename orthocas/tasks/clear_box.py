@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocas.errors import DomainError, InvalidValueError, SingularTaskError
 from orthocas.tasks.domains import Box, Domain, StopKind, Wall, register_domain, require_within_limits
-from orthocas.tasks.samples import sample_evenly, sample_uniform
+from orthocas.tasks.samples import compute_row_scale, sample_evenly, sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
@@ -248,22 +248,6 @@ class ClearBox(Box):
                 f"the Jacobian of task '{self.task.name}' is not finite at any of {RULES.samples} samples"
             )
         return compute_row_scale(J[finite], self.task.units)
-
-
-def compute_row_scale(J: Array, units: tuple[str, ...]) -> Array:
-    """Root mean square length of the rows of each unit, (m,). It does not depend on how axes are turned; 1 if zero.
-
-    Args:
-        J: task Jacobians at samples, (N, m, n).
-        units: units of the task components; rows with the same unit share one scale, rows of unknown unit have their
-            own.
-    """
-    squares = (J**2).sum(axis=2).mean(axis=0)
-    groups = [unit or f"own {i}" for i, unit in enumerate(units)]
-    means = [
-        np.mean([square for square, other in zip(squares, groups, strict=True) if other == mine]) for mine in groups
-    ]
-    return np.sqrt([mean if mean > 0 else 1.0 for mean in means])
 
 
 def exclude_singular(domain: Domain, task: Task, least_singular_value: float | None) -> Domain:

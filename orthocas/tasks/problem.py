@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from orthocas.errors import InvalidValueError, MetricError, NotRedundantError, SingularTaskError
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import KinematicTree
-from orthocas.tasks.clear_box import compute_row_scale, exclude_singular
+from orthocas.tasks.clear_box import exclude_singular
 from orthocas.tasks.domains import Domain, domain_from_data, require_within_limits
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.regular_box import regular_box
-from orthocas.tasks.samples import sample_uniform
+from orthocas.tasks.samples import compute_row_scale, sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.archive import Stored
 from orthocas.tools.checks import Array, require_kind, require_shape, require_text
