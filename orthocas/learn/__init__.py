@@ -1,7 +1,7 @@
 """Coordinates (x, xi) in robot learning: actions of Gymnasium environments, and episodes of recorded joints."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -66,7 +66,7 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
         require_kind("env", env, gymnasium.Env)
         super().__init__(env)
         require_kind("chart", chart, Chart)
-        inner, outer = env.action_space, env.observation_space
+        inner, outer = env.action_space, cast(Any, env.observation_space)
         if getattr(inner, "shape", None) != (chart.n,):
             raise InvalidValueError("actions of env", str(inner)[:80], f"{chart.n} joint positions")
         if len(getattr(outer, "shape", None) or ()) != 1:
@@ -81,7 +81,8 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
             raise InvalidValueError("step", sizes.tolist(), f"one finite number or {chart.n}, > 0")
         self._step = np.broadcast_to(sizes, chart.n)
         self._tracker: Tracker | None = None
-        more, (low, high) = np.full(chart.r + 1, np.inf), _read_bounds(outer)
+        more = np.full(chart.r + 1, np.inf)
+        low, high = (np.asarray(end, dtype=float) for end in (outer.low, outer.high))
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (chart.n,), np.float64)
         self.observation_space = gymnasium.spaces.Box(np.append(low, -more), np.append(high, more), dtype=np.float64)
 
@@ -100,7 +101,13 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
             raise gymnasium.error.ResetNeeded("step before reset, expected reset first")
         change = as_float_array("action", action)
         require_shape("action", change.shape, (self.chart.n,))
-        target = self._compute_target(self._tracker.q, self._step * np.clip(change, -1.0, 1.0))
+        # phi at a change from q, by turns in the tip's axes for orientations.
+        chart, m, change = self.chart, self.chart.m, self._step * np.clip(change, -1.0, 1.0)
+        phi = chart.phi(self._tracker.q)
+        target = np.array(phi + change)
+        if chart.parts.relative.turned:
+            none = np.zeros(m)
+            target[:m] = np.array(chart.parts.relative.moved(phi[:m], change[:m], phi[:m], none, none)[0]).ravel()
         for _ in range(20):
             self._tracker.step(target)
             if self._tracker.status != TrackerStatus.NEARER:
@@ -108,15 +115,6 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
         status = self._tracker.status
         observation, reward, terminated, truncated, info = self.env.step(self._tracker.q)
         return self._extend(observation), reward, terminated, truncated, info | {"tracker": status}
-
-    def _compute_target(self, q: Array, change: Array) -> Array:
-        """phi at a change from q."""
-        phi, m = self.chart.phi(q), self.chart.m
-        target = np.array(phi + change)
-        if self.chart.parts.relative.turned:
-            none = np.zeros(m)
-            target[:m] = np.array(self.chart.parts.relative.moved(phi[:m], change[:m], phi[:m], none, none)[0]).ravel()
-        return target
 
     def _read_joints(self) -> Array:
         positions = as_float_array("positions", self._positions(self.env))
@@ -132,10 +130,6 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
         low, high = self.chart.problem.domain.bounds
         distance = np.minimum(q - low, high - q).min()
         return np.asarray(np.concatenate([observation, self.chart.xi(q), [distance]]))
-
-
-def _read_bounds(space: Any) -> tuple[Array, Array]:
-    return np.asarray(space.low, dtype=float), np.asarray(space.high, dtype=float)
 
 
 def coordinates_of(chart: Chart, q: ArrayLike) -> Array:
