@@ -21,6 +21,7 @@ def run(folder: Path, *blocks: str) -> list[list[float]]:
 def test_basis_fits_saves_loads_distils_and_compares(tmp_path: Path) -> None:
     more = """
 from concurrent.futures import ThreadPoolExecutor
+from orthocas import bases
 assert [stage.result.status.value for stage in fit.stages] == ["converged"]
 assert fit.chart.notes["solver"] == "gauss_newton"
 assert oc.load("radial.orthocas").coordinates.parametrisation == Radial(60)
@@ -71,6 +72,7 @@ except InvalidValueError as error:
 def test_loss_term_acts_and_its_gauss_newton_matrix_and_hessian_are_right(tmp_path: Path) -> None:
     more = """
 from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.loss import loss
 from orthocas.bases import JointSpace
 from orthocas.tasks.samples import evaluate_samples
 from orthocas.tasks.samples import sample_evenly
@@ -200,8 +202,6 @@ def test_names_are_taken_once() -> None:
 from dataclasses import replace
 from types import SimpleNamespace
 import orthocas as oc
-from orthocas.fitting.loss import loss
-from orthocas import bases
 from orthocas.fitting.terms import find_term
 for registered in ({", ".join(f"lambda: {call}" for call in TAKEN)}):
     try:
