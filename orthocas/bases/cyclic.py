@@ -55,9 +55,9 @@ def cyclic_joints(problem: Problem) -> tuple[str, ...]:
         ours, docs/explanation/domains.md.
 
     Example:
-        >>> import orthocas as oc
         >>> from orthocas import problems
-        >>> oc.cyclic_joints(problems.get("planar_3r_xy")), oc.cyclic_joints(problems.get("planar_3r_x"))
+        >>> from orthocas.bases import cyclic_joints
+        >>> cyclic_joints(problems.get("planar_3r_xy")), cyclic_joints(problems.get("planar_3r_x"))
         (('q1',), ())
     """
     require_kind("problem", problem, Problem)

@@ -46,11 +46,12 @@ def register_parametrisation(
     Example:
         >>> from dataclasses import dataclass
         >>> import orthocas as oc
+        >>> from orthocas import bases
         >>> @dataclass(frozen=True)
         ... class Cubic(oc.Polynomial):
         ...     degree: int = 3
         >>> oc.register_parametrisation("cubic", Cubic, parse=lambda text: Cubic())
-        >>> oc.bases.parse_parametrisation("cubic")
+        >>> bases.parse_parametrisation("cubic")
         Cubic(degree=3, cyclic=(), joints=None, without=())
     """
     require_kind("name", name, str)
