@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from orthocas.bases.cyclic import keeps_self_motions, turns_tool, widen_over_cyclic_joints
 from orthocas.bases.family import CyclicParametrisation, JointSpace, LinearFamily, Parametrisation
 from orthocas.bases.mlp import MLP
-from orthocas.bases.products import Polynomial, Products
+from orthocas.bases.products import Polynomial
 from orthocas.bases.registry import warn_unless_savable
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
@@ -24,7 +24,6 @@ from orthocas.fitting.exact_quantity import choose_quantities, take_exactly
 from orthocas.fitting.fit import Fit, fix_gauge, normalise
 from orthocas.fitting.like import Like, Likeness, MeaningError
 from orthocas.fitting.settings import require_parametrisation
-from orthocas.fitting.terms import RULES as LOSS_RULES
 from orthocas.fitting.terms import Weights, find_term
 from orthocas.fitting.wide_search import (
     RULES,
@@ -32,6 +31,7 @@ from orthocas.fitting.wide_search import (
     WideSettings,
     WideSolution,
     find_best,
+    find_least_volume,
     is_on_side_of_centre,
     search_families,
 )
@@ -250,10 +250,12 @@ def _build_problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch
 
 
 def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomial | MLP, ...]:
-    """Under a pose, polynomials without the turns of base and tool, then without that of the tool only.
+    """Under a pose, families without the turn of the tool; first without that of the base, too, if it can turn fully.
 
-    Then those that are linear in the joints on whose position the self-motions do not depend, by proof. Then those that
-    are so in such slides without limits only, if there are others: a joint that turns has one turn.
+    These are polynomials, and before them small networks in another metric than the identity.
+
+    Then come polynomials that are linear in the joints on whose position the self-motions do not depend, by proof. Then
+    those that are so in such slides without limits only, if there are others: a joint that turns has one turn.
     Then a network, but not for coordinates that are to mean something, nor with slides without limits.
     """
     robot = problem.robot
@@ -263,10 +265,18 @@ def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomia
     endless = [k for k in free if slides[k] and np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
     tool = [k for k in range(robot.n) if turns_tool(problem.task, k)] if like in (None, "swivel") else []
     base = [k for k in free if k not in tool]
-    names, fewer, of_base, of_tool = (tuple(robot.joint_names[k] for k in part) for part in (free, endless, base, tool))
-    families: list[Polynomial | MLP] = [Polynomial(RULES.degree, of_base, without=of_tool)] if tool else []
-    if tool and base and len(base) + len(tool) < robot.n - problem.r:
-        families.insert(0, Polynomial(RULES.degree, without=(*of_base, *of_tool)))
+    turns = [k for k in base if not slides[k] and robot.upper[k] - robot.lower[k] >= 2 * np.pi]
+    names, fewer = (tuple(robot.joint_names[k] for k in part) for part in (free, endless))
+    families: list[Polynomial | MLP] = []
+    for left_out in ([*tool, *turns], tool) if tool and turns else (tool,) if tool else ():
+        linear, without = (
+            tuple(robot.joint_names[k] for k in part)
+            for part in ([k for k in base if k not in left_out], sorted(left_out))
+        )
+        if len(linear) + len(without) < robot.n - problem.r:
+            if like is None and not problem.metric.is_identity and problem.r == 1:
+                families.append(MLP(RULES.small_network, True, linear, without))
+            families.append(Polynomial(RULES.degree, linear, without=without))
     families.append(Polynomial(RULES.degree, names))
     if names != fewer:
         families.append(Polynomial(RULES.degree_of_all, fewer))
@@ -293,7 +303,7 @@ def _prepare(problem: Problem, family: Parametrisation, like: Likeness | None) -
 def _find_free_turns(problem: Problem, family: Parametrisation) -> tuple[str, ...]:
     """Joints that turn tool or base and that a family does without: it is regular at any turn of them, or at none."""
     names = problem.robot.joint_names
-    left_out = family.without if isinstance(family, Products) else ()
+    left_out = getattr(family, "without", ())
     places = {name: names.index(name) for name in left_out if name in names}
     return tuple(name for name, k in places.items() if turns_tool(problem.task, k) or keeps_self_motions(problem, k))
 
@@ -340,7 +350,7 @@ def _finish(
         raise DomainError(f"{wrong}: give a smaller box as branch, another branch, or another parametrisation")
     coordinates, quantities, meaning = _name_coordinates(solution, settings, posture)
     # the domain is where coordinates are regular; how much of the branch that is, and how good they are there
-    domain = RegularPart(clear.domain, coordinates, LOSS_RULES.least_volume / clear.r)
+    domain = RegularPart(clear.domain, coordinates, find_least_volume(clear))
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
     share = float(domain.contains(counted).mean()) if len(counted) else float("nan")
     measured = quantities is not None and problem.r == 1
@@ -385,7 +395,7 @@ def _name_coordinates(
     """
     problem, raw, quantities, seed = solution.problem, solution.coordinates, settings.quantities, settings.seed
     if not raw.size:
-        return raw, quantities, {} if quantities is None else {"exact meaning": "; ".join(quantities.names)}
+        return raw, quantities, {} if quantities is None else {"meaning": "; ".join(quantities.names), "exact": "yes"}
     first = sample_problem(problem, RULES.first, (seed, RULES.first_tag))
     coordinates = normalise(raw, problem.domain.centre, first)
     if quantities is not None:
@@ -425,7 +435,7 @@ class WideFit(Fit):
         facts = super().facts()
         branch = "" if self.branch is None else self.branch.name
         share = percent(self.regular_share, 2)
-        named, exact = self.chart.named_coordinates[0], "exact meaning" in self.chart.notes
+        named, exact = self.chart.parts.named_coordinates[0], "exact" in self.chart.notes
         meaning = "" if self.meaning is None else f"{self.meaning.explained}: {named}"
         own = {
             "branch": branch,

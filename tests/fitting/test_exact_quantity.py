@@ -15,8 +15,10 @@ from programs import Run, needs_c
 import orthocas as oc
 from orthocas import control
 from orthocas.bases.given import SEW_KINDS, SEWKind, find_periods, sew_angle
+from orthocas.charts.trackers import TrackerStatus
 from orthocas.codegen import check_c
 from orthocas.errors import DomainError, InvalidValueError, ShapeError
+from orthocas.fitting.wide import WideFit
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import dense_function
 from orthocas.tools.expressions import write_tape
@@ -49,7 +51,7 @@ def robot_of(name: str) -> oc.Robot:
 
 
 @cache
-def swivel_fit(name: str, kind: SEWKind) -> oc.WideFit:
+def swivel_fit(name: str, kind: SEWKind) -> WideFit:
     robot = robot_of(name)
     task = oc.Task.pose(robot)
     if kind == "conventional":
@@ -72,7 +74,9 @@ def test_xi_is_the_swivel_and_moves_it_by_what_is_asked(name: str, kind: SEWKind
     fit, robot = swivel_fit(name, kind), robot_of(name)
     chart, domain, least = fit.chart, fit.chart.problem.domain, ARMS[name][3][SEW_KINDS.index(kind)]
     assert fit.regular_share > least
-    assert chart.named_coordinates == (f"xi1: {'swivel' if kind == 'conventional' else 'sew:stereographic'} [rad]",)
+    assert chart.parts.named_coordinates == (
+        f"xi1: {'swivel' if kind == 'conventional' else 'sew:stereographic'} [rad]",
+    )
     q = sample_uniform(domain, 3000, 5)
     psi = swivels(robot, kind, q)
     np.testing.assert_allclose(chart.xi(q)[:, 0], psi, atol=1e-12, rtol=0)
@@ -85,7 +89,7 @@ def test_xi_is_the_swivel_and_moves_it_by_what_is_asked(name: str, kind: SEWKind
         tracker, phi = chart.tracker(start), chart.phi(start)
         for k in range(1, 7):
             tracker.step(phi + np.append(np.zeros(6), 0.05 * k))
-        if tracker.status is oc.TrackerStatus.OK:
+        if tracker.status is TrackerStatus.OK:
             arrived += 1
             moved = wrapped(swivels(robot, kind, tracker.q[None]) - angle)
             assert moved == pytest.approx(0.3, abs=1e-9)
@@ -98,7 +102,7 @@ def test_values_of_angles_count_up_to_whole_turns() -> None:
     """A swivel of pi - 0.01 and a change by 0.02: xi passes its jump, in solve and in a tracker."""
     fit, robot = swivel_fit("panda", "conventional"), robot_of("panda")
     chart = fit.chart
-    assert chart.turns.tolist() == [0.0] * 6 + [2 * np.pi]
+    assert chart.parts.turns.tolist() == [0.0] * 6 + [2 * np.pi]
     q = sample_uniform(chart.problem.domain, 20_000, 6)
     near = q[np.pi - np.abs(swivels(robot, "conventional", q)) < 0.02][:10]
     assert len(near) == 10
@@ -111,7 +115,7 @@ def test_values_of_angles_count_up_to_whole_turns() -> None:
         tracker = chart.tracker(start)
         for k in range(1, 6):
             tracker.step(phi + np.append(np.zeros(6), 0.02 * k * np.sign(phi[-1])))
-        if tracker.status is oc.TrackerStatus.OK:
+        if tracker.status is TrackerStatus.OK:
             now = swivels(robot, "conventional", tracker.q[None])
             assert wrapped(now - phi[-1]) == pytest.approx(0.1 * np.sign(phi[-1]), abs=1e-9)
             assert np.abs(tracker.q - start).max() < 1
@@ -126,8 +130,8 @@ def test_files_solutions_and_c_of_a_swivel(tmp_path: Path) -> None:
     again = oc.load(tmp_path / "swivel")
     np.testing.assert_array_equal(again.phi(q), chart.phi(q))
     np.testing.assert_array_equal(again.problem.domain.contains(2 * q), chart.problem.domain.contains(2 * q))
-    assert again.turns.tolist() == chart.turns.tolist()
-    assert again.named_coordinates == ("xi1: swivel [rad]",)
+    assert again.parts.turns.tolist() == chart.parts.turns.tolist()
+    assert again.parts.named_coordinates == ("xi1: swivel [rad]",)
     found = again.solve(chart.phi(q))
     assert (found.status == oc.InverseStatus.FOUND).all()
     np.testing.assert_allclose(chart.task(found.q), chart.task(q), atol=1e-8)
@@ -158,8 +162,8 @@ def test_a_joint_that_is_regular_nearly_everywhere_is_the_coordinate_by_itself(t
     fit = oc.fit_wide(robot, oc.Task.pose(robot), like="platform")
     chart, domain = fit.chart, fit.chart.problem.domain
     assert fit.regular_share > 0.995
-    assert chart.named_coordinates == ("xi1: platform [rad]",)
-    assert chart.turns[-1] == 0  # a joint is no angle that jumps
+    assert chart.parts.named_coordinates == ("xi1: platform [rad]",)
+    assert chart.parts.turns[-1] == 0  # a joint is no angle that jumps
     q = sample_uniform(domain, 400, 1)
     np.testing.assert_array_equal(chart.xi(q)[:, 0], q[:, 3])
     rolled = 0
@@ -169,20 +173,20 @@ def test_a_joint_that_is_regular_nearly_everywhere_is_the_coordinate_by_itself(t
         for a in np.linspace(0, np.pi / 2, 60):
             turn = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
             tracker.step(np.append(chart.problem.task.value(p, R @ turn), start[3]))
-            inside = inside and tracker.status is oc.TrackerStatus.OK
+            inside = inside and tracker.status is TrackerStatus.OK
         if inside:
             rolled += 1
             assert abs(tracker.q[3] - start[3]) < 1e-9
     assert rolled > 30
     near = oc.fit_wide(robot, oc.Task.pose(robot), like="platform", exact=False, samples=2000)
-    assert near.chart.named_coordinates == ("xi1: like platform [rad]",)
+    assert near.chart.parts.named_coordinates == ("xi1: like platform [rad]",)
 
 
 def test_coordinates_are_fitted_where_a_quantity_folds() -> None:
     """Joints of a planar arm: self-motions change the first one steadily, and turn the second one back."""
     known = oc.problems.get("planar_3r_xy")
     fits = [oc.fit_wide(known.robot, known.task, BENT, like=like) for like in ("q1", "q2")]
-    assert [fit.chart.named_coordinates[0] for fit in fits] == ["xi1: q1 [rad]", "xi1: like q2 [rad]"]
+    assert [fit.chart.parts.named_coordinates[0] for fit in fits] == ["xi1: q1 [rad]", "xi1: like q2 [rad]"]
     assert fits[1].meaning is not None
     assert fits[1].meaning.against > 0.03
     whole = oc.fit_wide(known.robot, known.task, BENT, like="q2", exact=True)
@@ -204,7 +208,7 @@ def test_several_quantities_are_coordinates_if_there_are_enough_of_them() -> Non
     robot = oc.Robot.planar([1.0] * 4, [1.0] * 4)
     task, box = oc.Task.position(robot, "xy"), oc.Box([0.3, 0.8, 0.8, 0.8], [0.8, 0.4, 0.4, 0.4])
     fit = oc.fit_wide(robot, task, box, like=["q1", mixed])
-    assert fit.chart.named_coordinates == ("xi1: q1 [rad]", "xi2: mixed")
+    assert fit.chart.parts.named_coordinates == ("xi1: q1 [rad]", "xi2: mixed")
     q = sample_uniform(fit.chart.problem.domain, 500, 1)
     values = np.column_stack([q[:, 0], q[:, 0] + np.sin(q[:, 1] - 0.8)])
     np.testing.assert_allclose(fit.chart.xi(q), values, atol=1e-12)
@@ -212,7 +216,7 @@ def test_several_quantities_are_coordinates_if_there_are_enough_of_them() -> Non
     given = oc.Given.from_function("both", 4, lambda q: ca.vertcat(q[0], mixed(q)))
     same = oc.fit_wide(robot, task, box, parametrisation=given)
     np.testing.assert_array_equal(same.chart.xi(q), fit.chart.xi(q))
-    assert same.chart.named_coordinates == ("xi1: both 1", "xi2: both 2")
+    assert same.chart.parts.named_coordinates == ("xi1: both 1", "xi2: both 2")
     with pytest.raises(InvalidValueError, match="exact is given with 1 quantity, expected 2 of them"):
         oc.fit_wide(robot, task, box, like="q1", exact=True)
     with pytest.raises(InvalidValueError, match="like is quantities that the task leaves nothing of"):
