@@ -251,7 +251,8 @@ class MLPFamily:
             gradients *= ca.repmat(slope, 1, r)
             # one sample as rows: then generated C needs no transposed copy of the weights
             gradients = (gradients.T @ W).T if N == 1 else W.T @ gradients
-        t, turning = len(self.turning), self.turning
+        turning: list[int] = self.turning
+        t = len(turning)
         by_angle = gradients[:t, :] * ca.repmat(ca.cos(q[turning, :]), 1, r)
         by_angle -= gradients[t : 2 * t, :] * ca.repmat(ca.sin(q[turning, :]), 1, r)
         # rows of the network's joints, of linear ones, and of those that coordinates do not depend on
