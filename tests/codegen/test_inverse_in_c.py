@@ -152,7 +152,7 @@ def test_compiled_curves_are_as_near(name: str, tmp_path: Path) -> None:
     ended = theirs.status <= oc.InverseStatus.NEAREST
     assert domain.contains(theirs.q[ended]).all()
     np.testing.assert_allclose(chart.parts.relative.difference(x, chart.task(theirs.q))[ended], 0, atol=1e-8)
-    away = np.abs(wrap_shortest(chart.xi(theirs.q) - chart.xi(wishes), chart.turns[chart.m :]))[:, 0]
+    away = np.abs(wrap_shortest(chart.xi(theirs.q) - chart.xi(wishes), chart.parts.turns[chart.m :]))[:, 0]
     np.testing.assert_allclose(away[ended], theirs.distance[ended], atol=1e-9)
 
 
