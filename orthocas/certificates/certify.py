@@ -47,7 +47,6 @@ RULES = CertifyRules()
 #: boxes of the one-to-one proof, in those that the proof without folds took
 _MORE_BOXES = {ELIMINATION: 3, COFACTORS: 30}
 Mapped = Callable[..., Iterable[BoxResults]]
-_LARGEST_BOX = Limits(smallest=2.0**-6, first_failure=True, folds=False)
 
 
 def certify(
@@ -105,10 +104,18 @@ def certify(
     limits = Limits(seconds=check_options(chart, time_limit, executor))
     bound = check_bound(chart, bound)
     rows = build_chart_rows(chart)
-    base = cover_domain(chart.problem.domain) if resume is None else _resume(chart, bound, resume)
+    base = cover_domain(chart.problem.domain)
+    if resume is not None:
+        # Go on with what the earlier search left open, by the same method.
+        require_same(chart, resume)
+        if resume.bound != bound or resume.fold:
+            raise CertifyError(
+                f"resume is a certificate for bound {resume.bound:g}, expected one for {bound:g} without a fold"
+            )
+        base = resume.regular
     check = choose_check(chart, rows, bound, None if resume is None else resume.method)
     guarded = chart.problem.domain.room_to_fold is not None
-    # Near the boundary of such a domain, there is always something left to prove.
+    # Near the boundary of a domain that keeps folds out, there is always something left to prove.
     if guarded:
         limits = replace(limits, boxes=RULES.guarded_boxes)
     search = Search(check, base, limits, rank_by_volume(base), executor)
@@ -117,6 +124,7 @@ def certify(
     def so_far() -> Certificate:
         return _build_certificate(chart, check.method, bound, search, injective, time.monotonic() - start, resume)
 
+    # Look for folds first, then prove all parts, then with the time that is left a box where phi is one-to-one.
     try:
         search.visit(_sample_suspects(chart))
         search.run(_report_search(monitor, "regular", guarded=guarded))
@@ -158,12 +166,17 @@ def certified_box(
         >>> bool((oc.certified_box(chart).half_width == chart.problem.domain.half_width).all())
         True
     """
-    limits = replace(_LARGEST_BOX, seconds=check_options(chart, time_limit, executor))
+    # Boxes near the centre come first, and a box without a proof ends the search: those behind it do not matter.
+    seconds = check_options(chart, time_limit, executor)
+    limits = Limits(seconds, smallest=2.0**-6, first_failure=True, folds=False)
     check = choose_inside_check(chart, build_chart_rows(chart), check_bound(chart, bound))
     base = cover_domain(chart.problem.domain)
     search = Search(check, base, limits, rank_by_distance(base), executor)
     search.run(_report_search(monitor, "largest box"))
-    scale = find_proved_scale(search.build_subdivision())
+    # The largest copy of the domain about its centre that no open part reaches into, rounded down.
+    parts = search.build_subdivision()
+    low, high = parts.leaves(OPEN)
+    scale = float(measure_distances(parts, low, high).min()) if len(low) else 1.0
     if scale == 0:
         raise CertifyError("nothing is proved around the centre of the domain, expected a chart that is regular there")
     domain = chart.problem.domain
@@ -209,21 +222,32 @@ def check_certificate(
     bound, rows = check_bound(chart, certificate.bound), build_chart_rows(chart)
     check = choose_check(chart, rows, bound, certificate.method)
     mapped: Mapped = map if executor is None else partial(in_order, executor)
-    if certificate.fold and not _check_fold(chart, check, np.array(certificate.fold)):
+    domain, whole = chart.problem.domain, certificate.regular
+    # A fold is two points of the domain at which det J is proved to have opposite signs.
+    if certificate.fold:
+        points = np.array(certificate.fold)
+        ends = check(points, points)
+        if not (domain.contains(points).all() and ends.regular.all() and ends.sign.prod() < 0):
+            return False
+    # The parts are proved, with one sign unless the chart folds, and their bounds are what the certificate says.
+    parts = _check_parts(check, whole, mapped, monitor)
+    signs = {int(sign) for results in parts for sign in np.unique(results.sign) if sign}
+    least = min((float(results.conditioning.min()) for results in parts), default=0.0)
+    one_sign = len(signs) < 2 or bool(certificate.fold)
+    if not (all(results.proved.all() for results in parts) and one_sign and least >= certificate.conditioning):
         return False
-    if not _check_regular(certificate, _check_parts(check, certificate.regular, mapped, monitor)):
+    if abs(_estimate_proved_fraction(domain, whole) - certificate.clear_share) > RULES.same_fraction:
         return False
-    fraction = _estimate_proved_fraction(chart.problem.domain, certificate.regular)
-    if abs(fraction - certificate.clear_share) > RULES.same_fraction:
-        return False
-    # The one-to-one box has its own check, and must lie around the centre.
+    # The one-to-one box has its own check, and must lie in the domain, around its centre.
     box = certificate.injective
     if box is None:
         return True
     one_to_one = choose_one_to_one_check(chart, rows, box)
-    if one_to_one is None or not box.complete or not _is_around_centre(certificate, box):
+    if one_to_one is None or not box.complete:
         return False
-    return all(results.proved.all() for results in _check_parts(one_to_one, box, mapped, monitor))
+    off = (box.low + box.high - whole.low - whole.high) / (box.high - box.low)
+    inside = (box.low >= whole.low).all() and (box.high <= whole.high).all() and np.abs(off).max() < RULES.off_centre
+    return bool(inside) and all(results.proved.all() for results in _check_parts(one_to_one, box, mapped, monitor))
 
 
 def check_options(chart: Chart, time_limit: float | None, executor: Executor | None) -> float:
@@ -287,18 +311,10 @@ def require_same(chart: Chart, certificate: Certificate) -> None:
         raise CertifyError("the certificate is void: it covers another domain")
 
 
-def _resume(chart: Chart, bound: float, certificate: Certificate) -> Subdivision:
-    require_same(chart, certificate)
-    if certificate.bound != bound or certificate.fold:
-        raise CertifyError(
-            f"resume is a certificate for bound {certificate.bound:g}, expected one for {bound:g} without a fold"
-        )
-    return certificate.regular
-
-
 def _sample_suspects(chart: Chart) -> Array:
     """The centre, and the sample with the least sign(det J(centre)) det J: uniform, near faces, and near corners."""
     domain = chart.problem.domain
+    # Powers of uniform samples lie near faces and corners.
     rng = np.random.default_rng(0)
     unit = rng.uniform(-1, 1, (RULES.samples, chart.n))
     powers = rng.choice([1.0, 0.5, 0.25], (RULES.samples, 1))
@@ -323,8 +339,8 @@ def _find_one_to_one_box(
     from there, larger ones are tried with more, until one of them would take too many.
     """
     end = time.monotonic() + limits.seconds
-    check = choose_one_to_one_check(chart, rows, base)
     best: Subdivision | None = None
+    check = choose_one_to_one_check(chart, rows, base)
     if check is None:
         return None
 
@@ -375,12 +391,6 @@ def _try_scales(shares: Sequence[Array], proved: Callable[[Array, int], bool], m
         proved(shares[low], most)
 
 
-def find_proved_scale(parts: Subdivision) -> float:
-    """The scale of the largest copy of a box about its centre that no open part reaches into."""
-    low, high = parts.leaves(OPEN)
-    return float(measure_distances(parts, low, high).min()) if len(low) else 1.0
-
-
 def _build_certificate(
     chart: Chart,
     method: str,
@@ -391,13 +401,12 @@ def _build_certificate(
     resume: Certificate | None,
 ) -> Certificate:
     fold = tuple(tuple(point.tolist()) for point in search.signs.values()) if search.folded else ()
-    # What an earlier search took and found counts as well.
-    before = (0, 0.0) if resume is None else (resume.boxes, resume.seconds)
-    conditioning = (
-        search.conditioning
-        if resume is None or not resume.conditioning
-        else min(search.conditioning, resume.conditioning)
-    )
+    # What an earlier search took and proved counts as well.
+    boxes, conditioning = search.evaluated, search.conditioning
+    if resume is not None:
+        boxes, seconds = boxes + resume.boxes, seconds + resume.seconds
+        if resume.conditioning:
+            conditioning = min(conditioning, resume.conditioning)
     domain, parts = chart.problem.domain, search.build_subdivision()
     return Certificate(
         fingerprint(chart.problem, chart.coordinates),
@@ -407,8 +416,8 @@ def _build_certificate(
         conditioning * (1 - 1e-9) if bound > 0 and np.isfinite(conditioning) else 0.0,
         injective,
         fold,
-        before[0] + search.evaluated,
-        before[1] + seconds,
+        boxes,
+        seconds,
         getattr(domain, "least_singular_value", 0.0),
         getattr(domain, "least_volume", 0.0),
         _estimate_proved_fraction(domain, parts),
@@ -428,14 +437,15 @@ def _estimate_proved_fraction(domain: Domain, parts: Subdivision) -> float:
         return 1.0
     rng, volumes = np.random.default_rng(0), (high - low).prod(axis=1)
 
-    def clear(low: Array, high: Array) -> float:
+    # The share of positions between corners whose relative singular value is above the bound.
+    def measure_clear(low: Array, high: Array) -> float:
         values = bound.singular_values(rng.uniform(low, high, (RULES.samples, parts.n)))
         return float(np.mean(values > bound.least_singular_value))
 
     chosen = rng.choice(len(low), RULES.samples, p=volumes / volumes.sum())
-    left = float(volumes.sum() / (parts.high - parts.low).prod()) * clear(low[chosen], high[chosen])
+    left = float(volumes.sum() / (parts.high - parts.low).prod()) * measure_clear(low[chosen], high[chosen])
     # Not all is proved, whatever samples say.
-    return float(np.clip(1 - left / clear(parts.low, parts.high), 0.0, 1 - 2**-53))
+    return float(np.clip(1 - left / measure_clear(parts.low, parts.high), 0.0, 1 - 2**-53))
 
 
 def _report_search(monitor: Monitor, stage: str, *, guarded: bool = False) -> Look:
@@ -456,28 +466,6 @@ def _report_search(monitor: Monitor, stage: str, *, guarded: bool = False) -> Lo
         monitor(Progress(stage, done, detail))
 
     return show
-
-
-def _check_regular(certificate: Certificate, parts: list[BoxResults]) -> bool:
-    """Whether the parts are proved, with one sign unless the chart folds, and the conditioning is what it says."""
-    signs = {int(sign) for results in parts for sign in np.unique(results.sign) if sign}
-    least = min((float(results.conditioning.min()) for results in parts), default=0.0)
-    proved = all(results.proved.all() for results in parts)
-    return proved and (len(signs) < 2 or bool(certificate.fold)) and least >= certificate.conditioning
-
-
-def _check_fold(chart: Chart, check: BoxCheck, points: Array) -> bool:
-    """Whether det J is proved to have opposite signs at two points (2, n) of the domain."""
-    results = check(points, points)
-    return bool(chart.problem.domain.contains(points).all() and results.regular.all() and results.sign.prod() < 0)
-
-
-def _is_around_centre(certificate: Certificate, box: Subdivision) -> bool:
-    """Whether a box lies in the domain, around its centre."""
-    domain = certificate.regular
-    off = (box.low + box.high - domain.low - domain.high) / (box.high - box.low)
-    inside = (box.low >= domain.low).all() and (box.high <= domain.high).all()
-    return bool(inside and np.abs(off).max() < RULES.off_centre)
 
 
 def _check_parts(check: BoxCheck, parts: Subdivision, mapped: Mapped, monitor: Monitor) -> list[BoxResults]:
