@@ -210,6 +210,10 @@ class MLPFamily:
         stacked = ca.vertcat(by_angle, gradients[2 * t :, :])[rows, :]
         return [stacked[:, j * N : (j + 1) * N] for j in range(self.outputs)]
 
+    def split_layers(self, theta: Array) -> list[tuple[Array, Array]]:
+        """Weights (out, width) and biases (out,) of every layer."""
+        return [(W.T.copy(), b) for W, b in zip(*_layers(theta, self.widths), strict=True)]
+
     def pullback(self, points: Array, theta: Array, memory: ArrayMemory | None = None) -> tuple[Array, Pulled]:
         """J_xi at points (N, n), (N, r, n), and the map from dL/dJ_xi to dL/dtheta; see `ArrayFamily`."""
         angles, t = points[:, self._turning], len(self._turning)

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.bases.products import ProductFamily
-from orthocas.certificates.box_checks import BoxResults, find_most_influential
+from orthocas.certificates.box_checks import BoxResults, check_in_turn, find_most_influential
 from orthocas.certificates.jets import Around, compute_powers
 from orthocas.certificates.rows import ProductRows, transform_task_rows
 from orthocas.certificates.taylor import (
@@ -37,12 +37,12 @@ from orthocas.certificates.taylor import (
     evaluate_sine_cosine,
     list_monomials,
     sum_error,
+    weigh_halving,
 )
 from orthocas.charts.certificate import COFACTORS
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import CertifyError
-from orthocas.tools.batch import one_blas_thread
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import Tape, evaluate_tape, write_tape
 
@@ -313,11 +313,8 @@ class CofactorCheck:
 
     def __call__(self, low: Array, high: Array) -> BoxResults:
         """Evaluate boxes between corners (boxes, n)."""
-        with one_blas_thread(), np.errstate(invalid="ignore", over="ignore"):
-            pieces = [slice(k, k + RULES.at_once) for k in range(0, len(low), RULES.at_once)]
-            parts = [self._check_few(low[piece], high[piece]) for piece in pieces]
-        regular, sign, compute_gains = (np.concatenate(each) for each in zip(*parts, strict=True))
-        return BoxResults(regular, regular, sign, np.zeros(len(low)), find_most_influential(compute_gains, self.joints))
+        regular, sign, gains = check_in_turn(self._check_few, low, high, RULES.at_once)
+        return BoxResults(regular, regular, sign, np.zeros(len(low)), find_most_influential(gains, self.joints))
 
     def _check_few(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array, Array]:
         coefficients, rest = self.determinant(low, high)
@@ -362,17 +359,11 @@ def compute_gains(coefficients: Array, rest: Array, n: int) -> Array:
 
     The rest is shared out like the terms of the highest degree, which it is most like.
     """
-    sizes, taken = np.abs(coefficients), _weigh_halving(n)
+    sizes, taken = np.abs(coefficients), weigh_halving(tuple(range(n)), SERIES_DEGREE)
     highest = len(list_indices(n, SERIES_DEGREE - 1))
     last = taken[:, highest:] @ sizes[highest:]
     gains: Array = taken @ sizes + last / (last.sum(axis=0) + TINY) * rest
     return gains.T
-
-
-@cache
-def _weigh_halving(n: int) -> Array:
-    """1 - 2^-power of each variable in each monomial, (n, monomials)."""
-    return np.array([[1 - 0.5 ** m.count(v) for m in list_indices(n, SERIES_DEGREE)] for v in range(n)])
 
 
 @cache

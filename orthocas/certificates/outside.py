@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from orthocas.bases.family import Family, LinearFamily
+from orthocas.bases.family import LinearFamily
 from orthocas.bases.mlp import MLPFamily
 from orthocas.certificates.box_checks import (
     NEVER,
@@ -69,7 +69,13 @@ def require_all_positions(chart: Chart, variables: Collection[int]) -> None:
     endless_variables = [joint for joint in endless if joint in variables]
     if not endless_variables:
         return
-    alike = _find_periodic_joints(chart)
+    coordinates = chart.coordinates
+    # `build_chart_rows` has refused others.
+    assert isinstance(coordinates, Coordinates)
+    # A full turn must change neither J_x nor J_xi.
+    alike = _find_unchanged(write_tape(problem.task.smooth_function), chart.n)
+    if len(coordinates.offset):
+        alike &= {*coordinates.idle, *(coordinates.active[i] for i in _find_periodic_inputs(coordinates))}
     for joint in endless_variables:
         name = problem.robot.joint_names[joint]
         if problem.robot.tree.prismatic[joint] or problem.domain.half_width[joint] < np.pi:
@@ -81,23 +87,14 @@ def require_all_positions(chart: Chart, variables: Collection[int]) -> None:
             )
 
 
-def _find_periodic_joints(chart: Chart) -> set[int]:
-    """The joints whose full turns change neither J_x nor J_xi."""
-    coordinates = chart.coordinates
-    # `build_chart_rows` has refused others.
-    assert isinstance(coordinates, Coordinates)
-    task = _find_unchanged(write_tape(chart.problem.task.smooth_function), chart.n)
-    if not len(coordinates.offset):
-        return task
-    own = _find_periodic_inputs(coordinates.family, len(coordinates.active), coordinates)
-    return task & {*coordinates.idle, *(coordinates.active[i] for i in own)}
-
-
-def _find_periodic_inputs(family: Family, n: int, coordinates: Coordinates) -> set[int]:
-    """The same for the coordinates of a family of n joints."""
+def _find_periodic_inputs(coordinates: Coordinates) -> set[int]:
+    """The active joints, by their places among these, whose full turns do not change J_xi."""
+    family, n = coordinates.family, len(coordinates.active)
+    # Networks take sines and cosines of all joints that they do not take as they are.
     if isinstance(family, MLPFamily):
         return {i for i, direct in enumerate(family.direct) if not direct}
     q = ca.SX.sym("q", n)
+    # Each function of a basis is looked at alone.
     if isinstance(family, LinearFamily):
         values = family.basis(q)
     else:
@@ -118,7 +115,21 @@ def find_periodic_joints(tape: Tape, n: int) -> frozenset[int]:
     def leaf(name: str, of: Any) -> _Shift:
         return _Shift(nothing, float(of)) if name == "const" else _Shift(unit[of])
 
-    shifts = evaluate_tape(tape, leaf, lambda name, of: _Shift(_compute_shift(name, of)))
+    # Only whole numbers of moderate size are added and multiplied, which is exact.
+    def step(name: str, of: Sequence[_Shift]) -> _Shift:
+        shifts = [each.turn for each in of]
+        if name in _EXACT:
+            return _Shift(_keep_whole(_EXACT[name](*shifts)))
+        for one, other in ((of[0], of[-1]), (of[-1], of[0])):
+            if name == "mul" and one.constant is not None:
+                return _Shift(_keep_whole(np.where(other.turn == 0, 0.0, other.turn * one.constant)))
+        # Other functions stay where all that they depend on does; those with a period, where it turns as a whole.
+        still = np.all([shift == 0 for shift in shifts], axis=0)
+        if name in ("sin", "cos", "tan"):
+            still = ~np.isnan(shifts[0])
+        return _Shift(np.where(still, 0.0, np.nan))
+
+    shifts = evaluate_tape(tape, leaf, step)
     alike = np.all([~np.isnan(each.turn) for each in shifts], axis=0)
     return frozenset(np.flatnonzero(alike).tolist())
 
@@ -128,20 +139,6 @@ class _Shift(NamedTuple):
 
     turn: Any  #: change by a turn of each joint / 2 pi; NaN where it is no constant
     constant: float | None = None  #: the value itself, if it is a number
-
-
-def _compute_shift(name: str, of: Sequence[_Shift]) -> Any:
-    """The change of a step. Only whole numbers of moderate size are added and multiplied, which is exact."""
-    shifts = [each.turn for each in of]
-    if name in _EXACT:
-        return _keep_whole(_EXACT[name](*shifts))
-    for one, other in ((of[0], of[-1]), (of[-1], of[0])):
-        if name == "mul" and one.constant is not None:
-            return _keep_whole(np.where(other.turn == 0, 0.0, other.turn * one.constant))
-    still = np.all([shift == 0 for shift in shifts], axis=0)
-    if name in ("sin", "cos", "tan"):
-        still = ~np.isnan(shifts[0])
-    return np.where(still, 0.0, np.nan)
 
 
 _EXACT: Mapping[str, Callable[..., Any]] = {
@@ -197,12 +194,19 @@ class OutsideCheck:
         # Boxes that may lie outside: others, too large for the value at their centre, are rarely proved to.
         half = (high - low)[:, list(self.variables)] / 2
         near = np.asarray(self.domain.least_singular_value - values > RULES.steep * half.sum(axis=1))
-        widest = self._avoid_slivers(values, low, high, inside.widest)
+        # Thin boxes with a centre outside are halved in their widest joint, so that they become worth a try.
+        joints = np.array(self.joints)
+        widths = (high - low)[:, joints] / 2
+        halved = (high - low)[np.arange(len(low)), np.maximum(inside.widest, 0)] / 2
+        thin = (halved < RULES.thin * widths.max(axis=1)) & (inside.widest >= 0)
+        thin &= values < self.domain.least_singular_value
+        widest = np.where(thin, joints[widths.argmax(axis=1)], inside.widest)
         outside = np.zeros(len(low), dtype=bool)
         if near.any():
             with one_blas_thread():
                 outside[near], widest[near] = self.check_outside(low[near], high[near])
         regular, sign = inside.regular & ~outside, np.where(outside, 0, inside.sign)
+        # A domain that keeps folds out takes care of boxes with the other sign itself.
         if self.guarded:
             widest[regular & ~own & (values > self.domain.least_singular_value)] = NEVER
             regular, sign = regular & (sign == self.sign), np.where(sign == self.sign, sign, 0)
@@ -213,15 +217,6 @@ class OutsideCheck:
             conditioning=np.where(outside, np.inf, inside.conditioning),
             widest=widest,
         )
-
-    def _avoid_slivers(self, values: Array, low: Array, high: Array, widest: Array) -> Array:
-        """The joint to halve: of thin boxes with a centre outside the widest one, so that they become worth a try."""
-        joints = np.array(self.joints)
-        half = (high - low)[:, joints] / 2
-        joint = np.maximum(widest, 0)
-        thin = (high - low)[np.arange(len(low)), joint] / 2 < RULES.thin * half.max(axis=1)
-        thin &= (values < self.domain.least_singular_value) & (widest >= 0)
-        return np.where(thin, joints[half.argmax(axis=1)], widest)
 
     def check_outside(self, low: Array, high: Array) -> tuple[Array, Array]:
         """Whether boxes lie outside, and the joint to halve to find out."""

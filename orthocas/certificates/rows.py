@@ -17,7 +17,6 @@ Source:
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -138,6 +137,7 @@ def build_chart_rows(chart: Chart) -> ChartRows:
     active = tuple(coordinates.active)
     task, moved_by = build_task_rows(chart.problem.task, chart.problem.domain, active)
     own, depends = _build_coordinate_rows(coordinates)
+    # A base at whose positions det J is the same stands still.
     base = _find_base(chart)
     variables = tuple(sorted({*moved_by, *depends} - {*base}))
     if len(variables) > MOST_VARIABLES:
@@ -227,7 +227,7 @@ def _build_coordinate_rows(coordinates: Coordinates) -> tuple[CoordinateRows | N
         rows = ProductRows.build(family, coordinates.theta)
         return rows, {active[i] for i in rows.find_dependences()}
     if isinstance(family, MLPFamily):
-        return NetworkRows.build(family, coordinates.theta), set(active)
+        return NetworkRows(tuple(family.split_layers(coordinates.theta)), family.direct), set(active)
     own = ca.SX.sym("q", len(active))
     xi = family.expression(own, ca.SX(ca.DM(coordinates.theta)))
     function = dense_function("xi", [own], [xi])
@@ -282,7 +282,20 @@ def transform_task_rows(task: Task, domain: Domain) -> tuple[ca.Function, float]
 
 def build_velocity_rows(tree: KinematicTree, q: ca.SX, body: int) -> ca.SX:
     """Jacobian of the tip's velocity and angular velocity in the axes of a body of the chain, (6, n)."""
-    poses = _build_poses(tree, q, body)
+    # Poses of all bodies in the frame of that one: outwards to the tip, then back to the base.
+    chain = tree.carriers(tree.tip_parent)
+    here = chain.index(body)
+    poses: dict[int, Pose] = {body: (ca.SX.eye(3), ca.SX.zeros(3))}
+    for below, i in zip(chain[here:], chain[here + 1 :], strict=False):
+        R, p = poses[below]
+        rotation, shift = _step(tree, q, i)
+        poses[i] = (R @ rotation, p + R @ shift)
+    for i, below in zip(chain[here:0:-1], chain[here - 1 :: -1] if here else [], strict=False):
+        R, p = poses[i]
+        rotation, shift = _step(tree, q, i)
+        back = R @ rotation.T
+        poses[below] = (back, p - back @ shift)
+    # Turning joints move the tip about their axes, sliding ones along.
     R, p = poses[tree.tip_parent]
     tip = p + R @ constant(tree.tip_translation)
     J = ca.SX(6, tree.n)
@@ -326,23 +339,6 @@ def _choose_sparsest(q: ca.SX, choices: list[ca.SX]) -> ca.SX:
     return min(choices, key=lambda J: int(ca.jacobian(ca.vec(J), q).nnz()))
 
 
-def _build_poses(tree: KinematicTree, q: ca.SX, body: int) -> dict[int, Pose]:
-    """Rotation and position of every body of the chain, in the frame of one of them."""
-    chain = tree.carriers(tree.tip_parent)
-    here = chain.index(body)
-    poses: dict[int, Pose] = {body: (ca.SX.eye(3), ca.SX.zeros(3))}
-    for below, i in zip(chain[here:], chain[here + 1 :], strict=False):
-        R, p = poses[below]
-        rotation, shift = _step(tree, q, i)
-        poses[i] = (R @ rotation, p + R @ shift)
-    for i, below in zip(chain[here:0:-1], chain[here - 1 :: -1] if here else [], strict=False):
-        R, p = poses[i]
-        rotation, shift = _step(tree, q, i)
-        back = R @ rotation.T
-        poses[below] = (back, p - back @ shift)
-    return poses
-
-
 def _step(tree: KinematicTree, q: ca.SX, i: int) -> Pose:
     """Rotation and position of a body in the frame of its parent."""
     rotation, shift = constant(tree.rotations[i]), constant(tree.translations[i])
@@ -376,19 +372,40 @@ class ProductRows:
         """The tables of a family with its parameters."""
         n, r = family.space.n, family.outputs
         terms = np.array([(0,) * n, *family.terms])
+        # The functions of one joint each, of which all others are products.
         alone = np.flatnonzero(np.count_nonzero(terms, axis=1) == 1)
         q = ca.SX.sym("q", n)
-        values = family.basis(q)[[int(k) - 1 for k in alone]]
+        functions = family.basis(q)[[int(k) - 1 for k in alone]]
         numbers = np.zeros((n, terms.max() + 1), dtype=int)
         for place, k in enumerate(alone):
             joint = int(np.flatnonzero(terms[k])[0])
             numbers[joint, terms[k, joint]] = place
-        graph = TaylorGraph.build(dense_function("functions", [q], [values]), "the coordinates")
+        graph = TaylorGraph.build(dense_function("functions", [q], [functions]), "the coordinates")
+        # Derivatives of functions are sums of others, so those of the coordinates are tables, order by order.
+        steps = [family.build_derivative_matrix(i) for i in range(n)]
         C = np.hstack([np.zeros((r, 1)), theta.reshape(r, -1)])
-        return cls(r, terms, graph, numbers, _differentiate_basis(family, terms, C, highest))
+        tables: dict[Monomial, tuple[Any, Any]] = {(): (C, np.abs(C))}
+        orders: list[Derivatives] = []
+        for order in range(1, highest + 1):
+            indices = list_multi_indices(n, order)
+            # The derivatives of a polynomial of a lower degree vanish.
+            if orders and not len(orders[-1].used):
+                nothing = np.zeros((len(indices) * r, 0))
+                orders.append(Derivatives(orders[-1].used, nothing, nothing, 0.0))
+                continue
+            for index in indices:
+                values, sizes = tables[index[:-1]]
+                step = steps[index[-1]]
+                tables[index] = (values @ step, sizes @ abs(step))
+            table, sizes = (np.concatenate([tables[index][k] for index in indices]) for k in (0, 1))
+            used = np.flatnonzero(sizes.any(axis=0))
+            rounding = 4 * UNIT * (len(terms) + 64 * order)
+            orders.append(Derivatives(used, table[:, used], sizes[:, used] * UP, rounding))
+        return cls(r, terms, graph, numbers, tuple(orders))
 
     def __call__(self, boxes: list[TaylorModel], half_widths: Array, variables: Variables) -> TaylorModel:
         """J_xi, (r, n, boxes), for models of the joints on boxes of the given half-widths (n, boxes)."""
+        # Taylor's series: derivatives at the centre, and the next order on the whole box for the remainder.
         points = [TaylorModel.constant(box.centre) for box in boxes]
         values, errors = self._evaluate_basis(self.functions(points))
         parts, left_out = [], np.zeros((self.r, len(boxes), half_widths.shape[1]))
@@ -414,12 +431,13 @@ class ProductRows:
         """The derivatives of J_xi at the centres of boxes. The next order, on the whole box, bounds the rest."""
         points = [TaylorModel.constant(np.ascontiguousarray(c)) for c in around.centre]
         values, errors = self._evaluate_basis(self.functions(points))
-        known = [self._evaluate_derivatives(order, values, errors) for order in range(1, around.order + 2)]
+        orders = [self._evaluate_derivatives(order, values, errors) for order in range(1, around.order + 2)]
+        # What is left out: the next order anywhere between the points.
         linear = np.stack([around.centre, around.reach, *np.zeros((2, *around.centre.shape))], axis=1)
         boxes = [TaylorModel((k,), each, np.zeros(each.shape[1:])) for k, each in enumerate(linear)]
         weights = average_largest(build_power_weights(around, around.order + 1))
         left_out = self._bound_derivatives(around.order + 2, boxes) * weights
-        derivatives, doubts = zip(*known, strict=True)
+        derivatives, doubts = zip(*orders, strict=True)
         return Jets(derivatives, doubts, left_out.sum(axis=2) * compute_margin(left_out.shape[2]) + TINY)
 
     def _evaluate_derivatives(self, order: int, values: Array, errors: Array) -> tuple[Array, Array]:
@@ -464,45 +482,12 @@ class ProductRows:
         return out
 
 
-def _differentiate_basis(family: ProductFamily, terms: Array, C: Array, highest: int) -> tuple[Derivatives, ...]:
-    n = family.space.n
-    steps = [family.build_derivative_matrix(i) for i in range(n)]
-    known: dict[Monomial, tuple[Any, Any]] = {(): (C, np.abs(C))}
-    orders: list[Derivatives] = []
-    for order in range(1, highest + 1):
-        indices = list_multi_indices(n, order)
-        # The derivatives of a polynomial of a lower degree vanish.
-        if orders and not len(orders[-1].used):
-            nothing = np.zeros((len(indices) * len(C), 0))
-            orders.append(Derivatives(orders[-1].used, nothing, nothing, 0.0))
-            continue
-        for index in indices:
-            values, sizes = known[index[:-1]]
-            step = steps[index[-1]]
-            known[index] = (values @ step, sizes @ abs(step))
-        table, sizes = (np.concatenate([known[index][k] for index in indices]) for k in (0, 1))
-        used = np.flatnonzero(sizes.any(axis=0))
-        rounding = 4 * UNIT * (len(terms) + 64 * order)
-        orders.append(Derivatives(used, table[:, used], sizes[:, used] * UP, rounding))
-    return tuple(orders)
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class NetworkRows:
     """J_xi of xi = W_out tanh(W_2 tanh(W_1 [sin q; cos q; q] + b_1) + b_2) on boxes."""
 
     layers: tuple[tuple[Array, Array], ...]  #: weights (out, in) and biases (out,)
     direct: tuple[bool, ...]  #: which joints enter as q itself
-
-    @classmethod
-    def build(cls, family: MLPFamily, theta: Array) -> "NetworkRows":
-        """The layers of a family with its parameters."""
-        layers, start = [], 0
-        for width, out in pairwise(family.widths):
-            end = start + out * width
-            layers.append((theta[start:end].reshape(width, out).T.copy(), theta[end : end + out]))
-            start = end + out
-        return cls(tuple(layers), family.direct)
 
     def __call__(self, joints: list[TaylorModel], half_widths: Array, variables: Variables) -> TaylorModel:
         """J_xi, (r, n, boxes), for models of the joints."""
@@ -520,24 +505,19 @@ class NetworkRows:
             gradient = TaylorModel.constant(weights[:, None])
             for (W, _), slope in zip(self.layers[-2::-1], slopes[::-1], strict=True):
                 gradient = _multiply_weights(W.T, gradient * slope)
-            rows.append(self._differentiate_by_joint(gradient, sines, cosines))
+            # From the inputs [sin q; cos q; q] to the joints.
+            count, columns = len(sines), []
+            angle, slide = 0, 2 * count
+            for slides in self.direct:
+                if slides:
+                    columns.append(gradient[slide])
+                    slide += 1
+                else:
+                    by_sine, by_cosine = gradient[angle], gradient[count + angle]
+                    columns.append(by_sine * cosines[angle] - by_cosine * sines[angle])
+                    angle += 1
+            rows.append(stack(columns))
         return stack(rows)
-
-    def _differentiate_by_joint(
-        self, gradient: TaylorModel, sines: list[TaylorModel], cosines: list[TaylorModel]
-    ) -> TaylorModel:
-        """Derivatives by the joints from those by the inputs [sin q; cos q; q]."""
-        turning, columns = len(sines), []
-        angle, slide = 0, 2 * turning
-        for slides in self.direct:
-            if slides:
-                columns.append(gradient[slide])
-                slide += 1
-            else:
-                by_sine, by_cosine = gradient[angle], gradient[turning + angle]
-                columns.append(by_sine * cosines[angle] - by_cosine * sines[angle])
-                angle += 1
-        return stack(columns)
 
 
 def _multiply_weights(W: Array, models: TaylorModel) -> TaylorModel:

@@ -206,6 +206,7 @@ class TaylorModel:
 
     def _bound_remainder(self, other: "TaylorModel") -> Array:
         """The remainder of a product: degrees above 3, the remainders of the factors, and rounding."""
+        # Sizes by degree.
         a, b = self.sum_sizes(), other.sum_sizes()
         all_a, all_b = a.sum(axis=0), b.sum(axis=0)
         high = a[3] * (b[1] + b[2] + b[3]) + a[2] * (b[2] + b[3]) + a[1] * b[3]
@@ -215,11 +216,13 @@ class TaylorModel:
 
     def compose(self, series: "Series") -> "TaylorModel":
         """The model of f(self), for the series of f about the centre."""
+        # Without variables, the remainder takes the place of all that varies.
         if not self.variables:
             first = np.abs(series.values[1:]) + series.errors[1:]
             e = self.remainder
             doubt = series.errors[0] + series.tail + e * (first[0] + e * (first[1] + e * first[2]))
             return TaylorModel.constant(series.values[0], doubt * UP)
+        # Horner's rule in what is away from the centre.
         away = TaylorModel(self.variables, self.coefficients.copy(), self.remainder)
         away.coefficients[0] = 0
         values = [TaylorModel.constant(series.values[k], series.errors[k]) for k in range(4)]
@@ -235,21 +238,23 @@ class TaylorModel:
 
         A coefficient shrinks by 2^-power; the remainder is shared out like the cubic terms, which it is most like.
         """
-        taken, size = _weigh_halving(self.variables).T, np.abs(self.coefficients)
+        taken, size = weigh_halving(self.variables, DEGREE), np.abs(self.coefficients)
         cubic = order_starts(len(self.variables))[3]
         flat, shape = size.reshape(len(size), -1), (len(taken), *size.shape[1:])
         last = (taken[:, cubic:] @ flat[cubic:]).reshape(shape)
-        known = (taken[:, :cubic] @ flat[:cubic]).reshape(shape) + last
+        of_terms = (taken[:, :cubic] @ flat[:cubic]).reshape(shape) + last
         # Remainders may be infinite.
         with np.errstate(invalid="ignore"):
-            gains: Array = known + last / (last.sum(axis=0) + TINY) * self.remainder
+            gains: Array = of_terms + last / (last.sum(axis=0) + TINY) * self.remainder
         return gains
 
 
 @cache
-def _weigh_halving(variables: Variables) -> Array:
-    """1 - 2^-power of each variable in each monomial, (monomials, variables)."""
-    return np.array([[1 - 0.5 ** powers.count(v) for v in variables] for powers in list_monomials(variables)])
+def weigh_halving(variables: Variables, degree: int) -> Array:
+    """1 - 2^-power of each variable in each monomial up to a degree, (variables, monomials)."""
+    monomials = list_monomials(variables, degree)
+    taken = [[1 - 0.5 ** powers.count(v) for powers in monomials] for v in variables]
+    return np.array(taken).reshape(len(variables), len(monomials))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,6 +268,7 @@ class Series:
 
 def stack(models: list[TaylorModel]) -> TaylorModel:
     """Models of the same shape as one, with a new first axis."""
+    # All models get the variables and the shape that they have together.
     variables = tuple(sorted({v for model in models for v in model.variables}))
     shape = np.broadcast_shapes(*(model.remainder.shape for model in models))
     parts = [model.broadcast_to(shape).extend(variables) for model in models]
@@ -276,30 +282,32 @@ def _widen(model: TaylorModel, error: Array) -> TaylorModel:
 
 def evaluate_sine_cosine(x: Array) -> tuple[Enclosed, Enclosed]:
     """Sine and cosine of numbers up to 1e6 in size."""
-    known = np.abs(x) <= _WIDEST_ANGLE
-    x = np.where(known, x, 0.0)
+    valid = np.abs(x) <= _WIDEST_ANGLE
+    x = np.where(valid, x, 0.0)
+    # Quarter turns are taken off, then the two series follow.
     turns = np.rint(x * (2 / np.pi))
     # |r| < 0.79.
     r = ((x - turns * _HALF_PI[0]) - turns * _HALF_PI[1]) - turns * _HALF_PI[2]
     square = r * r
     s = r * _evaluate_horner(square, [(-1.0) ** k / factorial(2 * k + 1) for k in range(10)])
     c = _evaluate_horner(square, [(-1.0) ** k / factorial(2 * k) for k in range(11)])
+    # Each quarter turn swaps sine and cosine, and one of the signs.
     quarter = turns % 4
     sine = np.choose(quarter.astype(int), [s, c, -s, -c])
     cosine = np.choose(quarter.astype(int), [c, -s, -c, s])
-    error = np.where(known, _ERROR, np.inf)
+    error = np.where(valid, _ERROR, np.inf)
     return (sine, error), (cosine, error)
 
 
 def evaluate_exponential(x: Array) -> Enclosed:
     """e^x of numbers up to 700 in size."""
-    known = np.abs(x) <= _WIDEST_EXPONENT
-    x = np.where(known, x, 0.0)
+    valid = np.abs(x) <= _WIDEST_EXPONENT
+    x = np.where(valid, x, 0.0)
     whole = np.rint(x * (1 / np.log(2.0)))
     # |r| < 0.35.
     r = (x - whole * _LN2[0]) - whole * _LN2[1]
     value = np.ldexp(_evaluate_horner(r, [1 / factorial(k) for k in range(16)]), whole.astype(int))
-    return value, np.where(known, _ERROR * value, np.inf)
+    return value, np.where(valid, _ERROR * value, np.inf)
 
 
 def evaluate_tanh(x: Array) -> Enclosed:
@@ -311,6 +319,7 @@ def evaluate_tanh(x: Array) -> Enclosed:
 
 def _evaluate_horner(x: Array, coefficients: list[float]) -> Array:
     """Sum of coefficients[k] x^k."""
+    # From the highest power down.
     value = np.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         value = value * x + coefficient
@@ -396,6 +405,7 @@ def power(model: TaylorModel, exponent_: int) -> TaylorModel:
     """The model of f^k for a whole number k."""
     if exponent_ < 0:
         return reciprocal(power(model, -exponent_))
+    # From the first binary digit on, square for each, and multiply for those that are 1.
     result = TaylorModel.constant(np.ones_like(model.centre))
     for bit in bin(exponent_)[2:]:
         result = result * result

@@ -188,7 +188,7 @@ def _build_network(coordinates: Coordinates) -> Form | None:
     if not isinstance(family, MLPFamily):
         return None
     scale, fitted, depth = coordinates.scale[:, None], len(coordinates.offset), len(family.hidden)
-    layers = _split_layers(family, coordinates.theta)
+    layers = [(W, b[:, None]) for W, b in family.split_layers(coordinates.theta)]
     A, c = _split_idle(coordinates)
     W_out = np.zeros((coordinates.r, family.hidden[-1]))
     W_out[:fitted] = scale * layers[depth][0]
@@ -202,16 +202,6 @@ def _build_network(coordinates: Coordinates) -> Form | None:
         tables |= {f"W_{k}": W, f"b_{k}": b}
     plain = {name: [int(k) for k in of] for name, of in indices.items()}
     return Form("coordinates", {"kind": "network", "depth": depth}, "", tables, plain)
-
-
-def _split_layers(family: MLPFamily, theta: Array) -> list[tuple[Array, Array]]:
-    """Weights (out, width) and biases (out, 1) of all layers."""
-    layers, start = [], 0
-    for width, out in pairwise(family.widths):
-        middle, end = start + out * width, start + out * (width + 1)
-        layers.append((theta[start:middle].reshape(width, out).T, theta[middle:end, None]))
-        start = end
-    return layers
 
 
 def _build_expression(chart: Chart) -> Form:
