@@ -6,7 +6,6 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +23,14 @@ from orthocas.tools.files import compute_digest, make_folder, open_draft_folder,
 from orthocas.tools.interrupts import deferred
 from orthocas.tools.processes import run_program
 
-_FLAGS = ("-O2",)  # -O3 takes twice as long, and gains little
+# -O3 takes twice as long, and gains little.
+_FLAGS = ("-O2",)
 _PREFIX = "kernel"
 _ENTRY = """int {name}(const double **arg, double **res, int *iw, double *w) {{
   return {prefix}_{name}(arg, res, iw, w, 0);
 }}"""
-_STAGES = 12  # as in templates/runner.c.jinja
+# As in templates/runner.c.jinja.
+_STAGES = 12
 
 
 def kept_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], folder: str | Path | None = None) -> Path:
@@ -48,9 +49,13 @@ def kept_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], fo
     compiler, options = compilers()[0], ("-std=c99", "-fPIC", "-shared", *flags)
     content = [*(text.encode() for text in sources.values()), repr((compiler, options)).encode()]
     name = f"{kind}-{hashlib.sha256(b'/'.join(content)).hexdigest()[:32]}.so"
-    place = _cache() if folder is None else as_path("folder", folder)
+    # Relative paths in XDG_CACHE_HOME do not count, as its specification demands.
+    cache_home = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    default = (cache_home if cache_home.is_absolute() else Path.home() / ".cache") / "orthocas" / "libraries"
+    place = default if folder is None else as_path("folder", folder)
     library = make_folder("folder", place, mode=0o700).resolve() / name
     _require_own(library.parent)
+    # Draft and checksum appear together, so that other processes never see half a library.
     if not _is_whole(library):
         with open_draft_folder() as place, publish(library.parent) as drafts:
             for file, text in sources.items():
@@ -104,17 +109,6 @@ def _is_whole(library: Path) -> bool:
         return False
 
 
-def template(name: str) -> str:
-    """A file of `templates/`."""
-    return (files(__package__) / "templates" / name).read_text()
-
-
-def _cache() -> Path:
-    """Relative paths in XDG_CACHE_HOME do not count, as its specification demands."""
-    inputs = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return (inputs if inputs.is_absolute() else Path.home() / ".cache") / "orthocas" / "libraries"
-
-
 class Kernel(ctypes.Structure):
     """`kernel` of templates/runner.c.jinja: a function with its own work arrays, for one thread."""
 
@@ -141,19 +135,18 @@ class CompiledFunctions:
 
     Args:
         functions: functions with different names. Inputs and outputs are columns.
-        folder: where compiled libraries are kept; default as in `orthocas.compile_inverse`.
 
     Raises:
         CompileError: as `kept_library`.
     """
 
-    def __init__(self, functions: Sequence[ca.Function], folder: Path | None = None) -> None:
+    def __init__(self, functions: Sequence[ca.Function]) -> None:
         kernels = generate_kernels(list(functions), _PREFIX)
         sizes = {f.name(): tuple(f.nnz_out(i) for i in range(f.n_out())) for f in functions}
         self._functions = {name: _Function(kernels.work[name], outputs) for name, outputs in sizes.items()}
         entries = [_ENTRY.format(name=name, prefix=_PREFIX) for name in sizes]
         code = "\n\n".join(["#include <math.h>\n#include <string.h>", kernels.code, *entries, ""])
-        self.library = kept_library("functions", {"functions.c": code}, _FLAGS, folder)
+        self.library = kept_library("functions", {"functions.c": code}, _FLAGS)
 
     def kernel(self, name: str, constants: Sequence[Array | None] = ()) -> Kernel:
         """A function for compiled code.
@@ -162,6 +155,7 @@ class CompiledFunctions:
             name: of the function.
             constants: inputs that stay; None for those that the caller sets.
         """
+        # Work arrays of its own, and constants that live as long as the kernel.
         arg, res, iw, w = (max(1, size) for size in self._functions[name].work)
         arguments, results = (ctypes.c_void_p * arg)(), (ctypes.c_void_p * res)()
         integers, doubles = np.zeros(iw, dtype=np.intc), np.zeros(w)
@@ -181,6 +175,7 @@ class CompiledFunctions:
         kernel = self.kernel(name, [None] * len(arguments))
         inputs = [np.ascontiguousarray(argument, dtype=float) for argument in arguments]
         outputs = [np.empty((N, size)) for size in self._functions[name].outputs]
+        # Pointers to inputs and outputs, and from row to row a stride, 0 where all rows are equal.
         places = [
             (ctypes.c_void_p * len(arrays))(*(array.ctypes.data for array in arrays)) for arrays in (inputs, outputs)
         ]

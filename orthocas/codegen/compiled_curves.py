@@ -11,13 +11,13 @@ import numpy as np
 from orthocas.charts.chart import Chart
 from orthocas.charts.curve_tracer import RULES
 from orthocas.charts.curves import Nearest, SelfMotionCurves
-from orthocas.codegen.compiled import template
 from orthocas.codegen.kernels import generate_kernels
-from orthocas.codegen.rendering import write_numbers
+from orthocas.codegen.rendering import read_template, write_numbers
 from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.checks import Array
 
-_PIECE = 64  # rows that a thread takes at once
+# Rows that a thread takes at once.
+_PIECE = 64
 _STARTS = 1 + RULES.near_phi + RULES.near_x + RULES.more
 
 
@@ -35,12 +35,13 @@ class CompiledCurves:
         library.curve_room.restype, library.curve_rows.restype = ctypes.c_ulong, None
         room = library.curve_room()
 
+        # Stored starts serve rows for which those at the caller's end nowhere.
         def search_piece(first: int) -> None:
             rows = slice(first, first + _PIECE)
             stages = self.curves.stages(targets[rows], own[rows])
             starts = np.concatenate(stages).transpose(1, 0, 2)
-            given = (np.ascontiguousarray(array) for array in (targets[rows], starts))
-            arrays = (*given, np.empty(room, dtype=np.uint8), best.q[rows], best.distance[rows], between[rows])
+            inputs = (np.ascontiguousarray(array) for array in (targets[rows], starts))
+            arrays = (*inputs, np.empty(room, dtype=np.uint8), best.q[rows], best.distance[rows], between[rows])
             phi, q_start, *others = (ctypes.c_void_p(array.ctypes.data) for array in arrays)
             counts = ctypes.c_long(len(stages[0])), ctypes.c_long(starts.shape[1])
             library.curve_rows(ctypes.c_long(len(starts)), phi, q_start, *counts, ctypes.c_double(tolerance), *others)
@@ -70,6 +71,7 @@ def curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
         functions.append(dense_function("curve_pivots", [q], [domain.condition.pivots(q)]))
         sizes["CONDITION"] = functions[-1].numel_out(0)
     kernels, turn = generate_kernels(functions, "kernel"), float(chart.turns[chart.m])
+    # The code asks for sizes of work arrays, numbers of `CurveRules`, and the box of the domain.
     sizes |= {f"{name}_{word}": size for name, work in kernels.sizes().items() for word, size in work.items()}
     sizes |= {name.upper(): repr(value) for name, value in asdict(RULES).items()}
     sizes["XI_SIZE"] = repr(float(chart.phi_sizes[chart.m]))
@@ -81,4 +83,4 @@ def curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
     kinds = {"turning": curves.tracer.turning, "bounded": np.isfinite(low), "winding": curves.boxed.winding}
     lines += [f"static const int {name}[N] = {{{write_numbers(values)}}};" for name, values in kinds.items()]
     head = "#include <math.h>\n#include <stddef.h>\n#include <string.h>"
-    return "\n".join([head, kernels.code, *lines, template("curve_rows.c")])
+    return "\n".join([head, kernels.code, *lines, read_template("curve_rows.c")])

@@ -13,19 +13,23 @@ from orthocas.charts.curves import SelfMotionCurves
 from orthocas.charts.inverse import Inverse, Solutions
 from orthocas.charts.methods import solve_with, targets_of_wish
 from orthocas.charts.newton import NEWTON, Attempt, Newton
-from orthocas.codegen.compiled import kept_library, loaded, template
+from orthocas.codegen.compiled import kept_library, loaded
 from orthocas.codegen.compiled_curves import CompiledCurves, curve_source
 from orthocas.codegen.generate import generate_c
+from orthocas.codegen.rendering import read_template
 from orthocas.tools.batch import run_in_threads
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices, require_kind
 from orthocas.tools.display import Shown
 from orthocas.tools.files import open_draft_folder
 
-_FLAGS = ("-O3",)  # no warnings as errors: compilers doubt pointers of CasADi that pass the end of an array
+# No warnings as errors: compilers doubt pointers of CasADi that pass the end of an array.
+_FLAGS = ("-O3",)
 _ROWS = "inverse_rows.c"
-_ITERATIONS, _FEW_ITERATIONS = 100, 12  # evaluations of phi, also where another search follows
-_PIECE = 512  # rows that a thread takes at once
+# Evaluations of phi; few where another search follows.
+_ITERATIONS, _FEW_ITERATIONS = 100, 12
+# Rows that a thread takes at once.
+_PIECE = 512
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -76,13 +80,13 @@ class CompiledInverse(Shown):
     def _attempt(self, targets: Array, starts: Array, iterations: int) -> tuple[Attempt, Indices]:
         """What C finds from starts (N, n), and the rows where that is nothing."""
         attempt, condition = Attempt.empty(*targets.shape), np.empty(len(targets))
-        given, rows_in_c = (np.ascontiguousarray(targets), np.ascontiguousarray(starts)), self._c.arm_inverse_rows
+        inputs, rows_in_c = (np.ascontiguousarray(targets), np.ascontiguousarray(starts)), self._c.arm_inverse_rows
         rows_in_c.restype = None
 
         def solve_piece(first: int) -> None:
             rows = slice(first, first + _PIECE)
-            phi, q_start, q, found = (array[rows] for array in (*given, attempt.q, attempt.residual))
-            arrays = (phi, q_start, self.chart.phi_sizes, q, found, condition[rows])
+            phi, q_start, q, reached = (array[rows] for array in (*inputs, attempt.q, attempt.residual))
+            arrays = (phi, q_start, self.chart.phi_sizes, q, reached, condition[rows])
             rows_in_c(
                 ctypes.c_long(len(phi)),
                 ctypes.c_int(iterations),
@@ -90,6 +94,7 @@ class CompiledInverse(Shown):
             )
 
         run_in_threads(solve_piece, range(0, len(targets), _PIECE))
+        # C returns phi in place of the residual, and a negative condition where it finds nothing.
         phi_map = self.chart.parts.phi_map
         attempt.residual[:] = phi_map.difference(targets, attempt.residual) / phi_map.scale(targets)
         attempt.iterations[:], attempt.suspicious[:] = 1, ~(condition < NEWTON.suspicious)
@@ -131,7 +136,7 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
     with open_draft_folder() as drafts:
         generate_c(chart, drafts, name="arm")
         sources = {name: (drafts / name).read_text(encoding="utf-8") for name in ("arm.h", "arm.c")}
-    sources[_ROWS] = template(_ROWS)
+    sources[_ROWS] = read_template(_ROWS)
     curves = chart.parts.inverse.curves
     if isinstance(curves, SelfMotionCurves):
         sources["curves.c"] = curve_source(chart, curves)

@@ -13,7 +13,7 @@ import numpy as np
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
 from orthocas.codegen.export_forms import Form, build_form, write_function
-from orthocas.codegen.export_inverse import build_inverse_forms, statuses
+from orthocas.codegen.export_inverse import build_inverse_forms, write_statuses
 from orthocas.codegen.rendering import is_generated, render
 from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, ControlStatus
 from orthocas.control.linear_algebra import ROUNDS, SOFTEST
@@ -28,7 +28,8 @@ from orthocas.version import VERSION
 _COMMON = ("from base64 import b64decode", "from functools import cache")
 _ROUNDS = "LAST_ROUNDS = 2  # of the inverse, at a solution: two, so that third derivatives are right\n"
 _SHARED = re.compile(r"_shared\((.*), q\)$", re.MULTILINE)
-_WIDTH = 100  # characters of a line of base64
+# Characters of a line of base64.
+_WIDTH = 100
 TORQUE_LAWS = (Impedance, PDPlus)  #: that can be exported
 _LAW_STATUSES = ("OK", "OUTSIDE_DOMAIN", "SINGULAR", "NOT_FINITE", "SATURATED")
 
@@ -79,7 +80,8 @@ LIBRARIES = {
         erf=("torch.erf", "import torch"),
         constants="ROWS = 8192  # joint positions at once, so that memory stays bounded; raise it on a GPU\n" + _ROUNDS,
         note="q is a floating-point tensor. Results have its precision and device, and are differentiable.",
-        names={"moveaxis": "movedim"},  # torch.func.vmap does not know the former
+        # torch.func.vmap does not know the former.
+        names={"moveaxis": "movedim"},
         tables="""
 with torch.inference_mode(False):  # what is made in that mode has no derivatives later
     _TABLES = {name: _numbers(*parts) for name, parts in _NUMBERS.items()}
@@ -152,6 +154,7 @@ def export(chart: Chart | Impedance | PDPlus, to: str, path: str | Path, force: 
 
 def write_module(chart: Chart | Impedance | PDPlus, to: str) -> str:
     """The module as text."""
+    # A law comes with its chart.
     laws = []
     if isinstance(chart, TORQUE_LAWS):
         if to == "numpy":
@@ -167,7 +170,7 @@ def write_module(chart: Chart | Impedance | PDPlus, to: str) -> str:
         "task": task_code.strip("\n"),
         "others": "\n\n\n".join(map(_write_form, others)),
     }
-    # Names and numbers about the chart, as Python that is plain ASCII
+    # Names and numbers about the chart, as Python that is plain ASCII.
     values = {
         "to": to,
         "library": library,
@@ -181,7 +184,7 @@ def write_module(chart: Chart | Impedance | PDPlus, to: str) -> str:
         "units": ascii(task.units),
         "centre": tuple(problem.domain.centre.tolist()),
         "half_width": tuple(problem.domain.half_width.tolist()),
-        "statuses": statuses(),
+        "statuses": write_statuses(),
         "numbers": "\n".join(_write_table(name, table) for form in forms for name, table in form.tables.items()),
         "indices": "\n".join(_write_indices(name, rows) for form in forms for name, rows in form.indices.items()),
     }
@@ -232,6 +235,7 @@ def _build_law(law: Impedance | PDPlus) -> Form:
 
 def _write_law_functions(law: Impedance | PDPlus) -> list[str]:
     """Code of the errors, and of the robot's matrices and torques."""
+    # Symbols of the state, of a velocity of the joints, and of the targets of the task.
     chart, n, m = law.chart, law.chart.n, law.chart.m
     q, dq, w = (ca.MX.sym(name, n) for name in ("q", "dq", "w"))
     x_d, dx_d, ddx_d = (ca.MX.sym(name, m) for name in ("x_d", "dx_d", "ddx_d"))
@@ -250,6 +254,7 @@ def _write_law_functions(law: Impedance | PDPlus) -> list[str]:
         ),
         _write_graph("_gravity", "Gravity torque, (n, N).", [q], [law.model.gravity_torque(robot, inputs)]),
     ]
+    # Feed-forward needs how targets and errors move.
     if law.feed_forward:
         drift = chart.parts.relative.compute_drift(q, x_d, dx_d)
         bend = chart.parts.relative.compute_bias(q, dq, w, (x_d, dx_d, ddx_d))
@@ -292,6 +297,7 @@ def _write_graph(name: str, summary: str, inputs: list[ca.MX], outputs: list[ca.
 
 def _write_table(name: str, table: Array) -> str:
     """A table in base64."""
+    # Zeros have no sign.
     text = b64encode((np.asarray(table, dtype="<f8") + 0.0).tobytes()).decode()
     parts = [text[k : k + _WIDTH] for k in range(0, max(len(text), 1), _WIDTH)]
     lines = "\n".join(f'            "{part}"' for part in parts)

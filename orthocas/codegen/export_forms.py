@@ -68,11 +68,18 @@ def build_form(chart: Chart) -> Form:
     """
     coordinates = chart.coordinates
     if isinstance(coordinates, Coordinates) and len(coordinates.offset):
-        # what `_build_expression` would write as many thousand lines
+        # Tables in place of many thousand lines.
         form = _build_network(coordinates) or _build_products(coordinates)
         if form is not None:
             return form
-    return _build_expression(chart)
+    # Otherwise, xi and its Jacobian operation by operation.
+    q, xi = ca.SX.sym("q", chart.n), chart.function("xi")
+    slopes = dense_function("J_xi", [q], [chart.function("jacobian")(q)[chart.m :, :]])
+    code = [
+        write_function("_xi", "Coordinates, (r, N), of columns q (n, N).", xi),
+        write_function("_xi_and_slopes", "Coordinates, then their Jacobian row by row, (r + r n, N).", xi, slopes),
+    ]
+    return Form("coordinates", {"kind": "expression"}, "\n\n".join(code), {}, {})
 
 
 def _build_products(coordinates: Coordinates) -> Form | None:
@@ -80,6 +87,7 @@ def _build_products(coordinates: Coordinates) -> Form | None:
     family = coordinates.family
     if not isinstance(family, ProductFamily):
         return None
+    # Products that the coordinates or their derivatives need, level by level.
     slopes = coordinates.scale[:, None, None] * family.derivative_tables(coordinates.theta).transpose(1, 0, 2)
     used = np.flatnonzero(slopes[:, :, 1:].any(axis=(0, 1)))
     plan = TermLevels.of(family.terms, [family.terms[k] for k in used])
@@ -187,6 +195,7 @@ def _build_network(coordinates: Coordinates) -> Form | None:
     family = coordinates.family
     if not isinstance(family, MLPFamily):
         return None
+    # The last layer has the scale and offset of the coordinates; idle joints come beside it.
     scale, fitted, depth = coordinates.scale[:, None], len(coordinates.offset), len(family.hidden)
     layers = [(W, b[:, None]) for W, b in family.split_layers(coordinates.theta)]
     A, c = _split_idle(coordinates)
@@ -202,18 +211,6 @@ def _build_network(coordinates: Coordinates) -> Form | None:
         tables |= {f"W_{k}": W, f"b_{k}": b}
     plain = {name: [int(k) for k in of] for name, of in indices.items()}
     return Form("coordinates", {"kind": "network", "depth": depth}, "", tables, plain)
-
-
-def _build_expression(chart: Chart) -> Form:
-    """xi and its Jacobian, operation by operation."""
-    q = ca.SX.sym("q", chart.n)
-    slopes = dense_function("J_xi", [q], [chart.function("jacobian")(q)[chart.m :, :]])
-    xi = chart.function("xi")
-    code = [
-        write_function("_xi", "Coordinates, (r, N), of columns q (n, N).", xi),
-        write_function("_xi_and_slopes", "Coordinates, then their Jacobian row by row, (r + r n, N).", xi, slopes),
-    ]
-    return Form("coordinates", {"kind": "expression"}, "\n\n".join(code), {}, {})
 
 
 def write_function(name: str, summary: str, *functions: ca.Function) -> str:

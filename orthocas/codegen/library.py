@@ -4,7 +4,6 @@ import ctypes
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from numpy.typing import ArrayLike
 from orthocas.charts.chart import Chart
 from orthocas.codegen.generate import GeneratedC, generate_c
 from orthocas.codegen.precision import DOUBLE, SINGLE, Precision
+from orthocas.codegen.rendering import read_template
 from orthocas.control.controller import Controller, ControlStatus, require_controller
 from orthocas.control.memory import memory_of
 from orthocas.control.operational_space import PDPlus
@@ -28,8 +28,10 @@ from orthocas.tools.processes import run_program
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 NO_DOUBLE = ("-Wdouble-promotion", "-Wfloat-conversion")  #: for code in single precision
 _POINTER = ctypes.c_void_p
-_STATES = 64  # as in templates/ticks.c
-_MICROSECONDS = 3e5  # to spend on one measurement
+# As in templates/ticks.c.
+_STATES = 64
+# To spend on one measurement.
+_MICROSECONDS = 3e5
 
 
 def compilers() -> tuple[str, ...]:
@@ -374,10 +376,10 @@ def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int =
     first = cases[0][1]
     with open_draft_folder() as folder:
         data, program = folder / "states", folder / "ticks"
-        numbers = np.concatenate([part.ravel() for law, _ in cases for part in (_states(law), gain_numbers(law))])
-        first.numbers(numbers).tofile(data)
-        source = files(__package__) / "templates" / "ticks.c"
-        (folder / "ticks.c").write_text(source.read_text())
+        # For each law its states, then its gains.
+        parts = [part.ravel() for law, _ in cases for part in (_sample_states(law), gain_numbers(law))]
+        first.numbers(np.concatenate(parts)).tofile(data)
+        (folder / "ticks.c").write_text(read_template("ticks.c"))
         number = f"-DNUMBER={first.precision.c_name}"
         run_program([compilers()[0], "-O2", number, str(folder / "ticks.c"), "-o", str(program), "-ldl"])
         arguments = [str(program), str(data), str(calls), str(cases[0][0].problem.n)]
@@ -388,9 +390,10 @@ def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int =
     return [Ticks(*map(float, line.split())) for line in lines]
 
 
-def _states(law: Controller) -> Array:
+def _sample_states(law: Controller) -> Array:
     """States inside the domain with references nearby, (64, 2 n + 3 k)."""
     rng, domain, n, k = np.random.default_rng(0), law.problem.domain, law.problem.n, len(law.labels)
+    # The inner part of a box may lie outside a condition: the centre does not.
     q = domain.centre + 0.4 * domain.half_width * rng.uniform(-1, 1, (_STATES, n))
     q[~domain.contains(q)] = domain.centre
     reference = np.array([law.measured(point).full().ravel() for point in q]) + 0.01 * rng.normal(size=(_STATES, k))

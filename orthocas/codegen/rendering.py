@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Mapping
 from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,11 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, pass_context
 from jinja2.runtime import Context
 
 _INFINITIES = {np.inf: "INFINITY", -np.inf: "-INFINITY"}
+
+
+def read_template(name: str) -> str:
+    """A file of `templates/` as it is."""
+    return (files(__package__) / "templates" / name).read_text()
 
 
 def render(template: str, values: Mapping[str, Any]) -> str:

@@ -46,6 +46,7 @@ def build_supervision_kernels(controller: Controller) -> list[ca.Function]:
     inputs = fallback.mx_in()
     measured, relative = controller.measured(q), Relative(controller.problem.task)
     start, velocity, acceleration, end = (ca.MX.sym(name, k) for name in ("start", "velocity", "acceleration", "end"))
+    # Errors and rates of the task by its own rules, all others as differences.
     turned = relative.convert_rates(start[:m], velocity[:m], acceleration[:m])
     rates = [ca.vertcat(*parts) for parts in zip(turned, (velocity[m:], acceleration[m:]), strict=True)]
     deviation = [ca.densify(measured), _subtract(controller, relative, reference, measured)]
@@ -56,6 +57,7 @@ def build_supervision_kernels(controller: Controller) -> list[ca.Function]:
         ca.Function("gap", [start, velocity, acceleration, end], gap),
         _build_implied(controller, relative),
     ]
+    # Orientations turn instead of adding up, laws may remember, and domains may be bounded by singular positions.
     if relative.turned:
         kernels += [relative.moved, relative.turned_by]
     if (memory := memory_of(controller)) is not None:
@@ -89,7 +91,7 @@ def _build_implied(controller: Controller, relative: Relative) -> ca.Function:
     q, dq = (ca.MX.sym(name, n) for name in ("q", "dq"))
     value, *rates, change = (ca.MX.sym(name, k) for name in names)
 
-    # J and dJ/dt dq of the quantities, orientations relative to the reference
+    # J and dJ/dt dq of the quantities, orientations relative to the reference.
     slope = relative.error(q, value[:m])[1]
     if controller.chart is not None and controller.labels == controller.chart.labels:
         own = controller.chart.coordinates.functions
@@ -99,6 +101,7 @@ def _build_implied(controller: Controller, relative: Relative) -> ca.Function:
         J, bias = ca.vertcat(slope, J_2), ca.jtimes(J_2 @ dq, q, dq)
     bias = ca.vertcat(controller.problem.task.rates_derivative_function(q, dq, dq), bias)
 
+    # Rates of the reference as errors count; with fewer or more quantities than joints, damped least squares.
     turned = relative.convert_rates(value[:m], rates[0][:m], rates[1][:m])
     velocity, acceleration = (ca.vertcat(a, b[m:]) for a, b in zip(turned, rates, strict=True))
     B = ca.horzcat(change, velocity, acceleration - bias)
@@ -159,7 +162,7 @@ def describe_supervision(controller: Controller, safety: Safety) -> dict[str, An
         "settings": [_describe_setting(name, value) for name, value in safety.in_c(controller.command).items()],
         "turning": np.isinf(robot.lower) & np.isinf(robot.upper) & ~np.array(robot.tree.prismatic),
         "bounded": np.isfinite(lower) & np.isfinite(upper) & (controller.chart is not None),
-        # a path of a corridor ends one radius before the boundary of its box, which may be many radii wide
+        # A path of a corridor ends one radius before the boundary of its box, which may be many radii wide.
         "boundary_unit": domain.half_width if path is None else np.minimum(domain.half_width, path.radius),
         "boundary": _describe_boundary(controller),
         "turned_first": relative.first,
@@ -207,7 +210,7 @@ def _describe_boundary(controller: Controller) -> dict[str, Any] | None:
     fold_span = None
     if (room := domain.room_to_fold) is not None:
         meaning += " So is\n * the bound on the volume of the coordinates, in shares of the median."
-        # of a median position, because the centre may be near the bound
+        # Of a median position, because the centre may be near the bound.
         fold_span = float(np.median(Batched(room)(sample_uniform(domain, RULES.samples, 0))[0]))
     return {
         "meaning": meaning,
