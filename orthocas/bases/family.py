@@ -39,16 +39,16 @@ class Memories:
     @contextmanager
     def borrow(self, count: int) -> Iterator[list[ArrayMemory]]:
         """So many memories that nobody else uses meanwhile."""
-        found: list[ArrayMemory] = []
+        borrowed: list[ArrayMemory] = []
         for _ in range(count):
             try:
-                found.append(self._spare.pop())
+                borrowed.append(self._spare.pop())
             except IndexError:
-                found.append(ArrayMemory())
+                borrowed.append(ArrayMemory())
         try:
-            yield found
+            yield borrowed
         finally:
-            self._spare.extend(reversed(found))
+            self._spare.extend(reversed(borrowed))
 
 
 Expression = TypeVar("Expression", ca.SX, ca.MX)

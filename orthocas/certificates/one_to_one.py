@@ -86,16 +86,7 @@ class OneToOneCheck:
         return _build_results(*check_in_turn(self._check_few, low, high, RULES.at_once))
 
     def _check_few(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array]:
-        # Centres of the boxes, and the largest differences that two points of the whole with such centres have.
-        rounding = 8 * UNIT * (np.abs(self.low) + np.abs(self.high))
-        centre, outer = (self.low + self.high) / 2, (self.high - self.low) / 2
-        nearest = np.maximum(np.maximum(low - centre, centre - high), 0)
-        room = np.maximum(outer - nearest, 0) * UP + rounding
-        half = (high - low) / 2 * UP + rounding
-        columns, q = list(self.active), (low + high).T / 2
-        middles = np.ascontiguousarray(half.T[columns])
-        middles[list(self.still)] = 0
-        around = Around((low + high).T[columns] / 2, middles, np.ascontiguousarray(room.T[columns]))
+        q, around = (low + high).T / 2, self._build_around(low, high)
         # The coordinates bound how far two points are apart in joints that stand still.
         if self.still and self.coordinates is not None:
             for _ in range(RULES.rounds):
@@ -131,6 +122,20 @@ class OneToOneCheck:
         if around.order < ORDERS[-1] and promising.any():
             promising[promising] = have_positive_pivots(compute_pivots(select_boxes(narrow, promising)))
         return proved, find_most_influential(gains, self.active), promising
+
+    def _build_around(self, low: Array, high: Array) -> Around:
+        """Centres of the boxes, and the largest differences that two points of the whole with such centres have."""
+        # The farther a centre is from that of the whole, the less room is left for two points around it.
+        rounding = 8 * UNIT * (np.abs(self.low) + np.abs(self.high))
+        centre, outer = (self.low + self.high) / 2, (self.high - self.low) / 2
+        nearest = np.maximum(np.maximum(low - centre, centre - high), 0)
+        room = np.maximum(outer - nearest, 0) * UP + rounding
+        half = (high - low) / 2 * UP + rounding
+        # Jm does not depend on the centre of joints that stand still.
+        columns = list(self.active)
+        middles = np.ascontiguousarray(half.T[columns])
+        middles[list(self.still)] = 0
+        return Around((low + high).T[columns] / 2, middles, np.ascontiguousarray(room.T[columns]))
 
     def _narrow_differences(self, around: Around, own: Jets) -> Around:
         """Smaller differences: for xi(q) = xi(p), each row w of a combination of coordinates has w Jm d = 0."""

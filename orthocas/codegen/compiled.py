@@ -49,10 +49,7 @@ def kept_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], fo
     compiler, options = compilers()[0], ("-std=c99", "-fPIC", "-shared", *flags)
     content = [*(text.encode() for text in sources.values()), repr((compiler, options)).encode()]
     name = f"{kind}-{hashlib.sha256(b'/'.join(content)).hexdigest()[:32]}.so"
-    # Relative paths in XDG_CACHE_HOME do not count, as its specification demands.
-    cache_home = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    default = (cache_home if cache_home.is_absolute() else Path.home() / ".cache") / "orthocas" / "libraries"
-    place = default if folder is None else as_path("folder", folder)
+    place = _find_cache() if folder is None else as_path("folder", folder)
     library = make_folder("folder", place, mode=0o700).resolve() / name
     _require_own(library.parent)
     # Draft and checksum appear together, so that other processes never see half a library.
@@ -64,6 +61,13 @@ def kept_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], fo
             run_program([compiler, *options, "-o", str(drafts / name), *code, "-lm"])
             (drafts / f"{name}.sha256").write_text(compute_digest(drafts / name))
     return library
+
+
+def _find_cache() -> Path:
+    """Where libraries are kept by default."""
+    # Relative paths in XDG_CACHE_HOME do not count, as its specification demands.
+    place = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (place if place.is_absolute() else Path.home() / ".cache") / "orthocas" / "libraries"
 
 
 def loaded(library: Path) -> ctypes.CDLL:

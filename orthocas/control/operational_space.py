@@ -179,9 +179,7 @@ class _OperationalSpace(LawOfChart):
         for name, value in {
             "chart": chart,
             "stiffness": (positive_gains if as_stiffness else non_negative_gains)("stiffness", stiffness, n),
-            "damping_stiffness": None
-            if damping_stiffness is None
-            else positive_gains("damping_stiffness", damping_stiffness, n),
+            "damping_stiffness": damping_stiffness,
             "model": model,
             "damping_ratio": non_negative_gains("damping_ratio", damping_ratio, n),
             "coupling": coupling,
@@ -193,6 +191,7 @@ class _OperationalSpace(LawOfChart):
         if remembers is not None:
             # Bounds of another size raise here.
             _ = self.memory
+        # What is doubtful can be switched on, with a warning.
         doubts = [*_doubt_ratio(self.damping_ratio), *self._find_holding_doubts()]
         if coupling == "decoupled" and (metric := chart.problem.metric.name) != "inertia":
             doubts.append(f"a decoupled law relies on A = M (inertia), but the metric of this chart is {metric}")
@@ -280,11 +279,15 @@ class _OperationalSpace(LawOfChart):
                 "(inertia)"
             )
         result += _doubt_ratio(self.damping_ratio)
-        if self.coupling == "decoupled" and (leak := self._compute_leak_deg()) > RULES.much_deg:
-            result.append(
-                f"the gradients of this chart lean into the task by {leak:.0f} deg (rms): decoupled springs pull at "
-                "both, which coupled ones do not; see docs/how-to/wide.md"
-            )
+        if self.coupling == "decoupled":
+            points = sample_uniform(self.problem.domain, RULES.samples, 0)
+            sines = Judged.at(self.problem, self.chart.coordinates, points).leak_sines
+            leak = float(np.degrees(np.sqrt(np.mean(np.arcsin(np.clip(sines, 0.0, 1.0)) ** 2))))
+            if leak > RULES.much_deg:
+                result.append(
+                    f"the gradients of this chart lean into the task by {leak:.0f} deg (rms): decoupled springs pull "
+                    "at both, which coupled ones do not; see docs/how-to/wide.md"
+                )
         if share := self.check_damping().indefinite_share:
             where = f"in {percent(share, fault=True)} of the domain with these gains"
             result.append(f"the damping matrix (29) is indefinite {where}; the damping design double_diagonal never is")
@@ -295,12 +298,6 @@ class _OperationalSpace(LawOfChart):
         if self.model.gravity == "robot":
             return []
         return find_holding_doubts(self.model.robot(self.problem), self.problem.domain, self.limit)
-
-    def _compute_leak_deg(self) -> float:
-        """Root mean square of the chart's leaks at samples [deg]."""
-        points = sample_uniform(self.problem.domain, RULES.samples, 0)
-        sines = Judged.at(self.problem, self.chart.coordinates, points).leak_sines
-        return float(np.degrees(np.sqrt(np.mean(np.arcsin(np.clip(sines, 0.0, 1.0)) ** 2))))
 
     @property
     def gains(self) -> dict[str, Array]:
@@ -321,19 +318,19 @@ class _OperationalSpace(LawOfChart):
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
         q, dq, robot, model = inputs["q"], inputs["dq"], self.problem.robot, self.model
 
-        # f_imp = -K e - D de, (33); Lambda is M_phi, or its blocks
+        # f_imp = -K e - D de, (33); Lambda is M_phi, or its blocks.
         e, de, J = self._compute_errors(inputs)
         B, Lambda, volume = self._compute_inertia(J, model.mass_matrix(robot, inputs))
         force = -inputs["stiffness"] * e - self._apply_damping(Lambda, inputs, de)
 
-        # f_FF = Lambda (dd_phi_d + (J M^-1 C - dJ/dt) w), (35), with w = J^-1 d_phi_d: by (8) also when decoupled
+        # f_FF = Lambda (dd_phi_d + (J M^-1 C - dJ/dt) w), (35), with w = J^-1 d_phi_d: by (8) also when decoupled.
         if self.feed_forward:
             w = B @ (Lambda @ self._compute_drift(inputs))
             reference = inputs["reference"], inputs["reference_velocity"], inputs["reference_acceleration"]
             bias = compute_bias(self.chart, q, dq, dq if model.source == "given" else w, reference)
             force += Lambda @ (B.T @ model.coriolis_torque(robot, inputs, w) - bias)
 
-        # tau = J^T f + g + J_tip^T wrench + extra_torque
+        # tau = J^T f + g + J_tip^T wrench + extra_torque.
         gravity = model.gravity_torque(robot, inputs)
         torque = J.T @ force + gravity + model.feed_forward(robot, inputs)
         relative = volume / self.median_volume

@@ -67,9 +67,15 @@ class BatchedFlow:
         y, s, step = starts.copy(), np.zeros(len(starts)), np.full(len(starts), RULES.first)
         running = np.arange(len(starts))
         while running.size:
-            # Try a step of each running trajectory, keep good ones, and adapt all step sizes.
+            # Try a step of each running trajectory, of many in blocks of columns.
             tried = np.minimum(step[running], 1 - s[running])
-            moved, error = self._take_steps(y[running], tried[:, None], parameters[running])
+            inputs = y[running], tried[:, None], parameters[running]
+            if running.size <= RULES.few:
+                moved, error = self._few(*inputs)
+            else:
+                outputs = self._many(*map(arrange_blocks, inputs))
+                moved, error = (split_by_sample(out[:, None], running.size)[:, :, 0] for out in outputs)
+            # Keep good steps, and adapt the sizes of all.
             ratio = np.nan_to_num(error[:, 0] / tolerance, nan=np.inf)
             good = ratio <= 1
             y[running[good]] = moved[good]
@@ -78,14 +84,6 @@ class BatchedFlow:
             step[running] = tried * np.clip(growth, RULES.shrink, RULES.grow)
             running = running[(s[running] < 1) & (step[running] > RULES.smallest)]
         return y, s >= 1
-
-    def _take_steps(self, *arguments: Array) -> list[Array]:
-        """One step of some trajectories: y (N, k), step sizes (N, 1), p (N, l) -> y (N, k), errors (N, 1)."""
-        N = len(arguments[0])
-        if RULES.few >= N:
-            return self._few(*arguments)
-        outputs = self._many(*map(arrange_blocks, arguments))
-        return [split_by_sample(out[:, None], N)[:, :, 0] for out in outputs]
 
     @cached_property
     def _few(self) -> Batched:
@@ -164,7 +162,7 @@ class TaskFlow:
         """Pull points (N, n) to the leaf h(q) = level (m,)."""
         return self.move(points, level - self.problem.task.batched(points)[0], tolerance)
 
-    def pull_with_derivative(self, points: Array, level: Array, tolerance: float = TOLERANCE) -> tuple[Moved, Array]:
+    def pull_with_derivative(self, points: Array, level: Array) -> tuple[Moved, Array]:
         """Do the same as `pull`, and return d q_hat / dq, (N, n, n), by forward sensitivities.
 
         The flow maps leaves to leaves, so r vectors v that start tangent to the leaf of q stay tangent to leaves, with
@@ -183,7 +181,7 @@ class TaskFlow:
         directions = (Z / lengths[:, None, :]).transpose(0, 2, 1).reshape(-1, r * n)
         starts = np.concatenate([points, directions, np.log(lengths)], axis=1)
         dx = level - self.problem.task.batched(points)[0]
-        ends, arrived = self._with_tangents.find_end_points(starts, dx, tolerance)
+        ends, arrived = self._with_tangents.find_end_points(starts, dx, TOLERANCE)
         # Directions and logarithms of lengths make the vectors again.
         tangents = ends[:, n : n + r * n].reshape(-1, r, n) * np.exp(ends[:, n + r * n :])[:, :, None]
         moved = Moved(ends[:, :n], np.where(arrived, Arrival.REACHED, Arrival.SINGULAR))
@@ -287,21 +285,17 @@ class GrownCoordinates:
         solution are NaN.
         """
         m, n = self.problem.m, self.problem.n
+        # The point of the leaf with these coordinates, then along the flow to the task values.
         start = self.flow.pull(q_start, self.leaf.level)
         on_leaf = self.leaf.points(phi[:, m:], np.where(start.reached[:, None], start.points, np.nan))
-        known = np.isfinite(on_leaf).all(axis=1)
-        solutions = np.full((len(phi), n), np.nan)
-        moved = self.flow.move(on_leaf[known], phi[known, :m] - self.leaf.level, RULES.inverse)
-        solutions[known] = np.where(moved.reached[:, None], self._correct_task(moved.points, phi[known, :m]), np.nan)
+        rows = np.isfinite(on_leaf).all(axis=1)
+        solutions, x = np.full((len(phi), n), np.nan), phi[rows, :m]
+        moved = self.flow.move(on_leaf[rows], x - self.leaf.level, RULES.inverse)
+        # One more step removes the integration error, which matters if task values are large numbers.
+        left = x - self.problem.task.batched(moved.points)[0]
+        corrected = self.flow.move(moved.points, left, RULES.inverse).points
+        solutions[rows] = np.where(moved.reached[:, None], corrected, np.nan)
         return q_start + remove_turns(self.problem, solutions - q_start) if self.leaf.periodic else solutions
-
-    def _correct_task(self, points: Array, x: Array) -> Array:
-        """Points (N, n) after a Newton step along the task gradients to the task values x (N, m).
-
-        The step removes the integration error, which matters if task values are large numbers.
-        """
-        dx = x - self.problem.task.batched(points)[0]
-        return self.flow.move(points, dx, RULES.inverse).points
 
     @property
     def functions(self) -> dict[str, ca.Function]:
@@ -329,5 +323,5 @@ class GrownCoordinates:
         return np.where(moved.reached & ~values.inside, Arrival.OUTSIDE, moved.status)
 
     def _mask_unknown(self, moved: Moved, values: LeafValues, results: Array) -> Array:
-        known = self._find_status(moved, values) == Arrival.REACHED
-        return np.where(known.reshape(-1, *[1] * (results.ndim - 1)), results, np.nan)
+        reached = self._find_status(moved, values) == Arrival.REACHED
+        return np.where(reached.reshape(-1, *[1] * (results.ndim - 1)), results, np.nan)

@@ -113,8 +113,13 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
     require_kind("problem", problem, Problem)
     require_driven("involutivity", problem.robot.tree)
     require_memory(f"{samples} samples of the defect", 32.0 * samples * problem.n * problem.m**2)
+    # Uniform samples of the domain, without the near-singular ones.
+    check(problem, samples, seed)
+    points = sample_uniform(problem.domain, samples, seed)
+    points = points[is_regular(problem, points)]
+    if not len(points):
+        raise SingularTaskError(f"task '{problem.task.name}' is near-singular at all {samples} samples of the domain")
     # Brackets across the span at all samples, and the scale of what cancels in them.
-    points = _sample_regular(problem, samples, seed)
     brackets = TaskBrackets.build(problem)
     across, size, basis = Batched(brackets.build_tensor_function())(points)
     T = across.reshape(-1, problem.n, problem.m, problem.m)
@@ -142,16 +147,6 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
     )
 
 
-def _sample_regular(problem: Problem, samples: int, seed: int) -> Array:
-    """Uniform samples of the domain, without the near-singular ones."""
-    check(problem, samples, seed)
-    points = sample_uniform(problem.domain, samples, seed)
-    regular = is_regular(problem, points)
-    if not regular.any():
-        raise SingularTaskError(f"task '{problem.task.name}' is near-singular at all {samples} samples of the domain")
-    return points[regular]
-
-
 def _compute_squared_turns(T: Array, basis: Array, half_width: Array) -> Array:
     """Sum over pairs of |T(e_a, e_b)|_A^2 / (k_a + k_b) [rad^2], (N,).
 
@@ -163,6 +158,7 @@ def _compute_squared_turns(T: Array, basis: Array, half_width: Array) -> Array:
         basis: columns e_1..e_m, (N, n, m).
         half_width: half-widths of the domain, (n,).
     """
+    # In the rotated basis, both the metric and C^-1 are diagonal.
     k, V = np.linalg.eigh(basis.transpose(0, 2, 1) @ (3 / half_width[:, None] ** 2 * basis))
     turned = V.transpose(0, 2, 1)[:, None] @ T @ V[:, None]
     squared = (turned**2).sum(axis=1) / (k[:, :, None] + k[:, None, :])

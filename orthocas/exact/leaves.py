@@ -76,6 +76,7 @@ def is_covered(region: Box, points: Array) -> NDArray[np.bool_]:
 
 def require_on_leaf(problem: Problem, level: Array, points: Array) -> None:
     """Raise InvalidValueError unless points (N, n) lie on the leaf h(q) = level (m,), relative to the size of J_x."""
+    # In units of the size of the gradients, an error of the task is a distance.
     J = problem.task.evaluate_jacobian(points)
     off = np.abs(problem.task.batched(points)[0] - level).max(axis=1)
     size = np.sqrt((J**2).sum(axis=(1, 2)).mean())
@@ -158,8 +159,8 @@ class DiskLeaf:
             height = height - residual / slope
             if np.abs(residual / slope).max(initial=0.0) < RULES.on_disk:
                 break
-        known = inside & (located.distance < RULES.on_disk)
-        return np.where(known[:, None], feet + height * normals, np.nan)
+        covered = inside & (located.distance < RULES.on_disk)
+        return np.where(covered[:, None], feet + height * normals, np.nan)
 
     def to_arrays(self) -> Mapping[str, Array | Indices]:
         """All arrays, for chart files."""
@@ -178,6 +179,7 @@ class DiskLeaf:
     def _edges(self) -> tuple[Array, Array]:
         """Two edges of every triangle in space, (F, 2, 3), and in the disk, (F, 2, 2)."""
         first, *others = (self.faces[:, k] for k in range(3))
+        # From the first corner to the two others.
         in_space = np.stack([self.vertices[other] - self.vertices[first] for other in others], axis=1)
         in_disk = np.stack([self.disk[other] - self.disk[first] for other in others], axis=1)
         return in_space, in_disk
@@ -389,14 +391,13 @@ class CircleLeaf:
         return np.concatenate([np.cos(angles), np.sin(angles), points[:, ~turning]], axis=1)
 
 
-def trace_circle_leaf(problem: Problem, level: Array, start: Array, samples: int = SAMPLES) -> CircleLeaf:
+def trace_circle_leaf(problem: Problem, level: Array, start: Array) -> CircleLeaf:
     """Trace the leaf from one of its points until it closes.
 
     Args:
         problem: a problem with r = 1.
         level: x0, (m,).
         start: a point of the leaf, where xi0 = 0, (n,).
-        samples: number of samples to keep.
 
     Raises:
         GrowError: if the leaf does not close within 200 rad, or runs into a singularity.
@@ -406,19 +407,19 @@ def trace_circle_leaf(problem: Problem, level: Array, start: Array, samples: int
     while travelled < RULES.longest:
         piece = trace(q, RULES.piece)
         away = remove_turns(problem, piece[1:] - start)
-        # Arc length to the start, along the curve.
+        # Arc length to the start, along the curve. It has closed near the start, once the way there is behind.
         left = -(np.diff(piece, axis=0) * away).sum(axis=1) / step
         back = np.flatnonzero((np.linalg.norm(away, axis=1) < 2 * step) & (left >= 0))
         if back.size:
             k = int(back[-1])
-            return _close_circle(problem, level, start, travelled + (k + 1) * step + left[k], samples)
+            return _close_circle(problem, level, start, travelled + (k + 1) * step + left[k])
         q, travelled = piece[-1], travelled + RULES.piece
     raise GrowError(f"the base leaf h(q) = {level.tolist()} does not close within {RULES.longest:g} rad of arc length")
 
 
-def _close_circle(problem: Problem, level: Array, start: Array, length: float, samples: int) -> CircleLeaf:
+def _close_circle(problem: Problem, level: Array, start: Array, length: float) -> CircleLeaf:
     """Trace the leaf once around, with corrections of its length."""
-    trace = _build_tracer(problem, level, samples)
+    trace = _build_tracer(problem, level, SAMPLES)
     for _ in range(RULES.closings):
         curve = trace(start, length)
         last = curve[-1] - curve[-2]
