@@ -252,7 +252,7 @@ def find_most_influential(influences: Array, joints: Variables) -> Array:
     return np.where(finite, np.array(joints)[np.argmax(np.nan_to_num(influences), axis=1)], UNKNOWN)
 
 
-def check_in_turn(check: Callable[[Array, Array], tuple[Array, ...]], low: Array, high: Array, at_once: int) -> Any:
+def check_in_turn(check: Callable[[Array, Array], tuple[Any, ...]], low: Array, high: Array, at_once: int) -> Any:
     """What a check returns for boxes between corners (boxes, n), for a few at once, whose terms fit into the cache."""
     pieces = [slice(k, k + at_once) for k in range(0, len(low), at_once)]
     # With one thread, rounding is the same everywhere; on some boxes, bounds are infinite.
