@@ -71,6 +71,84 @@ Expansion = tuple[Array, Array]  #: coefficients (..., monomials, boxes) in t fr
 
 
 @dataclass(frozen=True, eq=False, repr=False)
+class CofactorCheck:
+    """Proves det J != 0 by its expansion along the row of the coordinate."""
+
+    determinant: "Determinant"
+    method = COFACTORS
+
+    @property
+    def joints(self) -> Variables:
+        """The joints that det J depends on."""
+        return self.determinant.joints
+
+    def __call__(self, low: Array, high: Array) -> BoxResults:
+        """Evaluate boxes between corners (boxes, n)."""
+        regular, sign, gains = check_in_turn(self._check_few, low, high, RULES.at_once)
+        return BoxResults(regular, regular, sign, np.zeros(len(low)), find_most_influential(gains, self.joints))
+
+    def _check_few(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array, Array]:
+        coefficients, rest = self.determinant(low, high)
+        sign = np.nan_to_num(np.sign(coefficients[0]))
+        n = len(self.joints)
+        return is_positive(coefficients * sign, rest, n), sign, compute_gains(coefficients, rest, n)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Determinant:
+    """det J, up to a positive factor: the scale of the coordinate, and that of task rows that are rotated."""
+
+    joints: Variables  #: on which it depends
+    cofactors: "WaveSeries"  #: of the columns where dxi/dq varies; then the sum of the others times their constants
+    slopes: "PolynomialSeries"  #: dxi/dq of the columns where it varies
+
+    @classmethod
+    def build(cls, chart: Chart) -> "Determinant | None":
+        """Of a chart with one fitted coordinate, a polynomial, and task rows of sines and cosines; None for others."""
+        coordinates = chart.coordinates
+        if not isinstance(coordinates, Coordinates) or len(coordinates.offset) != 1:
+            return None
+        active, family = list(coordinates.active), coordinates.family
+        if not chart.m + 1 == len(active) <= RULES.columns:
+            return None
+        # A family is polynomial if each derivative of a one-joint function is a sum of earlier ones.
+        if not isinstance(family, ProductFamily):
+            return None
+        if any(np.triu(family.one_joint_derivatives(i)).any() for i in range(family.space.n)):
+            return None
+        try:
+            z = compute_cofactors([[row[j] for j in active] for row in _expand_task_rows(chart)])
+        except CertifyError:
+            return None
+        values, doubts = _differentiate_coordinate(family, coordinates.theta)
+        varying = [j for j in range(len(z)) if (np.abs(values[j, 1:]) + doubts[j, 1:]).any()]
+        constant = Waves.constant(0.0, chart.n)
+        for j in {*range(len(z))} - {*varying}:
+            constant = constant + z[j] * Waves.constant(float(values[j, 0]), chart.n, float(doubts[j, 0]))
+        sums = [*(z[j] for j in varying), constant.trim()]
+        turning = {i for each in sums for i in np.flatnonzero(each.frequencies.any(axis=0)).tolist()}
+        every = list_indices(len(active), _bound_degree(family))
+        bending = {active[i] for k, m in enumerate(every) if (np.abs(values[:, k]) + doubts[:, k]).any() for i in m}
+        joints = tuple(sorted(turning | bending))
+        own = PolynomialSeries.build(values[varying], doubts[varying], family, [active.index(j) for j in joints])
+        return cls(joints, WaveSeries.build(sums, joints), own)
+
+    def __call__(self, low: Array, high: Array) -> Expansion:
+        """The expansion on boxes between corners (boxes, n)."""
+        chosen = list(self.joints)
+        middle = ((low + high) / 2)[:, chosen].T
+        half = np.nextafter(np.maximum(high[:, chosen].T - middle, middle - low[:, chosen].T), np.inf) + TINY
+        (A, rest_a), (B, rest_b) = self.slopes(middle, half), self.cofactors(middle, half)
+        products, rest = _multiply_expansions(A, B[:-1], self.slopes.degree, len(chosen))
+        total_a, total_b = (np.abs(part).sum(axis=1) for part in (A, B[:-1]))
+        carried = rest_a * (total_b + rest_b[:-1]) + total_a * rest_b[:-1] + rest
+        carried += sum_error(_SPLITS * len(A)) * total_a * total_b
+        coefficients = products + B[-1]
+        unknown = carried.sum(axis=0) + rest_b[-1] + UNIT * np.abs(coefficients).sum(axis=0)
+        return coefficients, unknown * compute_margin(A.shape[1] + len(coefficients)) + TINY
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class WaveSeries:
     """Taylor series of sums of waves."""
 
@@ -159,60 +237,6 @@ class PolynomialSeries:
         return coefficients * build_power_table(h, self.degree), (self.errors + rounding)[:, None] * reach * UP + TINY
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Determinant:
-    """det J, up to a positive factor: the scale of the coordinate, and that of task rows that are rotated."""
-
-    joints: Variables  #: on which it depends
-    cofactors: WaveSeries  #: of the columns where dxi/dq varies; then the sum of the others times their constants
-    slopes: PolynomialSeries  #: dxi/dq of the columns where it varies
-
-    @classmethod
-    def build(cls, chart: Chart) -> "Determinant | None":
-        """Of a chart with one fitted coordinate, a polynomial, and task rows of sines and cosines; None for others."""
-        coordinates = chart.coordinates
-        if not isinstance(coordinates, Coordinates) or len(coordinates.offset) != 1:
-            return None
-        active, family = list(coordinates.active), coordinates.family
-        if not chart.m + 1 == len(active) <= RULES.columns:
-            return None
-        # A family is polynomial if each derivative of a one-joint function is a sum of earlier ones.
-        if not isinstance(family, ProductFamily):
-            return None
-        if any(np.triu(family.one_joint_derivatives(i)).any() for i in range(family.space.n)):
-            return None
-        try:
-            z = compute_cofactors([[row[j] for j in active] for row in _expand_task_rows(chart)])
-        except CertifyError:
-            return None
-        values, doubts = _differentiate_coordinate(family, coordinates.theta)
-        varying = [j for j in range(len(z)) if (np.abs(values[j, 1:]) + doubts[j, 1:]).any()]
-        constant = Waves.constant(0.0, chart.n)
-        for j in {*range(len(z))} - {*varying}:
-            constant = constant + z[j] * Waves.constant(float(values[j, 0]), chart.n, float(doubts[j, 0]))
-        sums = [*(z[j] for j in varying), constant.trim()]
-        turning = {i for each in sums for i in np.flatnonzero(each.frequencies.any(axis=0)).tolist()}
-        every = list_indices(len(active), _bound_degree(family))
-        bending = {active[i] for k, m in enumerate(every) if (np.abs(values[:, k]) + doubts[:, k]).any() for i in m}
-        joints = tuple(sorted(turning | bending))
-        own = PolynomialSeries.build(values[varying], doubts[varying], family, [active.index(j) for j in joints])
-        return cls(joints, WaveSeries.build(sums, joints), own)
-
-    def __call__(self, low: Array, high: Array) -> Expansion:
-        """The expansion on boxes between corners (boxes, n)."""
-        chosen = list(self.joints)
-        middle = ((low + high) / 2)[:, chosen].T
-        half = np.nextafter(np.maximum(high[:, chosen].T - middle, middle - low[:, chosen].T), np.inf) + TINY
-        (A, rest_a), (B, rest_b) = self.slopes(middle, half), self.cofactors(middle, half)
-        products, rest = _multiply_expansions(A, B[:-1], self.slopes.degree, len(chosen))
-        total_a, total_b = (np.abs(part).sum(axis=1) for part in (A, B[:-1]))
-        carried = rest_a * (total_b + rest_b[:-1]) + total_a * rest_b[:-1] + rest
-        carried += sum_error(_SPLITS * len(A)) * total_a * total_b
-        coefficients = products + B[-1]
-        unknown = carried.sum(axis=0) + rest_b[-1] + UNIT * np.abs(coefficients).sum(axis=0)
-        return coefficients, unknown * compute_margin(A.shape[1] + len(coefficients)) + TINY
-
-
 def list_indices(n: int, degree: int) -> tuple[Monomial, ...]:
     """The monomials in n variables up to a degree."""
     return list_monomials(tuple(range(n)), degree)
@@ -297,30 +321,6 @@ def _sum_by_degree(coefficients: Array, n: int, degree: int) -> Array:
     """Sums of the sizes of the coefficients of each degree, (degrees, pairs, boxes)."""
     starts = [len(list_indices(n, d - 1)) if d else 0 for d in range(degree + 1)]
     return np.add.reduceat(np.abs(coefficients), starts, axis=1).swapaxes(0, 1)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class CofactorCheck:
-    """Proves det J != 0 by its expansion along the row of the coordinate."""
-
-    determinant: Determinant
-    method = COFACTORS
-
-    @property
-    def joints(self) -> Variables:
-        """The joints that det J depends on."""
-        return self.determinant.joints
-
-    def __call__(self, low: Array, high: Array) -> BoxResults:
-        """Evaluate boxes between corners (boxes, n)."""
-        regular, sign, gains = check_in_turn(self._check_few, low, high, RULES.at_once)
-        return BoxResults(regular, regular, sign, np.zeros(len(low)), find_most_influential(gains, self.joints))
-
-    def _check_few(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array, Array]:
-        coefficients, rest = self.determinant(low, high)
-        sign = np.nan_to_num(np.sign(coefficients[0]))
-        n = len(self.joints)
-        return is_positive(coefficients * sign, rest, n), sign, compute_gains(coefficients, rest, n)
 
 
 def is_positive(coefficients: Array, rest: Array, n: int) -> NDArray[np.bool_]:

@@ -60,6 +60,40 @@ class OneToOneRules:
 RULES = OneToOneRules()
 
 
+def choose_one_to_one_check(chart: Chart, rows: ChartRows, base: Subdivision) -> "OneToOneCheck | ConvexCheck | None":
+    """The check for a box in the domain of a chart, with rows whose vanishing differences are those of phi.
+
+    None if the other rows depend on an idle joint, which then is none, or jump where an arc tangent begins a new turn,
+    or stand for those at another heading of a moving base.
+    """
+    tip, tree, active = TipRows.build(chart.problem.task), chart.problem.robot.tree, rows.active
+    coordinates, closed_form = chart.coordinates, isinstance(rows.coordinates, ProductRows | None)
+    # Steps jump where an arc tangent begins a new turn, but for those of a coordinate's own period.
+    jumps = (tip is None and _has_angle(rows.task)) or (_has_angle(rows.coordinates) and not rows.turns[rows.m :].all())
+    if rows.base or {*rows.variables} - {*active} or jumps:
+        return None
+    # Rows without derivatives in closed form have the convex check.
+    if tip is None or not closed_form:
+        true = replace(rows, task=build_true_gradients(chart.problem.task, active)[0])
+        centre = chart.problem.domain.centre[None]
+        inverse = np.asarray(np.linalg.pinv(true(centre, centre).centre[:, :, 0]), dtype=float)
+        return ConvexCheck(true, inverse, base.low, base.high)
+    own: ProductRows | None = None
+    if rows.coordinates is not None:
+        assert isinstance(coordinates, Coordinates)
+        assert isinstance(coordinates.family, ProductFamily)
+        own = ProductRows.build(coordinates.family, coordinates.theta, ORDERS[-1] + 2)
+    # Leading joints on which J does not depend keep a free range.
+    leading = takewhile(lambda i: i not in rows.variables, tree.carriers(tree.tip_parent))
+    still = tuple(active.index(i) for i in leading if i in active)
+    task = TipJets.build(tip, tree, active, chart.problem.domain)
+    return OneToOneCheck(task, own, active, still, base.low, base.high)
+
+
+def _has_angle(rows: CoordinateRows | None) -> bool:
+    return isinstance(rows, GraphRows) and any(step[0] == "atan2" for step in rows.graph.tape["steps"])
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class OneToOneCheck:
     """Proves that Jm(c, d) is nonsingular, for centres c in a box and all d that two points of the whole can have."""
@@ -202,40 +236,6 @@ class ConvexCheck:
         change = (J.bound_magnitude()[circles] * widths).sum(axis=1)
         proved &= np.asarray((change * UP < self.rows.turns[circles, None]).all(axis=0))
         return proved, find_most_influential(compute_influences(turned), J.variables)
-
-
-def choose_one_to_one_check(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToOneCheck | ConvexCheck | None:
-    """The check for a box in the domain of a chart, with rows whose vanishing differences are those of phi.
-
-    None if the other rows depend on an idle joint, which then is none, or jump where an arc tangent begins a new turn,
-    or stand for those at another heading of a moving base.
-    """
-    tip, tree, active = TipRows.build(chart.problem.task), chart.problem.robot.tree, rows.active
-    coordinates, closed_form = chart.coordinates, isinstance(rows.coordinates, ProductRows | None)
-    # Steps jump where an arc tangent begins a new turn, but for those of a coordinate's own period.
-    jumps = (tip is None and _has_angle(rows.task)) or (_has_angle(rows.coordinates) and not rows.turns[rows.m :].all())
-    if rows.base or {*rows.variables} - {*active} or jumps:
-        return None
-    # Rows without derivatives in closed form have the convex check.
-    if tip is None or not closed_form:
-        true = replace(rows, task=build_true_gradients(chart.problem.task, active)[0])
-        centre = chart.problem.domain.centre[None]
-        inverse = np.asarray(np.linalg.pinv(true(centre, centre).centre[:, :, 0]), dtype=float)
-        return ConvexCheck(true, inverse, base.low, base.high)
-    own: ProductRows | None = None
-    if rows.coordinates is not None:
-        assert isinstance(coordinates, Coordinates)
-        assert isinstance(coordinates.family, ProductFamily)
-        own = ProductRows.build(coordinates.family, coordinates.theta, ORDERS[-1] + 2)
-    # Leading joints on which J does not depend keep a free range.
-    leading = takewhile(lambda i: i not in rows.variables, tree.carriers(tree.tip_parent))
-    still = tuple(active.index(i) for i in leading if i in active)
-    task = TipJets.build(tip, tree, active, chart.problem.domain)
-    return OneToOneCheck(task, own, active, still, base.low, base.high)
-
-
-def _has_angle(rows: CoordinateRows | None) -> bool:
-    return isinstance(rows, GraphRows) and any(step[0] == "atan2" for step in rows.graph.tape["steps"])
 
 
 def _build_results(proved: Array, widest: Array) -> BoxResults:

@@ -56,6 +56,67 @@ class OutsideRules:
 RULES = OutsideRules()
 
 
+def choose_check(chart: Chart, rows: ChartRows, bound: float, method: str | None = None) -> RegularCheck:
+    """The check of a chart: of its whole box or, of a part of it, of what is not proved to lie outside.
+
+    Args:
+        chart: the chart.
+        rows: its rows.
+        bound: of the conditioning.
+        method: of the proofs inside. Default: the fastest.
+
+    Raises:
+        CertifyError: if there is no such method for the chart; if a joint is unbounded, and a proof for its half-width
+            is none for all its positions. In a corridor, an unbounded joint whose distance to the path counts is one of
+            these.
+    """
+    domain = chart.problem.domain
+    domain.require_bounds("proof")
+    require_all_positions(chart, rows.variables)
+    check, near, clear = choose_inside_check(chart, rows, bound, method), domain.path_bound, domain.singular_bound
+    if near is not None:
+        # After a turn of an unbounded joint that counts, what is far from the path may be near it.
+        for joint in {*near.unbounded} & {*near.counted.tolist()}:
+            name = chart.problem.robot.joint_names[joint]
+            raise CertifyError(f"joint '{name}' is unbounded and counts in the corridor, expected an infinite radius")
+        start = near.postures[near.contains(near.postures)][:1]
+        return CorridorCheck(check, near, float(check(start, start).sign[0]))
+    if clear is None:
+        return check
+    own, variables = _choose_rows(chart, clear)
+    require_all_positions(chart, variables)
+    # The sign is that of these rows, which have other scales than the chart's.
+    sign = float(check(domain.centre[None], domain.centre[None]).sign[0])
+    return OutsideCheck(check, own, clear, sign, tuple(sorted(variables)), domain.room_to_fold is not None)
+
+
+def choose_inside_check(chart: Chart, rows: ChartRows, bound: float, method: str | None = None) -> RegularCheck:
+    """The check of boxes that lie in the domain; see `choose_check`."""
+    determinant = Determinant.build(chart) if bound == 0 and method != ELIMINATION else None
+    if determinant is not None:
+        return CofactorCheck(determinant)
+    if method == COFACTORS:
+        raise CertifyError("the chart's determinant has no expansion, so it has no certificate of this method")
+    return EliminationCheck(rows, bound)
+
+
+def _choose_rows(chart: Chart, domain: SingularBound) -> tuple[GraphRows, set[int]]:
+    """The rows that check positions, as `domain.is_clear` takes them, and the joints that they depend on.
+
+    Rows of a whole position or a whole orientation may be rotated if they have the same scale: then the rotation
+    changes no singular value, and rows in the axes of a body of the arm depend on fewer joints.
+    """
+    task, joints = chart.problem.task, range(chart.n)
+    tip = TipRows.build(task)
+    if tip is not None and tip.axis is None and len(domain.scale) % 3 == 0:
+        own_axes = domain.jacobian_function is task.frame_jacobian_function or not tip.rotation
+        if own_axes and (domain.scale[::3] == domain.scale.reshape(-1, 3).T).all():
+            return build_task_rows(task, chart.problem.domain, joints)
+    if domain.jacobian_function is not task.jacobian_function:
+        return build_closed_form(domain.jacobian_function, joints)
+    return build_true_gradients(task, joints)
+
+
 def require_all_positions(chart: Chart, variables: Collection[int]) -> None:
     """Raise CertifyError unless a proof for the half-widths of unbounded joints is one for all their positions.
 
@@ -284,64 +345,3 @@ class CorridorCheck:
             conditioning=np.where(outside, np.inf, inside.conditioning),
             widest=inside.widest,
         )
-
-
-def choose_check(chart: Chart, rows: ChartRows, bound: float, method: str | None = None) -> RegularCheck:
-    """The check of a chart: of its whole box or, of a part of it, of what is not proved to lie outside.
-
-    Args:
-        chart: the chart.
-        rows: its rows.
-        bound: of the conditioning.
-        method: of the proofs inside. Default: the fastest.
-
-    Raises:
-        CertifyError: if there is no such method for the chart; if a joint is unbounded, and a proof for its half-width
-            is none for all its positions. In a corridor, an unbounded joint whose distance to the path counts is one of
-            these.
-    """
-    domain = chart.problem.domain
-    domain.require_bounds("proof")
-    require_all_positions(chart, rows.variables)
-    check, near, clear = choose_inside_check(chart, rows, bound, method), domain.path_bound, domain.singular_bound
-    if near is not None:
-        # After a turn of an unbounded joint that counts, what is far from the path may be near it.
-        for joint in {*near.unbounded} & {*near.counted.tolist()}:
-            name = chart.problem.robot.joint_names[joint]
-            raise CertifyError(f"joint '{name}' is unbounded and counts in the corridor, expected an infinite radius")
-        start = near.postures[near.contains(near.postures)][:1]
-        return CorridorCheck(check, near, float(check(start, start).sign[0]))
-    if clear is None:
-        return check
-    own, variables = _choose_rows(chart, clear)
-    require_all_positions(chart, variables)
-    # The sign is that of these rows, which have other scales than the chart's.
-    sign = float(check(domain.centre[None], domain.centre[None]).sign[0])
-    return OutsideCheck(check, own, clear, sign, tuple(sorted(variables)), domain.room_to_fold is not None)
-
-
-def choose_inside_check(chart: Chart, rows: ChartRows, bound: float, method: str | None = None) -> RegularCheck:
-    """The check of boxes that lie in the domain; see `choose_check`."""
-    determinant = Determinant.build(chart) if bound == 0 and method != ELIMINATION else None
-    if determinant is not None:
-        return CofactorCheck(determinant)
-    if method == COFACTORS:
-        raise CertifyError("the chart's determinant has no expansion, so it has no certificate of this method")
-    return EliminationCheck(rows, bound)
-
-
-def _choose_rows(chart: Chart, domain: SingularBound) -> tuple[GraphRows, set[int]]:
-    """The rows that check positions, as `domain.is_clear` takes them, and the joints that they depend on.
-
-    Rows of a whole position or a whole orientation may be rotated if they have the same scale: then the rotation
-    changes no singular value, and rows in the axes of a body of the arm depend on fewer joints.
-    """
-    task, joints = chart.problem.task, range(chart.n)
-    tip = TipRows.build(task)
-    if tip is not None and tip.axis is None and len(domain.scale) % 3 == 0:
-        own_axes = domain.jacobian_function is task.frame_jacobian_function or not tip.rotation
-        if own_axes and (domain.scale[::3] == domain.scale.reshape(-1, 3).T).all():
-            return build_task_rows(task, chart.problem.domain, joints)
-    if domain.jacobian_function is not task.jacobian_function:
-        return build_closed_form(domain.jacobian_function, joints)
-    return build_true_gradients(task, joints)

@@ -3,7 +3,7 @@
 import re
 import textwrap
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -32,72 +32,6 @@ _SHARED = re.compile(r"_shared\((.*), q\)$", re.MULTILINE)
 _WIDTH = 100
 TORQUE_LAWS = (Impedance, PDPlus)  #: that can be exported
 _LAW_STATUSES = ("OK", "OUTSIDE_DOMAIN", "SINGULAR", "NOT_FINITE", "SATURATED")
-
-
-@dataclass(frozen=True)
-class Library:
-    """A library with the functions of NumPy under its own name. `templates/NAME.py.jinja` has what it needs besides."""
-
-    title: str
-    prefix: str  #: of its functions in code
-    imports: tuple[str, ...]  #: the standard library, an empty line, others
-    erf: tuple[str, str]  #: its error function, and what that imports
-    constants: str
-    note: str
-    tables: str = ""  #: what is made of the numbers when the module is imported
-    names: Mapping[str, str] = field(default_factory=dict)  #: of functions that have another one than in NumPy
-    fuses: bool = False  #: whether it computes shared values again for everything that needs them, if we let it
-
-    def translate(self, text: str) -> str:
-        """Code for NumPy as code for this library."""
-        text = text if self.fuses else _SHARED.sub(r"\1", text)
-        for name, own in self.names.items():
-            text = text.replace(f"np.{name}(", f"{self.prefix}.{own}(")
-        return re.sub(r"\bnp\.", f"{self.prefix}.", text).replace("_erf(", f"{self.erf[0]}(")
-
-    def imports_for(self, code: str) -> str:
-        """The imports that a module's code, still for NumPy, needs."""
-        lines = list(self.imports)
-        if "_erf(" in code and self.erf[1] not in lines:
-            lines.insert(0 if self.erf[1] == "import math" else lines.index("") + 1, self.erf[1])
-        return "\n".join(lines)
-
-
-LIBRARIES = {
-    "numpy": Library(
-        title="NumPy",
-        prefix="np",
-        imports=(*_COMMON, "", "import numpy as np"),
-        erf=("np.vectorize(math.erf)", "import math"),
-        constants="ROWS = 1024  # joint positions at once, so that intermediate values stay in the cache\n"
-        "LAST_ROUNDS = 1  # of the inverse, at a solution\n",
-        note="Single precision if q is numpy.float32, double otherwise.",
-    ),
-    "torch": Library(
-        title="PyTorch",
-        prefix="torch",
-        imports=("import struct", *_COMMON, "", "import torch"),
-        erf=("torch.erf", "import torch"),
-        constants="ROWS = 8192  # joint positions at once, so that memory stays bounded; raise it on a GPU\n" + _ROUNDS,
-        note="q is a floating-point tensor. Results have its precision and device, and are differentiable.",
-        # torch.func.vmap does not know the former.
-        names={"moveaxis": "movedim"},
-        tables="""
-with torch.inference_mode(False):  # what is made in that mode has no derivatives later
-    _TABLES = {name: _numbers(*parts) for name, parts in _NUMBERS.items()}
-    _TABLES |= {name: torch.tensor(values, dtype=torch.int64) for name, values in _INDICES.items()}
-""",
-    ),
-    "jax": Library(
-        title="JAX",
-        prefix="jnp",
-        imports=(*_COMMON, "", "import jax", "import jax.numpy as jnp", "import numpy"),
-        erf=("jax.scipy.special.erf", "import jax"),
-        constants=_ROUNDS,
-        note="Results have the precision of q, and are differentiable; `jax_enable_x64` allows double precision.",
-        fuses=True,
-    ),
-}
 
 
 def export(chart: Chart | Impedance | PDPlus, to: str, path: str | Path, force: bool = False) -> Path:
@@ -185,8 +119,12 @@ def write_module(chart: Chart | Impedance | PDPlus, to: str) -> str:
         "centre": tuple(problem.domain.centre.tolist()),
         "half_width": tuple(problem.domain.half_width.tolist()),
         "statuses": write_statuses(),
-        "numbers": "\n".join(_write_table(name, table) for form in forms for name, table in form.tables.items()),
-        "indices": "\n".join(_write_indices(name, rows) for form in forms for name, rows in form.indices.items()),
+        "numbers": [(name, table.shape, _encode(table)) for form in forms for name, table in form.tables.items()],
+        "indices": [
+            (name, textwrap.wrap("".join(f"{row}, " for row in rows), _WIDTH))
+            for form in forms
+            for name, rows in form.indices.items()
+        ],
     }
     return render("module.py", values)
 
@@ -295,16 +233,74 @@ def _write_graph(name: str, summary: str, inputs: list[ca.MX], outputs: list[ca.
     return write_function(name, summary, dense_function("f", [ca.vertcat(*symbols)], [graph(*symbols)]))
 
 
-def _write_table(name: str, table: Array) -> str:
-    """A table in base64."""
+def _encode(table: Array) -> list[str]:
+    """Lines of base64 with the numbers of a table."""
     # Zeros have no sign.
     text = b64encode((np.asarray(table, dtype="<f8") + 0.0).tobytes()).decode()
-    parts = [text[k : k + _WIDTH] for k in range(0, max(len(text), 1), _WIDTH)]
-    lines = "\n".join(f'            "{part}"' for part in parts)
-    return f'    "{name}": (\n        {table.shape},\n        (\n{lines}\n        ),\n    ),'
+    return textwrap.wrap(text, _WIDTH) or [""]
 
 
-def _write_indices(name: str, values: Sequence[int]) -> str:
-    """Indices as plain numbers."""
-    lines = textwrap.fill("".join(f"{value}, " for value in values), _WIDTH)
-    return f'    "{name}": (\n{textwrap.indent(lines, " " * 8)}\n    ),'
+@dataclass(frozen=True)
+class Library:
+    """A library with the functions of NumPy under its own name. `templates/NAME.py.jinja` has what it needs besides."""
+
+    title: str
+    prefix: str  #: of its functions in code
+    imports: tuple[str, ...]  #: the standard library, an empty line, others
+    erf: tuple[str, str]  #: its error function, and what that imports
+    constants: str
+    note: str
+    tables: str = ""  #: what is made of the numbers when the module is imported
+    names: Mapping[str, str] = field(default_factory=dict)  #: of functions that have another one than in NumPy
+    fuses: bool = False  #: whether it computes shared values again for everything that needs them, if we let it
+
+    def translate(self, text: str) -> str:
+        """Code for NumPy as code for this library."""
+        text = text if self.fuses else _SHARED.sub(r"\1", text)
+        for name, own in self.names.items():
+            text = text.replace(f"np.{name}(", f"{self.prefix}.{own}(")
+        return re.sub(r"\bnp\.", f"{self.prefix}.", text).replace("_erf(", f"{self.erf[0]}(")
+
+    def imports_for(self, code: str) -> str:
+        """The imports that a module's code, still for NumPy, needs."""
+        lines = list(self.imports)
+        if "_erf(" in code and self.erf[1] not in lines:
+            lines.insert(0 if self.erf[1] == "import math" else lines.index("") + 1, self.erf[1])
+        return "\n".join(lines)
+
+
+LIBRARIES = {
+    "numpy": Library(
+        title="NumPy",
+        prefix="np",
+        imports=(*_COMMON, "", "import numpy as np"),
+        erf=("np.vectorize(math.erf)", "import math"),
+        constants="ROWS = 1024  # joint positions at once, so that intermediate values stay in the cache\n"
+        "LAST_ROUNDS = 1  # of the inverse, at a solution\n",
+        note="Single precision if q is numpy.float32, double otherwise.",
+    ),
+    "torch": Library(
+        title="PyTorch",
+        prefix="torch",
+        imports=("import struct", *_COMMON, "", "import torch"),
+        erf=("torch.erf", "import torch"),
+        constants="ROWS = 8192  # joint positions at once, so that memory stays bounded; raise it on a GPU\n" + _ROUNDS,
+        note="q is a floating-point tensor. Results have its precision and device, and are differentiable.",
+        # torch.func.vmap does not know the former.
+        names={"moveaxis": "movedim"},
+        tables="""
+with torch.inference_mode(False):  # what is made in that mode has no derivatives later
+    _TABLES = {name: _numbers(*parts) for name, parts in _NUMBERS.items()}
+    _TABLES |= {name: torch.tensor(values, dtype=torch.int64) for name, values in _INDICES.items()}
+""",
+    ),
+    "jax": Library(
+        title="JAX",
+        prefix="jnp",
+        imports=(*_COMMON, "", "import jax", "import jax.numpy as jnp", "import numpy"),
+        erf=("jax.scipy.special.erf", "import jax"),
+        constants=_ROUNDS,
+        note="Results have the precision of q, and are differentiable; `jax_enable_x64` allows double precision.",
+        fuses=True,
+    ),
+}

@@ -16,38 +16,6 @@ from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import ARITHMETIC, Tape, write_tape
 
-_OPERATORS = {
-    **ARITHMETIC,
-    "pow": "{0} ** {1}",
-    "constpow": "{0} ** {1}",
-}
-_CONDITIONS = {
-    "not": "{0} == 0",
-    "lt": "{0} < {1}",
-    "le": "{0} <= {1}",
-    "eq": "{0} == {1}",
-    "ne": "{0} != {1}",
-    "and": "({0} != 0) & ({1} != 0)",
-    "or": "({0} != 0) | ({1} != 0)",
-}
-
-_FUNCTIONS = {
-    name: name
-    for name in (
-        *("exp", "log", "sqrt", "sin", "cos", "tan", "sinh", "cosh", "tanh", "floor", "ceil", "log1p", "expm1"),
-        *("sign", "hypot", "fmod", "copysign", "fmin", "fmax"),
-    )
-} | {
-    "asin": "arcsin",
-    "acos": "arccos",
-    "atan": "arctan",
-    "asinh": "arcsinh",
-    "acosh": "arccosh",
-    "atanh": "arctanh",
-    "atan2": "arctan2",
-    "fabs": "abs",
-}  # names in NumPy, which PyTorch and JAX share
-
 
 @dataclass(frozen=True, eq=False)
 class Form:
@@ -98,7 +66,24 @@ def _build_products(coordinates: Coordinates) -> Form | None:
     q = ca.SX.sym("q", coordinates.space.n)
     functions = family.basis(q[coordinates.active])[[rows[term] for term in plan.levels[0]]]
     code = write_function("_one_joint", "Functions of one joint each, (k, N).", dense_function("f", [q], [functions]))
-    tables = _build_coefficients(coordinates, plan, rows) | _build_slopes(coordinates, slopes, plan, rows)
+
+    # C (r, terms), A (r, n) and c (r, 1).
+    r, n, fitted, active = coordinates.r, coordinates.space.n, len(coordinates.offset), coordinates.active
+    A, c = _split_idle(coordinates)
+    C, theta = np.zeros((r, len(plan.terms))), coordinates.theta.reshape(fitted, -1)
+    for k, term in enumerate(plan.terms):
+        if term in rows:
+            C[:fitted, k] = coordinates.scale * theta[:, rows[term]]
+    c[:fitted] = -coordinates.scale[:, None] * coordinates.offset[:, None]
+
+    # T (r n, terms of derivatives) and D (r, n, 1), from the slopes (fitted, active, 1 + K).
+    lower = [term for term in plan.terms if term in plan.lower]
+    T, D = np.zeros((r, n, len(lower))), A.copy()
+    for k, term in enumerate(lower):
+        if term in rows:
+            T[:fitted, active, k] = slopes[:, :, 1 + rows[term]]
+    D[:fitted, active] = slopes[:, :, 0]
+    tables = {"C": C, "A": A, "c": c, "T": T.reshape(r * n, -1), "D": D[:, :, None]}
     return Form("coordinates", {"kind": "products", **plan.counts}, code, tables, plan.indices)
 
 
@@ -115,6 +100,7 @@ class TermLevels:
     @classmethod
     def of(cls, terms: Iterable[Term], of_derivatives: Iterable[Term]) -> Self:
         """The levels of these terms, with what they are made of."""
+        # Terms with all that they are products of; without derivatives, one term stands for the lower ones.
         every, lower = with_parts(terms), with_parts(of_derivatives)
         every |= {_split_term(term)[1] for term in every}
         lower = lower or {min(term for term in every if np.count_nonzero(term) == 1)}
@@ -150,31 +136,6 @@ def _split_term(term: Term) -> tuple[Term, Term]:
     """A term without its last factor, and that factor alone."""
     rest, joint, index = split(term)
     return rest, tuple(index if k == joint else 0 for k in range(len(term)))
-
-
-def _build_coefficients(coordinates: Coordinates, plan: TermLevels, rows: dict[Term, int]) -> dict[str, Array]:
-    """C (r, terms), A (r, n) and c (r, 1)."""
-    fitted, scale = len(coordinates.offset), coordinates.scale[:, None]
-    A, c = _split_idle(coordinates)
-    C = np.zeros((coordinates.r, len(plan.terms)))
-    theta = coordinates.theta.reshape(fitted, -1)
-    for k, term in enumerate(plan.terms):
-        if term in rows:
-            C[:fitted, k] = coordinates.scale * theta[:, rows[term]]
-    c[:fitted] = -scale * coordinates.offset[:, None]
-    return {"C": C, "A": A, "c": c}
-
-
-def _build_slopes(coordinates: Coordinates, slopes: Array, plan: TermLevels, rows: dict[Term, int]) -> dict[str, Array]:
-    """T (r n, terms of derivatives) and D (r, n, 1), from the slopes (fitted, active, 1 + K)."""
-    r, n, fitted, active = coordinates.r, coordinates.space.n, len(coordinates.offset), coordinates.active
-    lower = [term for term in plan.terms if term in plan.lower]
-    T, D = np.zeros((r, n, len(lower))), _split_idle(coordinates)[0]
-    for k, term in enumerate(lower):
-        if term in rows:
-            T[:fitted, active, k] = slopes[:, :, 1 + rows[term]]
-    D[:fitted, active] = slopes[:, :, 0]
-    return {"T": T.reshape(r * n, -1), "D": D[:, :, None]}
 
 
 def _split_idle(coordinates: Coordinates) -> tuple[Array, Array]:
@@ -215,6 +176,7 @@ def _build_network(coordinates: Coordinates) -> Form | None:
 
 def write_function(name: str, summary: str, *functions: ca.Function) -> str:
     """A Python function of columns q (n, N) with the entries of dense SX functions' outputs, row by row, (k, N)."""
+    # One tape for all functions, in which what they share is computed once.
     q = ca.SX.sym("q", functions[0].size_in(0)[0])
     rows = ca.vertcat(*(ca.vec(ca.densify(function(q)).T) for function in functions))
     lines = _write_tape(write_tape(ca.Function("rows", [q], [ca.cse(rows)])))
@@ -230,7 +192,10 @@ def _write_tape(tape: Tape) -> list[str]:
     results: dict[int, str] = {}
     for (name, into, *of), uses in zip(tape["steps"], _count_uses(tape["steps"]), strict=True):
         if name == "const":
-            constants[into] = _write_literal(float(of[0]))
+            # Exactly; in brackets where an operator beside it would take its sign.
+            value = float(of[0])
+            word = f'float("{value}")' if np.isinf(value) else repr(value)
+            constants[into] = word if value >= 0 or np.isinf(value) else f"({word})"
         elif name == "output":
             results[into] = f"y{into}"
             lines.append(f"y{into} = {_write_array(of[0], constants)}")
@@ -252,6 +217,40 @@ def _count_uses(steps: Sequence[Sequence[Any]]) -> list[int]:
     return result
 
 
+_OPERATORS = {
+    **ARITHMETIC,
+    "pow": "{0} ** {1}",
+    "constpow": "{0} ** {1}",
+}
+_CONDITIONS = {
+    "not": "{0} == 0",
+    "lt": "{0} < {1}",
+    "le": "{0} <= {1}",
+    "eq": "{0} == {1}",
+    "ne": "{0} != {1}",
+    "and": "({0} != 0) & ({1} != 0)",
+    "or": "({0} != 0) | ({1} != 0)",
+}
+
+# Names in NumPy, which PyTorch and JAX share.
+_FUNCTIONS = {
+    name: name
+    for name in (
+        *("exp", "log", "sqrt", "sin", "cos", "tan", "sinh", "cosh", "tanh", "floor", "ceil", "log1p", "expm1"),
+        *("sign", "hypot", "fmod", "copysign", "fmin", "fmax"),
+    )
+} | {
+    "asin": "arcsin",
+    "acos": "arccos",
+    "atan": "arctan",
+    "asinh": "arcsinh",
+    "acosh": "arccosh",
+    "atanh": "arctanh",
+    "atan2": "arctan2",
+    "fabs": "abs",
+}
+
+
 def _write_operation(name: str, of: list[Any], constants: dict[int, str]) -> str:
     """One operation on work slots."""
     if name in _OPERATORS:
@@ -267,10 +266,3 @@ def _write_operation(name: str, of: list[Any], constants: dict[int, str]) -> str
 def _write_array(slot: int, constants: dict[int, str]) -> str:
     """The value in a work slot as an array, for functions that take nothing else."""
     return f"np.full_like(q[0], {constants[slot]})" if slot in constants else f"w{slot}"
-
-
-def _write_literal(value: float) -> str:
-    """The number in Python, exactly; in brackets where an operator beside it would take its sign."""
-    if value in (float("inf"), float("-inf")):
-        return f'float("{value}")'
-    return repr(value) if value >= 0 else f"({value!r})"

@@ -422,9 +422,14 @@ class _OperationalSpace(LawOfChart):
 
     def _apply_damping(self, Lambda: ca.MX, inputs: dict[str, ca.MX], velocities: ca.MX) -> ca.MX:
         """D V, with the same blocks, for V (n, c)."""
+        # A function of its own, block by block, so that its code appears once.
+        n, c = velocities.shape
+        inertia, K, Z, V = (ca.MX.sym(*of) for of in (("Lambda", n, n), ("K", n), ("Z", n), ("V", n, c)))
+        places = [place.tolist() for place in np.split(np.arange(n), np.cumsum(self._blocks)[:-1])]
+        parts = [apply_damping(self.damping, inertia[p, p], K[p], Z[p], V[p, :]) for p in places]
+        damping = ca.Function("damping", [inertia, K, Z, V], [ca.densify(ca.vertcat(*parts))])
         designed_for = inputs.get("damping_stiffness", inputs["stiffness"])
-        function = _build_block_damping(self.damping, self._blocks, velocities.shape[1])
-        return function(Lambda, designed_for, inputs["damping_ratio"], velocities)
+        return damping(Lambda, designed_for, inputs["damping_ratio"], velocities)
 
     def _compute_errors(self, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
         """The error e, how fast it changes, and J = de/dq."""
@@ -487,12 +492,3 @@ class PDPlus(_OperationalSpace):
     feed_forward = True
     name: ClassVar[str] = "pd_plus"
     force = "Operational space PD+: tau = J^T (f_imp + f_FF)"
-
-
-def _build_block_damping(design: DampingDesign, blocks: tuple[int, ...], columns: int) -> ca.Function:
-    """Lambda (block diagonal), stiffness, damping_ratio, V (n, columns) -> D V; D has the same blocks."""
-    n = sum(blocks)
-    Lambda, K, Z, V = (ca.MX.sym(*of) for of in (("Lambda", n, n), ("K", n), ("Z", n), ("V", n, columns)))
-    places = [place.tolist() for place in np.split(np.arange(n), np.cumsum(blocks)[:-1])]
-    parts = [apply_damping(design, Lambda[p, p], K[p], Z[p], V[p, :]) for p in places]
-    return ca.Function("damping", [Lambda, K, Z, V], [ca.densify(ca.vertcat(*parts))])
