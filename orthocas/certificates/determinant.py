@@ -405,12 +405,12 @@ class Waves:
     @classmethod
     def sine(cls, joint: int, n: int) -> "Waves":
         """The sine of a joint's position."""
-        return cls(_both_ways(joint, n), np.array([-0.5j, 0.5j]), 0.0)
+        return cls(_pair_frequencies(joint, n), np.array([-0.5j, 0.5j]), 0.0)
 
     @classmethod
     def cosine(cls, joint: int, n: int) -> "Waves":
         """The cosine of a joint's position."""
-        return cls(_both_ways(joint, n), np.array([0.5 + 0j, 0.5 + 0j]), 0.0)
+        return cls(_pair_frequencies(joint, n), np.array([0.5 + 0j, 0.5 + 0j]), 0.0)
 
     @property
     def size(self) -> float:
@@ -459,7 +459,7 @@ class Waves:
         return values
 
 
-def _both_ways(joint: int, n: int) -> NDArray[np.int64]:
+def _pair_frequencies(joint: int, n: int) -> NDArray[np.int64]:
     unit = np.eye(n, dtype=np.int64)[joint]
     return np.stack([unit, -unit])
 

@@ -288,11 +288,11 @@ def build_velocity_rows(tree: KinematicTree, q: ca.SX, body: int) -> ca.SX:
     poses: dict[int, Pose] = {body: (ca.SX.eye(3), ca.SX.zeros(3))}
     for below, i in zip(chain[here:], chain[here + 1 :], strict=False):
         R, p = poses[below]
-        rotation, shift = _step(tree, q, i)
+        rotation, shift = _build_step(tree, q, i)
         poses[i] = (R @ rotation, p + R @ shift)
     for i, below in zip(chain[here:0:-1], chain[here - 1 :: -1] if here else [], strict=False):
         R, p = poses[i]
-        rotation, shift = _step(tree, q, i)
+        rotation, shift = _build_step(tree, q, i)
         back = R @ rotation.T
         poses[below] = (back, p - back @ shift)
     # Turning joints move the tip about their axes, sliding ones along.
@@ -339,7 +339,7 @@ def _choose_sparsest(q: ca.SX, choices: list[ca.SX]) -> ca.SX:
     return min(choices, key=lambda J: int(ca.jacobian(ca.vec(J), q).nnz()))
 
 
-def _step(tree: KinematicTree, q: ca.SX, i: int) -> Pose:
+def _build_step(tree: KinematicTree, q: ca.SX, i: int) -> Pose:
     """Rotation and position of a body in the frame of its parent."""
     rotation, shift = constant(tree.rotations[i]), constant(tree.translations[i])
     if tree.prismatic[i]:

@@ -33,7 +33,7 @@ _ENTRY = """int {name}(const double **arg, double **res, int *iw, double *w) {{
 _STAGES = 12
 
 
-def kept_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], folder: str | Path | None = None) -> Path:
+def keep_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], folder: str | Path | None = None) -> Path:
     """The shared library of C sources, compiled now or earlier: its name is a digest of sources, compiler and flags.
 
     Args:
@@ -70,7 +70,7 @@ def _find_cache() -> Path:
     return (place if place.is_absolute() else Path.home() / ".cache") / "orthocas" / "libraries"
 
 
-def loaded(library: Path) -> ctypes.CDLL:
+def load_library(library: Path) -> ctypes.CDLL:
     """Load a library that was kept.
 
     Raises:
@@ -141,7 +141,7 @@ class CompiledFunctions:
         functions: functions with different names. Inputs and outputs are columns.
 
     Raises:
-        CompileError: as `kept_library`.
+        CompileError: as `keep_library`.
     """
 
     def __init__(self, functions: Sequence[ca.Function]) -> None:
@@ -150,7 +150,7 @@ class CompiledFunctions:
         self._functions = {name: _Function(kernels.work[name], outputs) for name, outputs in sizes.items()}
         entries = [_ENTRY.format(name=name, prefix=_PREFIX) for name in sizes]
         code = "\n\n".join(["#include <math.h>\n#include <string.h>", kernels.code, *entries, ""])
-        self.library = kept_library("functions", {"functions.c": code}, _FLAGS)
+        self.library = keep_library("functions", {"functions.c": code}, _FLAGS)
 
     def kernel(self, name: str, constants: Sequence[Array | None] = ()) -> Kernel:
         """A function for compiled code.
@@ -188,22 +188,22 @@ class CompiledFunctions:
             for arrays in (inputs, outputs)
         ]
         counts = [ctypes.c_int(len(arrays)) for arrays in (inputs, outputs)]
-        rows = runner("rows")
+        rows = get_runner("rows")
         rows(ctypes.byref(kernel), ctypes.c_long(N), counts[0], places[0], strides[0], counts[1], places[1], strides[1])
         return outputs
 
     @cached_property
     def _c(self) -> ctypes.CDLL:
-        return loaded(self.library)
+        return load_library(self.library)
 
 
 @cache
-def runner(name: str) -> Any:
+def get_runner(name: str) -> Any:
     """A function of templates/runner.c.jinja, which calls kernels."""
     method = scipy.integrate.DOP853
     tables = {"a": method.A, "b": method.B, "c": method.C, "e3": method.E3[:-1], "e5": method.E5[:-1]}
     source = render("runner.c", tables)
-    return getattr(loaded(kept_library("runner", {"runner.c": source}, ("-O3",))), f"orthocas_{name}")
+    return getattr(load_library(keep_library("runner", {"runner.c": source}, ("-O3",))), f"orthocas_{name}")
 
 
 class _State(ctypes.Structure):
@@ -275,6 +275,6 @@ class Integrator:
     def _run(self, name: str, *arguments: Any) -> None:
         pointers = [ctypes.c_void_p(a.ctypes.data) if isinstance(a, np.ndarray) else a for a in arguments]
         with deferred():
-            failed = runner(name)(ctypes.byref(self._state), *pointers)
+            failed = get_runner(name)(ctypes.byref(self._state), *pointers)
         if failed:
             raise SimulationError("the integrator gave up: its steps became too short, or too many")

@@ -17,10 +17,10 @@ from orthocas.charts.curves import Nearest, SelfMotionCurves
 from orthocas.charts.inverse import Inverse, Solutions
 from orthocas.charts.methods import solve_with, targets_of_wish
 from orthocas.charts.newton import NEWTON, Attempt, Newton
-from orthocas.codegen.compiled import kept_library, loaded
+from orthocas.codegen.compiled import keep_library, load_library
 from orthocas.codegen.generate import generate_c
 from orthocas.codegen.kernels import generate_kernels
-from orthocas.codegen.rendering import read_template, render
+from orthocas.codegen.rendering import get_template, render
 from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_kind
@@ -101,7 +101,7 @@ class CompiledInverse(Shown):
 
     @cached_property
     def _c(self) -> Any:
-        return loaded(self.library)
+        return load_library(self.library)
 
 
 def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledInverse:
@@ -135,11 +135,11 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
     with open_draft_folder() as drafts:
         generate_c(chart, drafts, name="arm")
         sources = {name: (drafts / name).read_text(encoding="utf-8") for name in ("arm.h", "arm.c")}
-    sources[_ROWS] = read_template(_ROWS)
+    sources[_ROWS] = get_template(_ROWS)
     curves = chart.parts.inverse.curves
     if isinstance(curves, SelfMotionCurves):
         sources["curves.c"] = write_curve_source(chart, curves)
-    return CompiledInverse(chart, kept_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder))
+    return CompiledInverse(chart, keep_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder))
 
 
 @dataclass(frozen=True, eq=False)

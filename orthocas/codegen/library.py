@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from orthocas.charts.chart import Chart
 from orthocas.codegen.generate import GeneratedC, generate_c
 from orthocas.codegen.precision import DOUBLE, SINGLE, Precision
-from orthocas.codegen.rendering import read_template
+from orthocas.codegen.rendering import get_template
 from orthocas.control.controller import Controller, ControlStatus, require_controller
-from orthocas.control.memory import memory_of
+from orthocas.control.memory import find_memory
 from orthocas.control.operational_space import PDPlus
 from orthocas.control.safety import Safety
 from orthocas.errors import CompileError
@@ -215,7 +215,7 @@ class Supervisor:
         if safety is not None:
             struct = settings(*(tuple(value) if isinstance(value, np.ndarray) else value for value in values.values()))
             self._safety = ctypes.pointer(struct)
-        memory = memory_of(controller)
+        memory = find_memory(controller)
         fields = {} if memory is None else {name: number * len(value) for name, value in memory.start.items()}
         self._state = _build_state(self._n, self._k, number, settings, _build_struct("Memory", fields))()
         self._command = library.numbers(np.zeros(self._n))
@@ -379,7 +379,7 @@ def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int =
         # For each law its states, then its gains.
         parts = [part.ravel() for law, _ in cases for part in (_sample_states(law), gain_numbers(law))]
         first.numbers(np.concatenate(parts)).tofile(data)
-        (folder / "ticks.c").write_text(read_template("ticks.c"))
+        (folder / "ticks.c").write_text(get_template("ticks.c"))
         number = f"-DNUMBER={first.precision.c_name}"
         run_program([compilers()[0], "-O2", number, str(folder / "ticks.c"), "-o", str(program), "-ldl"])
         arguments = [str(program), str(data), str(calls), str(cases[0][0].problem.n)]

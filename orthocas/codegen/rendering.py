@@ -14,7 +14,7 @@ from jinja2.runtime import Context
 _INFINITIES = {np.inf: "INFINITY", -np.inf: "-INFINITY"}
 
 
-def read_template(name: str) -> str:
+def get_template(name: str) -> str:
     """A file of `templates/` as it is."""
     return (files(__package__) / "templates" / name).read_text()
 

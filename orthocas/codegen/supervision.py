@@ -9,7 +9,7 @@ import numpy as np
 from orthocas.charts.chart import Chart
 from orthocas.codegen.rendering import clean_word, clean_words, write_number, write_numbers
 from orthocas.control.controller import Controller
-from orthocas.control.memory import memory_of
+from orthocas.control.memory import find_memory
 from orthocas.control.safety import SIGNED, UNBOUNDED, Safety
 from orthocas.tasks.domains import Domain
 from orthocas.tasks.relative import Relative
@@ -60,7 +60,7 @@ def build_supervision_kernels(controller: Controller) -> list[ca.Function]:
     # Orientations turn instead of adding up, laws may remember, and domains may be bounded by singular positions.
     if relative.turned:
         kernels += [relative.moved, relative.turned_by]
-    if (memory := memory_of(controller)) is not None:
+    if (memory := find_memory(controller)) is not None:
         inputs = memory.step.mx_in()
         kernels.append(ca.Function("memory", inputs, [ca.densify(out) for out in memory.step.call(inputs)]))
     domain = None if controller.chart is None else find_condition(controller.chart)
@@ -223,7 +223,7 @@ def _describe_boundary(controller: Controller) -> dict[str, Any] | None:
 
 def _describe_memory(controller: Controller) -> dict[str, Any] | None:
     """The fields that a law remembers, and the gains that they are added to."""
-    memory = memory_of(controller)
+    memory = find_memory(controller)
     if memory is None:
         return None
     return {

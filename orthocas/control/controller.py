@@ -196,7 +196,7 @@ def law_of(name: str) -> type[Law]:
     return _LAWS[name]
 
 
-def law_facts(controller: Controller) -> dict[str, str]:
+def list_law_facts(controller: Controller) -> dict[str, str]:
     """The facts that every controller displays: quantities, gains, other settings and problem."""
     return {
         "law": f"{controller.name}, commands {controller.command} of {controller.problem.n} joints",
@@ -235,7 +235,7 @@ class LawOfChart(Shown):
 
     def facts(self: Any) -> dict[str, str]:
         """Quantities, gains, settings and problem."""
-        return law_facts(self)
+        return list_law_facts(self)
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         """Raise UnreachableReferenceError if the motion from q_start along the reference leaves the chart's domain."""
@@ -402,7 +402,7 @@ def get_counted_function(controller: Controller, name: Literal["function", "ener
 
 def replace_smallest_volume(graph: ca.Function, smallest: float) -> ca.Function:
     """The same graph of a controller, with another smallest volume of the gradients, relative to the median."""
-    inputs, call = _guard_call(graph)
+    inputs, call = _find_guard_call(graph)
     if call is None:
         return graph
     # The same call of the guard, with another last input.
@@ -413,13 +413,13 @@ def replace_smallest_volume(graph: ca.Function, smallest: float) -> ca.Function:
 
 def find_squared_volume(graph: ca.Function) -> ca.Function | None:
     """Inputs of a controller -> squared volume of its gradients, relative to the median; None without a guard."""
-    inputs, call = _guard_call(graph)
+    inputs, call = _find_guard_call(graph)
     if call is None:
         return None
     return ca.Function("squared_volume", inputs, [call.dep(call.which_function().n_in() - 2)])
 
 
-def _guard_call(graph: ca.Function) -> tuple[list[ca.MX], ca.MX | None]:
+def _find_guard_call(graph: ca.Function) -> tuple[list[ca.MX], ca.MX | None]:
     """Inputs of a graph, and the call of the guard that all its outputs come from, if it has one."""
     inputs = graph.mx_in()
     call = graph.call(inputs, True, False)[0].dep(0)

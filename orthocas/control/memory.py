@@ -122,7 +122,7 @@ class Remembers(Protocol):
         """The memory of a law that has the input `extra_torque`."""
 
 
-def memory_of(controller: Controller) -> Memory | None:
+def find_memory(controller: Controller) -> Memory | None:
     """The memory of a law; None for laws without one."""
     return getattr(controller, "memory", None)
 
@@ -150,7 +150,7 @@ class Remembering(Shown):
 
     def __init__(self, controller: Controller) -> None:
         require_controller(controller)
-        memory = memory_of(controller)
+        memory = find_memory(controller)
         self._controller, self._memory = controller, memory
         self._law = _call_with_arrays(get_counted_function(controller))
         self._step = None if memory is None else _call_with_arrays(memory.step)

@@ -21,7 +21,7 @@ import orthocas as oc
 from orthocas import learn
 from orthocas.cli.commands import build_app
 
-_READS = re.compile(r"(read|load)_?\w*|loaded|from_(file|urdf|mjcf)|urdf_look")
+_READS = re.compile(r"(read|load)_?\w*|from_(file|urdf|mjcf)|urdf_look")
 
 _MODULES = ("charts", "control", "obstacles", "paths", "problems", "simulation", "solvers", "viewer")  # of public names
 _LATER = {"Memory"}  # its arguments are not checked yet
