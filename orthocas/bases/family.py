@@ -40,6 +40,7 @@ class Memories:
     def borrow(self, count: int) -> Iterator[list[ArrayMemory]]:
         """So many memories that nobody else uses meanwhile."""
         borrowed: list[ArrayMemory] = []
+        # Take spare ones, and make those that are missing; all come back for others.
         for _ in range(count):
             try:
                 borrowed.append(self._spare.pop())

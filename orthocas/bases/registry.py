@@ -96,6 +96,7 @@ def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
             kind.__name__,
             f"a registered one, so that it can be saved: orthocas.register_parametrisation('...', {kind.__name__})",
         )
+    # Settings that are parametrisations become data themselves.
     parts = {part.name: getattr(parametrisation, part.name) for part in fields(parametrisation)}
     inner = {name: parametrisation_to_data(part) for name, part in parts.items() if isinstance(part, Parametrisation)}
     settings = {**asdict(parametrisation), **inner}

@@ -114,6 +114,7 @@ def rotate_to_singular_basis(J: TaylorModel) -> tuple[TaylorModel, Array]:
     U and V are taken as they are in floating-point numbers. They are checked to be orthogonal up to 1e-9, so they are
     nonsingular, and the sign of their determinants is that of the computed ones.
     """
+    # Vectors that are not orthogonal, or not finite, have no sign.
     Ut, V = find_singular_vectors(J)
     signs = np.nan_to_num(np.sign(np.linalg.det(Ut) * np.linalg.det(V))) * (is_orthogonal(Ut) & is_orthogonal(V))
     return multiply_between(Ut, J, V), signs
@@ -148,6 +149,7 @@ def multiply_between(left: Array, J: TaylorModel, right: Array) -> TaylorModel:
 
 def compute_pivots(J: TaylorModel) -> list[TaylorModel]:
     """The pivots of Gaussian elimination without exchanges, models (boxes,). Their product is det J."""
+    # The Schur complement of each pivot takes the place of the matrix.
     diagonal = [J[0, 0]]
     while len(J.remainder) > 1:
         ratios = J[1:, 0] * reciprocal(diagonal[-1][None])

@@ -266,6 +266,7 @@ def check_bound(chart: Chart, bound: float) -> float:
     bound = as_number("bound", bound)
     if not 0 <= bound < 1:
         raise InvalidValueError("bound", bound, "a number from 0 to below 1")
+    # Bounds above 0 need a fixed base and the Euclidean metric.
     if bound > 0 and build_chart_rows(chart).base:
         raise CertifyError(f"bound is {bound:g} on a moving base, expected 0: the sign of det J is proved there")
     if bound > 0 and not chart.problem.metric.is_identity:
@@ -296,6 +297,7 @@ def require_same(chart: Chart, certificate: Certificate) -> None:
     certificate.require_for(fingerprint(chart.problem, chart.coordinates))
     if not certificate.digest:
         raise CertifyError("the certificate has no digest, expected one made by `certify`")
+    # It holds for the domain that it was made for only, with all that this leaves out.
     left_out = getattr(chart.problem.domain, "least_singular_value", 0.0)
     if certificate.least_singular_value != left_out:
         raise CertifyError(
@@ -457,6 +459,7 @@ def _report_search(monitor: Monitor, stage: str, *, guarded: bool = False) -> Lo
     start = time.monotonic()
 
     def show(search: Search) -> None:
+        # Never all, as long as a box is open.
         limits, share = search.limits, search.proved_volume
         if search.open_count:
             share = min(share, 1 - 2**-53)
@@ -469,6 +472,7 @@ def _report_search(monitor: Monitor, stage: str, *, guarded: bool = False) -> Lo
 
 
 def _check_parts(check: BoxCheck, parts: Subdivision, mapped: Mapped, monitor: Monitor) -> list[BoxResults]:
+    # In pieces, whose results come in order.
     low, high = parts.leaves(PROVED)
     pieces = [slice(k, k + RULES.at_once) for k in range(0, len(low), RULES.at_once)]
     results = []

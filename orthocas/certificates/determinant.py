@@ -135,10 +135,12 @@ class Determinant:
 
     def __call__(self, low: Array, high: Array) -> Expansion:
         """The expansion on boxes between corners (boxes, n)."""
+        # Both factors about the centres of the boxes, then their products.
         chosen = list(self.joints)
         middle = ((low + high) / 2)[:, chosen].T
         half = np.nextafter(np.maximum(high[:, chosen].T - middle, middle - low[:, chosen].T), np.inf) + TINY
         (A, rest_a), (B, rest_b) = self.slopes(middle, half), self.cofactors(middle, half)
+        # What each factor leaves out is multiplied by the sizes of the other.
         products, rest = _multiply_expansions(A, B[:-1], self.slopes.degree, len(chosen))
         total_a, total_b = (np.abs(part).sum(axis=1) for part in (A, B[:-1]))
         carried = rest_a * (total_b + rest_b[:-1]) + total_a * rest_b[:-1] + rest
@@ -259,6 +261,7 @@ def _differentiate_coordinate(family: ProductFamily, theta: Array) -> tuple[Arra
     """
     degree, space = _bound_degree(family), family.space
     nothing = np.zeros((space.n, 1))
+    # Jets at the centre, on a box without width.
     rows = ProductRows.build(family, theta, degree + 2)
     jets = rows.build_jets(Around(space.centre[:, None], nothing, nothing, degree))
     every = list_indices(space.n, degree)
@@ -290,6 +293,7 @@ def _plan_products(n: int, degree: int) -> tuple[tuple[bool, int, slice, NDArray
 
     Each entry is whether that one belongs to a, its place, those of the others, and where the products go.
     """
+    # Each pair of degrees belongs to the factor of the lower one, and equal degrees to a.
     every = list_indices(n, max(SERIES_DEGREE, degree))
     place = {m: k for k, m in enumerate(every)}
     starts = [len(list_indices(n, d - 1)) if d else 0 for d in range(max(SERIES_DEGREE, degree) + 2)]
@@ -487,6 +491,7 @@ def expand_waves(tape: Tape, n: int) -> list[Waves]:
         return Waves.constant(float(of), n) if name == "const" else int(of)
 
     def step(name: str, of: Sequence[Waves | int]) -> Waves | int:
+        # A leaf is a number or a joint; only sine and cosine take a joint.
         if name in ("sin", "cos"):
             if isinstance(joint := of[0], Waves):
                 raise CertifyError("the task uses a sine of more than the position of a joint")

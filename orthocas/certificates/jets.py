@@ -96,6 +96,7 @@ def build_power_weights(around: Around, order: int) -> Array:
     n, boxes = around.centre.shape
     weights = np.ones((1, 1, boxes))
     for k in range(1, order + 1):
+        # Each multi-index is one of the order before, times one more factor C + s D.
         before, last = _find_prefixes(n, k)
         grown = np.zeros((len(last), k + 1, boxes))
         grown[:, :-1] = weights[before] * around.middles[last][:, None]

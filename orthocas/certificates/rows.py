@@ -93,6 +93,7 @@ class ChartRows:
         if self.coordinates is not None:
             active = list(self.active)
             rows.append(self.coordinates([joints[i] for i in active], half_widths[active], self.active))
+        # All rows get the variables that they have together.
         variables = tuple(sorted({v for part in rows for v in part.variables}))
         rows = [part.extend(variables) for part in rows]
         return TaylorModel(
@@ -209,6 +210,7 @@ def build_joint_models(low: Array, high: Array, variables: Variables) -> tuple[l
     half = np.nextafter(np.maximum(high - centre, centre - low), np.inf) + TINY
     models = []
     for k in range(low.shape[1]):
+        # q_k = centre + half-width t.
         if k in variables:
             linear = np.stack([centre[:, k], half[:, k], *np.zeros((2, len(low)))])
             models.append(TaylorModel((k,), linear, np.zeros(len(low))))
@@ -248,6 +250,7 @@ class TipRows:
     @classmethod
     def build(cls, task: Task) -> "TipRows | None":
         """Of a task; None for tasks of other kinds or frames, and for a tip that does not move."""
+        # The task's recipe says what it compares.
         kind = task.recipe["kind"]
         if task.robot.tree.tip_parent < 0 or not task.of_tip:
             return None

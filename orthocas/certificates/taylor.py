@@ -91,6 +91,7 @@ def plan_product(left: Variables, right: Variables) -> Product:
     def of(one: Monomial, others: tuple[Monomial, ...]) -> Places:
         return _merge_places([index[tuple(sorted(one + other))] for other in others])
 
+    # Of b, linear and quadratic terms; of a, quadratic ones.
     a, b = list_monomials(left), list_monomials(right)
     starts = order_starts(len(left))
     middle = b[1 : order_starts(len(right))[3]]

@@ -180,6 +180,7 @@ def write_curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
     """
     q, domain = ca.MX.sym("q", chart.n), chart.problem.domain
     x, own = ca.MX.sym("x", chart.m), chart.coordinates.functions
+    # Errors and gradients of the task, xi with its gradient, and the condition of the domain.
     functions = [
         dense_function("curve_task", [q, x], curves.tracer.equations.call([q, x])),
         dense_function("curve_xi", [q], [chart.runnable(own["xi"])(q)]),

@@ -72,6 +72,7 @@ def export(chart: Chart | Impedance | PDPlus, to: str, path: str | Path, force: 
     if not isinstance(chart, TORQUE_LAWS):
         require_kind("chart", chart, Chart)
     require_known("library", to, LIBRARIES)
+    # A file of that name is replaced only if it was exported, unless forced.
     target = as_path("path", path)
     if target.suffix != ".py" or not target.stem.isidentifier() or target.stem in LIBRARIES:
         raise InvalidValueError("path", repr(str(target))[:200], f"a module NAME.py, other than {to}.py")
@@ -143,6 +144,7 @@ def _build_law(law: Impedance | PDPlus) -> Form:
     model, n, m = law.model, law.chart.n, law.chart.m
     if model.gains(law.problem, law.feed_forward):
         raise InvalidValueError("model of the law", ", ".join(model.gains(law.problem, law.feed_forward)), "its own")
+    # Numbers of the law as columns; joints that turn without end count their turns.
     bound, domain = law.problem.domain.reach, law.problem.domain
     stiffness = law.stiffness if law.damping_stiffness is None else law.damping_stiffness
     turn = np.zeros(law.problem.n)
@@ -156,6 +158,7 @@ def _build_law(law: Impedance | PDPlus) -> Form:
     }
     tables = {name: value[:, None] for name, value in columns.items()}
     tables["reach"] = np.array([domain.centre - bound, domain.centre + bound])[:, :, None]
+    # Choices that are words or scalars.
     values = {
         "formula": law.formula,
         "feed_forward": law.feed_forward,

@@ -219,6 +219,7 @@ def _describe_library(
     chart: Chart, controller: Controller | None, name: str, rows: bool, precision: Precision, kernels: Kernels
 ) -> dict[str, Any]:
     """Values of the templates about names, versions, number type and kernels; no law yet."""
+    # The law comes later, from `describe_law`.
     what = "chart" if controller is None else f"{controller.name} controller"
     problem, label = chart.problem, chart.coordinates.label
     title = f"{what} of {problem.name}: {label}, task {problem.task.name}, metric {problem.metric.name}"

@@ -110,6 +110,7 @@ def _write_product(rows: int, columns: int, count: int) -> str:
         f"  for (i=0; i<{count}; ++i, y+={columns}, z+={rows}) {{",
         "    const double* xk = x;",
     ]
+    # Blocks of four columns, then what is left.
     for start, stop, step in ((0, fours, 4), (fours, columns, 1)):
         if start < stop:
             terms = " + ".join(f"xk[j+{c * rows}]*y[k+{c}]" for c in range(step))
@@ -209,6 +210,7 @@ def _measure_slots(function: ca.Function) -> dict[int, int]:
     """Size of every slot of the work array, in numbers."""
     result: dict[int, int] = {}
     for k in range(function.n_instructions() if function.is_a("MXFunction") else 0):
+        # A call may have several outputs, each with a place of its own; places below 0 are not used.
         node = function.instruction_MX(k)
         places = [] if function.instruction_id(k) == ca.OP_OUTPUT else function.instruction_output(k)
         for index, place in enumerate(places):
@@ -221,6 +223,7 @@ def _measure_slots(function: ca.Function) -> dict[int, int]:
 
 def _write_body(function: ca.Function, block: str) -> str | None:
     """The body in C of a function of `orthocas.control.linear_algebra` that is faster than what CasADi writes."""
+    # Functions are known by their names.
     size = function.size1_in(0) if function.n_in() else 0
     if function.name() == LARGE_INVERSE:
         return render("algebra.c", {"what": "inverse", "size": size}).rstrip("\n")
@@ -313,6 +316,7 @@ def _find_calls(function: ca.Function, states: int) -> list[tuple[ca.Function, i
     given = function.mx_in()[:states]
 
     def collect(called: ca.Function, arguments: list[ca.MX]) -> None:
+        # Those of calls of q, in turn, may be shared as well.
         if _are_first(arguments, given):
             result.append((called, len(arguments)))
             result.extend(_find_calls(called, 1))

@@ -196,6 +196,7 @@ class Supervisor:
         require_kind("library", library, CompiledLibrary)
         require_controller(controller)
         self._n, self._k, self._library = library.n, len(controller.labels), library
+        # Functions of the state, and what else than pointers they take.
         self._functions = {
             name: library.function(name) for name in ("start", "take_over", "resume", "hold", "release", "step")
         }
@@ -206,6 +207,7 @@ class Supervisor:
         self._functions |= {"stream": stream, "pace": pace}
         if safety is not None:
             require_kind("safety", safety, Safety)
+        # Settings as a struct, those of the library unless others are given.
         values = (safety or Safety.of(controller)).in_c(controller.command)
         number = library.precision.c_type
         kinds = {name: ctypes.c_int if isinstance(value, int) else number for name, value in values.items()}
@@ -215,6 +217,7 @@ class Supervisor:
         if safety is not None:
             struct = settings(*(tuple(value) if isinstance(value, np.ndarray) else value for value in values.values()))
             self._safety = ctypes.pointer(struct)
+        # The state, with what the law remembers.
         memory = find_memory(controller)
         fields = {} if memory is None else {name: number * len(value) for name, value in memory.start.items()}
         self._state = _build_state(self._n, self._k, number, settings, _build_struct("Memory", fields))()
@@ -314,6 +317,7 @@ def _build_state(
     n: int, k: int, number: Any, settings: type[ctypes.Structure], memory: type[ctypes.Structure]
 ) -> type[ctypes.Structure]:
     """The struct `NAME_state` of templates/robot.h.jinja."""
+    # Fields in the order of the header; torque laws have a spring, a load and an observer.
     joints, quantities = number * n, number * k
     has_spring = any(field[0] == "brake_stiffness" for field in settings._fields_)
     counts = ("mode", "cause", "asked", "bad_ticks", "fresh", "stale_ticks", "same_ticks")

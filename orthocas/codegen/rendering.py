@@ -27,6 +27,7 @@ def render(template: str, values: Mapping[str, Any]) -> str:
 @cache
 def _environment() -> Environment:
     """Blocks vanish with their lines; `x | numbers` are literals of C, and `x | array` an initialiser."""
+    # Missing names are errors, and generated text is not HTML.
     environment = Environment(
         loader=PackageLoader("orthocas.codegen", "templates"),
         undefined=StrictUndefined,

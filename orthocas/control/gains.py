@@ -112,6 +112,7 @@ def _match_everywhere(chart: Chart, mobilities: Array, frequency: float, bound: 
     robot, corners = chart.problem.robot, np.empty((0, chart.n, chart.n))
     for _ in range(RULES.rounds):
         stiffness = _match(mobilities, frequency, bound, corners)
+        # The fastest mode that descents find with this stiffness.
         W = compute_mobility(chart, find_fastest_posture(chart, stiffness, robot)[None], robot)
         root = np.sqrt(stiffness)
         excess = float(np.linalg.eigvalsh(root[:, None] * W[0] * root)[-1]) / bound**2

@@ -25,6 +25,7 @@ def invert_spd(matrix: Expression) -> tuple[Any, Any]:
     NaN or infinite where the matrix is singular. SX are written out, by L D L^T; graphs (MX) have loops instead, whose
     code does not grow with k.
     """
+    # Graphs in loops, expressions written out.
     k = matrix.shape[0]
     if k == 1:
         return 1 / matrix, matrix

@@ -224,6 +224,7 @@ class _OperationalSpace(LawOfChart):
         Raises:
             ShapeError, InvalidValueError, UnknownNameError: as for the law itself, and for a delay beside a stiffness.
         """
+        # Words become the objects that they name.
         require_known("memory", memory, ("none", *MEMORIES))
         remembers = None if memory == "none" else MEMORIES[memory]()
         if stiffness is None:
@@ -279,6 +280,7 @@ class _OperationalSpace(LawOfChart):
                 "(inertia)"
             )
         result += _doubt_ratio(self.damping_ratio)
+        # Decoupled springs pull at both where gradients lean.
         if self.coupling == "decoupled":
             points = sample_uniform(self.problem.domain, RULES.samples, 0)
             sines = Judged.at(self.problem, self.chart.coordinates, points).leak_sines
@@ -288,6 +290,7 @@ class _OperationalSpace(LawOfChart):
                     f"the gradients of this chart lean into the task by {leak:.0f} deg (rms): decoupled springs pull "
                     "at both, which coupled ones do not; see docs/how-to/wide.md"
                 )
+        # Damping that feeds energy in.
         if share := self.check_damping().indefinite_share:
             where = f"in {percent(share, fault=True)} of the domain with these gains"
             result.append(f"the damping matrix (29) is indefinite {where}; the damping design double_diagonal never is")
@@ -356,6 +359,7 @@ class _OperationalSpace(LawOfChart):
         that of the problem's robot with the payload, also if the law is given another one.
         """
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
+        # Kinetic and spring energy, and the power of the damping.
         K = ca.diag(inputs["stiffness"])
         M = self.model.own_mass_matrix(self.problem.robot, inputs)
         e, de, J = self._compute_errors(inputs)

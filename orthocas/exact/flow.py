@@ -309,6 +309,7 @@ class BatchedFlow:
     @cached_property
     def _step(self) -> ca.Function:
         """One step: y, step size, p -> new y and its estimated error in units of the tolerance."""
+        # Slopes at the stages, each from those before, then the step and two estimates of its error.
         k = self.field.size1_in(0)
         y, step, p = ca.SX.sym("y", k), ca.SX.sym("step"), ca.SX.sym("p", self.field.size1_in(1))
         method, slopes = scipy.integrate.DOP853, list[Any]()

@@ -223,12 +223,14 @@ class TaskBrackets:
         along e_a is that of G along e_a, times column b of R^-1. In these terms P v is (I - O O^T) U v.
         """
         q, m = ca.SX.sym("q", problem.n), problem.m
+        # Gradients G = A^-1 J^T and an orthonormal basis of their span, through U^-T J^T = O R.
         J = problem.task.jacobian_function(q)
         U = ca.chol(ca.sparsify(problem.metric.function(q)))
         raised = ca.solve(U.T, J.T)
         gradients = ca.solve(U, raised)
         unit, R = ca.qr(raised)
         basis, weights = ca.solve(U, unit), ca.inv(R)
+        # Derivatives of the fields along each other, their brackets, and the parts across the span.
         along = [U @ ca.jtimes(gradients, q, basis[:, a]) @ weights for a in range(m)]
         brackets = [along[a][:, b] - along[b][:, a] for a in range(m) for b in range(m)]
         across = ca.horzcat(*[v - unit @ (unit.T @ v) for v in brackets])

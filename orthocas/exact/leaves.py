@@ -105,6 +105,7 @@ class DiskLeaf:
     periodic = True
 
     def __post_init__(self) -> None:
+        # Arrays may come from a file: shapes, indices, and points that lie on disk and leaf.
         count = len(self.vertices)
         shapes: dict[str, tuple[int | None, ...]] = {
             "level": (1,),
