@@ -57,11 +57,9 @@ class BoxCheck(Protocol):
     @property
     def joints(self) -> Variables:
         """The joints on which the result depends: halving others is of no use."""
-        ...
 
     def __call__(self, low: Array, high: Array) -> BoxResults:
         """Evaluate boxes between corners (boxes, n)."""
-        ...
 
 
 class RegularCheck(BoxCheck, Protocol):
@@ -70,7 +68,6 @@ class RegularCheck(BoxCheck, Protocol):
     @property
     def method(self) -> str:
         """Name of the method in certificates."""
-        ...
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -174,8 +171,7 @@ def lower_bound(model: TaylorModel) -> Array:
     least = np.minimum(least, 0)
     rest = np.abs(model.coefficients[1 + len(squares) :]).sum(axis=0) - np.abs(square).sum(axis=0)
     rounding = sum_error(4 * len(model.coefficients)) * np.abs(model.coefficients).sum(axis=0)
-    bound: Array = model.centre + least.sum(axis=0) - rest - model.remainder * UP - rounding
-    return bound
+    return np.asarray(model.centre + least.sum(axis=0) - rest - model.remainder * UP - rounding)
 
 
 def bound_conditioning(J: TaylorModel, m: int) -> Array:
@@ -244,8 +240,7 @@ def compute_influences(turned: TaylorModel) -> Array:
     """How much halving each variable narrows the matrix, relative to its singular values, (boxes, variables)."""
     # The diagonal holds the singular values of the centre.
     middle = np.sqrt(np.abs(np.stack([turned.centre[k, k] for k in range(len(turned.remainder))])) + 1e-300)
-    gains: Array = (turned.compute_gains() / (middle[:, None] * middle[None])).sum(axis=(1, 2)).T
-    return gains
+    return np.asarray((turned.compute_gains() / (middle[:, None] * middle[None])).sum(axis=(1, 2)).T)
 
 
 def find_most_influential(influences: Array, joints: Variables) -> Array:

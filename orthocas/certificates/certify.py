@@ -328,8 +328,7 @@ def _sample_suspects(chart: Chart) -> Array:
     J_x = chart.problem.task.batched_jacobian(points)[0].reshape(-1, chart.m, chart.n)
     volumes = np.linalg.det(np.nan_to_num(np.concatenate([J_x, chart.coordinates.jacobian(points)], axis=1)))
     worst = int(np.argmin(volumes * np.sign(volumes[0])))
-    suspects: Array = points[[0, worst]]
-    return suspects
+    return np.asarray(points[[0, worst]])
 
 
 def _find_one_to_one_box(

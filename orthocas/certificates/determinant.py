@@ -354,8 +354,7 @@ def bound_polynomial(coefficients: Array, n: int) -> Array:
     sizes = np.abs(coefficients).sum(axis=0)
     higher = np.abs(coefficients[kept:]).sum(axis=0)
     rounding = sum_error(8 * n * (degree + 1) + len(coefficients)) * sizes
-    least: Array = form.min(axis=0) - (higher + rounding) * UP - TINY
-    return least
+    return np.asarray(form.min(axis=0) - (higher + rounding) * UP - TINY)
 
 
 def compute_gains(coefficients: Array, rest: Array, n: int) -> Array:
@@ -459,8 +458,7 @@ class Waves:
 
     def __call__(self, q: Array) -> Array:
         """Values at points (N, n), rounded, (N,)."""
-        values: Array = (np.exp(1j * (q @ self.frequencies.T)) @ self.coefficients).real
-        return values
+        return np.asarray((np.exp(1j * (q @ self.frequencies.T)) @ self.coefficients).real)
 
 
 def _pair_frequencies(joint: int, n: int) -> NDArray[np.int64]:

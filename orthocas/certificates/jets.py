@@ -47,8 +47,7 @@ class Around:
     @property
     def reach(self) -> Array:
         """How far a point c + t + s d is from c at most, (n, boxes)."""
-        reach: Array = (self.middles + self.differences) * UP
-        return reach
+        return np.asarray((self.middles + self.differences) * UP)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,21 +101,18 @@ def build_power_weights(around: Around, order: int) -> Array:
         grown[:, :-1] = weights[before] * around.middles[last][:, None]
         grown[:, 1:] += weights[before] * around.differences[last][:, None]
         weights = grown
-    scaled: Array = weights / _compute_factorials(n, order)[:, None, None]
-    return scaled
+    return np.asarray(weights / _compute_factorials(n, order)[:, None, None])
 
 
 def average_even(weights: Array) -> Array:
     """The average over s in [-1, 1] of polynomials (terms, powers, boxes)."""
     powers_ = np.arange(weights.shape[1])
-    average: Array = np.einsum("tkb,k->tb", weights, np.where(powers_ % 2, 0.0, 1 / (powers_ + 1)))
-    return average
+    return np.asarray(np.einsum("tkb,k->tb", weights, np.where(powers_ % 2, 0.0, 1 / (powers_ + 1))))
 
 
 def average_largest(weights: Array) -> Array:
     """The average over s in [-1, 1] of polynomials (terms, powers, boxes) in |s|."""
-    average: Array = np.einsum("tkb,k->tb", weights, 1 / (np.arange(weights.shape[1]) + 1))
-    return average
+    return np.asarray(np.einsum("tkb,k->tb", weights, 1 / (np.arange(weights.shape[1]) + 1)))
 
 
 @cache
@@ -152,5 +148,4 @@ def compute_powers(widths: Array, order: int) -> Array:
     for k in range(1, order + 1):
         before, last = _find_prefixes(n, k)
         powers = powers[before] * widths[last]
-    scaled: Array = powers / _compute_factorials(n, order)[:, None]
-    return scaled
+    return np.asarray(powers / _compute_factorials(n, order)[:, None])

@@ -396,5 +396,4 @@ def _bound_rest(around: Around, lengths: Array) -> Array:
     # Of the joint itself and those after it, then of those before.
     later = np.cumsum(steps[::-1], axis=0)[::-1]
     before = upto - np.diff(upto, axis=0, prepend=0.0)
-    rest: Array = (later + before * lengths[:, None]) * UP
-    return rest
+    return np.asarray((later + before * lengths[:, None]) * UP)

@@ -240,8 +240,7 @@ def measure_distances(base: Subdivision, low: Array, high: Array) -> Array:
 
 def _measure_volumes(base: Subdivision, low: Array, high: Array) -> Array:
     # As fractions of the whole.
-    shares: Array = ((high - low) / (base.high - base.low)).prod(axis=1)
-    return shares
+    return np.asarray(((high - low) / (base.high - base.low)).prod(axis=1))
 
 
 def _stack_corners(batch: list[tuple[float, int, Array, Array]]) -> tuple[Array, Array]:

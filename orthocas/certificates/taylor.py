@@ -128,8 +128,7 @@ class TaylorModel:
     @property
     def centre(self) -> Array:
         """The constant coefficients, (..., boxes)."""
-        value: Array = self.coefficients[0]
-        return value
+        return np.asarray(self.coefficients[0])
 
     def sum_sizes(self) -> Array:
         """Sums of the absolute coefficients of each degree, (4, ..., boxes)."""
@@ -137,13 +136,11 @@ class TaylorModel:
         size = np.abs(self.coefficients)
         if not self.variables:
             return np.concatenate([size, np.zeros((3, *size.shape[1:]))])
-        sums: Array = np.add.reduceat(size, starts, axis=0)
-        return sums
+        return np.asarray(np.add.reduceat(size, starts, axis=0))
 
     def bound_magnitude(self) -> Array:
         """A bound of the absolute values, (..., boxes)."""
-        bound: Array = (np.abs(self.coefficients).sum(axis=0) + self.remainder) * UP
-        return bound
+        return np.asarray((np.abs(self.coefficients).sum(axis=0) + self.remainder) * UP)
 
     def __getitem__(self, part: object) -> "TaylorModel":
         index = part if isinstance(part, tuple) else (part,)
@@ -212,8 +209,7 @@ class TaylorModel:
         all_a, all_b = a.sum(axis=0), b.sum(axis=0)
         high = a[3] * (b[1] + b[2] + b[3]) + a[2] * (b[2] + b[3]) + a[1] * b[3]
         carried = self.remainder * (all_b + other.remainder) + other.remainder * all_a
-        bound: Array = (high + carried + sum_error(_PRODUCTS) * (all_a * all_b)) * UP + TINY
-        return bound
+        return np.asarray((high + carried + sum_error(_PRODUCTS) * (all_a * all_b)) * UP + TINY)
 
     def compose(self, series: "Series") -> "TaylorModel":
         """The model of f(self), for the series of f about the centre."""
@@ -231,8 +227,7 @@ class TaylorModel:
 
     def bound_deviation(self) -> Array:
         """A bound of the distance from the centre, (..., boxes)."""
-        bound: Array = (np.abs(self.coefficients[1:]).sum(axis=0) + self.remainder) * UP
-        return bound
+        return np.asarray((np.abs(self.coefficients[1:]).sum(axis=0) + self.remainder) * UP)
 
     def compute_gains(self) -> Array:
         """How much halving the interval of each variable takes from the bound of the values, (variables, ..., boxes).

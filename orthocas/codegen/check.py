@@ -294,8 +294,7 @@ def _estimate_amplification(precision: Precision, controller: Controller, law: B
 
 def _are_numbers(largest: float, *arrays: Array) -> NDArray[np.bool_]:
     """Rows without NaN, infinities and numbers that the C code rejects."""
-    finite: NDArray[np.bool_] = np.all([(np.abs(array) <= largest).all(axis=1) for array in arrays], axis=0)
-    return finite
+    return np.asarray(np.all([(np.abs(array) <= largest).all(axis=1) for array in arrays], axis=0))
 
 
 def _blank(good: NDArray[np.bool_], values: Array) -> Array:

@@ -96,20 +96,13 @@ class CompiledLibrary:
 
     def inverse(self, phi: Array, q_start: Array, *, max_iterations: int = 100) -> tuple[Array, int]:
         """q (n,), status; after at most so many evaluations of phi."""
-        q, arrays = self._zeros(self.n), [self.numbers(array) for array in (phi, q_start)]
-        for name, array in zip(("phi", "q_start"), arrays, strict=True):
-            require_shape(name, array.shape, (self.n,))
-        places = [array.ctypes.data_as(_POINTER) for array in (*arrays, q)]
-        return q, int(self.function("inverse")(*places[:2], int(max_iterations), places[2]))
+        q = self._zeros(self.n)
+        return q, self._call("inverse", [phi, q_start], [q], int(max_iterations))
 
     def nearest(self, phi: Array, q_start: Array, largest_step: float) -> tuple[Array, int]:
         """q (n,), status."""
-        run, q = self.function("nearest"), self._zeros(self.n)
-        run.argtypes, run.restype = [_POINTER, _POINTER, self.precision.c_type, _POINTER], ctypes.c_int
-        arrays = [self.numbers(array) for array in (phi, q_start)]
-        for name, array in zip(("phi", "q_start"), arrays, strict=True):
-            require_shape(name, array.shape, (self.n,))
-        return q, int(run(*(array.ctypes.data for array in arrays), largest_step, q.ctypes.data))
+        q = self._zeros(self.n)
+        return q, self._call("nearest", [phi, q_start], [q], self.precision.c_type(largest_step))
 
     def dynamics(self, q: Array, dq: Array) -> tuple[Array, Array, Array, int]:
         """M (n, n), bias (n,), gravity (n,), status."""
@@ -169,13 +162,14 @@ class CompiledLibrary:
     def _c(self) -> ctypes.CDLL:
         return ctypes.CDLL(str(self.path))
 
-    def _call(self, function: str, inputs: list[Array], outputs: list[Array]) -> int:
-        run = getattr(self._c, f"{self.name}_{function}")
-        arrays = [self.numbers(array) for array in inputs] + outputs
-        # C would read beyond the end of a short q or dq.
-        for array in arrays[: len(inputs)][:2]:
+    def _call(self, function: str, inputs: list[Array], outputs: list[Array], *numbers: Any) -> int:
+        """Call a function with arrays, then numbers, then the arrays that take its results; its status."""
+        arrays = [self.numbers(array) for array in inputs]
+        # C would read beyond the end of a short array; the first two have a number for each joint.
+        for array in arrays[:2]:
             require_shape(f"an argument of {function}", array.shape[:1], (self.n,))
-        return int(run(*(array.ctypes.data_as(ctypes.c_void_p) for array in arrays)))
+        places, results = ([array.ctypes.data_as(_POINTER) for array in some] for some in (arrays, outputs))
+        return int(self.function(function)(*places, *numbers, *results))
 
 
 def gain_numbers(controller: Controller) -> Array:

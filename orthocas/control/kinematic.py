@@ -20,18 +20,12 @@ from orthocas.control.controller import (
     guarded_graph,
     named_inputs,
 )
-from orthocas.control.gains import (
-    FEEDBACK,
-    LIMIT,
-    RULES,
-    command_limit,
-    non_negative_gains,
-)
+from orthocas.control.gains import FEEDBACK, LIMIT, RULES, command_limit, non_negative_gains
 from orthocas.control.linear_algebra import build_block_inertia, compute_median_volume
-from orthocas.errors import InvalidValueError, ShapeError
+from orthocas.errors import InvalidValueError
 from orthocas.robots.tree import require_driven
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, require_at_least, require_kind
+from orthocas.tools.checks import Array, as_float_array, require_at_least, require_kind, require_shape
 from orthocas.tools.display import Shown, listed, number_list
 from orthocas.tools.expressions import wrap_shortest
 
@@ -161,8 +155,7 @@ class XiTask(Shown):
         self.cost = non_negative_gains("cost", cost, chart.r)
         self.gain, self.lm_damping = float(gain), float(lm_damping)
         self.joints = chart.problem.robot.joint_names if joints is None else tuple(joints)
-        if len(self.joints) != chart.n:
-            raise ShapeError("joints", (len(self.joints),), (chart.n,))
+        require_shape("joints", (len(self.joints),), (chart.n,))
         self.target_xi: Array | None = None
         # Turns of joints that turn without end count from the last position.
         self._last: Array | None = None
@@ -178,8 +171,7 @@ class XiTask(Shown):
     def set_target(self, xi: ArrayLike) -> None:
         """Wanted coordinates xi_d, (r,)."""
         target = as_float_array("xi", xi)
-        if target.shape != (self.chart.r,):
-            raise ShapeError("xi", target.shape, (self.chart.r,))
+        require_shape("xi", target.shape, (self.chart.r,))
         self.target_xi = target.copy()
 
     def set_target_from_configuration(self, configuration: Any) -> None:

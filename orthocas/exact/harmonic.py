@@ -36,8 +36,6 @@ class SurfaceRules:
 RULES = SurfaceRules()
 
 
-__all__ = ["TriangleMesh", "build_level_surface", "require_disk"]
-
 Mask = NDArray[np.bool_]
 Function = Callable[[Array], Array]  #: (N, 3) -> (N,), or (N, 3) for a gradient
 
@@ -273,5 +271,4 @@ def solve_dirichlet(mesh: TriangleMesh, fixed: Indices, values: Array) -> Array:
 def compute_signed_areas(points: Array, faces: Indices) -> Array:
     """Signed areas of triangles in the plane, (F,), positive if counterclockwise."""
     a, b = points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]]
-    areas: Array = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
-    return areas
+    return np.asarray((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2)

@@ -162,8 +162,7 @@ def _compute_squared_turns(T: Array, basis: Array, half_width: Array) -> Array:
     k, V = np.linalg.eigh(basis.transpose(0, 2, 1) @ (3 / half_width[:, None] ** 2 * basis))
     turned = V.transpose(0, 2, 1)[:, None] @ T @ V[:, None]
     squared = (turned**2).sum(axis=1) / (k[:, :, None] + k[:, None, :])
-    total: Array = squared.sum(axis=(1, 2)) / 2
-    return total
+    return np.asarray(squared.sum(axis=(1, 2)) / 2)
 
 
 def lie_bracket(f: ca.SX, g: ca.SX, q: ca.SX) -> ca.SX:

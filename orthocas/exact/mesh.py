@@ -62,14 +62,12 @@ class TriangleMesh:
         # Without triangles, libigl would run out of memory.
         if not len(self.faces):
             return np.empty((0, 2), dtype=np.int64)
-        edges: Indices = igl.edges(self.faces)
-        return edges
+        return np.asarray(igl.edges(self.faces))
 
     @cached_property
     def boundary_edges(self) -> Indices:
         """Edges with a single triangle, directed as in that triangle, (B, 2)."""
-        edges: Indices = igl.boundary_facets(self.faces)[0]
-        return edges
+        return np.asarray(igl.boundary_facets(self.faces)[0])
 
     @cached_property
     def clashing_edges(self) -> int:
@@ -218,8 +216,7 @@ def _compute_barycentric(points: Array, triangles: Array) -> Array:
     # Of the triangles opposite corners 0, 1, 2.
     parts = np.cross(np.roll(to_corners, -1, axis=1), np.roll(to_corners, -2, axis=1))
     weights = np.maximum(np.einsum("ncd,nd->nc", parts, normals), 0.0)
-    result: Array = weights / weights.sum(axis=1, keepdims=True)
-    return result
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
 
 def _compute_normals(triangles: Array) -> Array:
@@ -229,8 +226,7 @@ def _compute_normals(triangles: Array) -> Array:
 
 def compute_cotangents(vertices: Array, faces: Indices) -> Array:
     """Cotangents of the corner angles, (F, 3); not finite for triangles without area."""
-    cot: Array = 2 * igl.cotmatrix_entries(vertices, faces)
-    return cot
+    return np.asarray(2 * igl.cotmatrix_entries(vertices, faces))
 
 
 def flip_to_delaunay(vertices: Array, faces: Indices) -> Indices:
@@ -271,8 +267,7 @@ def compute_smoothing_steps(points: Array, faces: Indices) -> Array:
     """Smoothing steps (V, 3) from each vertex to the mean of its neighbours; every vertex must be in a triangle."""
     neighbours = igl.adjacency_matrix(faces)
     mean = (neighbours @ points) / np.diff(neighbours.indptr)[:, None]
-    steps: Array = mean - points
-    return steps
+    return np.asarray(mean - points)
 
 
 def _flip(vertices: Array, faces: Indices, keys: Indices, first: Indices, second: Indices) -> bool:
@@ -299,8 +294,7 @@ def _is_allowed(vertices: Array, quads: Indices, keys: Indices) -> NDArray[np.bo
     one, other = np.cross(s - p, r - p), np.cross(q - s, r - s)
     normal = np.cross(q - p, r - p) + np.cross(p - q, s - q)
     ahead = (np.einsum("nd,nd->n", one, normal) > 0) & (np.einsum("nd,nd->n", other, normal) > 0)
-    result: NDArray[np.bool_] = (keys[place] != new) & ahead
-    return result
+    return np.asarray((keys[place] != new) & ahead)
 
 
 def _select_independent(quads: Indices, face: Indices, other: Indices, count: int) -> NDArray[np.bool_]:
@@ -310,5 +304,4 @@ def _select_independent(quads: Indices, face: Indices, other: Indices, count: in
     _, at_face = np.unique(np.stack([face, other], axis=1), return_index=True)
     wins = np.bincount(at_face // 2, minlength=len(face)) == 2
     new_edge = np.unique(number_edges(quads[:, 2], quads[:, 3], count), return_index=True)[1]
-    result: NDArray[np.bool_] = wins & np.isin(number, new_edge)
-    return result
+    return np.asarray(wins & np.isin(number, new_edge))
