@@ -12,8 +12,7 @@ import numpy as np
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
-from orthocas.codegen.export_forms import Form, build_form, write_function
-from orthocas.codegen.export_inverse import build_inverse_forms, write_statuses
+from orthocas.codegen.export_forms import Form, build_form, build_inverse_forms, write_function, write_statuses
 from orthocas.codegen.rendering import is_generated, render
 from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, ControlStatus
 from orthocas.control.linear_algebra import ROUNDS, SOFTEST

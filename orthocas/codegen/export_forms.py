@@ -1,4 +1,8 @@
-"""Coordinates as lines of NumPy, PyTorch or JAX: tables of products, networks, or tapes."""
+"""What exported modules consist of, as lines of NumPy, PyTorch or JAX.
+
+Coordinates are tables of products, networks, or tapes. The inverse has errors of phi, how fast phi moves, and numbers
+that are positive where solutions count as found.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,9 +16,19 @@ from orthocas.bases.mlp import MLPFamily
 from orthocas.bases.products import ProductFamily, Term, split, with_parts
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
+from orthocas.charts.inverse import InverseStatus
+from orthocas.tasks.domains import Domain, FoldBound
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import ARITHMETIC, Tape, write_tape
+
+#: those of `InverseStatus` in modules
+STATUSES = ("FOUND", "NEAREST", "OUTSIDE_DOMAIN", "LIMIT", "NOT_FOUND", "BAD_INPUT")
+# Of the half-widths: rounding at boundaries and joint limits.
+_SLACK = 1e-9
+# Gradients that differ by less at so many points count as the same.
+_PARALLEL, _POINTS = 1e-12, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +186,103 @@ def _build_network(coordinates: Coordinates) -> Form | None:
         tables |= {f"W_{k}": W, f"b_{k}": b}
     plain = {name: [int(k) for k in of] for name, of in indices.items()}
     return Form("coordinates", {"kind": "network", "depth": depth}, "", tables, plain)
+
+
+def write_statuses() -> str:
+    """Their numbers, as Python."""
+    return ", ".join(str(int(InverseStatus[name])) for name in STATUSES)
+
+
+def build_inverse_forms(chart: Chart) -> list[Form]:
+    """The functions `_inverse` of columns phi and q_start (2 n, N), and `_nearest` of columns q_wish and x (n + m, N).
+
+    And what they call beside the functions of phi.
+    """
+    domain, rooms = chart.problem.domain, _count_rooms(chart.problem.domain)
+    nearest = {
+        "range": np.array(domain.bounds)[:, :, None],
+        "half_width": domain.half_width[:, None],
+        "identity": np.eye(chart.n + rooms),
+    }
+    return [_build_newton(chart), *_build_rooms(chart), Form("nearest", {"rooms": rooms}, "", nearest, {})]
+
+
+def _build_newton(chart: Chart) -> Form:
+    """Newton's method, with errors and rates as `chart.solve` has them."""
+    problem, n = chart.problem, chart.n
+    domain, robot = problem.domain, problem.robot
+    slack = _SLACK * domain.half_width
+    low, high = domain.bounds
+    bounds = np.array([low - slack, high + slack, robot.lower - slack, robot.upper + slack])
+    target, value = ca.SX.sym("target", n), ca.SX.sym("value", n)
+    difference = chart.parts.phi_map.difference(target, value)
+    functions = [
+        write_function(
+            "_difference",
+            "Targets less values of phi by the shorter way around, (n, N), of both in columns (2 n, N).",
+            dense_function("f", [ca.vertcat(target, value)], [difference]),
+        )
+    ]
+    # A whole orientation moves with the angular velocity, not with the derivative of its components.
+    rates = "_task_and_slopes"
+    if chart.parts.relative.turned:
+        summary = "Task values, then how fast they move, angular velocities in the tip's axes, (m + m n, N)."
+        rates = "_task_and_rates"
+        functions.append(write_function(rates, summary, problem.task.function, chart.parts.relative.rates))
+    tables = {"centre": domain.centre[:, None], "sizes": chart.phi_sizes[:, None], "bounds": bounds[:, :, None]}
+    return Form("inverse", {"rates": rates}, "\n\n".join(functions), tables, {})
+
+
+def _count_rooms(domain: Domain) -> int:
+    """How many numbers are positive inside a domain, beside the bounds of joints."""
+    if domain.singular_bound is not None:
+        return 1 if domain.fold_bound is None else 2
+    if domain.path_bound is not None:
+        return 1
+    return 0 if domain.condition is None else int(domain.condition.pivots.size1_out(0))
+
+
+def _build_rooms(chart: Chart) -> list[Form]:
+    """The function `_room` of columns q (n, N) -> (rooms, N), for what a domain asks beside its box."""
+    domain = chart.problem.domain
+    if (bound := domain.singular_bound) is not None:
+        fold = domain.fold_bound
+        summary = "Rows that must not be singular, one by one, (m n, N)."
+        rows = write_function("_frame_rows", summary, bound.jacobian_function)
+        values = {"kind": "clear", "squared_bound": bound.least_singular_value**2, "folds": fold is not None}
+        tables = {"row_scale": bound.scale[:, None], "unit": np.eye(chart.m)}
+        return [Form("room", values, rows, tables, {}), *([] if fold is None else [_build_room_to_fold(chart, fold)])]
+    if (path := domain.path_bound) is not None:
+        starts, axes, squares = path.lines
+        tables = {
+            "path_radius": path.radius[path.counted][:, None],
+            "path_starts": starts[:, :, None],
+            "path_axes": axes[:, :, None],
+            "path_lengths": np.sqrt(squares)[:, None],
+        }
+        return [Form("room", {"kind": "path"}, "", tables, {"path_joints": path.counted.tolist()})]
+    if domain.condition is None:
+        return [Form("room", {"kind": "box"}, "", {}, {})]
+    summary = "Numbers (k, N) that are positive at columns q that meet the condition of the domain."
+    return [Form("room", {"kind": "condition"}, write_function("_pivots", summary, domain.condition.pivots), {}, {})]
+
+
+def _build_room_to_fold(chart: Chart, fold: FoldBound) -> Form:
+    """The volume of the domain's coordinates, by the gradients of the chart where these are the same."""
+    # Gradients may differ by positive factors.
+    points = sample_uniform(chart.problem.domain, _POINTS, 0)
+    theirs = np.array([np.array(fold.gradients(q)) for q in points])
+    own = chart.coordinates.jacobian(points)
+    units = [rows / np.linalg.norm(rows, axis=2, keepdims=True) for rows in (theirs, own)]
+    same = bool(np.abs(units[0] - units[1]).max() < _PARALLEL)
+    values = {
+        "kind": "fold",
+        "least_volume": fold.least_volume,
+        "orientation": fold.orientation,
+        "own_gradients": not same,
+    }
+    summary = "Gradients of the domain's coordinates, (r n, N)."
+    return Form("room", values, "" if same else write_function("_own_gradients", summary, fold.gradients), {}, {})
 
 
 def write_function(name: str, summary: str, *functions: ca.Function) -> str:
