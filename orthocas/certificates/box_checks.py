@@ -239,8 +239,8 @@ def have_positive_pivots(pivots: list[TaylorModel]) -> NDArray[np.bool_]:
 def compute_influences(turned: TaylorModel) -> Array:
     """How much halving each variable narrows the matrix, relative to its singular values, (boxes, variables)."""
     # The diagonal holds the singular values of the centre.
-    middle = np.sqrt(np.abs(np.stack([turned.centre[k, k] for k in range(len(turned.remainder))])) + 1e-300)
-    return np.asarray((turned.compute_gains() / (middle[:, None] * middle[None])).sum(axis=(1, 2)).T)
+    diagonal = np.sqrt(np.abs(np.stack([turned.centre[k, k] for k in range(len(turned.remainder))])) + 1e-300)
+    return np.asarray((turned.compute_gains() / (diagonal[:, None] * diagonal[None])).sum(axis=(1, 2)).T)
 
 
 def find_most_influential(influences: Array, joints: Variables) -> Array:

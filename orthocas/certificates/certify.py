@@ -345,15 +345,16 @@ def _find_one_to_one_box(
     if check is None:
         return None
 
-    def proved(share: Array, most: int) -> bool:
+    def proved(fraction: Array, most: int) -> bool:
         nonlocal best
         # A box about the same centre, with so much of the width of each joint.
-        centre, whole = (base.low + base.high) / 2, share == 1
-        low, high = np.where(whole, base.low, centre - share * half), np.where(whole, base.high, centre + share * half)
+        centre, whole = (base.low + base.high) / 2, fraction == 1
+        reach = fraction * half
+        low, high = np.where(whole, base.low, centre - reach), np.where(whole, base.high, centre + reach)
         part = Subdivision.whole(low, high)
-        middle, own = (part.low + part.high)[None] / 2, replace(check, low=part.low, high=part.high)
+        point, own = (part.low + part.high)[None] / 2, replace(check, low=part.low, high=part.high)
         # At the centre of the box, the two points may be farthest apart.
-        if not own(middle, middle).proved.all():
+        if not own(point, point).proved.all():
             return False
         left = Limits(max(end - time.monotonic(), 0.0), boxes=most, hopeless=most // 4)
         search = Search(own, part, left, rank_by_volume(part), executor)
@@ -368,28 +369,28 @@ def _find_one_to_one_box(
     idle = ~np.isin(joints, rows.active)
     held, half = np.isin(joints, check.still_joints), (base.high - base.low) / 2
     for range_ in (np.inf, RULES.held_range) if held.any() else (np.inf,):
-        share = np.where(idle, 1.0, np.minimum(1.0, range_ / half))
-        _try_scales([np.where(idle | held, share, scale) for scale in scales], proved, limits.boxes)
+        fraction = np.where(idle, 1.0, np.minimum(1.0, range_ / half))
+        _try_scales([np.where(idle | held, fraction, scale) for scale in scales], proved, limits.boxes)
         if best is not None:
             break
     return best
 
 
-def _try_scales(shares: Sequence[Array], proved: Callable[[Array, int], bool], most: int) -> None:
+def _try_scales(boxes: Sequence[Array], proved: Callable[[Array, int], bool], most: int) -> None:
     """Ask for proofs of boxes of increasing size: the largest one, then by bisection with few boxes, then with many."""
-    if proved(shares[-1], RULES.few_boxes):
+    if proved(boxes[-1], RULES.few_boxes):
         return
     # Those before `low` are proved, those from `high` on are not with few boxes.
-    low, high = 0, len(shares) - 1
+    low, high = 0, len(boxes) - 1
     while low < high:
-        middle = (low + high) // 2
-        low, high = (middle + 1, high) if proved(shares[middle], RULES.few_boxes) else (low, middle)
+        half_way = (low + high) // 2
+        low, high = (half_way + 1, high) if proved(boxes[half_way], RULES.few_boxes) else (low, half_way)
     if low == 0:
         return
-    while low + 1 < len(shares) and proved(shares[low + 1], most):
+    while low + 1 < len(boxes) and proved(boxes[low + 1], most):
         low += 2
-    if low < len(shares):
-        proved(shares[low], most)
+    if low < len(boxes):
+        proved(boxes[low], most)
 
 
 def _build_certificate(
@@ -438,7 +439,7 @@ def _estimate_proved_fraction(domain: Domain, parts: Subdivision) -> float:
         return 1.0
     rng, volumes = np.random.default_rng(0), (high - low).prod(axis=1)
 
-    # The share of positions between corners whose relative singular value is above the bound.
+    # The fraction of positions between corners whose relative singular value is above the bound.
     def measure_clear(low: Array, high: Array) -> float:
         values = bound.singular_values(rng.uniform(low, high, (RULES.samples, parts.n)))
         return float(np.mean(values > bound.least_singular_value))
@@ -459,12 +460,12 @@ def _report_search(monitor: Monitor, stage: str, *, guarded: bool = False) -> Lo
 
     def show(search: Search) -> None:
         # Never all, as long as a box is open.
-        limits, share = search.limits, search.proved_volume
+        limits, proved = search.limits, search.proved_volume
         if search.open_count:
-            share = min(share, 1 - 2**-53)
+            proved = min(proved, 1 - 2**-53)
         spent = max(search.evaluated / limits.boxes, (time.monotonic() - start) / max(limits.seconds, 1e-9))
-        done = 1.0 if not search.open_count else min(1.0, spent if guarded else max(share, spent))
-        detail = f"{search.evaluated:,} boxes, {search.open_count:,} open, {percent(share, 2)} proved"
+        done = 1.0 if not search.open_count else min(1.0, spent if guarded else max(proved, spent))
+        detail = f"{search.evaluated:,} boxes, {search.open_count:,} open, {percent(proved, 2)} proved"
         monitor(Progress(stage, done, detail))
 
     return show

@@ -137,9 +137,9 @@ class Determinant:
         """The expansion on boxes between corners (boxes, n)."""
         # Both factors about the centres of the boxes, then their products.
         chosen = list(self.joints)
-        middle = ((low + high) / 2)[:, chosen].T
-        half = np.nextafter(np.maximum(high[:, chosen].T - middle, middle - low[:, chosen].T), np.inf) + TINY
-        (A, rest_a), (B, rest_b) = self.slopes(middle, half), self.cofactors(middle, half)
+        centre = ((low + high) / 2)[:, chosen].T
+        half = np.nextafter(np.maximum(high[:, chosen].T - centre, centre - low[:, chosen].T), np.inf) + TINY
+        (A, rest_a), (B, rest_b) = self.slopes(centre, half), self.cofactors(centre, half)
         # What each factor leaves out is multiplied by the sizes of the other.
         products, rest = _multiply_expansions(A, B[:-1], self.slopes.degree, len(chosen))
         total_a, total_b = (np.abs(part).sum(axis=1) for part in (A, B[:-1]))

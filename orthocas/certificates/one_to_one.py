@@ -182,9 +182,9 @@ class OneToOneCheck:
         D = around.differences.copy()
         for rows in (projected, np.broadcast_to(np.eye(r), (len(centre), r, r))):
             # Upper and lower bounds of the sizes of rows @ J for |J - centre| <= doubt, (boxes, rows, columns).
-            middle = np.abs(rows @ centre)
+            size_at_centre = np.abs(rows @ centre)
             error = (np.abs(rows) @ (doubt + sum_error(rows.shape[2]) * np.abs(centre))) * UP
-            sizes, least = (middle + error) * UP, (middle - error) / UP
+            sizes, least = (size_at_centre + error) * UP, (size_at_centre - error) / UP
             for row in range(sizes.shape[1]):
                 # |w J_k| D_k is at most the sum over the other columns.
                 for k in self.still:

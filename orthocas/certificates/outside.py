@@ -73,21 +73,21 @@ def choose_check(chart: Chart, rows: ChartRows, bound: float, method: str | None
     domain = chart.problem.domain
     domain.require_bounds("proof")
     require_all_positions(chart, rows.variables)
-    check, near, clear = choose_inside_check(chart, rows, bound, method), domain.path_bound, domain.singular_bound
-    if near is not None:
+    check, path, singular = choose_inside_check(chart, rows, bound, method), domain.path_bound, domain.singular_bound
+    if path is not None:
         # After a turn of an unbounded joint that counts, what is far from the path may be near it.
-        for joint in {*near.unbounded} & {*near.counted.tolist()}:
+        for joint in {*path.unbounded} & {*path.counted.tolist()}:
             name = chart.problem.robot.joint_names[joint]
             raise CertifyError(f"joint '{name}' is unbounded and counts in the corridor, expected an infinite radius")
-        start = near.postures[near.contains(near.postures)][:1]
-        return CorridorCheck(check, near, float(check(start, start).sign[0]))
-    if clear is None:
+        start = path.postures[path.contains(path.postures)][:1]
+        return CorridorCheck(check, path, float(check(start, start).sign[0]))
+    if singular is None:
         return check
-    own, variables = _choose_rows(chart, clear)
+    own, variables = _choose_rows(chart, singular)
     require_all_positions(chart, variables)
     # The sign is that of these rows, which have other scales than the chart's.
     sign = float(check(domain.centre[None], domain.centre[None]).sign[0])
-    return OutsideCheck(check, own, clear, sign, tuple(sorted(variables)), domain.room_to_fold is not None)
+    return OutsideCheck(check, own, singular, sign, tuple(sorted(variables)), domain.room_to_fold is not None)
 
 
 def choose_inside_check(chart: Chart, rows: ChartRows, bound: float, method: str | None = None) -> RegularCheck:
@@ -302,9 +302,9 @@ def _build_least_row(turned: TaylorModel) -> TaylorModel:
     row = turned[-1]
     linear = slice(1, 1 + len(turned.variables))
     for j in range(len(turned.remainder) - 1):
-        share = np.zeros_like(turned.coefficients[:, -1, j])
-        share[linear] = -turned.coefficients[linear, -1, j] / turned.centre[j, j]
-        row = row + TaylorModel(turned.variables, share[:, None], np.zeros(share[:1].shape)) * turned[j]
+        part = np.zeros_like(turned.coefficients[:, -1, j])
+        part[linear] = -turned.coefficients[linear, -1, j] / turned.centre[j, j]
+        row = row + TaylorModel(turned.variables, part[:, None], np.zeros(part[:1].shape)) * turned[j]
     return row
 
 
@@ -333,8 +333,8 @@ class CorridorCheck:
 
     def __call__(self, low: Array, high: Array) -> BoxResults:
         """Evaluate boxes between corners (boxes, n)."""
-        middle, half = (low + high) / 2, (high - low) / 2
-        distance: Any = np.sqrt(self.domain.squared_distance(middle))
+        centre, half = (low + high) / 2, (high - low) / 2
+        distance: Any = np.sqrt(self.domain.squared_distance(centre))
         outside = distance > 1 + RULES.rounding + self.domain.lengths(half)
         inside = self.inside(low, high)
         return BoxResults(

@@ -195,12 +195,12 @@ class Search:
                 self._codes[place] = PROVED
                 self.open_count -= 1
                 continue
-            shares = (b - a) / (self.base.high - self.base.low)
+            widths = (b - a) / (self.base.high - self.base.low)
             joint = int(results.widest[k])
             # Where bounds are infinite, halve the relatively widest joint: a choice that stays the same may never help.
             if joint == UNKNOWN:
-                joint = max(self.check.joints, key=lambda i: float(shares[i]))
-            if joint == NEVER or shares[joint] <= self.limits.smallest:
+                joint = max(self.check.joints, key=lambda i: float(widths[i]))
+            if joint == NEVER or widths[joint] <= self.limits.smallest:
                 self.dead += 1
                 self.failed = min(self.failed, rank)
                 continue
@@ -233,8 +233,8 @@ def rank_by_distance(base: Subdivision) -> Priority:
 def measure_distances(base: Subdivision, low: Array, high: Array) -> Array:
     """The scale s at which a copy of the whole about its centre first touches each box, (boxes,)."""
     # Gaps between the centre and a box, in half-widths of the whole.
-    middle, half = (base.low + base.high) / 2, (base.high - base.low) / 2
-    gaps: Array = np.maximum(np.maximum(low - middle, middle - high), 0) / half
+    centre, half = (base.low + base.high) / 2, (base.high - base.low) / 2
+    gaps: Array = np.maximum(np.maximum(low - centre, centre - high), 0) / half
     return np.asarray(gaps.max(axis=1))
 
 

@@ -94,13 +94,13 @@ def plan_product(left: Variables, right: Variables) -> Product:
     # Of b, linear and quadratic terms; of a, quadratic ones.
     a, b = list_monomials(left), list_monomials(right)
     starts = order_starts(len(left))
-    middle = b[1 : order_starts(len(right))[3]]
+    inner = b[1 : order_starts(len(right))[3]]
     return Product(
         both,
         len(index),
         find_places(left, both),
         find_places(right, both),
-        tuple(of((i,), middle) for i in left),
+        tuple(of((i,), inner) for i in left),
         tuple(of((j,), a[starts[2] : starts[3]]) for j in right),
     )
 

@@ -197,7 +197,7 @@ def _write_law_functions(law: Impedance | PDPlus) -> list[str]:
     # Feed-forward needs how targets and errors move.
     if law.feed_forward:
         drift = chart.parts.relative.compute_drift(q, x_d, dx_d)
-        bend = chart.parts.relative.compute_bias(q, dq, w, (x_d, dx_d, ddx_d))
+        bias = chart.parts.relative.compute_bias(q, dq, w, (x_d, dx_d, ddx_d))
         coriolis = law.model.coriolis_torque(robot, inputs, w)
         states = [q, dq, w, x_d, dx_d, ddx_d]
         result += [
@@ -211,7 +211,7 @@ def _write_law_functions(law: Impedance | PDPlus) -> list[str]:
                 "_task_bend",
                 "How the rates of the errors change, of q, dq, w, x_d and its derivatives.",
                 states,
-                [bend],
+                [bias],
             ),
             _write_graph("_coriolis_torque", "C(q, dq) w, of q, dq, w.", [q, dq, w], [coriolis]),
             _BEND,

@@ -204,7 +204,7 @@ def _bound_stack(kernels: Kernels, chart: Chart, controller: Controller | None, 
     locals_ = round(RULES.locals_bytes * max(1.0, n / 7) ** 2)
     # These kernels run inside others.
     inner = [name for name in ("pivots", "gram", "room") if name in kernels.work]
-    clear = sum(kernels.array_bytes(name, size) for name in inner)
+    nested = sum(kernels.array_bytes(name, size) for name in inner)
     work = max(kernels.array_bytes(name, size) for name in kernels.work)
 
     # Two positions that the descent to the nearest x looks at, and the equations of its steps.
@@ -212,7 +212,7 @@ def _bound_stack(kernels: Kernels, chart: Chart, controller: Controller | None, 
     system = 2 * n + rooms
     descent = 2 * n * (n + rooms + 3) + 2 * n * n + n * rooms + system**2 + 4 * system
     nearest = kernels.array_bytes("near", size) + size * descent
-    return max(inverse, nearest, compose, work) + supervised + clear + locals_
+    return max(inverse, nearest, compose, work) + supervised + nested + locals_
 
 
 def _describe_library(

@@ -352,16 +352,16 @@ def _limit(command: ca.SX, limit: ca.SX, keep_direction: bool) -> ca.SX:
 
 def _is_inside(domain: Domain | None, q: ca.SX) -> ca.SX:
     """Whether q (n, 1) lies in the domain: between its boundaries, and where its condition holds, if it has one."""
-    in_box = clear = ca.SX(1)
+    in_box = meets_condition = ca.SX(1)
     if domain is None:
-        return ca.logic_and(in_box, clear)
+        return ca.logic_and(in_box, meets_condition)
     # Joints without boundaries, such as the angles of a torus, do not count.
     bounded = np.flatnonzero(np.isfinite(domain.reach)).tolist()
     if bounded:
         in_box = _all_hold(ca.fabs(q[bounded] - ca.DM(domain.centre[bounded])) <= ca.DM(domain.reach[bounded]))
     if domain.condition is not None:
-        clear = _all_hold(domain.condition.pivots(q) > 0)
-    return ca.logic_and(in_box, clear)
+        meets_condition = _all_hold(domain.condition.pivots(q) > 0)
+    return ca.logic_and(in_box, meets_condition)
 
 
 def _is_finite(value: ca.SX) -> ca.SX:

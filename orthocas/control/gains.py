@@ -240,10 +240,10 @@ def find_holding_doubts(robot: Robot, domain: Domain, limit: Array) -> list[str]
     joint = int(np.argmax(excess[worst]))
     unit = "N" if robot.tree.prismatic[joint] else "N m"
     where, most = ("at the centre of", "") if heavy[0] else ("everywhere in", "up to ")
-    share = percent(heavy[1:].mean(), fault=True)
+    fraction = percent(heavy[1:].mean(), fault=True)
     return [
         f"the motors cannot hold the arm {where} the domain: gravity needs {most}{needed[worst, joint]:.4g} {unit} at "
-        f"joint '{robot.joint_names[joint]}', the limit is {limit[joint]:.4g} {unit}, and at {share} of "
+        f"joint '{robot.joint_names[joint]}', the limit is {limit[joint]:.4g} {unit}, and at {fraction} of "
         f"{RULES.samples} samples of the domain gravity alone exceeds a limit"
     ]
 

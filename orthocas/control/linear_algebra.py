@@ -49,8 +49,8 @@ def _build_sweeps(k: int) -> ca.Function:
     state = ca.MX.sym("state", k * k + 1)
     A = ca.reshape(state[:-1], k, k)
     p, w = A[0, 0], A[1:, 0]
-    share = w / p
-    swept = ca.vertcat(ca.horzcat(A[1:, 1:] - w @ share.T, share), ca.horzcat(share.T, -1 / p))
+    ratio = w / p
+    swept = ca.vertcat(ca.horzcat(A[1:, 1:] - w @ ratio.T, ratio), ca.horzcat(ratio.T, -1 / p))
     sweeps = ca.Function("sweep", [state], [ca.vertcat(ca.vec(swept), state[-1] * p)]).fold(k)
     matrix = ca.MX.sym("A", k, k)
     end = sweeps(ca.vertcat(ca.vec(matrix), 1))
@@ -156,9 +156,9 @@ def apply_damping(
     # Both products with the root are one, of matrices side by side.
     c = velocities.shape[1]
     if design == "square_root":
-        share = ca.repmat(damping_ratio * ca.sqrt(stiffness), 1, c)
-        both = multiply_by_root(inertia, ca.horzcat(share * velocities, velocities))
-        return both[:, :c] + share * both[:, c:]
+        weight = ca.repmat(damping_ratio * ca.sqrt(stiffness), 1, c)
+        both = multiply_by_root(inertia, ca.horzcat(weight * velocities, velocities))
+        return both[:, :c] + weight * both[:, c:]
     # Springs as soft as the rounds of the square root can resolve: squared frequencies K_i / M_ii are at least 1e-6 of
     # the largest one, and 1e-12 1/s^2. K_i < 0 and NaN stay invalid.
     mass = ca.diag(inertia)

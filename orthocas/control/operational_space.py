@@ -291,8 +291,8 @@ class _OperationalSpace(LawOfChart):
                     "at both, which coupled ones do not; see docs/how-to/wide.md"
                 )
         # Damping that feeds energy in.
-        if share := self.check_damping().indefinite_share:
-            where = f"in {percent(share, fault=True)} of the domain with these gains"
+        if fraction := self.check_damping().indefinite_share:
+            where = f"in {percent(fraction, fault=True)} of the domain with these gains"
             result.append(f"the damping matrix (29) is indefinite {where}; the damping design double_diagonal never is")
         return result + self.model.remarks()
 

@@ -141,9 +141,9 @@ class _Sheet:
         a, b = ends
         below = self._evaluate_gap(a) < 0
         for _ in range(RULES.bisections):
-            middle = (a + b) / 2
-            same = ((self._evaluate_gap(middle) < 0) == below)[:, None]
-            a, b = np.where(same, middle, a), np.where(same, b, middle)
+            centre = (a + b) / 2
+            same = ((self._evaluate_gap(centre) < 0) == below)[:, None]
+            a, b = np.where(same, centre, a), np.where(same, b, centre)
         points: Array = np.where((np.abs(self._evaluate_gap(a)) < np.abs(self._evaluate_gap(b)))[:, None], a, b)
         off = np.flatnonzero(np.abs(self._evaluate_gap(points)) > self.tolerance)
         if len(off):

@@ -225,9 +225,9 @@ class TaskBrackets:
         # Gradients G = A^-1 J^T and an orthonormal basis of their span, through U^-T J^T = O R.
         J = problem.task.jacobian_function(q)
         U = ca.chol(ca.sparsify(problem.metric.function(q)))
-        raised = ca.solve(U.T, J.T)
-        gradients = ca.solve(U, raised)
-        unit, R = ca.qr(raised)
+        duals = ca.solve(U.T, J.T)
+        gradients = ca.solve(U, duals)
+        unit, R = ca.qr(duals)
         basis, weights = ca.solve(U, unit), ca.inv(R)
         # Derivatives of the fields along each other, their brackets, and the parts across the span.
         along = [U @ ca.jtimes(gradients, q, basis[:, a]) @ weights for a in range(m)]

@@ -279,9 +279,9 @@ class LinearLeaf:
         # Follow the straight line to xi in steps, so that Newton stays on the sheet.
         start = (q - self.centre) @ self.normals
         N = np.broadcast_to(self.normals.T, (len(xi), *self.normals.T.shape))
-        for share in np.linspace(0.0, 1.0, RULES.stages + 1)[1:]:
+        for fraction in np.linspace(0.0, 1.0, RULES.stages + 1)[1:]:
             for _ in range(RULES.iterations):
-                residual = self._compute_residual(q, start + share * (xi - start))
+                residual = self._compute_residual(q, start + fraction * (xi - start))
                 if np.abs(residual).max(initial=0.0) < RULES.solved:
                     break
                 J = np.concatenate([self.problem.task.evaluate_jacobian(q) / self._scale, N], axis=1)
@@ -373,10 +373,10 @@ class CircleLeaf:
     @cached_property
     def _spline(self) -> Any:
         """A spline of the curve without its drift, periodic in the arc length."""
-        share = np.linspace(0.0, 1.0, len(self.curve))[:, None]
-        periodic = self.curve - share * self._drift
+        fractions = np.linspace(0.0, 1.0, len(self.curve))[:, None]
+        periodic = self.curve - fractions * self._drift
         periodic[-1] = periodic[0]
-        return scipy.interpolate.CubicSpline(share[:, 0] * self.length[0], periodic, bc_type="periodic")
+        return scipy.interpolate.CubicSpline(fractions[:, 0] * self.length[0], periodic, bc_type="periodic")
 
     def _evaluate(self, along: Array) -> Array:
         return np.asarray(self._spline(along) + along[:, None] / self.length[0] * self._drift)
