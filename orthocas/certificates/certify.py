@@ -297,7 +297,7 @@ def require_same(chart: Chart, certificate: Certificate) -> None:
     certificate.require_for(fingerprint(chart.problem, chart.coordinates))
     if not certificate.digest:
         raise CertifyError("the certificate has no digest, expected one made by `certify`")
-    # It holds for the domain that it was made for only, with all that this leaves out.
+    # It holds only for the domain that it was made for, with the same bounds on singular values and folds.
     left_out = getattr(chart.problem.domain, "least_singular_value", 0.0)
     if certificate.least_singular_value != left_out:
         raise CertifyError(
@@ -459,7 +459,7 @@ def _report_search(monitor: Monitor, stage: str, *, guarded: bool = False) -> Lo
     start = time.monotonic()
 
     def show(search: Search) -> None:
-        # Never all, as long as a box is open.
+        # As long as a box is open, the proved share is below 100 %.
         limits, proved = search.limits, search.proved_volume
         if search.open_count:
             proved = min(proved, 1 - 2**-53)

@@ -91,7 +91,7 @@ def plan_product(left: Variables, right: Variables) -> Product:
     def of(one: Monomial, others: tuple[Monomial, ...]) -> Places:
         return _merge_places([index[tuple(sorted(one + other))] for other in others])
 
-    # Of b, linear and quadratic terms; of a, quadratic ones.
+    # Linear terms of a meet linear and quadratic ones of b, quadratic ones of a only linear ones.
     a, b = list_monomials(left), list_monomials(right)
     starts = order_starts(len(left))
     inner = b[1 : order_starts(len(right))[3]]

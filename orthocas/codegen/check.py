@@ -252,12 +252,12 @@ def sample_gains(controller: Controller, rows: int, rng: np.random.Generator) ->
     gains = []
     for name, gain in controller.gains.items():
         if name == "payload":
-            # Up to 2 kg, within some 0.1 m of the tip, with positive definite inertias
+            # Up to 2 kg, within some 0.1 m of the tip, with positive definite inertias.
             mass, factors = rng.uniform(0, 2, (rows, 1)), 0.05 * rng.normal(size=(rows, 3, 3))
             inertia = factors @ factors.transpose(0, 2, 1)
             values = np.hstack([mass, 0.1 * rng.normal(size=(rows, 3)), inertia[:, *np.triu_indices(3)]])
         elif name == "mass_matrix":
-            # One factor and a diagonal, so that it stays symmetric positive definite
+            # One factor and a diagonal, so that it stays symmetric positive definite.
             n = controller.problem.n
             diagonal = np.eye(n) * rng.uniform(0, 0.1, (rows, 1, n))
             values = (gain.reshape(n, n) * rng.uniform(0.5, 1.5, (rows, 1, 1)) + diagonal).reshape(rows, -1)

@@ -156,7 +156,7 @@ class CompiledCurves:
         library.curve_room.restype, library.curve_rows.restype = ctypes.c_ulong, None
         room = library.curve_room()
 
-        # Stored starts serve rows for which those at the caller's end nowhere.
+        # Later stages of starts serve only rows that the earlier ones leave without a solution.
         def search_piece(first: int) -> None:
             rows = slice(first, first + _CURVE_PIECE)
             stages = self.curves.stages(targets[rows], own[rows])

@@ -194,7 +194,7 @@ def _write_law_functions(law: Impedance | PDPlus) -> list[str]:
         ),
         _write_graph("_gravity", "Gravity torque, (n, N).", [q], [law.model.gravity_torque(robot, inputs)]),
     ]
-    # Feed-forward needs how targets and errors move.
+    # Feed-forward also needs the rates of targets and errors.
     if law.feed_forward:
         drift = chart.parts.relative.compute_drift(q, x_d, dx_d)
         bias = chart.parts.relative.compute_bias(q, dq, w, (x_d, dx_d, ddx_d))
@@ -237,7 +237,7 @@ def _write_graph(name: str, summary: str, inputs: list[ca.MX], outputs: list[ca.
 
 def _encode(table: Array) -> list[str]:
     """Lines of base64 with the numbers of a table."""
-    # Zeros have no sign.
+    # Adding 0.0 turns -0.0 into 0.0.
     text = b64encode((np.asarray(table, dtype="<f8") + 0.0).tobytes()).decode()
     return textwrap.wrap(text, _WIDTH) or [""]
 

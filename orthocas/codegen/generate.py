@@ -357,7 +357,7 @@ def _require_free(out: Path, name: str, files: Iterable[str], force: bool) -> No
                 f"a folder with a {path.name} that orthocas did not write",
                 "another folder, or force (--force) to replace it",
             )
-    # Nor may the build file of another library vanish.
+    # The build file of another library is not replaced, either.
     build = out / "CMakeLists.txt"
     other = build.is_file() and f"project({name} " not in build.read_text(encoding="utf-8", errors="replace")
     if other and not force:

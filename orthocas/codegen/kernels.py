@@ -223,7 +223,7 @@ def _measure_slots(function: ca.Function) -> dict[int, int]:
 
 def _write_body(function: ca.Function, block: str) -> str | None:
     """The body in C of a function of `orthocas.control.linear_algebra` that is faster than what CasADi writes."""
-    # Functions are known by their names.
+    # These functions carry fixed names.
     size = function.size1_in(0) if function.n_in() else 0
     if function.name() == LARGE_INVERSE:
         return render("algebra.c", {"what": "inverse", "size": size}).rstrip("\n")

@@ -190,7 +190,7 @@ class Supervisor:
         require_kind("library", library, CompiledLibrary)
         require_controller(controller)
         self._n, self._k, self._library = library.n, len(controller.labels), library
-        # Functions of the state, and what else than pointers they take.
+        # Functions of the supervised law; those that take numbers beside pointers state their types.
         self._functions = {
             name: library.function(name) for name in ("start", "take_over", "resume", "hold", "release", "step")
         }

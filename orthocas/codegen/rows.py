@@ -120,7 +120,7 @@ def _write_operations(function: ca.Function) -> tuple[list[str], int]:
             value = f"q[{of[0]} * LANES + l]"
         else:
             value = _OPERATIONS[name].format(*(f"w{place}" for place in of))
-        # Lanes count rows whose sines need the library of C.
+        # Each lane counts arguments that are too large for its own sine.
         if name in ("sin", "cos"):
             lines.append(f"far += fabs(w{of[0]}) <= FAR ? 0.0 : 1.0;")
         lines.append(f"w{into} = {value};")

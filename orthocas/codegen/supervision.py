@@ -124,7 +124,7 @@ def find_condition(chart: Chart) -> Domain | None:
 def describe_law(controller: Controller) -> dict[str, Any]:
     """Values of the templates about the law: gains, what its command means, and how it counts turns of joints."""
     problem, torque = controller.problem, controller.command == "torque"
-    # Joints that turn without end have a period; robots may hold themselves.
+    # Joints that turn without end have a period; some robots compensate gravity themselves.
     turns = np.zeros(problem.n)
     turns[list(problem.turning)] = 2 * np.pi
     if controller.settings.get("gravity") == "robot":
@@ -175,14 +175,14 @@ def describe_supervision(controller: Controller, safety: Safety) -> dict[str, An
 def _describe_setting(name: str, value: Any) -> dict[str, Any]:
     """A setting of `Safety` as a field of a struct, its value, and what C requires of it."""
     place, meaning = f"safety->{name}", Safety.meaning(name)
-    # Numbers alone must be positive, or whole and not negative.
+    # A single number must be positive; a count must not be negative.
     if not isinstance(value, np.ndarray):
         whole = isinstance(value, int)
         check = f"{place} >= 0" if whole else f"{place} > 0.0 && {place} <= LARGEST"
         literal = write_number(value if whole else float(value))
         kind = "int" if whole else "double"
         return {"name": name, "kind": kind, "size": 0, "meaning": meaning, "check": check, "literal": literal}
-    # Lists may be signed or infinite where their names say so.
+    # Lists are finite and not negative, unless UNBOUNDED or SIGNED names them.
     check = f"all_from({'-INFINITY' if name in SIGNED else '0.0'}, {place}, {value.size})"
     if name not in UNBOUNDED:
         check += f" && all_within({place}, {value.size}, LARGEST)"

@@ -192,7 +192,7 @@ class Remembering(Shown):
         used = law.gains | {gain: law.gains[gain] + self.fields[name] for gain, name in adds.items()}
         command, (number,) = _evaluate(self._law, *state, *used.values())
         status = ControlStatus(int(number))
-        # A limit that cuts the command stops the memory, and so does a tick without one before it.
+        # The memory stands still while a limit cuts the command, and in the first tick.
         if self._step is not None:
             active, since = float(status == ControlStatus.OK), 0.0 if self._fresh else as_number("period", period)
             fields = _evaluate(self._step, *state, *law.gains.values(), command, active, since, *self.fields.values())

@@ -191,7 +191,7 @@ class _OperationalSpace(LawOfChart):
         if remembers is not None:
             # Bounds of another size raise here.
             _ = self.memory
-        # What is doubtful can be switched on, with a warning.
+        # Doubtful settings are accepted with a warning.
         doubts = [*_doubt_ratio(self.damping_ratio), *self._find_holding_doubts()]
         if coupling == "decoupled" and (metric := chart.problem.metric.name) != "inertia":
             doubts.append(f"a decoupled law relies on A = M (inertia), but the metric of this chart is {metric}")
@@ -280,7 +280,7 @@ class _OperationalSpace(LawOfChart):
                 "(inertia)"
             )
         result += _doubt_ratio(self.damping_ratio)
-        # Decoupled springs pull at both where gradients lean.
+        # Where coordinates leak, decoupled springs pull at task and xi.
         if self.coupling == "decoupled":
             points = sample_uniform(self.problem.domain, RULES.samples, 0)
             sines = Judged.at(self.problem, self.chart.coordinates, points).leak_sines
@@ -290,7 +290,7 @@ class _OperationalSpace(LawOfChart):
                     f"the gradients of this chart lean into the task by {leak:.0f} deg (rms): decoupled springs pull "
                     "at both, which coupled ones do not; see docs/how-to/wide.md"
                 )
-        # Damping that feeds energy in.
+        # Indefinite damping can feed energy in.
         if fraction := self.check_damping().indefinite_share:
             where = f"in {percent(fraction, fault=True)} of the domain with these gains"
             result.append(f"the damping matrix (29) is indefinite {where}; the damping design double_diagonal never is")

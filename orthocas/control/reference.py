@@ -98,7 +98,7 @@ class Reference(Shown):
         _require_number("duration", duration, above=0.0)
         zeta = _require_number("damping_ratio", damping_ratio, above=-np.finfo(float).tiny)
         times, targets = _build_stairs(names, value, changes, duration)
-        # Each segment starts where the one before has come to.
+        # Each segment starts where the one before ends.
         profile = build_low_pass(len(names), omega0, zeta)
         run = Batched(profile)
         parameters = [np.concatenate([targets[0], value, np.zeros_like(value)])]

@@ -197,7 +197,7 @@ def _compute_joint_motion(controller: Controller, points: Array, slow: Array) ->
         q = ca.MX.sym("q", n)
         moving = ca.vertcat(relative.rates(q), ca.jacobian(controller.measured(q)[m:], q))
         function = dense_function("J", [q], [moving])
-    # The slowest joint counts, at nine of ten points.
+    # The slowest joint counts, at 90 % of the points.
     J = Batched(function)(points)[0].reshape(len(points), -1, n)
     largest = (np.abs(np.linalg.pinv(J[np.isfinite(J).all(axis=(1, 2))])) / slow[:, None]).max(axis=1)
     return np.asarray(np.quantile(largest, 0.9, axis=0))

@@ -105,7 +105,7 @@ class DiskLeaf:
     periodic = True
 
     def __post_init__(self) -> None:
-        # Arrays may come from a file: shapes, indices, and points that lie on disk and leaf.
+        # Arrays may come from a file: check shapes and indices, and that points lie on disk and leaf.
         count = len(self.vertices)
         shapes: dict[str, tuple[int | None, ...]] = {
             "level": (1,),
@@ -408,7 +408,7 @@ def trace_circle_leaf(problem: Problem, level: Array, start: Array) -> CircleLea
     while travelled < RULES.longest:
         piece = trace(q, RULES.piece)
         away = remove_turns(problem, piece[1:] - start)
-        # Arc length to the start, along the curve. It has closed near the start, once the way there is behind.
+        # Arc length that is left to the start: the curve closes where it is near, and about to pass it.
         left = -(np.diff(piece, axis=0) * away).sum(axis=1) / step
         back = np.flatnonzero((np.linalg.norm(away, axis=1) < 2 * step) & (left >= 0))
         if back.size:
