@@ -73,11 +73,10 @@ def check_c(
 
     Raises:
         CompileError: if there is no compiler, or compilation fails.
-        AgreementError: if a result differs by more than 1e-10 of its largest entry (single precision: 1e-3), or a
-            status differs. Near singularities, where one rounding of q, or of one joint, changes commands by more than
-            1e-12 (1e-5), the accepted difference is a hundred times that change. In single precision, that of commands
-            also grows with the inverse square of the volume of the gradients, relative to its median, and their status
-            may be that of a place within 0.01 half-widths.
+        AgreementError: if a status differs, or a result differs by more than the tolerance of its number type
+            (`Precision`), relative to its largest entry. Near singularities, more is accepted where one rounding of q,
+            or of one joint, changes commands much. In single precision, that of commands also grows with the inverse
+            square of the volume of the gradients, and their status may be that of a place nearby.
     """
     require_kind("chart", chart, Chart)
     n, precision = chart.n, SINGLE if generated.single_precision else DOUBLE
@@ -109,7 +108,7 @@ def list_corners(n: int) -> Array:
 
 
 def spoil(rng: np.random.Generator, *arrays: Array) -> list[Array]:
-    """Copies with a NaN, infinite or huge number in every twentieth row of one array; corner cases stay as they are."""
+    """Copies with NaN, infinite or huge numbers in some rows, in one array each; corner cases stay as they are."""
     copies = [array.copy() for array in arrays]
     for row in range(0, len(arrays[0]) - len(list_corners(arrays[0].shape[1])), RULES.spoil_every):
         array = copies[rng.integers(len(copies))]

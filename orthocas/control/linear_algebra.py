@@ -146,8 +146,8 @@ def apply_damping(
     - square_root: D = M^1/2 Z K^1/2 + K^1/2 Z M^1/2. Symmetric, but not always positive semi-definite.
     - double_diagonal: D = 2 Z^1/2 (M # K) Z^1/2, always positive semi-definite, with the geometric mean
       M # K = K^1/2 (K^-1/2 M K^-1/2)^1/2 K^1/2. With one damping ratio z for all coordinates, D is diagonal in the
-      generalised eigenvectors of (K, M), and every mode has the damping ratio z. A spring softer than 1e-6 of the
-      stiffest one, also K_i = 0, is damped as if it had that stiffness, so hardly.
+      generalised eigenvectors of (K, M), and every mode has the damping ratio z. A spring softer than `SOFTEST` of
+      the stiffest one, also K_i = 0, is damped as if it had that stiffness, so hardly.
 
     Source:
         square_root: [AS2023] eq. (29); double diagonalisation: [AOFH2003]; its form without eigenvectors and for
@@ -159,8 +159,8 @@ def apply_damping(
         weight = ca.repmat(damping_ratio * ca.sqrt(stiffness), 1, c)
         both = multiply_by_root(inertia, ca.horzcat(weight * velocities, velocities))
         return both[:, :c] + weight * both[:, c:]
-    # Springs as soft as the rounds of the square root can resolve: squared frequencies K_i / M_ii are at least 1e-6 of
-    # the largest one, and 1e-12 1/s^2. K_i < 0 and NaN stay invalid.
+    # Squared frequencies K_i / M_ii are at least as large as the rounds of the square root can resolve. K_i < 0 and NaN
+    # stay invalid.
     mass = ca.diag(inertia)
     floor = mass * ca.fmax(SOFTEST * ca.mmax(stiffness / mass), SOFTEST**2)
     stiff = ca.if_else(stiffness < 0, stiffness, ca.if_else(stiffness < floor, floor, stiffness))

@@ -269,8 +269,8 @@ class BatchedFlow:
     def find_end_points(self, starts: Array, parameters: Array, tolerance: float) -> tuple[Array, NDArray[np.bool_]]:
         """States at s = 1, (N, k), and which trajectories reached s = 1, (N,).
 
-        The other trajectories stopped where the step size fell below 1e-9 or the field was not finite. Their rows hold
-        the last state.
+        The other trajectories stopped where steps became too short or the field was not finite. Their rows hold the
+        last state.
 
         Args:
             starts: (N, k).

@@ -207,7 +207,7 @@ def build_disk_leaf(problem: Problem, level: Array, region: Box, cells: int = CE
         cells: number of cells along the longest edge of the region.
 
     Raises:
-        GrowError: if n is not 3, m is not 1, or the shortest edge of the region has fewer than 5 cells.
+        GrowError: if n is not 3, m is not 1, or the shortest edge of the region has too few cells.
         NotADiskError: if that part of the leaf is not a disk; the message says what it is.
     """
     if (problem.n, problem.m) != (3, 1):
@@ -401,7 +401,7 @@ def trace_circle_leaf(problem: Problem, level: Array, start: Array) -> CircleLea
         start: a point of the leaf, where xi0 = 0, (n,).
 
     Raises:
-        GrowError: if the leaf does not close within 200 rad, or runs into a singularity.
+        GrowError: if the leaf is too long to close, or runs into a singularity.
     """
     trace = _build_tracer(problem, level, RULES.steps)
     q, travelled, step = start, 0.0, RULES.piece / RULES.steps
