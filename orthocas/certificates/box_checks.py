@@ -155,7 +155,7 @@ def compute_pivots(J: TaylorModel) -> list[TaylorModel]:
     return diagonal
 
 
-def lower_bound(model: TaylorModel) -> Array:
+def bound_from_below(model: TaylorModel) -> Array:
     """A number below all values, (boxes,); NaN or -inf where nothing is known.
 
     Each variable is bounded exactly in its linear and square term, g t + h t^2 for t in [-1, 1]; mixed terms and cubic
@@ -180,7 +180,7 @@ def bound_conditioning(J: TaylorModel, m: int) -> Array:
     if m == n:
         return np.ones(J.remainder.shape[-1])
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        volume = lower_bound(_build_volume(J, m)) * _ORTHOGONAL
+        volume = bound_from_below(_build_volume(J, m)) * _ORTHOGONAL
     volume = np.clip(np.nan_to_num(volume, nan=0.0), 0.0, 1.0)
     # The smallest of n singular values with that product, whose squares add up to n: each bound improves the next one.
     least = np.zeros_like(volume)
@@ -233,7 +233,7 @@ def _sum_models(parts: list[TaylorModel]) -> TaylorModel:
 
 def have_positive_pivots(pivots: list[TaylorModel]) -> NDArray[np.bool_]:
     """Whether all pivots have one sign on the box and the pivots of the centre are positive."""
-    return np.asarray(np.all([lower_bound(pivot) > 0 for pivot in pivots], axis=0))
+    return np.asarray(np.all([bound_from_below(pivot) > 0 for pivot in pivots], axis=0))
 
 
 def compute_influences(turned: TaylorModel) -> Array:

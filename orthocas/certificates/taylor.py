@@ -57,7 +57,7 @@ def list_monomials(variables: Variables, degree: int = DEGREE) -> tuple[Monomial
 
 
 @cache
-def order_starts(count: int) -> tuple[int, ...]:
+def find_order_starts(count: int) -> tuple[int, ...]:
     """Where the monomials of degree 0, 1, 2, 3 in so many variables start, and how many there are in all."""
     linear, quadratic = 1 + count, (1 + count) * (2 + count) // 2
     return 0, 1, linear, quadratic, quadratic * (3 + count) // 3
@@ -93,8 +93,8 @@ def plan_product(left: Variables, right: Variables) -> Product:
 
     # Linear terms of a meet linear and quadratic ones of b, quadratic ones of a only linear ones.
     a, b = list_monomials(left), list_monomials(right)
-    starts = order_starts(len(left))
-    inner = b[1 : order_starts(len(right))[3]]
+    starts = find_order_starts(len(left))
+    inner = b[1 : find_order_starts(len(right))[3]]
     return Product(
         both,
         len(index),
@@ -132,7 +132,7 @@ class TaylorModel:
 
     def sum_sizes(self) -> Array:
         """Sums of the absolute coefficients of each degree, (4, ..., boxes)."""
-        starts = order_starts(len(self.variables))[:4]
+        starts = find_order_starts(len(self.variables))[:4]
         size = np.abs(self.coefficients)
         if not self.variables:
             return np.concatenate([size, np.zeros((3, *size.shape[1:]))])
@@ -150,7 +150,7 @@ class TaylorModel:
         """The same model with more variables."""
         if variables == self.variables:
             return self
-        wide = np.zeros((order_starts(len(variables))[4], *self.coefficients.shape[1:]))
+        wide = np.zeros((find_order_starts(len(variables))[4], *self.coefficients.shape[1:]))
         wide[find_places(self.variables, variables)] = self.coefficients
         return TaylorModel(variables, wide, self.remainder)
 
@@ -189,7 +189,7 @@ class TaylorModel:
         out[table.right] = a[0] * b
         out[table.left] += b[0] * a
         out[0] = a[0] * b[0]
-        starts, end = order_starts(len(self.variables)), order_starts(len(other.variables))[3]
+        starts, end = find_order_starts(len(self.variables)), find_order_starts(len(other.variables))[3]
         for i, where in enumerate(table.by_linear, 1):
             out[where] += a[i] * b[1:end]
         for j, where in enumerate(table.quadratic_by, 1):
@@ -235,7 +235,7 @@ class TaylorModel:
         A coefficient shrinks by 2^-power; the remainder is shared out like the cubic terms, which it is most like.
         """
         taken, size = weigh_halving(self.variables, DEGREE), np.abs(self.coefficients)
-        cubic = order_starts(len(self.variables))[3]
+        cubic = find_order_starts(len(self.variables))[3]
         flat, shape = size.reshape(len(size), -1), (len(taken), *size.shape[1:])
         last = (taken[:, cubic:] @ flat[cubic:]).reshape(shape)
         of_terms = (taken[:, :cubic] @ flat[:cubic]).reshape(shape) + last

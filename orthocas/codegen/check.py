@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from orthocas.charts.chart import Chart
 from orthocas.codegen.generate import GeneratedC
-from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
+from orthocas.codegen.library import CompiledLibrary, compile_shared, find_compilers, gain_numbers
 from orthocas.codegen.precision import DOUBLE, SINGLE, Precision, find_bounds_inside
 from orthocas.control.controller import (
     FROM_THE_LAW,
@@ -87,7 +87,7 @@ def check_c(
     around = domain.half_width * RULES.reach * np.random.default_rng(seed).uniform(-1, 1, (states, n))
     q = precision.round(np.vstack([domain.centre + around, corners]))
     differences: dict[str, float] = {}
-    for compiler in compilers():
+    for compiler in find_compilers():
         with open_draft_folder() as folder:
             path = compile_shared(generated, folder, compiler=compiler)
             library = CompiledLibrary(path, generated.name, n, generated.single_precision)
@@ -99,7 +99,7 @@ def check_c(
                     f"expected at most {precision.tolerance:g} relative"
                 )
             differences[name] = max(value, differences.get(name, 0.0))
-    return AgreementCheck(len(q), tuple(Path(compiler).name for compiler in compilers()), differences)
+    return AgreementCheck(len(q), tuple(Path(compiler).name for compiler in find_compilers()), differences)
 
 
 def list_corners(n: int) -> Array:

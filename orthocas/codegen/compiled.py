@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 
 from orthocas.codegen.kernels import generate_kernels
-from orthocas.codegen.library import compilers
+from orthocas.codegen.library import find_compilers
 from orthocas.codegen.rendering import render
 from orthocas.errors import CompileError, SimulationError
 from orthocas.tools.cached import cached_property
@@ -46,7 +46,7 @@ def keep_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], fo
         CompileError: if there is no C compiler, or it fails, or the folder is not the user's own.
         InvalidValueError: if the folder cannot be written.
     """
-    compiler, options = compilers()[0], ("-std=c99", "-fPIC", "-shared", *flags)
+    compiler, options = find_compilers()[0], ("-std=c99", "-fPIC", "-shared", *flags)
     content = [*(text.encode() for text in sources.values()), repr((compiler, options)).encode()]
     name = f"{kind}-{hashlib.sha256(b'/'.join(content)).hexdigest()[:32]}.so"
     place = _find_cache() if folder is None else as_path("folder", folder)

@@ -34,7 +34,7 @@ _STATES = 64
 _MICROSECONDS = 3e5
 
 
-def compilers() -> tuple[str, ...]:
+def find_compilers() -> tuple[str, ...]:
     """Those of gcc and clang that are on the PATH, or cc if neither is.
 
     Raises:
@@ -50,14 +50,14 @@ def compilers() -> tuple[str, ...]:
 def compile_shared(
     generated: GeneratedC, folder: Path, flags: tuple[str, ...] = ("-O2",), compiler: str | None = None
 ) -> Path:
-    """Compile a shared library in a folder, with warnings as errors; default compiler: the first of `compilers`.
+    """Compile a shared library in a folder, with warnings as errors; default compiler: the first of `find_compilers`.
 
     Raises:
         CompileError: if compilation fails; the message starts with the compiler's first lines.
     """
     library = folder / f"lib{generated.name}.so"
     source = generated.folder / f"{generated.name}.c"
-    compiler = compilers()[0] if compiler is None else compiler
+    compiler = find_compilers()[0] if compiler is None else compiler
     warnings = (*STRICT, *(NO_DOUBLE if generated.single_precision else ()))
     command = [compiler, *warnings, *flags, "-fPIC", "-shared", "-o", str(library), str(source), "-lm"]
     run_program(command)
@@ -379,7 +379,7 @@ def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int =
         first.numbers(np.concatenate(parts)).tofile(data)
         (folder / "ticks.c").write_text(get_template("ticks.c"))
         number = f"-DNUMBER={first.precision.c_name}"
-        run_program([compilers()[0], "-O2", number, str(folder / "ticks.c"), "-o", str(program), "-ldl"])
+        run_program([find_compilers()[0], "-O2", number, str(folder / "ticks.c"), "-o", str(program), "-ldl"])
         arguments = [str(program), str(data), str(calls), str(cases[0][0].problem.n)]
         for law, library in cases:
             sizes = (3 * len(law.labels), len(gain_numbers(law)))

@@ -11,7 +11,7 @@ import numpy as np
 from fuzz.child import Finding, run, verdict
 from fuzz.mutants import Rng, flipped, pick
 from orthocas.codegen.compiled import keep_library, load_library
-from orthocas.codegen.library import compilers
+from orthocas.codegen.library import find_compilers
 
 _SOURCE = "int answer(void) { return 42; }\n"
 
@@ -34,7 +34,7 @@ def originals(folder: Path) -> tuple[bytes, bytes, str]:
     other = folder / "other.so"
     source = folder / "other.c"
     source.write_text(_SOURCE.replace("42", "43"))
-    subprocess.run([compilers()[0], "-fPIC", "-shared", "-o", str(other), str(source)], check=True)
+    subprocess.run([find_compilers()[0], "-fPIC", "-shared", "-o", str(other), str(source)], check=True)
     return library.read_bytes(), other.read_bytes(), library.with_name(f"{library.name}.sha256").read_text()
 
 
