@@ -130,17 +130,8 @@ def test_names_from_robot_files_stay_in_comments(tmp_path: Path) -> None:
         assert not any("\\" in comment for comment in comments)
         assert not any("evil" in part for part in re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL).splitlines())
     for dialect in ("-std=c99", "-std=gnu17"):  # strict C99 reads trigraphs
-        command = [
-            find_compilers()[0],
-            *STRICT,
-            dialect,
-            "-Wtrigraphs",
-            "-Wcomment",
-            "-c",
-            str(source),
-            "-o",
-            "/dev/null",
-        ]
+        flags = (*STRICT, dialect, "-Wtrigraphs", "-Wcomment")
+        command = [find_compilers()[0], *flags, "-c", str(source), "-o", "/dev/null"]
         assert subprocess.run(command, capture_output=True, text=True, check=False).stderr == ""
     assert check_c(generated, chart, None, states=20).differences["phi"] < 1e-10
 
