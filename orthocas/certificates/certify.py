@@ -12,7 +12,7 @@ from orthocas.certificates.box_checks import BoxCheck, BoxResults
 from orthocas.certificates.one_to_one import choose_one_to_one_check
 from orthocas.certificates.outside import choose_check, choose_inside_check
 from orthocas.certificates.rows import ChartRows, build_chart_rows
-from orthocas.certificates.search import Limits, Look, Search, measure_distances, rank_by_distance, rank_by_volume
+from orthocas.certificates.search import Limits, Look, Search, measure_distances, rank_by_volume
 from orthocas.charts.certificate import COFACTORS, ELIMINATION, METHODS, OPEN, PROVED, Certificate, Subdivision
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
@@ -171,7 +171,7 @@ def certified_box(
     limits = Limits(seconds, smallest=2.0**-6, first_failure=True, folds=False)
     check = choose_inside_check(chart, build_chart_rows(chart), check_bound(chart, bound))
     base = cover_domain(chart.problem.domain)
-    search = Search(check, base, limits, rank_by_distance(base), executor)
+    search = Search(check, base, limits, partial(measure_distances, base), executor)
     search.run(_report_search(monitor, "largest box"))
     # The largest copy of the domain about its centre that no open part reaches into, rounded down.
     parts = search.build_subdivision()

@@ -89,11 +89,6 @@ class TaylorGraph:
         return [jet.slopes.get(joint, none) for joint in self.joints for jet in jets]
 
 
-def is_whole(value: float | None) -> bool:
-    """Whether a constant, if there is one, is a whole number that powers may have as exponent."""
-    return value is not None and abs(value) <= _LARGEST_POWER and value == round(value)
-
-
 def _build_one() -> TaylorModel:
     return TaylorModel.constant(np.ones(1))
 
@@ -188,7 +183,9 @@ def _require_bounds(tape: Tape, what: str, values: bool) -> None:
     def step(name: str, of: Sequence[_Step]) -> _Step:
         if name not in _KNOWN:
             raise CertifyError(f"{what} uses the operation {name}, which cannot be certified")
-        if name in POWERS and not is_whole(of[1].constant):
+        # Powers have whole constants of moderate size as exponents.
+        exponent = of[1].constant if name in POWERS else 0.0
+        if exponent is None or abs(exponent) > _LARGEST_POWER or exponent != round(exponent):
             raise CertifyError(f"{what} has a power that is no whole number, so it cannot be certified")
         if not all(operand.bounded for operand in _find_needed(name, of)):
             raise CertifyError(unbounded)

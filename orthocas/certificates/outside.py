@@ -286,7 +286,14 @@ class OutsideCheck:
         # The row v^T J with the change along the other singular vectors taken out.
         left, right = find_singular_vectors(J)
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            least = _build_least_row(multiply_between(left, J, right))
+            turned = multiply_between(left, J, right)
+            least, linear = turned[-1], slice(1, 1 + len(turned.variables))
+            # v = (a_1, ..., a_m-1, 1) in the singular basis, with a_j = -(linear part) / s_j.
+            for j in range(len(turned.remainder) - 1):
+                part = np.zeros_like(turned.coefficients[:, -1, j])
+                part[linear] = -turned.coefficients[linear, -1, j] / turned.centre[j, j]
+                away = TaylorModel(turned.variables, part[:, None], np.zeros(part[:1].shape))
+                least = least + away * turned[j]
             sizes = least.bound_magnitude()
             squared = (sizes**2).sum(axis=0) * UP
             squared += RULES.guards * (J.bound_magnitude() ** 2).sum(axis=(0, 1))
@@ -295,17 +302,6 @@ class OutsideCheck:
         small = squared <= self.domain.least_singular_value**2 * (1 - RULES.lengths)
         outside: Array = small & is_orthogonal(left) & is_orthogonal(right)
         return outside, find_most_influential(influences.T, least.variables)
-
-
-def _build_least_row(turned: TaylorModel) -> TaylorModel:
-    """v^T times a matrix in its singular basis, for v = (a_1, ..., a_m-1, 1) with a_j = -(linear part) / s_j."""
-    row = turned[-1]
-    linear = slice(1, 1 + len(turned.variables))
-    for j in range(len(turned.remainder) - 1):
-        part = np.zeros_like(turned.coefficients[:, -1, j])
-        part[linear] = -turned.coefficients[linear, -1, j] / turned.centre[j, j]
-        row = row + TaylorModel(turned.variables, part[:, None], np.zeros(part[:1].shape)) * turned[j]
-    return row
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -30,7 +30,7 @@ from orthocas.certificates.graph import TaylorGraph
 from orthocas.certificates.jets import (
     Around,
     Jets,
-    average_largest,
+    average_powers,
     build_power_weights,
     compute_powers,
     find_neighbours,
@@ -313,15 +313,11 @@ def build_velocity_rows(tree: KinematicTree, q: ca.SX, body: int) -> ca.SX:
 
 def build_axis_rows(tree: KinematicTree, q: ca.SX, axis: int) -> ca.SX:
     """Jacobian of the direction of a tip axis, along the two other axes of the tip, (2, n)."""
-    own, others = find_tip_axes(tree, axis)
+    # The axis (3,) and the two others (3, 2) in the frame of the body that carries the tip.
+    own, others = tree.tip_rotation[:, axis], tree.tip_rotation[:, [k for k in range(3) if k != axis]]
     J = build_velocity_rows(tree, q, tree.tip_parent)[3:, :]
     along = ca.horzcat(*[ca.cross(J[:, i], ca.SX(ca.DM(own))) for i in range(tree.n)])
     return constant(others.T) @ along
-
-
-def find_tip_axes(tree: KinematicTree, axis: int) -> tuple[Array, Array]:
-    """An axis of the tip (3,) and the two others (3, 2) in the frame of the body that carries it."""
-    return tree.tip_rotation[:, axis], tree.tip_rotation[:, [k for k in range(3) if k != axis]]
 
 
 def bound_rotation_error(tree: KinematicTree) -> float:
@@ -438,7 +434,7 @@ class ProductRows:
         # What is left out: the next order anywhere between the points.
         linear = np.stack([around.centre, around.reach, *np.zeros((2, *around.centre.shape))], axis=1)
         boxes = [TaylorModel((k,), each, np.zeros(each.shape[1:])) for k, each in enumerate(linear)]
-        weights = average_largest(build_power_weights(around, around.order + 1))
+        weights = average_powers(build_power_weights(around, around.order + 1), of_size=True)
         left_out = self._bound_derivatives(around.order + 2, boxes) * weights
         derivatives, doubts = zip(*orders, strict=True)
         return Jets(derivatives, doubts, left_out.sum(axis=2) * compute_margin(left_out.shape[2]) + TINY)

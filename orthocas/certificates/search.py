@@ -225,11 +225,6 @@ def rank_by_volume(base: Subdivision) -> Priority:
     return lambda low, high: -_measure_volumes(base, low, high)
 
 
-def rank_by_distance(base: Subdivision) -> Priority:
-    """Boxes that the smallest scaled copy of the whole touches first."""
-    return lambda low, high: measure_distances(base, low, high)
-
-
 def measure_distances(base: Subdivision, low: Array, high: Array) -> Array:
     """The scale s at which a copy of the whole about its centre first touches each box, (boxes,)."""
     # Gaps between the centre and a box, in half-widths of the whole.

@@ -4,7 +4,6 @@ import ctypes
 import hashlib
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -126,14 +125,6 @@ class Kernel(ctypes.Structure):
     _alive: tuple[Any, ...]  # what the pointers point to
 
 
-@dataclass(frozen=True, eq=False)
-class _Function:
-    """Sizes of a compiled function."""
-
-    work: tuple[int, int, int, int]  #: lengths of arg, res, iw and w
-    outputs: tuple[int, ...]
-
-
 class CompiledFunctions:
     """Dense functions of columns in one shared library. Threads may share it.
 
@@ -146,9 +137,10 @@ class CompiledFunctions:
 
     def __init__(self, functions: Sequence[ca.Function]) -> None:
         kernels = generate_kernels(list(functions), _PREFIX)
-        sizes = {f.name(): tuple(f.nnz_out(i) for i in range(f.n_out())) for f in functions}
-        self._functions = {name: _Function(kernels.work[name], outputs) for name, outputs in sizes.items()}
-        entries = [_ENTRY.format(name=name, prefix=_PREFIX) for name in sizes]
+        # Lengths of the work arrays and of the outputs, by function name.
+        self._work = kernels.work
+        self._outputs = {f.name(): [f.nnz_out(i) for i in range(f.n_out())] for f in functions}
+        entries = [_ENTRY.format(name=name, prefix=_PREFIX) for name in self._outputs]
         code = "\n\n".join(["#include <math.h>\n#include <string.h>", kernels.code, *entries, ""])
         self.library = keep_library("functions", {"functions.c": code}, _FLAGS)
 
@@ -160,7 +152,7 @@ class CompiledFunctions:
             constants: inputs that stay; None for those that the caller sets.
         """
         # Work arrays of its own, and constants that live as long as the kernel.
-        arg, res, iw, w = (max(1, size) for size in self._functions[name].work)
+        arg, res, iw, w = (max(1, size) for size in self._work[name])
         arguments, results = (ctypes.c_void_p * arg)(), (ctypes.c_void_p * res)()
         integers, doubles = np.zeros(iw, dtype=np.intc), np.zeros(w)
         kept = [None if value is None else np.ascontiguousarray(value, dtype=float) for value in constants]
@@ -178,7 +170,7 @@ class CompiledFunctions:
         N = max(len(argument) for argument in arguments if argument.ndim == 2)
         kernel = self.kernel(name, [None] * len(arguments))
         inputs = [np.ascontiguousarray(argument, dtype=float) for argument in arguments]
-        outputs = [np.empty((N, size)) for size in self._functions[name].outputs]
+        outputs = [np.empty((N, size)) for size in self._outputs[name]]
         # Pointers to inputs and outputs, and from row to row a stride, 0 where all rows are equal.
         places = [
             (ctypes.c_void_p * len(arrays))(*(array.ctypes.data for array in arrays)) for arrays in (inputs, outputs)

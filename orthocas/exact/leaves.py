@@ -69,11 +69,6 @@ def remove_turns(problem: Problem, differences: Array) -> Array:
     return np.asarray(wrap_shortest(differences, np.where(find_turning_joints(problem), 2 * np.pi, 0.0)))
 
 
-def is_covered(region: Box, points: Array) -> NDArray[np.bool_]:
-    """Which points lie in the region, up to rounding, (N,)."""
-    return np.asarray((np.abs(points - region.centre) <= region.half_width + 1e-9).all(axis=1))
-
-
 def require_on_leaf(problem: Problem, level: Array, points: Array) -> None:
     """Raise InvalidValueError unless points (N, n) lie on the leaf h(q) = level (m,), relative to the size of J_x."""
     # In units of the size of the gradients, an error of the task is a distance.
@@ -139,7 +134,8 @@ class DiskLeaf:
         located = self._in_space.locate(points)
         corners = self.disk[self.faces[located.face]]
         xi = np.einsum("sk,skr->sr", located.barycentric, corners)
-        return LeafValues(xi, self._gradients[located.face], is_covered(self.region, points))
+        inside = (np.abs(points - self.region_centre) <= self.region_half_width + 1e-9).all(axis=1)
+        return LeafValues(xi, self._gradients[located.face], np.asarray(inside))
 
     def points(self, xi: Array, near: Array | None = None) -> Array:
         """Points of the leaf with coordinates xi (N, 2) in the disk; NaN for other xi.
