@@ -88,6 +88,7 @@ class CofactorCheck:
         return BoxResults(regular, regular, sign, np.zeros(len(low)), find_most_influential(gains, self.joints))
 
     def _check_few(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array, Array]:
+        # det J is proved nonsingular with the sign that it has at the centre.
         coefficients, rest = self.determinant(low, high)
         sign = np.nan_to_num(np.sign(coefficients[0]))
         n = len(self.joints)
@@ -120,11 +121,13 @@ class Determinant:
             z = compute_cofactors([[row[j] for j in active] for row in _expand_task_rows(chart)])
         except CertifyError:
             return None
+        # Columns where dxi/dq varies stay apart; the others are summed up with their constants.
         values, doubts = _differentiate_coordinate(family, coordinates.theta)
         varying = [j for j in range(len(z)) if (np.abs(values[j, 1:]) + doubts[j, 1:]).any()]
         constant = Waves.constant(0.0, chart.n)
         for j in {*range(len(z))} - {*varying}:
             constant = constant + z[j] * Waves.constant(float(values[j, 0]), chart.n, float(doubts[j, 0]))
+        # The determinant depends on the joints of any wave, and on those of any monomial.
         sums = [*(z[j] for j in varying), constant.trim()]
         turning = {i for each in sums for i in np.flatnonzero(each.frequencies.any(axis=0)).tolist()}
         every = list_indices(len(active), _bound_degree(family))
