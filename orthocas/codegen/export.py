@@ -239,7 +239,7 @@ def _encode(table: Array) -> list[str]:
     """Lines of base64 with the numbers of a table."""
     # Adding 0.0 turns -0.0 into 0.0.
     text = b64encode((np.asarray(table, dtype="<f8") + 0.0).tobytes()).decode()
-    return textwrap.wrap(text, _WIDTH) or [""]
+    return [text[k : k + _WIDTH] for k in range(0, max(len(text), 1), _WIDTH)]
 
 
 @dataclass(frozen=True)
