@@ -121,7 +121,7 @@ def certify(
     search = Search(check, base, limits, rank_by_volume(base), executor)
     injective: Subdivision | None = None
 
-    def so_far() -> Certificate:
+    def build_so_far() -> Certificate:
         return _build_certificate(chart, check.method, bound, search, injective, time.monotonic() - start, resume)
 
     # Look for folds first, then prove all parts, then with the time that is left a box where phi is one-to-one.
@@ -133,8 +133,8 @@ def certify(
             most = int(np.clip(_MORE_BOXES[check.method] * search.evaluated, RULES.least_boxes, RULES.most_boxes))
             injective = _find_one_to_one_box(chart, rows, base, Limits(left, boxes=most), executor, monitor)
     except KeyboardInterrupt:
-        raise Interrupted(so_far()) from None
-    return so_far()
+        raise Interrupted(build_so_far()) from None
+    return build_so_far()
 
 
 def certified_box(
@@ -345,7 +345,7 @@ def _find_one_to_one_box(
     if check is None:
         return None
 
-    def proved(fraction: Array, most: int) -> bool:
+    def prove(fraction: Array, most: int) -> bool:
         nonlocal best
         # A box about the same centre, with so much of the width of each joint.
         centre, whole = (base.low + base.high) / 2, fraction == 1
@@ -370,27 +370,27 @@ def _find_one_to_one_box(
     held, half = np.isin(joints, check.still_joints), (base.high - base.low) / 2
     for range_ in (np.inf, RULES.held_range) if held.any() else (np.inf,):
         fraction = np.where(idle, 1.0, np.minimum(1.0, range_ / half))
-        _try_scales([np.where(idle | held, fraction, scale) for scale in scales], proved, limits.boxes)
+        _try_scales([np.where(idle | held, fraction, scale) for scale in scales], prove, limits.boxes)
         if best is not None:
             break
     return best
 
 
-def _try_scales(boxes: Sequence[Array], proved: Callable[[Array, int], bool], most: int) -> None:
+def _try_scales(boxes: Sequence[Array], prove: Callable[[Array, int], bool], most: int) -> None:
     """Ask for proofs of boxes of increasing size: the largest one, then by bisection with few boxes, then with many."""
-    if proved(boxes[-1], RULES.few_boxes):
+    if prove(boxes[-1], RULES.few_boxes):
         return
     # Those before `low` are proved, those from `high` on are not with few boxes.
     low, high = 0, len(boxes) - 1
     while low < high:
         half_way = (low + high) // 2
-        low, high = (half_way + 1, high) if proved(boxes[half_way], RULES.few_boxes) else (low, half_way)
+        low, high = (half_way + 1, high) if prove(boxes[half_way], RULES.few_boxes) else (low, half_way)
     if low == 0:
         return
-    while low + 1 < len(boxes) and proved(boxes[low + 1], most):
+    while low + 1 < len(boxes) and prove(boxes[low + 1], most):
         low += 2
     if low < len(boxes):
-        proved(boxes[low], most)
+        prove(boxes[low], most)
 
 
 def _build_certificate(

@@ -88,7 +88,7 @@ def plan_product(left: Variables, right: Variables) -> Product:
     both = tuple(sorted({*left, *right}))
     index = {monomial: k for k, monomial in enumerate(list_monomials(both))}
 
-    def of(one: Monomial, others: tuple[Monomial, ...]) -> Places:
+    def find_products(one: Monomial, others: tuple[Monomial, ...]) -> Places:
         return _merge_places([index[tuple(sorted(one + other))] for other in others])
 
     # Linear terms of a meet linear and quadratic ones of b, quadratic ones of a only linear ones.
@@ -100,8 +100,8 @@ def plan_product(left: Variables, right: Variables) -> Product:
         len(index),
         find_places(left, both),
         find_places(right, both),
-        tuple(of((i,), inner) for i in left),
-        tuple(of((j,), a[starts[2] : starts[3]]) for j in right),
+        tuple(find_products((i,), inner) for i in left),
+        tuple(find_products((j,), a[starts[2] : starts[3]]) for j in right),
     )
 
 
