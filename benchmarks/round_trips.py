@@ -61,7 +61,7 @@ def misses(name: str, count: int) -> str:
         solutions = chart.solve(phi)
         seconds = time.process_time() - begin
         found = solutions.found
-        wrong = (np.abs(chart.phi(solutions.q[found]) - phi[found]) > 1e-8 * chart.phi_sizes).any(axis=1)
+        wrong = (np.abs(chart.phi(solutions.q[found]) - phi[found]) > 1e-8 * chart.parts.phi_sizes).any(axis=1)
         cells += [int((~found).sum()), int(wrong.sum() + (~domain.contains(solutions.q[found])).sum())]
         cells += [round(1e6 * seconds / count)]
     wide = domain.centre + 1.4 * (sample_uniform(domain, count // 25, 6) - domain.centre)
@@ -123,7 +123,7 @@ def nearest(name: str, count: int) -> str:
     pool, xi, worse = sample_uniform(domain, _DENSE, 77), chart.xi(wishes), 0
     for k in range(count):
         others = at_task_value(chart, x[k], pool)
-        turns = chart.turns[chart.m :]
+        turns = chart.parts.turns[chart.m :]
         away = (
             np.linalg.norm(wrap_shortest(xi[k] - chart.xi(others), turns), axis=1)
             if len(others)
@@ -139,7 +139,7 @@ def nearest(name: str, count: int) -> str:
 
 def at_task_value(chart: oc.Chart, x: Array, pool: Array) -> Array:
     """Positions of the domain with the task value x (m,) to which damped least squares lead from a pool (S, n)."""
-    m, sizes, (low, high) = chart.m, chart.phi_sizes[: chart.m], chart.problem.domain.bounds
+    m, sizes, (low, high) = chart.m, chart.parts.phi_sizes[: chart.m], chart.problem.domain.bounds
     q, wanted = pool.copy(), np.broadcast_to(x, (len(pool), chart.m))
     for _ in range(15):
         e = chart.parts.relative.difference(wanted, chart.task(q)) / sizes

@@ -153,7 +153,7 @@ def _find_periodic_inputs(coordinates: Coordinates) -> set[int]:
     family, n = coordinates.family, len(coordinates.active)
     # Networks take sines and cosines of all joints that they do not take as they are.
     if isinstance(family, MLPFamily):
-        return {i for i, direct in enumerate(family.direct) if not direct}
+        return {*range(n)} - {*family.direct}
     q = ca.SX.sym("q", n)
     # Each function of a basis is looked at alone.
     if isinstance(family, LinearFamily):

@@ -78,7 +78,7 @@ class CompiledInverse(Shown):
         def solve_piece(first: int) -> None:
             rows = slice(first, first + _PIECE)
             phi, q_start, q, reached = (array[rows] for array in (*inputs, attempt.q, attempt.residual))
-            arrays = (phi, q_start, self.chart.phi_sizes, q, reached, condition[rows])
+            arrays = (phi, q_start, self.chart.parts.phi_sizes, q, reached, condition[rows])
             rows_in_c(
                 ctypes.c_long(len(phi)),
                 ctypes.c_int(iterations),
@@ -183,8 +183,8 @@ def write_curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
     # Errors and gradients of the task, xi with its gradient, and the condition of the domain.
     functions = [
         dense_function("curve_task", [q, x], curves.tracer.equations.call([q, x])),
-        dense_function("curve_xi", [q], [chart.runnable(own["xi"])(q)]),
-        dense_function("curve_gradient", [q], [chart.runnable(own["jacobian"])(q)]),
+        dense_function("curve_xi", [q], [chart.parts.runnable(own["xi"])(q)]),
+        dense_function("curve_gradient", [q], [chart.parts.runnable(own["jacobian"])(q)]),
     ]
     if domain.condition is not None:
         functions.append(dense_function("curve_pivots", [q], [domain.condition.pivots(q)]))
@@ -196,8 +196,8 @@ def write_curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
         "m": chart.m,
         "starts": _STARTS,
         "rules": asdict(RULES),
-        "xi_size": float(chart.phi_sizes[chart.m]),
-        "period": float(chart.turns[chart.m]),
+        "xi_size": float(chart.parts.phi_sizes[chart.m]),
+        "period": float(chart.parts.turns[chart.m]),
         "low": low,
         "high": high,
         "centre": domain.centre,

@@ -12,7 +12,7 @@ from typing import Any, Self
 import casadi as ca
 import numpy as np
 
-from orthocas.bases.mlp import MLPFamily
+from orthocas.bases.mlp import MLPFamily, split_layers
 from orthocas.bases.products import ProductFamily, Term, split, with_parts
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
@@ -172,18 +172,21 @@ def _build_network(coordinates: Coordinates) -> Form | None:
         return None
     # The last layer has the scale and offset of the coordinates; idle joints come beside it.
     scale, fitted, depth = coordinates.scale[:, None], len(coordinates.offset), len(family.hidden)
-    layers = [(W, b[:, None]) for W, b in family.split_layers(coordinates.theta)]
+    weights, biases = split_layers(coordinates.theta, family.widths)
+    active = np.array(coordinates.active, dtype=int)
     A, c = _split_idle(coordinates)
+    A[:fitted, active[list(family.linear)]] = scale * family.split_slopes(coordinates.theta)
     W_out = np.zeros((coordinates.r, family.hidden[-1]))
-    W_out[:fitted] = scale * layers[depth][0]
-    c[:fitted] = scale * (layers[depth][1] - coordinates.offset[:, None])
-    active, slides = np.array(coordinates.active, dtype=int), np.array(family.direct, dtype=bool)
-    turning, sliding, idle = active[~slides], active[slides], np.array(coordinates.idle, dtype=int)
+    W_out[:fitted] = scale * weights[depth].T
+    c[:fitted] = scale * (biases[depth] - coordinates.offset)[:, None]
+    turning, sliding = active[family.turning], active[family.direct]
+    # Joints that do not enter the network.
+    idle = np.setdiff1d(np.arange(coordinates.space.n), [*turning, *sliding])
     indices = {"turning": turning, "sliding": sliding, "idle": idle}
     indices["order"] = np.argsort(np.concatenate(list(indices.values())))
     tables = {"W_out": W_out, "A": A, "c": c}
-    for k, (W, b) in enumerate(layers[:depth]):
-        tables |= {f"W_{k}": W, f"b_{k}": b}
+    for k in range(depth):
+        tables |= {f"W_{k}": weights[k].T, f"b_{k}": biases[k][:, None]}
     plain = {name: [int(k) for k in of] for name, of in indices.items()}
     return Form("coordinates", {"kind": "network", "depth": depth}, "", tables, plain)
 
@@ -229,7 +232,7 @@ def _build_newton(chart: Chart) -> Form:
         summary = "Task values, then how fast they move, angular velocities in the tip's axes, (m + m n, N)."
         rates = "_task_and_rates"
         functions.append(write_function(rates, summary, problem.task.function, chart.parts.relative.rates))
-    tables = {"centre": domain.centre[:, None], "sizes": chart.phi_sizes[:, None], "bounds": bounds[:, :, None]}
+    tables = {"centre": domain.centre[:, None], "sizes": chart.parts.phi_sizes[:, None], "bounds": bounds[:, :, None]}
     return Form("inverse", {"rates": rates}, "\n\n".join(functions), tables, {})
 
 

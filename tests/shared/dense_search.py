@@ -9,7 +9,7 @@ STARTS = 4000
 
 def positions_at(chart: oc.Chart, x: np.ndarray, pool: np.ndarray) -> np.ndarray:
     """Positions of the domain with the task value x (m,) to which damped least squares lead from a pool (S, n)."""
-    m, sizes, (low, high) = chart.m, chart.phi_sizes[: chart.m], chart.problem.domain.bounds
+    m, sizes, (low, high) = chart.m, chart.parts.phi_sizes[: chart.m], chart.problem.domain.bounds
     q, wanted = pool.copy(), np.broadcast_to(x, (len(pool), m))
     for _ in range(15):
         e = chart.parts.relative.difference(wanted, chart.task(q)) / sizes
