@@ -21,7 +21,7 @@ from orthocas.control.controller import (
     count_turns_from_centre,
     fallback_function,
     guarded_graph,
-    law_facts,
+    list_law_facts,
     named_inputs,
 )
 from orthocas.control.gains import (
@@ -152,7 +152,7 @@ class KinematicProjector(TwoTaskLaw):
 
     def facts(self) -> dict[str, str]:
         """Quantities, gains and problem."""
-        return law_facts(self)
+        return list_law_facts(self)
 
     @property
     def settings(self) -> Mapping[str, str]:
@@ -280,7 +280,7 @@ class Projector(TwoTaskLaw):
 
     def facts(self) -> dict[str, str]:
         """Quantities, gains and problem."""
-        return law_facts(self)
+        return list_law_facts(self)
 
     @property
     def formula(self) -> str:

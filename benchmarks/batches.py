@@ -21,7 +21,7 @@ from benchmark import run, table
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.codegen.library import compilers
+from orthocas.codegen.library import find_compilers
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
@@ -71,7 +71,7 @@ def of_c(chart: oc.Chart, points: Array, folder: Path) -> dict[str, dict[str, Ca
     generated, library = oc.generate_c(chart, folder / "c", name="arm", rows=True), folder / "c" / "rows.so"
     sources = [str(generated.folder / file) for file in ("arm.c", "arm_rows.c")]
     flags = ["-O3", "-march=native", "-fPIC", "-shared"]
-    subprocess.run([compilers()[0], *flags, "-o", str(library), *sources, "-lm"], check=True)
+    subprocess.run([find_compilers()[0], *flags, "-o", str(library), *sources, "-lm"], check=True)
     run, arrays = ctypes.CDLL(str(library)).arm_phi_rows, (points, np.empty_like(points))
 
     def phi() -> None:

@@ -16,7 +16,7 @@ from benchmark import run
 import orthocas as oc
 from orthocas import problems
 from orthocas.codegen import CompiledLibrary, compile_shared, time_ticks
-from orthocas.codegen.library import compilers
+from orthocas.codegen.library import find_compilers
 from orthocas.control import Controller, Impedance, Kinematic, PDPlus
 
 _PLAIN = """
@@ -85,7 +85,7 @@ def main(quick: bool = False) -> dict[str, dict[str, float]]:
 def _plain_loop(folder: Path, n: int) -> CompiledLibrary:
     source, library = folder / "plain.c", folder / "libplain.so"
     source.write_text(_PLAIN)
-    subprocess.run([compilers()[0], "-O2", "-fPIC", "-shared", str(source), "-o", str(library)], check=True)
+    subprocess.run([find_compilers()[0], "-O2", "-fPIC", "-shared", str(source), "-o", str(library)], check=True)
     return CompiledLibrary(library, "plain", n)
 
 

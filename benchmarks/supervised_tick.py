@@ -17,7 +17,7 @@ from benchmark import run
 import orthocas as oc
 from orthocas import problems
 from orthocas.codegen import CompiledLibrary, Supervisor, check_c, compile_shared, time_ticks
-from orthocas.codegen.library import compilers
+from orthocas.codegen.library import find_compilers
 from orthocas.control import PDPlus
 from orthocas.simulation import MuJoCoPlant
 
@@ -74,7 +74,7 @@ def _supervised(folder: Path, library: CompiledLibrary) -> tuple[CompiledLibrary
     source, target = folder / "supervised.c", folder / "libsupervised.so"
     source.write_text(_SUPERVISED)
     words = ["-O2", "-fPIC", "-shared", f"-DNUMBER={library.precision.c_name}", str(source), str(library.path)]
-    subprocess.run([compilers()[0], *words, f"-Wl,-rpath,{folder}", "-o", str(target), "-lm"], check=True)
+    subprocess.run([find_compilers()[0], *words, f"-Wl,-rpath,{folder}", "-o", str(target), "-lm"], check=True)
     supervised = CompiledLibrary(target, "supervised", library.n, library.single_precision)
     return supervised, list((ctypes.c_int * 2).from_address(supervised.address("sizes")))
 

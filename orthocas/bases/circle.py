@@ -118,6 +118,7 @@ class CircleFamily:
 
     def jacobian(self, q: Expression, theta: Expression) -> list[Expression]:
         """Gradients (u dv - v du) / (u^2 + v^2), r matrices (n, N)."""
+        # Those of u and v, row by row over |(u, v)|^2.
         u, v = self._pairs(q, theta)
         slopes = self.pairs.jacobian(q, theta[: self.pairs.size])
         squared, n = u**2 + v**2, q.shape[0]
@@ -138,6 +139,7 @@ class CircleFamily:
 
     def turned(self, theta: Array, angles: Array) -> Array:
         """Parameters of xi - angles, (size,): every pair is turned back by its angle (r,) [rad]."""
+        # A turn of the plane of each pair.
         c, s = np.diag(np.cos(angles)), np.diag(np.sin(angles))
         return self._combine(theta, np.block([[c, s], [-s, c]]))
 

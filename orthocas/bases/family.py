@@ -39,16 +39,17 @@ class Memories:
     @contextmanager
     def borrow(self, count: int) -> Iterator[list[ArrayMemory]]:
         """So many memories that nobody else uses meanwhile."""
-        found: list[ArrayMemory] = []
+        borrowed: list[ArrayMemory] = []
+        # Take spare ones, and make those that are missing; all come back for others.
         for _ in range(count):
             try:
-                found.append(self._spare.pop())
+                borrowed.append(self._spare.pop())
             except IndexError:
-                found.append(ArrayMemory())
+                borrowed.append(ArrayMemory())
         try:
-            yield found
+            yield borrowed
         finally:
-            self._spare.extend(reversed(found))
+            self._spare.extend(reversed(borrowed))
 
 
 TURN = 2 * np.pi  #: period of coordinates that are angles [rad]
@@ -92,34 +93,27 @@ class Family(Protocol):
     @property
     def size(self) -> int:
         """Number of parameters."""
-        ...
 
     @property
     def outputs(self) -> int:
         """Number r of components."""
-        ...
 
     @property
     def as_matrices(self) -> bool:
         """Whether the family consists of dense products. Then it needs MX graphs with samples as columns, not SX."""
-        ...
 
     @property
     def width(self) -> int:
         """Largest number of intermediate values per sample. It limits how many samples fit into the cache."""
-        ...
 
     def expression(self, q: Expression, theta: Expression) -> Expression:
         """xi_theta(q), (r, N), for N joint positions side by side as columns (n, N); theta (size, 1)."""
-        ...
 
     def jacobian(self, q: Expression, theta: Expression) -> list[Expression]:
         """Gradients of the components, r matrices (n, N). Column s of matrix j is dxi_j/dq at joint position s."""
-        ...
 
     def initial(self, seed: int) -> Array:
         """A seeded starting point, (size,)."""
-        ...
 
 
 @runtime_checkable
@@ -138,7 +132,6 @@ class ArrayFamily(Family, Protocol):
             J_xi, (N, r, n), and the map from dL/dJ_xi (N, r, n) to dL/dtheta. It writes to an array (size,) of theta's
             type and returns it.
         """
-        ...
 
 
 @runtime_checkable
@@ -147,7 +140,6 @@ class ReorderableFamily(Family, Protocol):
 
     def reordered(self, theta: Array, order: Sequence[int]) -> Array:
         """Parameters of the components in another order, (size,)."""
-        ...
 
 
 @runtime_checkable
@@ -156,7 +148,6 @@ class CombinableFamily(Family, Protocol):
 
     def combined(self, theta: Array, B: Array) -> Array:
         """Parameters of B xi, (size,), for a matrix B (r, r)."""
-        ...
 
 
 @runtime_checkable
@@ -178,7 +169,6 @@ class LinearFamily(Family, Protocol):
 
     def basis(self, q: Expression) -> Expression:
         """psi(q), (K, N), for q (n, N); K is the `width` of the family."""
-        ...
 
 
 @runtime_checkable
@@ -187,7 +177,6 @@ class GradedFamily(LinearFamily, Protocol):
 
     def embed(self, theta: Array, coarser: Self) -> Array:
         """Convert parameters of a family of lower degree to this family, (size,)."""
-        ...
 
 
 @runtime_checkable
@@ -196,7 +185,6 @@ class SelfDerivativeFamily(LinearFamily, Protocol):
 
     def derivative_tables(self, theta: Array) -> Array:
         """C_i with d xi / d q_i = C_i (1, psi), (n, r, 1 + K)."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,25 +203,20 @@ class Parametrisation(Protocol):
     @property
     def label(self) -> str:
         """Short name, as used on the command line, for example 'polynomial:4'."""
-        ...
 
     @property
     def linear(self) -> bool:
         """Whether its families are linear in their parameters. Then `fit` minimises by Gauss-Newton or QuasiNewton."""
-        ...
 
     @property
     def closed_form(self) -> "Callable[[Problem], ClosedForm] | None":
         """The function that gives the parameters without a fit, or None if they are fitted."""
-        ...
 
     def for_problem(self, problem: "Problem") -> "Parametrisation":
         """The parametrisation for this problem. It is the object itself if it does not depend on the problem."""
-        ...
 
     def family(self, space: JointSpace, outputs: int) -> Family:
         """The family on the given joints, with `outputs` components."""
-        ...
 
 
 @runtime_checkable
@@ -243,19 +226,15 @@ class GradedParametrisation(Parametrisation, Protocol):
     @property
     def degree(self) -> int:
         """Total degree."""
-        ...
 
     def of_degree(self, degree: int) -> Self:
         """The same parametrisation with another degree."""
-        ...
 
     def term_count(self, n: int) -> int:
         """Number of basis functions for n joints, without building them."""
-        ...
 
     def family(self, space: JointSpace, outputs: int) -> GradedFamily:
         """The family on the given joints."""
-        ...
 
 
 @runtime_checkable
@@ -265,7 +244,6 @@ class CyclicParametrisation(Parametrisation, Protocol):
     @property
     def cyclic(self) -> Sequence[str]:
         """Names of these joints, after `for_problem`."""
-        ...
 
 
 def component_gradients(xi: Expression, q: Expression) -> list[Expression]:
@@ -341,5 +319,4 @@ class BasisFamily:
 
     def combined(self, theta: Array, B: Array) -> Array:
         """Coefficients of B xi, (size,), for a matrix B (r, r)."""
-        coefficients: Array = (B @ theta.reshape(self.outputs, self.width)).ravel()
-        return coefficients
+        return np.asarray((B @ theta.reshape(self.outputs, self.width)).ravel())

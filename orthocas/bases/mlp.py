@@ -41,6 +41,7 @@ class NetworkArrays:
         def arrays(name: str, *before: int) -> list[Array]:
             return [memory.array(f"{name}{k}", (*before, N, w), theta.dtype) for k, w in enumerate(widths[:-1])]
 
+        # Values of the layers lie in the last place of `up`, slopes 1 - a^2 beside them.
         self._up, self._below = arrays("up", widths[-1] + 1), arrays("below", widths[-1] + 1)
         self._s, self._work = arrays("slope"), arrays("work")
         self._a = [array[-1] for array in self._up]
@@ -53,6 +54,7 @@ class NetworkArrays:
 
     def gradients(self) -> Array:
         """Gradients of the outputs with respect to the inputs, (r, N, inputs)."""
+        # From the last layer to the inputs.
         *hidden, last = self._V
         np.multiply(last.T[:, None, :], self._s[-1], out=self._below[-1][:-1])
         for k in reversed(range(len(hidden))):
@@ -72,8 +74,8 @@ class NetworkArrays:
         self._up[0][:-1] = slopes
         for k, V in enumerate(self._V[:-1], start=1):
             up, h = self._up[k][:-1], self._below[k][:-1]
-            np.matmul(_flatten(self._up[k - 1][:-1]), V, out=_flatten(up))  # by h
-            # by s, times s
+            # By h, then by s, times s.
+            np.matmul(_flatten(self._up[k - 1][:-1]), V, out=_flatten(up))
             np.einsum("rsw,rsw->sw", up, h, out=self._work[k])
             up *= self._s[k]
         np.sum(self._up[-1][:-1], axis=1, out=by_V[-1].T)
@@ -82,8 +84,9 @@ class NetworkArrays:
             by_z, rest = self._below[k][-1], self._work[k]
             rest *= self._a[k]
             rest *= -2
+            # By a, then through tanh, and what s adds.
             if k < len(self._V) - 1:
-                np.matmul(self._below[k + 1][-1], self._V[k].T, out=by_z)  # by a
+                np.matmul(self._below[k + 1][-1], self._V[k].T, out=by_z)
                 by_z *= self._s[k]
                 by_z += rest
             else:
@@ -249,13 +252,13 @@ class MLPFamily:
         gradients = ca.horzcat(*(ca.repmat(W_out[j, :].T, 1, N) for j in range(r)))
         for (W, _), slope in zip(layers[-2::-1], reversed(slopes), strict=True):
             gradients *= ca.repmat(slope, 1, r)
-            # one sample as rows: then generated C needs no transposed copy of the weights
+            # One sample as rows: then generated C needs no transposed copy of the weights.
             gradients = (gradients.T @ W).T if N == 1 else W.T @ gradients
         turning: list[int] = self.turning
         t = len(turning)
         by_angle = gradients[:t, :] * ca.repmat(ca.cos(q[turning, :]), 1, r)
         by_angle -= gradients[t : 2 * t, :] * ca.repmat(ca.sin(q[turning, :]), 1, r)
-        # rows of the network's joints, of linear ones, and of those that coordinates do not depend on
+        # Rows of the network's joints, of linear ones, and of those that coordinates do not depend on.
         parts = [by_angle, gradients[2 * t :, :]]
         if self.linear:
             A = ca.reshape(theta[self._network_size :], r, len(self.linear))
@@ -264,7 +267,7 @@ class MLPFamily:
         without: list[int] = [i for i in range(self.space.n) if i not in entered]
         if without:
             parts.append(type(q).zeros(len(without), r * N))
-        # back to the order of the joints
+        # Back to the order of the joints.
         stacked = ca.vertcat(*parts)[np.argsort([*entered, *without]).tolist(), :]
         return [stacked[:, j * N : (j + 1) * N] for j in range(r)]
 
@@ -275,7 +278,8 @@ class MLPFamily:
         sin, cos = np.sin(angles).astype(theta.dtype), np.cos(angles).astype(theta.dtype)
         inputs = np.concatenate([sin, cos, points[:, direct].astype(theta.dtype)], axis=1)
         network = NetworkArrays(theta[:size], self.widths, inputs, memory or ArrayMemory())
-        g = network.gradients().transpose(1, 0, 2)  # (N, r, inputs)
+        # From the inputs, (N, r, inputs), to the joints.
+        g = network.gradients().transpose(1, 0, 2)
         J = np.zeros((len(points), self.outputs, self.space.n))
         J[:, :, turning] = g[:, :, :t] * cos[:, None] - g[:, :, t : 2 * t] * sin[:, None]
         J[:, :, direct] = g[:, :, 2 * t :]
@@ -315,12 +319,12 @@ class MLPFamily:
 
     def reordered(self, theta: Array, order: Sequence[int]) -> Array:
         """Parameters with the outputs in another order, (size,)."""
-        # the products with 0 and 1 are exact
+        # The products with 0 and 1 are exact.
         return self.combined(theta, np.eye(self.outputs)[list(order)])
 
     def combined(self, theta: Array, B: Array) -> Array:
         """Parameters of B xi, (size,), for a matrix B (r, r)."""
-        # W_out column by column, then b_out, then A
+        # W_out column by column, then b_out, then A.
         last = self.outputs * (self.widths[-2] + 1 + len(self.linear))
         columns = theta[-last:].reshape(-1, self.outputs) @ B.T
         return np.concatenate([theta[:-last], columns.ravel()])

@@ -55,9 +55,9 @@ def register_parametrisation(
         Cubic(degree=3, cyclic=(), joints=None, without=())
     """
     require_kind("name", name, str)
-    known = _REGISTERED.get(name)
-    if known is not None and known.kind is not kind:
-        raise InvalidValueError("name", repr(name), f"a name that {known.kind.__name__} does not use")
+    before = _REGISTERED.get(name)
+    if before is not None and before.kind is not kind:
+        raise InvalidValueError("name", repr(name), f"a name that {before.kind.__name__} does not use")
     if not isinstance(kind, type) or not is_dataclass(kind):
         raise InvalidValueError("kind", repr(kind), "a dataclass: chart files store its fields")
     _REGISTERED[name] = Registration(kind, parse)
@@ -65,7 +65,7 @@ def register_parametrisation(
 
 def parametrisation_names() -> tuple[str, ...]:
     """Names that the command line accepts."""
-    return tuple(name for name, known in _REGISTERED.items() if known.parse is not None)
+    return tuple(name for name, each in _REGISTERED.items() if each.parse is not None)
 
 
 def require_savable(parametrisation: Parametrisation) -> None:
@@ -91,12 +91,13 @@ def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
         InvalidValueError: if it is not registered, or its settings are not plain data.
     """
     kind = type(parametrisation)
-    if kind not in {known.kind for known in _REGISTERED.values()} or not is_dataclass(parametrisation):
+    if kind not in {each.kind for each in _REGISTERED.values()} or not is_dataclass(parametrisation):
         raise InvalidValueError(
             "parametrisation",
             kind.__name__,
             f"a registered one, so that it can be saved: orthocas.register_parametrisation('...', {kind.__name__})",
         )
+    # Settings that are parametrisations become data themselves.
     parts = {part.name: getattr(parametrisation, part.name) for part in fields(parametrisation)}
     inner = {name: parametrisation_to_data(part) for name, part in parts.items() if isinstance(part, Parametrisation)}
     settings = {**asdict(parametrisation), **inner}
@@ -117,17 +118,18 @@ def parametrisation_from_data(data: Mapping[str, Any]) -> Parametrisation:
         UnknownNameError: if no such parametrisation is registered.
     """
     require_kind("data of a parametrisation", data, Mapping)
-    kinds = {known.kind.__name__: known.kind for known in _REGISTERED.values()}
+    kinds = {each.kind.__name__: each.kind for each in _REGISTERED.values()}
     name: str = data.get("parametrisation", "")
     settings: Any = data.get("settings")
     require_known("parametrisation", name, kinds)
     kind = kinds[name]
     require_kind("settings", settings, dict)
-    known = {field.name for field in fields(kind)}  # type: ignore[arg-type]
+    names = {field.name for field in fields(kind)}  # type: ignore[arg-type]
+    # Settings that are parametrisations themselves.
     inner = {name: part for name, part in settings.items() if isinstance(part, dict) and "parametrisation" in part}
     settings = settings | {name: parametrisation_from_data(part) for name, part in inner.items()}
-    if not settings.keys() <= known:
-        raise InvalidValueError(f"settings of {kind.__name__}", sorted(settings), f"some of {sorted(known)}")
+    if not settings.keys() <= names:
+        raise InvalidValueError(f"settings of {kind.__name__}", sorted(settings), f"some of {sorted(names)}")
     return kind(**settings)
 
 
@@ -156,6 +158,7 @@ def _parse_whole(text: str) -> int:
 
 
 def _parse_products(text: str) -> tuple[int, Cyclic, int | None, tuple[str, ...]]:
+    # DEGREE, then joints=MOST, then joints and what is left out.
     degree, _, rest = text.partition(":")
     most = None
     if rest.startswith(f"{JOINTS}="):

@@ -8,10 +8,11 @@ Source:
     ours, docs/explanation/certificates.md.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
 from operator import mul
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,11 +57,9 @@ class BoxCheck(Protocol):
     @property
     def joints(self) -> Variables:
         """The joints on which the result depends: halving others is of no use."""
-        ...
 
     def __call__(self, low: Array, high: Array) -> BoxResults:
         """Evaluate boxes between corners (boxes, n)."""
-        ...
 
 
 class RegularCheck(BoxCheck, Protocol):
@@ -69,7 +68,6 @@ class RegularCheck(BoxCheck, Protocol):
     @property
     def method(self) -> str:
         """Name of the method in certificates."""
-        ...
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -113,6 +111,7 @@ def rotate_to_singular_basis(J: TaylorModel) -> tuple[TaylorModel, Array]:
     U and V are taken as they are in floating-point numbers. They are checked to be orthogonal up to 1e-9, so they are
     nonsingular, and the sign of their determinants is that of the computed ones.
     """
+    # Vectors that are not orthogonal, or not finite, have no sign.
     Ut, V = find_singular_vectors(J)
     signs = np.nan_to_num(np.sign(np.linalg.det(Ut) * np.linalg.det(V))) * (is_orthogonal(Ut) & is_orthogonal(V))
     return multiply_between(Ut, J, V), signs
@@ -134,9 +133,11 @@ def is_orthogonal(matrices: Array) -> NDArray[np.bool_]:
 
 def multiply_between(left: Array, J: TaylorModel, right: Array) -> TaylorModel:
     """left J right for matrices left (boxes, m, m) and right (boxes, n, n)."""
+    # One product for all coefficients of a box, from each side.
     N, m, n, boxes = J.coefficients.shape
     inner = np.ascontiguousarray(J.coefficients.transpose(3, 1, 0, 2)).reshape(boxes, m * N, n) @ right
     outer = (left @ inner.reshape(boxes, m, N * n)).reshape(boxes, m, N, n)
+    # Remainders and rounding pass through the absolute values.
     unknown = J.remainder + sum_error(m + n) * np.abs(J.coefficients).sum(axis=0)
     spread = np.abs(left) @ np.moveaxis(unknown, -1, 0) @ np.abs(right)
     coefficients = np.ascontiguousarray(outer.transpose(2, 1, 3, 0))
@@ -145,6 +146,7 @@ def multiply_between(left: Array, J: TaylorModel, right: Array) -> TaylorModel:
 
 def compute_pivots(J: TaylorModel) -> list[TaylorModel]:
     """The pivots of Gaussian elimination without exchanges, models (boxes,). Their product is det J."""
+    # The Schur complement of each pivot takes the place of the matrix.
     diagonal = [J[0, 0]]
     while len(J.remainder) > 1:
         ratios = J[1:, 0] * reciprocal(diagonal[-1][None])
@@ -153,7 +155,7 @@ def compute_pivots(J: TaylorModel) -> list[TaylorModel]:
     return diagonal
 
 
-def lower_bound(model: TaylorModel) -> Array:
+def bound_from_below(model: TaylorModel) -> Array:
     """A number below all values, (boxes,); NaN or -inf where nothing is known.
 
     Each variable is bounded exactly in its linear and square term, g t + h t^2 for t in [-1, 1]; mixed terms and cubic
@@ -169,8 +171,7 @@ def lower_bound(model: TaylorModel) -> Array:
     least = np.minimum(least, 0)
     rest = np.abs(model.coefficients[1 + len(squares) :]).sum(axis=0) - np.abs(square).sum(axis=0)
     rounding = sum_error(4 * len(model.coefficients)) * np.abs(model.coefficients).sum(axis=0)
-    bound: Array = model.centre + least.sum(axis=0) - rest - model.remainder * UP - rounding
-    return bound
+    return np.asarray(model.centre + least.sum(axis=0) - rest - model.remainder * UP - rounding)
 
 
 def bound_conditioning(J: TaylorModel, m: int) -> Array:
@@ -179,12 +180,18 @@ def bound_conditioning(J: TaylorModel, m: int) -> Array:
     if m == n:
         return np.ones(J.remainder.shape[-1])
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        least = lower_bound(_build_volume(J, m)) * _ORTHOGONAL
-    return _bound_smallest_singular_value(np.clip(np.nan_to_num(least, nan=0.0), 0.0, 1.0), n)
+        volume = bound_from_below(_build_volume(J, m)) * _ORTHOGONAL
+    volume = np.clip(np.nan_to_num(volume, nan=0.0), 0.0, 1.0)
+    # The smallest of n singular values with that product, whose squares add up to n: each bound improves the next one.
+    least = np.zeros_like(volume)
+    for _ in range(4):
+        least = volume * ((n - 1) / (n - least * least)) ** ((n - 1) / 2) / UP
+    return least
 
 
 def _build_volume(J: TaylorModel, m: int) -> TaylorModel:
     """The volume of the gradients of the coordinates across those of the task, (boxes,)."""
+    # In the singular vectors of the task rows, these are nearly diagonal.
     left, right = find_singular_vectors(J[:m])
     unit = np.broadcast_to(np.eye(1), (len(right), 1, 1))
     task = multiply_between(left, J[:m], right)
@@ -205,6 +212,7 @@ def _build_volume(J: TaylorModel, m: int) -> TaylorModel:
 
 def _solve_kernel(task: TaylorModel, m: int) -> TaylorModel:
     """X with [T_1, T_2] [X; I] = 0 for task rows [T_1, T_2], by elimination, (m, r, boxes)."""
+    # Elimination keeps each pivot row and the inverse of its pivot, and substitution begins with the last one.
     rows, inverses = [], []
     for _ in range(m):
         inverses.append(reciprocal(task[0, 0]))
@@ -223,31 +231,31 @@ def _sum_models(parts: list[TaylorModel]) -> TaylorModel:
     return reduce(lambda a, b: a + b, parts)
 
 
-def _bound_smallest_singular_value(volume: Array, n: int) -> Array:
-    """A number below the smallest of n singular values with that product, whose squares add up to n."""
-    least = np.zeros_like(volume)
-    # Each bound improves the next one.
-    for _ in range(4):
-        least = volume * ((n - 1) / (n - least * least)) ** ((n - 1) / 2) / UP
-    return least
-
-
 def have_positive_pivots(pivots: list[TaylorModel]) -> NDArray[np.bool_]:
     """Whether all pivots have one sign on the box and the pivots of the centre are positive."""
-    return np.asarray(np.all([lower_bound(pivot) > 0 for pivot in pivots], axis=0))
+    return np.asarray(np.all([bound_from_below(pivot) > 0 for pivot in pivots], axis=0))
 
 
 def compute_influences(turned: TaylorModel) -> Array:
     """How much halving each variable narrows the matrix, relative to its singular values, (boxes, variables)."""
-    middle = np.sqrt(np.abs(np.stack([turned.centre[k, k] for k in range(len(turned.remainder))])) + 1e-300)
-    gains: Array = (turned.compute_gains() / (middle[:, None] * middle[None])).sum(axis=(1, 2)).T
-    return gains
+    # The diagonal holds the singular values of the centre.
+    diagonal = np.sqrt(np.abs(np.stack([turned.centre[k, k] for k in range(len(turned.remainder))])) + 1e-300)
+    return np.asarray((turned.compute_gains() / (diagonal[:, None] * diagonal[None])).sum(axis=(1, 2)).T)
 
 
 def find_most_influential(influences: Array, joints: Variables) -> Array:
     """The joint of the largest influence on each box, (boxes,); `UNKNOWN` where they are not finite."""
     finite = np.isfinite(influences).all(axis=1)
     return np.where(finite, np.array(joints)[np.argmax(np.nan_to_num(influences), axis=1)], UNKNOWN)
+
+
+def check_in_turn(check: Callable[[Array, Array], tuple[Any, ...]], low: Array, high: Array, at_once: int) -> Any:
+    """What a check returns for boxes between corners (boxes, n), for a few at once, whose terms fit into the cache."""
+    pieces = [slice(k, k + at_once) for k in range(0, len(low), at_once)]
+    # With one thread, rounding is the same everywhere; on some boxes, bounds are infinite.
+    with one_blas_thread(), np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        parts = [check(low[piece], high[piece]) for piece in pieces]
+    return [np.concatenate(each) for each in zip(*parts, strict=True)]
 
 
 def select_boxes(J: TaylorModel, boxes: slice | NDArray[np.bool_]) -> TaylorModel:

@@ -12,7 +12,7 @@ from orthocas.certificates.box_checks import BoxCheck, BoxResults
 from orthocas.certificates.one_to_one import choose_one_to_one_check
 from orthocas.certificates.outside import choose_check, choose_inside_check
 from orthocas.certificates.rows import ChartRows, build_chart_rows
-from orthocas.certificates.search import Limits, Look, Search, measure_distances, rank_by_distance, rank_by_volume
+from orthocas.certificates.search import Limits, Look, Search, measure_distances, rank_by_volume
 from orthocas.charts.certificate import COFACTORS, ELIMINATION, METHODS, OPEN, PROVED, Certificate, Subdivision
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
@@ -47,7 +47,6 @@ RULES = CertifyRules()
 #: boxes of the one-to-one proof, in those that the proof without folds took
 _MORE_BOXES = {ELIMINATION: 3, COFACTORS: 30}
 Mapped = Callable[..., Iterable[BoxResults]]
-_LARGEST_BOX = Limits(smallest=2.0**-6, first_failure=True, folds=False)
 
 
 def certify(
@@ -105,18 +104,27 @@ def certify(
     limits = Limits(seconds=check_options(chart, time_limit, executor))
     bound = check_bound(chart, bound)
     rows = build_chart_rows(chart)
-    base = cover_domain(chart.problem.domain) if resume is None else _resume(chart, bound, resume)
+    base = cover_domain(chart.problem.domain)
+    if resume is not None:
+        # Go on with what the earlier search left open, by the same method.
+        require_same(chart, resume)
+        if resume.bound != bound or resume.fold:
+            raise CertifyError(
+                f"resume is a certificate for bound {resume.bound:g}, expected one for {bound:g} without a fold"
+            )
+        base = resume.regular
     check = choose_check(chart, rows, bound, None if resume is None else resume.method)
     guarded = chart.problem.domain.room_to_fold is not None
-    # Near the boundary of such a domain, there is always something left to prove.
+    # Near the boundary of a domain that keeps folds out, there is always something left to prove.
     if guarded:
         limits = replace(limits, boxes=RULES.guarded_boxes)
     search = Search(check, base, limits, rank_by_volume(base), executor)
     injective: Subdivision | None = None
 
-    def so_far() -> Certificate:
+    def build_so_far() -> Certificate:
         return _build_certificate(chart, check.method, bound, search, injective, time.monotonic() - start, resume)
 
+    # Look for folds first, then prove all parts, then with the time that is left a box where phi is one-to-one.
     try:
         search.visit(_sample_suspects(chart))
         search.run(_report_search(monitor, "regular", guarded=guarded))
@@ -125,8 +133,8 @@ def certify(
             most = int(np.clip(_MORE_BOXES[check.method] * search.evaluated, RULES.least_boxes, RULES.most_boxes))
             injective = _find_one_to_one_box(chart, rows, base, Limits(left, boxes=most), executor, monitor)
     except KeyboardInterrupt:
-        raise Interrupted(so_far()) from None
-    return so_far()
+        raise Interrupted(build_so_far()) from None
+    return build_so_far()
 
 
 def certified_box(
@@ -159,12 +167,17 @@ def certified_box(
         >>> bool((certified_box(chart).half_width == chart.problem.domain.half_width).all())
         True
     """
-    limits = replace(_LARGEST_BOX, seconds=check_options(chart, time_limit, executor))
+    # Boxes near the centre come first, and a box without a proof ends the search: those behind it do not matter.
+    seconds = check_options(chart, time_limit, executor)
+    limits = Limits(seconds, smallest=2.0**-6, first_failure=True, folds=False)
     check = choose_inside_check(chart, build_chart_rows(chart), check_bound(chart, bound))
     base = cover_domain(chart.problem.domain)
-    search = Search(check, base, limits, rank_by_distance(base), executor)
+    search = Search(check, base, limits, partial(measure_distances, base), executor)
     search.run(_report_search(monitor, "largest box"))
-    scale = find_proved_scale(search.build_subdivision())
+    # The largest copy of the domain about its centre that no open part reaches into, rounded down.
+    parts = search.build_subdivision()
+    low, high = parts.leaves(OPEN)
+    scale = float(measure_distances(parts, low, high).min()) if len(low) else 1.0
     if scale == 0:
         raise CertifyError("nothing is proved around the centre of the domain, expected a chart that is regular there")
     domain = chart.problem.domain
@@ -211,21 +224,32 @@ def check_certificate(
     bound, rows = check_bound(chart, certificate.bound), build_chart_rows(chart)
     check = choose_check(chart, rows, bound, certificate.method)
     mapped: Mapped = map if executor is None else partial(in_order, executor)
-    if certificate.fold and not _check_fold(chart, check, np.array(certificate.fold)):
+    domain, whole = chart.problem.domain, certificate.regular
+    # A fold is two points of the domain at which det J is proved to have opposite signs.
+    if certificate.fold:
+        points = np.array(certificate.fold)
+        ends = check(points, points)
+        if not (domain.contains(points).all() and ends.regular.all() and ends.sign.prod() < 0):
+            return False
+    # The parts are proved, with one sign unless the chart folds, and their bounds are what the certificate says.
+    parts = _check_parts(check, whole, mapped, monitor)
+    signs = {int(sign) for results in parts for sign in np.unique(results.sign) if sign}
+    least = min((float(results.conditioning.min()) for results in parts), default=0.0)
+    one_sign = len(signs) < 2 or bool(certificate.fold)
+    if not (all(results.proved.all() for results in parts) and one_sign and least >= certificate.conditioning):
         return False
-    if not _check_regular(certificate, _check_parts(check, certificate.regular, mapped, monitor)):
+    if abs(_estimate_proved_fraction(domain, whole) - certificate.clear_share) > RULES.same_fraction:
         return False
-    fraction = _estimate_proved_fraction(chart.problem.domain, certificate.regular)
-    if abs(fraction - certificate.clear_share) > RULES.same_fraction:
-        return False
-    # The one-to-one box has its own check, and must lie around the centre.
+    # The one-to-one box has its own check, and must lie in the domain, around its centre.
     box = certificate.injective
     if box is None:
         return True
     one_to_one = choose_one_to_one_check(chart, rows, box)
-    if one_to_one is None or not box.complete or not _is_around_centre(certificate, box):
+    if one_to_one is None or not box.complete:
         return False
-    return all(results.proved.all() for results in _check_parts(one_to_one, box, mapped, monitor))
+    off = (box.low + box.high - whole.low - whole.high) / (box.high - box.low)
+    inside = (box.low >= whole.low).all() and (box.high <= whole.high).all() and np.abs(off).max() < RULES.off_centre
+    return bool(inside) and all(results.proved.all() for results in _check_parts(one_to_one, box, mapped, monitor))
 
 
 def check_options(chart: Chart, time_limit: float | None, executor: Executor | None) -> float:
@@ -244,6 +268,7 @@ def check_bound(chart: Chart, bound: float) -> float:
     bound = as_number("bound", bound)
     if not 0 <= bound < 1:
         raise InvalidValueError("bound", bound, "a number from 0 to below 1")
+    # Bounds above 0 need a fixed base and the Euclidean metric.
     if bound > 0 and build_chart_rows(chart).base:
         raise CertifyError(f"bound is {bound:g} on a moving base, expected 0: the sign of det J is proved there")
     if bound > 0 and not chart.problem.metric.is_identity:
@@ -274,6 +299,7 @@ def require_same(chart: Chart, certificate: Certificate) -> None:
     certificate.require_for(fingerprint(chart.problem, chart.coordinates))
     if not certificate.digest:
         raise CertifyError("the certificate has no digest, expected one made by `certify`")
+    # It holds only for the domain that it was made for, with the same bounds on singular values and folds.
     left_out = getattr(chart.problem.domain, "least_singular_value", 0.0)
     if certificate.least_singular_value != left_out:
         raise CertifyError(
@@ -289,18 +315,10 @@ def require_same(chart: Chart, certificate: Certificate) -> None:
         raise CertifyError("the certificate is void: it covers another domain")
 
 
-def _resume(chart: Chart, bound: float, certificate: Certificate) -> Subdivision:
-    require_same(chart, certificate)
-    if certificate.bound != bound or certificate.fold:
-        raise CertifyError(
-            f"resume is a certificate for bound {certificate.bound:g}, expected one for {bound:g} without a fold"
-        )
-    return certificate.regular
-
-
 def _sample_suspects(chart: Chart) -> Array:
     """The centre, and the sample with the least sign(det J(centre)) det J: uniform, near faces, and near corners."""
     domain = chart.problem.domain
+    # Powers of uniform samples lie near faces and corners.
     rng = np.random.default_rng(0)
     unit = rng.uniform(-1, 1, (RULES.samples, chart.n))
     powers = rng.choice([1.0, 0.5, 0.25], (RULES.samples, 1))
@@ -312,8 +330,7 @@ def _sample_suspects(chart: Chart) -> Array:
     J_x = chart.problem.task.batched_jacobian(points)[0].reshape(-1, chart.m, chart.n)
     volumes = np.linalg.det(np.nan_to_num(np.concatenate([J_x, chart.coordinates.jacobian(points)], axis=1)))
     worst = int(np.argmin(volumes * np.sign(volumes[0])))
-    suspects: Array = points[[0, worst]]
-    return suspects
+    return np.asarray(points[[0, worst]])
 
 
 def _find_one_to_one_box(
@@ -325,20 +342,21 @@ def _find_one_to_one_box(
     from there, larger ones are tried with more, until one of them would take too many.
     """
     end = time.monotonic() + limits.seconds
-    check = choose_one_to_one_check(chart, rows, base)
     best: Subdivision | None = None
+    check = choose_one_to_one_check(chart, rows, base)
     if check is None:
         return None
 
-    def proved(share: Array, most: int) -> bool:
+    def prove(fraction: Array, most: int) -> bool:
         nonlocal best
         # A box about the same centre, with so much of the width of each joint.
-        centre, whole = (base.low + base.high) / 2, share == 1
-        low, high = np.where(whole, base.low, centre - share * half), np.where(whole, base.high, centre + share * half)
+        centre, whole = (base.low + base.high) / 2, fraction == 1
+        reach = fraction * half
+        low, high = np.where(whole, base.low, centre - reach), np.where(whole, base.high, centre + reach)
         part = Subdivision.whole(low, high)
-        middle, own = (part.low + part.high)[None] / 2, replace(check, low=part.low, high=part.high)
+        point, own = (part.low + part.high)[None] / 2, replace(check, low=part.low, high=part.high)
         # At the centre of the box, the two points may be farthest apart.
-        if not own(middle, middle).proved.all():
+        if not own(point, point).proved.all():
             return False
         left = Limits(max(end - time.monotonic(), 0.0), boxes=most, hopeless=most // 4)
         search = Search(own, part, left, rank_by_volume(part), executor)
@@ -353,34 +371,28 @@ def _find_one_to_one_box(
     idle = ~np.isin(joints, rows.active)
     held, half = np.isin(joints, check.still_joints), (base.high - base.low) / 2
     for range_ in (np.inf, RULES.held_range) if held.any() else (np.inf,):
-        share = np.where(idle, 1.0, np.minimum(1.0, range_ / half))
-        _try_scales([np.where(idle | held, share, scale) for scale in scales], proved, limits.boxes)
+        fraction = np.where(idle, 1.0, np.minimum(1.0, range_ / half))
+        _try_scales([np.where(idle | held, fraction, scale) for scale in scales], prove, limits.boxes)
         if best is not None:
             break
     return best
 
 
-def _try_scales(shares: Sequence[Array], proved: Callable[[Array, int], bool], most: int) -> None:
+def _try_scales(boxes: Sequence[Array], prove: Callable[[Array, int], bool], most: int) -> None:
     """Ask for proofs of boxes of increasing size: the largest one, then by bisection with few boxes, then with many."""
-    if proved(shares[-1], RULES.few_boxes):
+    if prove(boxes[-1], RULES.few_boxes):
         return
     # Those before `low` are proved, those from `high` on are not with few boxes.
-    low, high = 0, len(shares) - 1
+    low, high = 0, len(boxes) - 1
     while low < high:
-        middle = (low + high) // 2
-        low, high = (middle + 1, high) if proved(shares[middle], RULES.few_boxes) else (low, middle)
+        half_way = (low + high) // 2
+        low, high = (half_way + 1, high) if prove(boxes[half_way], RULES.few_boxes) else (low, half_way)
     if low == 0:
         return
-    while low + 1 < len(shares) and proved(shares[low + 1], most):
+    while low + 1 < len(boxes) and prove(boxes[low + 1], most):
         low += 2
-    if low < len(shares):
-        proved(shares[low], most)
-
-
-def find_proved_scale(parts: Subdivision) -> float:
-    """The scale of the largest copy of a box about its centre that no open part reaches into."""
-    low, high = parts.leaves(OPEN)
-    return float(measure_distances(parts, low, high).min()) if len(low) else 1.0
+    if low < len(boxes):
+        prove(boxes[low], most)
 
 
 def _build_certificate(
@@ -393,13 +405,12 @@ def _build_certificate(
     resume: Certificate | None,
 ) -> Certificate:
     fold = tuple(tuple(point.tolist()) for point in search.signs.values()) if search.folded else ()
-    # What an earlier search took and found counts as well.
-    before = (0, 0.0) if resume is None else (resume.boxes, resume.seconds)
-    conditioning = (
-        search.conditioning
-        if resume is None or not resume.conditioning
-        else min(search.conditioning, resume.conditioning)
-    )
+    # What an earlier search took and proved counts as well.
+    boxes, conditioning = search.evaluated, search.conditioning
+    if resume is not None:
+        boxes, seconds = boxes + resume.boxes, seconds + resume.seconds
+        if resume.conditioning:
+            conditioning = min(conditioning, resume.conditioning)
     domain, parts = chart.problem.domain, search.build_subdivision()
     return Certificate(
         fingerprint(chart.problem, chart.coordinates),
@@ -409,8 +420,8 @@ def _build_certificate(
         conditioning * (1 - 1e-9) if bound > 0 and np.isfinite(conditioning) else 0.0,
         injective,
         fold,
-        before[0] + search.evaluated,
-        before[1] + seconds,
+        boxes,
+        seconds,
         getattr(domain, "least_singular_value", 0.0),
         getattr(domain, "least_volume", 0.0),
         _estimate_proved_fraction(domain, parts),
@@ -430,14 +441,15 @@ def _estimate_proved_fraction(domain: Domain, parts: Subdivision) -> float:
         return 1.0
     rng, volumes = np.random.default_rng(0), (high - low).prod(axis=1)
 
-    def clear(low: Array, high: Array) -> float:
+    # The fraction of positions between corners whose relative singular value is above the bound.
+    def measure_clear(low: Array, high: Array) -> float:
         values = bound.singular_values(rng.uniform(low, high, (RULES.samples, parts.n)))
         return float(np.mean(values > bound.least_singular_value))
 
     chosen = rng.choice(len(low), RULES.samples, p=volumes / volumes.sum())
-    left = float(volumes.sum() / (parts.high - parts.low).prod()) * clear(low[chosen], high[chosen])
+    left = float(volumes.sum() / (parts.high - parts.low).prod()) * measure_clear(low[chosen], high[chosen])
     # Not all is proved, whatever samples say.
-    return float(np.clip(1 - left / clear(parts.low, parts.high), 0.0, 1 - 2**-53))
+    return float(np.clip(1 - left / measure_clear(parts.low, parts.high), 0.0, 1 - 2**-53))
 
 
 def _report_search(monitor: Monitor, stage: str, *, guarded: bool = False) -> Look:
@@ -449,40 +461,20 @@ def _report_search(monitor: Monitor, stage: str, *, guarded: bool = False) -> Lo
     start = time.monotonic()
 
     def show(search: Search) -> None:
-        limits, share = search.limits, search.proved_volume
+        # As long as a box is open, the proved share is below 100 %.
+        limits, proved = search.limits, search.proved_volume
         if search.open_count:
-            share = min(share, 1 - 2**-53)
+            proved = min(proved, 1 - 2**-53)
         spent = max(search.evaluated / limits.boxes, (time.monotonic() - start) / max(limits.seconds, 1e-9))
-        done = 1.0 if not search.open_count else min(1.0, spent if guarded else max(share, spent))
-        detail = f"{search.evaluated:,} boxes, {search.open_count:,} open, {percent(share, 2)} proved"
+        done = 1.0 if not search.open_count else min(1.0, spent if guarded else max(proved, spent))
+        detail = f"{search.evaluated:,} boxes, {search.open_count:,} open, {percent(proved, 2)} proved"
         monitor(Progress(stage, done, detail))
 
     return show
 
 
-def _check_regular(certificate: Certificate, parts: list[BoxResults]) -> bool:
-    """Whether the parts are proved, with one sign unless the chart folds, and the conditioning is what it says."""
-    signs = {int(sign) for results in parts for sign in np.unique(results.sign) if sign}
-    least = min((float(results.conditioning.min()) for results in parts), default=0.0)
-    proved = all(results.proved.all() for results in parts)
-    return proved and (len(signs) < 2 or bool(certificate.fold)) and least >= certificate.conditioning
-
-
-def _check_fold(chart: Chart, check: BoxCheck, points: Array) -> bool:
-    """Whether det J is proved to have opposite signs at two points (2, n) of the domain."""
-    results = check(points, points)
-    return bool(chart.problem.domain.contains(points).all() and results.regular.all() and results.sign.prod() < 0)
-
-
-def _is_around_centre(certificate: Certificate, box: Subdivision) -> bool:
-    """Whether a box lies in the domain, around its centre."""
-    domain = certificate.regular
-    off = (box.low + box.high - domain.low - domain.high) / (box.high - box.low)
-    inside = (box.low >= domain.low).all() and (box.high <= domain.high).all()
-    return bool(inside and np.abs(off).max() < RULES.off_centre)
-
-
 def _check_parts(check: BoxCheck, parts: Subdivision, mapped: Mapped, monitor: Monitor) -> list[BoxResults]:
+    # In pieces, whose results come in order.
     low, high = parts.leaves(PROVED)
     pieces = [slice(k, k + RULES.at_once) for k in range(0, len(low), RULES.at_once)]
     results = []

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.bases.products import ProductFamily
-from orthocas.certificates.box_checks import BoxResults, find_most_influential
+from orthocas.certificates.box_checks import BoxResults, check_in_turn, find_most_influential
 from orthocas.certificates.jets import Around, compute_powers
 from orthocas.certificates.rows import ProductRows, transform_task_rows
 from orthocas.certificates.taylor import (
@@ -37,12 +37,12 @@ from orthocas.certificates.taylor import (
     evaluate_sine_cosine,
     list_monomials,
     sum_error,
+    weigh_halving,
 )
 from orthocas.charts.certificate import COFACTORS
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import CertifyError
-from orthocas.tools.batch import one_blas_thread
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import Tape, evaluate_tape, write_tape
 
@@ -68,6 +68,89 @@ SERIES_DEGREE = 5  #: of the polynomials: more of it costs more and leaves less 
 _SPLITS = 2**SERIES_DEGREE  #: products of two coefficients that add up to one, for each pair of factors
 
 Expansion = tuple[Array, Array]  #: coefficients (..., monomials, boxes) in t from -1 to 1, and a bound of the rest
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CofactorCheck:
+    """Proves det J != 0 by its expansion along the row of the coordinate."""
+
+    determinant: "Determinant"
+    method = COFACTORS
+
+    @property
+    def joints(self) -> Variables:
+        """The joints that det J depends on."""
+        return self.determinant.joints
+
+    def __call__(self, low: Array, high: Array) -> BoxResults:
+        """Evaluate boxes between corners (boxes, n)."""
+        regular, sign, gains = check_in_turn(self._check_few, low, high, RULES.at_once)
+        return BoxResults(regular, regular, sign, np.zeros(len(low)), find_most_influential(gains, self.joints))
+
+    def _check_few(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array, Array]:
+        # det J is proved nonsingular with the sign that it has at the centre.
+        coefficients, rest = self.determinant(low, high)
+        sign = np.nan_to_num(np.sign(coefficients[0]))
+        n = len(self.joints)
+        return is_positive(coefficients * sign, rest, n), sign, compute_gains(coefficients, rest, n)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Determinant:
+    """det J, up to a positive factor: the scale of the coordinate, and that of task rows that are rotated."""
+
+    joints: Variables  #: on which it depends
+    cofactors: "WaveSeries"  #: of the columns where dxi/dq varies; then the sum of the others times their constants
+    slopes: "PolynomialSeries"  #: dxi/dq of the columns where it varies
+
+    @classmethod
+    def build(cls, chart: Chart) -> "Determinant | None":
+        """Of a chart with one fitted coordinate, a polynomial, and task rows of sines and cosines; None for others."""
+        coordinates = chart.coordinates
+        if not isinstance(coordinates, Coordinates) or len(coordinates.offset) != 1:
+            return None
+        active, family = list(coordinates.active), coordinates.family
+        if not chart.m + 1 == len(active) <= RULES.columns:
+            return None
+        # A family is polynomial if each derivative of a one-joint function is a sum of earlier ones.
+        if not isinstance(family, ProductFamily):
+            return None
+        if any(np.triu(family.one_joint_derivatives(i)).any() for i in range(family.space.n)):
+            return None
+        try:
+            z = compute_cofactors([[row[j] for j in active] for row in _expand_task_rows(chart)])
+        except CertifyError:
+            return None
+        # Columns where dxi/dq varies stay apart; the others are summed up with their constants.
+        values, doubts = _differentiate_coordinate(family, coordinates.theta)
+        varying = [j for j in range(len(z)) if (np.abs(values[j, 1:]) + doubts[j, 1:]).any()]
+        constant = Waves.constant(0.0, chart.n)
+        for j in {*range(len(z))} - {*varying}:
+            constant = constant + z[j] * Waves.constant(float(values[j, 0]), chart.n, float(doubts[j, 0]))
+        # The determinant depends on the joints of any wave, and on those of any monomial.
+        sums = [*(z[j] for j in varying), constant.trim()]
+        turning = {i for each in sums for i in np.flatnonzero(each.frequencies.any(axis=0)).tolist()}
+        every = list_indices(len(active), _bound_degree(family))
+        bending = {active[i] for k, m in enumerate(every) if (np.abs(values[:, k]) + doubts[:, k]).any() for i in m}
+        joints = tuple(sorted(turning | bending))
+        own = PolynomialSeries.build(values[varying], doubts[varying], family, [active.index(j) for j in joints])
+        return cls(joints, WaveSeries.build(sums, joints), own)
+
+    def __call__(self, low: Array, high: Array) -> Expansion:
+        """The expansion on boxes between corners (boxes, n)."""
+        # Both factors about the centres of the boxes, then their products.
+        chosen = list(self.joints)
+        centre = ((low + high) / 2)[:, chosen].T
+        half = np.nextafter(np.maximum(high[:, chosen].T - centre, centre - low[:, chosen].T), np.inf) + TINY
+        (A, rest_a), (B, rest_b) = self.slopes(centre, half), self.cofactors(centre, half)
+        # What each factor leaves out is multiplied by the sizes of the other.
+        products, rest = _multiply_expansions(A, B[:-1], self.slopes.degree, len(chosen))
+        total_a, total_b = (np.abs(part).sum(axis=1) for part in (A, B[:-1]))
+        carried = rest_a * (total_b + rest_b[:-1]) + total_a * rest_b[:-1] + rest
+        carried += sum_error(_SPLITS * len(A)) * total_a * total_b
+        coefficients = products + B[-1]
+        unknown = carried.sum(axis=0) + rest_b[-1] + UNIT * np.abs(coefficients).sum(axis=0)
+        return coefficients, unknown * compute_margin(A.shape[1] + len(coefficients)) + TINY
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -159,60 +242,6 @@ class PolynomialSeries:
         return coefficients * build_power_table(h, self.degree), (self.errors + rounding)[:, None] * reach * UP + TINY
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Determinant:
-    """det J, up to a positive factor: the scale of the coordinate, and that of task rows that are rotated."""
-
-    joints: Variables  #: on which it depends
-    cofactors: WaveSeries  #: of the columns where dxi/dq varies; then the sum of the others times their constants
-    slopes: PolynomialSeries  #: dxi/dq of the columns where it varies
-
-    @classmethod
-    def build(cls, chart: Chart) -> "Determinant | None":
-        """Of a chart with one fitted coordinate, a polynomial, and task rows of sines and cosines; None for others."""
-        coordinates = chart.coordinates
-        if not isinstance(coordinates, Coordinates) or len(coordinates.offset) != 1:
-            return None
-        active, family = list(coordinates.active), coordinates.family
-        if not chart.m + 1 == len(active) <= RULES.columns:
-            return None
-        # A family is polynomial if each derivative of a one-joint function is a sum of earlier ones.
-        if not isinstance(family, ProductFamily):
-            return None
-        if any(np.triu(family.one_joint_derivatives(i)).any() for i in range(family.space.n)):
-            return None
-        try:
-            z = compute_cofactors([[row[j] for j in active] for row in _expand_task_rows(chart)])
-        except CertifyError:
-            return None
-        values, doubts = _differentiate_coordinate(family, coordinates.theta)
-        varying = [j for j in range(len(z)) if (np.abs(values[j, 1:]) + doubts[j, 1:]).any()]
-        constant = Waves.constant(0.0, chart.n)
-        for j in {*range(len(z))} - {*varying}:
-            constant = constant + z[j] * Waves.constant(float(values[j, 0]), chart.n, float(doubts[j, 0]))
-        sums = [*(z[j] for j in varying), constant.trim()]
-        turning = {i for each in sums for i in np.flatnonzero(each.frequencies.any(axis=0)).tolist()}
-        every = list_indices(len(active), _bound_degree(family))
-        bending = {active[i] for k, m in enumerate(every) if (np.abs(values[:, k]) + doubts[:, k]).any() for i in m}
-        joints = tuple(sorted(turning | bending))
-        own = PolynomialSeries.build(values[varying], doubts[varying], family, [active.index(j) for j in joints])
-        return cls(joints, WaveSeries.build(sums, joints), own)
-
-    def __call__(self, low: Array, high: Array) -> Expansion:
-        """The expansion on boxes between corners (boxes, n)."""
-        chosen = list(self.joints)
-        middle = ((low + high) / 2)[:, chosen].T
-        half = np.nextafter(np.maximum(high[:, chosen].T - middle, middle - low[:, chosen].T), np.inf) + TINY
-        (A, rest_a), (B, rest_b) = self.slopes(middle, half), self.cofactors(middle, half)
-        products, rest = _multiply_expansions(A, B[:-1], self.slopes.degree, len(chosen))
-        total_a, total_b = (np.abs(part).sum(axis=1) for part in (A, B[:-1]))
-        carried = rest_a * (total_b + rest_b[:-1]) + total_a * rest_b[:-1] + rest
-        carried += sum_error(_SPLITS * len(A)) * total_a * total_b
-        coefficients = products + B[-1]
-        unknown = carried.sum(axis=0) + rest_b[-1] + UNIT * np.abs(coefficients).sum(axis=0)
-        return coefficients, unknown * compute_margin(A.shape[1] + len(coefficients)) + TINY
-
-
 def list_indices(n: int, degree: int) -> tuple[Monomial, ...]:
     """The monomials in n variables up to a degree."""
     return list_monomials(tuple(range(n)), degree)
@@ -235,6 +264,7 @@ def _differentiate_coordinate(family: ProductFamily, theta: Array) -> tuple[Arra
     """
     degree, space = _bound_degree(family), family.space
     nothing = np.zeros((space.n, 1))
+    # Jets at the centre, on a box without width.
     rows = ProductRows.build(family, theta, degree + 2)
     jets = rows.build_jets(Around(space.centre[:, None], nothing, nothing, degree))
     every = list_indices(space.n, degree)
@@ -266,6 +296,7 @@ def _plan_products(n: int, degree: int) -> tuple[tuple[bool, int, slice, NDArray
 
     Each entry is whether that one belongs to a, its place, those of the others, and where the products go.
     """
+    # Each pair of degrees belongs to the factor of the lower one, and equal degrees to a.
     every = list_indices(n, max(SERIES_DEGREE, degree))
     place = {m: k for k, m in enumerate(every)}
     starts = [len(list_indices(n, d - 1)) if d else 0 for d in range(max(SERIES_DEGREE, degree) + 2)]
@@ -299,33 +330,6 @@ def _sum_by_degree(coefficients: Array, n: int, degree: int) -> Array:
     return np.add.reduceat(np.abs(coefficients), starts, axis=1).swapaxes(0, 1)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class CofactorCheck:
-    """Proves det J != 0 by its expansion along the row of the coordinate."""
-
-    determinant: Determinant
-    method = COFACTORS
-
-    @property
-    def joints(self) -> Variables:
-        """The joints that det J depends on."""
-        return self.determinant.joints
-
-    def __call__(self, low: Array, high: Array) -> BoxResults:
-        """Evaluate boxes between corners (boxes, n)."""
-        with one_blas_thread(), np.errstate(invalid="ignore", over="ignore"):
-            pieces = [slice(k, k + RULES.at_once) for k in range(0, len(low), RULES.at_once)]
-            parts = [self._check_few(low[piece], high[piece]) for piece in pieces]
-        regular, sign, compute_gains = (np.concatenate(each) for each in zip(*parts, strict=True))
-        return BoxResults(regular, regular, sign, np.zeros(len(low)), find_most_influential(compute_gains, self.joints))
-
-    def _check_few(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array, Array]:
-        coefficients, rest = self.determinant(low, high)
-        sign = np.nan_to_num(np.sign(coefficients[0]))
-        n = len(self.joints)
-        return is_positive(coefficients * sign, rest, n), sign, compute_gains(coefficients, rest, n)
-
-
 def is_positive(coefficients: Array, rest: Array, n: int) -> NDArray[np.bool_]:
     """Whether polynomials (monomials, boxes) in n variables from -1 to 1 are above a rest everywhere, (boxes,)."""
     sizes = np.abs(coefficients).sum(axis=0)
@@ -353,8 +357,7 @@ def bound_polynomial(coefficients: Array, n: int) -> Array:
     sizes = np.abs(coefficients).sum(axis=0)
     higher = np.abs(coefficients[kept:]).sum(axis=0)
     rounding = sum_error(8 * n * (degree + 1) + len(coefficients)) * sizes
-    least: Array = form.min(axis=0) - (higher + rounding) * UP - TINY
-    return least
+    return np.asarray(form.min(axis=0) - (higher + rounding) * UP - TINY)
 
 
 def compute_gains(coefficients: Array, rest: Array, n: int) -> Array:
@@ -362,17 +365,11 @@ def compute_gains(coefficients: Array, rest: Array, n: int) -> Array:
 
     The rest is shared out like the terms of the highest degree, which it is most like.
     """
-    sizes, taken = np.abs(coefficients), _weigh_halving(n)
+    sizes, taken = np.abs(coefficients), weigh_halving(tuple(range(n)), SERIES_DEGREE)
     highest = len(list_indices(n, SERIES_DEGREE - 1))
     last = taken[:, highest:] @ sizes[highest:]
     gains: Array = taken @ sizes + last / (last.sum(axis=0) + TINY) * rest
     return gains.T
-
-
-@cache
-def _weigh_halving(n: int) -> Array:
-    """1 - 2^-power of each variable in each monomial, (n, monomials)."""
-    return np.array([[1 - 0.5 ** m.count(v) for m in list_indices(n, SERIES_DEGREE)] for v in range(n)])
 
 
 @cache
@@ -414,12 +411,12 @@ class Waves:
     @classmethod
     def sine(cls, joint: int, n: int) -> "Waves":
         """The sine of a joint's position."""
-        return cls(_both_ways(joint, n), np.array([-0.5j, 0.5j]), 0.0)
+        return cls(_pair_frequencies(joint, n), np.array([-0.5j, 0.5j]), 0.0)
 
     @classmethod
     def cosine(cls, joint: int, n: int) -> "Waves":
         """The cosine of a joint's position."""
-        return cls(_both_ways(joint, n), np.array([0.5 + 0j, 0.5 + 0j]), 0.0)
+        return cls(_pair_frequencies(joint, n), np.array([0.5 + 0j, 0.5 + 0j]), 0.0)
 
     @property
     def size(self) -> float:
@@ -464,11 +461,10 @@ class Waves:
 
     def __call__(self, q: Array) -> Array:
         """Values at points (N, n), rounded, (N,)."""
-        values: Array = (np.exp(1j * (q @ self.frequencies.T)) @ self.coefficients).real
-        return values
+        return np.asarray((np.exp(1j * (q @ self.frequencies.T)) @ self.coefficients).real)
 
 
-def _both_ways(joint: int, n: int) -> NDArray[np.int64]:
+def _pair_frequencies(joint: int, n: int) -> NDArray[np.int64]:
     unit = np.eye(n, dtype=np.int64)[joint]
     return np.stack([unit, -unit])
 
@@ -496,6 +492,7 @@ def expand_waves(tape: Tape, n: int) -> list[Waves]:
         return Waves.constant(float(of), n) if name == "const" else int(of)
 
     def step(name: str, of: Sequence[Waves | int]) -> Waves | int:
+        # A leaf is a number or a joint; only sine and cosine take a joint.
         if name in ("sin", "cos"):
             if isinstance(joint := of[0], Waves):
                 raise CertifyError("the task uses a sine of more than the position of a joint")

@@ -75,6 +75,7 @@ class TaylorGraph:
         """Values, or the entries dh_i/dq_j with the rows i of the first column first, for models of q_1, ..., q_n."""
         moving = self.joints or ()
 
+        # The derivative of an input by itself is 1.
         def leaf(name: str, of: Any) -> _Jet:
             if name == "const":
                 return _Jet(TaylorModel.constant(np.array([float(of)])), {})
@@ -83,13 +84,9 @@ class TaylorGraph:
         jets = evaluate_tape(self.tape, leaf, _apply_step)
         if self.joints is None:
             return [_get_value(jet) for jet in jets]
+        # Entries that do not depend on a joint have no slope.
         none = TaylorModel.constant(np.zeros(1))
         return [jet.slopes.get(joint, none) for joint in self.joints for jet in jets]
-
-
-def is_whole(value: float | None) -> bool:
-    """Whether a constant, if there is one, is a whole number that powers may have as exponent."""
-    return value is not None and abs(value) <= _LARGEST_POWER and value == round(value)
 
 
 def _build_one() -> TaylorModel:
@@ -98,29 +95,23 @@ def _build_one() -> TaylorModel:
 
 def _apply_step(name: str, of: Sequence[_Jet]) -> _Jet:
     """A step of any kind."""
+    a, slopes = of[0], Slopes()
+    # f^k has the derivative k f^(k - 1) f'.
     if name in POWERS:
         assert of[1].value is not None
-        return _apply_power(of[0], int(of[1].value.centre.flat[0]))
-    if len(of) == 1:
-        return _apply_unary(name, *of)
-    return {"add": _add, "sub": _subtract, "mul": _multiply, "div": _divide, "atan2": _apply_angle}[name](*of)
-
-
-def _apply_unary(name: str, a: _Jet) -> _Jet:
-    value = UNARY[name](a.value) if name in UNARY and a.value is not None else None
+        value, exponent = _get_value(a), int(of[1].value.centre.flat[0])
+        if exponent and a.slopes:
+            slopes = _scale_slopes(power(value, exponent - 1).multiply_by(float(exponent)), a.slopes)
+        return _Jet(power(value, exponent), slopes)
+    if len(of) > 1:
+        return {"add": _add, "sub": _subtract, "mul": _multiply, "div": _divide, "atan2": _take_angle}[name](*of)
+    # Of functions of one operand, those that are linear are their own derivatives.
+    result = UNARY[name](a.value) if name in UNARY and a.value is not None else None
     if name in _LINEAR:
-        return _Jet(value, {j: UNARY[name](slope) for j, slope in a.slopes.items()})
-    return _Jet(value, _scale_slopes(_DERIVATIVES[name](_get_value(a), value), a.slopes) if a.slopes else {})
-
-
-def _apply_power(a: _Jet, exponent: int) -> _Jet:
-    value = _get_value(a)
-    slopes = (
-        _scale_slopes(power(value, exponent - 1).multiply_by(float(exponent)), a.slopes)
-        if exponent and a.slopes
-        else {}
-    )
-    return _Jet(power(value, exponent), slopes)
+        slopes = {j: UNARY[name](slope) for j, slope in a.slopes.items()}
+    elif a.slopes:
+        slopes = _scale_slopes(_DERIVATIVES[name](_get_value(a), result), a.slopes)
+    return _Jet(result, slopes)
 
 
 def _add(a: _Jet, b: _Jet) -> _Jet:
@@ -147,7 +138,7 @@ def _divide(a: _Jet, b: _Jet) -> _Jet:
     return _Jet(value, slopes)
 
 
-def _apply_angle(y: _Jet, x: _Jet) -> _Jet:
+def _take_angle(y: _Jet, x: _Jet) -> _Jet:
     """atan2(y, x), without a value, with the derivative (x y' - y x') / (x^2 + y^2)."""
     a, b = _get_value(y), _get_value(x)
     inverse = reciprocal(square(b) + square(a))
@@ -179,29 +170,31 @@ def _add_slopes(*parts: Slopes) -> Slopes:
 class _Step(NamedTuple):
     """What is known of a place of a tape before it is used."""
 
-    known: bool  #: whether its value has bounds
+    bounded: bool  #: whether its value has bounds
     moving: bool  #: whether it has derivatives
     constant: float | None = None
 
 
 def _require_bounds(tape: Tape, what: str, values: bool) -> None:
     """Refuse operations whose derivative has no bounds, or needs a value that has none; and outputs without bounds."""
-    unknown = f"{what} uses the value of log, atan, asin, acos or atan2, which cannot be certified"
+    unbounded = f"{what} uses the value of log, atan, asin, acos or atan2, which cannot be certified"
 
     # Follow the tape with what is known of each place.
     def step(name: str, of: Sequence[_Step]) -> _Step:
         if name not in _KNOWN:
             raise CertifyError(f"{what} uses the operation {name}, which cannot be certified")
-        if name in POWERS and not is_whole(of[1].constant):
+        # Powers have whole constants of moderate size as exponents.
+        exponent = of[1].constant if name in POWERS else 0.0
+        if exponent is None or abs(exponent) > _LARGEST_POWER or exponent != round(exponent):
             raise CertifyError(f"{what} has a power that is no whole number, so it cannot be certified")
-        if not all(operand.known for operand in _find_needed(name, of)):
-            raise CertifyError(unknown)
-        bounded = name in UNARY or name in BINARY or name in POWERS
-        return _Step(bounded and all(operand.known for operand in of), any(operand.moving for operand in of))
+        if not all(operand.bounded for operand in _find_needed(name, of)):
+            raise CertifyError(unbounded)
+        bounded = (name in UNARY or name in BINARY or name in POWERS) and all(operand.bounded for operand in of)
+        return _Step(bounded, any(operand.moving for operand in of))
 
     outputs = evaluate_tape(tape, lambda name, of: _Step(True, name == "input", of if name == "const" else None), step)
-    if values and not all(output.known for output in outputs):
-        raise CertifyError(unknown)
+    if values and not all(output.bounded for output in outputs):
+        raise CertifyError(unbounded)
 
 
 def _find_needed(name: str, of: Sequence[_Step]) -> Sequence[_Step]:

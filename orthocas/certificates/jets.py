@@ -47,8 +47,7 @@ class Around:
     @property
     def reach(self) -> Array:
         """How far a point c + t + s d is from c at most, (n, boxes)."""
-        reach: Array = (self.middles + self.differences) * UP
-        return reach
+        return np.asarray((self.middles + self.differences) * UP)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,11 +80,11 @@ class Jets:
         squared[:, :, alone] /= 2
         centre = model[0][:, :, 0] + squared[:, :, alone].sum(axis=2)
         mixed = self.derivatives[3] * (weights[3][:, 2] / 3)
-        higher = [self.derivatives[k] * average_even(weights[k]) for k in range(DEGREE + 1, around.order + 1)]
+        higher = [self.derivatives[k] * average_powers(weights[k]) for k in range(DEGREE + 1, around.order + 1)]
         terms = np.concatenate([squared, mixed, *higher], axis=2)
         coefficients = np.concatenate([centre[:, :, None], *model[1:]], axis=2)
         # The remainder covers errors of the derivatives and rounding of the sums.
-        doubt = sum((e * average_even(w)).sum(axis=2) for e, w in zip(self.doubts, weights, strict=True))
+        doubt = sum((e * average_powers(w)).sum(axis=2) for e, w in zip(self.doubts, weights, strict=True))
         size = np.abs(coefficients).sum(axis=2) + np.abs(terms).sum(axis=2)
         remainder = (doubt + sum_error(8 * around.order) * size) * compute_margin(terms.shape[2]) + TINY
         return TaylorModel(variables, np.ascontiguousarray(coefficients.transpose(2, 0, 1, 3)), remainder), terms
@@ -96,26 +95,20 @@ def build_power_weights(around: Around, order: int) -> Array:
     n, boxes = around.centre.shape
     weights = np.ones((1, 1, boxes))
     for k in range(1, order + 1):
+        # Each multi-index is one of the order before, times one more factor C + s D.
         before, last = _find_prefixes(n, k)
         grown = np.zeros((len(last), k + 1, boxes))
         grown[:, :-1] = weights[before] * around.middles[last][:, None]
         grown[:, 1:] += weights[before] * around.differences[last][:, None]
         weights = grown
-    scaled: Array = weights / _compute_factorials(n, order)[:, None, None]
-    return scaled
+    return np.asarray(weights / _compute_factorials(n, order)[:, None, None])
 
 
-def average_even(weights: Array) -> Array:
-    """The average over s in [-1, 1] of polynomials (terms, powers, boxes)."""
-    powers_ = np.arange(weights.shape[1])
-    average: Array = np.einsum("tkb,k->tb", weights, np.where(powers_ % 2, 0.0, 1 / (powers_ + 1)))
-    return average
-
-
-def average_largest(weights: Array) -> Array:
-    """The average over s in [-1, 1] of polynomials (terms, powers, boxes) in |s|."""
-    average: Array = np.einsum("tkb,k->tb", weights, 1 / (np.arange(weights.shape[1]) + 1))
-    return average
+def average_powers(weights: Array, of_size: bool = False) -> Array:
+    """The average over s in [-1, 1] of polynomials (terms, powers, boxes) in s, or in |s|, (terms, boxes)."""
+    powers = np.arange(weights.shape[1])
+    averages = np.where(powers % 2 * (not of_size), 0.0, 1 / (powers + 1))
+    return np.asarray(np.einsum("tkb,k->tb", weights, averages))
 
 
 @cache
@@ -151,5 +144,4 @@ def compute_powers(widths: Array, order: int) -> Array:
     for k in range(1, order + 1):
         before, last = _find_prefixes(n, k)
         powers = powers[before] * widths[last]
-    scaled: Array = powers / _compute_factorials(n, order)[:, None]
-    return scaled
+    return np.asarray(powers / _compute_factorials(n, order)[:, None])

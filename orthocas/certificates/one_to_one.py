@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from orthocas.bases.products import ProductFamily
 from orthocas.certificates.box_checks import (
     BoxResults,
+    check_in_turn,
     compute_influences,
     compute_pivots,
     find_most_influential,
@@ -39,13 +40,12 @@ from orthocas.certificates.rows import (
     bound_rotation_error,
     build_true_gradients,
 )
-from orthocas.certificates.taylor import TINY, UNIT, UP, TaylorModel, compute_margin, evaluate_sine_cosine, sum_error
+from orthocas.certificates.taylor import TINY, UNIT, UP, compute_margin, evaluate_sine_cosine, sum_error
 from orthocas.charts.certificate import Subdivision
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.domains import Domain
-from orthocas.tools.batch import one_blas_thread
 from orthocas.tools.checks import Array
 
 
@@ -58,6 +58,40 @@ class OneToOneRules:
 
 
 RULES = OneToOneRules()
+
+
+def choose_one_to_one_check(chart: Chart, rows: ChartRows, base: Subdivision) -> "OneToOneCheck | ConvexCheck | None":
+    """The check for a box in the domain of a chart, with rows whose vanishing differences are those of phi.
+
+    None if the other rows depend on an idle joint, which then is none, or jump where an arc tangent begins a new turn,
+    or stand for those at another heading of a moving base.
+    """
+    tip, tree, active = TipRows.build(chart.problem.task), chart.problem.robot.tree, rows.active
+    coordinates, closed_form = chart.coordinates, isinstance(rows.coordinates, ProductRows | None)
+    # Steps jump where an arc tangent begins a new turn, but for those of a coordinate's own period.
+    jumps = (tip is None and _has_angle(rows.task)) or (_has_angle(rows.coordinates) and not rows.turns[rows.m :].all())
+    if rows.base or {*rows.variables} - {*active} or jumps:
+        return None
+    # Rows without derivatives in closed form have the convex check.
+    if tip is None or not closed_form:
+        true = replace(rows, task=build_true_gradients(chart.problem.task, active)[0])
+        centre = chart.problem.domain.centre[None]
+        inverse = np.asarray(np.linalg.pinv(true(centre, centre).centre[:, :, 0]), dtype=float)
+        return ConvexCheck(true, inverse, base.low, base.high)
+    own: ProductRows | None = None
+    if rows.coordinates is not None:
+        assert isinstance(coordinates, Coordinates)
+        assert isinstance(coordinates.family, ProductFamily)
+        own = ProductRows.build(coordinates.family, coordinates.theta, ORDERS[-1] + 2)
+    # Leading joints on which J does not depend keep a free range.
+    leading = takewhile(lambda i: i not in rows.variables, tree.carriers(tree.tip_parent))
+    still = tuple(active.index(i) for i in leading if i in active)
+    task = TipJets.build(tip, tree, active, chart.problem.domain)
+    return OneToOneCheck(task, own, active, still, base.low, base.high)
+
+
+def _has_angle(rows: CoordinateRows | None) -> bool:
+    return isinstance(rows, GraphRows) and any(step[0] == "atan2" for step in rows.graph.tape["steps"])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -83,17 +117,15 @@ class OneToOneCheck:
 
     def __call__(self, low: Array, high: Array) -> BoxResults:
         """Evaluate boxes between corners (boxes, n)."""
-        parts = []
-        with one_blas_thread(), np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            for k in range(0, len(low), RULES.at_once):
-                parts.append(self._check_few(low[k : k + RULES.at_once], high[k : k + RULES.at_once]))
-        return _join_results(parts)
+        return _build_results(*check_in_turn(self._check_few, low, high, RULES.at_once))
 
     def _check_few(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array]:
         q, around = (low + high).T / 2, self._build_around(low, high)
+        # The coordinates bound how far two points are apart in joints that stand still.
         if self.still and self.coordinates is not None:
             for _ in range(RULES.rounds):
                 around = self._narrow_differences(around, self.coordinates.build_jets(around))
+        # Higher derivatives where they may help.
         proved, widest, promising = self._check_at_order(q, around)
         for order in ORDERS[1:]:
             again = np.flatnonzero(promising)
@@ -105,6 +137,7 @@ class OneToOneCheck:
 
     def _check_at_order(self, q: Array, around: Around) -> tuple[NDArray[np.bool_], Array, NDArray[np.bool_]]:
         """Whether boxes are proved, the joint to halve, and whether they might be proved with higher derivatives."""
+        # The jets of the task's rows, then those of the coordinates.
         own = () if self.coordinates is None else (self.coordinates.build_jets(around),)
         jets = Jets.join([self.task(q, around), *own])
         # J averaged over the segments, in the singular basis of its centre.
@@ -126,11 +159,13 @@ class OneToOneCheck:
 
     def _build_around(self, low: Array, high: Array) -> Around:
         """Centres of the boxes, and the largest differences that two points of the whole with such centres have."""
+        # The farther a centre is from that of the whole, the less room is left for two points around it.
         rounding = 8 * UNIT * (np.abs(self.low) + np.abs(self.high))
         centre, outer = (self.low + self.high) / 2, (self.high - self.low) / 2
         nearest = np.maximum(np.maximum(low - centre, centre - high), 0)
         room = np.maximum(outer - nearest, 0) * UP + rounding
         half = (high - low) / 2 * UP + rounding
+        # Jm does not depend on the centre of joints that stand still.
         columns = list(self.active)
         middles = np.ascontiguousarray(half.T[columns])
         middles[list(self.still)] = 0
@@ -138,6 +173,7 @@ class OneToOneCheck:
 
     def _narrow_differences(self, around: Around, own: Jets) -> Around:
         """Smaller differences: for xi(q) = xi(p), each row w of a combination of coordinates has w Jm d = 0."""
+        # The combinations are those that single out one still joint each, and the coordinates themselves.
         model, terms = own.average(around, self.active)
         centre = model.centre.transpose(2, 0, 1)
         doubt = (model.bound_deviation() + (np.abs(terms).sum(axis=2) + own.rest) * UP).transpose(2, 0, 1)
@@ -146,10 +182,11 @@ class OneToOneCheck:
         D = around.differences.copy()
         for rows in (projected, np.broadcast_to(np.eye(r), (len(centre), r, r))):
             # Upper and lower bounds of the sizes of rows @ J for |J - centre| <= doubt, (boxes, rows, columns).
-            middle = np.abs(rows @ centre)
+            size_at_centre = np.abs(rows @ centre)
             error = (np.abs(rows) @ (doubt + sum_error(rows.shape[2]) * np.abs(centre))) * UP
-            sizes, least = (middle + error) * UP, (middle - error) / UP
+            sizes, least = (size_at_centre + error) * UP, (size_at_centre - error) / UP
             for row in range(sizes.shape[1]):
+                # |w J_k| D_k is at most the sum over the other columns.
                 for k in self.still:
                     others = (sizes[:, row] * D.T).sum(axis=1) - sizes[:, row, k] * D[k]
                     bound = np.maximum(others, 0) * UP * UP / least[:, row, k]
@@ -178,13 +215,10 @@ class ConvexCheck:
 
     def __call__(self, low: Array, high: Array) -> BoxResults:
         """Evaluate boxes between corners (boxes, n)."""
-        parts = []
-        with one_blas_thread(), np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            for k in range(0, len(low), RULES.at_once):
-                parts.append(self._check_few(self.rows(low[k : k + RULES.at_once], high[k : k + RULES.at_once])))
-        return _join_results(parts)
+        return _build_results(*check_in_turn(self._check_few, low, high, RULES.at_once))
 
-    def _check_few(self, J: TaylorModel) -> tuple[NDArray[np.bool_], Array]:
+    def _check_few(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array]:
+        J = self.rows(low, high)
         boxes = J.remainder.shape[-1]
         unit = np.broadcast_to(np.eye(len(self.inverse)), (boxes, *self.inverse.shape))
         product = multiply_between(np.broadcast_to(self.inverse, unit.shape), J, unit)
@@ -192,65 +226,26 @@ class ConvexCheck:
             product, coefficients=product.coefficients.swapaxes(1, 2), remainder=product.remainder.swapaxes(0, 1)
         )
         symmetric = product + transposed
+        # In its eigenvectors, the symmetric part is nearly diagonal.
         vectors = np.linalg.eigh(np.nan_to_num(np.moveaxis(symmetric.centre, -1, 0)))[1][:, :, ::-1]
         turned = multiply_between(vectors.transpose(0, 2, 1), symmetric, vectors)
-        proved = have_positive_pivots(compute_pivots(turned)) & is_orthogonal(vectors) & self._is_within_turn(J)
-        return proved, find_most_influential(compute_influences(turned), J.variables)
-
-    def _is_within_turn(self, J: TaylorModel) -> NDArray[np.bool_]:
-        """Whether rows with a period change by less than it, over the widths at their largest slopes, (boxes,)."""
+        proved = have_positive_pivots(compute_pivots(turned)) & is_orthogonal(vectors)
+        # Rows with a period change by less than it, over the widths at their largest slopes.
         circles = np.flatnonzero(self.rows.turns)
         widths = (self.high - self.low)[list(self.rows.active), None] * UP
         change = (J.bound_magnitude()[circles] * widths).sum(axis=1)
-        return np.asarray((change * UP < self.rows.turns[circles, None]).all(axis=0))
+        proved &= np.asarray((change * UP < self.rows.turns[circles, None]).all(axis=0))
+        return proved, find_most_influential(compute_influences(turned), J.variables)
 
 
-def choose_one_to_one_check(chart: Chart, rows: ChartRows, base: Subdivision) -> OneToOneCheck | ConvexCheck | None:
-    """The check for a box in the domain of a chart, with rows whose vanishing differences are those of phi.
-
-    None if the other rows depend on an idle joint, which then is none, or jump where an arc tangent begins a new turn,
-    or stand for those at another heading of a moving base.
-    """
-    tip, tree, active = TipRows.build(chart.problem.task), chart.problem.robot.tree, rows.active
-    coordinates, closed_form = chart.coordinates, isinstance(rows.coordinates, ProductRows | None)
-    if rows.base or {*rows.variables} - {*active} or _has_jumps(chart, rows):
-        return None
-    # Rows without derivatives in closed form have the convex check.
-    if tip is None or not closed_form:
-        true = replace(rows, task=build_true_gradients(chart.problem.task, active)[0])
-        centre = chart.problem.domain.centre[None]
-        inverse = np.asarray(np.linalg.pinv(true(centre, centre).centre[:, :, 0]), dtype=float)
-        return ConvexCheck(true, inverse, base.low, base.high)
-    own: ProductRows | None = None
-    if rows.coordinates is not None:
-        assert isinstance(coordinates, Coordinates)
-        assert isinstance(coordinates.family, ProductFamily)
-        own = ProductRows.build(coordinates.family, coordinates.theta, ORDERS[-1] + 2)
-    # Leading joints on which J does not depend keep a free range.
-    leading = takewhile(lambda i: i not in rows.variables, tree.carriers(tree.tip_parent))
-    still = tuple(active.index(i) for i in leading if i in active)
-    task = TipJets.build(tip, tree, active, chart.problem.domain)
-    return OneToOneCheck(task, own, active, still, base.low, base.high)
-
-
-def _has_jumps(chart: Chart, rows: ChartRows) -> bool:
-    """Whether task or coordinates have steps with jumps, other than those of a coordinate's own period."""
-    task = TipRows.build(chart.problem.task) is None and _has_angle(rows.task)
-    return task or (_has_angle(rows.coordinates) and not rows.turns[rows.m :].all())
-
-
-def _has_angle(rows: CoordinateRows | None) -> bool:
-    return isinstance(rows, GraphRows) and any(step[0] == "atan2" for step in rows.graph.tape["steps"])
-
-
-def _join_results(parts: list[tuple[NDArray[np.bool_], Array]]) -> BoxResults:
-    proved, widest = (np.concatenate(each) for each in zip(*parts, strict=True))
+def _build_results(proved: Array, widest: Array) -> BoxResults:
     nothing = np.zeros(len(proved))
     return BoxResults(proved, proved, nothing, nothing, widest)
 
 
 def _spread(left: Array, terms: Array, right: Array) -> Array:
     """Sums of |left @ term @ right| over the terms (rows, columns, terms, boxes), (rows, columns, boxes)."""
+    # One product from the left for all terms, then one from the right.
     rows, columns, count, boxes = terms.shape
     parts = np.ascontiguousarray(terms.transpose(3, 0, 1, 2))
     products = (left @ parts.reshape(boxes, rows, columns * count)).reshape(boxes, rows, columns, count)
@@ -274,6 +269,7 @@ class TipJets:
     @classmethod
     def build(cls, rows: TipRows, tree: KinematicTree, columns: tuple[int, ...], domain: Domain) -> "TipJets":
         """For boxes within a domain."""
+        # From the tip inwards, each joint's distance is at most the length of the chain behind it.
         doubt = 64 * (tree.n + 8) * bound_rotation_error(tree) * bound_reach(tree, domain)
         chain = tree.carriers(tree.tip_parent)
         slides = np.where(tree.prismatic, np.abs(domain.centre) + domain.half_width, 0.0)
@@ -335,20 +331,18 @@ class TipJets:
             if self.tree.prismatic[i]:
                 p = p + R[:, :, 2] * q[i][:, None]
             else:
-                R = R @ _rotate_about_z(q[i])
+                # Turn about z.
+                (s, _), (c, _) = evaluate_sine_cosine(q[i])
+                zero, one = np.zeros_like(s), np.ones_like(s)
+                turn = np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(-1, 3, 3)
+                R = R @ turn
             axes[i], origins[i] = R[:, :, 2], p
+        # Joints beside the chain do not move the tip.
         tip = p + R @ self.tree.tip_translation
         nothing = np.zeros((boxes, 3))
         own = np.stack([axes.get(i, nothing).T for i in self.columns])
         arms = np.stack([(tip - origins.get(i, tip)).T for i in self.columns])
         return own, arms, R @ self.tree.tip_rotation
-
-
-def _rotate_about_z(angles: Array) -> Array:
-    """Rz, (boxes, 3, 3)."""
-    (s, _), (c, _) = evaluate_sine_cosine(angles)
-    zero, one = np.zeros_like(s), np.ones_like(s)
-    return np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(-1, 3, 3)
 
 
 def _nest_products(axes: Array, first: Array, highest: int) -> list[Array]:
@@ -362,6 +356,7 @@ def _nest_products(axes: Array, first: Array, highest: int) -> list[Array]:
 
 def _nest_rotations(axes: Array, highest: int) -> list[Array]:
     """The skew part of [a_i]x [a_j]x ... [a_l]x as a vector, for multi-indices from order 1 on."""
+    # Matrices [a]x of cross products with the axes.
     n, _, boxes = axes.shape
     crosses = np.zeros((n, 3, 3, boxes))
     for k in range(3):
@@ -391,6 +386,7 @@ def _bound_rest(around: Around, lengths: Array) -> Array:
     the points. The length of a derivative depends on the last of its joints: sums over joints up to each, weighted by
     their steps.
     """
+    # Averages over s of sums over all multi-indices, by the sums of middles and differences of joints up to each.
     next_ = around.order + 1
     c, s = np.cumsum(around.middles, axis=0), np.cumsum(around.differences, axis=0)
     odd = sum(comb(next_, k) * c ** (next_ - k) * s**k / (k + 1) for k in range(0, next_, 2))
@@ -400,5 +396,4 @@ def _bound_rest(around: Around, lengths: Array) -> Array:
     # Of the joint itself and those after it, then of those before.
     later = np.cumsum(steps[::-1], axis=0)[::-1]
     before = upto - np.diff(upto, axis=0, prepend=0.0)
-    rest: Array = (later + before * lengths[:, None]) * UP
-    return rest
+    return np.asarray((later + before * lengths[:, None]) * UP)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from orthocas.bases.family import Family, LinearFamily
+from orthocas.bases.family import LinearFamily
 from orthocas.bases.mlp import MLPFamily
 from orthocas.certificates.box_checks import (
     NEVER,
@@ -56,6 +56,67 @@ class OutsideRules:
 RULES = OutsideRules()
 
 
+def choose_check(chart: Chart, rows: ChartRows, bound: float, method: str | None = None) -> RegularCheck:
+    """The check of a chart: of its whole box or, of a part of it, of what is not proved to lie outside.
+
+    Args:
+        chart: the chart.
+        rows: its rows.
+        bound: of the conditioning.
+        method: of the proofs inside. Default: the fastest.
+
+    Raises:
+        CertifyError: if there is no such method for the chart; if a joint is unbounded, and a proof for its half-width
+            is none for all its positions. In a corridor, an unbounded joint whose distance to the path counts is one of
+            these.
+    """
+    domain = chart.problem.domain
+    domain.require_bounds("proof")
+    require_all_positions(chart, rows.variables)
+    check, path, singular = choose_inside_check(chart, rows, bound, method), domain.path_bound, domain.singular_bound
+    if path is not None:
+        # After a turn of an unbounded joint that counts, what is far from the path may be near it.
+        for joint in {*path.unbounded} & {*path.counted.tolist()}:
+            name = chart.problem.robot.joint_names[joint]
+            raise CertifyError(f"joint '{name}' is unbounded and counts in the corridor, expected an infinite radius")
+        start = path.postures[path.contains(path.postures)][:1]
+        return CorridorCheck(check, path, float(check(start, start).sign[0]))
+    if singular is None:
+        return check
+    own, variables = _choose_rows(chart, singular)
+    require_all_positions(chart, variables)
+    # The sign is that of these rows, which have other scales than the chart's.
+    sign = float(check(domain.centre[None], domain.centre[None]).sign[0])
+    return OutsideCheck(check, own, singular, sign, tuple(sorted(variables)), domain.room_to_fold is not None)
+
+
+def choose_inside_check(chart: Chart, rows: ChartRows, bound: float, method: str | None = None) -> RegularCheck:
+    """The check of boxes that lie in the domain; see `choose_check`."""
+    determinant = Determinant.build(chart) if bound == 0 and method != ELIMINATION else None
+    if determinant is not None:
+        return CofactorCheck(determinant)
+    if method == COFACTORS:
+        raise CertifyError("the chart's determinant has no expansion, so it has no certificate of this method")
+    return EliminationCheck(rows, bound)
+
+
+def _choose_rows(chart: Chart, domain: SingularBound) -> tuple[GraphRows, set[int]]:
+    """The rows that check positions, as `domain.is_clear` takes them, and the joints that they depend on.
+
+    Rows of a whole position or a whole orientation may be rotated if they have the same scale: then the rotation
+    changes no singular value, and rows in the axes of a body of the arm depend on fewer joints.
+    """
+    task, joints = chart.problem.task, range(chart.n)
+    tip = TipRows.build(task)
+    if tip is not None and tip.axis is None and len(domain.scale) % 3 == 0:
+        own_axes = domain.jacobian_function is task.frame_jacobian_function or not tip.rotation
+        if own_axes and (domain.scale[::3] == domain.scale.reshape(-1, 3).T).all():
+            return build_task_rows(task, chart.problem.domain, joints)
+    if domain.jacobian_function is not task.jacobian_function:
+        return build_closed_form(domain.jacobian_function, joints)
+    return build_true_gradients(task, joints)
+
+
 def require_all_positions(chart: Chart, variables: Collection[int]) -> None:
     """Raise CertifyError unless a proof for the half-widths of unbounded joints is one for all their positions.
 
@@ -69,7 +130,13 @@ def require_all_positions(chart: Chart, variables: Collection[int]) -> None:
     endless_variables = [joint for joint in endless if joint in variables]
     if not endless_variables:
         return
-    alike = _find_periodic_joints(chart)
+    coordinates = chart.coordinates
+    # `build_chart_rows` has refused others.
+    assert isinstance(coordinates, Coordinates)
+    # A full turn must change neither J_x nor J_xi.
+    alike = _find_unchanged(write_tape(problem.task.smooth_function), chart.n)
+    if len(coordinates.offset):
+        alike &= {*coordinates.idle, *(coordinates.active[i] for i in _find_periodic_inputs(coordinates))}
     for joint in endless_variables:
         name = problem.robot.joint_names[joint]
         if problem.robot.tree.prismatic[joint] or problem.domain.half_width[joint] < np.pi:
@@ -81,23 +148,14 @@ def require_all_positions(chart: Chart, variables: Collection[int]) -> None:
             )
 
 
-def _find_periodic_joints(chart: Chart) -> set[int]:
-    """The joints whose full turns change neither J_x nor J_xi."""
-    coordinates = chart.coordinates
-    # `build_chart_rows` has refused others.
-    assert isinstance(coordinates, Coordinates)
-    task = _find_unchanged(write_tape(chart.problem.task.smooth_function), chart.n)
-    if not len(coordinates.offset):
-        return task
-    own = _find_periodic_inputs(coordinates.family, len(coordinates.active), coordinates)
-    return task & {*coordinates.idle, *(coordinates.active[i] for i in own)}
-
-
-def _find_periodic_inputs(family: Family, n: int, coordinates: Coordinates) -> set[int]:
-    """The same for the coordinates of a family of n joints."""
+def _find_periodic_inputs(coordinates: Coordinates) -> set[int]:
+    """The active joints, by their places among these, whose full turns do not change J_xi."""
+    family, n = coordinates.family, len(coordinates.active)
+    # Networks take sines and cosines of all joints that they do not take as they are.
     if isinstance(family, MLPFamily):
         return {*range(n)} - {*family.direct}
     q = ca.SX.sym("q", n)
+    # Each function of a basis is looked at alone.
     if isinstance(family, LinearFamily):
         values = family.basis(q)
     else:
@@ -118,7 +176,21 @@ def find_periodic_joints(tape: Tape, n: int) -> frozenset[int]:
     def leaf(name: str, of: Any) -> _Shift:
         return _Shift(nothing, float(of)) if name == "const" else _Shift(unit[of])
 
-    shifts = evaluate_tape(tape, leaf, lambda name, of: _Shift(_compute_shift(name, of)))
+    # Only whole numbers of moderate size are added and multiplied, which is exact.
+    def step(name: str, of: Sequence[_Shift]) -> _Shift:
+        shifts = [each.turn for each in of]
+        if name in _EXACT:
+            return _Shift(_keep_whole(_EXACT[name](*shifts)))
+        for one, other in ((of[0], of[-1]), (of[-1], of[0])):
+            if name == "mul" and one.constant is not None:
+                return _Shift(_keep_whole(np.where(other.turn == 0, 0.0, other.turn * one.constant)))
+        # Other functions stay where all that they depend on does; those with a period, where it turns as a whole.
+        still = np.all([shift == 0 for shift in shifts], axis=0)
+        if name in ("sin", "cos", "tan"):
+            still = ~np.isnan(shifts[0])
+        return _Shift(np.where(still, 0.0, np.nan))
+
+    shifts = evaluate_tape(tape, leaf, step)
     alike = np.all([~np.isnan(each.turn) for each in shifts], axis=0)
     return frozenset(np.flatnonzero(alike).tolist())
 
@@ -128,20 +200,6 @@ class _Shift(NamedTuple):
 
     turn: Any  #: change by a turn of each joint / 2 pi; NaN where it is no constant
     constant: float | None = None  #: the value itself, if it is a number
-
-
-def _compute_shift(name: str, of: Sequence[_Shift]) -> Any:
-    """The change of a step. Only whole numbers of moderate size are added and multiplied, which is exact."""
-    shifts = [each.turn for each in of]
-    if name in _EXACT:
-        return _keep_whole(_EXACT[name](*shifts))
-    for one, other in ((of[0], of[-1]), (of[-1], of[0])):
-        if name == "mul" and one.constant is not None:
-            return _keep_whole(np.where(other.turn == 0, 0.0, other.turn * one.constant))
-    still = np.all([shift == 0 for shift in shifts], axis=0)
-    if name in ("sin", "cos", "tan"):
-        still = ~np.isnan(shifts[0])
-    return np.where(still, 0.0, np.nan)
 
 
 _EXACT: Mapping[str, Callable[..., Any]] = {
@@ -197,12 +255,19 @@ class OutsideCheck:
         # Boxes that may lie outside: others, too large for the value at their centre, are rarely proved to.
         half = (high - low)[:, list(self.variables)] / 2
         near = np.asarray(self.domain.least_singular_value - values > RULES.steep * half.sum(axis=1))
-        widest = self._avoid_slivers(values, low, high, inside.widest)
+        # Thin boxes with a centre outside are halved in their widest joint, so that they become worth a try.
+        joints = np.array(self.joints)
+        widths = (high - low)[:, joints] / 2
+        halved = (high - low)[np.arange(len(low)), np.maximum(inside.widest, 0)] / 2
+        thin = (halved < RULES.thin * widths.max(axis=1)) & (inside.widest >= 0)
+        thin &= values < self.domain.least_singular_value
+        widest = np.where(thin, joints[widths.argmax(axis=1)], inside.widest)
         outside = np.zeros(len(low), dtype=bool)
         if near.any():
             with one_blas_thread():
                 outside[near], widest[near] = self.check_outside(low[near], high[near])
         regular, sign = inside.regular & ~outside, np.where(outside, 0, inside.sign)
+        # A domain that keeps folds out takes care of boxes with the other sign itself.
         if self.guarded:
             widest[regular & ~own & (values > self.domain.least_singular_value)] = NEVER
             regular, sign = regular & (sign == self.sign), np.where(sign == self.sign, sign, 0)
@@ -214,15 +279,6 @@ class OutsideCheck:
             widest=widest,
         )
 
-    def _avoid_slivers(self, values: Array, low: Array, high: Array, widest: Array) -> Array:
-        """The joint to halve: of thin boxes with a centre outside the widest one, so that they become worth a try."""
-        joints = np.array(self.joints)
-        half = (high - low)[:, joints] / 2
-        joint = np.maximum(widest, 0)
-        thin = (high - low)[np.arange(len(low)), joint] / 2 < RULES.thin * half.max(axis=1)
-        thin &= (values < self.domain.least_singular_value) & (widest >= 0)
-        return np.where(thin, joints[half.argmax(axis=1)], widest)
-
     def check_outside(self, low: Array, high: Array) -> tuple[Array, Array]:
         """Whether boxes lie outside, and the joint to halve to find out."""
         joints = build_joint_models(low, high, self.variables)[0]
@@ -230,7 +286,14 @@ class OutsideCheck:
         # The row v^T J with the change along the other singular vectors taken out.
         left, right = find_singular_vectors(J)
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            least = _build_least_row(multiply_between(left, J, right))
+            turned = multiply_between(left, J, right)
+            least, linear = turned[-1], slice(1, 1 + len(turned.variables))
+            # v = (a_1, ..., a_m-1, 1) in the singular basis, with a_j = -(linear part) / s_j.
+            for j in range(len(turned.remainder) - 1):
+                part = np.zeros_like(turned.coefficients[:, -1, j])
+                part[linear] = -turned.coefficients[linear, -1, j] / turned.centre[j, j]
+                away = TaylorModel(turned.variables, part[:, None], np.zeros(part[:1].shape))
+                least = least + away * turned[j]
             sizes = least.bound_magnitude()
             squared = (sizes**2).sum(axis=0) * UP
             squared += RULES.guards * (J.bound_magnitude() ** 2).sum(axis=(0, 1))
@@ -239,17 +302,6 @@ class OutsideCheck:
         small = squared <= self.domain.least_singular_value**2 * (1 - RULES.lengths)
         outside: Array = small & is_orthogonal(left) & is_orthogonal(right)
         return outside, find_most_influential(influences.T, least.variables)
-
-
-def _build_least_row(turned: TaylorModel) -> TaylorModel:
-    """v^T times a matrix in its singular basis, for v = (a_1, ..., a_m-1, 1) with a_j = -(linear part) / s_j."""
-    row = turned[-1]
-    linear = slice(1, 1 + len(turned.variables))
-    for j in range(len(turned.remainder) - 1):
-        share = np.zeros_like(turned.coefficients[:, -1, j])
-        share[linear] = -turned.coefficients[linear, -1, j] / turned.centre[j, j]
-        row = row + TaylorModel(turned.variables, share[:, None], np.zeros(share[:1].shape)) * turned[j]
-    return row
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -277,8 +329,8 @@ class CorridorCheck:
 
     def __call__(self, low: Array, high: Array) -> BoxResults:
         """Evaluate boxes between corners (boxes, n)."""
-        middle, half = (low + high) / 2, (high - low) / 2
-        distance: Any = np.sqrt(self.domain.squared_distance(middle))
+        centre, half = (low + high) / 2, (high - low) / 2
+        distance: Any = np.sqrt(self.domain.squared_distance(centre))
         outside = distance > 1 + RULES.rounding + self.domain.lengths(half)
         inside = self.inside(low, high)
         return BoxResults(
@@ -289,64 +341,3 @@ class CorridorCheck:
             conditioning=np.where(outside, np.inf, inside.conditioning),
             widest=inside.widest,
         )
-
-
-def choose_check(chart: Chart, rows: ChartRows, bound: float, method: str | None = None) -> RegularCheck:
-    """The check of a chart: of its whole box or, of a part of it, of what is not proved to lie outside.
-
-    Args:
-        chart: the chart.
-        rows: its rows.
-        bound: of the conditioning.
-        method: of the proofs inside. Default: the fastest.
-
-    Raises:
-        CertifyError: if there is no such method for the chart; if a joint is unbounded, and a proof for its half-width
-            is none for all its positions. In a corridor, an unbounded joint whose distance to the path counts is one of
-            these.
-    """
-    domain = chart.problem.domain
-    domain.require_bounds("proof")
-    require_all_positions(chart, rows.variables)
-    check, near, clear = choose_inside_check(chart, rows, bound, method), domain.path_bound, domain.singular_bound
-    if near is not None:
-        # After a turn of an unbounded joint that counts, what is far from the path may be near it.
-        for joint in {*near.unbounded} & {*near.counted.tolist()}:
-            name = chart.problem.robot.joint_names[joint]
-            raise CertifyError(f"joint '{name}' is unbounded and counts in the corridor, expected an infinite radius")
-        start = near.postures[near.contains(near.postures)][:1]
-        return CorridorCheck(check, near, float(check(start, start).sign[0]))
-    if clear is None:
-        return check
-    own, variables = _choose_rows(chart, clear)
-    require_all_positions(chart, variables)
-    # The sign is that of these rows, which have other scales than the chart's.
-    sign = float(check(domain.centre[None], domain.centre[None]).sign[0])
-    return OutsideCheck(check, own, clear, sign, tuple(sorted(variables)), domain.room_to_fold is not None)
-
-
-def choose_inside_check(chart: Chart, rows: ChartRows, bound: float, method: str | None = None) -> RegularCheck:
-    """The check of boxes that lie in the domain; see `choose_check`."""
-    determinant = Determinant.build(chart) if bound == 0 and method != ELIMINATION else None
-    if determinant is not None:
-        return CofactorCheck(determinant)
-    if method == COFACTORS:
-        raise CertifyError("the chart's determinant has no expansion, so it has no certificate of this method")
-    return EliminationCheck(rows, bound)
-
-
-def _choose_rows(chart: Chart, domain: SingularBound) -> tuple[GraphRows, set[int]]:
-    """The rows that check positions, as `domain.is_clear` takes them, and the joints that they depend on.
-
-    Rows of a whole position or a whole orientation may be rotated if they have the same scale: then the rotation
-    changes no singular value, and rows in the axes of a body of the arm depend on fewer joints.
-    """
-    task, joints = chart.problem.task, range(chart.n)
-    tip = TipRows.build(task)
-    if tip is not None and tip.axis is None and len(domain.scale) % 3 == 0:
-        own_axes = domain.jacobian_function is task.frame_jacobian_function or not tip.rotation
-        if own_axes and (domain.scale[::3] == domain.scale.reshape(-1, 3).T).all():
-            return build_task_rows(task, chart.problem.domain, joints)
-    if domain.jacobian_function is not task.jacobian_function:
-        return build_closed_form(domain.jacobian_function, joints)
-    return build_true_gradients(task, joints)

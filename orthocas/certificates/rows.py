@@ -30,7 +30,7 @@ from orthocas.certificates.graph import TaylorGraph
 from orthocas.certificates.jets import (
     Around,
     Jets,
-    average_largest,
+    average_powers,
     build_power_weights,
     compute_powers,
     find_neighbours,
@@ -93,6 +93,7 @@ class ChartRows:
         if self.coordinates is not None:
             active = list(self.active)
             rows.append(self.coordinates([joints[i] for i in active], half_widths[active], self.active))
+        # All rows get the variables that they have together.
         variables = tuple(sorted({v for part in rows for v in part.variables}))
         rows = [part.extend(variables) for part in rows]
         return TaylorModel(
@@ -137,6 +138,7 @@ def build_chart_rows(chart: Chart) -> ChartRows:
     active = tuple(coordinates.active)
     task, moved_by = build_task_rows(chart.problem.task, chart.problem.domain, active)
     own, depends = _build_coordinate_rows(coordinates)
+    # A base at whose positions det J is the same stands still.
     base = _find_base(chart)
     variables = tuple(sorted({*moved_by, *depends} - {*base}))
     if len(variables) > MOST_VARIABLES:
@@ -208,6 +210,7 @@ def build_joint_models(low: Array, high: Array, variables: Variables) -> tuple[l
     half = np.nextafter(np.maximum(high - centre, centre - low), np.inf) + TINY
     models = []
     for k in range(low.shape[1]):
+        # q_k = centre + half-width t.
         if k in variables:
             linear = np.stack([centre[:, k], half[:, k], *np.zeros((2, len(low)))])
             models.append(TaylorModel((k,), linear, np.zeros(len(low))))
@@ -247,6 +250,7 @@ class TipRows:
     @classmethod
     def build(cls, task: Task) -> "TipRows | None":
         """Of a task; None for tasks of other kinds or frames, and for a tip that does not move."""
+        # The task's recipe says what it compares.
         kind = task.recipe["kind"]
         if task.robot.tree.tip_parent < 0 or not task.of_tip:
             return None
@@ -281,7 +285,20 @@ def transform_task_rows(task: Task, domain: Domain) -> tuple[ca.Function, float]
 
 def build_velocity_rows(tree: KinematicTree, q: ca.SX, body: int) -> ca.SX:
     """Jacobian of the tip's velocity and angular velocity in the axes of a body of the chain, (6, n)."""
-    poses = _build_poses(tree, q, body)
+    # Poses of all bodies in the frame of that one: outwards to the tip, then back to the base.
+    chain = tree.carriers(tree.tip_parent)
+    here = chain.index(body)
+    poses: dict[int, Pose] = {body: (ca.SX.eye(3), ca.SX.zeros(3))}
+    for below, i in zip(chain[here:], chain[here + 1 :], strict=False):
+        R, p = poses[below]
+        rotation, shift = _build_step(tree, q, i)
+        poses[i] = (R @ rotation, p + R @ shift)
+    for i, below in zip(chain[here:0:-1], chain[here - 1 :: -1] if here else [], strict=False):
+        R, p = poses[i]
+        rotation, shift = _build_step(tree, q, i)
+        back = R @ rotation.T
+        poses[below] = (back, p - back @ shift)
+    # Turning joints move the tip about their axes, sliding ones along.
     R, p = poses[tree.tip_parent]
     tip = p + R @ constant(tree.tip_translation)
     J = ca.SX(6, tree.n)
@@ -296,15 +313,11 @@ def build_velocity_rows(tree: KinematicTree, q: ca.SX, body: int) -> ca.SX:
 
 def build_axis_rows(tree: KinematicTree, q: ca.SX, axis: int) -> ca.SX:
     """Jacobian of the direction of a tip axis, along the two other axes of the tip, (2, n)."""
-    own, others = find_tip_axes(tree, axis)
+    # The axis (3,) and the two others (3, 2) in the frame of the body that carries the tip.
+    own, others = tree.tip_rotation[:, axis], tree.tip_rotation[:, [k for k in range(3) if k != axis]]
     J = build_velocity_rows(tree, q, tree.tip_parent)[3:, :]
     along = ca.horzcat(*[ca.cross(J[:, i], ca.SX(ca.DM(own))) for i in range(tree.n)])
     return constant(others.T) @ along
-
-
-def find_tip_axes(tree: KinematicTree, axis: int) -> tuple[Array, Array]:
-    """An axis of the tip (3,) and the two others (3, 2) in the frame of the body that carries it."""
-    return tree.tip_rotation[:, axis], tree.tip_rotation[:, [k for k in range(3) if k != axis]]
 
 
 def bound_rotation_error(tree: KinematicTree) -> float:
@@ -325,24 +338,7 @@ def _choose_sparsest(q: ca.SX, choices: list[ca.SX]) -> ca.SX:
     return min(choices, key=lambda J: int(ca.jacobian(ca.vec(J), q).nnz()))
 
 
-def _build_poses(tree: KinematicTree, q: ca.SX, body: int) -> dict[int, Pose]:
-    """Rotation and position of every body of the chain, in the frame of one of them."""
-    chain = tree.carriers(tree.tip_parent)
-    here = chain.index(body)
-    poses: dict[int, Pose] = {body: (ca.SX.eye(3), ca.SX.zeros(3))}
-    for below, i in zip(chain[here:], chain[here + 1 :], strict=False):
-        R, p = poses[below]
-        rotation, shift = _step(tree, q, i)
-        poses[i] = (R @ rotation, p + R @ shift)
-    for i, below in zip(chain[here:0:-1], chain[here - 1 :: -1] if here else [], strict=False):
-        R, p = poses[i]
-        rotation, shift = _step(tree, q, i)
-        back = R @ rotation.T
-        poses[below] = (back, p - back @ shift)
-    return poses
-
-
-def _step(tree: KinematicTree, q: ca.SX, i: int) -> Pose:
+def _build_step(tree: KinematicTree, q: ca.SX, i: int) -> Pose:
     """Rotation and position of a body in the frame of its parent."""
     rotation, shift = constant(tree.rotations[i]), constant(tree.translations[i])
     if tree.prismatic[i]:
@@ -375,19 +371,40 @@ class ProductRows:
         """The tables of a family with its parameters."""
         n, r = family.space.n, family.outputs
         terms = np.array([(0,) * n, *family.terms])
+        # The functions of one joint each, of which all others are products.
         alone = np.flatnonzero(np.count_nonzero(terms, axis=1) == 1)
         q = ca.SX.sym("q", n)
-        values = family.basis(q)[[int(k) - 1 for k in alone]]
+        functions = family.basis(q)[[int(k) - 1 for k in alone]]
         numbers = np.zeros((n, terms.max() + 1), dtype=int)
         for place, k in enumerate(alone):
             joint = int(np.flatnonzero(terms[k])[0])
             numbers[joint, terms[k, joint]] = place
-        graph = TaylorGraph.build(dense_function("functions", [q], [values]), "the coordinates")
+        graph = TaylorGraph.build(dense_function("functions", [q], [functions]), "the coordinates")
+        # Derivatives of functions are sums of others, so those of the coordinates are tables, order by order.
+        steps = [family.build_derivative_matrix(i) for i in range(n)]
         C = np.hstack([np.zeros((r, 1)), theta.reshape(r, -1)])
-        return cls(r, terms, graph, numbers, _differentiate_basis(family, terms, C, highest))
+        tables: dict[Monomial, tuple[Any, Any]] = {(): (C, np.abs(C))}
+        orders: list[Derivatives] = []
+        for order in range(1, highest + 1):
+            indices = list_multi_indices(n, order)
+            # The derivatives of a polynomial of a lower degree vanish.
+            if orders and not len(orders[-1].used):
+                nothing = np.zeros((len(indices) * r, 0))
+                orders.append(Derivatives(orders[-1].used, nothing, nothing, 0.0))
+                continue
+            for index in indices:
+                values, sizes = tables[index[:-1]]
+                step = steps[index[-1]]
+                tables[index] = (values @ step, sizes @ abs(step))
+            table, sizes = (np.concatenate([tables[index][k] for index in indices]) for k in (0, 1))
+            used = np.flatnonzero(sizes.any(axis=0))
+            rounding = 4 * UNIT * (len(terms) + 64 * order)
+            orders.append(Derivatives(used, table[:, used], sizes[:, used] * UP, rounding))
+        return cls(r, terms, graph, numbers, tuple(orders))
 
     def __call__(self, boxes: list[TaylorModel], half_widths: Array, variables: Variables) -> TaylorModel:
         """J_xi, (r, n, boxes), for models of the joints on boxes of the given half-widths (n, boxes)."""
+        # Taylor's series: derivatives at the centre, and the next order on the whole box for the remainder.
         points = [TaylorModel.constant(box.centre) for box in boxes]
         values, errors = self._evaluate_basis(self.functions(points))
         parts, left_out = [], np.zeros((self.r, len(boxes), half_widths.shape[1]))
@@ -413,12 +430,13 @@ class ProductRows:
         """The derivatives of J_xi at the centres of boxes. The next order, on the whole box, bounds the rest."""
         points = [TaylorModel.constant(np.ascontiguousarray(c)) for c in around.centre]
         values, errors = self._evaluate_basis(self.functions(points))
-        known = [self._evaluate_derivatives(order, values, errors) for order in range(1, around.order + 2)]
+        orders = [self._evaluate_derivatives(order, values, errors) for order in range(1, around.order + 2)]
+        # What is left out: the next order anywhere between the points.
         linear = np.stack([around.centre, around.reach, *np.zeros((2, *around.centre.shape))], axis=1)
         boxes = [TaylorModel((k,), each, np.zeros(each.shape[1:])) for k, each in enumerate(linear)]
-        weights = average_largest(build_power_weights(around, around.order + 1))
+        weights = average_powers(build_power_weights(around, around.order + 1), of_size=True)
         left_out = self._bound_derivatives(around.order + 2, boxes) * weights
-        derivatives, doubts = zip(*known, strict=True)
+        derivatives, doubts = zip(*orders, strict=True)
         return Jets(derivatives, doubts, left_out.sum(axis=2) * compute_margin(left_out.shape[2]) + TINY)
 
     def _evaluate_derivatives(self, order: int, values: Array, errors: Array) -> tuple[Array, Array]:
@@ -463,29 +481,6 @@ class ProductRows:
         return out
 
 
-def _differentiate_basis(family: ProductFamily, terms: Array, C: Array, highest: int) -> tuple[Derivatives, ...]:
-    n = family.space.n
-    steps = [family.build_derivative_matrix(i) for i in range(n)]
-    known: dict[Monomial, tuple[Any, Any]] = {(): (C, np.abs(C))}
-    orders: list[Derivatives] = []
-    for order in range(1, highest + 1):
-        indices = list_multi_indices(n, order)
-        # The derivatives of a polynomial of a lower degree vanish.
-        if orders and not len(orders[-1].used):
-            nothing = np.zeros((len(indices) * len(C), 0))
-            orders.append(Derivatives(orders[-1].used, nothing, nothing, 0.0))
-            continue
-        for index in indices:
-            values, sizes = known[index[:-1]]
-            step = steps[index[-1]]
-            known[index] = (values @ step, sizes @ abs(step))
-        table, sizes = (np.concatenate([known[index][k] for index in indices]) for k in (0, 1))
-        used = np.flatnonzero(sizes.any(axis=0))
-        rounding = 4 * UNIT * (len(terms) + 64 * order)
-        orders.append(Derivatives(used, table[:, used], sizes[:, used] * UP, rounding))
-    return tuple(orders)
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class NetworkRows:
     """J_xi of xi = W_out tanh(W_2 tanh(W_1 [sin q; cos q; q] + b_1) + b_2) + A q on boxes."""
@@ -506,7 +501,7 @@ class NetworkRows:
     def __call__(self, joints: list[TaylorModel], half_widths: Array, variables: Variables) -> TaylorModel:
         """J_xi, (r, n, boxes), for models of the joints."""
         sines, cosines = ([of(joints[i]) for i in self.turning] for of in (sine, cosine))
-        # values from layer to layer, then gradients backwards
+        # Values from layer to layer, then gradients backwards.
         layer, slopes = stack([*sines, *cosines, *(joints[i] for i in self.direct)]), []
         one = TaylorModel.constant(np.ones((1, 1)))
         for W, b in self.layers[:-1]:
@@ -517,7 +512,7 @@ class NetworkRows:
             gradient = TaylorModel.constant(weights[:, None])
             for (W, _), slope in zip(self.layers[-2::-1], slopes[::-1], strict=True):
                 gradient = _multiply_weights(W.T, gradient * slope)
-            # by the joints, from derivatives by the inputs [sin q; cos q; q]
+            # By the joints, from derivatives by the inputs [sin q; cos q; q].
             turning, columns = len(sines), [TaylorModel.constant(np.full(1, value)) for value in constants]
             for k, i in enumerate(self.turning):
                 columns[i] = gradient[k] * cosines[k] - gradient[turning + k] * sines[k]

@@ -70,6 +70,7 @@ class Search:
 
     def __post_init__(self) -> None:
         low, high = self.base.leaves(OPEN)
+        # A search that goes on begins with what an earlier one has proved.
         self.proved_volume = self.base.share
         self._add(low, high)
 
@@ -84,34 +85,30 @@ class Search:
         return OPEN not in self._codes and not self.folded
 
     def run(self, look: Look) -> None:
-        """Search until all is proved, a fold is found, or a limit is reached. An interrupted search keeps its state."""
+        """Search until all is proved, a fold shows, or a limit is reached. An interrupted search keeps its state."""
         end = time.monotonic() + self.limits.seconds
         pending: dict[Future[BoxResults], list[tuple[float, int, Array, Array]]] = {}
         try:
             while self._waiting or pending:
-                if self._decided or time.monotonic() > end or self.evaluated >= self.limits.boxes or self._hopeless:
+                # A fold may end the search, and so may a failure that ranks before all that is left.
+                behind = bool(self._waiting) and self._waiting[0][0] > self.failed
+                if (self.folded and self.limits.folds) or (behind and self.limits.first_failure):
+                    break
+                # It also ends at its limits, and if all would take too many boxes at the pace so far.
+                hopeless = self.evaluated > max(self.limits.hopeless, self.proved_volume * self.limits.boxes)
+                if time.monotonic() > end or self.evaluated >= self.limits.boxes or hopeless:
                     break
                 self._step(pending)
                 look(self)
         finally:
+            # Batches that nobody has finished wait again.
             for future, batch in pending.items():
                 future.cancel()
                 self._return(batch)
 
-    @property
-    def _hopeless(self) -> bool:
-        """Whether all would take too many boxes, if it goes on as slowly as so far."""
-        late = self.evaluated > self.limits.hopeless
-        return late and self.evaluated > self.proved_volume * self.limits.boxes
-
-    @property
-    def _decided(self) -> bool:
-        """Whether the rest does not matter."""
-        behind = bool(self._waiting) and self._waiting[0][0] > self.failed
-        return (self.folded and self.limits.folds) or (behind and self.limits.first_failure)
-
     def visit(self, points: Array) -> None:
         """Note the signs of det J at points (k, n), where they are proved."""
+        # A point is a box without width.
         results = self.check(points, points)
         for point, regular, sign in zip(points, results.regular, results.sign.tolist(), strict=True):
             if regular and sign:
@@ -122,16 +119,22 @@ class Search:
         codes: list[int] = []
         root = 0
         for code in self.base.codes.tolist():
-            if code == OPEN:
-                codes += self._list_preorder(root)
-                root += 1
-            else:
+            if code != OPEN:
                 codes.append(code)
+                continue
+            # The tree below an open part of the base, each box before its halves.
+            waiting, root = [root], root + 1
+            while waiting:
+                place = waiting.pop()
+                codes.append(self._codes[place])
+                if codes[-1] < PROVED:
+                    waiting += [self._children[place] + 1, self._children[place]]
         return Subdivision(self.base.low, self.base.high, np.array(codes, dtype=np.uint8))
 
     def _step(self, pending: dict[Future[BoxResults], list[tuple[float, int, Array, Array]]]) -> None:
         """Evaluate one batch here, or give batches to the executor and take back those that are done."""
         check_remembered()
+        # Without an executor, one batch is evaluated here; Ctrl-C gives it back.
         if self.executor is None:
             batch = self._take()
             try:
@@ -141,7 +144,7 @@ class Search:
                 raise
             self._apply(batch, results)
             return
-        # Keep the executor busy, and take back what is done.
+        # Keep the executor busy, and take back what it has evaluated.
         while self._waiting and len(pending) < RULES.in_flight:
             batch = self._take()
             try:
@@ -151,19 +154,16 @@ class Search:
         done = wait(pending, return_when=FIRST_COMPLETED).done
         for future in done:
             batch = pending.pop(future)
-            if worker_died(future):
-                self._retry(batch)
-            else:
+            if not worker_died(future):
                 self._apply(batch, future.result())
-
-    def _retry(self, batch: list[tuple[float, int, Array, Array]]) -> None:
-        """Return boxes whose process died; those for which that was the last attempt stay open."""
-        self._deaths.update(place for _, place, _, _ in batch)
-        given_up = [box for box in batch if self._deaths[box[1]] >= ATTEMPTS]
-        self._return([box for box in batch if self._deaths[box[1]] < ATTEMPTS])
-        if given_up:
-            self.failed = min(self.failed, *(rank for rank, _, _, _ in given_up))
-            _log.warning("%d boxes are left unproved: worker processes died over them", len(given_up))
+                continue
+            # Boxes whose process died are tried again; after the last attempt they stay open.
+            self._deaths.update(place for _, place, _, _ in batch)
+            given_up = [box for box in batch if self._deaths[box[1]] >= ATTEMPTS]
+            self._return([box for box in batch if self._deaths[box[1]] < ATTEMPTS])
+            if given_up:
+                self.failed = min(self.failed, *(rank for rank, _, _, _ in given_up))
+                _log.warning("%d boxes are left unproved: worker processes died over them", len(given_up))
 
     def _take(self) -> list[tuple[float, int, Array, Array]]:
         # As many boxes as there are, but enough tasks for all workers of an executor.
@@ -180,11 +180,12 @@ class Search:
         """Close the boxes that are proved, and halve the others."""
         low, high = _stack_corners(batch)
         self.evaluated += len(batch)
-        # A point for each sign that is new is visited: signs at the centres of boxes without a proof are hints.
+        # Signs at the centres of boxes without a proof are hints: visit one point for each sign that is new.
         for sign in {-1, 1} - set(self.signs):
             there = np.flatnonzero(results.sign == sign)
             if there.size:
                 self.visit((low + high)[there[:1]] / 2)
+        # Proved boxes are closed, all others are halved.
         proved = results.proved
         if proved.any():
             self.conditioning = min(self.conditioning, float(results.conditioning[proved].min()))
@@ -194,40 +195,29 @@ class Search:
                 self._codes[place] = PROVED
                 self.open_count -= 1
                 continue
-            shares = (b - a) / (self.base.high - self.base.low)
+            widths = (b - a) / (self.base.high - self.base.low)
             joint = int(results.widest[k])
-            # The relatively widest joint: any choice that stays the same may never help.
+            # Where bounds are infinite, halve the relatively widest joint: a choice that stays the same may never help.
             if joint == UNKNOWN:
-                joint = max(self.check.joints, key=lambda i: float(shares[i]))
-            if joint != NEVER and shares[joint] > self.limits.smallest:
-                self._split_box(place, a, b, joint)
-            else:
+                joint = max(self.check.joints, key=lambda i: float(widths[i]))
+            if joint == NEVER or widths[joint] <= self.limits.smallest:
                 self.dead += 1
                 self.failed = min(self.failed, rank)
-
-    def _split_box(self, place: int, low: Array, high: Array, joint: int) -> None:
-        middle = halve_interval(low[joint], high[joint])
-        top, bottom = high.copy(), low.copy()
-        top[joint] = bottom[joint] = middle
-        self._codes[place], self._children[place] = joint, len(self._codes)
-        self.open_count -= 1
-        self._add(np.array([low, bottom]), np.array([top, high]))
+                continue
+            # The halves take the place of the box.
+            top, bottom = b.copy(), a.copy()
+            top[joint] = bottom[joint] = halve_interval(a[joint], b[joint])
+            self._codes[place], self._children[place] = joint, len(self._codes)
+            self.open_count -= 1
+            self._add(np.array([a, bottom]), np.array([top, b]))
 
     def _add(self, low: Array, high: Array) -> None:
+        # New boxes are open, and wait by their rank.
         self.open_count += len(low)
         for rank, a, b in zip(self.priority(low, high).tolist(), low, high, strict=True):
             heapq.heappush(self._waiting, (rank, len(self._codes), a, b))
             self._codes.append(OPEN)
             self._children.append(0)
-
-    def _list_preorder(self, root: int) -> list[int]:
-        codes, waiting = [], [root]
-        while waiting:
-            place = waiting.pop()
-            codes.append(self._codes[place])
-            if codes[-1] < PROVED:
-                waiting += [self._children[place] + 1, self._children[place]]
-        return codes
 
 
 def rank_by_volume(base: Subdivision) -> Priority:
@@ -235,21 +225,17 @@ def rank_by_volume(base: Subdivision) -> Priority:
     return lambda low, high: -_measure_volumes(base, low, high)
 
 
-def rank_by_distance(base: Subdivision) -> Priority:
-    """Boxes that the smallest scaled copy of the whole touches first."""
-    return lambda low, high: measure_distances(base, low, high)
-
-
 def measure_distances(base: Subdivision, low: Array, high: Array) -> Array:
     """The scale s at which a copy of the whole about its centre first touches each box, (boxes,)."""
-    middle, half = (base.low + base.high) / 2, (base.high - base.low) / 2
-    gaps: Array = np.maximum(np.maximum(low - middle, middle - high), 0) / half
+    # Gaps between the centre and a box, in half-widths of the whole.
+    centre, half = (base.low + base.high) / 2, (base.high - base.low) / 2
+    gaps: Array = np.maximum(np.maximum(low - centre, centre - high), 0) / half
     return np.asarray(gaps.max(axis=1))
 
 
 def _measure_volumes(base: Subdivision, low: Array, high: Array) -> Array:
-    shares: Array = ((high - low) / (base.high - base.low)).prod(axis=1)
-    return shares
+    # As fractions of the whole.
+    return np.asarray(((high - low) / (base.high - base.low)).prod(axis=1))
 
 
 def _stack_corners(batch: list[tuple[float, int, Array, Array]]) -> tuple[Array, Array]:

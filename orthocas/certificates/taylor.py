@@ -57,7 +57,7 @@ def list_monomials(variables: Variables, degree: int = DEGREE) -> tuple[Monomial
 
 
 @cache
-def order_starts(count: int) -> tuple[int, ...]:
+def find_order_starts(count: int) -> tuple[int, ...]:
     """Where the monomials of degree 0, 1, 2, 3 in so many variables start, and how many there are in all."""
     linear, quadratic = 1 + count, (1 + count) * (2 + count) // 2
     return 0, 1, linear, quadratic, quadratic * (3 + count) // 3
@@ -88,19 +88,20 @@ def plan_product(left: Variables, right: Variables) -> Product:
     both = tuple(sorted({*left, *right}))
     index = {monomial: k for k, monomial in enumerate(list_monomials(both))}
 
-    def of(one: Monomial, others: tuple[Monomial, ...]) -> Places:
+    def find_products(one: Monomial, others: tuple[Monomial, ...]) -> Places:
         return _merge_places([index[tuple(sorted(one + other))] for other in others])
 
+    # Linear terms of a meet linear and quadratic ones of b, quadratic ones of a only linear ones.
     a, b = list_monomials(left), list_monomials(right)
-    starts = order_starts(len(left))
-    middle = b[1 : order_starts(len(right))[3]]
+    starts = find_order_starts(len(left))
+    inner = b[1 : find_order_starts(len(right))[3]]
     return Product(
         both,
         len(index),
         find_places(left, both),
         find_places(right, both),
-        tuple(of((i,), middle) for i in left),
-        tuple(of((j,), a[starts[2] : starts[3]]) for j in right),
+        tuple(find_products((i,), inner) for i in left),
+        tuple(find_products((j,), a[starts[2] : starts[3]]) for j in right),
     )
 
 
@@ -127,22 +128,19 @@ class TaylorModel:
     @property
     def centre(self) -> Array:
         """The constant coefficients, (..., boxes)."""
-        value: Array = self.coefficients[0]
-        return value
+        return np.asarray(self.coefficients[0])
 
     def sum_sizes(self) -> Array:
         """Sums of the absolute coefficients of each degree, (4, ..., boxes)."""
-        starts = order_starts(len(self.variables))[:4]
+        starts = find_order_starts(len(self.variables))[:4]
         size = np.abs(self.coefficients)
         if not self.variables:
             return np.concatenate([size, np.zeros((3, *size.shape[1:]))])
-        sums: Array = np.add.reduceat(size, starts, axis=0)
-        return sums
+        return np.asarray(np.add.reduceat(size, starts, axis=0))
 
     def bound_magnitude(self) -> Array:
         """A bound of the absolute values, (..., boxes)."""
-        bound: Array = (np.abs(self.coefficients).sum(axis=0) + self.remainder) * UP
-        return bound
+        return np.asarray((np.abs(self.coefficients).sum(axis=0) + self.remainder) * UP)
 
     def __getitem__(self, part: object) -> "TaylorModel":
         index = part if isinstance(part, tuple) else (part,)
@@ -152,7 +150,7 @@ class TaylorModel:
         """The same model with more variables."""
         if variables == self.variables:
             return self
-        wide = np.zeros((order_starts(len(variables))[4], *self.coefficients.shape[1:]))
+        wide = np.zeros((find_order_starts(len(variables))[4], *self.coefficients.shape[1:]))
         wide[find_places(self.variables, variables)] = self.coefficients
         return TaylorModel(variables, wide, self.remainder)
 
@@ -191,7 +189,7 @@ class TaylorModel:
         out[table.right] = a[0] * b
         out[table.left] += b[0] * a
         out[0] = a[0] * b[0]
-        starts, end = order_starts(len(self.variables)), order_starts(len(other.variables))[3]
+        starts, end = find_order_starts(len(self.variables)), find_order_starts(len(other.variables))[3]
         for i, where in enumerate(table.by_linear, 1):
             out[where] += a[i] * b[1:end]
         for j, where in enumerate(table.quadratic_by, 1):
@@ -206,20 +204,22 @@ class TaylorModel:
 
     def _bound_remainder(self, other: "TaylorModel") -> Array:
         """The remainder of a product: degrees above 3, the remainders of the factors, and rounding."""
+        # Sizes by degree.
         a, b = self.sum_sizes(), other.sum_sizes()
         all_a, all_b = a.sum(axis=0), b.sum(axis=0)
         high = a[3] * (b[1] + b[2] + b[3]) + a[2] * (b[2] + b[3]) + a[1] * b[3]
         carried = self.remainder * (all_b + other.remainder) + other.remainder * all_a
-        bound: Array = (high + carried + sum_error(_PRODUCTS) * (all_a * all_b)) * UP + TINY
-        return bound
+        return np.asarray((high + carried + sum_error(_PRODUCTS) * (all_a * all_b)) * UP + TINY)
 
     def compose(self, series: "Series") -> "TaylorModel":
         """The model of f(self), for the series of f about the centre."""
+        # Without variables, the remainder takes the place of all that varies.
         if not self.variables:
             first = np.abs(series.values[1:]) + series.errors[1:]
             e = self.remainder
             doubt = series.errors[0] + series.tail + e * (first[0] + e * (first[1] + e * first[2]))
             return TaylorModel.constant(series.values[0], doubt * UP)
+        # Horner's rule in what is away from the centre.
         away = TaylorModel(self.variables, self.coefficients.copy(), self.remainder)
         away.coefficients[0] = 0
         values = [TaylorModel.constant(series.values[k], series.errors[k]) for k in range(4)]
@@ -227,29 +227,30 @@ class TaylorModel:
 
     def bound_deviation(self) -> Array:
         """A bound of the distance from the centre, (..., boxes)."""
-        bound: Array = (np.abs(self.coefficients[1:]).sum(axis=0) + self.remainder) * UP
-        return bound
+        return np.asarray((np.abs(self.coefficients[1:]).sum(axis=0) + self.remainder) * UP)
 
     def compute_gains(self) -> Array:
         """How much halving the interval of each variable takes from the bound of the values, (variables, ..., boxes).
 
         A coefficient shrinks by 2^-power; the remainder is shared out like the cubic terms, which it is most like.
         """
-        taken, size = _weigh_halving(self.variables).T, np.abs(self.coefficients)
-        cubic = order_starts(len(self.variables))[3]
+        taken, size = weigh_halving(self.variables, DEGREE), np.abs(self.coefficients)
+        cubic = find_order_starts(len(self.variables))[3]
         flat, shape = size.reshape(len(size), -1), (len(taken), *size.shape[1:])
         last = (taken[:, cubic:] @ flat[cubic:]).reshape(shape)
-        known = (taken[:, :cubic] @ flat[:cubic]).reshape(shape) + last
+        of_terms = (taken[:, :cubic] @ flat[:cubic]).reshape(shape) + last
         # Remainders may be infinite.
         with np.errstate(invalid="ignore"):
-            gains: Array = known + last / (last.sum(axis=0) + TINY) * self.remainder
+            gains: Array = of_terms + last / (last.sum(axis=0) + TINY) * self.remainder
         return gains
 
 
 @cache
-def _weigh_halving(variables: Variables) -> Array:
-    """1 - 2^-power of each variable in each monomial, (monomials, variables)."""
-    return np.array([[1 - 0.5 ** powers.count(v) for v in variables] for powers in list_monomials(variables)])
+def weigh_halving(variables: Variables, degree: int) -> Array:
+    """1 - 2^-power of each variable in each monomial up to a degree, (variables, monomials)."""
+    monomials = list_monomials(variables, degree)
+    taken = [[1 - 0.5 ** powers.count(v) for powers in monomials] for v in variables]
+    return np.array(taken).reshape(len(variables), len(monomials))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,6 +264,7 @@ class Series:
 
 def stack(models: list[TaylorModel]) -> TaylorModel:
     """Models of the same shape as one, with a new first axis."""
+    # All models get the variables and the shape that they have together.
     variables = tuple(sorted({v for model in models for v in model.variables}))
     shape = np.broadcast_shapes(*(model.remainder.shape for model in models))
     parts = [model.broadcast_to(shape).extend(variables) for model in models]
@@ -276,30 +278,32 @@ def _widen(model: TaylorModel, error: Array) -> TaylorModel:
 
 def evaluate_sine_cosine(x: Array) -> tuple[Enclosed, Enclosed]:
     """Sine and cosine of numbers up to 1e6 in size."""
-    known = np.abs(x) <= _WIDEST_ANGLE
-    x = np.where(known, x, 0.0)
+    valid = np.abs(x) <= _WIDEST_ANGLE
+    x = np.where(valid, x, 0.0)
+    # Quarter turns are taken off, then the two series follow.
     turns = np.rint(x * (2 / np.pi))
     # |r| < 0.79.
     r = ((x - turns * _HALF_PI[0]) - turns * _HALF_PI[1]) - turns * _HALF_PI[2]
     square = r * r
     s = r * _evaluate_horner(square, [(-1.0) ** k / factorial(2 * k + 1) for k in range(10)])
     c = _evaluate_horner(square, [(-1.0) ** k / factorial(2 * k) for k in range(11)])
+    # Each quarter turn swaps sine and cosine, and one of the signs.
     quarter = turns % 4
     sine = np.choose(quarter.astype(int), [s, c, -s, -c])
     cosine = np.choose(quarter.astype(int), [c, -s, -c, s])
-    error = np.where(known, _ERROR, np.inf)
+    error = np.where(valid, _ERROR, np.inf)
     return (sine, error), (cosine, error)
 
 
 def evaluate_exponential(x: Array) -> Enclosed:
     """e^x of numbers up to 700 in size."""
-    known = np.abs(x) <= _WIDEST_EXPONENT
-    x = np.where(known, x, 0.0)
+    valid = np.abs(x) <= _WIDEST_EXPONENT
+    x = np.where(valid, x, 0.0)
     whole = np.rint(x * (1 / np.log(2.0)))
     # |r| < 0.35.
     r = (x - whole * _LN2[0]) - whole * _LN2[1]
     value = np.ldexp(_evaluate_horner(r, [1 / factorial(k) for k in range(16)]), whole.astype(int))
-    return value, np.where(known, _ERROR * value, np.inf)
+    return value, np.where(valid, _ERROR * value, np.inf)
 
 
 def evaluate_tanh(x: Array) -> Enclosed:
@@ -311,6 +315,7 @@ def evaluate_tanh(x: Array) -> Enclosed:
 
 def _evaluate_horner(x: Array, coefficients: list[float]) -> Array:
     """Sum of coefficients[k] x^k."""
+    # From the highest power down.
     value = np.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         value = value * x + coefficient
@@ -396,6 +401,7 @@ def power(model: TaylorModel, exponent_: int) -> TaylorModel:
     """The model of f^k for a whole number k."""
     if exponent_ < 0:
         return reciprocal(power(model, -exponent_))
+    # From the first binary digit on, square for each, and multiply for those that are 1.
     result = TaylorModel.constant(np.ones_like(model.centre))
     for bit in bin(exponent_)[2:]:
         result = result * result

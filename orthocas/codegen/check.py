@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from orthocas.charts.chart import Chart
 from orthocas.codegen.generate import GeneratedC
-from orthocas.codegen.library import CompiledLibrary, compile_shared, compilers, gain_numbers
+from orthocas.codegen.library import CompiledLibrary, compile_shared, find_compilers, gain_numbers
 from orthocas.codegen.precision import DOUBLE, SINGLE, Precision, find_bounds_inside
 from orthocas.control.controller import (
     FROM_THE_LAW,
@@ -73,11 +73,10 @@ def check_c(
 
     Raises:
         CompileError: if there is no compiler, or compilation fails.
-        AgreementError: if a result differs by more than 1e-10 of its largest entry (single precision: 1e-3), or a
-            status differs. Near singularities, where one rounding of q, or of one joint, changes commands by more than
-            1e-12 (1e-5), the accepted difference is a hundred times that change. In single precision, that of commands
-            also grows with the inverse square of the volume of the gradients, relative to its median, and their status
-            may be that of a place within 0.01 half-widths.
+        AgreementError: if a status differs, or a result differs by more than the tolerance of its number type
+            (`Precision`), relative to its largest entry. Near singularities, more is accepted where one rounding of q,
+            or of one joint, changes commands much. In single precision, that of commands also grows with the inverse
+            square of the volume of the gradients, and their status may be that of a place nearby.
     """
     require_kind("chart", chart, Chart)
     n, precision = chart.n, SINGLE if generated.single_precision else DOUBLE
@@ -88,7 +87,7 @@ def check_c(
     around = domain.half_width * RULES.reach * np.random.default_rng(seed).uniform(-1, 1, (states, n))
     q = precision.round(np.vstack([domain.centre + around, corners]))
     differences: dict[str, float] = {}
-    for compiler in compilers():
+    for compiler in find_compilers():
         with open_draft_folder() as folder:
             path = compile_shared(generated, folder, compiler=compiler)
             library = CompiledLibrary(path, generated.name, n, generated.single_precision)
@@ -100,7 +99,7 @@ def check_c(
                     f"expected at most {precision.tolerance:g} relative"
                 )
             differences[name] = max(value, differences.get(name, 0.0))
-    return AgreementCheck(len(q), tuple(Path(compiler).name for compiler in compilers()), differences)
+    return AgreementCheck(len(q), tuple(Path(compiler).name for compiler in find_compilers()), differences)
 
 
 def list_corners(n: int) -> Array:
@@ -109,7 +108,7 @@ def list_corners(n: int) -> Array:
 
 
 def spoil(rng: np.random.Generator, *arrays: Array) -> list[Array]:
-    """Copies with a NaN, infinite or huge number in every twentieth row of one array; corner cases stay as they are."""
+    """Copies with NaN, infinite or huge numbers in some rows, in one array each; corner cases stay as they are."""
     copies = [array.copy() for array in arrays]
     for row in range(0, len(arrays[0]) - len(list_corners(arrays[0].shape[1])), RULES.spoil_every):
         array = copies[rng.integers(len(copies))]
@@ -127,7 +126,12 @@ def _compare(
     dq = library.precision.round(rng.normal(size=q.shape))
     dq[len(q) - len(list_corners(chart.n)) :] = 0
     differences = _compare_chart_and_dynamics(library, chart, *spoil(rng, q, dq))
-    differences["curvature"] = _compare_curvature(library, chart, q, dq, rng)
+    # dJ/dt v where it has a value, with any v.
+    v = library.precision.round(rng.normal(size=q.shape))
+    expected = Batched(chart.function("second_derivative"))(q, dq, v)[0]
+    curvature = np.array([library.curvature(*row)[0] for row in zip(q, dq, v, strict=True)])
+    good = np.asarray(np.isfinite(expected).all(axis=1))
+    differences["curvature"] = _compute_largest(curvature, _blank(good, expected))
     differences["check"] = library.check()
     differences["inverse"] = _compare_inverse(library, chart, q)
     if controller is not None:
@@ -144,6 +148,7 @@ def _compare_chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array
     expected = {"phi": chart.phi(somewhere), "jacobian": chart.jacobian(somewhere)}
     has_value = finite & np.isfinite(expected["phi"]).all(axis=1) & np.isfinite(expected["jacobian"]).all(axis=(1, 2))
     status = np.select([~finite, ~has_value], [ControlStatus.NOT_FINITE, ControlStatus.SINGULAR], inside)
+    # phi and J, zero where they have no value.
     results = [library.chart(row) for row in q]
     _require_status("chart", [row[-1] for row in results], status, q)
     phi, J = (np.array([row[k] for row in results]) for k in range(2))
@@ -151,6 +156,7 @@ def _compare_chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array
     # pi and -pi are one angle.
     phi = expected["phi"] + wrap_shortest(phi - expected["phi"], chart.parts.turns)
     differences = {"phi": _compute_largest(phi, expected["phi"]), "jacobian": _compute_largest(J, expected["jacobian"])}
+    # Mass matrix, bias and gravity, likewise.
     expected = {
         "mass_matrix": robot.mass_matrix(somewhere),
         "bias": robot.bias(somewhere, speed),
@@ -164,17 +170,9 @@ def _compare_chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array
     }
 
 
-def _compare_curvature(library: CompiledLibrary, chart: Chart, q: Array, dq: Array, rng: np.random.Generator) -> float:
-    """Largest relative difference of dJ/dt v where it has a value, with any v."""
-    v = library.precision.round(rng.normal(size=q.shape))
-    expected = Batched(chart.function("second_derivative"))(q, dq, v)[0]
-    results = [library.curvature(*row) for row in zip(q, dq, v, strict=True)]
-    good = np.asarray(np.isfinite(expected).all(axis=1))
-    return _compute_largest(np.array([row[0] for row in results]), _blank(good, expected))
-
-
 def _compare_inverse(library: CompiledLibrary, chart: Chart, q: Array) -> float:
     """Largest remaining error in phi of the solutions. Most targets must be solved from nearby, but not from afar."""
+    # Targets where phi has a value and J is far from singular.
     inner = q[: len(q) // 10]
     J = chart.jacobian(inner)
     finite = np.asarray(np.isfinite(chart.phi(inner)).all(axis=1) & np.isfinite(J).all(axis=(1, 2)))
@@ -187,9 +185,10 @@ def _compare_inverse(library: CompiledLibrary, chart: Chart, q: Array) -> float:
         raise AgreementError(
             f"the inverse map solved {solved} of {len(inner)} targets from {RULES.start:g} away, expected most"
         )
+    # NaN is no target and no start.
     nothing = np.full(chart.n, np.nan)
-    for given in ((nothing, q[0]), (q[0], nothing)):
-        solution, status = library.inverse(*given)
+    for arguments in ((nothing, q[0]), (q[0], nothing)):
+        solution, status = library.inverse(*arguments)
         if status != ControlStatus.NOT_FINITE or solution.any():
             raise AgreementError(
                 f"inverse returns {solution.tolist()} and status {status} for NaN, expected zeros and 3"
@@ -205,7 +204,10 @@ def _measure_inverse(library: CompiledLibrary, chart: Chart, target: Array, star
             raise AgreementError(f"the status of inverse is {status} at q = {solution.tolist()}")
         return float(np.abs(wrap_shortest(chart.phi(solution.astype(float)) - target, chart.parts.turns)).max())
     if status == ControlStatus.STOPPED_EARLY:
-        after, before = (_measure_remaining(library, chart, target, q) for q in (solution, start))
+        # Errors as the library has them, with its own phi and scale: far outside, rounding is large.
+        phi = np.array([library.chart(q)[0] for q in (solution, start)], dtype=float)
+        scale = chart.parts.phi_sizes + library.precision.coarse * np.abs(target)
+        after, before = np.abs(chart.parts.phi_map.difference(np.tile(target, (2, 1)), phi) / scale).max(axis=1)
         if not after <= before * (1 + 1e-5):
             raise AgreementError(
                 f"inverse returns {solution.tolist()}, farther off than its start: {after} for {before}"
@@ -215,20 +217,17 @@ def _measure_inverse(library: CompiledLibrary, chart: Chart, target: Array, star
     return np.inf
 
 
-def _measure_remaining(library: CompiledLibrary, chart: Chart, target: Array, q: Array) -> float:
-    """The largest error in phi as the library has it, with its own phi and scale: far outside, rounding is large."""
-    phi = library.chart(q)[0].astype(float)
-    scale = chart.parts.phi_sizes + library.precision.coarse * np.abs(target)
-    return float(np.abs(chart.parts.phi_map.difference(target[None], phi[None])[0] / scale).max())
-
-
 def _compare_control(
     library: CompiledLibrary, controller: Controller, q: Array, dq: Array, rng: np.random.Generator
 ) -> float:
     numbers = library.precision.round(gain_numbers(controller))
     if not np.array_equal(library.default_gains(len(numbers)), numbers):
         raise AgreementError("the default gains in C differ from the gains of the controller")
-    inputs = _sample_law_inputs(library.precision, controller, q, dq, rng)
+    # References near the quantities, and gains; some of all these numbers are spoiled.
+    around = np.nan_to_num(Batched(controller.measured)(q)[0])
+    reference = (around + 0.1 * rng.normal(size=around.shape), *rng.normal(size=(2, *around.shape)))
+    state = spoil(rng, q, dq, *reference)
+    inputs = [library.precision.round(values) for values in (*state, *sample_gains(controller, len(q), rng))]
     law = Batched(count_turns_from_centre(library.precision.graph(controller), controller.problem))
     command, status = law(*inputs)
     if not (status == ControlStatus.OK).any():
@@ -236,25 +235,15 @@ def _compare_control(
     rows = zip(*inputs[:2], np.hstack(inputs[2:5]), np.hstack(inputs[5:]), strict=True)
     results, statuses = zip(*(library.control(*row) for row in rows), strict=True)
     same = np.array(statuses) == status[:, 0]
+    # In single precision, any status will do where the law has another one next to q along a joint.
+    expected = status[:, 0]
     if library.single_precision:
-        expected = np.where(_is_near_another_status(controller, law, inputs), statuses, status[:, 0])
-    else:
-        expected = status[:, 0]
+        step = np.diag(RULES.nearby * controller.problem.domain.half_width)
+        near = [law(inputs[0] + way, *inputs[1:])[1][:, 0] != expected for way in np.vstack([step, -step])]
+        expected = np.where(np.any(near, axis=0), statuses, expected)
     _require_status("control", statuses, expected, inputs[0])
-    relative = _compute_differences(np.array(results), command) / _estimate_amplification(
-        library.precision, controller, law, inputs
-    )
-    return float(relative[same].max())
-
-
-def _sample_law_inputs(
-    precision: Precision, controller: Controller, q: Array, dq: Array, rng: np.random.Generator
-) -> list[Array]:
-    """Positions, velocities, references with two derivatives, and gains, some of them spoiled."""
-    around = np.nan_to_num(Batched(controller.measured)(q)[0])
-    reference = (around + 0.1 * rng.normal(size=around.shape), *rng.normal(size=(2, *around.shape)))
-    state = spoil(rng, q, dq, *reference)
-    return [precision.round(values) for values in (*state, *sample_gains(controller, len(q), rng))]
+    amplification = _estimate_amplification(library.precision, controller, law, inputs)
+    return float((_compute_differences(np.array(results), command) / amplification)[same].max())
 
 
 def sample_gains(controller: Controller, rows: int, rng: np.random.Generator) -> list[Array]:
@@ -262,12 +251,12 @@ def sample_gains(controller: Controller, rows: int, rng: np.random.Generator) ->
     gains = []
     for name, gain in controller.gains.items():
         if name == "payload":
-            # up to 2 kg, within some 0.1 m of the tip, with positive definite inertias
+            # Up to 2 kg, within some 0.1 m of the tip, with positive definite inertias.
             mass, factors = rng.uniform(0, 2, (rows, 1)), 0.05 * rng.normal(size=(rows, 3, 3))
             inertia = factors @ factors.transpose(0, 2, 1)
             values = np.hstack([mass, 0.1 * rng.normal(size=(rows, 3)), inertia[:, *np.triu_indices(3)]])
         elif name == "mass_matrix":
-            # one factor and a diagonal, so that it stays symmetric positive definite
+            # One factor and a diagonal, so that it stays symmetric positive definite.
             n = controller.problem.n
             diagonal = np.eye(n) * rng.uniform(0, 0.1, (rows, 1, n))
             values = (gain.reshape(n, n) * rng.uniform(0.5, 1.5, (rows, 1, 1)) + diagonal).reshape(rows, -1)
@@ -302,19 +291,9 @@ def _estimate_amplification(precision: Precision, controller: Controller, law: B
     return results
 
 
-def _is_near_another_status(controller: Controller, law: Batched, inputs: list[Array]) -> NDArray[np.bool_]:
-    """Whether the status of the law is another one at a place next to q along a joint, (N,)."""
-    q, others = inputs[0], inputs[1:]
-    step = np.diag(RULES.nearby * controller.problem.domain.half_width)
-    here = law(*inputs)[1][:, 0]
-    near = [law(q + way, *others)[1][:, 0] != here for way in np.vstack([step, -step])]
-    return np.asarray(np.any(near, axis=0))
-
-
 def _are_numbers(largest: float, *arrays: Array) -> NDArray[np.bool_]:
     """Rows without NaN, infinities and numbers that the C code rejects."""
-    finite: NDArray[np.bool_] = np.all([(np.abs(array) <= largest).all(axis=1) for array in arrays], axis=0)
-    return finite
+    return np.asarray(np.all([(np.abs(array) <= largest).all(axis=1) for array in arrays], axis=0))
 
 
 def _blank(good: NDArray[np.bool_], values: Array) -> Array:

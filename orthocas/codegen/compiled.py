@@ -4,9 +4,7 @@ import ctypes
 import hashlib
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +13,7 @@ import numpy as np
 import scipy
 
 from orthocas.codegen.kernels import generate_kernels
-from orthocas.codegen.library import compilers
+from orthocas.codegen.library import find_compilers
 from orthocas.codegen.rendering import render
 from orthocas.errors import CompileError, SimulationError
 from orthocas.tools.cached import cached_property
@@ -24,15 +22,17 @@ from orthocas.tools.files import compute_digest, make_folder, open_draft_folder,
 from orthocas.tools.interrupts import deferred
 from orthocas.tools.processes import run_program
 
-_FLAGS = ("-O2",)  # -O3 takes twice as long, and gains little
+# -O3 takes twice as long, and gains little.
+_FLAGS = ("-O2",)
 _PREFIX = "kernel"
 _ENTRY = """int {name}(const double **arg, double **res, int *iw, double *w) {{
   return {prefix}_{name}(arg, res, iw, w, 0);
 }}"""
-_STAGES = 12  # as in templates/runner.c.jinja
+# As in templates/runner.c.jinja.
+_STAGES = 12
 
 
-def kept_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], folder: str | Path | None = None) -> Path:
+def keep_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], folder: str | Path | None = None) -> Path:
     """The shared library of C sources, compiled now or earlier: its name is a digest of sources, compiler and flags.
 
     Args:
@@ -45,12 +45,13 @@ def kept_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], fo
         CompileError: if there is no C compiler, or it fails, or the folder is not the user's own.
         InvalidValueError: if the folder cannot be written.
     """
-    compiler, options = compilers()[0], ("-std=c99", "-fPIC", "-shared", *flags)
+    compiler, options = find_compilers()[0], ("-std=c99", "-fPIC", "-shared", *flags)
     content = [*(text.encode() for text in sources.values()), repr((compiler, options)).encode()]
     name = f"{kind}-{hashlib.sha256(b'/'.join(content)).hexdigest()[:32]}.so"
-    place = _cache() if folder is None else as_path("folder", folder)
+    place = _find_cache() if folder is None else as_path("folder", folder)
     library = make_folder("folder", place, mode=0o700).resolve() / name
     _require_own(library.parent)
+    # Draft and checksum appear together, so that other processes never see half a library.
     if not _is_whole(library):
         with open_draft_folder() as place, publish(library.parent) as drafts:
             for file, text in sources.items():
@@ -61,7 +62,14 @@ def kept_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], fo
     return library
 
 
-def loaded(library: Path) -> ctypes.CDLL:
+def _find_cache() -> Path:
+    """Where libraries are kept by default."""
+    # Relative paths in XDG_CACHE_HOME do not count, as its specification demands.
+    place = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (place if place.is_absolute() else Path.home() / ".cache") / "orthocas" / "libraries"
+
+
+def load_library(library: Path) -> ctypes.CDLL:
     """Load a library that was kept.
 
     Raises:
@@ -104,17 +112,6 @@ def _is_whole(library: Path) -> bool:
         return False
 
 
-def template(name: str) -> str:
-    """A file of `templates/`."""
-    return (files(__package__) / "templates" / name).read_text()
-
-
-def _cache() -> Path:
-    """Relative paths in XDG_CACHE_HOME do not count, as its specification demands."""
-    inputs = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return (inputs if inputs.is_absolute() else Path.home() / ".cache") / "orthocas" / "libraries"
-
-
 class Kernel(ctypes.Structure):
     """`kernel` of templates/runner.c.jinja: a function with its own work arrays, for one thread."""
 
@@ -128,32 +125,24 @@ class Kernel(ctypes.Structure):
     _alive: tuple[Any, ...]  # what the pointers point to
 
 
-@dataclass(frozen=True, eq=False)
-class _Function:
-    """Sizes of a compiled function."""
-
-    work: tuple[int, int, int, int]  #: lengths of arg, res, iw and w
-    outputs: tuple[int, ...]
-
-
 class CompiledFunctions:
     """Dense functions of columns in one shared library. Threads may share it.
 
     Args:
         functions: functions with different names. Inputs and outputs are columns.
-        folder: where compiled libraries are kept; default as in `orthocas.compile_inverse`.
 
     Raises:
-        CompileError: as `kept_library`.
+        CompileError: as `keep_library`.
     """
 
-    def __init__(self, functions: Sequence[ca.Function], folder: Path | None = None) -> None:
+    def __init__(self, functions: Sequence[ca.Function]) -> None:
         kernels = generate_kernels(list(functions), _PREFIX)
-        sizes = {f.name(): tuple(f.nnz_out(i) for i in range(f.n_out())) for f in functions}
-        self._functions = {name: _Function(kernels.work[name], outputs) for name, outputs in sizes.items()}
-        entries = [_ENTRY.format(name=name, prefix=_PREFIX) for name in sizes]
+        # Lengths of the work arrays and of the outputs, by function name.
+        self._work = kernels.work
+        self._outputs = {f.name(): [f.nnz_out(i) for i in range(f.n_out())] for f in functions}
+        entries = [_ENTRY.format(name=name, prefix=_PREFIX) for name in self._outputs]
         code = "\n\n".join(["#include <math.h>\n#include <string.h>", kernels.code, *entries, ""])
-        self.library = kept_library("functions", {"functions.c": code}, _FLAGS, folder)
+        self.library = keep_library("functions", {"functions.c": code}, _FLAGS)
 
     def kernel(self, name: str, constants: Sequence[Array | None] = ()) -> Kernel:
         """A function for compiled code.
@@ -162,7 +151,8 @@ class CompiledFunctions:
             name: of the function.
             constants: inputs that stay; None for those that the caller sets.
         """
-        arg, res, iw, w = (max(1, size) for size in self._functions[name].work)
+        # Work arrays of its own, and constants that live as long as the kernel.
+        arg, res, iw, w = (max(1, size) for size in self._work[name])
         arguments, results = (ctypes.c_void_p * arg)(), (ctypes.c_void_p * res)()
         integers, doubles = np.zeros(iw, dtype=np.intc), np.zeros(w)
         kept = [None if value is None else np.ascontiguousarray(value, dtype=float) for value in constants]
@@ -180,7 +170,8 @@ class CompiledFunctions:
         N = max(len(argument) for argument in arguments if argument.ndim == 2)
         kernel = self.kernel(name, [None] * len(arguments))
         inputs = [np.ascontiguousarray(argument, dtype=float) for argument in arguments]
-        outputs = [np.empty((N, size)) for size in self._functions[name].outputs]
+        outputs = [np.empty((N, size)) for size in self._outputs[name]]
+        # Pointers to inputs and outputs, and from row to row a stride, 0 where all rows are equal.
         places = [
             (ctypes.c_void_p * len(arrays))(*(array.ctypes.data for array in arrays)) for arrays in (inputs, outputs)
         ]
@@ -189,22 +180,22 @@ class CompiledFunctions:
             for arrays in (inputs, outputs)
         ]
         counts = [ctypes.c_int(len(arrays)) for arrays in (inputs, outputs)]
-        rows = runner("rows")
+        rows = get_runner("rows")
         rows(ctypes.byref(kernel), ctypes.c_long(N), counts[0], places[0], strides[0], counts[1], places[1], strides[1])
         return outputs
 
     @cached_property
     def _c(self) -> ctypes.CDLL:
-        return loaded(self.library)
+        return load_library(self.library)
 
 
 @cache
-def runner(name: str) -> Any:
+def get_runner(name: str) -> Any:
     """A function of templates/runner.c.jinja, which calls kernels."""
     method = scipy.integrate.DOP853
     tables = {"a": method.A, "b": method.B, "c": method.C, "e3": method.E3[:-1], "e5": method.E5[:-1]}
     source = render("runner.c", tables)
-    return getattr(loaded(kept_library("runner", {"runner.c": source}, ("-O3",))), f"orthocas_{name}")
+    return getattr(load_library(keep_library("runner", {"runner.c": source}, ("-O3",))), f"orthocas_{name}")
 
 
 class _State(ctypes.Structure):
@@ -276,6 +267,6 @@ class Integrator:
     def _run(self, name: str, *arguments: Any) -> None:
         pointers = [ctypes.c_void_p(a.ctypes.data) if isinstance(a, np.ndarray) else a for a in arguments]
         with deferred():
-            failed = runner(name)(ctypes.byref(self._state), *pointers)
+            failed = get_runner(name)(ctypes.byref(self._state), *pointers)
         if failed:
             raise SimulationError("the integrator gave up: its steps became too short, or too many")

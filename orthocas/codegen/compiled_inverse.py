@@ -1,31 +1,40 @@
 """The inverse map of a chart in compiled C, for large batches on machines with a compiler."""
 
 import ctypes
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.curves import SelfMotionCurves
+from orthocas.charts.curve_tracer import RULES
+from orthocas.charts.curves import Nearest, SelfMotionCurves
 from orthocas.charts.inverse import Inverse, Solutions
 from orthocas.charts.methods import solve_with, targets_of_wish
 from orthocas.charts.newton import NEWTON, Attempt, Newton
-from orthocas.codegen.compiled import kept_library, loaded, template
-from orthocas.codegen.compiled_curves import CompiledCurves, curve_source
+from orthocas.codegen.compiled import keep_library, load_library
 from orthocas.codegen.generate import generate_c
-from orthocas.tools.batch import run_in_threads
+from orthocas.codegen.kernels import generate_kernels
+from orthocas.codegen.rendering import get_template, render
+from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, Indices, require_kind
+from orthocas.tools.checks import Array, require_kind
 from orthocas.tools.display import Shown
 from orthocas.tools.files import open_draft_folder
 
-_FLAGS = ("-O3",)  # no warnings as errors: compilers doubt pointers of CasADi that pass the end of an array
+# No warnings as errors: compilers doubt pointers of CasADi that pass the end of an array.
+_FLAGS = ("-O3",)
 _ROWS = "inverse_rows.c"
-_ITERATIONS, _FEW_ITERATIONS = 100, 12  # evaluations of phi, also where another search follows
-_PIECE = 512  # rows that a thread takes at once
+# Evaluations of phi; few where another search follows.
+_ITERATIONS, _FEW_ITERATIONS = 100, 12
+# Rows that a thread takes at once; those along curves take longer.
+_PIECE, _CURVE_PIECE = 512, 64
+_STARTS = 1 + RULES.near_phi + RULES.near_x + RULES.more
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -57,32 +66,19 @@ class CompiledInverse(Shown):
         curves = parts.curves
         if isinstance(curves, SelfMotionCurves):
             curves = CompiledCurves(curves, lambda: self._c)
-        return replace(parts, local=self._local, brief=self._brief, curves=curves)
+        local, brief = partial(self._search, _ITERATIONS), partial(self._search, _FEW_ITERATIONS)
+        return replace(parts, local=local, brief=brief, curves=curves)
 
-    def _local(self, targets: Array, starts: Array) -> Attempt:
-        """Search from starts (N, n); where C finds nothing, NumPy finds how near one can get."""
-        attempt, failed = self._attempt(targets, starts, _ITERATIONS)
-        if failed.size:
-            attempt.replace(failed, Newton(self.chart.parts.phi_map)(targets[failed], starts[failed]))
-        return attempt
-
-    def _brief(self, targets: Array, starts: Array) -> Attempt:
-        """Search from starts (N, n); rows where C finds nothing soon stay there."""
-        attempt, failed = self._attempt(targets, starts, _FEW_ITERATIONS)
-        attempt.q[failed] = starts[failed]
-        attempt.residual[failed] = self.chart.parts.phi_map.residual(targets[failed], starts[failed])
-        return attempt
-
-    def _attempt(self, targets: Array, starts: Array, iterations: int) -> tuple[Attempt, Indices]:
-        """What C finds from starts (N, n), and the rows where that is nothing."""
+    def _search(self, iterations: int, targets: Array, starts: Array) -> Attempt:
+        """Search from starts (N, n) in C."""
         attempt, condition = Attempt.empty(*targets.shape), np.empty(len(targets))
-        given, rows_in_c = (np.ascontiguousarray(targets), np.ascontiguousarray(starts)), self._c.arm_inverse_rows
+        inputs, rows_in_c = (np.ascontiguousarray(targets), np.ascontiguousarray(starts)), self._c.arm_inverse_rows
         rows_in_c.restype = None
 
         def solve_piece(first: int) -> None:
             rows = slice(first, first + _PIECE)
-            phi, q_start, q, found = (array[rows] for array in (*given, attempt.q, attempt.residual))
-            arrays = (phi, q_start, self.chart.parts.phi_sizes, q, found, condition[rows])
+            phi, q_start, q, reached = (array[rows] for array in (*inputs, attempt.q, attempt.residual))
+            arrays = (phi, q_start, self.chart.parts.phi_sizes, q, reached, condition[rows])
             rows_in_c(
                 ctypes.c_long(len(phi)),
                 ctypes.c_int(iterations),
@@ -90,14 +86,22 @@ class CompiledInverse(Shown):
             )
 
         run_in_threads(solve_piece, range(0, len(targets), _PIECE))
+        # C returns phi in place of the residual, and a negative condition where it finds nothing.
         phi_map = self.chart.parts.phi_map
         attempt.residual[:] = phi_map.difference(targets, attempt.residual) / phi_map.scale(targets)
         attempt.iterations[:], attempt.suspicious[:] = 1, ~(condition < NEWTON.suspicious)
-        return attempt, np.flatnonzero(condition < 0)
+        # Where C finds nothing, NumPy finds how near one can get; rows for which another search follows stay there.
+        failed = np.flatnonzero(condition < 0)
+        if iterations == _FEW_ITERATIONS:
+            attempt.q[failed] = starts[failed]
+            attempt.residual[failed] = phi_map.residual(targets[failed], starts[failed])
+        elif failed.size:
+            attempt.replace(failed, Newton(phi_map)(targets[failed], starts[failed]))
+        return attempt
 
     @cached_property
     def _c(self) -> Any:
-        return loaded(self.library)
+        return load_library(self.library)
 
 
 def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledInverse:
@@ -131,8 +135,76 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
     with open_draft_folder() as drafts:
         generate_c(chart, drafts, name="arm")
         sources = {name: (drafts / name).read_text(encoding="utf-8") for name in ("arm.h", "arm.c")}
-    sources[_ROWS] = template(_ROWS)
+    sources[_ROWS] = get_template(_ROWS)
     curves = chart.parts.inverse.curves
     if isinstance(curves, SelfMotionCurves):
-        sources["curves.c"] = curve_source(chart, curves)
-    return CompiledInverse(chart, kept_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder))
+        sources["curves.c"] = write_curve_source(chart, curves)
+    return CompiledInverse(chart, keep_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder))
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledCurves:
+    """`SelfMotionCurves.search` in compiled C."""
+
+    curves: SelfMotionCurves
+    library: Callable[[], Any]  #: the library with the code of `write_curve_source`
+
+    def search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
+        """The nearest points for targets (N, n) of phi, from stored starts and one of the caller's (N, n)."""
+        best, between = Nearest.empty(own), np.zeros(len(own), dtype=np.int8)
+        library = self.library()
+        library.curve_room.restype, library.curve_rows.restype = ctypes.c_ulong, None
+        room = library.curve_room()
+
+        # Later stages of starts serve only rows that the earlier ones leave without a solution.
+        def search_piece(first: int) -> None:
+            rows = slice(first, first + _CURVE_PIECE)
+            stages = self.curves.stages(targets[rows], own[rows])
+            starts = np.concatenate(stages).transpose(1, 0, 2)
+            inputs = (np.ascontiguousarray(array) for array in (targets[rows], starts))
+            arrays = (*inputs, np.empty(room, dtype=np.uint8), best.q[rows], best.distance[rows], between[rows])
+            phi, q_start, *others = (ctypes.c_void_p(array.ctypes.data) for array in arrays)
+            counts = ctypes.c_long(len(stages[0])), ctypes.c_long(starts.shape[1])
+            library.curve_rows(ctypes.c_long(len(starts)), phi, q_start, *counts, ctypes.c_double(tolerance), *others)
+
+        run_in_threads(search_piece, range(0, len(own), _CURVE_PIECE))
+        best.between[:] = between
+        return best
+
+
+def write_curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
+    """C of the search along self-motion curves: templates/curve_rows.c.jinja for a chart.
+
+    Raises:
+        DomainError: if the domain has a condition, but no expression of it.
+    """
+    q, domain = ca.MX.sym("q", chart.n), chart.problem.domain
+    x, own = ca.MX.sym("x", chart.m), chart.coordinates.functions
+    # Errors and gradients of the task, xi with its gradient, and the condition of the domain.
+    functions = [
+        dense_function("curve_task", [q, x], curves.tracer.equations.call([q, x])),
+        dense_function("curve_xi", [q], [chart.parts.runnable(own["xi"])(q)]),
+        dense_function("curve_gradient", [q], [chart.parts.runnable(own["jacobian"])(q)]),
+    ]
+    if domain.condition is not None:
+        functions.append(dense_function("curve_pivots", [q], [domain.condition.pivots(q)]))
+    kernels, (low, high) = generate_kernels(functions, "kernel"), domain.bounds
+    values = {
+        "kernels": kernels.code,
+        "arrays": kernels.declare_arrays,
+        "call": kernels.write_call,
+        "m": chart.m,
+        "starts": _STARTS,
+        "rules": asdict(RULES),
+        "xi_size": float(chart.parts.phi_sizes[chart.m]),
+        "period": float(chart.parts.turns[chart.m]),
+        "low": low,
+        "high": high,
+        "centre": domain.centre,
+        "half_width": domain.half_width,
+        "turning": curves.tracer.turning,
+        "bounded": np.isfinite(low),
+        "winding": curves.boxed.winding,
+        "pivots": kernels.numbers.get("curve_pivots", 0),
+    }
+    return render("curve_rows.c", values)

@@ -1,4 +1,8 @@
-"""Coordinates as lines of NumPy, PyTorch or JAX: tables of products, networks, or tapes."""
+"""What exported modules consist of, as lines of NumPy, PyTorch or JAX.
+
+Coordinates are tables of products, networks, or tapes. The inverse has errors of phi, how fast phi moves, and numbers
+that are positive where solutions count as found.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,41 +16,19 @@ from orthocas.bases.mlp import MLPFamily, split_layers
 from orthocas.bases.products import ProductFamily, Term, split, with_parts
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
+from orthocas.charts.inverse import InverseStatus
+from orthocas.tasks.domains import Domain, FoldBound
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import ARITHMETIC, Tape, write_tape
 
-_OPERATORS = {
-    **ARITHMETIC,
-    "pow": "{0} ** {1}",
-    "constpow": "{0} ** {1}",
-}
-_CONDITIONS = {
-    "not": "{0} == 0",
-    "lt": "{0} < {1}",
-    "le": "{0} <= {1}",
-    "eq": "{0} == {1}",
-    "ne": "{0} != {1}",
-    "and": "({0} != 0) & ({1} != 0)",
-    "or": "({0} != 0) | ({1} != 0)",
-}
-
-_FUNCTIONS = {
-    name: name
-    for name in (
-        *("exp", "log", "sqrt", "sin", "cos", "tan", "sinh", "cosh", "tanh", "floor", "ceil", "log1p", "expm1"),
-        *("sign", "hypot", "fmod", "copysign", "fmin", "fmax"),
-    )
-} | {
-    "asin": "arcsin",
-    "acos": "arccos",
-    "atan": "arctan",
-    "asinh": "arcsinh",
-    "acosh": "arccosh",
-    "atanh": "arctanh",
-    "atan2": "arctan2",
-    "fabs": "abs",
-}  # names in NumPy, which PyTorch and JAX share
+#: those of `InverseStatus` in modules
+STATUSES = ("FOUND", "NEAREST", "OUTSIDE_DOMAIN", "LIMIT", "NOT_FOUND", "BAD_INPUT")
+# Of the half-widths: rounding at boundaries and joint limits.
+_SLACK = 1e-9
+# Gradients that differ by less at so many points count as the same.
+_PARALLEL, _POINTS = 1e-12, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +50,18 @@ def build_form(chart: Chart) -> Form:
     """
     coordinates = chart.coordinates
     if isinstance(coordinates, Coordinates) and len(coordinates.offset):
-        # what `_build_expression` would write as many thousand lines
+        # Tables in place of many thousand lines.
         form = _build_network(coordinates) or _build_products(coordinates)
         if form is not None:
             return form
-    return _build_expression(chart)
+    # Otherwise, xi and its Jacobian operation by operation.
+    q, xi = ca.SX.sym("q", chart.n), chart.function("xi")
+    slopes = dense_function("J_xi", [q], [chart.function("jacobian")(q)[chart.m :, :]])
+    code = [
+        write_function("_xi", "Coordinates, (r, N), of columns q (n, N).", xi),
+        write_function("_xi_and_slopes", "Coordinates, then their Jacobian row by row, (r + r n, N).", xi, slopes),
+    ]
+    return Form("coordinates", {"kind": "expression"}, "\n\n".join(code), {}, {})
 
 
 def _build_products(coordinates: Coordinates) -> Form | None:
@@ -80,6 +69,7 @@ def _build_products(coordinates: Coordinates) -> Form | None:
     family = coordinates.family
     if not isinstance(family, ProductFamily):
         return None
+    # Products that the coordinates or their derivatives need, level by level.
     slopes = coordinates.scale[:, None, None] * family.derivative_tables(coordinates.theta).transpose(1, 0, 2)
     used = np.flatnonzero(slopes[:, :, 1:].any(axis=(0, 1)))
     plan = TermLevels.of(family.terms, [family.terms[k] for k in used])
@@ -90,7 +80,24 @@ def _build_products(coordinates: Coordinates) -> Form | None:
     q = ca.SX.sym("q", coordinates.space.n)
     functions = family.basis(q[coordinates.active])[[rows[term] for term in plan.levels[0]]]
     code = write_function("_one_joint", "Functions of one joint each, (k, N).", dense_function("f", [q], [functions]))
-    tables = _build_coefficients(coordinates, plan, rows) | _build_slopes(coordinates, slopes, plan, rows)
+
+    # C (r, terms), A (r, n) and c (r, 1).
+    r, n, fitted, active = coordinates.r, coordinates.space.n, len(coordinates.offset), coordinates.active
+    A, c = _split_idle(coordinates)
+    C, theta = np.zeros((r, len(plan.terms))), coordinates.theta.reshape(fitted, -1)
+    for k, term in enumerate(plan.terms):
+        if term in rows:
+            C[:fitted, k] = coordinates.scale * theta[:, rows[term]]
+    c[:fitted] = -coordinates.scale[:, None] * coordinates.offset[:, None]
+
+    # T (r n, terms of derivatives) and D (r, n, 1), from the slopes (fitted, active, 1 + K).
+    lower = [term for term in plan.terms if term in plan.lower]
+    T, D = np.zeros((r, n, len(lower))), A.copy()
+    for k, term in enumerate(lower):
+        if term in rows:
+            T[:fitted, active, k] = slopes[:, :, 1 + rows[term]]
+    D[:fitted, active] = slopes[:, :, 0]
+    tables = {"C": C, "A": A, "c": c, "T": T.reshape(r * n, -1), "D": D[:, :, None]}
     return Form("coordinates", {"kind": "products", **plan.counts}, code, tables, plan.indices)
 
 
@@ -107,6 +114,7 @@ class TermLevels:
     @classmethod
     def of(cls, terms: Iterable[Term], of_derivatives: Iterable[Term]) -> Self:
         """The levels of these terms, with what they are made of."""
+        # Terms with all that they are products of; without derivatives, one term stands for the lower ones.
         every, lower = with_parts(terms), with_parts(of_derivatives)
         every |= {_split_term(term)[1] for term in every}
         lower = lower or {min(term for term in every if np.count_nonzero(term) == 1)}
@@ -144,31 +152,6 @@ def _split_term(term: Term) -> tuple[Term, Term]:
     return rest, tuple(index if k == joint else 0 for k in range(len(term)))
 
 
-def _build_coefficients(coordinates: Coordinates, plan: TermLevels, rows: dict[Term, int]) -> dict[str, Array]:
-    """C (r, terms), A (r, n) and c (r, 1)."""
-    fitted, scale = len(coordinates.offset), coordinates.scale[:, None]
-    A, c = _split_idle(coordinates)
-    C = np.zeros((coordinates.r, len(plan.terms)))
-    theta = coordinates.theta.reshape(fitted, -1)
-    for k, term in enumerate(plan.terms):
-        if term in rows:
-            C[:fitted, k] = coordinates.scale * theta[:, rows[term]]
-    c[:fitted] = -scale * coordinates.offset[:, None]
-    return {"C": C, "A": A, "c": c}
-
-
-def _build_slopes(coordinates: Coordinates, slopes: Array, plan: TermLevels, rows: dict[Term, int]) -> dict[str, Array]:
-    """T (r n, terms of derivatives) and D (r, n, 1), from the slopes (fitted, active, 1 + K)."""
-    r, n, fitted, active = coordinates.r, coordinates.space.n, len(coordinates.offset), coordinates.active
-    lower = [term for term in plan.terms if term in plan.lower]
-    T, D = np.zeros((r, n, len(lower))), _split_idle(coordinates)[0]
-    for k, term in enumerate(lower):
-        if term in rows:
-            T[:fitted, active, k] = slopes[:, :, 1 + rows[term]]
-    D[:fitted, active] = slopes[:, :, 0]
-    return {"T": T.reshape(r * n, -1), "D": D[:, :, None]}
-
-
 def _split_idle(coordinates: Coordinates) -> tuple[Array, Array]:
     """A (r, n) and c (r, 1) with A q + c = q - centre for the idle joints, and 0 for the other coordinates."""
     r, n, idle = coordinates.r, coordinates.space.n, list(coordinates.idle)
@@ -187,6 +170,7 @@ def _build_network(coordinates: Coordinates) -> Form | None:
     family = coordinates.family
     if not isinstance(family, MLPFamily):
         return None
+    # The last layer has the scale and offset of the coordinates; idle joints come beside it.
     scale, fitted, depth = coordinates.scale[:, None], len(coordinates.offset), len(family.hidden)
     weights, biases = split_layers(coordinates.theta, family.widths)
     active = np.array(coordinates.active, dtype=int)
@@ -196,7 +180,7 @@ def _build_network(coordinates: Coordinates) -> Form | None:
     W_out[:fitted] = scale * weights[depth].T
     c[:fitted] = scale * (biases[depth] - coordinates.offset)[:, None]
     turning, sliding = active[family.turning], active[family.direct]
-    # joints that do not enter the network
+    # Joints that do not enter the network.
     idle = np.setdiff1d(np.arange(coordinates.space.n), [*turning, *sliding])
     indices = {"turning": turning, "sliding": sliding, "idle": idle}
     indices["order"] = np.argsort(np.concatenate(list(indices.values())))
@@ -207,20 +191,106 @@ def _build_network(coordinates: Coordinates) -> Form | None:
     return Form("coordinates", {"kind": "network", "depth": depth}, "", tables, plain)
 
 
-def _build_expression(chart: Chart) -> Form:
-    """xi and its Jacobian, operation by operation."""
-    q = ca.SX.sym("q", chart.n)
-    slopes = dense_function("J_xi", [q], [chart.function("jacobian")(q)[chart.m :, :]])
-    xi = chart.function("xi")
-    code = [
-        write_function("_xi", "Coordinates, (r, N), of columns q (n, N).", xi),
-        write_function("_xi_and_slopes", "Coordinates, then their Jacobian row by row, (r + r n, N).", xi, slopes),
+def write_statuses() -> str:
+    """Their numbers, as Python."""
+    return ", ".join(str(int(InverseStatus[name])) for name in STATUSES)
+
+
+def build_inverse_forms(chart: Chart) -> list[Form]:
+    """The functions `_inverse` of columns phi and q_start (2 n, N), and `_nearest` of columns q_wish and x (n + m, N).
+
+    And what they call beside the functions of phi.
+    """
+    domain, rooms = chart.problem.domain, _count_rooms(chart.problem.domain)
+    nearest = {
+        "range": np.array(domain.bounds)[:, :, None],
+        "half_width": domain.half_width[:, None],
+        "identity": np.eye(chart.n + rooms),
+    }
+    return [_build_newton(chart), *_build_rooms(chart), Form("nearest", {"rooms": rooms}, "", nearest, {})]
+
+
+def _build_newton(chart: Chart) -> Form:
+    """Newton's method, with errors and rates as `chart.solve` has them."""
+    problem, n = chart.problem, chart.n
+    domain, robot = problem.domain, problem.robot
+    slack = _SLACK * domain.half_width
+    low, high = domain.bounds
+    bounds = np.array([low - slack, high + slack, robot.lower - slack, robot.upper + slack])
+    target, value = ca.SX.sym("target", n), ca.SX.sym("value", n)
+    difference = chart.parts.phi_map.difference(target, value)
+    functions = [
+        write_function(
+            "_difference",
+            "Targets less values of phi by the shorter way around, (n, N), of both in columns (2 n, N).",
+            dense_function("f", [ca.vertcat(target, value)], [difference]),
+        )
     ]
-    return Form("coordinates", {"kind": "expression"}, "\n\n".join(code), {}, {})
+    # A whole orientation moves with the angular velocity, not with the derivative of its components.
+    rates = "_task_and_slopes"
+    if chart.parts.relative.turned:
+        summary = "Task values, then how fast they move, angular velocities in the tip's axes, (m + m n, N)."
+        rates = "_task_and_rates"
+        functions.append(write_function(rates, summary, problem.task.function, chart.parts.relative.rates))
+    tables = {"centre": domain.centre[:, None], "sizes": chart.parts.phi_sizes[:, None], "bounds": bounds[:, :, None]}
+    return Form("inverse", {"rates": rates}, "\n\n".join(functions), tables, {})
+
+
+def _count_rooms(domain: Domain) -> int:
+    """How many numbers are positive inside a domain, beside the bounds of joints."""
+    if domain.singular_bound is not None:
+        return 1 if domain.fold_bound is None else 2
+    if domain.path_bound is not None:
+        return 1
+    return 0 if domain.condition is None else int(domain.condition.pivots.size1_out(0))
+
+
+def _build_rooms(chart: Chart) -> list[Form]:
+    """The function `_room` of columns q (n, N) -> (rooms, N), for what a domain asks beside its box."""
+    domain = chart.problem.domain
+    if (bound := domain.singular_bound) is not None:
+        fold = domain.fold_bound
+        summary = "Rows that must not be singular, one by one, (m n, N)."
+        rows = write_function("_frame_rows", summary, bound.jacobian_function)
+        values = {"kind": "clear", "squared_bound": bound.least_singular_value**2, "folds": fold is not None}
+        tables = {"row_scale": bound.scale[:, None], "unit": np.eye(chart.m)}
+        return [Form("room", values, rows, tables, {}), *([] if fold is None else [_build_room_to_fold(chart, fold)])]
+    if (path := domain.path_bound) is not None:
+        starts, axes, squares = path.lines
+        tables = {
+            "path_radius": path.radius[path.counted][:, None],
+            "path_starts": starts[:, :, None],
+            "path_axes": axes[:, :, None],
+            "path_lengths": np.sqrt(squares)[:, None],
+        }
+        return [Form("room", {"kind": "path"}, "", tables, {"path_joints": path.counted.tolist()})]
+    if domain.condition is None:
+        return [Form("room", {"kind": "box"}, "", {}, {})]
+    summary = "Numbers (k, N) that are positive at columns q that meet the condition of the domain."
+    return [Form("room", {"kind": "condition"}, write_function("_pivots", summary, domain.condition.pivots), {}, {})]
+
+
+def _build_room_to_fold(chart: Chart, fold: FoldBound) -> Form:
+    """The volume of the domain's coordinates, by the gradients of the chart where these are the same."""
+    # Gradients may differ by positive factors.
+    points = sample_uniform(chart.problem.domain, _POINTS, 0)
+    theirs = np.array([np.array(fold.gradients(q)) for q in points])
+    own = chart.coordinates.jacobian(points)
+    units = [rows / np.linalg.norm(rows, axis=2, keepdims=True) for rows in (theirs, own)]
+    same = bool(np.abs(units[0] - units[1]).max() < _PARALLEL)
+    values = {
+        "kind": "fold",
+        "least_volume": fold.least_volume,
+        "orientation": fold.orientation,
+        "own_gradients": not same,
+    }
+    summary = "Gradients of the domain's coordinates, (r n, N)."
+    return Form("room", values, "" if same else write_function("_own_gradients", summary, fold.gradients), {}, {})
 
 
 def write_function(name: str, summary: str, *functions: ca.Function) -> str:
     """A Python function of columns q (n, N) with the entries of dense SX functions' outputs, row by row, (k, N)."""
+    # One tape for all functions, in which what they share is computed once.
     q = ca.SX.sym("q", functions[0].size_in(0)[0])
     rows = ca.vertcat(*(ca.vec(ca.densify(function(q)).T) for function in functions))
     lines = _write_tape(write_tape(ca.Function("rows", [q], [ca.cse(rows)])))
@@ -236,7 +306,10 @@ def _write_tape(tape: Tape) -> list[str]:
     results: dict[int, str] = {}
     for (name, into, *of), uses in zip(tape["steps"], _count_uses(tape["steps"]), strict=True):
         if name == "const":
-            constants[into] = _write_literal(float(of[0]))
+            # Exactly; in brackets where an operator beside it would take its sign.
+            value = float(of[0])
+            word = f'float("{value}")' if np.isinf(value) else repr(value)
+            constants[into] = word if value >= 0 or np.isinf(value) else f"({word})"
         elif name == "output":
             results[into] = f"y{into}"
             lines.append(f"y{into} = {_write_array(of[0], constants)}")
@@ -258,6 +331,40 @@ def _count_uses(steps: Sequence[Sequence[Any]]) -> list[int]:
     return result
 
 
+_OPERATORS = {
+    **ARITHMETIC,
+    "pow": "{0} ** {1}",
+    "constpow": "{0} ** {1}",
+}
+_CONDITIONS = {
+    "not": "{0} == 0",
+    "lt": "{0} < {1}",
+    "le": "{0} <= {1}",
+    "eq": "{0} == {1}",
+    "ne": "{0} != {1}",
+    "and": "({0} != 0) & ({1} != 0)",
+    "or": "({0} != 0) | ({1} != 0)",
+}
+
+# Names in NumPy, which PyTorch and JAX share.
+_FUNCTIONS = {
+    name: name
+    for name in (
+        *("exp", "log", "sqrt", "sin", "cos", "tan", "sinh", "cosh", "tanh", "floor", "ceil", "log1p", "expm1"),
+        *("sign", "hypot", "fmod", "copysign", "fmin", "fmax"),
+    )
+} | {
+    "asin": "arcsin",
+    "acos": "arccos",
+    "atan": "arctan",
+    "asinh": "arcsinh",
+    "acosh": "arccosh",
+    "atanh": "arctanh",
+    "atan2": "arctan2",
+    "fabs": "abs",
+}
+
+
 def _write_operation(name: str, of: list[Any], constants: dict[int, str]) -> str:
     """One operation on work slots."""
     if name in _OPERATORS:
@@ -273,10 +380,3 @@ def _write_operation(name: str, of: list[Any], constants: dict[int, str]) -> str
 def _write_array(slot: int, constants: dict[int, str]) -> str:
     """The value in a work slot as an array, for functions that take nothing else."""
     return f"np.full_like(q[0], {constants[slot]})" if slot in constants else f"w{slot}"
-
-
-def _write_literal(value: float) -> str:
-    """The number in Python, exactly; in brackets where an operator beside it would take its sign."""
-    if value in (float("inf"), float("-inf")):
-        return f'float("{value}")'
-    return repr(value) if value >= 0 else f"({value!r})"

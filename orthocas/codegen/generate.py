@@ -25,14 +25,12 @@ from orthocas.control.controller import Controller, require_controller
 from orthocas.control.safety import Safety
 from orthocas.errors import ArchiveError, InvalidValueError
 from orthocas.robots.kinematics import TipTurn
-from orthocas.tasks.domains import Domain
-from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, as_path, require_kind, require_shape
 from orthocas.tools.expressions import choose_form, expand_scalars
 from orthocas.tools.files import open_output_folder, publish, require_writable
 from orthocas.version import VERSION
 
-# Names of C headers and libraries, which no library of ours can have
+# Names of C headers and libraries, which no library of ours can have.
 _TAKEN = (
     *("assert", "complex", "ctype", "errno", "fenv", "float", "inttypes", "iso646", "limits", "locale", "math"),
     *("setjmp", "signal", "stdarg", "stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath", "time"),
@@ -114,7 +112,12 @@ def generate_c(
         words = f"{chart.problem.name}_{'chart' if controller is None else controller.name}"
         words = re.sub(r"\W", "_", words, flags=re.ASCII)[-90:]
         name = words if words[0].isalpha() else f"robot_{words}"
-    _require_identifier(name)
+    # C must allow the name, and no header or library of C may have it.
+    is_identifier = isinstance(name, str) and re.fullmatch(r"[A-Za-z]\w{0,99}", name, flags=re.ASCII)
+    if not is_identifier or name.lower() in _TAKEN:
+        raise InvalidValueError(
+            "name", repr(name), "a C identifier that is not a C header or library, such as arm_controller"
+        )
 
     # CasADi writes the functions as kernels; templates put an interface around them.
     precision = SINGLE if single_precision else DOUBLE
@@ -152,6 +155,7 @@ def _check_law(chart: Chart, controller: Controller, safety: Safety | None) -> S
     require_controller(controller)
     if (controller.chart or chart) is not chart or controller.problem is not chart.problem:
         raise InvalidValueError("controller", f"a {controller.name} of another chart", "a controller of this chart")
+    # Settings of the caller have the shapes of the default ones.
     default = Safety.of(controller)
     if safety is None:
         return default
@@ -159,15 +163,6 @@ def _check_law(chart: Chart, controller: Controller, safety: Safety | None) -> S
     for field in fields(Safety):
         require_shape(field.name, np.shape(getattr(safety, field.name)), np.shape(getattr(default, field.name)))
     return safety
-
-
-def _require_identifier(name: str) -> None:
-    """Raise InvalidValueError for a name that C does not allow."""
-    is_identifier = isinstance(name, str) and re.fullmatch(r"[A-Za-z]\w{0,99}", name, flags=re.ASCII)
-    if not is_identifier or name.lower() in _TAKEN:
-        raise InvalidValueError(
-            "name", repr(name), "a C identifier that is not a C header or library, such as arm_controller"
-        )
 
 
 def _build_functions(chart: Chart, controller: Controller | None, precision: Precision) -> list[ca.Function]:
@@ -186,10 +181,11 @@ def _build_functions(chart: Chart, controller: Controller | None, precision: Pre
     near = chart.parts.reaching
     functions.append(ca.Function("near", near.mx_in(), near.call(near.mx_in())))
     domain = find_condition(chart)
+    # A condition that asks for coordinates of a network stays a graph.
     if domain is not None and domain.condition is not None:
-        # a graph where the condition asks for coordinates of a network
         pivots = ca.Function("pivots", [q], [domain.condition.pivots(q)])
         functions.append(pivots if domain.condition.pivots.is_a("MXFunction") else expand_scalars(pivots))
+    # The law and its supervision share what they compute of the state alone.
     if controller is not None:
         graph = precision.graph(controller)
         inputs = graph.mx_in()
@@ -208,21 +204,22 @@ def _bound_stack(kernels: Kernels, chart: Chart, controller: Controller | None, 
     locals_ = round(RULES.locals_bytes * max(1.0, n / 7) ** 2)
     # These kernels run inside others.
     inner = [name for name in ("pivots", "gram", "room") if name in kernels.work]
-    clear = sum(kernels.array_bytes(name, size) for name in inner)
+    nested = sum(kernels.array_bytes(name, size) for name in inner)
     work = max(kernels.array_bytes(name, size) for name in kernels.work)
 
-    # two positions that the descent to the nearest x looks at, and the equations of its steps
+    # Two positions that the descent to the nearest x looks at, and the equations of its steps.
     rooms = max(1, chart.parts.reaching.size1_out(2))
     system = 2 * n + rooms
     descent = 2 * n * (n + rooms + 3) + 2 * n * n + n * rooms + system**2 + 4 * system
     nearest = kernels.array_bytes("near", size) + size * descent
-    return max(inverse, nearest, compose, work) + supervised + clear + locals_
+    return max(inverse, nearest, compose, work) + supervised + nested + locals_
 
 
 def _describe_library(
     chart: Chart, controller: Controller | None, name: str, rows: bool, precision: Precision, kernels: Kernels
 ) -> dict[str, Any]:
     """Values of the templates about names, versions, number type and kernels; no law yet."""
+    # The law comes later, from `describe_law`.
     what = "chart" if controller is None else f"{controller.name} controller"
     problem, label = chart.problem, chart.coordinates.label
     title = f"{what} of {problem.name}: {label}, task {problem.task.name}, metric {problem.metric.name}"
@@ -247,8 +244,23 @@ def _describe_chart(chart: Chart, precision: Precision) -> dict[str, Any]:
     """Values of the templates about the robot, its joints, task, coordinates and domain."""
     problem, tree, domain, condition = chart.problem, chart.problem.robot.tree, chart.problem.domain, None
     names, units = clean_words(tree.joint_names), ["m" if sliding else "rad" for sliding in tree.prismatic]
-    if (conditioned := find_condition(chart)) is not None and (known := conditioned.condition) is not None:
-        condition = {"heading": clean_word(known.heading), "size": known.pivots.size1_out(0)}
+    if (conditioned := find_condition(chart)) is not None and (part := conditioned.condition) is not None:
+        condition = {"heading": clean_word(part.heading), "size": part.pivots.size1_out(0)}
+    # The boundaries, a line for each joint.
+    low, high = domain.bounds
+    domain_lines = ["all joint positions"]
+    if np.isfinite(low).any():
+        ranges = ["all positions" if np.isinf(a) else f"{a:.6g} to {b:.6g}" for a, b in zip(low, high, strict=True)]
+        domain_lines = [f"{name}: {range_}" for name, range_ in zip(names, ranges, strict=True)]
+    # The convention of orientation components, and their reference rotation, row by row.
+    orientation, turn = None, TipTurn.from_kind(problem.task.recipe["kind"])
+    if turn is not None and "reference" in problem.task.recipe:
+        orientation = {
+            "first": turn.labels[3 if turn.with_position else 0],
+            "axis": turn.axis,
+            "whole": turn.whole,
+            "reference": _write_row(np.ravel(problem.task.recipe["reference"])),
+        }
     task_units = [f" [{unit}]" if unit else "" for unit in clean_words(problem.task.units)]
     task_labels = zip(clean_words(problem.task.labels), task_units, strict=True)
     proof, turns = chart.certificate, chart.parts.turns
@@ -272,12 +284,12 @@ def _describe_chart(chart: Chart, precision: Precision) -> dict[str, Any]:
         "tip": clean_word(tree.tip_name),
         "gravity": _write_row(tree.gravity),
         "task_labels": ", ".join(label + unit for label, unit in task_labels),
-        "orientation": _describe_orientation(problem.task),
+        "orientation": orientation,
         "extra_labels": ", ".join(clean_words(chart.parts.named_coordinates)),
-        "angles": [label for label, turn in zip(clean_words(chart.labels), turns, strict=True) if turn],
+        "angles": [label for label, period in zip(clean_words(chart.labels), turns, strict=True) if period],
         "fingerprint": fingerprint(problem, chart.coordinates),
         "certificate": "none" if proof is None else f"{proof.heading} ({proof.method}, chart {proof.fingerprint[:16]})",
-        "domain_lines": _describe_bounds(domain, names),
+        "domain_lines": domain_lines,
         "condition": condition,
         "domain_lower": lower,
         "domain_upper": upper,
@@ -292,24 +304,6 @@ def _describe_chart(chart: Chart, precision: Precision) -> dict[str, Any]:
     }
 
 
-def _describe_orientation(task: Task) -> dict[str, Any] | None:
-    """The convention of orientation components, and their reference rotation, row by row."""
-    turn = TipTurn.from_kind(task.recipe["kind"])
-    if turn is None or "reference" not in task.recipe:
-        return None
-    first, reference = turn.labels[3 if turn.with_position else 0], _write_row(np.ravel(task.recipe["reference"]))
-    return {"first": first, "axis": turn.axis, "whole": turn.whole, "reference": reference}
-
-
-def _describe_bounds(domain: Domain, names: list[str]) -> list[str]:
-    """The boundaries of a domain, a line for each joint."""
-    lower, upper = domain.bounds
-    if np.isinf(lower).all():
-        return ["all joint positions"]
-    bounds = zip(names, lower, upper, strict=True)
-    return [f"{name}: {'all positions' if np.isinf(low) else f'{low:.6g} to {high:.6g}'}" for name, low, high in bounds]
-
-
 def _write_limit(limit: float) -> str:
     return f"{limit:.6g}" if np.isfinite(limit) else "unknown"
 
@@ -321,7 +315,15 @@ def _write_row(values: Array) -> str:
 def _compute_check(chart: Chart, controller: Controller | None, precision: Precision) -> dict[str, Any]:
     """A state, and what every function gives there, for `NAME_check`."""
     n, robot = chart.n, chart.problem.robot
-    q = precision.round(_choose_position(chart.problem.domain))
+    # Between the centre and a corner of the domain, or in the middle of the path of a corridor.
+    domain = chart.problem.domain
+    if (path := domain.path_bound) is not None:
+        inside = path.postures[path.contains(path.postures)]
+        q = np.asarray(inside[len(inside) // 2])
+    else:
+        fractions = [0.5**k for k in range(1, 20) if domain.contains(domain.centre + 0.5**k * domain.half_width)]
+        q = np.round(domain.centre + (fractions[0] if fractions else 0.0) * domain.half_width, 3)
+    q = precision.round(q)
     dq = precision.round(np.round(np.linspace(0.1, -0.2, n), 3))
     check: dict[str, Any] = {
         "q": q,
@@ -340,21 +342,12 @@ def _compute_check(chart: Chart, controller: Controller | None, precision: Preci
     return check
 
 
-def _choose_position(domain: Domain) -> Array:
-    """A joint position of a domain between its centre and a corner, (n,); of a corridor one on the path."""
-    path = domain.path_bound
-    if path is not None:
-        inside = path.postures[path.contains(path.postures)]
-        return np.asarray(inside[len(inside) // 2])
-    fractions = [0.5**k for k in range(1, 20) if domain.contains(domain.centre + 0.5**k * domain.half_width)]
-    return np.round(domain.centre + (fractions[0] if fractions else 0.0) * domain.half_width, 3)
-
-
 def _require_free(out: Path, name: str, files: Iterable[str], force: bool) -> None:
     """Raise InvalidValueError if the folder holds files of the user that would be overwritten."""
     if out.exists() and not out.is_dir():
         raise InvalidValueError("out", str(out), "a folder")
     require_writable(out / "README.md" if out.is_dir() else out, ArchiveError)
+    # Files that orthocas wrote are replaced, all others only by force.
     for path in (out / file for file in files):
         if path.is_symlink():
             raise ArchiveError(f"cannot write {path}: it is a symbolic link, expected a file or nothing")
@@ -364,6 +357,7 @@ def _require_free(out: Path, name: str, files: Iterable[str], force: bool) -> No
                 f"a folder with a {path.name} that orthocas did not write",
                 "another folder, or force (--force) to replace it",
             )
+    # The build file of another library is not replaced, either.
     build = out / "CMakeLists.txt"
     other = build.is_file() and f"project({name} " not in build.read_text(encoding="utf-8", errors="replace")
     if other and not force:

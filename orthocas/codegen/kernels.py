@@ -68,7 +68,11 @@ def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
     generator = ca.CodeGenerator("kernels.c", {"with_header": False, "with_export": False, "casadi_int": "int"})
     for function in functions:
         generator.add(function)
-    blocks = _split_definitions(_fix_product_sizes(generator.dump()))
+    # CasADi passes the sizes of dense products; compilers vectorise those with constant sizes.
+    text = generator.dump()
+    sizes = sorted({result.group(2, 3, 5) for result in _PRODUCT.finditer(text)})
+    calls = _PRODUCT.sub(r"casadi_product_\2_\3_\5(\1, \4, \6)", text)
+    blocks = _split_definitions("\n\n".join([*(_write_product(*map(int, size)) for size in sizes), calls]))
 
     # Functions at work reuse the arrays of those that have ended; inverses and roots get faster bodies.
     blocks, doubles = _compact_work_arrays(blocks, functions)
@@ -81,7 +85,12 @@ def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
     names = [function.name() for function in functions]
     code = "\n\n".join(_silence_warnings(blocks[name]) for name in _find_needed(blocks, names))
     code = re.sub(r"\bcasadi_inf\b", "INFINITY", re.sub(r"\bcasadi_nan\b", "NAN", code))
-    code = _make_conditions_explicit(code)
+    # Clang warns of numbers that C would convert to truth values: compare them with zero.
+    value = r"\(?(\*?\w+(?:\+\+|\[\w+\])?)\)?"
+    code = re.sub(rf"\({value}\?", r"((\1 != 0)?", code)
+    code = re.sub(rf"\(! ?{value} ?\)", r"(\1 == 0)", code)
+    code = re.sub(rf"\({value}(&&|\|\|){value}\)", r"((\1 != 0)\2(\3 != 0))", code)
+    # Types and names of CasADi become those of the library.
     code = re.sub(r"CASADI_CAST\((\w+), ([^()]+)\)", r"(\1)(\2)", code)
     code = re.sub(r"\bcasadi_real\b", "double", re.sub(r"\bcasadi_int\b", "int", code))
     code = re.sub(rf"\b(?:casadi_(?=\w)|(?={'|'.join(names)})(?=\w+\(const double\*\* arg))", f"{prefix}_", code)
@@ -89,13 +98,6 @@ def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
         code = f"{write_power(f'{prefix}_power')}\n\n" + re.sub(r"\bpow\(", f"{prefix}_power(", code)
     work = {f.name(): (f.sz_arg(), f.sz_res(), f.sz_iw(), doubles[f.name()]) for f in functions}
     return Kernels(code, work, {f.name(): f.numel_out(0) for f in functions}, prefix)
-
-
-def _fix_product_sizes(text: str) -> str:
-    """Replace dense products by versions with constant sizes, which compilers vectorise; CasADi passes the sizes."""
-    sizes = sorted({result.group(2, 3, 5) for result in _PRODUCT.finditer(text)})
-    calls = _PRODUCT.sub(r"casadi_product_\2_\3_\5(\1, \4, \6)", text)
-    return "\n\n".join([*(_write_product(*map(int, size)) for size in sizes), calls])
 
 
 def _write_product(rows: int, columns: int, count: int) -> str:
@@ -108,6 +110,7 @@ def _write_product(rows: int, columns: int, count: int) -> str:
         f"  for (i=0; i<{count}; ++i, y+={columns}, z+={rows}) {{",
         "    const double* xk = x;",
     ]
+    # Blocks of four columns, then what is left.
     for start, stop, step in ((0, fours, 4), (fours, columns, 1)):
         if start < stop:
             terms = " + ".join(f"xk[j+{c * rows}]*y[k+{c}]" for c in range(step))
@@ -129,9 +132,8 @@ def _split_definitions(text: str) -> dict[str, str]:
         if name is None:
             continue
         block = [line]
-        while not (
-            block[-1].endswith(";") if data else block[-1] == "}" or line.endswith("}")
-        ):  # or the definition is a single line
+        # A function ends with its brace, which is on the first line if the definition is a single one.
+        while not (block[-1].endswith(";") if data else block[-1] == "}" or line.endswith("}")):
             block.append(next(lines))
         result[name.group(1)] = "\n".join(block)
     return result
@@ -147,6 +149,7 @@ def _compact_work_arrays(blocks: dict[str, str], functions: list[ca.Function]) -
     Raises:
         CompileError: if a new version of CasADi lays the code out in another way.
     """
+    # The slots of a function begin where those of all that it calls have ended.
     names = {hash(f): f"casadi_f{number}" for number, f in enumerate(_order_functions(functions))}
     changed = dict(blocks)
     needed: dict[str, int] = {}
@@ -188,9 +191,9 @@ def _find_callees(function: ca.Function) -> list[ca.Function]:
 
 def _move_slots(block: str, function: ca.Function, below: int) -> tuple[str, int]:
     """Code whose slots in the work array begin at `below`, and the end of these slots."""
+    # Slots are declared as *w5=w+17, and no other operation may use the array.
     body = _PLACE.sub("", block.split("{", 1)[1])
     if re.search(r"\bw\b", re.sub(rf"{_CALL.pattern}\(arg1, res1, iw, w, 0\)", "", body)):
-        # An operation uses the array in a way of its own.
         return block, function.sz_w()
     sizes = _measure_slots(function)
     places = sorted((int(offset), sizes[int(place)]) for place, offset in _PLACE.findall(block))
@@ -207,6 +210,7 @@ def _measure_slots(function: ca.Function) -> dict[int, int]:
     """Size of every slot of the work array, in numbers."""
     result: dict[int, int] = {}
     for k in range(function.n_instructions() if function.is_a("MXFunction") else 0):
+        # A call may have several outputs, each with a place of its own; places below 0 are not used.
         node = function.instruction_MX(k)
         places = [] if function.instruction_id(k) == ca.OP_OUTPUT else function.instruction_output(k)
         for index, place in enumerate(places):
@@ -219,6 +223,7 @@ def _measure_slots(function: ca.Function) -> dict[int, int]:
 
 def _write_body(function: ca.Function, block: str) -> str | None:
     """The body in C of a function of `orthocas.control.linear_algebra` that is faster than what CasADi writes."""
+    # These functions carry fixed names.
     size = function.size1_in(0) if function.n_in() else 0
     if function.name() == LARGE_INVERSE:
         return render("algebra.c", {"what": "inverse", "size": size}).rstrip("\n")
@@ -257,14 +262,6 @@ def _silence_warnings(block: str) -> str:
     silenced = "".join(f"\n  (void){name};" for name in unused)
     static = head if head.startswith("static") else f"static {head}"
     return f"{static}{{{silenced}{body}"
-
-
-def _make_conditions_explicit(code: str) -> str:
-    """Compare numbers with zero where C would convert them to truth values; clang warns of such conversions."""
-    name = r"\(?(\*?\w+(?:\+\+|\[\w+\])?)\)?"
-    code = re.sub(rf"\({name}\?", r"((\1 != 0)?", code)
-    code = re.sub(rf"\(! ?{name} ?\)", r"(\1 == 0)", code)
-    return re.sub(rf"\({name}(&&|\|\|){name}\)", r"((\1 != 0)\2(\3 != 0))", code)
 
 
 def write_power(name: str) -> str:
@@ -319,6 +316,7 @@ def _find_calls(function: ca.Function, states: int) -> list[tuple[ca.Function, i
     given = function.mx_in()[:states]
 
     def collect(called: ca.Function, arguments: list[ca.MX]) -> None:
+        # Those of calls of q, in turn, may be shared as well.
         if _are_first(arguments, given):
             result.append((called, len(arguments)))
             result.extend(_find_calls(called, 1))
@@ -380,6 +378,7 @@ def _replace_calls(
         return None
     inputs = function.mx_in()
     outputs = function.call(inputs, True, False)
+    # Each call of the first input gets its other form; its arguments have their other forms already.
     flat, old, new = ca.Function(function.name(), inputs, outputs), list[ca.MX](), list[ca.MX]()
     for k in range(flat.n_instructions()):
         node = flat.instruction_MX(k)
@@ -410,6 +409,7 @@ def _take_sines(function: ca.Function) -> ca.Function | None:
     joints: dict[int, int] = {}
     entries: dict[int, ca.SX] = {}
     has_turns = False
+    # Run through the instructions, with symbols in place of sines and cosines of entries of q.
     for k in range(function.n_instructions()):
         code = function.instruction_id(k)
         into, of = function.instruction_output(k), function.instruction_input(k)

@@ -4,7 +4,6 @@ import ctypes
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,9 @@ from numpy.typing import ArrayLike
 from orthocas.charts.chart import Chart
 from orthocas.codegen.generate import GeneratedC, generate_c
 from orthocas.codegen.precision import DOUBLE, SINGLE, Precision
+from orthocas.codegen.rendering import get_template
 from orthocas.control.controller import Controller, ControlStatus, require_controller
-from orthocas.control.memory import memory_of
+from orthocas.control.memory import find_memory
 from orthocas.control.operational_space import PDPlus
 from orthocas.control.safety import Safety
 from orthocas.errors import CompileError
@@ -28,11 +28,13 @@ from orthocas.tools.processes import run_program
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 NO_DOUBLE = ("-Wdouble-promotion", "-Wfloat-conversion")  #: for code in single precision
 _POINTER = ctypes.c_void_p
-_STATES = 64  # as in templates/ticks.c
-_MICROSECONDS = 3e5  # to spend on one measurement
+# As in templates/ticks.c.
+_STATES = 64
+# To spend on one measurement.
+_MICROSECONDS = 3e5
 
 
-def compilers() -> tuple[str, ...]:
+def find_compilers() -> tuple[str, ...]:
     """Those of gcc and clang that are on the PATH, or cc if neither is.
 
     Raises:
@@ -48,14 +50,14 @@ def compilers() -> tuple[str, ...]:
 def compile_shared(
     generated: GeneratedC, folder: Path, flags: tuple[str, ...] = ("-O2",), compiler: str | None = None
 ) -> Path:
-    """Compile a shared library in a folder, with warnings as errors; default compiler: the first of `compilers`.
+    """Compile a shared library in a folder, with warnings as errors; default compiler: the first of `find_compilers`.
 
     Raises:
         CompileError: if compilation fails; the message starts with the compiler's first lines.
     """
     library = folder / f"lib{generated.name}.so"
     source = generated.folder / f"{generated.name}.c"
-    compiler = compilers()[0] if compiler is None else compiler
+    compiler = find_compilers()[0] if compiler is None else compiler
     warnings = (*STRICT, *(NO_DOUBLE if generated.single_precision else ()))
     command = [compiler, *warnings, *flags, "-fPIC", "-shared", "-o", str(library), str(source), "-lm"]
     run_program(command)
@@ -94,20 +96,13 @@ class CompiledLibrary:
 
     def inverse(self, phi: Array, q_start: Array, *, max_iterations: int = 100) -> tuple[Array, int]:
         """q (n,), status; after at most so many evaluations of phi."""
-        q, arrays = self._zeros(self.n), [self.numbers(array) for array in (phi, q_start)]
-        for name, array in zip(("phi", "q_start"), arrays, strict=True):
-            require_shape(name, array.shape, (self.n,))
-        places = [array.ctypes.data_as(_POINTER) for array in (*arrays, q)]
-        return q, int(self.function("inverse")(*places[:2], int(max_iterations), places[2]))
+        q = self._zeros(self.n)
+        return q, self._call("inverse", [phi, q_start], [q], int(max_iterations))
 
     def nearest(self, phi: Array, q_start: Array, largest_step: float) -> tuple[Array, int]:
         """q (n,), status."""
-        run, q = self.function("nearest"), self._zeros(self.n)
-        run.argtypes, run.restype = [_POINTER, _POINTER, self.precision.c_type, _POINTER], ctypes.c_int
-        arrays = [self.numbers(array) for array in (phi, q_start)]
-        for name, array in zip(("phi", "q_start"), arrays, strict=True):
-            require_shape(name, array.shape, (self.n,))
-        return q, int(run(*(array.ctypes.data for array in arrays), largest_step, q.ctypes.data))
+        q = self._zeros(self.n)
+        return q, self._call("nearest", [phi, q_start], [q], self.precision.c_type(largest_step))
 
     def dynamics(self, q: Array, dq: Array) -> tuple[Array, Array, Array, int]:
         """M (n, n), bias (n,), gravity (n,), status."""
@@ -167,13 +162,14 @@ class CompiledLibrary:
     def _c(self) -> ctypes.CDLL:
         return ctypes.CDLL(str(self.path))
 
-    def _call(self, function: str, inputs: list[Array], outputs: list[Array]) -> int:
-        run = getattr(self._c, f"{self.name}_{function}")
-        arrays = [self.numbers(array) for array in inputs] + outputs
-        # C would read beyond the end of a short q or dq.
-        for array in arrays[: len(inputs)][:2]:
+    def _call(self, function: str, inputs: list[Array], outputs: list[Array], *numbers: Any) -> int:
+        """Call a function with arrays, then numbers, then the arrays that take its results; its status."""
+        arrays = [self.numbers(array) for array in inputs]
+        # C would read beyond the end of a short array; the first two have a number for each joint.
+        for array in arrays[:2]:
             require_shape(f"an argument of {function}", array.shape[:1], (self.n,))
-        return int(run(*(array.ctypes.data_as(ctypes.c_void_p) for array in arrays)))
+        places, results = ([array.ctypes.data_as(_POINTER) for array in some] for some in (arrays, outputs))
+        return int(self.function(function)(*places, *numbers, *results))
 
 
 def gain_numbers(controller: Controller) -> Array:
@@ -194,6 +190,7 @@ class Supervisor:
         require_kind("library", library, CompiledLibrary)
         require_controller(controller)
         self._n, self._k, self._library = library.n, len(controller.labels), library
+        # Functions of the supervised law; those that take numbers beside pointers state their types.
         self._functions = {
             name: library.function(name) for name in ("start", "take_over", "resume", "hold", "release", "step")
         }
@@ -204,6 +201,7 @@ class Supervisor:
         self._functions |= {"stream": stream, "pace": pace}
         if safety is not None:
             require_kind("safety", safety, Safety)
+        # Settings as a struct, those of the library unless others are given.
         values = (safety or Safety.of(controller)).in_c(controller.command)
         number = library.precision.c_type
         kinds = {name: ctypes.c_int if isinstance(value, int) else number for name, value in values.items()}
@@ -213,7 +211,8 @@ class Supervisor:
         if safety is not None:
             struct = settings(*(tuple(value) if isinstance(value, np.ndarray) else value for value in values.values()))
             self._safety = ctypes.pointer(struct)
-        memory = memory_of(controller)
+        # The state, with what the law remembers.
+        memory = find_memory(controller)
         fields = {} if memory is None else {name: number * len(value) for name, value in memory.start.items()}
         self._state = _build_state(self._n, self._k, number, settings, _build_struct("Memory", fields))()
         self._command = library.numbers(np.zeros(self._n))
@@ -312,6 +311,7 @@ def _build_state(
     n: int, k: int, number: Any, settings: type[ctypes.Structure], memory: type[ctypes.Structure]
 ) -> type[ctypes.Structure]:
     """The struct `NAME_state` of templates/robot.h.jinja."""
+    # Fields in the order of the header; torque laws have a spring, a load and an observer.
     joints, quantities = number * n, number * k
     has_spring = any(field[0] == "brake_stiffness" for field in settings._fields_)
     counts = ("mode", "cause", "asked", "bad_ticks", "fresh", "stale_ticks", "same_ticks")
@@ -374,12 +374,12 @@ def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int =
     first = cases[0][1]
     with open_draft_folder() as folder:
         data, program = folder / "states", folder / "ticks"
-        numbers = np.concatenate([part.ravel() for law, _ in cases for part in (_states(law), gain_numbers(law))])
-        first.numbers(numbers).tofile(data)
-        source = files(__package__) / "templates" / "ticks.c"
-        (folder / "ticks.c").write_text(source.read_text())
+        # For each law its states, then its gains.
+        parts = [part.ravel() for law, _ in cases for part in (_sample_states(law), gain_numbers(law))]
+        first.numbers(np.concatenate(parts)).tofile(data)
+        (folder / "ticks.c").write_text(get_template("ticks.c"))
         number = f"-DNUMBER={first.precision.c_name}"
-        run_program([compilers()[0], "-O2", number, str(folder / "ticks.c"), "-o", str(program), "-ldl"])
+        run_program([find_compilers()[0], "-O2", number, str(folder / "ticks.c"), "-o", str(program), "-ldl"])
         arguments = [str(program), str(data), str(calls), str(cases[0][0].problem.n)]
         for law, library in cases:
             sizes = (3 * len(law.labels), len(gain_numbers(law)))
@@ -388,9 +388,10 @@ def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int =
     return [Ticks(*map(float, line.split())) for line in lines]
 
 
-def _states(law: Controller) -> Array:
+def _sample_states(law: Controller) -> Array:
     """States inside the domain with references nearby, (64, 2 n + 3 k)."""
     rng, domain, n, k = np.random.default_rng(0), law.problem.domain, law.problem.n, len(law.labels)
+    # The inner part of a box may lie outside a condition: the centre does not.
     q = domain.centre + 0.4 * domain.half_width * rng.uniform(-1, 1, (_STATES, n))
     q[~domain.contains(q)] = domain.centre
     reference = np.array([law.measured(point).full().ravel() for point in q]) + 0.01 * rng.normal(size=(_STATES, k))

@@ -13,7 +13,8 @@ from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, Controller, re
 from orthocas.tasks.domains import Domain
 from orthocas.tools.checks import Array
 
-_EXPONENT = re.compile(r"e\+?(-?)0*")  # 1e+06 becomes 1e6, and 1e-05 1e-5
+# 1e+06 becomes 1e6, and 1e-05 1e-5.
+_EXPONENT = re.compile(r"e\+?(-?)0*")
 _RANGE = float(np.finfo(np.float32).max)
 _MATHEMATICS = frozenset(
     (
@@ -132,18 +133,16 @@ def _make_single(token: re.Match[str]) -> str:
 
 def find_bounds_inside(domain: Domain, precision: Precision) -> tuple[Array, Array]:
     """Lower and upper bounds in a precision, (n,) each, that belong to the domain in Python and in C."""
-    centre, bounds = precision.round(domain.centre), []
+    centre, largest, bounds = precision.round(domain.centre), domain.reach, []
     for boundary in domain.bounds:
         bound = precision.round(boundary)
-        while (beyond := _lies_beyond(domain, bound, precision)).any():
+        # Joints that Python or C finds outside move inwards, one number after the other.
+        while True:
+            in_c = precision.round(abs(bound - centre))
+            beyond = (abs(bound - domain.centre) > largest) | (in_c > precision.round(largest))
+            if not beyond.any():
+                break
             inwards = np.nextafter(bound.astype(precision.scalar), centre.astype(precision.scalar))
             bound = np.where(beyond, inwards, bound)
         bounds.append(bound)
     return bounds[0], bounds[1]
-
-
-def _lies_beyond(domain: Domain, q: Array, precision: Precision) -> Any:
-    """Whether Python or C finds the joints of q outside, (n,)."""
-    distance, largest = abs(q - domain.centre), domain.reach
-    in_c = precision.round(abs(q - precision.round(domain.centre)))
-    return (distance > largest) | (in_c > precision.round(largest))

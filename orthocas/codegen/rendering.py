@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Mapping
 from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,11 @@ from jinja2.runtime import Context
 _INFINITIES = {np.inf: "INFINITY", -np.inf: "-INFINITY"}
 
 
+def get_template(name: str) -> str:
+    """A file of `templates/` as it is."""
+    return (files(__package__) / "templates" / name).read_text()
+
+
 def render(template: str, values: Mapping[str, Any]) -> str:
     """The text of `templates/TEMPLATE.jinja`. A name that the values lack is an error."""
     return _environment().get_template(f"{template}.jinja").render(values)
@@ -21,6 +27,7 @@ def render(template: str, values: Mapping[str, Any]) -> str:
 @cache
 def _environment() -> Environment:
     """Blocks vanish with their lines; `x | numbers` are literals of C, and `x | array` an initialiser."""
+    # Missing names are errors, and generated text is not HTML.
     environment = Environment(
         loader=PackageLoader("orthocas.codegen", "templates"),
         undefined=StrictUndefined,

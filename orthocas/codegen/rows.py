@@ -64,6 +64,7 @@ def render_rows(chart: Chart, values: Mapping[str, Any], precision: Precision) -
         most = f"at most {RULES.most_operations} for rows of it"
         raise InvalidValueError("operations of phi", together.n_instructions(), most)
     operations, slots = _write_operations(together)
+    # Numbers on the stack for each lane: q, entries of phi and the basis, sums, and slots.
     arrays = chart.n + len(places) + C.shape[1] + 1 + len(C) + slots
     values = {
         **values,
@@ -88,6 +89,7 @@ def render_rows(chart: Chart, values: Mapping[str, Any], precision: Precision) -
 
 def _split_phi(chart: Chart) -> tuple[ca.Function, list[int], ca.Function, Array, Array]:
     """Entries of phi, their places, a basis psi, and coefficients: the other entries are C psi - shift."""
+    # Coordinates that are sums of basis functions: these functions once, then a table.
     q, coordinates = ca.SX.sym("q", chart.n), chart.coordinates
     task = chart.problem.task.function(q)
     fitted = coordinates if isinstance(coordinates, Coordinates) and len(coordinates.offset) else None
@@ -98,6 +100,7 @@ def _split_phi(chart: Chart) -> tuple[ca.Function, list[int], ca.Function, Array
         C = fitted.scale[:, None] * fitted.theta.reshape(r, -1)
         basis = ca.Function("basis", [q], [ca.densify(family.basis(q[fitted.active]))])
         return ca.Function("direct", [q], [direct]), places, basis, C, fitted.scale * fitted.offset
+    # All others entry by entry.
     phi = expand_scalars(chart.function("phi"))
     empty = ca.Function("basis", [q], [ca.SX(0, 1)])
     return ca.Function("direct", [q], [phi(q)]), list(range(chart.n)), empty, np.zeros((0, 0)), np.zeros(0)
@@ -117,6 +120,7 @@ def _write_operations(function: ca.Function) -> tuple[list[str], int]:
             value = f"q[{of[0]} * LANES + l]"
         else:
             value = _OPERATIONS[name].format(*(f"w{place}" for place in of))
+        # Each lane counts arguments that are too large for its own sine.
         if name in ("sin", "cos"):
             lines.append(f"far += fabs(w{of[0]}) <= FAR ? 0.0 : 1.0;")
         lines.append(f"w{into} = {value};")

@@ -9,7 +9,7 @@ import numpy as np
 from orthocas.charts.chart import Chart
 from orthocas.codegen.rendering import clean_word, clean_words, write_number, write_numbers
 from orthocas.control.controller import Controller
-from orthocas.control.memory import memory_of
+from orthocas.control.memory import find_memory
 from orthocas.control.safety import SIGNED, UNBOUNDED, Safety
 from orthocas.tasks.domains import Domain
 from orthocas.tasks.relative import Relative
@@ -46,6 +46,7 @@ def build_supervision_kernels(controller: Controller) -> list[ca.Function]:
     inputs = fallback.mx_in()
     measured, relative = controller.measured(q), Relative(controller.problem.task)
     start, velocity, acceleration, end = (ca.MX.sym(name, k) for name in ("start", "velocity", "acceleration", "end"))
+    # Errors and rates of the task by its own rules, all others as differences.
     turned = relative.convert_rates(start[:m], velocity[:m], acceleration[:m])
     rates = [ca.vertcat(*parts) for parts in zip(turned, (velocity[m:], acceleration[m:]), strict=True)]
     deviation = [ca.densify(measured), _subtract(controller, relative, reference, measured)]
@@ -56,9 +57,10 @@ def build_supervision_kernels(controller: Controller) -> list[ca.Function]:
         ca.Function("gap", [start, velocity, acceleration, end], gap),
         _build_implied(controller, relative),
     ]
+    # Orientations turn instead of adding up, laws may remember, and domains may be bounded by singular positions.
     if relative.turned:
         kernels += [relative.moved, relative.turned_by]
-    if (memory := memory_of(controller)) is not None:
+    if (memory := find_memory(controller)) is not None:
         inputs = memory.step.mx_in()
         kernels.append(ca.Function("memory", inputs, [ca.densify(out) for out in memory.step.call(inputs)]))
     domain = None if controller.chart is None else find_condition(controller.chart)
@@ -89,7 +91,7 @@ def _build_implied(controller: Controller, relative: Relative) -> ca.Function:
     q, dq = (ca.MX.sym(name, n) for name in ("q", "dq"))
     value, *rates, change = (ca.MX.sym(name, k) for name in names)
 
-    # J and dJ/dt dq of the quantities, orientations relative to the reference
+    # J and dJ/dt dq of the quantities, orientations relative to the reference.
     slope = relative.error(q, value[:m])[1]
     if controller.chart is not None and controller.labels == controller.chart.labels:
         own = controller.chart.coordinates.functions
@@ -99,6 +101,7 @@ def _build_implied(controller: Controller, relative: Relative) -> ca.Function:
         J, bias = ca.vertcat(slope, J_2), ca.jtimes(J_2 @ dq, q, dq)
     bias = ca.vertcat(controller.problem.task.rates_derivative_function(q, dq, dq), bias)
 
+    # Rates of the reference as errors count; with fewer or more quantities than joints, damped least squares.
     turned = relative.convert_rates(value[:m], rates[0][:m], rates[1][:m])
     velocity, acceleration = (ca.vertcat(a, b[m:]) for a, b in zip(turned, rates, strict=True))
     B = ca.horzcat(change, velocity, acceleration - bias)
@@ -121,6 +124,7 @@ def find_condition(chart: Chart) -> Domain | None:
 def describe_law(controller: Controller) -> dict[str, Any]:
     """Values of the templates about the law: gains, what its command means, and how it counts turns of joints."""
     problem, torque = controller.problem, controller.command == "torque"
+    # Joints that turn without end have a period; some robots compensate gravity themselves.
     turns = np.zeros(problem.n)
     turns[list(problem.turning)] = 2 * np.pi
     if controller.settings.get("gravity") == "robot":
@@ -159,7 +163,7 @@ def describe_supervision(controller: Controller, safety: Safety) -> dict[str, An
         "settings": [_describe_setting(name, value) for name, value in safety.in_c(controller.command).items()],
         "turning": np.isinf(robot.lower) & np.isinf(robot.upper) & ~np.array(robot.tree.prismatic),
         "bounded": np.isfinite(lower) & np.isfinite(upper) & (controller.chart is not None),
-        # a path of a corridor ends one radius before the boundary of its box, which may be many radii wide
+        # A path of a corridor ends one radius before the boundary of its box, which may be many radii wide.
         "boundary_unit": domain.half_width if path is None else np.minimum(domain.half_width, path.radius),
         "boundary": _describe_boundary(controller),
         "turned_first": relative.first,
@@ -171,12 +175,14 @@ def describe_supervision(controller: Controller, safety: Safety) -> dict[str, An
 def _describe_setting(name: str, value: Any) -> dict[str, Any]:
     """A setting of `Safety` as a field of a struct, its value, and what C requires of it."""
     place, meaning = f"safety->{name}", Safety.meaning(name)
+    # A single number must be positive; a count must not be negative.
     if not isinstance(value, np.ndarray):
         whole = isinstance(value, int)
         check = f"{place} >= 0" if whole else f"{place} > 0.0 && {place} <= LARGEST"
         literal = write_number(value if whole else float(value))
         kind = "int" if whole else "double"
         return {"name": name, "kind": kind, "size": 0, "meaning": meaning, "check": check, "literal": literal}
+    # Lists are finite and not negative, unless UNBOUNDED or SIGNED names them.
     check = f"all_from({'-INFINITY' if name in SIGNED else '0.0'}, {place}, {value.size})"
     if name not in UNBOUNDED:
         check += f" && all_within({place}, {value.size}, LARGEST)"
@@ -207,7 +213,7 @@ def _describe_boundary(controller: Controller) -> dict[str, Any] | None:
     fold_span = None
     if (room := domain.room_to_fold) is not None:
         meaning += " So is\n * the bound on the volume of the coordinates, in shares of the median."
-        # of a median position, because the centre may be near the bound
+        # Of a median position, because the centre may be near the bound.
         fold_span = float(np.median(Batched(room)(sample_uniform(domain, RULES.samples, 0))[0]))
     return {
         "meaning": meaning,
@@ -220,7 +226,7 @@ def _describe_boundary(controller: Controller) -> dict[str, Any] | None:
 
 def _describe_memory(controller: Controller) -> dict[str, Any] | None:
     """The fields that a law remembers, and the gains that they are added to."""
-    memory = memory_of(controller)
+    memory = find_memory(controller)
     if memory is None:
         return None
     return {

@@ -169,6 +169,7 @@ def register(law: type[Law]) -> None:
     Raises:
         InvalidValueError: if another law has that name.
     """
+    # The name must be free, and options must say what they are.
     named = isinstance(getattr(law, "name", None), str)
     if named and _LAWS.get(law.name, law) is not law:
         raise InvalidValueError("name", repr(law.name), f"a free name, because {_LAWS[law.name].__name__} has this one")
@@ -195,7 +196,7 @@ def law_of(name: str) -> type[Law]:
     return _LAWS[name]
 
 
-def law_facts(controller: Controller) -> dict[str, str]:
+def list_law_facts(controller: Controller) -> dict[str, str]:
     """The facts that every controller displays: quantities, gains, other settings and problem."""
     return {
         "law": f"{controller.name}, commands {controller.command} of {controller.problem.n} joints",
@@ -234,7 +235,7 @@ class LawOfChart(Shown):
 
     def facts(self: Any) -> dict[str, str]:
         """Quantities, gains, settings and problem."""
-        return law_facts(self)
+        return list_law_facts(self)
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         """Raise UnreachableReferenceError if the motion from q_start along the reference leaves the chart's domain."""
@@ -313,6 +314,7 @@ def build_guard(domain: Domain | None, n: int, numbers: int, keep_direction: boo
         each entry, which may be infinite; q (n, 1); all input numbers of the law; and det(J A^-1 J^T) relative to its
         median over the domain, and the smallest regular value of that.
     """
+    # From the least to the most important reason: singular, outside the domain, not finite.
     command, fallback, limit, q = (ca.SX.sym(name, n) for name in ("command", "fallback", "limit", "q"))
     inputs, volume, smallest = ca.SX.sym("inputs", numbers), ca.SX.sym("volume"), ca.SX.sym("smallest")
     regular = ca.logic_and(volume > smallest, _are_finite(command))
@@ -320,6 +322,7 @@ def build_guard(domain: Domain | None, n: int, numbers: int, keep_direction: boo
     status = ca.if_else(_is_inside(domain, q), status, float(ControlStatus.OUTSIDE_DOMAIN))
     usable = ca.logic_and(_are_finite(inputs), _all_hold(limit > 0))
     status = ca.if_else(usable, status, float(ControlStatus.NOT_FINITE))
+    # Only a command of the law can be saturated; a fallback is cut as well.
     from_law = status == float(ControlStatus.OK)
     selected = _choose(from_law, command, fallback)
     cut = _limit(selected, limit, keep_direction)
@@ -331,6 +334,7 @@ def build_guard(domain: Domain | None, n: int, numbers: int, keep_direction: boo
 
 
 def _choose(from_law: ca.SX, command: ca.SX, fallback: ca.SX) -> ca.SX:
+    # Entry by entry, so that no NaN of the law gets through.
     rows = range(command.shape[0])
     safe = [ca.if_else(_is_finite(fallback[i]), fallback[i], 0) for i in rows]
     return ca.vertcat(*(ca.if_else(from_law, command[i], safe[i]) for i in rows))
@@ -348,18 +352,16 @@ def _limit(command: ca.SX, limit: ca.SX, keep_direction: bool) -> ca.SX:
 
 def _is_inside(domain: Domain | None, q: ca.SX) -> ca.SX:
     """Whether q (n, 1) lies in the domain: between its boundaries, and where its condition holds, if it has one."""
-    condition = None if domain is None else domain.condition
-    clear = ca.SX(1) if condition is None else _all_hold(condition.pivots(q) > 0)
-    return ca.logic_and(_is_in_box(domain, q), clear)
-
-
-def _is_in_box(domain: Domain | None, q: ca.SX) -> ca.SX:
-    """Whether q (n, 1) lies in the box; always true for joints without boundaries, such as the angles of a torus."""
-    widths = np.full(q.shape[0], np.inf) if domain is None else domain.reach
-    bounded = np.flatnonzero(np.isfinite(widths)).tolist()
-    if domain is None or not bounded:
-        return ca.SX(1)
-    return _all_hold(ca.fabs(q[bounded] - ca.DM(domain.centre[bounded])) <= ca.DM(widths[bounded]))
+    in_box = meets_condition = ca.SX(1)
+    if domain is None:
+        return ca.logic_and(in_box, meets_condition)
+    # Joints without boundaries, such as the angles of a torus, do not count.
+    bounded = np.flatnonzero(np.isfinite(domain.reach)).tolist()
+    if bounded:
+        in_box = _all_hold(ca.fabs(q[bounded] - ca.DM(domain.centre[bounded])) <= ca.DM(domain.reach[bounded]))
+    if domain.condition is not None:
+        meets_condition = _all_hold(domain.condition.pivots(q) > 0)
+    return ca.logic_and(in_box, meets_condition)
 
 
 def _is_finite(value: ca.SX) -> ca.SX:
@@ -385,6 +387,7 @@ def count_turns_from_centre(graph: ca.Function, problem: Problem) -> ca.Function
     """
     if not problem.turning:
         return graph
+    # q takes the place of its unwrapped form in a call of the graph.
     inputs = graph.mx_in()
     k = graph.name_in().index("q")
     counted = [*inputs[:k], problem.unwrap(inputs[k], ca.DM(problem.domain.centre)), *inputs[k + 1 :]]
@@ -399,9 +402,10 @@ def get_counted_function(controller: Controller, name: Literal["function", "ener
 
 def replace_smallest_volume(graph: ca.Function, smallest: float) -> ca.Function:
     """The same graph of a controller, with another smallest volume of the gradients, relative to the median."""
-    inputs, call = _guard_call(graph)
+    inputs, call = _find_guard_call(graph)
     if call is None:
         return graph
+    # The same call of the guard, with another last input.
     check = call.which_function()
     outputs = check(*(call.dep(i) for i in range(check.n_in() - 1)), ca.MX(smallest**2))
     return ca.Function(graph.name(), inputs, list(outputs), graph.name_in(), graph.name_out())
@@ -409,13 +413,13 @@ def replace_smallest_volume(graph: ca.Function, smallest: float) -> ca.Function:
 
 def find_squared_volume(graph: ca.Function) -> ca.Function | None:
     """Inputs of a controller -> squared volume of its gradients, relative to the median; None without a guard."""
-    inputs, call = _guard_call(graph)
+    inputs, call = _find_guard_call(graph)
     if call is None:
         return None
     return ca.Function("squared_volume", inputs, [call.dep(call.which_function().n_in() - 2)])
 
 
-def _guard_call(graph: ca.Function) -> tuple[list[ca.MX], ca.MX | None]:
+def _find_guard_call(graph: ca.Function) -> tuple[list[ca.MX], ca.MX | None]:
     """Inputs of a graph, and the call of the guard that all its outputs come from, if it has one."""
     inputs = graph.mx_in()
     call = graph.call(inputs, True, False)[0].dep(0)

@@ -92,8 +92,16 @@ def matched_stiffness(
     require_mass(chart.problem.robot, "gains by modes")
     if not 0 <= as_number("delay", delay) < np.inf:
         raise InvalidValueError("delay", delay, "a finite number >= 0")
-    bearable = _bound_modes(delay, damping_ratio, chart.n) if delay else np.inf
-    bound = min(as_number("fastest", fastest), bearable)
+    bound = as_number("fastest", fastest)
+    if delay:
+        # The fastest mode that has the phase margin at this delay.
+        ratio = float(positive_gains("damping_ratio", damping_ratio, chart.n).min())
+        crossing = np.sqrt(2 * ratio**2 + np.sqrt(4 * ratio**4 + 1))
+        phase = np.arctan(2 * ratio * crossing) - RULES.margin
+        if phase <= 0:
+            need = "a larger one: this leaves less than 30 deg without a delay"
+            raise InvalidValueError("damping_ratio", ratio, need)
+        bound = min(bound, float(phase / (crossing * delay)))
     points = sample_uniform(chart.problem.domain, RULES.samples, RULES.seed)
     mobilities = compute_mobility(chart, points, chart.problem.robot)
     return _match(mobilities, frequency, bound) if not delay else _match_everywhere(chart, mobilities, frequency, bound)
@@ -104,6 +112,7 @@ def _match_everywhere(chart: Chart, mobilities: Array, frequency: float, bound: 
     robot, corners = chart.problem.robot, np.empty((0, chart.n, chart.n))
     for _ in range(RULES.rounds):
         stiffness = _match(mobilities, frequency, bound, corners)
+        # The fastest mode that descents find with this stiffness.
         W = compute_mobility(chart, find_fastest_posture(chart, stiffness, robot)[None], robot)
         root = np.sqrt(stiffness)
         excess = float(np.linalg.eigvalsh(root[:, None] * W[0] * root)[-1]) / bound**2
@@ -111,16 +120,6 @@ def _match_everywhere(chart: Chart, mobilities: Array, frequency: float, bound: 
             break
         corners = np.concatenate([corners, W])
     return np.asarray(stiffness / max(1.0, excess))
-
-
-def _bound_modes(delay: float, damping_ratio: ArrayLike, n: int) -> float:
-    """The fastest mode [rad/s] that has the phase margin at a delay."""
-    ratio = float(positive_gains("damping_ratio", damping_ratio, n).min())
-    crossing = np.sqrt(2 * ratio**2 + np.sqrt(4 * ratio**4 + 1))
-    phase = np.arctan(2 * ratio * crossing) - RULES.margin
-    if phase <= 0:
-        raise InvalidValueError("damping_ratio", ratio, "a larger one: this leaves less than 30 deg without a delay")
-    return float(phase / (crossing * delay))
 
 
 def _match(mobilities: Array, frequency: float, fastest: float, bounded: Array | None = None) -> Array:
@@ -202,25 +201,21 @@ def compute_modes(mobility: Array, stiffness: Array, damping: Array) -> Modes:
 
     With S = M_phi^-1/2 and the unit eigenvectors u_i of S K S, v_i = S u_i.
     """
+    # The root S of M_phi^-1.
     values, vectors = np.linalg.eigh(mobility)
     half = (vectors * np.sqrt(values.clip(0))[:, None, :]) @ vectors.transpose(0, 2, 1)
     squares, shapes = np.linalg.eigh((half * stiffness) @ half)
     omega = np.sqrt(squares.clip(0))
-    # 2 zeta omega of each mode [1/s]
+    # 2 zeta omega of each mode [1/s].
     rates = np.einsum("kij,kij->kj", shapes, half @ damping @ half @ shapes)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = rates / (2 * omega)
-    return Modes(omega / (2 * np.pi), ratios, _compute_delays(omega, rates))
-
-
-def _compute_delays(omega: Array, rates: Array) -> Array:
-    """Delay [s] at which s^2 + (rate s + omega^2) exp(-s T) = 0 gets a root i Omega.
-
-    The modulus gives Omega^2 = rate^2/2 + sqrt(rate^4/4 + omega^4), the phase T = atan(rate Omega / omega^2) / Omega.
-    """
+    # With the delay T, s^2 + (rate s + omega^2) exp(-s T) = 0 gets a root i Omega. The modulus gives
+    # Omega^2 = rate^2/2 + sqrt(rate^4/4 + omega^4), the phase T = atan(rate Omega / omega^2) / Omega.
     crossing = np.sqrt(rates**2 / 2 + np.sqrt(rates**4 / 4 + omega**4))
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.arctan2(rates * crossing, omega**2) / crossing)
+        delays = np.asarray(np.arctan2(rates * crossing, omega**2) / crossing)
+    return Modes(omega / (2 * np.pi), ratios, delays)
 
 
 def find_holding_doubts(robot: Robot, domain: Domain, limit: Array) -> list[str]:
@@ -240,14 +235,15 @@ def find_holding_doubts(robot: Robot, domain: Domain, limit: Array) -> list[str]
     heavy = (excess > 1).any(axis=1)
     if not heavy.any():
         return []
+    # The centre comes first among the points.
     worst = 0 if heavy[0] else int(np.argmax(excess.max(axis=1)))
     joint = int(np.argmax(excess[worst]))
     unit = "N" if robot.tree.prismatic[joint] else "N m"
     where, most = ("at the centre of", "") if heavy[0] else ("everywhere in", "up to ")
-    share = percent(heavy[1:].mean(), fault=True)
+    fraction = percent(heavy[1:].mean(), fault=True)
     return [
         f"the motors cannot hold the arm {where} the domain: gravity needs {most}{needed[worst, joint]:.4g} {unit} at "
-        f"joint '{robot.joint_names[joint]}', the limit is {limit[joint]:.4g} {unit}, and at {share} of "
+        f"joint '{robot.joint_names[joint]}', the limit is {limit[joint]:.4g} {unit}, and at {fraction} of "
         f"{RULES.samples} samples of the domain gravity alone exceeds a limit"
     ]
 

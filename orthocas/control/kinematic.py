@@ -20,18 +20,12 @@ from orthocas.control.controller import (
     guarded_graph,
     named_inputs,
 )
-from orthocas.control.gains import (
-    FEEDBACK,
-    LIMIT,
-    RULES,
-    command_limit,
-    non_negative_gains,
-)
+from orthocas.control.gains import FEEDBACK, LIMIT, RULES, command_limit, non_negative_gains
 from orthocas.control.linear_algebra import build_block_inertia, compute_median_volume
-from orthocas.errors import InvalidValueError, ShapeError
+from orthocas.errors import InvalidValueError
 from orthocas.robots.tree import require_driven
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, require_at_least, require_kind
+from orthocas.tools.checks import Array, as_float_array, require_at_least, require_kind, require_shape
 from orthocas.tools.display import Shown, listed, number_list
 from orthocas.tools.expressions import wrap_shortest
 
@@ -99,11 +93,11 @@ class Kinematic(LawOfChart):
         inputs = named_inputs(n, self.gains, n)
         q = inputs["q"]
 
-        # The rate d_phi_d - Lambda_feedback e that phi is to have
+        # The rate d_phi_d - Lambda_feedback e that phi is to have.
         e, J = compute_errors(self.chart, q, inputs["reference"])
         rate = compute_drift(self.chart, q, inputs["reference"], inputs["reference_velocity"]) - inputs["feedback"] * e
 
-        # dq = J^-1 rate, with J^-1 = A^-1 J^T (J A^-1 J^T)^-1
+        # dq = J^-1 rate, with J^-1 = A^-1 J^T (J A^-1 J^T)^-1.
         B, Lambda, volume = build_block_inertia(n, (n,))(J, problem.metric.function(q))
         velocity = B @ (Lambda @ rate)
         scale = compute_median_volume(problem, self.chart.parts.rates, problem.metric, (n,))
@@ -161,13 +155,12 @@ class XiTask(Shown):
         self.cost = non_negative_gains("cost", cost, chart.r)
         self.gain, self.lm_damping = float(gain), float(lm_damping)
         self.joints = chart.problem.robot.joint_names if joints is None else tuple(joints)
-        if len(self.joints) != chart.n:
-            raise ShapeError("joints", (len(self.joints),), (chart.n,))
+        require_shape("joints", (len(self.joints),), (chart.n,))
         self.target_xi: Array | None = None
         # Turns of joints that turn without end count from the last position.
         self._last: Array | None = None
         # The last model, and the places of joints in it: looking them up takes longer than xi.
-        self._known: tuple[Any, list[tuple[Any, int]]] = (None, [])
+        self._of_model: tuple[Any, list[tuple[Any, int]]] = (None, [])
 
     def facts(self) -> dict[str, str]:
         """Cost, gain and target."""
@@ -178,8 +171,7 @@ class XiTask(Shown):
     def set_target(self, xi: ArrayLike) -> None:
         """Wanted coordinates xi_d, (r,)."""
         target = as_float_array("xi", xi)
-        if target.shape != (self.chart.r,):
-            raise ShapeError("xi", target.shape, (self.chart.r,))
+        require_shape("xi", target.shape, (self.chart.r,))
         self.target_xi = target.copy()
 
     def set_target_from_configuration(self, configuration: Any) -> None:
@@ -199,7 +191,7 @@ class XiTask(Shown):
 
     def compute_jacobian(self, configuration: Any) -> Array:
         """de/dq, (r, nv), with zeros for joints that the chart does not have."""
-        places = [place for _, place in self._places(configuration.model)]
+        places = [place for _, place in self._find_places(configuration.model)]
         J = np.zeros((self.chart.r, configuration.model.nv))
         J[:, places] = self.chart.coordinates.jacobian(self._read_position(configuration)[None])[0]
         return J
@@ -218,29 +210,29 @@ class XiTask(Shown):
     def _read_position(self, configuration: Any) -> Array:
         """The chart's joint positions, (n,)."""
         q = configuration.q
-        values = (q[place] for place, _ in self._places(configuration.model))
+        values = (q[place] for place, _ in self._find_places(configuration.model))
+        # Pinocchio stores joints that turn without end as cosine and sine.
         q = np.array([value if np.ndim(value) == 0 else np.arctan2(value[1], value[0]) for value in values])
         self._last = q if self._last is None else np.asarray(self.chart.problem.unwrap(q, self._last))
         return self._last
 
-    def _places(self, model: Any) -> list[tuple[Any, int]]:
-        """The places of joints; looking them up takes longer than xi."""
-        if model is not self._known[0]:
-            self._known = model, self._find_places(model)
-        return self._known[1]
-
     def _find_places(self, model: Any) -> list[tuple[Any, int]]:
         """For each joint its place in q, a slice for joints that Pinocchio stores as cosine and sine, and in dq."""
+        if model is self._of_model[0]:
+            return self._of_model[1]
+        # MuJoCo's models have other attributes than Pinocchio's.
         of_mujoco = not hasattr(model, "getJointId")
         names = [model.joint(k).name for k in range(model.njnt)] if of_mujoco else [*model.names]
         missing = [name for name in self.joints if name not in names]
         if missing:
             raise InvalidValueError("model", f"without a joint '{missing[0]}'", f"one of {', '.join(names)}")
-        if of_mujoco:
-            joints = [model.joint(name) for name in self.joints]
-            return [(int(joint.qposadr[0]), int(joint.dofadr[0])) for joint in joints]
-        places = []
+        places: list[tuple[Any, int]] = []
         for name in self.joints:
+            if of_mujoco:
+                joint = model.joint(name)
+                places.append((int(joint.qposadr[0]), int(joint.dofadr[0])))
+                continue
             joint = model.joints[model.getJointId(name)]
             places.append((joint.idx_q if joint.nq == 1 else slice(joint.idx_q, joint.idx_q + joint.nq), joint.idx_v))
+        self._of_model = model, places
         return places

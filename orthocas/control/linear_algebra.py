@@ -25,6 +25,7 @@ def invert_spd(matrix: Expression) -> tuple[Any, Any]:
     NaN or infinite where the matrix is singular. SX are written out, by L D L^T; graphs (MX) have loops instead, whose
     code does not grow with k.
     """
+    # Graphs in loops, expressions written out.
     k = matrix.shape[0]
     if k == 1:
         return 1 / matrix, matrix
@@ -48,8 +49,8 @@ def _build_sweeps(k: int) -> ca.Function:
     state = ca.MX.sym("state", k * k + 1)
     A = ca.reshape(state[:-1], k, k)
     p, w = A[0, 0], A[1:, 0]
-    share = w / p
-    swept = ca.vertcat(ca.horzcat(A[1:, 1:] - w @ share.T, share), ca.horzcat(share.T, -1 / p))
+    ratio = w / p
+    swept = ca.vertcat(ca.horzcat(A[1:, 1:] - w @ ratio.T, ratio), ca.horzcat(ratio.T, -1 / p))
     sweeps = ca.Function("sweep", [state], [ca.vertcat(ca.vec(swept), state[-1] * p)]).fold(k)
     matrix = ca.MX.sym("A", k, k)
     end = sweeps(ca.vertcat(ca.vec(matrix), 1))
@@ -73,23 +74,20 @@ def multiply_by_root(matrix: Expression, vectors: Expression) -> Expression:
 
 @cache
 def _build_rounds(k: int, c: int) -> ca.Function:
-    A, V = ca.MX.sym("A", k, k), ca.MX.sym("V", k, c)
-    product, result = A, A @ V
-    for _ in range(ROUNDS):
-        product, result = _build_newton_round(k, c)(product, result)
-    return ca.Function(ROOT_TIMES, [A, V], [result])
-
-
-@cache
-def _build_newton_round(k: int, c: int) -> ca.Function:
-    """One round on the product X (k, k), a rational function of A and therefore symmetric, and on S V (k, c)."""
+    # One round on the product X (k, k), a rational function of A and therefore symmetric, and on S V (k, c).
     kind = choose_kind(k)
     product, result, identity = kind.sym("X", k, k), kind.sym("SV", k, c), ca.DM.eye(k)
     inverse, determinant = invert_spd(product)
     mu_squared = determinant ** (-1 / k)
     next_result = ca.sqrt(mu_squared) * (result + inverse @ result / mu_squared) / 2
     next_product = (identity + (mu_squared * product + inverse / mu_squared) / 2) / 2
-    return ca.Function("newton_round", [product, result], [_mirror(next_product), ca.densify(next_result)])
+    newton_round = ca.Function("newton_round", [product, result], [_mirror(next_product), ca.densify(next_result)])
+    # All rounds call the same function, from X = A and A V on.
+    A, V = ca.MX.sym("A", k, k), ca.MX.sym("V", k, c)
+    X, SV = A, A @ V
+    for _ in range(ROUNDS):
+        X, SV = newton_round(X, SV)
+    return ca.Function(ROOT_TIMES, [A, V], [SV])
 
 
 def _mirror(matrix: Any) -> Any:
@@ -109,6 +107,7 @@ def build_block_inertia(n: int, blocks: tuple[int, ...]) -> ca.Function:
     eqs. (30), (31); one block gives the full M_phi. The volume is the product of det(J_b A^-1 J_b^T), which is 0 in
     singularities.
     """
+    # A block of rows of J after the other.
     k = sum(blocks)
     kind = choose_kind(n)
     J, A = kind.sym("J", k, n), kind.sym("A", n, n)
@@ -147,28 +146,24 @@ def apply_damping(
     - square_root: D = M^1/2 Z K^1/2 + K^1/2 Z M^1/2. Symmetric, but not always positive semi-definite.
     - double_diagonal: D = 2 Z^1/2 (M # K) Z^1/2, always positive semi-definite, with the geometric mean
       M # K = K^1/2 (K^-1/2 M K^-1/2)^1/2 K^1/2. With one damping ratio z for all coordinates, D is diagonal in the
-      generalised eigenvectors of (K, M), and every mode has the damping ratio z. A spring softer than 1e-6 of the
-      stiffest one, also K_i = 0, is damped as if it had that stiffness, so hardly.
+      generalised eigenvectors of (K, M), and every mode has the damping ratio z. A spring softer than `SOFTEST` of
+      the stiffest one, also K_i = 0, is damped as if it had that stiffness, so hardly.
 
     Source:
         square_root: [AS2023] eq. (29); double diagonalisation: [AOFH2003]; its form without eigenvectors and for
         several ratios is ours, docs/explanation/derivations_control.md#damping.
     """
+    # Both products with the root are one, of matrices side by side.
     c = velocities.shape[1]
     if design == "square_root":
-        share = ca.repmat(damping_ratio * ca.sqrt(stiffness), 1, c)
-        both = multiply_by_root(inertia, ca.horzcat(share * velocities, velocities))
-        return both[:, :c] + share * both[:, c:]
-    root_K = ca.sqrt(_stiffen(stiffness, inertia))
-    scale = ca.repmat(root_K * ca.sqrt(damping_ratio), 1, c)
-    return 2 * scale * multiply_by_root(inertia / (root_K @ root_K.T), scale * velocities)
-
-
-def _stiffen(stiffness: Expression, inertia: Expression) -> Expression:
-    """The stiffness with springs as soft as the rounds of the square root can resolve; K_i < 0 and NaN stay invalid.
-
-    Squared frequencies K_i / M_ii are at least 1e-6 of the largest one, and 1e-12 1/s^2.
-    """
+        weight = ca.repmat(damping_ratio * ca.sqrt(stiffness), 1, c)
+        both = multiply_by_root(inertia, ca.horzcat(weight * velocities, velocities))
+        return both[:, :c] + weight * both[:, c:]
+    # Squared frequencies K_i / M_ii are at least as large as the rounds of the square root can resolve. K_i < 0 and NaN
+    # stay invalid.
     mass = ca.diag(inertia)
     floor = mass * ca.fmax(SOFTEST * ca.mmax(stiffness / mass), SOFTEST**2)
-    return ca.if_else(stiffness < 0, stiffness, ca.if_else(stiffness < floor, floor, stiffness))
+    stiff = ca.if_else(stiffness < 0, stiffness, ca.if_else(stiffness < floor, floor, stiffness))
+    root_K = ca.sqrt(stiff)
+    scale = ca.repmat(root_K * ca.sqrt(damping_ratio), 1, c)
+    return 2 * scale * multiply_by_root(inertia / (root_K @ root_K.T), scale * velocities)

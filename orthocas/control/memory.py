@@ -85,6 +85,7 @@ class Memory:
             if not re.fullmatch(r"[a-z]\w*", name, flags=re.ASCII):
                 raise InvalidValueError("name of a field", repr(name), "small letters, digits and underscores, for C")
         object.__setattr__(self, "start", start)
+        # The step's outputs, and its last inputs, are the fields.
         sizes, inputs = {name: len(value) for name, value in start.items()}, self.step.name_in()
         outputs = {name.removeprefix("next_"): self.step.size1_out(name) for name in self.step.name_out()}
         last = {name: self.step.size1_in(name) for name in inputs[len(inputs) - len(start) :]}
@@ -121,7 +122,7 @@ class Remembers(Protocol):
         """The memory of a law that has the input `extra_torque`."""
 
 
-def memory_of(controller: Controller) -> Memory | None:
+def find_memory(controller: Controller) -> Memory | None:
     """The memory of a law; None for laws without one."""
     return getattr(controller, "memory", None)
 
@@ -149,7 +150,7 @@ class Remembering(Shown):
 
     def __init__(self, controller: Controller) -> None:
         require_controller(controller)
-        memory = memory_of(controller)
+        memory = find_memory(controller)
         self._controller, self._memory = controller, memory
         self._law = _call_with_arrays(get_counted_function(controller))
         self._step = None if memory is None else _call_with_arrays(memory.step)
@@ -180,6 +181,7 @@ class Remembering(Shown):
             reference: value, velocity and acceleration, (3, k).
             period: time since the last tick [s].
         """
+        # The law at the position with its turns counted, with what it remembers added to its gains.
         law, n = self._controller, self._controller.problem.n
         targets = as_float_array("reference", reference)
         require_shape("reference", targets.shape, (3, len(law.labels)))
@@ -190,6 +192,7 @@ class Remembering(Shown):
         used = law.gains | {gain: law.gains[gain] + self.fields[name] for gain, name in adds.items()}
         command, (number,) = _evaluate(self._law, *state, *used.values())
         status = ControlStatus(int(number))
+        # The memory stands still while a limit cuts the command, and in the first tick.
         if self._step is not None:
             active, since = float(status == ControlStatus.OK), 0.0 if self._fresh else as_number("period", period)
             fields = _evaluate(self._step, *state, *law.gains.values(), command, active, since, *self.fields.values())
@@ -258,11 +261,11 @@ class MomentumObserver(_Correcting):
         payload = [inputs["payload"]] if "payload" in inputs else []
         p, rate = _build_momentum(law.problem.robot.tree, bool(payload), model.gravity == "law")(q, dq, *payload)
 
-        # The momentum that the last tick foresaw; after a start, the one that explains the correction
+        # The momentum that the last tick foresaw; after a start, the one that explains the correction.
         anew, later = p + inputs["correction"] / self.rate, inputs["expected"] + period * inputs["drive"]
         expected = ca.if_else(ca.logic_and(period > 0, ca.fabs(later) <= LARGEST), later, anew)
 
-        # r follows tau_ext; dp/dt = tau + C^T dq - g + r drives the momentum until the next tick
+        # r follows tau_ext; dp/dt = tau + C^T dq - g + r drives the momentum until the next tick.
         r = self.rate * (p - expected)
         drive = inputs["command"] - model.feed_forward(law.problem.robot, inputs) + rate + r
         return _build_memory(fields, inputs, {"expected": expected, "drive": drive, "correction": _clip(-r, bound)})
@@ -305,7 +308,7 @@ class Adaptation(_Correcting):
         inputs = _name_inputs(law, fields)
         q, dq = inputs["q"], inputs["dq"]
 
-        # Y at the desired velocity w and acceleration a of the joints
+        # Y at the desired velocity w and acceleration a of the joints.
         e, de, J = law._compute_errors(inputs)
         B, Lambda, _ = build_block_inertia(chart.n, (chart.n,))(J, law.model.own_mass_matrix(problem.robot, inputs))
         w = B @ (Lambda @ law._compute_drift(inputs))
@@ -313,15 +316,18 @@ class Adaptation(_Correcting):
         a = -B @ (Lambda @ compute_bias(chart, q, dq, w, reference))
         Y = regressor(q, dq, w, a)
 
-        # dp/dt = -rate gain Y^T J^-1 (de / c + e), while the law commands
-        springs = self._compute_joint_stiffness(law)[list(joints)] / RULES.gravity**2
+        # dp/dt = -rate gain Y^T J^-1 (de / c + e), while the law commands; gains follow its stiffness at the joints,
+        # the diagonal of J^T K J at the centre of the domain.
+        J_centre = chart.parts.batched_rates(problem.domain.centre[None])[0]
+        stiffness = np.asarray((J_centre**2 * law.stiffness[:, None]).sum(axis=0))
+        springs = stiffness[list(joints)] / RULES.gravity**2
         slowest = self._compute_crossing(law)
         slope = -min(self.rate, slowest) * springs * (Y.T @ (B @ (Lambda @ (de / slowest + e))))
         change = ca.if_else(inputs["active"] > 0, inputs["active"] * inputs["period"] * slope, 0)
         largest = np.full(len(joints), float(bound.max()) / RULES.gravity)
         moments = _clip(inputs["moments"] + _replace_invalid(change), largest)
 
-        # What no moment explains is known from the start only
+        # What no moment explains is known from the start only.
         offset = ca.if_else(inputs["period"] > 0, inputs["offset"], inputs["correction"] - Y @ moments)
         correction = _clip(Y @ moments + offset, bound)
         offset = _replace_invalid(offset)
@@ -329,17 +335,13 @@ class Adaptation(_Correcting):
 
     def _compute_crossing(self, law: "_OperationalSpace") -> float:
         """c [1/s]; larger weights, and faster learning, make soft laws swing."""
+        # The slowest mode with a spring.
         modes = law.modes(law.problem.domain.centre)
         sprung = modes.frequencies > 0
         decays = 2 * np.pi * modes.frequencies[sprung] * np.minimum(modes.damping_ratios[sprung], 1.0)
         if not (decays > 0).any():
             raise InvalidValueError("law with a memory", "without springs and damping", "both, to learn from errors")
         return RULES.crossed * float(decays[decays > 0].min())
-
-    def _compute_joint_stiffness(self, law: "_OperationalSpace") -> Array:
-        """Stiffness of the law at the joints, the diagonal of J^T K J in the middle of the domain, (n,)."""
-        J = law.chart.parts.batched_rates(law.problem.domain.centre[None])[0]
-        return np.asarray((J**2 * law.stiffness[:, None]).sum(axis=0))
 
 
 MEMORIES: Mapping[str, type[MomentumObserver] | type[Adaptation]] = {
@@ -401,7 +403,7 @@ def _build_regressor(tree: KinematicTree) -> tuple[ca.Function, tuple[int, ...]]
     numbers = ca.SX.sym("numbers", len(dynamics.collect_inertials(tree)))
     rest, weightless = ca.SX(tree.n, 1), np.zeros(3)
     force = dynamics.build_inverse_dynamics(tree, q, rest, a, tree.gravity, inertials=numbers)
-    # C(q, dq) w by polarisation, as in `dynamics.build_coriolis_product`
+    # C(q, dq) w by polarisation, as in `dynamics.build_coriolis_product`.
     for sign in (1, -1):
         force += sign / 4 * dynamics.build_bias(tree, q, dq + sign * w, weightless, inertials=numbers)
     places, joints = dynamics.find_first_moments(tree)

@@ -179,9 +179,7 @@ class _OperationalSpace(LawOfChart):
         for name, value in {
             "chart": chart,
             "stiffness": (positive_gains if as_stiffness else non_negative_gains)("stiffness", stiffness, n),
-            "damping_stiffness": None
-            if damping_stiffness is None
-            else positive_gains("damping_stiffness", damping_stiffness, n),
+            "damping_stiffness": damping_stiffness,
             "model": model,
             "damping_ratio": non_negative_gains("damping_ratio", damping_ratio, n),
             "coupling": coupling,
@@ -193,6 +191,7 @@ class _OperationalSpace(LawOfChart):
         if remembers is not None:
             # Bounds of another size raise here.
             _ = self.memory
+        # Doubtful settings are accepted with a warning.
         doubts = [*_doubt_ratio(self.damping_ratio), *self._find_holding_doubts()]
         if coupling == "decoupled" and (metric := chart.problem.metric.name) != "inertia":
             doubts.append(f"a decoupled law relies on A = M (inertia), but the metric of this chart is {metric}")
@@ -225,6 +224,7 @@ class _OperationalSpace(LawOfChart):
         Raises:
             ShapeError, InvalidValueError, UnknownNameError: as for the law itself, and for a delay beside a stiffness.
         """
+        # Words become the objects that they name.
         require_known("memory", memory, ("none", *MEMORIES))
         remembers = None if memory == "none" else MEMORIES[memory]()
         if stiffness is None:
@@ -280,13 +280,19 @@ class _OperationalSpace(LawOfChart):
                 "(inertia)"
             )
         result += _doubt_ratio(self.damping_ratio)
-        if self.coupling == "decoupled" and (leak := self._compute_leak_deg()) > RULES.much_deg:
-            result.append(
-                f"the gradients of this chart lean into the task by {leak:.0f} deg (rms): decoupled springs pull at "
-                "both, which coupled ones do not; see docs/how-to/wide.md"
-            )
-        if share := self.check_damping().indefinite_share:
-            where = f"in {percent(share, fault=True)} of the domain with these gains"
+        # Where coordinates leak, decoupled springs pull at task and xi.
+        if self.coupling == "decoupled":
+            points = sample_uniform(self.problem.domain, RULES.samples, 0)
+            sines = Judged.at(self.problem, self.chart.coordinates, points).leak_sines
+            leak = float(np.degrees(np.sqrt(np.mean(np.arcsin(np.clip(sines, 0.0, 1.0)) ** 2))))
+            if leak > RULES.much_deg:
+                result.append(
+                    f"the gradients of this chart lean into the task by {leak:.0f} deg (rms): decoupled springs pull "
+                    "at both, which coupled ones do not; see docs/how-to/wide.md"
+                )
+        # Indefinite damping can feed energy in.
+        if fraction := self.check_damping().indefinite_share:
+            where = f"in {percent(fraction, fault=True)} of the domain with these gains"
             result.append(f"the damping matrix (29) is indefinite {where}; the damping design double_diagonal never is")
         return result + self.model.remarks()
 
@@ -295,12 +301,6 @@ class _OperationalSpace(LawOfChart):
         if self.model.gravity == "robot":
             return []
         return find_holding_doubts(self.model.robot(self.problem), self.problem.domain, self.limit)
-
-    def _compute_leak_deg(self) -> float:
-        """Root mean square of the chart's leaks at samples [deg]."""
-        points = sample_uniform(self.problem.domain, RULES.samples, 0)
-        sines = Judged.at(self.problem, self.chart.coordinates, points).leak_sines
-        return float(np.degrees(np.sqrt(np.mean(np.arcsin(np.clip(sines, 0.0, 1.0)) ** 2))))
 
     @property
     def gains(self) -> dict[str, Array]:
@@ -321,19 +321,19 @@ class _OperationalSpace(LawOfChart):
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
         q, dq, robot, model = inputs["q"], inputs["dq"], self.problem.robot, self.model
 
-        # f_imp = -K e - D de, (33); Lambda is M_phi, or its blocks
+        # f_imp = -K e - D de, (33); Lambda is M_phi, or its blocks.
         e, de, J = self._compute_errors(inputs)
         B, Lambda, volume = self._compute_inertia(J, model.mass_matrix(robot, inputs))
         force = -inputs["stiffness"] * e - self._apply_damping(Lambda, inputs, de)
 
-        # f_FF = Lambda (dd_phi_d + (J M^-1 C - dJ/dt) w), (35), with w = J^-1 d_phi_d: by (8) also when decoupled
+        # f_FF = Lambda (dd_phi_d + (J M^-1 C - dJ/dt) w), (35), with w = J^-1 d_phi_d: by (8) also when decoupled.
         if self.feed_forward:
             w = B @ (Lambda @ self._compute_drift(inputs))
             reference = inputs["reference"], inputs["reference_velocity"], inputs["reference_acceleration"]
             bias = compute_bias(self.chart, q, dq, dq if model.source == "given" else w, reference)
             force += Lambda @ (B.T @ model.coriolis_torque(robot, inputs, w) - bias)
 
-        # tau = J^T f + g + J_tip^T wrench + extra_torque
+        # tau = J^T f + g + J_tip^T wrench + extra_torque.
         gravity = model.gravity_torque(robot, inputs)
         torque = J.T @ force + gravity + model.feed_forward(robot, inputs)
         relative = volume / self.median_volume
@@ -359,6 +359,7 @@ class _OperationalSpace(LawOfChart):
         that of the problem's robot with the payload, also if the law is given another one.
         """
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
+        # Kinetic and spring energy, and the power of the damping.
         K = ca.diag(inputs["stiffness"])
         M = self.model.own_mass_matrix(self.problem.robot, inputs)
         e, de, J = self._compute_errors(inputs)
@@ -425,9 +426,14 @@ class _OperationalSpace(LawOfChart):
 
     def _apply_damping(self, Lambda: ca.MX, inputs: dict[str, ca.MX], velocities: ca.MX) -> ca.MX:
         """D V, with the same blocks, for V (n, c)."""
+        # A function of its own, block by block, so that its code appears once.
+        n, c = velocities.shape
+        inertia, K, Z, V = (ca.MX.sym(*of) for of in (("Lambda", n, n), ("K", n), ("Z", n), ("V", n, c)))
+        places = [place.tolist() for place in np.split(np.arange(n), np.cumsum(self._blocks)[:-1])]
+        parts = [apply_damping(self.damping, inertia[p, p], K[p], Z[p], V[p, :]) for p in places]
+        damping = ca.Function("damping", [inertia, K, Z, V], [ca.densify(ca.vertcat(*parts))])
         designed_for = inputs.get("damping_stiffness", inputs["stiffness"])
-        function = _build_block_damping(self.damping, self._blocks, velocities.shape[1])
-        return function(Lambda, designed_for, inputs["damping_ratio"], velocities)
+        return damping(Lambda, designed_for, inputs["damping_ratio"], velocities)
 
     def _compute_errors(self, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
         """The error e, how fast it changes, and J = de/dq."""
@@ -490,12 +496,3 @@ class PDPlus(_OperationalSpace):
     feed_forward = True
     name: ClassVar[str] = "pd_plus"
     force = "Operational space PD+: tau = J^T (f_imp + f_FF)"
-
-
-def _build_block_damping(design: DampingDesign, blocks: tuple[int, ...], columns: int) -> ca.Function:
-    """Lambda (block diagonal), stiffness, damping_ratio, V (n, columns) -> D V; D has the same blocks."""
-    n = sum(blocks)
-    Lambda, K, Z, V = (ca.MX.sym(*of) for of in (("Lambda", n, n), ("K", n), ("Z", n), ("V", n, columns)))
-    places = [place.tolist() for place in np.split(np.arange(n), np.cumsum(blocks)[:-1])]
-    parts = [apply_damping(design, Lambda[p, p], K[p], Z[p], V[p, :]) for p in places]
-    return ca.Function("damping", [Lambda, K, Z, V], [ca.densify(ca.vertcat(*parts))])

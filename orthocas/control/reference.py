@@ -98,6 +98,7 @@ class Reference(Shown):
         _require_number("duration", duration, above=0.0)
         zeta = _require_number("damping_ratio", damping_ratio, above=-np.finfo(float).tiny)
         times, targets = _build_stairs(names, value, changes, duration)
+        # Each segment starts where the one before ends.
         profile = build_low_pass(len(names), omega0, zeta)
         run = Batched(profile)
         parameters = [np.concatenate([targets[0], value, np.zeros_like(value)])]
@@ -123,6 +124,7 @@ class Reference(Shown):
         values = freeze_array("points", points, (len(t), len(names)))
         if len(t) < 2 or t[0] != 0 or np.diff(t).min() <= 0:
             raise InvalidValueError("times", t.tolist(), "at least two increasing times that begin with 0")
+        # At rest at both ends; the profile takes the polynomials one by one, highest power first.
         rest = [(order, np.zeros(len(names))) for order in (1, 2)]
         spline = scipy.interpolate.make_interp_spline(t, values, RULES.degree, bc_type=(rest, rest))
         taylor = [spline(t[:-1], order) / factorial(order) for order in reversed(range(RULES.degree + 1))]
@@ -188,6 +190,7 @@ def build_low_pass(k: int, natural_frequency: float, damping_ratio: float) -> ca
         A function of time t >= 0 and [target; value at t = 0; velocity at t = 0] (3 k, 1) -> value, velocity and
         acceleration, each (k, 1).
     """
+    # cosine and sine of the damped oscillation, each with its limit where it does not swing.
     t, parameters = ca.SX.sym("t"), ca.SX.sym("parameters", 3 * k)
     target, value0, velocity0 = parameters[:k], parameters[k : 2 * k], parameters[2 * k :]
     decay, beat = damping_ratio * natural_frequency, natural_frequency * np.sqrt(abs(1 - damping_ratio**2))
@@ -223,20 +226,16 @@ def _check_names(labels: Sequence[str]) -> tuple[str, ...]:
     return tuple(labels)
 
 
-def _check_changes(changes: Sequence[Change]) -> Sequence[Change]:
-    require_kind("changes", changes, Sequence)
-    for change in changes:
-        if not isinstance(change, Sequence) or len(change) != 2:
-            raise InvalidValueError("an entry of changes", repr(change)[:80], "a time and targets, (0.5, {'x': 0.1})")
-    return changes
-
-
 def _build_stairs(
     labels: tuple[str, ...], start: Array, changes: Sequence[Change], duration: float
 ) -> tuple[Array, Array]:
     """Segment boundaries (S + 1,) and targets (S, k)."""
     times, targets = [0.0], [start]
-    for time, moves in _check_changes(changes):
+    require_kind("changes", changes, Sequence)
+    for change in changes:
+        if not isinstance(change, Sequence) or len(change) != 2:
+            raise InvalidValueError("an entry of changes", repr(change)[:80], "a time and targets, (0.5, {'x': 0.1})")
+        time, moves = change
         at = _require_number("time of a step", time)
         if not times[-1] <= at < duration:
             raise InvalidValueError("time of a step", at, f"from {times[-1]:g} to below the duration {duration:g} s")
@@ -245,6 +244,7 @@ def _build_stairs(
         for label, value in moves.items():
             require_known("quantity", label, labels)
             target[labels.index(label)] = _require_number(f"target of {label}", value)
+        # Changes at one time are one step.
         if at == times[-1]:
             targets[-1] = target
         else:
@@ -313,6 +313,7 @@ def _explain_outside(chart: Chart, q: Array) -> str:
     domain = chart.problem.domain
     if domain.condition is not None and not np.all(np.asarray(domain.condition.pivots(q)) > 0):
         return domain.explain(q)
+    # The joint that is farthest out, in widths of its range.
     low, high = domain.bounds
     i = int(np.argmax(np.abs(q - domain.centre) / (high - low)))
     low, high = low[i], high[i]

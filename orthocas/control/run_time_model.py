@@ -76,6 +76,7 @@ class RunTimeModel:
 
     def gains(self, problem: Problem, coriolis: bool) -> dict[str, Array]:
         """The default values of the inputs by name; a given model is that of the centre of the domain at rest."""
+        # What was asked for becomes an input; a given model takes the place of the law's own.
         result: dict[str, Array] = {}
         for name in ("payload", "wrench"):
             if (value := getattr(self, name)) is not None:

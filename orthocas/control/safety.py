@@ -94,14 +94,24 @@ class Safety:
     brake_yield: Annotated[Array, "largest torque of that spring, which gives way slowly beyond it [N m]"]
 
     def __post_init__(self) -> None:
+        # The kind of a setting is that of its annotation.
         for setting in fields(self):
             value = getattr(self, setting.name)
             if get_args(setting.type)[0] is int:
                 require_count(setting.name, value, least=0)
             elif get_args(setting.type)[0] is float:
-                _require_number(setting.name, value)
+                if not 0 < as_number(setting.name, value) < np.inf:
+                    raise InvalidValueError(setting.name, value, "a finite number > 0")
             else:
-                object.__setattr__(self, setting.name, _freeze_numbers(setting.name, value))
+                # Lists are frozen; some may be infinite, some negative.
+                array = np.array(as_float_array(setting.name, value))
+                infinite = setting.name not in UNBOUNDED and np.isinf(array).any()
+                if array.ndim != 1 or np.isnan(array).any() or infinite:
+                    raise InvalidValueError(setting.name, array.tolist(), "a list of numbers")
+                if setting.name not in SIGNED and array.size and array.min() < 0:
+                    raise InvalidValueError(setting.name, array.min(), "numbers >= 0")
+                array.setflags(write=False)
+                object.__setattr__(self, setting.name, array)
         if not self.catch_margin < self.near_margin < self.return_margin < 1:
             margins = (self.catch_margin, self.near_margin, self.return_margin)
             raise InvalidValueError("margins", margins, "catch_margin < near_margin < return_margin < 1")
@@ -133,6 +143,7 @@ class Safety:
         """
         require_controller(controller)
         robot, n, domain = controller.problem.robot, controller.problem.n, controller.problem.domain
+        # The mass matrix at the centre, and gravity and the span of the quantities at samples.
         M = np.asarray(robot.mass_matrix(domain.centre))
         points = sample_uniform(domain, RULES.samples, RULES.seed)
         gravity = np.abs(robot.gravity(points)).max(axis=0)
@@ -186,6 +197,7 @@ def _compute_joint_motion(controller: Controller, points: Array, slow: Array) ->
         q = ca.MX.sym("q", n)
         moving = ca.vertcat(relative.rates(q), ca.jacobian(controller.measured(q)[m:], q))
         function = dense_function("J", [q], [moving])
+    # The slowest joint counts, at 90 % of the points.
     J = Batched(function)(points)[0].reshape(len(points), -1, n)
     largest = (np.abs(np.linalg.pinv(J[np.isfinite(J).all(axis=(1, 2))])) / slow[:, None]).max(axis=1)
     return np.asarray(np.quantile(largest, 0.9, axis=0))
@@ -199,18 +211,3 @@ def _spread(name: str, value: ArrayLike, default: object) -> object:
     if numbers.ndim:
         require_shape(name, numbers.shape, default.shape)
     return np.full(default.shape, numbers)
-
-
-def _require_number(name: str, value: float) -> None:
-    if not 0 < as_number(name, value) < np.inf:
-        raise InvalidValueError(name, value, "a finite number > 0")
-
-
-def _freeze_numbers(name: str, value: ArrayLike) -> Array:
-    array = np.array(as_float_array(name, value))
-    if array.ndim != 1 or np.isnan(array).any() or (name not in UNBOUNDED and np.isinf(array).any()):
-        raise InvalidValueError(name, array.tolist(), "a list of numbers")
-    if name not in SIGNED and array.size and array.min() < 0:
-        raise InvalidValueError(name, array.min(), "numbers >= 0")
-    array.setflags(write=False)
-    return array

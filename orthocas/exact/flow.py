@@ -39,83 +39,6 @@ RULES = FlowRules()
 TOLERANCE = 1e-10  #: default local error of a step [rad] or [m]; end points are then accurate to about 1e-8
 
 
-@dataclass(frozen=True, eq=False)
-class BatchedFlow:
-    """Integrates dy/ds = f(y, p) from s = 0 to 1 for many y and p, by the 8th-order method of Dormand and Prince.
-
-    Coefficients and error estimate are those of `scipy.integrate.DOP853` ([HNW1993] Sec. II.10); the batching is ours.
-
-    Args:
-        field: f, (k, 1) x (l, 1) -> (k, 1).
-        scale: factor on the tolerance of each state, (k,).
-    """
-
-    field: ca.Function
-    scale: Array
-
-    def find_end_points(self, starts: Array, parameters: Array, tolerance: float) -> tuple[Array, NDArray[np.bool_]]:
-        """States at s = 1, (N, k), and which trajectories reached s = 1, (N,).
-
-        The other trajectories stopped where the step size fell below 1e-9 or the field was not finite. Their rows hold
-        the last state.
-
-        Args:
-            starts: (N, k).
-            parameters: (N, l).
-            tolerance: tolerance of the local error of a step.
-        """
-        y, s, step = starts.copy(), np.zeros(len(starts)), np.full(len(starts), RULES.first)
-        running = np.arange(len(starts))
-        while running.size:
-            # Try a step of each running trajectory, keep good ones, and adapt all step sizes.
-            tried = np.minimum(step[running], 1 - s[running])
-            moved, error = self._take_steps(y[running], tried[:, None], parameters[running])
-            ratio = np.nan_to_num(error[:, 0] / tolerance, nan=np.inf)
-            good = ratio <= 1
-            y[running[good]] = moved[good]
-            s[running[good]] += tried[good]
-            growth = RULES.safety * np.maximum(ratio, 1e-16) ** (-1 / 8)
-            step[running] = tried * np.clip(growth, RULES.shrink, RULES.grow)
-            running = running[(s[running] < 1) & (step[running] > RULES.smallest)]
-        return y, s >= 1
-
-    def _take_steps(self, *arguments: Array) -> list[Array]:
-        """One step of some trajectories: y (N, k), step sizes (N, 1), p (N, l) -> y (N, k), errors (N, 1)."""
-        N = len(arguments[0])
-        if RULES.few >= N:
-            return self._few(*arguments)
-        outputs = self._many(*map(arrange_blocks, arguments))
-        return [split_by_sample(out[:, None], N)[:, :, 0] for out in outputs]
-
-    @cached_property
-    def _few(self) -> Batched:
-        return Batched(self._step)
-
-    @cached_property
-    def _many(self) -> ColumnFunction:
-        return ColumnFunction(self._step)
-
-    @cached_property
-    def _step(self) -> ca.Function:
-        """One step: y, step size, p -> new y and its estimated error in units of the tolerance."""
-        k = self.field.size1_in(0)
-        y, step, p = ca.SX.sym("y", k), ca.SX.sym("step"), ca.SX.sym("p", self.field.size1_in(1))
-        method, slopes = scipy.integrate.DOP853, list[Any]()
-        for i in range(RULES.stages):
-            slopes.append(self.field(y + step * _sum_weighted(method.A[i, :i], slopes), p) if i else self.field(y, p))
-        moved = y + step * _sum_weighted(method.B, slopes)
-        scale = ca.DM(self.scale)
-        fifth = ca.sumsqr(_sum_weighted(method.E5[: RULES.stages], slopes) / scale)
-        third = ca.sumsqr(_sum_weighted(method.E3[: RULES.stages], slopes) / scale)
-        error = step * fifth / ca.sqrt(fifth + 0.01 * third + 1e-300)
-        return dense_function("step", [y, step, p], [moved, error])
-
-
-def _sum_weighted(weights: Array, slopes: list[Any]) -> Any:
-    """Weighted sum, without the terms whose weight is zero."""
-    return sum(float(w) * slope for w, slope in zip(weights, slopes, strict=True) if w != 0)
-
-
 class Arrival(IntEnum):
     """How a trajectory ended."""
 
@@ -135,94 +58,6 @@ class Moved:
     def reached(self) -> NDArray[np.bool_]:
         """Which trajectories reached the desired task value, (N,)."""
         return np.asarray(self.status == Arrival.REACHED)
-
-
-@dataclass(frozen=True, eq=False)
-class TaskFlow:
-    """The flow dq/ds = J_x^#A dx, s in [0, 1], which changes task values by exactly dx, A-orthogonally to the leaves.
-
-    For m = 1 it is dq/ds = dx grad_A h / (dh(grad_A h)), the curve of [AS2023] eq. (23) with the task value as its
-    parameter. It ends on the desired leaf without a stopping rule (ours,
-    docs/explanation/derivations_exact.md#growing). For m >= 2 it follows the straight line in task coordinates; other
-    paths end elsewhere unless the distribution is involutive.
-    """
-
-    problem: Problem
-
-    def move(self, points: Array, dx: Array, tolerance: float = TOLERANCE) -> Moved:
-        """Change the task values of points (N, n) by dx (N, m).
-
-        Args:
-            points: joint positions.
-            dx: desired changes of the task values.
-            tolerance: local error of a step [rad] or [m].
-        """
-        ends, arrived = self._positions.find_end_points(points, dx, tolerance)
-        return Moved(ends, np.where(arrived, Arrival.REACHED, Arrival.SINGULAR))
-
-    def pull(self, points: Array, level: Array, tolerance: float = TOLERANCE) -> Moved:
-        """Pull points (N, n) to the leaf h(q) = level (m,)."""
-        return self.move(points, level - self.problem.task.batched(points)[0], tolerance)
-
-    def pull_with_derivative(self, points: Array, level: Array, tolerance: float = TOLERANCE) -> tuple[Moved, Array]:
-        """Do the same as `pull`, and return d q_hat / dq, (N, n, n), by forward sensitivities.
-
-        The flow maps leaves to leaves, so r vectors v that start tangent to the leaf of q stay tangent to leaves, with
-        dv/ds = (df/dq) v. The code stores each v as a direction and the logarithm of its length. Where flow lines
-        converge, lengths fall by many orders of magnitude, and rounding would destroy the directions of v itself. Since
-        q_hat is constant along the flow, the derivative is [v_1 ... v_r] Z^T A, where Z is an A-orthonormal basis of
-        ker J_x(q).
-        """
-        n, r = self.problem.n, self.problem.r
-        A = self.problem.metric.evaluate(points)
-        inverse = np.asarray(np.linalg.inv(A), dtype=float)
-        # Tangent vectors start as an A-orthonormal basis of ker J_x.
-        samples = Samples(points, self.problem.task.evaluate_jacobian(points), inverse)
-        Z = samples.null_basis
-        lengths = np.linalg.norm(Z, axis=1)
-        directions = (Z / lengths[:, None, :]).transpose(0, 2, 1).reshape(-1, r * n)
-        starts = np.concatenate([points, directions, np.log(lengths)], axis=1)
-        dx = level - self.problem.task.batched(points)[0]
-        ends, arrived = self._with_tangents.find_end_points(starts, dx, tolerance)
-        # Directions and logarithms of lengths make the vectors again.
-        tangents = ends[:, n : n + r * n].reshape(-1, r, n) * np.exp(ends[:, n + r * n :])[:, :, None]
-        moved = Moved(ends[:, :n], np.where(arrived, Arrival.REACHED, Arrival.SINGULAR))
-        return moved, tangents.transpose(0, 2, 1) @ Z.transpose(0, 2, 1) @ A
-
-    @cached_property
-    def field(self) -> ca.Function:
-        """q (n, 1), dx (m, 1) -> J_x^#A dx (n, 1)."""
-        q, dx = ca.SX.sym("q", self.problem.n), ca.SX.sym("dx", self.problem.m)
-        gradients = self.build_gradients(q)
-        J = self.problem.task.jacobian_function(q)
-        return dense_function("field", [q, dx], [gradients @ _solve_spd(J @ gradients, dx)])
-
-    def build_gradients(self, q: ca.SX) -> ca.SX:
-        """Gradients of the task in the metric, A^-1 J_x^T (n, m), for a symbol q ([AS2023] eq. (16))."""
-        J = self.problem.task.jacobian_function(q)
-        return J.T if self.problem.metric.is_identity else _solve_spd(self.problem.metric.function(q), J.T)
-
-    @cached_property
-    def _positions(self) -> BatchedFlow:
-        return BatchedFlow(self.field, np.ones(self.problem.n))
-
-    @cached_property
-    def _with_tangents(self) -> BatchedFlow:
-        """The flow with r tangent vectors, stored as directions u with |u| = 1 and logarithms of lengths."""
-        n, m, r = self.problem.n, self.problem.m, self.problem.r
-        y, dx = ca.SX.sym("y", n + r * (n + 1)), ca.SX.sym("dx", m)
-        q, directions = y[:n], ca.reshape(y[n : n + r * n], n, r)
-        dq = self.field(q, dx)
-        turning = ca.jacobian(dq, q) @ directions
-        stretching = ca.sum1(directions * turning) / ca.sum1(directions**2)
-        rates = turning - directions * ca.repmat(stretching, n, 1)
-        field = dense_function("field_with_tangents", [y, dx], [ca.vertcat(dq, ca.vec(rates), stretching.T)])
-        return BatchedFlow(field, np.r_[np.ones(n), np.full(r * (n + 1), RULES.looser)])
-
-
-def _solve_spd(A: ca.SX, B: ca.SX) -> ca.SX:
-    """A^-1 B for symmetric positive definite A, with half the operations of `ca.solve`."""
-    return ca.ldl_solve(B, *ca.ldl(A))
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,21 +122,17 @@ class GrownCoordinates:
         solution are NaN.
         """
         m, n = self.problem.m, self.problem.n
+        # The point of the leaf with these coordinates, then along the flow to the task values.
         start = self.flow.pull(q_start, self.leaf.level)
         on_leaf = self.leaf.points(phi[:, m:], np.where(start.reached[:, None], start.points, np.nan))
-        known = np.isfinite(on_leaf).all(axis=1)
-        solutions = np.full((len(phi), n), np.nan)
-        moved = self.flow.move(on_leaf[known], phi[known, :m] - self.leaf.level, RULES.inverse)
-        solutions[known] = np.where(moved.reached[:, None], self._correct_task(moved.points, phi[known, :m]), np.nan)
+        rows = np.isfinite(on_leaf).all(axis=1)
+        solutions, x = np.full((len(phi), n), np.nan), phi[rows, :m]
+        moved = self.flow.move(on_leaf[rows], x - self.leaf.level, RULES.inverse)
+        # One more step removes the integration error, which matters if task values are large numbers.
+        left = x - self.problem.task.batched(moved.points)[0]
+        corrected = self.flow.move(moved.points, left, RULES.inverse).points
+        solutions[rows] = np.where(moved.reached[:, None], corrected, np.nan)
         return q_start + remove_turns(self.problem, solutions - q_start) if self.leaf.periodic else solutions
-
-    def _correct_task(self, points: Array, x: Array) -> Array:
-        """Points (N, n) after a Newton step along the task gradients to the task values x (N, m).
-
-        The step removes the integration error, which matters if task values are large numbers.
-        """
-        dx = x - self.problem.task.batched(points)[0]
-        return self.flow.move(points, dx, RULES.inverse).points
 
     @property
     def functions(self) -> dict[str, ca.Function]:
@@ -316,7 +147,7 @@ class GrownCoordinates:
         )
 
     @cached_property
-    def flow(self) -> TaskFlow:
+    def flow(self) -> "TaskFlow":
         """The flow along the task gradients."""
         return TaskFlow(self.problem)
 
@@ -329,5 +160,169 @@ class GrownCoordinates:
         return np.where(moved.reached & ~values.inside, Arrival.OUTSIDE, moved.status)
 
     def _mask_unknown(self, moved: Moved, values: LeafValues, results: Array) -> Array:
-        known = self._find_status(moved, values) == Arrival.REACHED
-        return np.where(known.reshape(-1, *[1] * (results.ndim - 1)), results, np.nan)
+        reached = self._find_status(moved, values) == Arrival.REACHED
+        return np.where(reached.reshape(-1, *[1] * (results.ndim - 1)), results, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class TaskFlow:
+    """The flow dq/ds = J_x^#A dx, s in [0, 1], which changes task values by exactly dx, A-orthogonally to the leaves.
+
+    For m = 1 it is dq/ds = dx grad_A h / (dh(grad_A h)), the curve of [AS2023] eq. (23) with the task value as its
+    parameter. It ends on the desired leaf without a stopping rule (ours,
+    docs/explanation/derivations_exact.md#growing). For m >= 2 it follows the straight line in task coordinates; other
+    paths end elsewhere unless the distribution is involutive.
+    """
+
+    problem: Problem
+
+    def move(self, points: Array, dx: Array, tolerance: float = TOLERANCE) -> Moved:
+        """Change the task values of points (N, n) by dx (N, m).
+
+        Args:
+            points: joint positions.
+            dx: desired changes of the task values.
+            tolerance: local error of a step [rad] or [m].
+        """
+        ends, arrived = self._positions.find_end_points(points, dx, tolerance)
+        return Moved(ends, np.where(arrived, Arrival.REACHED, Arrival.SINGULAR))
+
+    def pull(self, points: Array, level: Array, tolerance: float = TOLERANCE) -> Moved:
+        """Pull points (N, n) to the leaf h(q) = level (m,)."""
+        return self.move(points, level - self.problem.task.batched(points)[0], tolerance)
+
+    def pull_with_derivative(self, points: Array, level: Array) -> tuple[Moved, Array]:
+        """Do the same as `pull`, and return d q_hat / dq, (N, n, n), by forward sensitivities.
+
+        The flow maps leaves to leaves, so r vectors v that start tangent to the leaf of q stay tangent to leaves, with
+        dv/ds = (df/dq) v. The code stores each v as a direction and the logarithm of its length. Where flow lines
+        converge, lengths fall by many orders of magnitude, and rounding would destroy the directions of v itself. Since
+        q_hat is constant along the flow, the derivative is [v_1 ... v_r] Z^T A, where Z is an A-orthonormal basis of
+        ker J_x(q).
+        """
+        n, r = self.problem.n, self.problem.r
+        A = self.problem.metric.evaluate(points)
+        inverse = np.asarray(np.linalg.inv(A), dtype=float)
+        # Tangent vectors start as an A-orthonormal basis of ker J_x.
+        samples = Samples(points, self.problem.task.evaluate_jacobian(points), inverse)
+        Z = samples.null_basis
+        lengths = np.linalg.norm(Z, axis=1)
+        directions = (Z / lengths[:, None, :]).transpose(0, 2, 1).reshape(-1, r * n)
+        starts = np.concatenate([points, directions, np.log(lengths)], axis=1)
+        dx = level - self.problem.task.batched(points)[0]
+        ends, arrived = self._with_tangents.find_end_points(starts, dx, TOLERANCE)
+        # Directions and logarithms of lengths make the vectors again.
+        tangents = ends[:, n : n + r * n].reshape(-1, r, n) * np.exp(ends[:, n + r * n :])[:, :, None]
+        moved = Moved(ends[:, :n], np.where(arrived, Arrival.REACHED, Arrival.SINGULAR))
+        return moved, tangents.transpose(0, 2, 1) @ Z.transpose(0, 2, 1) @ A
+
+    @cached_property
+    def field(self) -> ca.Function:
+        """q (n, 1), dx (m, 1) -> J_x^#A dx (n, 1)."""
+        q, dx = ca.SX.sym("q", self.problem.n), ca.SX.sym("dx", self.problem.m)
+        gradients = self.build_gradients(q)
+        J = self.problem.task.jacobian_function(q)
+        return dense_function("field", [q, dx], [gradients @ _solve_spd(J @ gradients, dx)])
+
+    def build_gradients(self, q: ca.SX) -> ca.SX:
+        """Gradients of the task in the metric, A^-1 J_x^T (n, m), for a symbol q ([AS2023] eq. (16))."""
+        J = self.problem.task.jacobian_function(q)
+        return J.T if self.problem.metric.is_identity else _solve_spd(self.problem.metric.function(q), J.T)
+
+    @cached_property
+    def _positions(self) -> "BatchedFlow":
+        return BatchedFlow(self.field, np.ones(self.problem.n))
+
+    @cached_property
+    def _with_tangents(self) -> "BatchedFlow":
+        """The flow with r tangent vectors, stored as directions u with |u| = 1 and logarithms of lengths."""
+        n, m, r = self.problem.n, self.problem.m, self.problem.r
+        y, dx = ca.SX.sym("y", n + r * (n + 1)), ca.SX.sym("dx", m)
+        q, directions = y[:n], ca.reshape(y[n : n + r * n], n, r)
+        dq = self.field(q, dx)
+        turning = ca.jacobian(dq, q) @ directions
+        stretching = ca.sum1(directions * turning) / ca.sum1(directions**2)
+        rates = turning - directions * ca.repmat(stretching, n, 1)
+        field = dense_function("field_with_tangents", [y, dx], [ca.vertcat(dq, ca.vec(rates), stretching.T)])
+        return BatchedFlow(field, np.r_[np.ones(n), np.full(r * (n + 1), RULES.looser)])
+
+
+def _solve_spd(A: ca.SX, B: ca.SX) -> ca.SX:
+    """A^-1 B for symmetric positive definite A, with half the operations of `ca.solve`."""
+    return ca.ldl_solve(B, *ca.ldl(A))
+
+
+@dataclass(frozen=True, eq=False)
+class BatchedFlow:
+    """Integrates dy/ds = f(y, p) from s = 0 to 1 for many y and p, by the 8th-order method of Dormand and Prince.
+
+    Coefficients and error estimate are those of `scipy.integrate.DOP853` ([HNW1993] Sec. II.10); the batching is ours.
+
+    Args:
+        field: f, (k, 1) x (l, 1) -> (k, 1).
+        scale: factor on the tolerance of each state, (k,).
+    """
+
+    field: ca.Function
+    scale: Array
+
+    def find_end_points(self, starts: Array, parameters: Array, tolerance: float) -> tuple[Array, NDArray[np.bool_]]:
+        """States at s = 1, (N, k), and which trajectories reached s = 1, (N,).
+
+        The other trajectories stopped where steps became too short or the field was not finite. Their rows hold the
+        last state.
+
+        Args:
+            starts: (N, k).
+            parameters: (N, l).
+            tolerance: tolerance of the local error of a step.
+        """
+        y, s, step = starts.copy(), np.zeros(len(starts)), np.full(len(starts), RULES.first)
+        running = np.arange(len(starts))
+        while running.size:
+            # Try a step of each running trajectory, of many in blocks of columns.
+            tried = np.minimum(step[running], 1 - s[running])
+            inputs = y[running], tried[:, None], parameters[running]
+            if running.size <= RULES.few:
+                moved, error = self._few(*inputs)
+            else:
+                outputs = self._many(*map(arrange_blocks, inputs))
+                moved, error = (split_by_sample(out[:, None], running.size)[:, :, 0] for out in outputs)
+            # Keep good steps, and adapt the sizes of all.
+            ratio = np.nan_to_num(error[:, 0] / tolerance, nan=np.inf)
+            good = ratio <= 1
+            y[running[good]] = moved[good]
+            s[running[good]] += tried[good]
+            growth = RULES.safety * np.maximum(ratio, 1e-16) ** (-1 / 8)
+            step[running] = tried * np.clip(growth, RULES.shrink, RULES.grow)
+            running = running[(s[running] < 1) & (step[running] > RULES.smallest)]
+        return y, s >= 1
+
+    @cached_property
+    def _few(self) -> Batched:
+        return Batched(self._step)
+
+    @cached_property
+    def _many(self) -> ColumnFunction:
+        return ColumnFunction(self._step)
+
+    @cached_property
+    def _step(self) -> ca.Function:
+        """One step: y, step size, p -> new y and its estimated error in units of the tolerance."""
+        # Slopes at the stages, each from those before, then the step and two estimates of its error.
+        k = self.field.size1_in(0)
+        y, step, p = ca.SX.sym("y", k), ca.SX.sym("step"), ca.SX.sym("p", self.field.size1_in(1))
+        method, slopes = scipy.integrate.DOP853, list[Any]()
+        for i in range(RULES.stages):
+            slopes.append(self.field(y + step * _sum_weighted(method.A[i, :i], slopes), p) if i else self.field(y, p))
+        moved = y + step * _sum_weighted(method.B, slopes)
+        scale = ca.DM(self.scale)
+        fifth = ca.sumsqr(_sum_weighted(method.E5[: RULES.stages], slopes) / scale)
+        third = ca.sumsqr(_sum_weighted(method.E3[: RULES.stages], slopes) / scale)
+        error = step * fifth / ca.sqrt(fifth + 0.01 * third + 1e-300)
+        return dense_function("step", [y, step, p], [moved, error])
+
+
+def _sum_weighted(weights: Array, slopes: list[Any]) -> Any:
+    """Weighted sum, without the terms whose weight is zero."""
+    return sum(float(w) * slope for w, slope in zip(weights, slopes, strict=True) if w != 0)

@@ -36,8 +36,6 @@ class SurfaceRules:
 RULES = SurfaceRules()
 
 
-__all__ = ["TriangleMesh", "build_level_surface", "require_disk"]
-
 Mask = NDArray[np.bool_]
 Function = Callable[[Array], Array]  #: (N, 3) -> (N,), or (N, 3) for a gradient
 
@@ -74,7 +72,11 @@ def build_level_surface(
     corners = np.stack([freeze_array("low", low, (3,)), freeze_array("high", high, (3,))])
     if not np.all(corners[0] < corners[1]):
         raise InvalidValueError("low", corners[0].tolist(), f"less than high = {corners[1].tolist()}")
-    axes = _build_grid_axes(corners, require_count("cells", cells, least=2))
+    # A grid of nearly cubic cells, so many of them along the longest edge.
+    width = corners[1] - corners[0]
+    longest = require_count("cells", cells, least=2)
+    counts = np.maximum(1, np.ceil(longest * width / width.max() - 1e-9)).astype(int) + 1
+    axes = [np.linspace(corners[0, i], corners[1, i], counts[i]) for i in range(3)]
     # Marching cubes, then Newton steps onto the surface, then flips and smoothing in turns.
     gap, largest = _sample_gap(h, level, axes)
     points, faces, free, ends = _march_cubes(gap, axes)
@@ -135,12 +137,13 @@ class _Sheet:
 
     def _bisect(self, ends: Array) -> Array:
         """A point of the surface between each pair of ends (2, K, 3)."""
+        # Halves whose value has the sign of the first end move that end.
         a, b = ends
         below = self._evaluate_gap(a) < 0
         for _ in range(RULES.bisections):
-            middle = (a + b) / 2
-            same = ((self._evaluate_gap(middle) < 0) == below)[:, None]
-            a, b = np.where(same, middle, a), np.where(same, b, middle)
+            centre = (a + b) / 2
+            same = ((self._evaluate_gap(centre) < 0) == below)[:, None]
+            a, b = np.where(same, centre, a), np.where(same, b, centre)
         points: Array = np.where((np.abs(self._evaluate_gap(a)) < np.abs(self._evaluate_gap(b)))[:, None], a, b)
         off = np.flatnonzero(np.abs(self._evaluate_gap(points)) > self.tolerance)
         if len(off):
@@ -153,15 +156,9 @@ class _Sheet:
         return _evaluate_checked(self.h, points, "h", ()) - self.level
 
 
-def _build_grid_axes(corners: Array, cells: int) -> list[Array]:
-    """Grid coordinates along each axis: nearly cubic cells, `cells` of them along the longest edge."""
-    width = corners[1] - corners[0]
-    counts = np.maximum(1, np.ceil(cells * width / width.max() - 1e-9)).astype(int) + 1
-    return [np.linspace(corners[0, i], corners[1, i], counts[i]) for i in range(3)]
-
-
 def _sample_gap(h: Function, level: float, axes: list[Array]) -> tuple[NDArray[np.float32], float]:
     """h - level on the grid in single precision with the signs preserved, and the largest |h|."""
+    # Slab by slab, since the grid does not fit into memory in double precision.
     shape = tuple(len(axis) for axis in axes)
     gap = np.empty(shape, dtype=np.float32)
     slab = max(1, RULES.chunk // (shape[1] * shape[2]))
@@ -178,6 +175,7 @@ def _sample_gap(h: Function, level: float, axes: list[Array]) -> tuple[NDArray[n
 
 def _march_cubes(gap: NDArray[np.float32], axes: list[Array]) -> tuple[Array, Indices, Mask, Array]:
     """Marching cubes: vertices (V, 3), faces (F, 3), free axes (V, 3), and the ends of their grid edges (2, V, 3)."""
+    # Vertices lie on grid edges, between the grid points around them.
     _push_from_zero(gap)
     index, faces, _, _ = skimage.measure.marching_cubes(gap, 0.0, gradient_direction="descent")
     corners = np.stack([np.floor(index), np.ceil(index)]).astype(int)
@@ -189,8 +187,9 @@ def _march_cubes(gap: NDArray[np.float32], axes: list[Array]) -> tuple[Array, In
 def _push_from_zero(gap: NDArray[np.float32]) -> None:
     """Keep the surface away from grid points, where marching cubes triangles shrink to zero size.
 
-    In place, |h - level| becomes at least _CLEARANCE times the largest change to a neighbour. Zeros become positive.
+    In place, |h - level| becomes at least `clearance` times the largest change to a neighbour. Zeros become positive.
     """
+    # The largest change to a neighbour, along each axis and both ways.
     change = np.zeros_like(gap)
     for axis in range(3):
         step = np.abs(np.diff(gap, axis=axis))
@@ -272,5 +271,4 @@ def solve_dirichlet(mesh: TriangleMesh, fixed: Indices, values: Array) -> Array:
 def compute_signed_areas(points: Array, faces: Indices) -> Array:
     """Signed areas of triangles in the plane, (F,), positive if counterclockwise."""
     a, b = points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]]
-    areas: Array = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
-    return areas
+    return np.asarray((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2)

@@ -113,8 +113,13 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
     require_kind("problem", problem, Problem)
     require_driven("involutivity", problem.robot.tree)
     require_memory(f"{samples} samples of the defect", 32.0 * samples * problem.n * problem.m**2)
+    # Uniform samples of the domain, without the near-singular ones.
+    check(problem, samples, seed)
+    points = sample_uniform(problem.domain, samples, seed)
+    points = points[is_regular(problem, points)]
+    if not len(points):
+        raise SingularTaskError(f"task '{problem.task.name}' is near-singular at all {samples} samples of the domain")
     # Brackets across the span at all samples, and the scale of what cancels in them.
-    points = _sample_regular(problem, samples, seed)
     brackets = TaskBrackets.build(problem)
     across, size, basis = Batched(brackets.build_tensor_function())(points)
     T = across.reshape(-1, problem.n, problem.m, problem.m)
@@ -142,16 +147,6 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
     )
 
 
-def _sample_regular(problem: Problem, samples: int, seed: int) -> Array:
-    """Uniform samples of the domain, without the near-singular ones."""
-    check(problem, samples, seed)
-    points = sample_uniform(problem.domain, samples, seed)
-    regular = is_regular(problem, points)
-    if not regular.any():
-        raise SingularTaskError(f"task '{problem.task.name}' is near-singular at all {samples} samples of the domain")
-    return points[regular]
-
-
 def _compute_squared_turns(T: Array, basis: Array, half_width: Array) -> Array:
     """Sum over pairs of |T(e_a, e_b)|_A^2 / (k_a + k_b) [rad^2], (N,).
 
@@ -163,11 +158,11 @@ def _compute_squared_turns(T: Array, basis: Array, half_width: Array) -> Array:
         basis: columns e_1..e_m, (N, n, m).
         half_width: half-widths of the domain, (n,).
     """
+    # In the rotated basis, both the metric and C^-1 are diagonal.
     k, V = np.linalg.eigh(basis.transpose(0, 2, 1) @ (3 / half_width[:, None] ** 2 * basis))
     turned = V.transpose(0, 2, 1)[:, None] @ T @ V[:, None]
     squared = (turned**2).sum(axis=1) / (k[:, :, None] + k[:, None, :])
-    total: Array = squared.sum(axis=(1, 2)) / 2
-    return total
+    return np.asarray(squared.sum(axis=(1, 2)) / 2)
 
 
 def lie_bracket(f: ca.SX, g: ca.SX, q: ca.SX) -> ca.SX:
@@ -227,12 +222,14 @@ class TaskBrackets:
         along e_a is that of G along e_a, times column b of R^-1. In these terms P v is (I - O O^T) U v.
         """
         q, m = ca.SX.sym("q", problem.n), problem.m
+        # Gradients G = A^-1 J^T and an orthonormal basis of their span, through U^-T J^T = O R.
         J = problem.task.jacobian_function(q)
         U = ca.chol(ca.sparsify(problem.metric.function(q)))
-        raised = ca.solve(U.T, J.T)
-        gradients = ca.solve(U, raised)
-        unit, R = ca.qr(raised)
+        duals = ca.solve(U.T, J.T)
+        gradients = ca.solve(U, duals)
+        unit, R = ca.qr(duals)
         basis, weights = ca.solve(U, unit), ca.inv(R)
+        # Derivatives of the fields along each other, their brackets, and the parts across the span.
         along = [U @ ca.jtimes(gradients, q, basis[:, a]) @ weights for a in range(m)]
         brackets = [along[a][:, b] - along[b][:, a] for a in range(m) for b in range(m)]
         across = ca.horzcat(*[v - unit @ (unit.T @ v) for v in brackets])

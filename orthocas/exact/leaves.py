@@ -10,8 +10,8 @@ import scipy
 from numpy.typing import NDArray
 
 from orthocas.errors import GrowError, InvalidValueError
-from orthocas.exact.harmonic import TriangleMesh, build_level_surface, map_to_disk
-from orthocas.exact.mesh import TriangleLocator
+from orthocas.exact.harmonic import build_level_surface, map_to_disk
+from orthocas.exact.mesh import TriangleLocator, TriangleMesh
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import evaluate_samples, sample_uniform
@@ -69,13 +69,9 @@ def remove_turns(problem: Problem, differences: Array) -> Array:
     return np.asarray(wrap_shortest(differences, np.where(find_turning_joints(problem), 2 * np.pi, 0.0)))
 
 
-def is_covered(region: Box, points: Array) -> NDArray[np.bool_]:
-    """Which points lie in the region, up to rounding, (N,)."""
-    return np.asarray((np.abs(points - region.centre) <= region.half_width + 1e-9).all(axis=1))
-
-
 def require_on_leaf(problem: Problem, level: Array, points: Array) -> None:
     """Raise InvalidValueError unless points (N, n) lie on the leaf h(q) = level (m,), relative to the size of J_x."""
+    # In units of the size of the gradients, an error of the task is a distance.
     J = problem.task.evaluate_jacobian(points)
     off = np.abs(problem.task.batched(points)[0] - level).max(axis=1)
     size = np.sqrt((J**2).sum(axis=(1, 2)).mean())
@@ -104,6 +100,7 @@ class DiskLeaf:
     periodic = True
 
     def __post_init__(self) -> None:
+        # Arrays may come from a file: check shapes and indices, and that points lie on disk and leaf.
         count = len(self.vertices)
         shapes: dict[str, tuple[int | None, ...]] = {
             "level": (1,),
@@ -137,7 +134,8 @@ class DiskLeaf:
         located = self._in_space.locate(points)
         corners = self.disk[self.faces[located.face]]
         xi = np.einsum("sk,skr->sr", located.barycentric, corners)
-        return LeafValues(xi, self._gradients[located.face], is_covered(self.region, points))
+        inside = (np.abs(points - self.region_centre) <= self.region_half_width + 1e-9).all(axis=1)
+        return LeafValues(xi, self._gradients[located.face], np.asarray(inside))
 
     def points(self, xi: Array, near: Array | None = None) -> Array:
         """Points of the leaf with coordinates xi (N, 2) in the disk; NaN for other xi.
@@ -158,8 +156,8 @@ class DiskLeaf:
             height = height - residual / slope
             if np.abs(residual / slope).max(initial=0.0) < RULES.on_disk:
                 break
-        known = inside & (located.distance < RULES.on_disk)
-        return np.where(known[:, None], feet + height * normals, np.nan)
+        covered = inside & (located.distance < RULES.on_disk)
+        return np.where(covered[:, None], feet + height * normals, np.nan)
 
     def to_arrays(self) -> Mapping[str, Array | Indices]:
         """All arrays, for chart files."""
@@ -178,6 +176,7 @@ class DiskLeaf:
     def _edges(self) -> tuple[Array, Array]:
         """Two edges of every triangle in space, (F, 2, 3), and in the disk, (F, 2, 2)."""
         first, *others = (self.faces[:, k] for k in range(3))
+        # From the first corner to the two others.
         in_space = np.stack([self.vertices[other] - self.vertices[first] for other in others], axis=1)
         in_disk = np.stack([self.disk[other] - self.disk[first] for other in others], axis=1)
         return in_space, in_disk
@@ -204,7 +203,7 @@ def build_disk_leaf(problem: Problem, level: Array, region: Box, cells: int = CE
         cells: number of cells along the longest edge of the region.
 
     Raises:
-        GrowError: if n is not 3, m is not 1, or the shortest edge of the region has fewer than 5 cells.
+        GrowError: if n is not 3, m is not 1, or the shortest edge of the region has too few cells.
         NotADiskError: if that part of the leaf is not a disk; the message says what it is.
     """
     if (problem.n, problem.m) != (3, 1):
@@ -276,9 +275,9 @@ class LinearLeaf:
         # Follow the straight line to xi in steps, so that Newton stays on the sheet.
         start = (q - self.centre) @ self.normals
         N = np.broadcast_to(self.normals.T, (len(xi), *self.normals.T.shape))
-        for share in np.linspace(0.0, 1.0, RULES.stages + 1)[1:]:
+        for fraction in np.linspace(0.0, 1.0, RULES.stages + 1)[1:]:
             for _ in range(RULES.iterations):
-                residual = self._compute_residual(q, start + share * (xi - start))
+                residual = self._compute_residual(q, start + fraction * (xi - start))
                 if np.abs(residual).max(initial=0.0) < RULES.solved:
                     break
                 J = np.concatenate([self.problem.task.evaluate_jacobian(q) / self._scale, N], axis=1)
@@ -370,10 +369,10 @@ class CircleLeaf:
     @cached_property
     def _spline(self) -> Any:
         """A spline of the curve without its drift, periodic in the arc length."""
-        share = np.linspace(0.0, 1.0, len(self.curve))[:, None]
-        periodic = self.curve - share * self._drift
+        fractions = np.linspace(0.0, 1.0, len(self.curve))[:, None]
+        periodic = self.curve - fractions * self._drift
         periodic[-1] = periodic[0]
-        return scipy.interpolate.CubicSpline(share[:, 0] * self.length[0], periodic, bc_type="periodic")
+        return scipy.interpolate.CubicSpline(fractions[:, 0] * self.length[0], periodic, bc_type="periodic")
 
     def _evaluate(self, along: Array) -> Array:
         return np.asarray(self._spline(along) + along[:, None] / self.length[0] * self._drift)
@@ -389,36 +388,35 @@ class CircleLeaf:
         return np.concatenate([np.cos(angles), np.sin(angles), points[:, ~turning]], axis=1)
 
 
-def trace_circle_leaf(problem: Problem, level: Array, start: Array, samples: int = SAMPLES) -> CircleLeaf:
+def trace_circle_leaf(problem: Problem, level: Array, start: Array) -> CircleLeaf:
     """Trace the leaf from one of its points until it closes.
 
     Args:
         problem: a problem with r = 1.
         level: x0, (m,).
         start: a point of the leaf, where xi0 = 0, (n,).
-        samples: number of samples to keep.
 
     Raises:
-        GrowError: if the leaf does not close within 200 rad, or runs into a singularity.
+        GrowError: if the leaf is too long to close, or runs into a singularity.
     """
     trace = _build_tracer(problem, level, RULES.steps)
     q, travelled, step = start, 0.0, RULES.piece / RULES.steps
     while travelled < RULES.longest:
         piece = trace(q, RULES.piece)
         away = remove_turns(problem, piece[1:] - start)
-        # Arc length to the start, along the curve.
+        # Arc length that is left to the start: the curve closes where it is near, and about to pass it.
         left = -(np.diff(piece, axis=0) * away).sum(axis=1) / step
         back = np.flatnonzero((np.linalg.norm(away, axis=1) < 2 * step) & (left >= 0))
         if back.size:
             k = int(back[-1])
-            return _close_circle(problem, level, start, travelled + (k + 1) * step + left[k], samples)
+            return _close_circle(problem, level, start, travelled + (k + 1) * step + left[k])
         q, travelled = piece[-1], travelled + RULES.piece
     raise GrowError(f"the base leaf h(q) = {level.tolist()} does not close within {RULES.longest:g} rad of arc length")
 
 
-def _close_circle(problem: Problem, level: Array, start: Array, length: float, samples: int) -> CircleLeaf:
+def _close_circle(problem: Problem, level: Array, start: Array, length: float) -> CircleLeaf:
     """Trace the leaf once around, with corrections of its length."""
-    trace = _build_tracer(problem, level, samples)
+    trace = _build_tracer(problem, level, SAMPLES)
     for _ in range(RULES.closings):
         curve = trace(start, length)
         last = curve[-1] - curve[-2]

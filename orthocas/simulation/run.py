@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.control.controller import Controller, get_counted_function, require_controller
-from orthocas.control.memory import memory_of
+from orthocas.control.memory import find_memory
 from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
 from orthocas.errors import Interrupted, InvalidValueError, SimulationError
@@ -166,7 +166,7 @@ def prepare(controller: Controller, reference: Reference, q_start: ArrayLike, se
         law: SupervisedLaw | LawWithMemory | None = None
         if settings.safety is not None:
             law = SupervisedLaw(controller, settings.safety, settings.resume_after, 1 / rate)
-        elif memory_of(controller) is not None:
+        elif find_memory(controller) is not None:
             law = LawWithMemory(controller, 1 / rate)
         if scene is not None:
             run = partial(run_physics, scene=scene, supervised=law)
@@ -213,7 +213,7 @@ def _check_settings(loop: ClosedLoop, reference: Reference, settings: Settings, 
         if value is not None and not 0 < as_number(name, value) < np.inf:
             raise InvalidValueError(name, value, "a finite number > 0")
     require_kind("compiled", settings.compiled, bool)
-    sampled, in_mujoco, remembers = rate is not None, scene is not None, memory_of(law) is not None
+    sampled, in_mujoco, remembers = rate is not None, scene is not None, find_memory(law) is not None
     forces = bool(loop.loads.pushes) or settings.friction is not None or loop.stops is not None
     forces = forces or loop.plant is not law.problem.robot
     last_push = max((push.start for push in loop.loads.pushes), default=0.0)

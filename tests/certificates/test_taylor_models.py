@@ -11,7 +11,12 @@ from public_objects import given, network, partly_linear
 
 import orthocas as oc
 from orthocas.certificates import taylor
-from orthocas.certificates.box_checks import bound_conditioning, compute_pivots, lower_bound, rotate_to_singular_basis
+from orthocas.certificates.box_checks import (
+    bound_conditioning,
+    bound_from_below,
+    compute_pivots,
+    rotate_to_singular_basis,
+)
 from orthocas.certificates.graph import TaylorGraph
 from orthocas.certificates.rows import build_chart_rows, build_joint_models
 from orthocas.certificates.taylor import (
@@ -105,7 +110,7 @@ def test_reciprocals_and_roots_give_up_where_they_may_be_undefined() -> None:
     (x,), _ = build_joint_models(np.array([[-0.1]]), np.array([[0.2]]), (0,))
     for function in (taylor.reciprocal, taylor.square_root, taylor.reciprocal_square_root):
         assert not np.isfinite(function(x).remainder).any()
-        assert not (lower_bound(function(x)) > -np.inf).any()
+        assert not (bound_from_below(function(x)) > -np.inf).any()
 
 
 def test_exact_products_lie_within_the_remainder() -> None:
@@ -131,11 +136,11 @@ def test_exact_products_lie_within_the_remainder() -> None:
 def test_lower_bounds_lie_below_all_values_and_are_sharp_for_parabolas() -> None:
     rng = np.random.default_rng(5)
     model = TaylorModel((0, 1), rng.normal(size=(10, 50)), rng.uniform(0, 0.1, 50))
-    bound = lower_bound(model)
+    bound = bound_from_below(model)
     for _ in range(200):
         assert (values_at(model, rng.uniform(-1, 1, (50, 2))) - model.remainder >= bound).all()
     (x,), _ = build_joint_models(np.array([[-1.0]]), np.array([[2.0]]), (0,))
-    assert lower_bound(x * x)[0] == pytest.approx(0, abs=1e-12)
+    assert bound_from_below(x * x)[0] == pytest.approx(0, abs=1e-12)
 
 
 @pytest.mark.parametrize("build", [chart, network, partly_linear, given, fourier])
@@ -208,7 +213,7 @@ def test_lower_bounds_of_long_sums_lie_below_the_exact_ones(count: int) -> None:
     ] *= -1  # least at the ends of the interval
     coefficients[1 + count + 1] = 1.0
     exact = [Fraction(float(value)) for value in coefficients[:, 0]]
-    bound = lower_bound(TaylorModel(variables, coefficients, np.zeros(2)))[0]
+    bound = bound_from_below(TaylorModel(variables, coefficients, np.zeros(2)))[0]
     assert Fraction(float(bound)) <= exact[0] - sum(map(abs, exact[1:]))
 
 

@@ -14,7 +14,7 @@ from programs import built, needs_c, path_flags
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared, gain_numbers
-from orthocas.codegen.library import STRICT, compilers
+from orthocas.codegen.library import STRICT, find_compilers
 from orthocas.control import Controller, ControlStatus, PDPlus
 from orthocas.errors import CompileError
 
@@ -64,7 +64,7 @@ def clang(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path, monkeypatch:
     if shutil.which("clang") is None:
         script = tmp_path / "bin" / "clang"
         script.parent.mkdir()
-        script.write_text(CLANG.format(python=sys.executable, linker=compilers()[0]))
+        script.write_text(CLANG.format(python=sys.executable, linker=find_compilers()[0]))
         script.chmod(0o755)
         monkeypatch.setenv("PATH", str(script.parent), prepend=":")
     return str(shutil.which("clang"))
@@ -143,7 +143,7 @@ def test_calls_take_no_more_stack_than_the_header_says(arm_chart: oc.Chart, clan
     """Measured on a painted stack, for what needs most, by gcc without optimisation and clang with it."""
     solver = oc.solvers.LBFGS(max_iterations=1)
     network = oc.fit(arm_chart.problem, oc.MLP((16, 12)), samples=50, solver=solver).chart
-    gcc, clang_2 = (compilers()[0], "-O0"), (clang, "-O2")
+    gcc, clang_2 = (find_compilers()[0], "-O0"), (clang, "-O2")
     for law, ways in ((PDPlus(arm_chart, 50.0), (gcc, clang_2)), (PDPlus(network, 50.0), (gcc,))):
         generated = oc.generate_c(law.chart, tmp_path, law, "arm")
         for compiler, flag in ways:
@@ -158,7 +158,9 @@ def test_object_holds_no_state_and_calls_only_mathematics(pd_plus: Generated, tm
     """Symbols of the object file: functions and read-only data; undefined ones are of math.h, or copy memory."""
     generated, _ = pd_plus
     source = generated.folder / "arm.c"
-    subprocess.run([compilers()[0], "-std=c99", "-O1", "-c", str(source), "-o", str(tmp_path / "arm.o")], check=True)
+    subprocess.run(
+        [find_compilers()[0], "-std=c99", "-O1", "-c", str(source), "-o", str(tmp_path / "arm.o")], check=True
+    )
     if shutil.which("nm") is None:
         pytest.skip("no nm")
     symbols = subprocess.run(["nm", str(tmp_path / "arm.o")], capture_output=True, text=True, check=True).stdout
@@ -207,7 +209,7 @@ def test_clang_accepts_it_and_computes_the_same(planar_chart: oc.Chart, clang: s
     law = PDPlus(planar_chart, 50.0, coupling="decoupled")
     proof = check_c(oc.generate_c(planar_chart, tmp_path, law, "arm"), planar_chart, law)
     assert "clang" in proof.compilers
-    assert len(proof.compilers) == len(compilers())
+    assert len(proof.compilers) == len(find_compilers())
     done = subprocess.run([clang, "--version"], capture_output=True, text=True, check=True)
     assert "clang version" in done.stdout
 
@@ -215,7 +217,7 @@ def test_clang_accepts_it_and_computes_the_same(planar_chart: oc.Chart, clang: s
 def test_every_dialect_accepts_it(pd_plus: Generated, tmp_path: Path) -> None:
     """C99 and later, GNU's too; with more warnings than promised; the header in C++."""
     generated, _ = pd_plus
-    source, compiler = generated.folder / "arm.c", compilers()[0]
+    source, compiler = generated.folder / "arm.c", find_compilers()[0]
     more = ["-Wshadow", "-Wconversion", "-Wcast-qual", "-Wstrict-prototypes"]
     whole = ["-O2", "-c", "-o", str(tmp_path / "arm.o")]
     for dialect in ("c99", "gnu99", "c11", "gnu17"):

@@ -16,7 +16,7 @@ from programs import Run, needs_c, needs_cmake, output_of
 
 import orthocas as oc
 from orthocas.codegen import GeneratedC, check_c
-from orthocas.codegen.library import STRICT, compilers
+from orthocas.codegen.library import STRICT, find_compilers
 from orthocas.control import PDPlus
 from orthocas.errors import InvalidValueError, NoExpressionError, one_line
 from orthocas.fitting.fit import Fit
@@ -66,7 +66,7 @@ def test_installed_libraries_are_found_and_linked(pd_plus: tuple[GeneratedC, PDP
     (package,) = place.rglob("arm.pc")
     flags = output_of("env", f"PKG_CONFIG_PATH={package.parent}", "pkg-config", "--cflags", "--libs", "arm")
     program, library = project / "by_package", package.parent.parent
-    output_of(compilers()[0], project / "main.c", "-o", program, *shlex.split(flags), f"-Wl,-rpath,{library}")
+    output_of(find_compilers()[0], project / "main.c", "-o", program, *shlex.split(flags), f"-Wl,-rpath,{library}")
     output_of(program)
 
 
@@ -93,7 +93,7 @@ def test_words_of_others_do_not_become_code(tmp_path: Path) -> None:
     chart = oc.fit(problem, oc.Linear()).chart
     generated = oc.generate_c(chart, tmp_path, None, "arm")
     check_c(generated, chart, None, states=100)
-    assert "evil" not in output_of(compilers()[0], "-E", "-P", tmp_path / "arm.c").replace("evil_", "")
+    assert "evil" not in output_of(find_compilers()[0], "-E", "-P", tmp_path / "arm.c").replace("evil_", "")
     assert re.fullmatch(r"[a-z]\w*", oc.generate_c(chart, tmp_path / "unnamed").name, flags=re.ASCII)
 
 
@@ -130,7 +130,8 @@ def test_names_from_robot_files_stay_in_comments(tmp_path: Path) -> None:
         assert not any("\\" in comment for comment in comments)
         assert not any("evil" in part for part in re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL).splitlines())
     for dialect in ("-std=c99", "-std=gnu17"):  # strict C99 reads trigraphs
-        command = [compilers()[0], *STRICT, dialect, "-Wtrigraphs", "-Wcomment", "-c", str(source), "-o", "/dev/null"]
+        flags = (*STRICT, dialect, "-Wtrigraphs", "-Wcomment")
+        command = [find_compilers()[0], *flags, "-c", str(source), "-o", "/dev/null"]
         assert subprocess.run(command, capture_output=True, text=True, check=False).stderr == ""
     assert check_c(generated, chart, None, states=20).differences["phi"] < 1e-10
 

@@ -130,7 +130,7 @@ def test_a_relative_cache_does_not_count(monkeypatch: pytest.MonkeyPatch, tmp_pa
     monkeypatch.setenv("HOME", str(tmp_path))
     for given, wanted in (("cache", tmp_path / ".cache"), ("", tmp_path / ".cache"), ("/var/tmp", Path("/var/tmp"))):
         monkeypatch.setenv("XDG_CACHE_HOME", given)
-        assert compiled._cache() == wanted / "orthocas" / "libraries"
+        assert compiled._find_cache() == wanted / "orthocas" / "libraries"
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from public_objects import cyclic, fitted, given, network, with_idle_joint
 
 import orthocas as oc
 from orthocas.codegen import GeneratedC
-from orthocas.codegen.library import NO_DOUBLE, STRICT, compilers
+from orthocas.codegen.library import NO_DOUBLE, STRICT, find_compilers
 from orthocas.errors import InvalidValueError
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
@@ -33,7 +33,9 @@ def phi_rows(generated: GeneratedC, q: Array, *flags: str) -> tuple[Array, int]:
     sources = [str(generated.folder / f"{generated.name}{end}.c") for end in ("", "_rows")]
     library = str(generated.folder / "rows.so")
     strict = (*STRICT, *(NO_DOUBLE if generated.single_precision else ()))
-    subprocess.run([compilers()[0], *strict, *flags, "-fPIC", "-shared", "-o", library, *sources, "-lm"], check=True)
+    subprocess.run(
+        [find_compilers()[0], *strict, *flags, "-fPIC", "-shared", "-o", library, *sources, "-lm"], check=True
+    )
     points, phi = np.ascontiguousarray(q, dtype=kind), np.empty(q.shape, dtype=kind)
     pointers = [ctypes.c_void_p(array.ctypes.data) for array in (points, phi)]
     status = getattr(ctypes.CDLL(library), f"{generated.name}_phi_rows")(ctypes.c_long(len(q)), *pointers)

@@ -15,7 +15,7 @@ from programs import Run, built, needs_c, output_of
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, check_c, compile_shared, gain_numbers
-from orthocas.codegen.library import compilers
+from orthocas.codegen.library import find_compilers
 from orthocas.codegen.precision import SINGLE
 from orthocas.control import Controller, ControlStatus, Impedance, Kinematic, PDPlus, Safety
 from orthocas.errors import AgreementError
@@ -257,7 +257,7 @@ def test_stack_and_numbers_are_smaller(generated: GeneratedC, law: Controller, t
     double = oc.generate_c(law.chart, tmp_path, law, "arm")
     assert generated.stack_bytes < 0.9 * double.stack_bytes
     (tmp_path / "stack").mkdir()
-    program = built(generated, "stack_use.c", tmp_path / "stack", "-DNUMBER=float", "-O2", compiler=compilers()[0])
+    program = built(generated, "stack_use.c", tmp_path / "stack", "-DNUMBER=float", "-O2", compiler=find_compilers()[0])
     used = [int(word) for word in output_of(program).split()]
     assert 500 < max(used) <= generated.stack_bytes
 

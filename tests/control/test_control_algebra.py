@@ -12,7 +12,7 @@ import pytest
 from scipy.linalg import eigh, sqrtm
 
 from orthocas.codegen.kernels import generate_kernels
-from orthocas.codegen.library import compilers
+from orthocas.codegen.library import find_compilers
 from orthocas.control.linear_algebra import DAMPING_DESIGNS, DampingDesign, apply_damping, invert_spd, multiply_by_root
 from orthocas.tools.checks import Array
 from orthocas.tools.processes import run_program
@@ -151,7 +151,7 @@ def test_roots_in_generated_c_stop_when_they_are_exact(tmp_path: Path, size: int
     source, library = tmp_path / "root.c", tmp_path / "root.so"
     source.write_text(f"#include <math.h>\n{kernels.code.replace('static int own_root', 'int own_root')}\n")
     strict = ["-std=c99", "-O2", "-Warray-bounds", "-Werror"]
-    run_program([compilers()[0], *strict, "-fPIC", "-shared", "-o", str(library), str(source), "-lm"])
+    run_program([find_compilers()[0], *strict, "-fPIC", "-shared", "-o", str(library), str(source), "-lm"])
     given_places, found_places, _, length = kernels.work["root"]
     run = ctypes.CDLL(str(library)).own_root
     for condition in (1.0, 1e2, 1e4, 1e6):

@@ -22,7 +22,7 @@ import orthocas as oc
 from orthocas import certificates, charts, control, learn, paths, problems, simulation, solvers, viewer
 from orthocas.cli.commands import build_app
 
-_READS = re.compile(r"(read|load)_?\w*|loaded|from_(file|urdf|mjcf)|urdf_look")
+_READS = re.compile(r"(read|load)_?\w*|from_(file|urdf|mjcf)|urdf_look")
 
 _MODULES = (oc, certificates, charts, control, learn, paths, problems, simulation, solvers, viewer)  # of public names
 _REFERENCE = Path(__file__).parents[2] / "docs" / "reference"  # it describes these, and others in modules

@@ -46,7 +46,7 @@ READERS = {  #: functions that read files, by module and name, with the campaign
     "charts.chart.load": "charts",
     "charts.chart_file.read_chart": "charts",
     "charts.ready.load": "calls",
-    "codegen.compiled.loaded": "libraries",
+    "codegen.compiled.load_library": "libraries",
     "paths.tool_path.read_path": "paths",
     "tasks.corridor.read_postures": "postures",
     "robots.urdf.read_srdf_postures": "robots",

@@ -10,8 +10,8 @@ import numpy as np
 
 from fuzz.child import Finding, run, verdict
 from fuzz.mutants import Rng, flipped, pick
-from orthocas.codegen.compiled import kept_library, loaded
-from orthocas.codegen.library import compilers
+from orthocas.codegen.compiled import keep_library, load_library
+from orthocas.codegen.library import find_compilers
 
 _SOURCE = "int answer(void) { return 42; }\n"
 
@@ -30,11 +30,11 @@ def judge(folder: Path, seed: int) -> str | None:
 @cache
 def originals(folder: Path) -> tuple[bytes, bytes, str]:
     """A library, another one, and the checksum of the first."""
-    library = kept_library("answer", {"answer.c": _SOURCE}, (), folder)
+    library = keep_library("answer", {"answer.c": _SOURCE}, (), folder)
     other = folder / "other.so"
     source = folder / "other.c"
     source.write_text(_SOURCE.replace("42", "43"))
-    subprocess.run([compilers()[0], "-fPIC", "-shared", "-o", str(other), str(source)], check=True)
+    subprocess.run([find_compilers()[0], "-fPIC", "-shared", "-o", str(other), str(source)], check=True)
     return library.read_bytes(), other.read_bytes(), library.with_name(f"{library.name}.sha256").read_text()
 
 
@@ -51,7 +51,7 @@ def _load(folder: Path, rng: Rng) -> None:
         library.with_name("answer.so.sha256").write_bytes(given.encode())
         library.chmod(mode := pick(rng, (0o600, 0o755, 0o622, 0o666, 0o777)))
         Path(place).chmod(open_to := pick(rng, (0o700, 0o755, 0o770, 0o777)))
-        answer = loaded(library).answer()
+        answer = load_library(library).answer()
         assert (written, given) == (content, checksum), "a library is loaded that was changed"
         assert not (mode | open_to) & 0o022, "a library is loaded that others may write"
         assert os.name != "posix" or answer == 42

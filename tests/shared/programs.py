@@ -14,7 +14,7 @@ import pytest
 
 import orthocas as oc
 from orthocas.codegen import GeneratedC
-from orthocas.codegen.library import compilers
+from orthocas.codegen.library import find_compilers
 
 PROGRAMS = Path(__file__).parents[1] / "c"
 
@@ -62,7 +62,7 @@ def built(generated: GeneratedC, program: str, out: Path, *flags: str, compiler:
     target = out / Path(program).stem
     sources = [str(PROGRAMS / program), str(generated.folder / "arm.c")]
     command = [
-        compiler or compilers()[0],
+        compiler or find_compilers()[0],
         "-std=c99",
         "-O1",
         "-g1",

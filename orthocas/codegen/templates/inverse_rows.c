@@ -1,13 +1,13 @@
 /* Rows of the inverse map in one call. Compile with -DN=joints, next to a generated library named arm.
  *
- * For each row, after at most so many evaluations of phi: q and, unless `condition` is NULL, phi there, and |J| |J^-1| of J with rows divided by the sizes, or -1
- * where nothing was found. */
+ * For each row, after at most so many evaluations of phi: q and, unless `condition` is NULL, phi there, and |J| |J^-1|
+ * of J with rows divided by the sizes, or -1 where there is no solution. */
 #include "arm.h"
 
 #include <math.h>
 #include <string.h>
 
-void arm_inverse_rows(long rows, int iterations, const double *phi, const double *q_start, const double *sizes, double *q, double *found,
+void arm_inverse_rows(long rows, int iterations, const double *phi, const double *q_start, const double *sizes, double *q, double *reached,
                       double *condition);
 
 /* Product of the Frobenius norms of A and its inverse, by Gauss-Jordan elimination with pivoting; overwrites A. */
@@ -48,7 +48,7 @@ static double condition_of(double *A) {
   return sqrt(before) * sqrt(after);
 }
 
-void arm_inverse_rows(long rows, int iterations, const double *phi, const double *q_start, const double *sizes, double *q, double *found,
+void arm_inverse_rows(long rows, int iterations, const double *phi, const double *q_start, const double *sizes, double *q, double *reached,
                       double *condition) {
   double jacobian[N * N];
   long k;
@@ -58,7 +58,7 @@ void arm_inverse_rows(long rows, int iterations, const double *phi, const double
     if (condition == NULL) continue;
     condition[k] = -1.0;
     if (status != ARM_OK && status != ARM_OUTSIDE_DOMAIN) continue;
-    status = arm_chart(q + k * N, found + k * N, jacobian);
+    status = arm_chart(q + k * N, reached + k * N, jacobian);
     for (i = 0; i < N; ++i)
       for (j = 0; j < N; ++j) jacobian[i * N + j] /= sizes[i];
     if (status == ARM_OK || status == ARM_OUTSIDE_DOMAIN) condition[k] = condition_of(jacobian);
