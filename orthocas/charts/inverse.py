@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.charts.curves import CurveSearch
+from orthocas.charts.inside import Inside
 from orthocas.charts.newton import Attempt, Continuation, LocalSolver
 from orthocas.charts.phi import PhiMap, largest
-from orthocas.charts.search import InDomain, Inside, Starts
+from orthocas.charts.search import InDomain, Starts
 from orthocas.errors import InverseError
 from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.problem import Problem
@@ -217,7 +218,7 @@ class Inverse:
 
     def _searched(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Found:
         """What the search finds from given starts, or from the rough inverse and, where that fails, in the domain."""
-        follows = self.curves is not None and (inside or starts is None)
+        follows = inside or (self.curves is not None and starts is None)
         first = self.local if self.brief is None or not follows else self.brief
         best = self._attempt(targets, self.starts.guess(targets) if starts is None else starts, tolerance, first)
         self._tell_beyond(targets, best)

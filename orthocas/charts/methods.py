@@ -10,6 +10,7 @@ from orthocas.charts.coordinates import Coordinates, InvertibleMap
 from orthocas.charts.curves import SelfMotionCurves
 from orthocas.charts.descent import RULES as DESCENT
 from orthocas.charts.descent import BoxedPhi
+from orthocas.charts.inside import Inside
 from orthocas.charts.inverse import Inverse, Solutions
 from orthocas.charts.newton import (
     NEWTON,
@@ -22,7 +23,7 @@ from orthocas.charts.newton import (
     inverse_function,
 )
 from orthocas.charts.phi import Differences, PhiFunctions, PhiMap, fill_coordinates, leave_over
-from orthocas.charts.search import Cells, InDomain, Inside, Starts
+from orthocas.charts.search import Cells, InDomain, Starts
 from orthocas.charts.trackers import ReachingTracker, Tracker, near_function
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, units_hint
 from orthocas.tasks.problem import measure_task_sizes
