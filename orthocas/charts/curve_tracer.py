@@ -311,9 +311,9 @@ class CurveTracer:
         n, m, scale = task.robot.n, task.m, ca.DM(self.boxed.phi_map.sizes[: self.boxed.m])
         relative = Relative(task)
         q, x = ca.SX.sym("q", n), ca.SX.sym("x", n - 1)
-        e = relative.difference(x[:m], task.function(q)) / scale
+        e = relative.difference(x[:m, :], task.function(q)) / scale
         J = relative.rates(q) / ca.repmat(scale, 1, n)
-        return q, x, ca.vertcat(e, x[m:] - q[held]), ca.vertcat(J, ca.SX.eye(n)[held, :])
+        return q, x, ca.vertcat(e, x[m:, :] - q[held, :]), ca.vertcat(J, ca.SX.eye(n)[held, :])
 
     @cached_property
     def turning(self) -> NDArray[np.bool_]:

@@ -23,15 +23,19 @@ class InsideRules:
     """Numbers of the search. Chosen on pr2-left-wide, held on other seeds and charts (benchmarks/round_trips.py)."""
 
     starts: int = 8  #: stored positions near x, where no q with x is known inside
-    near_phi: int = 4  #: stored positions near each phi, from which curves are sought on each slice
-    near_x: int = 8  #: the same near each x
+    near_phi: int = 2  #: stored positions near each phi, from which curves are sought on each slice
+    near_x: int = 4  #: the same near each x
+    places: tuple[float, ...] = (-1.0, -0.5, 0.0, 0.5, 1.0)  #: of the first held joint on slices, in half-widths
     slack: float = 0.1  #: [rad] or [m]: points of curves so far outside the box are moved to its face
     probes: int = 64  #: positions at which the speeds of joints are measured
-    near: int = 4  #: stored positions near each phi from which slides start
-    short: int = 10  #: points on curves from which slides start
-    steps: int = 6  #: of these slides
-    long: int = 4  #: slides to the end, from the best of these
-    most: int = 48  #: points nearest to xi, of which those are chosen
+    near: int = 5  #: stored positions near each phi from which slides start
+    short: int = 14  #: points on curves from which slides start
+    steps: int = 4  #: of these slides
+    long: int = 4  #: longer slides from the best of these
+    more: int = 8  #: steps of these slides
+    settled: float = 1e-5  #: error of x from which a slide to the end may start
+    last: int = 1  #: slides to the end
+    most: int = 100  #: points nearest to xi, of which those are chosen
     apart: float = 0.2  #: their least distance from one another, in half-widths
     arrived: float = 2e-2  #: error of x from which a long slide may start
     nearly: float = 1e-4  #: distance in xi after a short slide from which a long one most probably ends at a solution
@@ -94,7 +98,8 @@ class Inside:
         open_to = ends.best(N)[1] > RULES.nearly
         on_slices = self._turned(targets, self._slices.points(targets, q, np.flatnonzero(open_to)), q)
         ends = ends.joined(self._slid(targets, on_slices.apart(N, RULES.short), RULES.steps, RULES.arrived))
-        ends = self._slid(targets, ends.apart(N, RULES.long), SLIDE.most, SLIDE.kept)
+        ends = self._slid(targets, ends.apart(N, RULES.long), RULES.more, RULES.settled)
+        ends = self._slid(targets, ends.apart(N, RULES.last), SLIDE.most, SLIDE.kept)
         place, distance = ends.best(N)
         u = np.where(np.isfinite(distance)[:, None], ends.u[place], 0.0)
         return self.boxed.points(u), distance
@@ -177,20 +182,12 @@ class Slices:
     """Finds positions with the task values x, and any xi, r > 1.
 
     Where r - 1 joints are held, all positions of a regular x form closed curves, as they do for r = 1. The held joints
-    are those that move x least over their ranges. They are held at the centre of the domain, and one by one at their
-    boundaries: 2 r - 1 slices. The curves of all slices pass through most of the regions that positions with x form.
+    are those that move x least over their ranges: the first of them at its boundaries and between, the others where
+    stored positions near x have them. So the curves pass through most of the regions that positions with x form.
     """
 
     boxed: BoxedPhi
     starts: Starts
-
-    @cached_property
-    def tracer(self) -> CurveTracer:
-        """Traces the curves."""
-        q = sample_uniform(self.boxed.domain, RULES.probes, 0)
-        J = self.boxed.phi_map.jacobian(q)[:, : self.boxed.m] / self.boxed.phi_map.sizes[: self.boxed.m, None]
-        reach = np.nanmean(np.linalg.norm(J, axis=1), axis=0) * self.boxed.domain.half_width
-        return CurveTracer(self.boxed, tuple(int(j) for j in np.argsort(reach)[: q.shape[1] - self.boxed.m - 1]))
 
     def points(self, targets: Array, own: Array, rows: Indices) -> Points:
         """Points in or near the box with x nearly as in some rows of targets (N, n).
@@ -199,40 +196,43 @@ class Slices:
         once more to both sides, where their turns change xi unevenly.
         """
         low, high = self.boxed.domain.bounds
-        K, towards = len(self._held), np.where(self.boxed.even, own, self.boxed.domain.centre)
-        found = [Points.of(rows[:0], own[:0])]
+        uneven = ~self.boxed.even
+        towards, found = np.where(uneven, self.boxed.domain.centre, own)[rows], [Points.of(rows[:0], own[:0])]
         with np.errstate(all="ignore"):
             for traces in self._curves(targets[rows]):
-                row = rows[traces.row // K]
-                steps = self.tracer.steps(traces, towards[row], self.boxed.winding & ~self.boxed.even)
+                steps = self.tracer.steps(traces, towards[traces.row // len(RULES.places)], uneven)
                 q = steps.q[:, 0]
                 near = ((q >= low - RULES.slack) & (q <= high + RULES.slack)).all(axis=1)
-                found.append(Points.of(rows[steps.row[near] // K], self.boxed.of_points(q[near])))
+                row = rows[steps.row[near] // len(RULES.places)]
+                found.append(Points.of(row, self.boxed.of_points(q[near])))
         return reduce(Points.joined, found)
 
     def _curves(self, targets: Array) -> list[Traces]:
         """Curves of all slices; number k of K of target j is row K j + k."""
-        m, n, held = self.boxed.m, targets.shape[1], list(self.tracer.held)
-        K, N = len(self._held), len(targets)
-        x = np.concatenate([np.repeat(targets[:, :m], K, axis=0), np.tile(self._held, (N, 1))], axis=1)
+        m, n, K = self.boxed.m, targets.shape[1], len(RULES.places)
         near = self.starts.nearest(targets, RULES.near_phi, n), self.starts.nearest(targets, RULES.near_x, m)
         start = np.repeat(np.concatenate(near).transpose(1, 0, 2), K, axis=0)
-        start[:, :, held] = x[:, None, m:]
-        S = start.shape[1]
-        q, arrived = self.tracer.reach(np.repeat(x, S, axis=0), start.reshape(-1, n))
-        q, known, found = q.reshape(-1, S, n), ~arrived.reshape(-1, S), []
+        held, domain = list(self.tracer.held), self.boxed.domain
+        places = domain.centre[held[0]] + domain.half_width[held[0]] * np.array(RULES.places)
+        start[:, :, held[0]] = np.tile(places, len(targets))[:, None]
+        x = np.concatenate(
+            [np.repeat(targets[:, :m], K, axis=0)[:, None].repeat(start.shape[1], axis=1), start[:, :, held]], axis=2
+        )
+        q, arrived = self.tracer.reach(x.reshape(-1, n - 1), start.reshape(-1, n))
+        q, known, found = q.reshape(start.shape), ~arrived.reshape(start.shape[:2]), []
         away = self.tracer.away(q)
         while not known.all():
             left = np.flatnonzero(~known.all(axis=1))
             first = np.argmin(np.where(known[left], np.inf, away[left]), axis=1)
-            found.append(self.tracer.trace(x[left], q[left, first], left))
+            found.append(self.tracer.trace(x[left, first], q[left, first], left))
             known[left, first] = True
             known[left] |= self.tracer.on_curves(q[left], found[-1])
         return found
 
     @cached_property
-    def _held(self) -> Array:
-        """Positions of the held joints on each slice, (2 r - 1, r - 1)."""
-        held, domain = list(self.tracer.held), self.boxed.domain
-        steps = np.vstack([np.zeros(len(held)), np.eye(len(held)), -np.eye(len(held))])
-        return np.asarray(domain.centre[held] + domain.half_width[held] * steps)
+    def tracer(self) -> CurveTracer:
+        """Traces the curves."""
+        q = sample_uniform(self.boxed.domain, RULES.probes, 0)
+        J = self.boxed.phi_map.jacobian(q)[:, : self.boxed.m] / self.boxed.phi_map.sizes[: self.boxed.m, None]
+        reach = np.nanmean(np.linalg.norm(J, axis=1), axis=0) * self.boxed.domain.half_width
+        return CurveTracer(self.boxed, tuple(int(j) for j in np.argsort(reach)[: q.shape[1] - self.boxed.m - 1]))

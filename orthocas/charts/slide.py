@@ -31,7 +31,7 @@ class SlideRules:
     rounded: float = 1e-22  #: squared distance that is rounding
     least: float = 1e-15  #: decrease that is rounding
     penalty: float = 1e5  #: of squared excess of bounds, relative to the squared distance in xi
-    rounds: int = 10  #: guesses which bounds hold
+    rounds: int = 30  #: guesses which bounds hold
     room: float = 1e-9  #: to the ends of the conditions of the domain
 
 
@@ -95,12 +95,11 @@ class _Run:
         P, B, left = H[:, :, :m], H[:, :, m:], gap[:, m:]
         longest, walls = self._longest[rows, None], self._walls(rows)
         back = _times(P, gap[:, :m])
-        back *= np.minimum(1.0, longest / _size(back))
         wanted = left * np.minimum(1.0, longest / _size(_times(B, left)))
         z = walls.project(B, back, wanted)
-        along = _times(B, z)
-        part = np.minimum(1.0, longest / _size(along))
-        d = np.clip(back + part * along, boxed.low - u, boxed.high - u)
+        d = back + _times(B, z)
+        part = np.minimum(1.0, longest / _size(d))
+        d = np.clip(part * d, boxed.low - u, boxed.high - u)
         new, after = self._corrected(rows, u + d, P, B, walls)
         error, before = largest(after[:, :m]), largest(gap[:, :m])
         square, promised = (left**2).sum(axis=1), (left**2).sum(axis=1) - ((left - part * z) ** 2).sum(axis=1)
@@ -199,7 +198,7 @@ def project(B: Array, low: Array, high: Array, wanted: Array) -> Array:
         before = held[left]
         now = (values > high[left]) * 1 - (values < low[left]) * 1
         changes = now != before
-        if k >= RULES.rounds // 2:  # the first bound alone, so that they do not change back and forth
+        if k >= RULES.rounds // 6:  # the first bound alone, so that they do not change back and forth
             changes &= np.cumsum(changes, axis=1) == 1
         some = changes.any(axis=1)
         left = left[some]
