@@ -201,7 +201,7 @@ def _solve_held(programs: Programs, held: NDArray[np.int8]) -> tuple[Array, NDAr
     here, j = np.nonzero(joint)
     K[here, j], K[here, j, j] = 0.0, 1.0
     bounds = np.where(held < 0, programs.low, programs.high)
-    d: Array = np.linalg.solve(K, np.where(joint, bounds, -programs.g)[:, :, None])[:, :, 0]
+    d = np.asarray(np.linalg.solve(K, np.where(joint, bounds, -programs.g)[:, :, None])[:, :, 0], dtype=float)
     slope = (programs.H @ d[:, :, None])[:, :, 0] + programs.g
     now = np.where(joint, held * (slope * held < 0), 0)
     now += ~joint * ((d > programs.high + RULES.slack) * 1 - (d < programs.low - RULES.slack) * 1)
