@@ -100,8 +100,9 @@ class Inside:
         ends = ends.joined(self._slid(targets, on_slices.apart(N, RULES.short), RULES.steps, RULES.arrived))
         ends = self._slid(targets, ends.apart(N, RULES.long), RULES.more, RULES.settled)
         ends = self._slid(targets, ends.apart(N, RULES.last), SLIDE.most, SLIDE.kept)
-        place, distance = ends.best(N)
-        u = np.where(np.isfinite(distance)[:, None], ends.u[place], 0.0)
+        (place, distance), u = ends.best(N), self.boxed.of_points(q)
+        found = np.isfinite(distance)
+        u[found] = ends.u[place[found]]
         return self.boxed.points(u), distance
 
     def _slid(self, targets: Array, points: "Points", most: int, arrived: float) -> "Points":
@@ -158,6 +159,8 @@ class Points:
         """Up to so many of the nearest points of each of N rows that lie apart; one alone of rows nearly solved."""
         order = np.lexsort((self.away, self.row))
         order = order[np.isfinite(self.away[order])]
+        if not order.size:
+            return Points(self.row[order], self.u[order], self.away[order])
         row = self.row[order]
         rank = np.arange(len(row)) - np.searchsorted(row, np.arange(N))[row]
         order, row, rank = (array[rank < RULES.most] for array in (order, row, rank))

@@ -256,12 +256,14 @@ class Inverse:
             found = near.distance == 0
             best.improve(rows[found], self._found(targets[rows[found]], near.q[found]))
             return
-        if rows.size and self.in_domain is not None:
-            q, _ = self.in_domain.search(targets[rows], tolerance)
-            attempt = Attempt(q, self.phi_map.residual(targets[rows], q), best.iterations[rows], np.ones(len(q), bool))
-            best.improve(rows, self._judged(attempt, tolerance))
-        if not self.problem.domain.is_box:  # it may be a small part of its box
-            self._restart(targets, best, rows, RULES.restarts, InverseStatus.FOUND, tolerance)
+        if not rows.size or self.in_domain is None or self.inside is None:
+            return
+        if self.problem.domain.is_box:
+            q = self.in_domain.search(targets[rows], tolerance)[0]
+        else:  # it may be a small part of its box, and most cells lie outside
+            q = self.inside.nearest(targets[rows], best.q[rows])[0]
+        attempt = Attempt(q, self.phi_map.residual(targets[rows], q), best.iterations[rows], np.ones(len(q), bool))
+        best.improve(rows, self._judged(attempt, tolerance))
 
     def _restart(
         self, targets: Array, best: Found, rows: Indices, count: int, worst: InverseStatus, tolerance: float
