@@ -114,7 +114,7 @@ class InverseMethods(PhiFunctions):
         from phi(q_start) to phi, so that every xi within `xi_range(q_start)` is found. Without a start, Newton's method
         starts at a rough inverse of phi, a polynomial fitted to points of the domain, then at stored points of the
         domain whose phi is nearest. Rows that still have no solution inside are searched for along the self-motion
-        curves of x (r = 1), or in all cells of the domain that may hold one. q is the first solution inside that is
+        curves of x (r = 1, or from some of these in wide charts), or in all cells of the domain that may hold one. q is the first solution inside that is
         found; `solutions` looks for all.
 
         Args:
