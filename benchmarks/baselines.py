@@ -568,11 +568,11 @@ class _ExtraCoordinates:
         return self.chart.coordinates.functions["second_derivative"](q, dq, dq)
 
     def wrap_shortest(self, difference: ca.MX) -> ca.MX:
-        shorter: ca.MX = wrap_shortest(difference, self.chart.turns)
+        shorter: ca.MX = wrap_shortest(difference, self.chart.parts.turns)
         return shorter
 
     def runnable(self, graph: ca.Function) -> ca.Function:
-        return self.chart.runnable(graph)
+        return self.chart.parts.runnable(graph)
 
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         """Raise UnreachableReferenceError if the motion from q_start along the reference leaves the chart's domain."""

@@ -60,7 +60,7 @@ def slopes(f: Callable[[Array], Any], q: Array) -> Array:
 
 def errors(chart: oc.Chart, phi: Array, q: Array) -> Array:
     """Weighted as the tracker's."""
-    e = np.asarray(chart.parts.phi_map.difference(phi, chart.phi(q))) / chart.phi_sizes
+    e = np.asarray(chart.parts.phi_map.difference(phi, chart.phi(q))) / chart.parts.phi_sizes
     return e * np.where(np.arange(chart.n) < chart.m, 1.0, RULES.xi_weight)
 
 
@@ -111,7 +111,7 @@ def hand(chart: oc.Chart, seed: int) -> dict[str, float]:
     x_error, least = (float(np.linalg.norm(errors(chart, phi, end)[:m])) for end in (q, best))
     places = chart.task(np.array(path))[:, :3]
     return {
-        "nearer": (x_error - least) * float(chart.phi_sizes[0]),
+        "nearer": (x_error - least) * float(chart.parts.phi_sizes[0]),
         "off": float(np.linalg.norm(places[-1] - phi[:3])),
         "way": float(np.linalg.norm(places[-1] - places[TICKS - 1])),
         "rest": float(np.abs(tracker.step(phi) - q).max()),

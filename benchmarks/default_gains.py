@@ -29,7 +29,7 @@ from orthocas.codegen.library import CompiledLibrary, compile_shared, gain_numbe
 from orthocas.control import ControlStatus, PDPlus, Reference, Safety
 from orthocas.control.gains import compute_mobility, find_fastest_posture
 from orthocas.errors import UnreachableReferenceError
-from orthocas.problems.arms import urdf_path
+from orthocas.problems import urdf_path
 from orthocas.simulation import MuJoCoPlant
 from orthocas.tasks.samples import sample_uniform
 

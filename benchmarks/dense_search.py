@@ -10,8 +10,8 @@ STARTS = 4000
 
 def positions_at(chart: oc.Chart, x: Array, pool: Array) -> Array:
     """Positions of the domain with the task value x (m,) to which damped least squares lead from a pool (S, n)."""
-    m, sizes, (low, high) = chart.m, chart.phi_sizes[: chart.m], chart.problem.domain.bounds
-    q, wanted = pool.copy(), np.broadcast_to(x, (len(pool), chart.m))
+    m, sizes, (low, high) = chart.m, chart.parts.phi_sizes[: chart.m], chart.problem.domain.bounds
+    q, wanted = pool.copy(), np.broadcast_to(x, (len(pool), m))
     for _ in range(15):
         e = chart.parts.relative.difference(wanted, chart.task(q)) / sizes
         J = chart.parts.relative.batched_rates(q)[0].reshape(-1, m, chart.n) / sizes[:, None]

@@ -13,7 +13,7 @@ from benchmark import run
 from c_timing import nanoseconds_per_call
 
 import orthocas as oc
-from orthocas.problems.arms import iiwa
+from orthocas.problems import iiwa
 
 WORDS = {
     "orthocas": "orthocas",

@@ -8,7 +8,7 @@ from statistics import median
 from benchmark import run, table
 
 import orthocas as oc
-from orthocas import problems
+from orthocas import bases, problems
 
 CASES = (
     ("iiwa", "polynomial:3"),
@@ -45,7 +45,7 @@ def build(name: str) -> oc.Problem:
 
 def row(name: str, label: str, runs: int, samples: int) -> str:
     """One row of the table: median CPU time of fits, quality on held-out samples."""
-    problem, parametrisation = build(name), oc.bases.parse_parametrisation(label)
+    problem, parametrisation = build(name), bases.parse_parametrisation(label)
     seconds = []
     for _ in range(runs):
         start = time.process_time()

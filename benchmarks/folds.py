@@ -6,6 +6,7 @@ from suggested_domains import robot_of
 
 import orthocas as oc
 from orthocas.charts.point_quality import Judged
+from orthocas.tasks.domains import default_box
 from orthocas.tasks.samples import sample_boundary_weighted, sample_uniform
 
 HEADER = (
@@ -54,7 +55,7 @@ def main(quick: bool = False) -> list[str]:
     cases = [(arm, "iiwa", degree, 10_000_000) for degree in DEGREES]
     for name, task in ROBOTS:
         robot = robot_of(name)
-        problem = oc.Problem(robot, oc.Task.named(robot, task), domain=oc.default_box(robot))
+        problem = oc.Problem(robot, oc.Task.named(robot, task), domain=default_box(robot))
         cases.append((problem, f"{name}, {task}", 5, 400_000))
     return table(HEADER, (row(*case) for case in ([(arm, "iiwa", 2, 20_000)] if quick else cases)))
 

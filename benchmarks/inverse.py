@@ -15,6 +15,8 @@ from benchmark import run
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.charts.inverse import Solutions
+from orthocas.charts.trackers import TrackerStatus
 from orthocas.codegen import CompiledInverse
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.display import percent
@@ -46,9 +48,7 @@ def main(quick: bool = False) -> dict[str, float]:
     return found
 
 
-def batch(
-    chart: oc.Chart, solve: Callable[..., oc.Solutions], q: Any, name: str, near: float | None
-) -> dict[str, float]:
+def batch(chart: oc.Chart, solve: Callable[..., Solutions], q: Any, name: str, near: float | None) -> dict[str, float]:
     """Time one batch, the best of some, and check every row."""
     phi, rng = chart.phi(q), np.random.default_rng(2)
     starts = None if near is None else q + rng.uniform(-near, near, q.shape)
@@ -59,7 +59,7 @@ def batch(
         seconds.append(time.perf_counter() - begin)
     good = solutions.found
     off = np.abs(chart.phi(solutions.q) - phi).max(axis=1) > 1e-8
-    wrong = int((good & (off | ~oc.contains(chart.problem.domain, solutions.q))).sum())
+    wrong = int((good & (off | ~chart.problem.domain.contains(solutions.q))).sum())
     title = "none" if near is None else f"near, {near}"
     change = np.abs(solutions.q - q)[good].max()
     print(
@@ -83,7 +83,7 @@ def stream(chart: oc.Chart, compiled: CompiledInverse, ticks: int) -> dict[str, 
         begin = time.perf_counter()
         q.append(tracker.step(phi))
         times.append(time.perf_counter() - begin)
-        assert tracker.status == oc.TrackerStatus.OK
+        assert tracker.status == TrackerStatus.OK
     single = []
     for phi, start in zip(path[1:301], q, strict=False):
         begin = time.perf_counter()

@@ -4,11 +4,12 @@ from benchmark import run
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.charts.quality import Report
 
 CASES = (("planar_3r_x", 6), ("planar_3r_x", 8), ("iiwa", 4))
 
 
-def main(quick: bool = False) -> dict[str, oc.Report]:
+def main(quick: bool = False) -> dict[str, Report]:
     """Print a row for each problem, degree and weight; return the reports on held-out samples."""
     found = {}
     print("| problem | degree | lambda4 | task std [deg] | longest over shortest gradient |\n|" + " --- |" * 5)

@@ -16,6 +16,7 @@ import numpy as np
 from benchmark import run, table
 
 import orthocas as oc
+from orthocas import bases
 from orthocas.codegen import CompiledLibrary, compile_shared, generate_c
 from orthocas.codegen.library import time_ticks
 from orthocas.tools.checks import Array
@@ -37,7 +38,7 @@ class Case:
 
     name: str
     problem: oc.Problem
-    parametrisation: oc.bases.Parametrisation
+    parametrisation: bases.Parametrisation
 
 
 def robot(file: str, *tips: str, base: str | None = None) -> oc.Robot:

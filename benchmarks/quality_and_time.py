@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from matplotlib.figure import Figure
 
 import orthocas as oc
-from orthocas import problems
+from orthocas import bases, problems
 
 
 class Point(NamedTuple):
@@ -74,7 +74,7 @@ def measured(case: Case, samples: int, wall: bool) -> Point:
     """Fit and judge."""
     problem, clock = problems.get("iiwa"), time.perf_counter if wall else time.process_time
     oc.fit(problem, oc.Polynomial(1))  # the first call loads libraries
-    chosen = oc.bases.parse_parametrisation(case.label)
+    chosen = bases.parse_parametrisation(case.label)
     start = clock()
     fit = oc.fit(problem, chosen, weights=case.weights, precision=case.precision)
     seconds = clock() - start

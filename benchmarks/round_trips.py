@@ -62,7 +62,7 @@ def misses(name: str, count: int) -> str:
         solutions = chart.solve(phi)
         seconds = time.process_time() - begin
         found = solutions.found
-        wrong = (np.abs(chart.phi(solutions.q[found]) - phi[found]) > 1e-8 * chart.phi_sizes).any(axis=1)
+        wrong = (np.abs(chart.phi(solutions.q[found]) - phi[found]) > 1e-8 * chart.parts.phi_sizes).any(axis=1)
         cells += [int((~found).sum()), int(wrong.sum() + (~domain.contains(solutions.q[found])).sum())]
         cells += [round(1e6 * seconds / count)]
     wide = domain.centre + 1.4 * (sample_uniform(domain, count // 25, 6) - domain.centre)
@@ -124,7 +124,7 @@ def nearest(name: str, count: int) -> str:
     pool, xi, worse = sample_uniform(domain, STARTS, 77), chart.xi(wishes), 0
     for k in range(count):
         others = positions_at(chart, x[k], pool)
-        turns = chart.turns[chart.m :]
+        turns = chart.parts.turns[chart.m :]
         away = (
             np.linalg.norm(wrap_shortest(xi[k] - chart.xi(others), turns), axis=1)
             if len(others)

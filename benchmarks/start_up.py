@@ -17,7 +17,7 @@ STARTS = {
     "import casadi (the floor of a chart)": ["-c", "import casadi"],
     "import casadi, pinocchio (the floor of a robot file)": ["-c", "import casadi, pinocchio"],
     "import orthocas": ["-c", "import orthocas"],
-    "import all of orthocas": ["-c", "import orthocas as oc; [getattr(oc, n) for n in oc.__all__ if n != 'plotting']"],
+    "import all of orthocas": ["-c", "import orthocas as oc; [getattr(oc, n) for n in oc.__all__]"],
     "orthocas --help": ["-m", "orthocas", "--help"],
     "orthocas info iiwa": ["-m", "orthocas", "info", "iiwa"],
     "orthocas fit iiwa": ["-m", "orthocas", "fit", "iiwa", "--out", "a.orthocas"],

@@ -9,6 +9,7 @@ from benchmark import run, table
 from numpy.typing import NDArray
 
 import orthocas as oc
+from orthocas.charts.trackers import TrackerStatus
 from orthocas.errors import DomainError, PathError
 from orthocas.tasks.problem import relative_singular_values
 from orthocas.tasks.regular_box import find_joint_range
@@ -120,7 +121,7 @@ def with_chart(chart: oc.Chart, q: Numbers, path: Numbers) -> float:
     tracker, phi = chart.tracker(q), chart.phi(q)
     for position in path:
         now = tracker.step(np.concatenate([position, phi[3:]]))
-        if tracker.status != oc.TrackerStatus.OK:
+        if tracker.status != TrackerStatus.OK:
             return float("nan")
     return float(np.abs(now - q).max())
 

@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import orthocas as oc
-from orthocas import problems, solvers
+from orthocas import bases, problems, solvers
 from orthocas.cli.output import terminal_monitor
 from orthocas.fitting.compare import Comparison
 from orthocas.fitting.comparison_figures import convergence_figure, front_figure
 from orthocas.solvers.protocol import Solver
 from orthocas.tools.progress import Monitor, silent
 
-Parametrisations = Sequence[oc.bases.Parametrisation | oc.SEW]
+Parametrisations = Sequence[bases.Parametrisation | oc.SEW]
 
 WEIGHTS = oc.Weights(folds=0.0, angles="paper")  # angles alone, so that families differ in nothing else
 ADAM = solvers.Adam(epochs=60, learning_rate=5e-3)

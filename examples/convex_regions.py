@@ -31,7 +31,7 @@ from pydrake.solvers import MathematicalProgram
 from spheres import Places, Query, World
 
 import orthocas as oc
-from orthocas.problems.arms import urdf_path
+from orthocas.problems import urdf_path
 from orthocas.tools.checks import Array
 from orthocas.tools.display import percent
 

@@ -27,6 +27,7 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.problems.propellers import logarithms
 from orthocas.robots import KinematicTree
+from orthocas.tasks.metric import Metric
 from orthocas.tools.checks import Array
 
 LENGTHS = (1.0, 0.8, 0.7, 0.5)  # of the links [m]
@@ -48,7 +49,7 @@ class Case:
 def cases() -> list[Case]:
     """All problems."""
     hexarotor, arm, pair = problems.get("hexarotor"), planar_4r(True), two_arms()
-    tilted = oc.Metric.custom(hexarotor.robot, "of the neighbours", lambda w: ca.diag(1 + w[[1, 2, 3, 4, 5, 0]] ** 2))
+    tilted = Metric.custom(hexarotor.robot, "of the neighbours", lambda w: ca.diag(1 + w[[1, 2, 3, 4, 5, 0]] ** 2))
     return [
         Case("hexarotor, A = I", hexarotor, True, logarithms),
         Case("hexarotor, metric of the neighbours", _with_metric(hexarotor, tilted), False),
@@ -60,7 +61,7 @@ def cases() -> list[Case]:
     ]
 
 
-def _with_metric(problem: oc.Problem, metric: "oc.Metric | str") -> oc.Problem:
+def _with_metric(problem: oc.Problem, metric: "Metric | str") -> oc.Problem:
     return oc.Problem(problem.robot, problem.task, metric, problem.domain, problem.name)
 
 

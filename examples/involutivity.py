@@ -21,6 +21,7 @@ from matplotlib.ticker import StrMethodFormatter
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.exact.involutivity import Involutivity
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Weights
 from orthocas.tasks.samples import sample_problem
 
@@ -56,7 +57,7 @@ class Row:
     """The measurements for one case."""
 
     case: Case
-    found: oc.Involutivity
+    found: Involutivity
     angle: float  #: on held-out samples, in the metric [deg]
     task_std: float  #: standard deviation as `oc.evaluate` reports it [deg]
 

@@ -20,13 +20,14 @@ from scipy.optimize import minimize
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.tasks.metric import Metric
 from orthocas.tools.checks import Array
 
 ROTORS = (0.0, 0.3, 1.0, 3.0, 10.0)  # inertias b of the rotors, reflected to the joints [kg m^2]
 DEGREES = (3, 5)
 
 
-def with_metric(problem: oc.Problem, metric: Array | oc.Metric) -> oc.Problem:
+def with_metric(problem: oc.Problem, metric: Array | Metric) -> oc.Problem:
     """The same problem with another metric."""
     return oc.Problem(problem.robot, problem.task, metric, problem.domain, problem.name)
 
@@ -39,7 +40,7 @@ def of_links(problem: oc.Problem, weights: Array) -> oc.Problem:
 def with_rotors(problem: oc.Problem, inertia: float) -> oc.Problem:
     """With the metric M + b I."""
     mass = problem.robot.function("mass_matrix")
-    metric = oc.Metric.custom(problem.robot, "with rotors", lambda q: mass(q) + inertia * ca.SX.eye(problem.n))
+    metric = Metric.custom(problem.robot, "with rotors", lambda q: mass(q) + inertia * ca.SX.eye(problem.n))
     return with_metric(problem, metric)
 
 

@@ -112,7 +112,7 @@ class InJoints:
 
     def _valid(self, state: base.State) -> bool:
         q = self.joints(state)
-        return self.clear(q) > 0 and bool(oc.contains(self.world.domain, q))
+        return self.clear(q) > 0 and bool(self.world.domain.contains(q))
 
 
 class OnPosition(base.Constraint):

@@ -17,6 +17,7 @@ from rendering import fan_picture, widest_coordinate
 from self_motion_picture import robot_file, save_trimmed
 
 import orthocas as oc
+from orthocas.bases import cyclic_joints
 from orthocas.charts import Card, Model
 from orthocas.charts.chart_file import fingerprint
 from orthocas.charts.self_motion import fan_along
@@ -264,7 +265,7 @@ def card_of(name: str, chart: oc.Chart) -> Card:
         task=chart.problem.task.name,
         coordinates=chart.coordinates.label,
         joints=chart.problem.robot.joint_names,
-        cyclic_joints=oc.cyclic_joints(chart.problem),
+        cyclic_joints=cyclic_joints(chart.problem),
         centre=tuple(domain.centre.tolist()),
         half_width=tuple(domain.half_width.tolist()),
         quality=oc.evaluate(chart, SAMPLES, SEED).as_dict(),

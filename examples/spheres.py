@@ -51,7 +51,7 @@ class World:
             ends[1, : self.chart.m] = ends[0, : self.chart.m]
         for share in np.linspace(0, 1, 61)[1:]:
             q, status = self.library.inverse((1 - share) * ends[0] + share * ends[1], path[-1])
-            if status != ControlStatus.OK or not oc.contains(self.domain, q):
+            if status != ControlStatus.OK or not self.domain.contains(q):
                 return None
             path.append(q)
         points = self.chart.problem.robot.joint_points(np.array([path[k] for k in (0, 24, 30, 36, 60)]))
@@ -100,7 +100,7 @@ class Places:
 
     def _solved(self, place: Array, start: Array) -> Array | None:
         q, status = self.world.library.inverse(np.concatenate([self.x, place]), start)
-        return q if status == ControlStatus.OK and oc.contains(self.world.domain, q) else None
+        return q if status == ControlStatus.OK and self.world.domain.contains(q) else None
 
 
 class Evaluator:

@@ -10,24 +10,18 @@ if not _os.path.isdir(_os.path.join(_FOLDER, "problems")):
     __path__.append(_os.path.dirname(_FOLDER))
 
 _HOMES: dict[str, tuple[str, str]] = {}  # of the public names: module and name there; filled on first use
-_OTHERS = {
-    "__version__": ("orthocas.version", "VERSION"),
-    # names of packages until version 0.1
-    "parametrisations": ("orthocas", "bases"),
-    "following": ("orthocas", "paths"),
-}
 
 
 def __getattr__(name: str) -> object:
     """A public name, imported on first use: all of them take half a second, and few programs need all."""
     from importlib import import_module  # late, because the command line watches for Ctrl-C only after this file
 
-    homes = _read_homes()
+    homes = {**_read_homes(), "__version__": ("orthocas.version", "VERSION")}
     if name == "__all__":
-        return sorted(homes, key=lambda public: (not public.isupper(), not public[0].isupper(), public))
-    if name not in homes and name not in _OTHERS:
+        return sorted(_HOMES, key=lambda public: (not public.isupper(), not public[0].isupper(), public))
+    if name not in homes:
         raise AttributeError(f"module 'orthocas' has no attribute '{name}'")
-    home, own_name = _OTHERS.get(name) or homes[name]
+    home, own_name = homes[name]
     members = vars(import_module(home))
     globals()[name] = members[own_name] if own_name in members else import_module(f"{home}.{own_name}")
     return globals()[name]

@@ -1,20 +1,27 @@
-"""Named problems and their data."""
+"""Named problems: the arms of [AS2023], planar ones (links of 1 m and 3 kg are ours) and the KUKA LBR iiwa 7 R800.
+
+`propellers` has one that is no arm.
+"""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
+from importlib.resources import as_file, files
+from pathlib import Path
 
-from orthocas.problems import arms, propellers
+import numpy as np
+
+from orthocas.problems import propellers
+from orthocas.robots.robot import Robot
+from orthocas.tasks.domains import Box, Torus
 from orthocas.tasks.problem import Problem
+from orthocas.tasks.task import Task
 from orthocas.tools.checks import require_known
 
 __all__ = ["get", "names"]
 
-_PROBLEMS: dict[str, Callable[[], Problem]] = {
-    "planar_2r": arms.planar_2r,
-    "planar_3r_x": arms.planar_3r_x,
-    "planar_3r_xy": arms.planar_3r_xy,
-    "iiwa": arms.iiwa,
-    "hexarotor": propellers.hexarotor,
-}
+CENTRE = (0.0, 0.52, 0.0, -1.05, 0.0, 0.79, 0.0)  #: q0 of the iiwa [rad]
+HALF_WIDTH = np.pi / 4  #: of its box [rad]
+_BENT = Box((0.6, 0.8, 0.8), np.pi / 8)  #: of the planar arms [rad]; neither task is singular here
 
 
 def names() -> tuple[str, ...]:
@@ -30,3 +37,52 @@ def get(name: str) -> Problem:
     """
     require_known("problem", name, _PROBLEMS)
     return _PROBLEMS[name]()
+
+
+def _arm(joints: int) -> Robot:
+    return Robot.planar(lengths=[1.0] * joints, masses=[3.0] * joints)
+
+
+def planar_2r() -> Problem:
+    """Two joints, task x of the tip, A = I, whole torus ([AS2023] Sec. 6.1).
+
+    Self-motion manifolds are circles here, so no smooth coordinate is good everywhere. Expect bad regions near the
+    singularities of the task.
+    """
+    robot = _arm(2)
+    return Problem(robot, Task.position(robot, "x"), "euclidean", Torus(2), "planar_2r")
+
+
+def planar_3r_x() -> Problem:
+    """Three joints, task x of the tip, A = M. Exact coordinates exist. The box avoids singularities (ours)."""
+    robot = _arm(3)
+    return Problem(robot, Task.position(robot, "x"), "inertia", _BENT, "planar_3r_x")
+
+
+def planar_3r_xy() -> Problem:
+    """Three joints, task (x, y) of the tip, A = M. No exact coordinates exist. Same box as planar_3r_x (ours)."""
+    robot = _arm(3)
+    return Problem(robot, Task.position(robot, "xy"), "inertia", _BENT, "planar_3r_xy")
+
+
+def urdf_path() -> AbstractContextManager[Path]:
+    """The path of the arm's URDF file, valid while the context is open."""
+    return as_file(files(__package__) / "data" / "iiwa7_r800.urdf")
+
+
+def iiwa_robot() -> Robot:
+    """The arm with its tip at the flange (link_ee)."""
+    with urdf_path() as path:
+        return Robot.from_urdf(path, tip="link_ee")
+
+
+def iiwa() -> Problem:
+    """Seven joints, flange position, A = I, hypercube with edges of pi/2 around q0."""
+    arm = iiwa_robot()
+    return Problem(arm, Task.position(arm), "euclidean", Box(CENTRE, HALF_WIDTH), "iiwa")
+
+
+_PROBLEMS: dict[str, Callable[[], Problem]] = {
+    **{build.__name__: build for build in (planar_2r, planar_3r_x, planar_3r_xy, iiwa)},
+    "hexarotor": propellers.hexarotor,
+}

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 import orthocas as oc
-from orthocas.problems.arms import urdf_path
+from orthocas.problems import urdf_path
 from orthocas.tasks.regular_box import regular_box
 from orthocas.tools.checks import Array
 

@@ -5,6 +5,7 @@ Docstrings are plain text for `help` and editors; on pages they also get Greek l
 
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from docutils import nodes
@@ -15,7 +16,6 @@ from sphinx.ext.napoleon import Config, GoogleDocstring
 from sphinx.transforms import SphinxTransform
 from sphinx.util.typing import stringify_annotation
 
-import orthocas
 from orthocas.tools.checks import Array
 
 NAMES = ["alpha", "beta", "delta", "epsilon", "theta", "lambda", "xi", "rho", "sigma", "tau", "phi", "psi", "pi"]
@@ -23,7 +23,18 @@ GREEK = dict(zip(NAMES, "αβδεθλξρστφψπ", strict=True))
 LETTER = "|".join(GREEK)
 
 CODE = re.compile(r"(`[^`]+`)")
-LINKED = re.compile(rf"`(?:orthocas\.|oc\.)?((?:{'|'.join(orthocas.__all__)})(?:\.\w+)*)(?:\(.*\))?`")
+DIRECTIVE = re.compile(r"^\.\. auto(?:class|function|module):: (orthocas(?:\.\w+)+)$", flags=re.MULTILINE)
+DESCRIBED = [
+    name
+    for page in (Path(__file__).parents[1] / "reference").glob("*.md")
+    for name in DIRECTIVE.findall(page.read_text())
+]
+PLACES = {  # of names in the reference; classes also go by their last word, `Report`
+    **{name.split(".")[-1]: name for name in DESCRIBED if name.split(".")[-1][0].isupper()},
+    **{name.removeprefix("orthocas."): name for name in DESCRIBED},
+    **{name: name for name in DESCRIBED},
+}
+LINKED = re.compile(rf"`(?:oc\.)?({'|'.join(sorted(map(re.escape, PLACES), reverse=True))})((?:\.\w+)*)(?:\(.*\))?`")
 POWER = re.compile(r"\^(-?\d+|-?T|#A?|\*|\{[^}\s]+\})")
 INDEX = re.compile(rf"(?<!\w)(d?(?:[A-Za-z]|{LETTER})|grad)_({LETTER}|[A-Za-z0-9]{{1,3}}|\{{[^}}\s]+\}})(?!\w)")
 WORD = re.compile(rf"(?<![\w`])(d?)({LETTER})(\d?)(?!\w|=|\.\w)")
@@ -55,7 +66,7 @@ def markup(text: str) -> str:
 
 def _code(text: str) -> str:
     name = LINKED.fullmatch(text)
-    return f":py:obj:`{text.strip('`')} <orthocas.{name[1]}>`" if name else f"`{text}`"
+    return f":py:obj:`{text.strip('`')} <{PLACES[name[1]]}{name[2]}>`" if name else f"`{text}`"
 
 
 def _prose(text: str) -> str:

@@ -26,6 +26,7 @@ import mujoco
 import numpy as np
 
 import orthocas as oc
+from orthocas.charts.trackers import TrackerStatus
 from orthocas.simulation import MuJoCoPlant
 from orthocas.tools.checks import Array
 
@@ -120,11 +121,11 @@ def main(sticks: Iterator[Array] | None = None, quick: bool = False) -> dict[str
         state.qpos[:] = q[-1]
         mujoco.mj_kinematics(model, state)
         error = float(np.abs(state.body("tip").xpos - wanted[:3]).max())
-        (errors if tracker.status == oc.TrackerStatus.OK else held).append(error)
+        (errors if tracker.status == TrackerStatus.OK else held).append(error)
         room = min(room, float(np.minimum(q[-1] - robot.lower, robot.upper - q[-1]).min()))
     found = {
-        "reached": float(np.mean(np.array(statuses) == oc.TrackerStatus.OK)),
-        "nearest": float(np.mean(np.array(statuses) == oc.TrackerStatus.NEAREST)),
+        "reached": float(np.mean(np.array(statuses) == TrackerStatus.OK)),
+        "nearest": float(np.mean(np.array(statuses) == TrackerStatus.NEAREST)),
         "hand_error_m": max(errors, default=np.nan),
         "at_boundary_m": float(np.median(held)),
         "fastest": float((np.abs(np.diff(q, axis=0)) / limit).max()),

@@ -55,9 +55,9 @@ def cyclic_joints(problem: Problem) -> tuple[str, ...]:
         ours, docs/explanation/domains.md.
 
     Example:
-        >>> import orthocas as oc
         >>> from orthocas import problems
-        >>> oc.cyclic_joints(problems.get("planar_3r_xy")), oc.cyclic_joints(problems.get("planar_3r_x"))
+        >>> from orthocas.bases import cyclic_joints
+        >>> cyclic_joints(problems.get("planar_3r_xy")), cyclic_joints(problems.get("planar_3r_x"))
         (('q1',), ())
     """
     require_kind("problem", problem, Problem)
@@ -277,14 +277,19 @@ def suffix(cyclic: Cyclic, without: tuple[str, ...] = ()) -> str:
     return linear + (f":{_WITHOUT}={','.join(without)}" if without else "")
 
 
-def parse_suffix(text: str) -> tuple[Cyclic, tuple[str, ...]]:
-    """Parse what ends a label: '', 'cyclic' or 'cyclic=NAME,NAME', then 'without=NAME,NAME'."""
+def parse_suffix(text: str, before: str) -> tuple[Cyclic, tuple[str, ...]]:
+    """Parse what ends a label: '', 'cyclic' or 'cyclic=NAME,NAME', then 'without=NAME,NAME'.
+
+    Args:
+        text: the end of the label.
+        before: what may stand before it, for messages.
+    """
     cyclic: Cyclic = ()
     without: tuple[str, ...] = ()
     for part in text.split(":") if text else ():
         word, equals, names = part.partition("=")
         if word not in (_WORD, _WITHOUT) or (not names if equals else word == _WITHOUT):
-            wanted = "'joints=2', then 'cyclic' or 'cyclic=JOINT,JOINT', then 'without=JOINT' after the degree"
+            wanted = f"{before}, then 'cyclic' or 'cyclic=JOINT,JOINT', then 'without=JOINT'"
             raise InvalidValueError("parametrisation", repr(text), wanted)
         if word == _WORD:
             cyclic = tuple(names.split(",")) if equals else "auto"

@@ -1,13 +1,15 @@
 """Multilayer perceptron of sines and cosines of the joints, or of the joints themselves ([AS2023] Sec. 6, Fig. 16)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
+from orthocas.bases import cyclic as cyclic_choice
+from orthocas.bases.cyclic import Cyclic
 from orthocas.bases.family import ArrayMemory, Expression, JointSpace, Pulled
 from orthocas.errors import InvalidValueError
 from orthocas.tools.checks import Array, require_count, require_kind
@@ -34,7 +36,7 @@ class NetworkArrays:
 
     def __init__(self, theta: Array, widths: Sequence[int], inputs: Array, memory: ArrayMemory) -> None:
         N, self._widths = len(inputs), widths
-        self._V, self._b = _layers(theta, widths)
+        self._V, self._b = split_layers(theta, widths)
 
         def arrays(name: str, *before: int) -> list[Array]:
             return [memory.array(f"{name}{k}", (*before, N, w), theta.dtype) for k, w in enumerate(widths[:-1])]
@@ -66,7 +68,7 @@ class NetworkArrays:
             slopes: the derivatives.
             result: takes dL/dtheta, (size,), and is returned.
         """
-        by_V, by_b = _layers(result, self._widths)
+        by_V, by_b = split_layers(result, self._widths)
         self._up[0][:-1] = slopes
         for k, V in enumerate(self._V[:-1], start=1):
             up, h = self._up[k][:-1], self._below[k][:-1]
@@ -96,8 +98,8 @@ def _flatten(stack: Array) -> Array:
     return stack.reshape(-1, stack.shape[2])
 
 
-def _layers(theta: Array, widths: Sequence[int]) -> tuple[list[Array], list[Array]]:
-    """V and b of every layer, as views."""
+def split_layers(theta: Array, widths: Sequence[int]) -> tuple[list[Array], list[Array]]:
+    """V (width, next width) and b (next width,) of every layer, as views."""
     V, b, start = [], [], 0
     for width, out in pairwise(widths):
         end = start + width * out
@@ -115,6 +117,9 @@ class MLP:
         hidden: widths of the hidden layers, each >= 1.
         raw: whether revolute joints enter as q itself, too. Coordinates are then not periodic. The number of parameters
             that the paper states for its network in Sec. 9 is that of raw inputs.
+        cyclic: joints that do not enter the network, but appear in one linear term each, by name, or "auto" for all
+            cyclic joints of the problem; see `Polynomial`.
+        without: names of joints that coordinates do not depend on; see `Polynomial`.
 
     Example:
         >>> import orthocas as oc
@@ -126,10 +131,15 @@ class MLP:
         ('mlp:6x6', 91)
         >>> oc.MLP(hidden=(1024, 512), raw=True).label
         'mlp:1024x512:raw'
+        >>> oc.MLP((24, 24), raw=True, cyclic=["A1"], without=["A7"]).label
+        'mlp:24x24:raw:cyclic=A1:without=A7'
     """
 
     hidden: tuple[int, ...] = (64, 64)
     raw: bool = False
+    # others keep their fingerprints
+    cyclic: Cyclic = field(default=(), metadata={"stored": "if given"})
+    without: tuple[str, ...] = field(default=(), metadata={"stored": "if given"})
     linear = False
     closed_form = None
 
@@ -138,44 +148,67 @@ class MLP:
             raise InvalidValueError("hidden", self.hidden, "the widths of at least one hidden layer, such as (64, 64)")
         object.__setattr__(self, "hidden", tuple(require_count("hidden", width) for width in self.hidden))
         require_kind("raw", self.raw, bool)
+        object.__setattr__(self, "cyclic", cyclic_choice.check_cyclic(self.cyclic))
+        object.__setattr__(self, "without", cyclic_choice.check_without(self.without, self.cyclic))
 
     @property
     def label(self) -> str:
-        """'mlp:WIDTHxWIDTH', and ':raw' for raw inputs."""
-        return "mlp:" + "x".join(map(str, self.hidden)) + (":raw" if self.raw else "")
+        """'mlp:WIDTHxWIDTH', ':raw' for raw inputs, and the joints that enter in another way."""
+        widths = "x".join(map(str, self.hidden)) + (":raw" if self.raw else "")
+        return f"mlp:{widths}{cyclic_choice.suffix(self.cyclic, self.without)}"
 
     def for_problem(self, problem: "Problem") -> "MLP":
-        """The object itself: it does not depend on the problem."""
-        return self
+        """The parametrisation with the names of the problem's cyclic joints, if it reduces any."""
+        return replace(self, cyclic=cyclic_choice.resolved(self.cyclic, problem)) if self.cyclic else self
 
     def family(self, space: JointSpace, outputs: int) -> "MLPFamily":
-        """The network on the given joints."""
-        return MLPFamily(space, outputs, self.hidden, self.raw)
+        """The network on the given joints.
+
+        Raises:
+            InvalidValueError: if no joint enters the network.
+        """
+        linear = tuple(cyclic_choice.indices(self.cyclic, space))
+        without = cyclic_choice.indices(self.without, space)
+        inputs = tuple(i for i in range(space.n) if i not in (*linear, *without))
+        if not inputs:
+            raise InvalidValueError("cyclic and without", self.label, "at least one joint that enters the network")
+        return MLPFamily(space, outputs, self.hidden, self.raw, inputs, linear)
 
 
 @dataclass(frozen=True, eq=False)
 class MLPFamily:
-    """The network on given joints. theta holds W_1, b_1, ..., W_out, b_out, with matrices column by column."""
+    """The network on given joints. theta holds W_1, b_1, ..., W_out, b_out, then A, with matrices column by column."""
 
     space: JointSpace
     outputs: int
     hidden: tuple[int, ...]
-    raw: bool = False
+    raw: bool
+    inputs: tuple[int, ...]  #: joints that enter the network
+    linear: tuple[int, ...]  #: joints q_l that add A q_l
     as_matrices: bool = True
 
     @property
-    def direct(self) -> tuple[bool, ...]:
-        """Which joints enter as q itself."""
-        return (True,) * self.space.n if self.raw else self.space.prismatic
+    def turning(self) -> list[int]:
+        """Joints that enter the network as sine and cosine."""
+        return [i for i in self.inputs if not (self.raw or self.space.prismatic[i])]
+
+    @property
+    def direct(self) -> list[int]:
+        """Joints that enter the network as q itself."""
+        return [i for i in self.inputs if self.raw or self.space.prismatic[i]]
 
     @property
     def widths(self) -> tuple[int, ...]:
         """Widths of all layers, from the inputs to the outputs."""
-        return (2 * self.space.n - sum(self.direct), *self.hidden, self.outputs)
+        return (2 * len(self.turning) + len(self.direct), *self.hidden, self.outputs)
 
     @property
     def size(self) -> int:
-        """Number of weights and biases."""
+        """Number of weights and biases, and of entries of A."""
+        return self._network_size + self.outputs * len(self.linear)
+
+    @property
+    def _network_size(self) -> int:
         return sum(out * (width + 1) for width, out in pairwise(self.widths))
 
     @property
@@ -183,61 +216,8 @@ class MLPFamily:
         """Width of the widest layer."""
         return max(self.widths)
 
-    def expression(self, q: Expression, theta: Expression) -> Expression:
-        """xi_theta(q), (r, N), for q (n, N)."""
-        return self._forward(q, self._layers(theta))[0]
-
-    def jacobian(self, q: Expression, theta: Expression) -> list[Expression]:
-        """Gradients of the components, r matrices (n, N), by the chain rule from the outputs to the inputs.
-
-        The gradients of all components pass through the layers side by side, as one matrix (width, r N), because BLAS
-        is fast at large products.
-        """
-        layers = self._layers(theta)
-        slopes = self._forward(q, layers)[1]
-        N = q.shape[1]
-        W_out = layers[-1][0]
-        gradients = ca.horzcat(*(ca.repmat(W_out[j, :].T, 1, N) for j in range(self.outputs)))
-        for (W, _), slope in zip(layers[-2::-1], reversed(slopes), strict=True):
-            gradients *= ca.repmat(slope, 1, self.outputs)
-            # one sample as rows: then generated C needs no transposed copy of the weights
-            gradients = (gradients.T @ W).T if N == 1 else W.T @ gradients
-        t = len(self._turning)
-        by_angle = gradients[:t, :] * ca.repmat(ca.cos(q[self._turning, :]), 1, self.outputs)
-        by_angle -= gradients[t : 2 * t, :] * ca.repmat(ca.sin(q[self._turning, :]), 1, self.outputs)
-        # back to the order of the joints
-        rows = np.argsort([*self._turning, *self._direct_joints]).tolist()
-        stacked = ca.vertcat(by_angle, gradients[2 * t :, :])[rows, :]
-        return [stacked[:, j * N : (j + 1) * N] for j in range(self.outputs)]
-
-    def pullback(self, points: Array, theta: Array, memory: ArrayMemory | None = None) -> tuple[Array, Pulled]:
-        """J_xi at points (N, n), (N, r, n), and the map from dL/dJ_xi to dL/dtheta; see `ArrayFamily`."""
-        angles, t = points[:, self._turning], len(self._turning)
-        sin, cos = np.sin(angles).astype(theta.dtype), np.cos(angles).astype(theta.dtype)
-        inputs = np.concatenate([sin, cos, points[:, self._direct_joints].astype(theta.dtype)], axis=1)
-        network = NetworkArrays(theta, self.widths, inputs, memory or ArrayMemory())
-        g = network.gradients().transpose(1, 0, 2)  # (N, r, inputs)
-        J = np.empty((len(points), self.outputs, self.space.n))
-        J[:, :, self._turning] = g[:, :, :t] * cos[:, None] - g[:, :, t : 2 * t] * sin[:, None]
-        J[:, :, self._direct_joints] = g[:, :, 2 * t :]
-
-        def back(slopes: Array, result: Array) -> Array:
-            by_angle, direct = slopes[:, :, self._turning].astype(theta.dtype), slopes[:, :, self._direct_joints]
-            parts = [by_angle * cos[:, None], -by_angle * sin[:, None], direct.astype(theta.dtype)]
-            return network.pull_back(np.concatenate(parts, axis=2).transpose(1, 0, 2), result)
-
-        return J, back
-
-    @property
-    def _turning(self) -> list[int]:
-        return [i for i, direct in enumerate(self.direct) if not direct]
-
-    @property
-    def _direct_joints(self) -> list[int]:
-        return [i for i, direct in enumerate(self.direct) if direct]
-
-    def _layers(self, theta: Expression) -> list[tuple[Expression, Expression]]:
-        """Weights and biases of every layer."""
+    def _split(self, theta: Expression) -> list[tuple[Expression, Expression]]:
+        """Weights (out, width) and biases (out, 1) of every layer."""
         layers, start = [], 0
         for width, out in pairwise(self.widths):
             W = ca.reshape(theta[start : start + out * width], out, width)
@@ -245,12 +225,77 @@ class MLPFamily:
             start += out * (width + 1)
         return layers
 
+    def split_slopes(self, theta: Array) -> Array:
+        """A, (r, linear)."""
+        return theta[self._network_size :].reshape(len(self.linear), self.outputs).T
+
+    def expression(self, q: Expression, theta: Expression) -> Expression:
+        """xi_theta(q), (r, N), for q (n, N)."""
+        xi = self._forward(q, self._split(theta))[0]
+        if self.linear:
+            xi += ca.reshape(theta[self._network_size :], self.outputs, len(self.linear)) @ q[list(self.linear), :]
+        return xi
+
+    def jacobian(self, q: Expression, theta: Expression) -> list[Expression]:
+        """Gradients of the components, r matrices (n, N), by the chain rule from the outputs to the inputs.
+
+        The gradients of all components pass through the layers side by side, as one matrix (width, r N), because BLAS
+        is fast at large products.
+        """
+        layers = self._split(theta)
+        slopes = self._forward(q, layers)[1]
+        N, r = q.shape[1], self.outputs
+        W_out = layers[-1][0]
+        gradients = ca.horzcat(*(ca.repmat(W_out[j, :].T, 1, N) for j in range(r)))
+        for (W, _), slope in zip(layers[-2::-1], reversed(slopes), strict=True):
+            gradients *= ca.repmat(slope, 1, r)
+            # one sample as rows: then generated C needs no transposed copy of the weights
+            gradients = (gradients.T @ W).T if N == 1 else W.T @ gradients
+        turning: list[int] = self.turning
+        t = len(turning)
+        by_angle = gradients[:t, :] * ca.repmat(ca.cos(q[turning, :]), 1, r)
+        by_angle -= gradients[t : 2 * t, :] * ca.repmat(ca.sin(q[turning, :]), 1, r)
+        # rows of the network's joints, of linear ones, and of those that coordinates do not depend on
+        parts = [by_angle, gradients[2 * t :, :]]
+        if self.linear:
+            A = ca.reshape(theta[self._network_size :], r, len(self.linear))
+            parts.append(ca.horzcat(*(ca.repmat(A[j, :].T, 1, N) for j in range(r))))
+        entered: list[int] = [*turning, *self.direct, *self.linear]
+        without: list[int] = [i for i in range(self.space.n) if i not in entered]
+        if without:
+            parts.append(type(q).zeros(len(without), r * N))
+        # back to the order of the joints
+        stacked = ca.vertcat(*parts)[np.argsort([*entered, *without]).tolist(), :]
+        return [stacked[:, j * N : (j + 1) * N] for j in range(r)]
+
+    def pullback(self, points: Array, theta: Array, memory: ArrayMemory | None = None) -> tuple[Array, Pulled]:
+        """J_xi at points (N, n), (N, r, n), and the map from dL/dJ_xi to dL/dtheta; see `ArrayFamily`."""
+        turning, direct, linear, size = self.turning, self.direct, list(self.linear), self._network_size
+        angles, t = points[:, turning], len(turning)
+        sin, cos = np.sin(angles).astype(theta.dtype), np.cos(angles).astype(theta.dtype)
+        inputs = np.concatenate([sin, cos, points[:, direct].astype(theta.dtype)], axis=1)
+        network = NetworkArrays(theta[:size], self.widths, inputs, memory or ArrayMemory())
+        g = network.gradients().transpose(1, 0, 2)  # (N, r, inputs)
+        J = np.zeros((len(points), self.outputs, self.space.n))
+        J[:, :, turning] = g[:, :, :t] * cos[:, None] - g[:, :, t : 2 * t] * sin[:, None]
+        J[:, :, direct] = g[:, :, 2 * t :]
+        J[:, :, linear] = self.split_slopes(theta)
+
+        def back(slopes: Array, result: Array) -> Array:
+            by_angle, by_direct = slopes[:, :, turning].astype(theta.dtype), slopes[:, :, direct].astype(theta.dtype)
+            parts = [by_angle * cos[:, None], -by_angle * sin[:, None], by_direct]
+            network.pull_back(np.concatenate(parts, axis=2).transpose(1, 0, 2), result[:size])
+            result[size:] = slopes[:, :, linear].sum(axis=0).T.ravel()
+            return result
+
+        return J, back
+
     def _forward(
         self, q: Expression, layers: list[tuple[Expression, Expression]]
     ) -> tuple[Expression, list[Expression]]:
-        """Outputs (r, N), and the derivatives 1 - tanh^2 of the hidden layers, (width, N) each."""
-        angles = q[self._turning, :]
-        layer = ca.vertcat(ca.sin(angles), ca.cos(angles), q[self._direct_joints, :])
+        """Outputs of the network (r, N), and the derivatives 1 - tanh^2 of the hidden layers, (width, N) each."""
+        angles = q[self.turning, :]
+        layer = ca.vertcat(ca.sin(angles), ca.cos(angles), q[self.direct, :])
         slopes = []
         for depth, (W, b) in enumerate(layers):
             layer = W @ layer + ca.repmat(b, 1, q.shape[1])
@@ -260,13 +305,13 @@ class MLPFamily:
         return layer, slopes
 
     def initial(self, seed: int) -> Array:
-        """Glorot-uniform weights and zero biases, (size,)."""
+        """Glorot-uniform weights, zero biases and no linear terms, (size,)."""
         rng = np.random.default_rng(seed)
         parts = []
         for width, out in pairwise(self.widths):
             bound = np.sqrt(6 / (width + out))
             parts += [rng.uniform(-bound, bound, out * width), np.zeros(out)]
-        return np.concatenate(parts)
+        return np.concatenate([*parts, np.zeros(self.outputs * len(self.linear))])
 
     def reordered(self, theta: Array, order: Sequence[int]) -> Array:
         """Parameters with the outputs in another order, (size,)."""
@@ -275,7 +320,7 @@ class MLPFamily:
 
     def combined(self, theta: Array, B: Array) -> Array:
         """Parameters of B xi, (size,), for a matrix B (r, r)."""
-        # W_out column by column, then b_out
-        last = self.outputs * (self.widths[-2] + 1)
+        # W_out column by column, then b_out, then A
+        last = self.outputs * (self.widths[-2] + 1 + len(self.linear))
         columns = theta[-last:].reshape(-1, self.outputs) @ B.T
         return np.concatenate([theta[:-last], columns.ravel()])

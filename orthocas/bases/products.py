@@ -229,7 +229,7 @@ class Polynomial(Products):
     Args:
         degree: total degree, >= 1.
         cyclic: joints that appear in one linear term each, by name, or "auto" for all cyclic joints of the problem.
-            Charts are then valid for all positions of these joints; see `orthocas.cyclic_joints`.
+            Charts are then valid for all positions of these joints; see `orthocas.bases.cyclic_joints`.
         joints: most joints in one product, >= 1. Default: all. With 2, terms of three joints and more are left out:
             that is most of them with many joints, and they gain little.
         without: names of joints that coordinates do not depend on, such as the last one under a pose: xi then stays
@@ -285,7 +285,7 @@ class Fourier(Products):
     Args:
         degree: total degree, >= 1.
         cyclic: joints that appear in one linear term each instead of sines and cosines, by name, or "auto" for all
-            cyclic joints of the problem; see `orthocas.cyclic_joints`.
+            cyclic joints of the problem; see `orthocas.bases.cyclic_joints`.
         joints: most joints in one product, >= 1. Default: all.
         without: names of joints that coordinates do not depend on.
 

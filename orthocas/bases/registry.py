@@ -46,11 +46,12 @@ def register_parametrisation(
     Example:
         >>> from dataclasses import dataclass
         >>> import orthocas as oc
+        >>> from orthocas import bases
         >>> @dataclass(frozen=True)
         ... class Cubic(oc.Polynomial):
         ...     degree: int = 3
         >>> oc.register_parametrisation("cubic", Cubic, parse=lambda text: Cubic())
-        >>> oc.bases.parse_parametrisation("cubic")
+        >>> bases.parse_parametrisation("cubic")
         Cubic(degree=3, cyclic=(), joints=None, without=())
     """
     require_kind("name", name, str)
@@ -160,15 +161,15 @@ def _parse_products(text: str) -> tuple[int, Cyclic, int | None, tuple[str, ...]
     if rest.startswith(f"{JOINTS}="):
         number, _, rest = rest.removeprefix(f"{JOINTS}=").partition(":")
         most = _parse_whole(number)
-    cyclic, without = parse_suffix(rest)
+    cyclic, without = parse_suffix(rest, "after the degree 'joints=2'")
     return _parse_whole(degree), cyclic, most, without
 
 
 def _parse_mlp(text: str) -> MLP:
-    widths, colon, inputs = text.partition(":")
-    if colon and inputs != "raw":
-        raise InvalidValueError("parametrisation", repr(f"mlp:{text}")[:80], "nothing but ':raw' after the widths")
-    return MLP(tuple(_parse_whole(width) for width in widths.split("x")), bool(colon))
+    widths, _, rest = text.partition(":")
+    raw, _, joints = rest.partition(":") if rest.partition(":")[0] == "raw" else ("", "", rest)
+    cyclic, without = parse_suffix(joints, "after the widths 'raw'")
+    return MLP(tuple(_parse_whole(width) for width in widths.split("x")), bool(raw), cyclic, without)
 
 
 def _parse_linear(text: str) -> Linear:

@@ -154,8 +154,9 @@ def certified_box(
     Example:
         >>> import orthocas as oc
         >>> from orthocas import problems
+        >>> from orthocas.certificates import certified_box
         >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
-        >>> bool((oc.certified_box(chart).half_width == chart.problem.domain.half_width).all())
+        >>> bool((certified_box(chart).half_width == chart.problem.domain.half_width).all())
         True
     """
     limits = replace(_LARGEST_BOX, seconds=check_options(chart, time_limit, executor))
@@ -195,8 +196,9 @@ def check_certificate(
     Example:
         >>> import orthocas as oc
         >>> from orthocas import problems
+        >>> from orthocas.certificates import check_certificate
         >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
-        >>> oc.check_certificate(chart, oc.certify(chart))
+        >>> check_certificate(chart, oc.certify(chart))
         True
     """
     # The certificate must be one of this chart before any number of it is checked.

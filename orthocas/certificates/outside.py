@@ -96,7 +96,7 @@ def _find_periodic_joints(chart: Chart) -> set[int]:
 def _find_periodic_inputs(family: Family, n: int, coordinates: Coordinates) -> set[int]:
     """The same for the coordinates of a family of n joints."""
     if isinstance(family, MLPFamily):
-        return {i for i, direct in enumerate(family.direct) if not direct}
+        return {*range(n)} - {*family.direct}
     q = ca.SX.sym("q", n)
     if isinstance(family, LinearFamily):
         values = family.basis(q)

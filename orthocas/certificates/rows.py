@@ -17,7 +17,6 @@ Source:
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -25,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.bases.cyclic import Mobile
-from orthocas.bases.mlp import MLPFamily
+from orthocas.bases.mlp import MLPFamily, split_layers
 from orthocas.bases.products import ProductFamily
 from orthocas.certificates.graph import TaylorGraph
 from orthocas.certificates.jets import (
@@ -227,7 +226,7 @@ def _build_coordinate_rows(coordinates: Coordinates) -> tuple[CoordinateRows | N
         rows = ProductRows.build(family, coordinates.theta)
         return rows, {active[i] for i in rows.find_dependences()}
     if isinstance(family, MLPFamily):
-        return NetworkRows.build(family, coordinates.theta), set(active)
+        return NetworkRows.build(family, coordinates.theta), {active[i] for i in family.inputs}
     own = ca.SX.sym("q", len(active))
     xi = family.expression(own, ca.SX(ca.DM(coordinates.theta)))
     function = dense_function("xi", [own], [xi])
@@ -489,55 +488,43 @@ def _differentiate_basis(family: ProductFamily, terms: Array, C: Array, highest:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class NetworkRows:
-    """J_xi of xi = W_out tanh(W_2 tanh(W_1 [sin q; cos q; q] + b_1) + b_2) on boxes."""
+    """J_xi of xi = W_out tanh(W_2 tanh(W_1 [sin q; cos q; q] + b_1) + b_2) + A q on boxes."""
 
     layers: tuple[tuple[Array, Array], ...]  #: weights (out, in) and biases (out,)
-    direct: tuple[bool, ...]  #: which joints enter as q itself
+    turning: list[int]  #: joints that enter as sine and cosine
+    direct: list[int]  #: joints that enter as q itself
+    slopes: Array  #: A of all joints, (r, n); 0 for those of the network
 
     @classmethod
     def build(cls, family: MLPFamily, theta: Array) -> "NetworkRows":
         """The layers of a family with its parameters."""
-        layers, start = [], 0
-        for width, out in pairwise(family.widths):
-            end = start + out * width
-            layers.append((theta[start:end].reshape(width, out).T.copy(), theta[end : end + out]))
-            start = end + out
-        return cls(tuple(layers), family.direct)
+        layers = tuple((V.T.copy(), b) for V, b in zip(*split_layers(theta, family.widths), strict=True))
+        slopes = np.zeros((family.outputs, family.space.n))
+        slopes[:, list(family.linear)] = family.split_slopes(theta)
+        return cls(layers, family.turning, family.direct, slopes)
 
     def __call__(self, joints: list[TaylorModel], half_widths: Array, variables: Variables) -> TaylorModel:
         """J_xi, (r, n, boxes), for models of the joints."""
-        turning = [q for q, slides in zip(joints, self.direct, strict=True) if not slides]
-        sliding = [q for q, slides in zip(joints, self.direct, strict=True) if slides]
-        sines, cosines = [sine(q) for q in turning], [cosine(q) for q in turning]
-        # Values from layer to layer, then gradients backwards.
-        layer, slopes = stack([*sines, *cosines, *sliding]), []
+        sines, cosines = ([of(joints[i]) for i in self.turning] for of in (sine, cosine))
+        # values from layer to layer, then gradients backwards
+        layer, slopes = stack([*sines, *cosines, *(joints[i] for i in self.direct)]), []
         one = TaylorModel.constant(np.ones((1, 1)))
         for W, b in self.layers[:-1]:
             layer = tanh(_multiply_weights(W, layer) + TaylorModel.constant(b[:, None]))
             slopes.append(one - square(layer))
         rows = []
-        for weights in self.layers[-1][0]:
+        for weights, constants in zip(self.layers[-1][0], self.slopes, strict=True):
             gradient = TaylorModel.constant(weights[:, None])
             for (W, _), slope in zip(self.layers[-2::-1], slopes[::-1], strict=True):
                 gradient = _multiply_weights(W.T, gradient * slope)
-            rows.append(self._differentiate_by_joint(gradient, sines, cosines))
+            # by the joints, from derivatives by the inputs [sin q; cos q; q]
+            turning, columns = len(sines), [TaylorModel.constant(np.full(1, value)) for value in constants]
+            for k, i in enumerate(self.turning):
+                columns[i] = gradient[k] * cosines[k] - gradient[turning + k] * sines[k]
+            for k, i in enumerate(self.direct):
+                columns[i] = gradient[2 * turning + k]
+            rows.append(stack(columns))
         return stack(rows)
-
-    def _differentiate_by_joint(
-        self, gradient: TaylorModel, sines: list[TaylorModel], cosines: list[TaylorModel]
-    ) -> TaylorModel:
-        """Derivatives by the joints from those by the inputs [sin q; cos q; q]."""
-        turning, columns = len(sines), []
-        angle, slide = 0, 2 * turning
-        for slides in self.direct:
-            if slides:
-                columns.append(gradient[slide])
-                slide += 1
-            else:
-                by_sine, by_cosine = gradient[angle], gradient[turning + angle]
-                columns.append(by_sine * cosines[angle] - by_cosine * sines[angle])
-                angle += 1
-        return stack(columns)
 
 
 def _multiply_weights(W: Array, models: TaylorModel) -> TaylorModel:

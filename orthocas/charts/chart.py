@@ -74,20 +74,12 @@ class Chart(InverseMethods, Shown):
         )
         return {
             "chart": f"{self.coordinates.label} coordinates of {self.problem.heading}",
-            "phi": listed([*self.labels[: self.m], *self.named_coordinates]),
+            "phi": listed([*self.labels[: self.m], *self.parts.named_coordinates]),
             "parameters": str(self.coordinates.size),
             **{name: problem[name] for name in ("task", "metric", "domain")},
             **({"made by": made} if made else {}),
             **({"certificate": self.certificate.heading} if self.certificate else {}),
         }
-
-    @property
-    def named_coordinates(self) -> tuple[str, ...]:
-        """Labels of the coordinates, with what a fit made the first ones like: 'xi1: like swivel at home [rad]'."""
-        labels, meaning = self.labels[self.m :], self.notes.get("meaning")
-        named = meaning.split("; ") if isinstance(meaning, str) else []
-        named = [name if name.startswith("like ") else f"like {name}" for name in named]  # older charts only name it
-        return (*(f"{label}: {name}" for label, name in zip(labels, named, strict=False)), *labels[len(named) :])
 
     def quality(self, q: ArrayLike) -> PointQuality:
         """How good the chart is at one joint position (n,), or at each of a set or a path (N, n).
@@ -197,15 +189,6 @@ class Chart(InverseMethods, Shown):
         """
         write_chart(as_path("path", path), self.problem, self.coordinates, self.notes, self.certificate, force)
 
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Read a chart file. Loading never runs code from the file.
-
-        Raises:
-            ChartFileError: if the file is missing, truncated, foreign, edited, or from a newer version.
-        """
-        return cls(*read_chart(as_path("path", path)))
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GrownChart(Chart):
@@ -227,7 +210,10 @@ class GrownChart(Chart):
 
 
 def load(path: str | Path) -> Chart:
-    """Read a chart file; see `Chart.load`. A grown chart comes back as a `GrownChart`.
+    """Read a chart file. Loading never runs code from the file. A grown chart comes back as a `GrownChart`.
+
+    Raises:
+        ChartFileError: if the file is missing, truncated, foreign, edited, or from a newer version.
 
     Example:
         >>> from pathlib import Path
@@ -242,7 +228,7 @@ def load(path: str | Path) -> Chart:
         >>> bool((again.xi([0.7, 0.9, 0.6]) == chart.xi([0.7, 0.9, 0.6])).all())
         True
     """
-    chart = Chart.load(path)
-    if isinstance(chart.coordinates, GrownCoordinates):
-        return GrownChart(chart.problem, chart.coordinates, chart.notes)
-    return chart
+    problem, coordinates, notes, certificate = read_chart(as_path("path", path))
+    if isinstance(coordinates, GrownCoordinates):
+        return GrownChart(problem, coordinates, notes)
+    return Chart(problem, coordinates, notes, certificate)

@@ -8,7 +8,6 @@ from numpy.typing import ArrayLike
 
 from orthocas.charts.coordinates import Coordinates, InvertibleMap
 from orthocas.charts.curves import SelfMotionCurves
-from orthocas.charts.descent import RULES as DESCENT
 from orthocas.charts.descent import BoxedPhi
 from orthocas.charts.inside import Inside
 from orthocas.charts.inverse import Inverse, Solutions
@@ -28,7 +27,6 @@ from orthocas.charts.trackers import ReachingTracker, Tracker, near_function
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, units_hint
 from orthocas.tasks.problem import measure_task_sizes
 from orthocas.tasks.relative import Relative
-from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
     Array,
@@ -40,6 +38,7 @@ from orthocas.tools.checks import (
     require_kind,
     require_known,
 )
+from orthocas.tools.expressions import choose_form
 
 FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian", "inverse")
 
@@ -61,7 +60,8 @@ class InverseMethods(PhiFunctions):
                 number of full turns and the sheet of a linear leaf.
             outside: accept solutions outside the domain, where the chart is not known to be good, and beyond joint
                 limits.
-            tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components, `phi_sizes`.
+            tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components: how far those of the
+                task move over the domain, and 1 for xi.
 
         Returns:
             q, (n,) or (N, n), inside the domain unless `outside`.
@@ -80,7 +80,7 @@ class InverseMethods(PhiFunctions):
             >>> try:
             ...     chart.inverse(chart.phi(start) + [0.0, 0.0, 2.0], start)
             ... except oc.errors.InverseError as error:
-            ...     bool(oc.contains(chart.problem.domain, error.nearest))
+            ...     bool(chart.problem.domain.contains(error.nearest))
             True
         """
         targets, single = as_point_set("phi", phi, self.n)
@@ -114,13 +114,13 @@ class InverseMethods(PhiFunctions):
         from phi(q_start) to phi, so that every xi within `xi_range(q_start)` is found. Without a start, Newton's method
         starts at a rough inverse of phi, a polynomial fitted to points of the domain, then at stored points of the
         domain whose phi is nearest. Rows that still have no solution inside are searched for along the self-motion
-        curves of x (r = 1, or from some of these in wide charts), or in all cells of the domain that may hold one. q is the first solution inside that is
-        found; `solutions` looks for all.
+        curves of x (r = 1, or some of them in wide charts), or in all cells of the domain that may hold one. q is the
+        first solution inside that is found; `solutions` looks for all.
 
         Args:
             phi: target values, (n,) or (N, n). Rows that are not finite get the status BAD_INPUT.
             q_start: initial guess (n,), or (N, n) with one guess per row of phi.
-            tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components, `phi_sizes`.
+            tolerance: largest remaining |phi(q) - phi|, as in `inverse`.
             inside: keep q in the domain, and so within the joint limits. Rows without a solution there, from q_start or
                 other starts, get the q inside with the same x and the nearest xi that is found, with the status
                 NEAREST. If none with that x is found inside, the status is OUTSIDE_DOMAIN with a q within the box of
@@ -218,39 +218,6 @@ class InverseMethods(PhiFunctions):
         parts = self.parts.point_functions, self.problem.domain, q0, largest_step
         return ReachingTracker(*parts, self.parts.reaching, self.m) if nearest else Tracker(*parts)
 
-    def left_over(self, q_start: ArrayLike, q: ArrayLike, tolerance: float = 1e-9) -> Array | None:
-        """What a loop in (x, xi) leaves over in the joints: q - q_start (n,), less full turns of endless joints.
-
-        phi is one-to-one near each point only, so x and xi may come back while the joints do not. A loop that can be
-        shrunk to a point, while its joints stay in the domain, leaves nothing over. A loop around a full turn of the
-        tool or the base cannot be shrunk, and closes only if xi does not change with the joint that turns.
-
-        Args:
-            q_start: where the loop began, (n,).
-            q: where it ended, (n,).
-            tolerance: of phi, relative to `phi_sizes`.
-
-        Returns:
-            (n,) [rad] or [m]; None if x or xi differ, so that the path is open.
-        """
-        start, end = as_point("q_start", q_start, self.n), as_point("q", q, self.n)
-        apart = self.parts.phi_map.difference(self.phi(end), self.phi(start)) / self.phi_sizes
-        return leave_over(float(np.abs(apart).max()), tolerance, end - start, self.problem.turning)
-
-    @cached_property
-    def turn_shifts(self) -> dict[str, Array]:
-        """What a full turn of a joint that turns without end adds to xi everywhere, (r,) by the joint's name.
-
-        One posture then has many values of xi, these apart. Joints whose turns do not change xi are missing, and so are
-        those whose turns change it by different amounts in different postures.
-        """
-        q, found = sample_uniform(self.problem.domain, 8, 0), {}
-        for k in self.problem.turning:
-            shift = self.parts.phi_map.difference(self.phi(q + 2 * np.pi * np.eye(self.n)[k]), self.phi(q))[:, self.m :]
-            if np.abs(shift[0]).max() > DESCENT.same and np.ptp(shift, axis=0).max() < DESCENT.same:
-                found[self.problem.robot.joint_names[k]] = np.asarray(shift[0])
-        return found
-
     def function(self, name: str) -> ca.Function:
         """A CasADi function: xi, phi, jacobian, task, task_jacobian, second_derivative or inverse.
 
@@ -272,20 +239,8 @@ class InverseMethods(PhiFunctions):
         return ChartParts(self)
 
     @cached_property
-    def phi_sizes(self) -> Array:
-        """Sizes of the components of phi, (n,): how far task components move over the domain, and 1 for xi."""
-        return np.concatenate([measure_task_sizes(self.problem), np.ones(self.r)])
-
-    @property
-    def turns(self) -> Array:
-        """Periods of the components of phi, (n,): 2 pi for circle-valued coordinates, 0 where there is none."""
-        own = self.coordinates
-        periods = own.turns if isinstance(own, Coordinates) else np.full(self.r, getattr(own, "turn", 0.0))
-        return np.concatenate([np.zeros(self.m), periods])
-
-    @cached_property
     def _inverse_function(self) -> ca.Function:
-        return inverse_function(self.function("phi"), self.phi_sizes, self.parts.phi_map.difference)
+        return inverse_function(self.function("phi"), self.parts.phi_sizes, self.parts.phi_map.difference)
 
     def _outside_error(
         self, targets: Array, q_start: ArrayLike | None, found: Solutions, beyond: Indices, single: bool
@@ -362,6 +317,53 @@ class ChartParts:
     chart: InverseMethods
 
     @cached_property
+    def phi_sizes(self) -> Array:
+        """Sizes of the components of phi, (n,): how far task components move over the domain, and 1 for xi."""
+        return np.concatenate([measure_task_sizes(self.chart.problem), np.ones(self.chart.r)])
+
+    @property
+    def turns(self) -> Array:
+        """Periods of the components of phi, (n,): 2 pi for circle-valued coordinates, 0 where there is none."""
+        own, chart = self.chart.coordinates, self.chart
+        periods = own.turns if isinstance(own, Coordinates) else np.full(chart.r, getattr(own, "turn", 0.0))
+        return np.concatenate([np.zeros(chart.m), periods])
+
+    @property
+    def named_coordinates(self) -> tuple[str, ...]:
+        """Labels of the coordinates, with what a fit made the first ones like: 'xi1: like swivel at home [rad]'."""
+        labels, meaning = self.chart.labels[self.chart.m :], self.chart.notes.get("meaning")
+        named = meaning.split("; ") if isinstance(meaning, str) else []
+        named = [name if name.startswith("like ") else f"like {name}" for name in named]  # older charts only name it
+        return (*(f"{label}: {name}" for label, name in zip(labels, named, strict=False)), *labels[len(named) :])
+
+    def runnable(self, graph: ca.Function) -> ca.Function:
+        """The fast form of a graph of this chart's functions: scalar code, or the graph itself for networks.
+
+        It is also the graph itself for robots with more than 10 joints.
+        """
+        own = self.chart.coordinates
+        return graph if isinstance(own, Coordinates) and own.as_matrices else choose_form(graph, self.chart.n)
+
+    def left_over(self, q_start: ArrayLike, q: ArrayLike, tolerance: float = 1e-9) -> Array | None:
+        """What a loop in (x, xi) leaves over in the joints: q - q_start (n,), less full turns of endless joints.
+
+        phi is one-to-one near each point only, so x and xi may come back while the joints do not. A loop that can be
+        shrunk to a point, while its joints stay in the domain, leaves nothing over. A loop around a full turn of the
+        tool or the base cannot be shrunk, and closes only if xi does not change with the joint that turns.
+
+        Args:
+            q_start: where the loop began, (n,).
+            q: where it ended, (n,).
+            tolerance: of phi, relative to `phi_sizes`.
+
+        Returns:
+            (n,) [rad] or [m]; None if x or xi differ, so that the path is open.
+        """
+        start, end = as_point("q_start", q_start, self.chart.n), as_point("q", q, self.chart.n)
+        apart = self.phi_map.difference(self.chart.phi(end), self.chart.phi(start)) / self.phi_sizes
+        return leave_over(float(np.abs(apart).max()), tolerance, end - start, self.chart.problem.turning)
+
+    @cached_property
     def relative(self) -> Relative:
         """Task values relative to wanted ones."""
         return Relative(self.chart.problem.task)
@@ -388,7 +390,7 @@ class ChartParts:
     def phi_map(self) -> PhiMap:
         """phi and J for solvers of phi(q) = phi."""
         chart = self.chart
-        return PhiMap(chart.phi, self.batched_rates, chart.phi_sizes, Differences(chart.turns, self.relative))
+        return PhiMap(chart.phi, self.batched_rates, self.phi_sizes, Differences(self.turns, self.relative))
 
     @cached_property
     def inverse(self) -> Inverse:

@@ -1,6 +1,6 @@
 """The map phi(q) = [h(q); xi(q)] as functions, its angles, and the scale of its errors."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar, overload
 
@@ -14,7 +14,7 @@ from orthocas.tasks.problem import Problem
 from orthocas.tasks.relative import Relative
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_point_set, require_shape
-from orthocas.tools.expressions import choose_form, wrap_shortest
+from orthocas.tools.expressions import wrap_shortest
 
 ROUNDING = 1e-5  #: of phi: 1e-9 of it are 45 units in the last place
 _SINGULAR = 1e-8  # ratio of singular values of J below which the inverse map fails
@@ -109,6 +109,7 @@ class PhiFunctions:
 
     problem: Problem
     coordinates: CoordinateMap
+    notes: Mapping[str, str | float]
 
     @property
     def n(self) -> int:
@@ -129,14 +130,6 @@ class PhiFunctions:
     def labels(self) -> tuple[str, ...]:
         """Names of the components of phi: those of the task, then xi1, xi2, ..."""
         return (*self.problem.task.labels, *(f"xi{k + 1}" for k in range(self.r)))
-
-    def runnable(self, graph: ca.Function) -> ca.Function:
-        """The fast form of a graph of this chart's functions: scalar code, or the graph itself for networks.
-
-        It is also the graph itself for robots with more than 10 joints.
-        """
-        matrices = isinstance(self.coordinates, Coordinates) and self.coordinates.as_matrices
-        return graph if matrices else choose_form(graph, self.n)
 
     @overload
     def xi(self, q: Symbolic) -> Symbolic: ...

@@ -237,7 +237,7 @@ class Report(Shown):
         return self.conditioning.p01 < RULES.degenerate
 
     def plot(self) -> "Figure":
-        """Histograms of angles and leaks, as a matplotlib figure; see `orthocas.plotting.quality_figure`."""
+        """Histograms of angles and leaks, as a matplotlib figure; see `figures.quality_figure`."""
         from orthocas.charts.figures import quality_figure  # with matplotlib, which takes long to import
 
         return quality_figure(self)

@@ -7,6 +7,7 @@ from importlib.resources import as_file, files
 from typing import Any, Self
 
 from orthocas.charts.chart import Chart
+from orthocas.charts.chart import load as load_file
 from orthocas.tools.checks import require_known
 from orthocas.tools.display import Shown, listed, number_list, percent
 
@@ -121,7 +122,7 @@ def load(name: str) -> Chart:
     """
     require_known("ready chart", name, names())
     with as_file(_DATA / f"{name}.orthocas") as path:
-        return Chart.load(path)
+        return load_file(path)
 
 
 def card(name: str) -> Card:

@@ -9,11 +9,13 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
+from orthocas.charts.descent import RULES as DESCENT
 from orthocas.charts.newton import Newton
 from orthocas.charts.phi import counted_on, largest, require_no_turns
 from orthocas.errors import InvalidValueError, degrees_hint
 from orthocas.tasks.domains import StopKind
 from orthocas.tasks.problem import Problem
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array, Indices, as_number, as_point, freeze_array, require_count
 from orthocas.tools.display import Shown, listed, number_list
 from orthocas.tools.expressions import wrap_shortest
@@ -27,14 +29,14 @@ class SelfMotionRules:
     """Numbers of ranges and self-motions."""
 
     at_limit: float = 1e-9  #: half-widths: boundaries closer to a joint limit are that limit
-    tolerance: float = 1e-11  #: largest error of the components that are held, relative to `Chart.phi_sizes`
+    tolerance: float = 1e-11  #: largest error of the components that are held, relative to `ChartParts.phi_sizes`
     corrections: int = 8  #: of a step
     sharpest: float = float(np.cos(0.35))  #: of the angle between the tangents at both ends of a step
     shortest: float = 1e-5  #: fraction of the largest step below which there is no way on
     longest: float = 1000.0  #: length of a curve [rad] or [m] after which it counts as endless
     rounding: float = 2e-12  #: of the place of a boundary on a step
     step: float = 0.1  #: [rad] or [m], of the widest step
-    phi_tolerance: float = 1e-10  #: of phi, relative to `Chart.phi_sizes`
+    phi_tolerance: float = 1e-10  #: of phi, relative to `ChartParts.phi_sizes`
     farthest: float = 3.0  #: distance of a point from its neighbour, in lengths of the predicted step
     most: int = 4  #: times as many points as wanted, at most
 
@@ -142,7 +144,7 @@ class LevelCurve:
         self.walls, self._step = Walls(chart.problem), step
         whole = bool((held >= chart.m).any())
         self._value, self._jacobian, self._difference = _of_phi(chart) if whole else _of_task(chart)
-        self._held, self._sizes = held, chart.phi_sizes[held]
+        self._held, self._sizes = held, chart.parts.phi_sizes[held]
 
     def follow(self, q: Array, direction: Array, signs: Signs | None = None) -> Branch:
         """Follow the curve from q (n,) until it leaves the domain, meets a fold, or returns to q.
@@ -298,7 +300,7 @@ class XiRange(Shown):
     """
 
     intervals: tuple[Interval, ...]
-    turn_shifts: Mapping[str, Array] = field(default_factory=dict)  #: as `Chart.turn_shifts`
+    turn_shifts: Mapping[str, Array] = field(default_factory=dict)  #: (r,) by joint, see `find_turn_shifts`
 
     def __getitem__(self, label: str | int) -> Interval:
         names = {interval.label: interval for interval in self.intervals}
@@ -340,12 +342,27 @@ class XiRange(Shown):
 def xi_range(chart: "Chart", q: ArrayLike) -> XiRange:
     """How far each coordinate reaches alone; see `Chart.xi_range`."""
     start = start_inside(chart, q)
-    return XiRange(tuple(_interval(chart, start, k) for k in range(chart.r)), chart.turn_shifts)
+    return XiRange(tuple(_interval(chart, start, k) for k in range(chart.r)), find_turn_shifts(chart))
+
+
+def find_turn_shifts(chart: "Chart") -> dict[str, Array]:
+    """What a full turn of a joint that turns without end adds to xi everywhere, (r,) by the joint's name.
+
+    One posture then has many values of xi, these apart. Joints whose turns do not change xi are missing, and so are
+    those whose turns change it by different amounts in different postures.
+    """
+    q, shifts = sample_uniform(chart.problem.domain, 8, 0), {}
+    for k in chart.problem.turning:
+        turned = chart.phi(q + 2 * np.pi * np.eye(chart.n)[k])
+        shift = chart.parts.phi_map.difference(turned, chart.phi(q))[:, chart.m :]
+        if np.abs(shift[0]).max() > DESCENT.same and np.ptp(shift, axis=0).max() < DESCENT.same:
+            shifts[chart.problem.robot.joint_names[k]] = np.asarray(shift[0])
+    return shifts
 
 
 def too_far(chart: "Chart", q: Array, wanted: Array) -> str:
     """The coordinate that is wanted (r,) farthest outside its range at q (n,), in words; empty if there is none."""
-    if chart.turns.any():
+    if chart.parts.turns.any():
         return ""
     reach = xi_range(chart, q)
     beyond = np.maximum(reach.low - wanted, wanted - reach.high)
@@ -389,7 +406,7 @@ def branch_along(chart: "Chart", q: Array, k: int, sign: float) -> Branch:
 
 def xi_along(chart: "Chart", points: Array) -> Array:
     """Coordinates (N, r) along a curve from its first point on, without the jumps of circle-valued ones."""
-    return counted_on(chart.xi(points), chart.turns[chart.m :])
+    return counted_on(chart.xi(points), chart.parts.turns[chart.m :])
 
 
 def _interval(chart: "Chart", q: Array, k: int) -> Interval:
@@ -574,7 +591,7 @@ def _curve(chart: "Chart", q: Array, step: float) -> SelfMotionCurve:
 
 def _set(chart: "Chart", q: Array, samples: int) -> SelfMotion:
     """Points on a lattice in xi, and the extent from its outermost points on."""
-    require_no_turns(chart.labels, chart.turns, "a set of self-motions")
+    require_no_turns(chart.labels, chart.parts.turns, "a set of self-motions")
     alone = xi_range(chart, q)
     points = filled(chart, q, alone, samples)
     xi = chart.xi(points)

@@ -103,7 +103,7 @@ class Tracker(Shown):
         """What the way since the last reset leaves over in the joints, (n,), less full turns of endless joints.
 
         None while x or xi differ from those of the start. A loop around a full turn of tool or base may leave
-        something over, see `Chart.left_over`.
+        something over, see `ChartParts.left_over`.
         """
         q, phi = self._start
         apart = self._functions.distance(phi, self._solver.phi)

@@ -14,6 +14,7 @@ import typer
 from orthocas.charts import quality
 from orthocas.charts.certificate import METHODS, Certificate
 from orthocas.charts.chart import Chart
+from orthocas.charts.chart import load as load_file
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.ready import Card, card, load, names
 from orthocas.cli.options import AsJson, ChartPath, Force, parse_number, parse_whole_number
@@ -86,7 +87,7 @@ def evaluate(
     json: AsJson = False,
 ) -> None:
     """Measure the quality of a chart on held-out samples of its domain."""
-    loaded = Chart.load(chart)
+    loaded = load_file(chart)
     report = quality.evaluate(loaded, samples, seed)
     if json:
         print_json({**report.as_dict(), **build_reach_data(loaded)})
@@ -129,14 +130,23 @@ def certify(
     processes = 0 if "://" in workers else require_count("--workers", parse_whole_number(workers))
     target = out or chart
     require_free(target, CHART, force)
-    loaded = Chart.load(chart)
+    loaded = load_file(chart)
     with _start_workers(processes, workers) as executor, terminal_monitor() as monitor:
         start = time.monotonic()
+        # Check the proof in the file, and end.
         if check:
             holds = certificates.check_certificate(loaded, executor=executor, monitor=monitor)
             assert loaded.certificate is not None
-            _report_check(loaded.certificate, holds, time.monotonic() - start, json)
+            took = time.monotonic() - start
+            if json:
+                print_json({"holds": holds, **loaded.certificate.as_dict(), "seconds": took})
+            else:
+                verdict = "holds" if holds else "does NOT hold"
+                partly = "" if loaded.certificate.proved or not holds else " for the part that is proved"
+                line = f"the certificate {verdict}{partly}, {took:.3g} s"
+                print_rows({"check": line, **loaded.certificate.facts()})
             raise typer.Exit(0 if holds and loaded.certificate.proved else _NOT_PROVED)
+        # Prove, from where the file's certificate stopped; Ctrl-C keeps what is proved so far.
         resume = _find_unfinished(loaded, bound)
         try:
             certificate = certificates.certify(
@@ -184,12 +194,3 @@ def _find_unfinished(chart: Chart, bound: float | None) -> Certificate | None:
     if saved.proved or saved.fold or (bound is not None and bound != saved.bound):
         return None
     return saved
-
-
-def _report_check(certificate: Certificate, holds: bool, seconds: float, json: bool) -> None:
-    if json:
-        print_json({"holds": holds, **certificate.as_dict(), "seconds": seconds})
-    else:
-        verdict = "holds" if holds else "does NOT hold"
-        partly = "" if certificate.proved or not holds else " for the part that is proved"
-        print_rows({"check": f"the certificate {verdict}{partly}, {seconds:.3g} s", **certificate.facts()})

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orthocas.charts.chart import Chart
+from orthocas.charts.chart import Chart, load
 from orthocas.cli.options import AsJson, ChartPath, Force, Limit, parse_one_or_all, spread_options
 from orthocas.cli.output import note, print_json, print_rows
 from orthocas.codegen.check import AgreementCheck, check_c
@@ -75,7 +75,7 @@ def codegen(
         raise OptionError("settings of a controller require a controller: --controller is none")
     # CasADi may lose Ctrl-C while it builds functions
     with deferred():
-        loaded = Chart.load(chart)
+        loaded = load(chart)
         # Raises for grown charts.
         loaded.function("xi")
         law = None if controller == _NONE else build_controller(controller, loaded, settings, limit)
@@ -158,7 +158,7 @@ def export(
     json: AsJson = False,
 ) -> None:
     """Write task, xi, phi, Jacobian and inverse of a chart as one Python module that needs the library only."""
-    loaded = Chart.load(chart)
+    loaded = load(chart)
     module = export_chart(loaded, to, out, force)
     if json:
         print_json({"module": str(module), "library": to, "joints": loaded.n, "labels": list(loaded.labels)})

@@ -41,7 +41,8 @@ def build_app(words: Sequence[str]) -> typer.Typer:
     app.callback()(_options)
     for name, summary in COMMANDS.items():
         module = f"{__package__}.{_MODULES.get(name, name)}"
-        command = getattr(import_module(module), name) if name in words else _do_nothing
+        # Nothing stands for a command that is not called.
+        command = getattr(import_module(module), name) if name in words else lambda: None
         app.command(name, help=None if name in words else summary)(command)
     return app
 
@@ -61,16 +62,6 @@ def _options(
     """Options of the command line itself."""
 
 
-def _do_nothing() -> None:
-    """Stands for a command that is not called."""
-
-
-def _print_error(text: str) -> None:
-    """Print one line of bounded length on standard error."""
-    line = one_line(text)
-    typer.echo(f"orthocas: {line[:1000]}{'...' if len(line) > 1000 else ''}", err=True)
-
-
 def run(app: typer.Typer) -> int:
     """Run a command line. Bad input gives one line on standard error and exit code 2, a signal its own code."""
     with ended_in_order() as ended, remembered() as pressed:
@@ -84,7 +75,8 @@ def run(app: typer.Typer) -> int:
                 typer.echo(_format_error(error), err=True)
             elif not (pressed() or ended()):
                 # Otherwise it is what a library made of a signal.
-                _print_error(_format_error(error))
+                line = one_line(_format_error(error))
+                typer.echo(f"orthocas: {line[:1000]}{'...' if len(line) > 1000 else ''}", err=True)
             code = 2
         return ended() or (report_interrupt() if pressed() or code == INTERRUPTED else code)
 

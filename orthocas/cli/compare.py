@@ -8,7 +8,7 @@ import typer
 from orthocas import problems
 from orthocas.bases.products import Polynomial
 from orthocas.bases.registry import parse_parametrisation
-from orthocas.charts.chart import Chart
+from orthocas.charts.chart import load
 from orthocas.charts.figures import quality_figure, self_motion_figure
 from orthocas.charts.quality import evaluate
 from orthocas.cli.options import (
@@ -68,8 +68,9 @@ def compare(
     json: AsJson = False,
 ) -> None:
     """Fit a grid of parametrisations, solvers and seeds; write tables, pictures and charts."""
+    # A chart file stands for the problem in it.
     is_name = problem in problems.names() or is_robot_file(problem) or not Path(problem).exists()
-    built = ProblemOptions().build_problem(problem) if is_name else Chart.load(problem).problem
+    built = ProblemOptions().build_problem(problem) if is_name else load(problem).problem
     parametrisations = [parse_parametrisation(name) for name in param or _PARAMETRISATIONS]
     minimisers: list[Solver] | None = [get_solver(name) for name in solver] if solver else None
     loss = parse_weights(weights, None)

@@ -149,7 +149,9 @@ def fit(
     kind, branch = _check_domain(domain, corridor, bounds)
     if kind == _BRANCH:
         loss_text = None if weights == WEIGHTS_TEXT else weights
-        _check_none(solver=solver, max_mutual_deg=max_mutual_deg, weights=loss_text, angles=angles)
+        own = {"solver": solver, "max-mutual-deg": max_mutual_deg, "weights": loss_text, "angles": angles}
+        if given := [name for name, value in own.items() if value is not None]:
+            raise OptionError(f"--domain branch has a solver and a loss of its own: leave out --{given[0]}")
 
     # What can be refused is refused before anything takes time.
     built = None if kind else _build_problem(problem, words, corridor)
@@ -166,8 +168,11 @@ def fit(
         with terminal_monitor() as monitor:
             if kind == _AUTO:
                 built, suggestion = _suggest_problem(problem, words, parametrisation, bounds, loss, seed, monitor)
-                if (minimiser, samples, max_mutual_deg, like) == (None,) * 4:
-                    result = _reuse_fit(suggestion, built, parametrisation)
+                # The fit that confirmed the domain serves if it has the family that is asked for.
+                default = choose_parametrisation(built, True) == choose_parametrisation(built, False)
+                same = parametrisation is not None or default
+                if same and (minimiser, samples, max_mutual_deg, like) == (None,) * 4:
+                    result = replace(suggestion.fit, chart=replace(suggestion.fit.chart, problem=built))
             elif kind == _BRANCH:
                 result = _fit_wide(problem, words, branch, quantities, parametrisation, samples, seed, monitor)
             if result is None:
@@ -207,14 +212,6 @@ def _check_domain(domain: str | None, corridor: Path | None, bounds: Mapping[str
     return kind, branch.strip()
 
 
-def _check_none(**values: object) -> None:
-    """Raise OptionError for options that wide charts do not have."""
-    for name, value in values.items():
-        if value is not None:
-            option = f"--{name.replace('_', '-')}"
-            raise OptionError(f"--domain branch has a solver and a loss of its own: leave out {option}")
-
-
 def _build_problem(name: str, words: ProblemOptions, corridor: Path | None) -> Problem:
     """The problem of a command line, in the surroundings of the postures of a file if one is given."""
     if corridor is None:
@@ -239,6 +236,7 @@ def _suggest_problem(
     """The problem of `--domain auto`, and the suggestion that its domain comes from."""
     words.require_none(("half_width",), "--domain auto finds the half-width")
     words.require_none(("least_singular_value",), "--domain auto stays clear of singular postures")
+    # A named problem, or what the options describe for a robot file.
     base = None if is_robot_file(name) else words.build_problem(name)
     robot, task, metric = _build_parts(name, words, base)
     home = words.home or (words.find_centre(robot) if base is None else base.domain.centre)
@@ -255,14 +253,6 @@ def _suggest_problem(
         monitor=monitor,
     )
     return Problem(robot, task, metric, suggestion.domain, Path(name).stem if base is None else base.name), suggestion
-
-
-def _reuse_fit(suggestion: DomainSuggestion, built: Problem, parametrisation: Parametrisation | None) -> Fit | None:
-    """The fit that confirmed the domain, if it has the family that is asked for."""
-    default = choose_parametrisation(built, True) == choose_parametrisation(built, False)
-    if parametrisation is None and not default:
-        return None
-    return replace(suggestion.fit, chart=replace(suggestion.fit.chart, problem=built))
 
 
 def _fit_wide(
@@ -320,9 +310,12 @@ def _save_and_report(
     if json:
         print_json(_describe_fit(result, report, target, suggestion))
     else:
-        print_rows(
-            {**_format_fit(result, report, target), **({} if suggestion is None else _format_domain(suggestion))}
-        )
+        rows = _format_fit(result, report, target)
+        if suggestion is not None:
+            # What ends the domain in each joint.
+            rows["home"] = f"{number_list(suggestion.home)} ({suggestion.home_source})"
+            rows |= {end.joint: f"half-width {end.half_width:.3g}, {end.explanation}" for end in suggestion.joints}
+        print_rows(rows)
     if result.status is Status.INTERRUPTED:
         note("interrupted: the chart holds the best coordinates found so far")
         raise typer.Exit(INTERRUPTED)
@@ -364,14 +357,6 @@ def _format_fit(result: Fit, report: Report, target: Path) -> dict[str, str]:
             f"--least-singular-value {bound:g} leaves out singular positions and keeps {percent(share)}"
         )
     return {**rows, **format_reach_rows(result.chart), "chart": str(target)}
-
-
-def _format_domain(suggestion: DomainSuggestion) -> dict[str, str]:
-    """What ends the domain in each joint."""
-    rows = {"home": f"{number_list(suggestion.home)} ({suggestion.home_source})"}
-    for joint in suggestion.joints:
-        rows[joint.joint] = f"half-width {joint.half_width:.3g}, {joint.explanation}"
-    return rows
 
 
 def _describe_wide(result: Fit) -> dict[str, Any]:

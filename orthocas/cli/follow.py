@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orthocas.charts.chart import Chart
+from orthocas.charts.chart import Chart, load
 from orthocas.cli.options import AsJson, ChartPath, Force, parse_number, parse_numbers, parse_one_or_all
 from orthocas.cli.output import print_json, print_rows
 from orthocas.errors import InvalidValueError
@@ -65,7 +65,7 @@ def follow(
     require_place(out, force)
     # CasADi may lose Ctrl-C while it builds functions.
     with deferred():
-        loaded = Chart.load(chart)
+        loaded = load(chart)
         # Raises for grown charts.
         loaded.function("xi")
     waypoints, choice = _read_task(path, loaded, xi)

@@ -188,13 +188,14 @@ class ProblemOptions:
             return Problem(robot, task, self.metric or "euclidean", box, Path(name).stem, self.least_singular_value)
         if name not in problems.names():
             raise UnknownNameError("problem", name, (*problems.names(), "or a FILE.urdf"))
+        # A named problem, with what the options change.
         base: Problem = problems.get(name)
         if all(value in (None, ()) for value in astuple(self)):
             return base
         self.require_no_robot(f"the named problem '{name}'")
-        centre, parse_half_width, domain = self.find_centre(base.robot), self.parse_half_width(), base.domain
-        if centre is not None or parse_half_width is not None:
-            domain = default_box(base.robot, base.domain.centre if centre is None else centre, parse_half_width)
+        centre, half_width, domain = self.find_centre(base.robot), self.parse_half_width(), base.domain
+        if centre is not None or half_width is not None:
+            domain = default_box(base.robot, base.domain.centre if centre is None else centre, half_width)
         task = base.task if self.task is None else Task.named(base.robot, self.task)
         metric = base.metric if self.metric is None else self.metric
         return Problem(base.robot, task, metric, domain, name, self.least_singular_value)

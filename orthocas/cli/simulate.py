@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from orthocas.charts.chart import Chart
+from orthocas.charts.chart import Chart, load
 from orthocas.charts.quality import evaluate
 from orthocas.cli.codegen import CONTROLLERS, add_law_options, build_controller, require_settings
 from orthocas.cli.options import AsJson, ChartPath, Force, Limit, parse_number, parse_numbers, parse_whole_number
@@ -92,7 +92,7 @@ def simulate(
     _check_folder(out, animation, force)
     # CasADi may lose Ctrl-C while it builds functions.
     with deferred():
-        loaded = Chart.load(chart)
+        loaded = load(chart)
         # Raises for grown charts.
         loaded.function("xi")
         plan = read_steps(steps, loaded)
@@ -239,6 +239,7 @@ def build_report(controller: Controller, chart: Chart, plan: Plan, seen: Traject
     first = int(bad[0]) if bad.size else None
     status, cause = (ControlStatus(int(column[first or 0])) for column in (seen.status, seen.cause))
     inside = np.asarray(chart.problem.domain.contains(seen.q))
+    # Coupling is measured in runs of steps that nothing else disturbs.
     evaluated = (
         plan.has_steps and not plan.pushes and seen.outcome is Outcome.COMPLETE and inside.all() and not bad.size
     )
@@ -277,6 +278,7 @@ def format_report(report: dict[str, Any], problem: Problem) -> dict[str, str]:
     errors = [
         f"{label} {_format(value)} {units.get(label, '')}".strip() for label, value in report["tracking_error"].items()
     ]
+    # The unit of the largest command: torques or velocities, of sliding joints or turning ones.
     joint, command = max(report["largest_command"].items(), key=lambda pair: pair[1])
     by_torque = report["command"] == "torque"
     lengths = units.get(joint) == "m"

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from orthocas import problems
-from orthocas.charts.chart import Chart
+from orthocas.charts.chart import Chart, load
 from orthocas.cli.options import AsJson, Force, ProblemOptions, add_problem_options, is_robot_file, parse_whole_number
 from orthocas.cli.output import note, print_json, print_rows
 from orthocas.errors import OptionError
@@ -17,7 +17,7 @@ from orthocas.robots.robot import Robot
 from orthocas.tools.interrupts import deferred
 from orthocas.viewer import view as open_view
 from orthocas.viewer.motion import cyclic_motions, read_joint_motion, read_run
-from orthocas.viewer.view import PORT, View, export_page, require_page
+from orthocas.viewer.view import PORT, export_page, require_page
 from orthocas.viewer.window import LOCAL, is_local, require_free
 
 _RUN = "trajectory.npz"  # in the folders of `orthocas simulate`
@@ -75,11 +75,32 @@ def view(
     with deferred():
         scene = _read_scene(target, chart, robot, words)
     if compare:
-        scene = _compare_motions(scene, path)
+        # Motions along a closed path instead of a chart.
+        if not isinstance(scene.shown, Chart):
+            raise OptionError("--compare requires a chart file, whose coordinates are compared")
+        points = None if path is None else read_path(path, scene.shown)[0]
+        scene = _Scene(cyclic_motions(scene.shown, points), scene.shown, scene.meshes, scene.locked)
+    arm, meshes, locks = scene.robot, scene.meshes, scene.locked
     if export is not None:
-        _export(scene, export, force, json)
-    else:
-        _serve(scene, host, port, browse, json)
+        shape = export_page(scene.shown, export, robot=arm, robot_file=meshes, locked=locks, force=force)
+        _note_missing(shape.missing)
+        size = export.stat().st_size
+        if json:
+            print_json({"page": str(export), "bytes": size, "missing_meshes": list(shape.missing)})
+        else:
+            print_rows({"page": str(export), "size": f"{size / 2**20:.1f} MiB, with all it needs: it works offline"})
+        return
+    with open_view(scene.shown, robot=arm, robot_file=meshes, locked=locks, host=host, port=port) as page:
+        _note_missing(page.missing)
+        local = is_local(host)
+        who = "this machine only (--host opens it to others)" if local else "all who reach it and know this address"
+        if json:
+            print_json({"url": page.url, "host": host, "local": local, "missing_meshes": list(page.missing)})
+        else:
+            print_rows({"page": page.url, "open to": who, "end": "Ctrl-C"})
+        if browse and not webbrowser.open(page.url):
+            note(f"no browser could be opened here; open {page.url} yourself")
+        page.wait()
 
 
 def _read_scene(target: str, chart: Path | None, meshes: Path | None, words: ProblemOptions) -> _Scene:
@@ -93,66 +114,16 @@ def _read_scene(target: str, chart: Path | None, meshes: Path | None, words: Pro
         words.require_no_robot(f"the named problem '{target}'")
         return _Scene(problems.get(target).robot, None, meshes, locked)
     if place.is_dir() or place.suffix.lower() in (".npz", ".csv"):
-        owner = _load_owner(chart, meshes, words)
+        if chart is None and meshes is None:
+            raise OptionError("files of motions hold no robot: give --chart or --robot")
+        owner = words.build_robot(str(meshes)) if chart is None else load(chart)
         arm = owner.problem.robot if isinstance(owner, Chart) else owner
         file = place / _RUN if place.is_dir() else place
         motion = read_joint_motion(file, arm) if file.suffix.lower() == ".csv" else read_run(file, arm)
         return _Scene(motion, owner, meshes, locked)
     if chart is not None:
         raise OptionError(f"{target} is a chart: leave out --chart")
-    return _Scene(Chart.load(place), None, meshes, locked)
-
-
-def _load_owner(chart: Path | None, meshes: Path | None, words: ProblemOptions) -> Robot | Chart:
-    """Whose motion it is."""
-    if chart is not None:
-        return Chart.load(chart)
-    if meshes is None:
-        raise OptionError("files of motions hold no robot: give --chart or --robot")
-    return words.build_robot(str(meshes))
-
-
-def _compare_motions(scene: _Scene, path: Path | None) -> _Scene:
-    """Motions along a closed path instead of a chart."""
-    chart = scene.shown
-    if not isinstance(chart, Chart):
-        raise OptionError("--compare requires a chart file, whose coordinates are compared")
-    points = None if path is None else read_path(path, chart)[0]
-    return _Scene(cyclic_motions(chart, points), chart, scene.meshes, scene.locked)
-
-
-def _export(scene: _Scene, page: Path, force: bool, json: bool) -> None:
-    shape = export_page(
-        scene.shown, page, robot=scene.robot, robot_file=scene.meshes, locked=scene.locked, force=force
-    )  # fmt: skip
-    _note_missing(shape.missing)
-    size = page.stat().st_size
-    if json:
-        print_json({"page": str(page), "bytes": size, "missing_meshes": list(shape.missing)})
-    else:
-        print_rows({"page": str(page), "size": f"{size / 2**20:.1f} MiB, with all it needs: it works offline"})
-
-
-def _serve(scene: _Scene, host: str, port: int, browse: bool, json: bool) -> None:
-    page = open_view(
-        scene.shown, robot=scene.robot, robot_file=scene.meshes, locked=scene.locked, host=host, port=port
-    )  # fmt: skip
-    with page:
-        _note_missing(page.missing)
-        _print_address(page, host, json)
-        if browse and not webbrowser.open(page.url):
-            note(f"no browser could be opened here; open {page.url} yourself")
-        page.wait()
-
-
-def _print_address(page: View, host: str, json: bool) -> None:
-    """Where the page is, and who can open it."""
-    local = is_local(host)
-    if json:
-        print_json({"url": page.url, "host": host, "local": local, "missing_meshes": list(page.missing)})
-    else:
-        who = "this machine only (--host opens it to others)" if local else "all who reach it and know this address"
-        print_rows({"page": page.url, "open to": who, "end": "Ctrl-C"})
+    return _Scene(load(place), None, meshes, locked)
 
 
 def _note_missing(missing: tuple[str, ...]) -> None:

@@ -149,7 +149,7 @@ def _compare_chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array
     phi, J = (np.array([row[k] for row in results]) for k in range(2))
     expected = {name: _blank(has_value, value) for name, value in expected.items()}
     # pi and -pi are one angle.
-    phi = expected["phi"] + wrap_shortest(phi - expected["phi"], chart.turns)
+    phi = expected["phi"] + wrap_shortest(phi - expected["phi"], chart.parts.turns)
     differences = {"phi": _compute_largest(phi, expected["phi"]), "jacobian": _compute_largest(J, expected["jacobian"])}
     expected = {
         "mass_matrix": robot.mass_matrix(somewhere),
@@ -203,7 +203,7 @@ def _measure_inverse(library: CompiledLibrary, chart: Chart, target: Array, star
     if status in (ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN):
         if (status == ControlStatus.OK) != chart.problem.domain.contains(solution.astype(float)):
             raise AgreementError(f"the status of inverse is {status} at q = {solution.tolist()}")
-        return float(np.abs(wrap_shortest(chart.phi(solution.astype(float)) - target, chart.turns)).max())
+        return float(np.abs(wrap_shortest(chart.phi(solution.astype(float)) - target, chart.parts.turns)).max())
     if status == ControlStatus.STOPPED_EARLY:
         after, before = (_measure_remaining(library, chart, target, q) for q in (solution, start))
         if not after <= before * (1 + 1e-5):
@@ -218,7 +218,7 @@ def _measure_inverse(library: CompiledLibrary, chart: Chart, target: Array, star
 def _measure_remaining(library: CompiledLibrary, chart: Chart, target: Array, q: Array) -> float:
     """The largest error in phi as the library has it, with its own phi and scale: far outside, rounding is large."""
     phi = library.chart(q)[0].astype(float)
-    scale = chart.phi_sizes + library.precision.coarse * np.abs(target)
+    scale = chart.parts.phi_sizes + library.precision.coarse * np.abs(target)
     return float(np.abs(chart.parts.phi_map.difference(target[None], phi[None])[0] / scale).max())
 
 

@@ -61,7 +61,7 @@ def curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
     functions = [
         dense_function("curve_task", [q, x], curves.tracer.equations.call([q, x])),
         *(
-            dense_function(f"curve_{name}", [q], [chart.runnable(own[which])(q)])
+            dense_function(f"curve_{name}", [q], [chart.parts.runnable(own[which])(q)])
             for name, which in (("xi", "xi"), ("gradient", "jacobian"))
         ),
     ]
@@ -69,10 +69,10 @@ def curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
     if domain.condition is not None:
         functions.append(dense_function("curve_pivots", [q], [domain.condition.pivots(q)]))
         sizes["CONDITION"] = functions[-1].numel_out(0)
-    kernels, turn = generate_kernels(functions, "kernel"), float(chart.turns[chart.m])
+    kernels, turn = generate_kernels(functions, "kernel"), float(chart.parts.turns[chart.m])
     sizes |= {f"{name}_{word}": size for name, work in kernels.sizes().items() for word, size in work.items()}
     sizes |= {name.upper(): repr(value) for name, value in asdict(RULES).items()}
-    sizes["XI_SIZE"] = repr(float(chart.phi_sizes[chart.m]))
+    sizes["XI_SIZE"] = repr(float(chart.parts.phi_sizes[chart.m]))
     sizes["PERIOD"] = repr(turn) if turn > 0 else "INFINITY"
     low, high = domain.bounds
     arrays = {"low": low, "high": high, "centre": domain.centre, "half_width": domain.half_width}

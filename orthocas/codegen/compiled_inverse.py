@@ -82,7 +82,7 @@ class CompiledInverse(Shown):
         def solve_piece(first: int) -> None:
             rows = slice(first, first + _PIECE)
             phi, q_start, q, found = (array[rows] for array in (*given, attempt.q, attempt.residual))
-            arrays = (phi, q_start, self.chart.phi_sizes, q, found, condition[rows])
+            arrays = (phi, q_start, self.chart.parts.phi_sizes, q, found, condition[rows])
             rows_in_c(
                 ctypes.c_long(len(phi)),
                 ctypes.c_int(iterations),

@@ -243,7 +243,7 @@ def _write_law_functions(law: Impedance | PDPlus) -> list[str]:
         write_function(
             "_shortest",
             "Errors by the shorter way around for coordinates that are angles, (n, N).",
-            dense_function("f", [e], [wrap_shortest(e, chart.turns)]),
+            dense_function("f", [e], [wrap_shortest(e, chart.parts.turns)]),
         ),
         _write_graph(
             "_mass_matrix", "Entries of M row by row, (n n, N).", [q], [ca.vec(law.model.mass_matrix(robot, inputs))]

@@ -8,7 +8,7 @@ from typing import Any, Self
 import casadi as ca
 import numpy as np
 
-from orthocas.bases.mlp import MLPFamily
+from orthocas.bases.mlp import MLPFamily, split_layers
 from orthocas.bases.products import ProductFamily, Term, split, with_parts
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
@@ -188,30 +188,23 @@ def _build_network(coordinates: Coordinates) -> Form | None:
     if not isinstance(family, MLPFamily):
         return None
     scale, fitted, depth = coordinates.scale[:, None], len(coordinates.offset), len(family.hidden)
-    layers = _split_layers(family, coordinates.theta)
+    weights, biases = split_layers(coordinates.theta, family.widths)
+    active = np.array(coordinates.active, dtype=int)
     A, c = _split_idle(coordinates)
+    A[:fitted, active[list(family.linear)]] = scale * family.split_slopes(coordinates.theta)
     W_out = np.zeros((coordinates.r, family.hidden[-1]))
-    W_out[:fitted] = scale * layers[depth][0]
-    c[:fitted] = scale * (layers[depth][1] - coordinates.offset[:, None])
-    active, slides = np.array(coordinates.active, dtype=int), np.array(family.direct, dtype=bool)
-    turning, sliding, idle = active[~slides], active[slides], np.array(coordinates.idle, dtype=int)
+    W_out[:fitted] = scale * weights[depth].T
+    c[:fitted] = scale * (biases[depth] - coordinates.offset)[:, None]
+    turning, sliding = active[family.turning], active[family.direct]
+    # joints that do not enter the network
+    idle = np.setdiff1d(np.arange(coordinates.space.n), [*turning, *sliding])
     indices = {"turning": turning, "sliding": sliding, "idle": idle}
     indices["order"] = np.argsort(np.concatenate(list(indices.values())))
     tables = {"W_out": W_out, "A": A, "c": c}
-    for k, (W, b) in enumerate(layers[:depth]):
-        tables |= {f"W_{k}": W, f"b_{k}": b}
+    for k in range(depth):
+        tables |= {f"W_{k}": weights[k].T, f"b_{k}": biases[k][:, None]}
     plain = {name: [int(k) for k in of] for name, of in indices.items()}
     return Form("coordinates", {"kind": "network", "depth": depth}, "", tables, plain)
-
-
-def _split_layers(family: MLPFamily, theta: Array) -> list[tuple[Array, Array]]:
-    """Weights (out, width) and biases (out, 1) of all layers."""
-    layers, start = [], 0
-    for width, out in pairwise(family.widths):
-        middle, end = start + out * width, start + out * (width + 1)
-        layers.append((theta[start:middle].reshape(width, out).T, theta[middle:end, None]))
-        start = end
-    return layers
 
 
 def _build_expression(chart: Chart) -> Form:

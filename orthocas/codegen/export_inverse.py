@@ -57,7 +57,7 @@ def _newton(chart: Chart) -> Form:
         summary = "Task values, then how fast they move, angular velocities in the tip's axes, (m + m n, N)."
         rates = "_task_and_rates"
         functions.append(write_function(rates, summary, problem.task.function, chart.parts.relative.rates))
-    tables = {"centre": domain.centre[:, None], "sizes": chart.phi_sizes[:, None], "bounds": bounds[:, :, None]}
+    tables = {"centre": domain.centre[:, None], "sizes": chart.parts.phi_sizes[:, None], "bounds": bounds[:, :, None]}
     return Form("inverse", {"rates": rates}, "\n\n".join(functions), tables, {})
 
 

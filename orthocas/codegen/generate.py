@@ -251,7 +251,7 @@ def _describe_chart(chart: Chart, precision: Precision) -> dict[str, Any]:
         condition = {"heading": clean_word(known.heading), "size": known.pivots.size1_out(0)}
     task_units = [f" [{unit}]" if unit else "" for unit in clean_words(problem.task.units)]
     task_labels = zip(clean_words(problem.task.labels), task_units, strict=True)
-    proof, turns = chart.certificate, chart.turns
+    proof, turns = chart.certificate, chart.parts.turns
     lower, upper = find_bounds_inside(domain, precision)
     return {
         "n": chart.n,
@@ -273,7 +273,7 @@ def _describe_chart(chart: Chart, precision: Precision) -> dict[str, Any]:
         "gravity": _write_row(tree.gravity),
         "task_labels": ", ".join(label + unit for label, unit in task_labels),
         "orientation": _describe_orientation(problem.task),
-        "extra_labels": ", ".join(clean_words(chart.named_coordinates)),
+        "extra_labels": ", ".join(clean_words(chart.parts.named_coordinates)),
         "angles": [label for label, turn in zip(clean_words(chart.labels), turns, strict=True) if turn],
         "fingerprint": fingerprint(problem, chart.coordinates),
         "certificate": "none" if proof is None else f"{proof.heading} ({proof.method}, chart {proof.fingerprint[:16]})",
@@ -285,7 +285,7 @@ def _describe_chart(chart: Chart, precision: Precision) -> dict[str, Any]:
         "domain_half_width": domain.half_width,
         "domain_reach": domain.reach,
         "rooms": max(1, chart.parts.reaching.size1_out(2)),
-        "phi_sizes": chart.phi_sizes,
+        "phi_sizes": chart.parts.phi_sizes,
         "phi_turns": turns,
         "phi_rounds": np.where(turns > 0, 1 / np.where(turns > 0, turns, 1.0), 0.0),
         "turned": chart.parts.relative.turned,

@@ -78,7 +78,7 @@ def _subtract(controller: Controller, relative: Relative, end: ca.MX, start: ca.
         unit = ca.sumsqr(relative.task.quaternion_function(end[:m])) < RULES.unit
         difference = ca.if_else(unit, difference, ca.MX.nan(len(controller.labels)))
     if controller.chart is not None and controller.labels == controller.chart.labels:
-        difference = wrap_shortest(difference, controller.chart.turns)
+        difference = wrap_shortest(difference, controller.chart.parts.turns)
     return ca.densify(difference)
 
 

@@ -230,7 +230,7 @@ class LawOfChart(Shown):
     @cached_property
     def function(self) -> ca.Function:
         """q, dq (n, 1), reference and its derivatives (n, 1), gains -> command (n, 1), status (1, 1)."""
-        return self.chart.runnable(count_turns_from_centre(self.graph, self.problem))
+        return self.chart.parts.runnable(count_turns_from_centre(self.graph, self.problem))
 
     def facts(self: Any) -> dict[str, str]:
         """Quantities, gains, settings and problem."""
@@ -263,7 +263,7 @@ def compute_errors(chart: Chart, q: ca.MX, reference: ca.MX) -> tuple[ca.MX, ca.
     """
     m, own = chart.m, chart.coordinates.functions
     e, slope = chart.parts.relative.error(q, reference[:m])
-    rest = wrap_shortest(own["xi"](q) - reference[m:], chart.turns[m:])
+    rest = wrap_shortest(own["xi"](q) - reference[m:], chart.parts.turns[m:])
     return ca.vertcat(e, rest), ca.vertcat(slope, own["jacobian"](q))
 
 

@@ -172,7 +172,7 @@ class XiTask(Shown):
     def facts(self) -> dict[str, str]:
         """Cost, gain and target."""
         target = "none yet" if self.target_xi is None else number_list(self.target_xi)
-        labels = listed(self.chart.named_coordinates)
+        labels = listed(self.chart.parts.named_coordinates)
         return {"task": f"{labels}, cost {number_list(self.cost)}, gain {self.gain:g}", "target": target}
 
     def set_target(self, xi: ArrayLike) -> None:
@@ -195,7 +195,7 @@ class XiTask(Shown):
         if self.target_xi is None:
             raise InvalidValueError("target of the task", "none", "one from `set_target`")
         error = self.chart.xi(self._read_position(configuration)) - self.target_xi
-        return np.asarray(wrap_shortest(error, self.chart.turns[self.chart.m :]))
+        return np.asarray(wrap_shortest(error, self.chart.parts.turns[self.chart.m :]))
 
     def compute_jacobian(self, configuration: Any) -> Array:
         """de/dq, (r, nv), with zeros for joints that the chart does not have."""

@@ -348,7 +348,7 @@ class _OperationalSpace(LawOfChart):
     @cached_property
     def energy(self) -> ca.Function:
         """The fast form of `energy_graph`."""
-        return self.chart.runnable(count_turns_from_centre(self.energy_graph, self.problem))
+        return self.chart.parts.runnable(count_turns_from_centre(self.energy_graph, self.problem))
 
     @cached_property
     def energy_graph(self) -> ca.Function:
@@ -376,7 +376,7 @@ class _OperationalSpace(LawOfChart):
         chosen = {name: inputs[name] for name in ("q", *self._damping_inputs)}
         J, M = self.chart.parts.rates(inputs["q"]), self.model.own_mass_matrix(self.problem.robot, inputs)
         D = self._apply_damping(self._compute_inertia(J, M)[1], inputs, ca.MX.eye(self.chart.n))
-        return self.chart.runnable(build_function("damping_matrix", chosen, {"D": D}))
+        return self.chart.parts.runnable(build_function("damping_matrix", chosen, {"D": D}))
 
     def check_damping(self, samples: int = 1000, seed: int = 0) -> DampingCheck:
         """Find the smallest eigenvalue of D over uniform samples of the domain; (29) can make it negative."""

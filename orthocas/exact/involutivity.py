@@ -188,9 +188,9 @@ def lie_bracket(f: ca.SX, g: ca.SX, q: ca.SX) -> ca.SX:
 
     Example:
         >>> import casadi as ca
-        >>> import orthocas as oc
+        >>> from orthocas.exact.involutivity import lie_bracket
         >>> q = ca.SX.sym("q", 2)
-        >>> oc.lie_bracket(ca.vertcat(1, 0), ca.vertcat(0, q[0]), q)
+        >>> lie_bracket(ca.vertcat(1, 0), ca.vertcat(0, q[0]), q)
         SX([0, 1])
     """
     if not isinstance(q, ca.SX | ca.MX) or not q.is_valid_input():

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from orthocas.bases.family import Parametrisation
 from orthocas.bases.registry import require_savable
-from orthocas.charts.chart import Chart
+from orthocas.charts.chart import load
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.quality import evaluate
 from orthocas.codegen.library import control_tick
@@ -354,7 +354,7 @@ def measure_control_ticks(results: Sequence[CellResult], cells: Sequence[Cell], 
         try:
             # CasADi may make a RuntimeError of Ctrl-C while it builds functions.
             with deferred():
-                chart = Chart.load(file)
+                chart = load(file)
             ticks[label] = control_tick(chart)
         except (OrthocasError, OSError, RuntimeError, MemoryError):
             # A measurement that fails must not lose the fits.
@@ -436,7 +436,7 @@ class Comparison(Shown):
         }
 
     def plot(self) -> "Figure":
-        """Errors of all fits over what they cost, as a matplotlib figure; see `orthocas.plotting.front_figure`."""
+        """Errors of all fits over what they cost, as a matplotlib figure; see `comparison_figures.front_figure`."""
         from orthocas.fitting.comparison_figures import front_figure  # with matplotlib, which takes long to import
 
         return front_figure(self)

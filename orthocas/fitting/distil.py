@@ -95,7 +95,7 @@ def distil(
     space = JointSpace.of(chart.problem)
     whole = parametrisation.family(space, chart.r)
     circle = whole if isinstance(whole, CircleFamily) else None
-    if circle is not None and not chart.turns.any():
+    if circle is not None and not chart.parts.turns.any():
         raise InvalidValueError("parametrisation", parametrisation.label, "one that is not circle-valued for this leaf")
     family = whole if circle is None else circle.pairs
     if isinstance(family, LinearFamily):
@@ -183,7 +183,7 @@ def _evaluate(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> 
     held_out = sample_uniform(chart.problem.domain, min(count, RULES.held_out), RULES.held_out_seed)
     held_out_targets = _sample_targets(chart, held_out)
     errors = wrap_shortest(
-        distilled.coordinates.xi(held_out_targets.points) - held_out_targets.xi, distilled.turns[chart.m :]
+        distilled.coordinates.xi(held_out_targets.points) - held_out_targets.xi, distilled.parts.turns[chart.m :]
     )
     gradients = held_out_targets.gradients / held_out_targets.weight
     turned = np.linalg.norm(distilled.coordinates.jacobian(held_out_targets.points) - gradients, axis=2)

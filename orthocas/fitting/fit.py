@@ -61,7 +61,7 @@ def fit(
     those in the metric for A = M and for tasks that turn the tool.
 
     Joints that do not affect the task become coordinates themselves. With `Polynomial(degree, cyclic="auto")`, the
-    domain of the chart covers all positions of the cyclic joints; see `orthocas.cyclic_joints`. Families linear in
+    domain of the chart covers all positions of the cyclic joints (`orthocas.bases.cyclic_joints`). Families linear in
     their parameters start from a spectral solution of low degree, and the degree rises step by step. Between the
     degrees, a search for the worst points of the domain keeps the chart from folding. Ctrl-C raises `Interrupted`: its
     `result` is the fit with the best coordinates so far and status INTERRUPTED. So callers that need a finished fit,

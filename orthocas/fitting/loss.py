@@ -68,7 +68,8 @@ def loss(
         >>> import casadi as ca
         >>> import orthocas as oc
         >>> from orthocas import problems
-        >>> L = oc.loss(problems.get("planar_3r_xy"), oc.Polynomial(2), samples=50)
+        >>> from orthocas.fitting.loss import loss
+        >>> L = loss(problems.get("planar_3r_xy"), oc.Polynomial(2), samples=50)
         >>> theta = ca.MX.sym("theta", L.size1_in(0))
         >>> H = ca.hessian(L(theta), theta)[0]
         >>> H.shape

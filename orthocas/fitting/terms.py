@@ -24,6 +24,7 @@ class LossRules:
     wide_volume: float = 0.5  #: volume that a wide fit asks for at its first samples
     worst_volume: float = 0.3  #: the same once the worst samples have joined, and for networks
     least_volume: float = 0.05  #: over r: bound of the domain of a wide chart, in the identity metric
+    least_in_metric: float = 0.02  #: the same of charts in another metric: gradients orthogonal there lean in this one
     beyond: float = 2.0  #: over that bound: the volume in the identity metric that is enough beside another metric
     nearly_folded: float = 1e-4  #: volume below which an inverse loses digits
     shortest: float = 1e-12  #: length of a gradient that counts as zero
@@ -377,7 +378,7 @@ def find_term(name: str) -> LossTerm:
 _OF_WIDE_FITS = (
     RegularityTerm("volume", RULES.wide_volume),
     RegularityTerm("volume with the worst", RULES.worst_volume),
-    RegularityTerm("euclidean volume", RULES.beyond * RULES.least_volume, euclidean=True),
+    RegularityTerm("euclidean volume", RULES.beyond * RULES.least_in_metric, euclidean=True),
     MetricLengthTerm(),
 )
 _OURS = (MetricTaskTerm(), MetricMutualTerm(), LengthTerm(), RegularityTerm(), FOLD_TERM)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from orthocas.bases.cyclic import keeps_self_motions, turns_tool, widen_over_cyclic_joints
 from orthocas.bases.family import CyclicParametrisation, JointSpace, LinearFamily, Parametrisation
 from orthocas.bases.mlp import MLP
-from orthocas.bases.products import Polynomial, Products
+from orthocas.bases.products import Polynomial
 from orthocas.bases.registry import warn_unless_savable
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
@@ -22,7 +22,6 @@ from orthocas.errors import BranchWarning, DomainError, Interrupted, InvalidValu
 from orthocas.fitting.fit import Fit, fix_gauge, normalise
 from orthocas.fitting.like import Like, Likeness, Meaning, MeaningError
 from orthocas.fitting.settings import require_parametrisation
-from orthocas.fitting.terms import RULES as LOSS_RULES
 from orthocas.fitting.terms import Weights, find_term
 from orthocas.fitting.wide_search import (
     RULES,
@@ -30,6 +29,7 @@ from orthocas.fitting.wide_search import (
     WideSettings,
     WideSolution,
     find_best,
+    find_least_volume,
     is_on_side_of_centre,
     search_families,
 )
@@ -245,10 +245,12 @@ def _build_problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch
 
 
 def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomial | MLP, ...]:
-    """Under a pose, polynomials without the turns of base and tool, then without that of the tool only.
+    """Under a pose, families without the turn of the tool; first without that of the base, too, if it can turn fully.
 
-    Then those that are linear in the joints on whose position the self-motions do not depend, by proof. Then those that
-    are so in such slides without limits only, if there are others: a joint that turns has one turn.
+    These are polynomials, and before them small networks in another metric than the identity.
+
+    Then come polynomials that are linear in the joints on whose position the self-motions do not depend, by proof. Then
+    those that are so in such slides without limits only, if there are others: a joint that turns has one turn.
     Then a network, but not for coordinates that are to mean something, nor with slides without limits.
     """
     robot = problem.robot
@@ -258,10 +260,18 @@ def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomia
     endless = [k for k in free if slides[k] and np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
     tool = [k for k in range(robot.n) if turns_tool(problem.task, k)] if like in (None, "swivel") else []
     base = [k for k in free if k not in tool]
-    names, fewer, of_base, of_tool = (tuple(robot.joint_names[k] for k in part) for part in (free, endless, base, tool))
-    families: list[Polynomial | MLP] = [Polynomial(RULES.degree, of_base, without=of_tool)] if tool else []
-    if tool and base and len(base) + len(tool) < robot.n - problem.r:
-        families.insert(0, Polynomial(RULES.degree, without=(*of_base, *of_tool)))
+    turns = [k for k in base if not slides[k] and robot.upper[k] - robot.lower[k] >= 2 * np.pi]
+    names, fewer = (tuple(robot.joint_names[k] for k in part) for part in (free, endless))
+    families: list[Polynomial | MLP] = []
+    for left_out in ([*tool, *turns], tool) if tool and turns else (tool,) if tool else ():
+        linear, without = (
+            tuple(robot.joint_names[k] for k in part)
+            for part in ([k for k in base if k not in left_out], sorted(left_out))
+        )
+        if len(linear) + len(without) < robot.n - problem.r:
+            if like is None and not problem.metric.is_identity and problem.r == 1:
+                families.append(MLP(RULES.small_network, True, linear, without))
+            families.append(Polynomial(RULES.degree, linear, without=without))
     families.append(Polynomial(RULES.degree, names))
     if names != fewer:
         families.append(Polynomial(RULES.degree_of_all, fewer))
@@ -287,7 +297,7 @@ def _prepare(problem: Problem, family: Parametrisation, like: Likeness | None) -
 def _find_free_turns(problem: Problem, family: Parametrisation) -> tuple[str, ...]:
     """Joints that turn tool or base and that a family does without: it is regular at any turn of them, or at none."""
     names = problem.robot.joint_names
-    left_out = family.without if isinstance(family, Products) else ()
+    left_out = getattr(family, "without", ())
     places = {name: names.index(name) for name in left_out if name in names}
     return tuple(name for name, k in places.items() if turns_tool(problem.task, k) or keeps_self_motions(problem, k))
 
@@ -327,7 +337,7 @@ def _finish(
     else:
         coordinates = fix_gauge(normalise(raw, centre, first), centre) if len(raw.offset) else raw
     # the domain is where coordinates are regular; how much of the branch that is, and how good they are there
-    domain = RegularPart(clear.domain, coordinates, LOSS_RULES.least_volume / clear.r)
+    domain = RegularPart(clear.domain, coordinates, find_least_volume(clear))
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
     counted = sample_nonsingular(clear.robot, clear.task, branch.box, RULES.held_out, (seed, RULES.counted_tag))
     share = float(domain.contains(counted).mean()) if len(counted) else float("nan")

@@ -8,7 +8,6 @@ import scipy
 from numpy.typing import NDArray
 
 from orthocas.bases.family import ArrayFamily, CombinableFamily, JointSpace, LinearFamily, Parametrisation
-from orthocas.bases.products import Products
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError
 from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
@@ -39,11 +38,13 @@ class WideRules:
     degree: int = 6  #: of polynomials that are linear in base and tool joints
     degree_of_all: int = 5  #: of polynomials in which these count like all others
     network: tuple[int, ...] = (64, 64, 64)  #: layers where polynomials leave out much
+    small_network: tuple[int, ...] = (24, 24)  #: layers in another metric than the identity; as fast as polynomials
 
-    alignment: float = 0.3  #: weight of the mean sin^2 of the leaks
+    alignment: float = 1.0  #: weight of the mean sin^2 of the leaks
     mutual: float = 0.15  #: weight of the mean cos^2 between gradients of different coordinates
     evenness: float = 0.03  #: weight of the mean squared logarithm of the lengths of gradients
     uniform: float = 0.5  #: fraction of samples that are uniform; the others are boundary-weighted
+    uniform_of_networks: float = 0.7
     per_term: int = 30  #: samples for each basis function
     least_samples: int = 5000
     most_samples: int = 20_000
@@ -61,7 +62,7 @@ class WideRules:
     fresh: int = 50_000  #: samples of which the worst join
     worst: int = 5000
     fresh_of_networks: int = 200_000
-    worst_of_networks: int = 30_000
+    worst_of_networks: int = 10_000
 
     held_out: int = 20_000  #: samples that evaluate coordinates
     enough: float = 5e-4  #: fraction of bad positions, many near limits, that is as good as none
@@ -69,7 +70,7 @@ class WideRules:
     poor: float = 1e-3  #: fraction of bad positions above which another family is tried
     poor_of_several: float = 4e-3  #: the same with r > 1
     poor_without_turns: float = 3e-3  #: the same of coordinates without the turns of tool and base, after all rounds
-    poor_without_tool: float = 6e-3  #: the same of the last family that leaves out joints: a network takes its place
+    poor_without_tool: float = 6e-3  #: the same of coordinates without the turn of the tool only
     very_poor: float = 2e-2  #: fraction above which it is a network at once
     still_poor: float = 6e-3  #: fraction above which it is a network after polynomials in all joints
 
@@ -123,8 +124,8 @@ def search_families(searches: Sequence["Search"]) -> "Search":
     """
     symmetric = [search for search in searches if search.symmetric]
     for search in symmetric:
-        search.begin(f"{_STAGE}, without {search.left_out}")
-        most = RULES.poor_without_tool if search is symmetric[-1] else RULES.poor_without_turns
+        search.begin(f"{_STAGE}, {search.parametrisation.label}")
+        most = RULES.poor_without_turns if len(search.left_out) > 1 else RULES.poor_without_tool
         # rounds with the worst samples divide the fraction of bad positions by two to four
         if search.is_enough(4 * most):
             search.go_on()
@@ -156,7 +157,7 @@ class Search:
 
     The loss is that of `fit`, with the terms "volume" and "metric length" in place of angles::
 
-        L = mean_q [ max(0, 1 - v(q) / t)^2 + 0.3 mean_j sin^2 leak_j(q) + 0.15 mean_jk cos^2(j, k)
+        L = mean_q [ max(0, 1 - v(q) / t)^2 + mean_j sin^2 leak_j(q) + 0.15 mean_jk cos^2(j, k)
                      + 0.03 sum_j log^2(l_j(q) / L_j) ] + meaning
 
     Terms of the user join it.
@@ -174,7 +175,7 @@ class Search:
         self.family = parametrisation.family(JointSpace.of(problem), problem.r)
         self.linear = isinstance(self.family, LinearFamily)
         #: names of joints that coordinates do not depend on
-        self.left_out = ", ".join(parametrisation.without) if isinstance(parametrisation, Products) else ""
+        self.left_out: tuple[str, ...] = getattr(parametrisation, "without", ())
         self.symmetric = bool(self.left_out)
         wide = int(np.clip(RULES.per_term * self.family.width, RULES.least_samples, RULES.most_samples))
         self.samples = settings.samples or (wide if self.linear else RULES.network_samples)
@@ -234,7 +235,8 @@ class Search:
 
     def sample(self, count: int, tag: int) -> Array:
         """Samples: some uniform, like positions that count for the share, the others boundary-weighted."""
-        domain, seed, even = self.problem.domain, self.settings.seed, int(RULES.uniform * count)
+        domain, seed = self.problem.domain, self.settings.seed
+        even = int((RULES.uniform if self.linear else RULES.uniform_of_networks) * count)
         uniform = sample_uniform(domain, even, (seed, tag, RULES.uniform_tag))
         points = np.vstack([uniform, sample_boundary_weighted(domain, count - even, (seed, tag))])
         points = points[is_on_side_of_centre(self.problem, points)]
@@ -322,7 +324,7 @@ class Search:
         target = LOSS.wide_volume if volume == "volume" else LOSS.worst_volume
         weights = {volume: 2 / target**2, "metric length": 2 * RULES.evenness}
         if not self.problem.metric.is_identity:
-            weights["euclidean volume"] = 2 / (LOSS.beyond * LOSS.least_volume / self.problem.r) ** 2
+            weights["euclidean volume"] = 2 / (LOSS.beyond * find_least_volume(self.problem)) ** 2
         return weights
 
     def _choose_weights(self, volume: str) -> Weights:
@@ -385,7 +387,7 @@ class Search:
 
     def _take(self, name: str, result: SolveResult, samples: int) -> None:
         """Take the result of a stage, and keep its parameters if they are the best so far."""
-        theta, bound = result.theta, LOSS.least_volume / self.problem.r
+        theta, bound = result.theta, find_least_volume(self.problem)
         self.stages.append(Stage(name, theta.size, samples, result))
         # regular at the centre, and at all but few of other samples
         at_centre, volumes = (
@@ -429,6 +431,11 @@ class Search:
     def _held_out(self) -> Samples:
         """Samples that evaluate coordinates."""
         return sample_frames(self.problem, self.sample(RULES.held_out, RULES.held_out_tag))
+
+
+def find_least_volume(problem: Problem) -> float:
+    """The bound of the domain of a wide chart: least volume of coordinates in the identity metric."""
+    return (LOSS.least_volume if problem.metric.is_identity else LOSS.least_in_metric) / problem.r
 
 
 def is_on_side_of_centre(problem: Problem, points: Array) -> NDArray[np.bool_]:

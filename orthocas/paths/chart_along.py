@@ -85,8 +85,9 @@ def corridor_problem(problem: Problem, postures: ArrayLike, radius: float = RADI
         >>> import numpy as np
         >>> import orthocas as oc
         >>> from orthocas import problems
+        >>> from orthocas.paths import corridor_problem
         >>> postures = np.linspace([0.0, 0.6, 0.8], [0.8, 1.6, 0.8], 20)
-        >>> problem = oc.corridor_problem(problems.get("planar_3r_xy"), postures)
+        >>> problem = corridor_problem(problems.get("planar_3r_xy"), postures)
         >>> chart = oc.fit(problem, oc.Polynomial(3), samples=500).chart
         >>> bool(oc.evaluate(chart, samples=500).conditioning.min > 0.5)
         True
@@ -99,7 +100,12 @@ def corridor_problem(problem: Problem, postures: ArrayLike, radius: float = RADI
     prismatic = np.array(problem.robot.tree.prismatic)
     sizes = np.where(prismatic, RULES.prismatic * size, size)
     whole = find_joint_range(problem.robot, margin_deg)
-    path = path[_thin_out(path / sizes)]
+    # Postures that are far enough apart, and the last one.
+    scaled, kept = path / sizes, [0]
+    for k in range(1, len(path)):
+        if np.linalg.norm(scaled[k] - scaled[kept[-1]]) >= RULES.spacing or k == len(path) - 1:
+            kept.append(k)
+    path = path[kept]
 
     # Which joints only turn the whole task, or do not move it, is asked in the narrow corridor.
     narrow = Problem(problem.robot, problem.task, problem.metric, _build_corridor(whole, path, sizes), problem.name)
@@ -111,15 +117,6 @@ def corridor_problem(problem: Problem, postures: ArrayLike, radius: float = RADI
         sizes[k] = np.inf
     free = Problem(problem.robot, problem.task, problem.metric, _build_corridor(whole, path, sizes), problem.name)
     return widen_over_cyclic_joints(free, cyclic)
-
-
-def _thin_out(z: Array) -> list[int]:
-    """Rows of a path (N, n) that are at least so far apart, and the last one."""
-    kept = [0]
-    for k in range(1, len(z)):
-        if np.linalg.norm(z[k] - z[kept[-1]]) >= RULES.spacing:
-            kept.append(k)
-    return kept if kept[-1] == len(z) - 1 else [*kept, len(z) - 1]
 
 
 def _build_corridor(whole: Box, path: Array, sizes: Array) -> Corridor:

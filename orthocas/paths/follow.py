@@ -18,8 +18,7 @@ from orthocas.paths.joint_motion import JointMotion, Margins
 from orthocas.paths.tool_path import RULES, ToolPath
 from orthocas.robots.obstacles import LinkDistances, Obstacle
 from orthocas.robots.tree import require_driven
-from orthocas.tasks.clear_box import compute_row_scale
-from orthocas.tasks.samples import sample_uniform
+from orthocas.tasks.samples import compute_row_scale, sample_uniform
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind
@@ -97,11 +96,21 @@ def follow(
         raise InvalidValueError("period", period, "a time from 1e-5 to 10 s")
 
     # phi(s) of the tool path, and q(s) with phi(q(s)) = phi(s).
-    path = _read_tool_path(chart, tool_path, xi, start)
+    if not isinstance(xi, str):
+        path = ToolPath.schedule(chart, tool_path, xi)
+    elif xi in (HOLD, OBJECTIVE):
+        path = ToolPath.hold(chart, tool_path, chart.xi(start))
+    else:
+        raise InvalidValueError("xi", repr(xi)[:80], f"'{HOLD}', '{OBJECTIVE}', an array or a function")
     solver = PhiSolver(chart)
     curve = JointCurve.trace(solver, path.phi, start)
     if isinstance(xi, str) and xi == OBJECTIVE:
-        path, curve = _choose_xi(solver, path, curve, limits, start)
+        # From coordinates that are held, or from a walk where that is not possible.
+        costs = Costs(limits)
+        choice = XiChoice(path, costs, solver)
+        q = walk(chart, costs, path.x(choice.s), start) if isinstance(curve, LostCurve) else curve.q(choice.s)
+        path = choice.optimise(q)
+        curve = JointCurve.trace(solver, path.phi, q[0])
     # Where it ends early, leaves the domain or comes too near to an obstacle, an error says why.
     if isinstance(curve, LostCurve):
         limits.check_kept(path, curve.s, curve.q)
@@ -113,26 +122,6 @@ def follow(
     _, first, second = curve.evaluate(list_places())
     law = compute_fastest_law(first, second, limits.velocity, limits.acceleration)
     return _sample_on_stamps(path, curve, law, limits, stamp)
-
-
-def _read_tool_path(chart: Chart, tool_path: Any, xi: Any, start: Array) -> ToolPath:
-    """The tool path with scheduled coordinates, or with those of the start."""
-    if not isinstance(xi, str):
-        return ToolPath.schedule(chart, tool_path, xi)
-    if xi not in (HOLD, OBJECTIVE):
-        raise InvalidValueError("xi", repr(xi)[:80], f"'{HOLD}', '{OBJECTIVE}', an array or a function")
-    return ToolPath.hold(chart, tool_path, chart.xi(start))
-
-
-def _choose_xi(
-    solver: PhiSolver, path: ToolPath, held: JointCurve | LostCurve, limits: "MotionLimits", start: Array
-) -> tuple[ToolPath, JointCurve | LostCurve]:
-    """The path with coordinates by objective, from those that are held, or from a walk where that is not possible."""
-    costs = Costs(limits)
-    choice = XiChoice(path, costs, solver)
-    q = walk(solver.chart, costs, path.x(choice.s), start) if isinstance(held, LostCurve) else held.q(choice.s)
-    chosen = choice.optimise(q)
-    return chosen, JointCurve.trace(solver, chosen.phi, q[0])
 
 
 def _read_limits(
@@ -187,7 +176,7 @@ def _sample_on_stamps(
         raise SolveError("no speed along the path keeps the limits at all time stamps")
     x, xi = path.x(s), path.xi(s)
     names = limits.chart.labels, limits.chart.problem.robot.joint_names
-    over = limits.chart.left_over(q[0], q[-1], RULES.returns)
+    over = limits.chart.parts.left_over(q[0], q[-1], RULES.returns)
     return JointMotion(*names, times, q, dq, ddq, x, xi, s, over, limits.measure_margins(q, dq, ddq))
 
 
@@ -289,10 +278,12 @@ class MotionLimits:
 
     def measure_margins(self, q: Array, dq: Array, ddq: Array) -> Margins:
         """What a motion leaves, at its time stamps."""
+        # Room to the boundary, relative to the half-widths.
         low, high = self.chart.problem.domain.bounds
         room = np.minimum(q - low, high - q) / self.chart.problem.domain.half_width
         worst = int(np.argmin(room.min(axis=0)))
         bounded = bool(np.isfinite(room).any())
+        # The least singular value, and the obstacle that a link comes nearest to.
         values = np.linalg.svd(self.compute_scaled_jacobian(q), compute_uv=False)
         distances = self.distances(q)
         pair = int(np.argmin(distances.min(axis=0))) if distances.size else -1
@@ -367,20 +358,16 @@ def walk(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
     points = []
     for target in x:
         for _ in range(RULES.walk_steps):
-            q = q + _compute_step(chart, costs, target, q)
+            J = chart.parts.relative.batched_rates(q[None])[0].reshape(chart.m, chart.n)
+            # Towards x the step of least norm, within the null space (n, r) a damped Gauss-Newton step.
+            toward = np.linalg.pinv(J, rcond=1e-3) @ chart.parts.relative.difference(target, chart.task(q))
+            inner = np.linalg.svd(J)[2][chart.m :].T
+            residuals, gradients = (part[0] for part in costs(q[None]))
+            G = gradients @ inner
+            along = -inner @ np.linalg.solve(G.T @ G + RULES.walk_damping * np.eye(chart.r), G.T @ residuals)
+            q = q + _limit_step(toward) + _limit_step(along)
         points.append(q)
     return np.array(points)
-
-
-def _compute_step(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
-    J = chart.parts.relative.batched_rates(q[None])[0].reshape(chart.m, chart.n)
-    inner = np.linalg.svd(J)[2][chart.m :].T  # (n, r)
-    # Within the null space a damped Gauss-Newton step, towards x the step of least norm.
-    residuals, gradients = (part[0] for part in costs(q[None]))
-    G = gradients @ inner
-    along = -inner @ np.linalg.solve(G.T @ G + RULES.walk_damping * np.eye(chart.r), G.T @ residuals)
-    task = np.linalg.pinv(J, rcond=1e-3) @ chart.parts.relative.difference(x, chart.task(q))
-    return _limit_step(task) + _limit_step(along)
 
 
 def _limit_step(step: Array) -> Array:
@@ -409,7 +396,9 @@ class XiChoice:
 
     def __init__(self, path: ToolPath, costs: Costs, solver: PhiSolver) -> None:
         self.path, self.costs, self.solver, self.chart = path, costs, solver, solver.chart
-        pieces = _count_pieces(path)
+        # More pieces of the spline on longer paths.
+        length = np.linalg.norm(path.steps, axis=1).sum()
+        pieces = int(np.clip(np.ceil(RULES.piece_density * length), RULES.fewest_pieces, RULES.most_pieces))
         self.s = np.linspace(0.0, 1.0, RULES.cost_places * pieces + 1)
         self.nodes = np.linspace(0.0, 1.0, pieces + 1)
         # Closed paths have the same value at both ends.
@@ -425,7 +414,11 @@ class XiChoice:
 
     def optimise(self, first: Array) -> ToolPath:
         """The tool path with chosen coordinates, from joint positions near it at the places `s`, (P, n)."""
-        state = self._find_first_state(first)
+        # The spline through the coordinates of these positions, or through their mean where that has no solution.
+        xi = counted_on(self.chart.xi(first), self.chart.parts.turns[self.chart.m :])
+        values = np.linalg.lstsq(self._basis, xi, rcond=None)[0]
+        means = np.tile(xi.mean(axis=0), (len(values), 1))
+        state = self._evaluate_state(values, first) or self._evaluate_state(means, first)
         if state is None:
             return self.path
         damping = RULES.damping
@@ -434,7 +427,10 @@ class XiChoice:
             # Levenberg-Marquardt: more damping until a step lowers the cost.
             better = None
             while better is None and damping < RULES.most_damping:
-                better = self._try_step(state, hessian, gradient, damping)
+                scaled = hessian + damping * np.diag(np.diag(hessian) + 1e-9)
+                change = -np.linalg.solve(scaled, gradient).reshape(state.values.shape)
+                new = self._evaluate_state(state.values + change, state.q)
+                better = new if new is not None and new.cost < state.cost else None
                 damping *= 8 if better is None else 0.3
             if better is None:
                 break
@@ -442,12 +438,6 @@ class XiChoice:
             if gain < RULES.least_gain * state.cost:
                 break
         return self.path.replace_xi(self._build_spline(self._unit @ state.values))
-
-    def _find_first_state(self, q: Array) -> _State | None:
-        """The spline through the coordinates of joint positions, or through their mean where that has no solution."""
-        xi = counted_on(self.chart.xi(q), self.chart.turns[self.chart.m :])
-        values = np.linalg.lstsq(self._basis, xi, rcond=None)[0]
-        return self._evaluate_state(values, q) or self._evaluate_state(np.tile(xi.mean(axis=0), (len(values), 1)), q)
 
     def _build_spline(self, values: Array) -> CubicSpline:
         return CubicSpline(self.nodes, values, bc_type="periodic" if self.path.closed else "not-a-knot")
@@ -474,16 +464,3 @@ class XiChoice:
         slope += self._smooth @ state.values
         size = B.shape[1] * r
         return hessian.reshape(size, size), slope.ravel()
-
-    def _try_step(self, state: _State, hessian: Array, gradient: Array, damping: float) -> _State | None:
-        """A damped step, if it lowers the cost."""
-        scaled = hessian + damping * np.diag(np.diag(hessian) + 1e-9)
-        change = -np.linalg.solve(scaled, gradient).reshape(state.values.shape)
-        new = self._evaluate_state(state.values + change, state.q)
-        return new if new is not None and new.cost < state.cost else None
-
-
-def _count_pieces(path: ToolPath) -> int:
-    """Pieces of the spline: more on longer paths."""
-    length = np.linalg.norm(path.steps, axis=1).sum()
-    return int(np.clip(np.ceil(RULES.piece_density * length), RULES.fewest_pieces, RULES.most_pieces))

@@ -37,7 +37,7 @@ class PhiSolver:
                 chart.coordinates.functions["second_derivative"](q, v, w),
             )
             turning = ca.Function("turning", [q, v, w], [ca.densify(ca.vertcat(*bends))])
-        self._turning = Batched(chart.runnable(turning))
+        self._turning = Batched(chart.parts.runnable(turning))
 
     def jacobian(self, q: Array) -> Array:
         """J (N, n, n) at joint positions (N, n), with the rates of orientations."""
@@ -183,7 +183,8 @@ def compute_fastest_law(first: Array, second: Array, velocity: Array, accelerati
         SolveError: if the linear program fails.
     """
     # z(s) = (ds/dt)^2 is a spline with q'' z + q' z' / 2 as acceleration, which is linear in its coefficients.
-    knots = _build_knots()
+    inner = np.linspace(0.0, 1.0, RULES.law_pieces + 1)
+    knots = np.concatenate([np.zeros(RULES.law_degree), inner, np.ones(RULES.law_degree)])
     moves = np.maximum(np.abs(first), RULES.turning_slope * np.abs(first).max(axis=0) + 1e-12)
     speeds = ((velocity / moves) ** 2).min(axis=1)
     slowest = _find_worst(-speeds)
@@ -211,20 +212,14 @@ def compute_fastest_law(first: Array, second: Array, velocity: Array, accelerati
 
 def _integrate_time(z: BSpline) -> TimeLaw:
     """Time along the path: steps of constant acceleration take 2 ds / (speed before + speed after)."""
-    s = (
-        1 - np.cos(np.linspace(0.0, np.pi, RULES.time_steps + 1))
-    ) / 2  # finer near the ends, where the speed changes most
+    # Finer near the ends, where the speed changes most.
+    s = (1 - np.cos(np.linspace(0.0, np.pi, RULES.time_steps + 1))) / 2
     squares = z(s)
     squares = np.maximum(squares, RULES.least_square * squares.max())
     squares[[0, -1]] = 0.0
     speed = np.sqrt(squares)
     times = np.concatenate([[0.0], np.cumsum(2 * np.diff(s) / (speed[1:] + speed[:-1]))])
     return TimeLaw(times, s, speed)
-
-
-def _build_knots() -> Array:
-    inner = np.linspace(0.0, 1.0, RULES.law_pieces + 1)
-    return np.concatenate([np.zeros(RULES.law_degree), inner, np.ones(RULES.law_degree)])
 
 
 def _find_worst(values: Array) -> Indices:

@@ -47,7 +47,7 @@ class JointMotion(Shown):
     x: Array  #: (N, m) task values
     xi: Array  #: (N, r)
     s: Array  #: (N,) parameter of the path, from 0 to 1
-    left_over: Array | None  #: (n,) what the path leaves over in the joints, see `Chart.left_over`; None: it is open
+    left_over: Array | None  #: (n,) what the path leaves over in the joints, `ChartParts.left_over`; None: open
     margins: Margins
 
     def __post_init__(self) -> None:
@@ -112,19 +112,15 @@ class JointMotion(Shown):
         """
         target = as_path("path", path)
         require_place(target, force)
-        with publish(target.parent) as drafts:
-            (drafts / target.name).write_text(self._format_text(), encoding="utf-8", newline="")
-
-    def _format_text(self) -> str:
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        names = self.joint_names
         # q, then dq, then ddq of all joints; x and xi last.
-        rates = [f"{order}_{name}" for order in ("d", "dd") for name in names]
-        writer.writerow([_HEAD, *names, *rates, *self.labels])
+        rates = [f"{order}_{name}" for order in ("d", "dd") for name in self.joint_names]
+        writer.writerow([_HEAD, *self.joint_names, *rates, *self.labels])
         table = np.column_stack([self.times, self.q, self.dq, self.ddq, self.x, self.xi])
         writer.writerows([repr(float(value)) for value in row] for row in table)
-        return text.getvalue()
+        with publish(target.parent) as drafts:
+            (drafts / target.name).write_text(text.getvalue(), encoding="utf-8", newline="")
 
 
 def require_place(path: Path, force: bool) -> None:

@@ -29,7 +29,7 @@ class PathRules:
     samples: int = 501  #: of a path that is given as a function
     same_ends: float = 1e-9  #: distance of the ends of closed paths, relative to the sizes of the task
 
-    residual: float = 1e-10  #: of phi at all positions of a motion, relative to `Chart.phi_sizes`
+    residual: float = 1e-10  #: of phi at all positions of a motion, relative to `ChartParts.phi_sizes`
     curve_step: float = 0.15  #: longest step of q along the path [rad] or [m]
     first_step: float = 0.01  #: of s
     shortest_step: float = 1e-6  #: of s, below which the path is lost
@@ -216,7 +216,7 @@ class ToolPath:
     @classmethod
     def schedule(cls, chart: "Chart", tool_path: Any, xi: Any) -> "ToolPath":
         """A tool path with a schedule: coordinates at the waypoints (N, r), or a function of s."""
-        values = counted_on(sample_path("xi", xi, chart.r, chart.labels[chart.m :]), chart.turns[chart.m :])
+        values = counted_on(sample_path("xi", xi, chart.r, chart.labels[chart.m :]), chart.parts.turns[chart.m :])
         if callable(xi) or callable(tool_path):
             return cls._build(chart, tool_path, values, np.linspace(0.0, 1.0, len(values)))
         return cls._build(chart, tool_path, values, None)
@@ -228,12 +228,12 @@ class ToolPath:
         if s_xi is None and len(xi) != len(x):
             raise InvalidValueError("number of rows of xi", len(xi), f"{len(x)}, as of tool_path")
         # s grows with the length of the chords, in units of the sizes of phi.
-        steps = chart.parts.relative.difference(x[1:], x[:-1]) / chart.phi_sizes[: chart.m]
+        steps = chart.parts.relative.difference(x[1:], x[:-1]) / chart.parts.phi_sizes[: chart.m]
         if callable(tool_path):
             s = np.linspace(0.0, 1.0, len(x))
         else:
             s = place_waypoints(np.hstack([steps, np.diff(xi, axis=0)]) if s_xi is None else steps)
-        path = TaskSpline(chart.parts.relative, s, x, chart.phi_sizes[: chart.m])
+        path = TaskSpline(chart.parts.relative, s, x, chart.parts.phi_sizes[: chart.m])
         closed = path.returns and bool(np.abs(xi[-1] - xi[0]).max() < 1e-9)
         curve = build_spline(s if s_xi is None else s_xi, xi, closed and len(xi) > 2)
         return cls(path.close() if closed else path, curve, s, x, steps, callable(tool_path), closed)

@@ -276,30 +276,28 @@ def _regroup(tree: KinematicTree) -> list[_Body]:
     Mass, first moment along the axis, and the inertia of a rod along the axis do not change when the body turns about
     that axis. So they can belong to the parent.
     """
-    bodies = [_body(tree.masses[i], tree.centres[i], tree.inertias[i]) for i in range(tree.n)]
+    # About the joint's frame in place of the centre of mass.
+    bodies = [
+        _Body(mass, mass * centre, inertia + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre)))
+        for mass, centre, inertia in zip(tree.masses, tree.centres, tree.inertias, strict=True)
+    ]
     for i in reversed(range(tree.n)):
         if tree.joint_kinds[i] == "prismatic":
             continue
         body = bodies[i]
         rod = _Body(body.mass, np.array([0, 0, body.moment[2]]), np.diag([body.inertia[1, 1]] * 2 + [0.0]))
         bodies[i] = _Body(0.0, body.moment - rod.moment, body.inertia - rod.inertia)
-        if tree.parents[i] >= 0:
-            _attach(bodies[tree.parents[i]], rod, tree.rotations[i], tree.translations[i])
+        if tree.parents[i] < 0:
+            continue
+        # The parent takes the rod, which is fixed at rotation R and position p in its frame.
+        parent, R, p = bodies[tree.parents[i]], tree.rotations[i], tree.translations[i]
+        moment = R @ rod.moment
+        shift = 2 * (p @ moment) * np.eye(3) - np.outer(p, moment) - np.outer(moment, p)
+        steiner = rod.mass * (p @ p * np.eye(3) - np.outer(p, p))
+        parent.inertia = parent.inertia + R @ rod.inertia @ R.T + shift + steiner
+        parent.moment = parent.moment + moment + rod.mass * p
+        parent.mass += rod.mass
     return bodies
-
-
-def _body(mass: float, centre: Array, inertia: Array) -> _Body:
-    return _Body(mass, mass * centre, inertia + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre)))
-
-
-def _attach(parent: _Body, child: _Body, R: Array, p: Array) -> None:
-    """Add a body fixed at rotation R and position p in the parent's frame."""
-    mc = R @ child.moment
-    shift = 2 * (p @ mc) * np.eye(3) - np.outer(p, mc) - np.outer(mc, p)
-    steiner = child.mass * (p @ p * np.eye(3) - np.outer(p, p))
-    parent.inertia = parent.inertia + R @ child.inertia @ R.T + shift + steiner
-    parent.moment = parent.moment + mc + child.mass * p
-    parent.mass += child.mass
 
 
 def check_payload(name: str, value: ArrayLike) -> Array:

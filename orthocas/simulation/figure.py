@@ -74,12 +74,14 @@ def trajectory_figure(trajectory: "Trajectory", units: Mapping[str, str] | None 
     figure = Picture(figsize=(10.5, max(5.4, 1.05 * k + 0.9)), layout="constrained")
     halves: Any = figure.subfigures(1, 2)
     left, right = halves
+    # On the left, each controlled quantity with its target and its largest error.
     units = units or {}
     quantities = left.subplots(k, 1, sharex=True, squeeze=False)[:, 0]
     draw_quantities(quantities, trajectory, units)
     for axes, label, worst in zip(quantities, trajectory.labels, trajectory.tracking_error, strict=True):
         axes.set_title(f"largest error {worst:.2g} {units.get(label, '')}", loc="right", fontsize=7.5, pad=2)
     quantities[0].legend(fontsize=RULES.font, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False)
+    # On the right joints, commands and, for torques, the storage.
     others = right.subplots(2 + (trajectory.kind == "torque"), 1, sharex=True)
     _draw_others(others, trajectory, units)
     for axes in (*quantities, *others):
@@ -95,9 +97,8 @@ def trajectory_figure(trajectory: "Trajectory", units: Mapping[str, str] | None 
 def draw_quantities(panels: Array, trajectory: "Trajectory", units: Mapping[str, str], drawn: bool = True) -> None:
     """Draw the reference and, if `drawn`, the actual value of each quantity in its own axes."""
     good = ~trajectory.fell_back & np.isfinite(trajectory.value).all(axis=1)
-    seen = np.vstack(
-        [trajectory.value[good], trajectory.reference]
-    )  # chart coordinates are meaningless outside the domain
+    # Chart coordinates are meaningless outside the domain.
+    seen = np.vstack([trajectory.value[good], trajectory.reference])
     lows, highs = seen.min(axis=0), seen.max(axis=0)
     spans = np.maximum(highs - lows, max(RULES.narrowest * (highs - lows).max(), 1e-9))
     middles = (lows + highs) / 2
@@ -107,7 +108,10 @@ def draw_quantities(panels: Array, trajectory: "Trajectory", units: Mapping[str,
         axes.plot(trajectory.times, trajectory.reference[:, i], "--", color=_REFERENCE, linewidth=1, label="reference")
         axes.set_ylim(middles[i] - 0.58 * spans[i], middles[i] + 0.58 * spans[i])
         unit = f" [{units[label]}]" if label in units else ""
-        axes.set_ylabel(f"{_format_label(label)}{unit}", fontsize=9)
+        # xi1 as a mathematical symbol; other labels unchanged.
+        number = label.removeprefix("xi")
+        symbol = rf"$\xi_{{{number}}}$" if label.startswith("xi") and number.isdigit() else label
+        axes.set_ylabel(f"{symbol}{unit}", fontsize=9)
         _set_style(axes, trajectory)
 
 
@@ -164,12 +168,6 @@ def _format_durations(lasting: Mapping[ControlStatus, float], chosen: Sequence[C
     return ", ".join(f"{status.words} {lasting[status]:.3g} s" for status in chosen)
 
 
-def _format_label(label: str) -> str:
-    """A label such as xi1 as a mathematical symbol; other labels unchanged."""
-    number = label.removeprefix("xi")
-    return rf"$\xi_{{{number}}}$" if label.startswith("xi") and number.isdigit() else label
-
-
 class MovingPicture:
     """Draws the moving parts over a background that is drawn once, so that a frame takes milliseconds.
 
@@ -182,9 +180,9 @@ class MovingPicture:
     def __init__(self, trajectory: "Trajectory", problem: Problem, speed: float = 1.0) -> None:
         k = len(trajectory.labels)
         height = max(4.2, RULES.panel * k + 0.8)
-        figure = Figure(
-            figsize=(RULES.width, round(height * RULES.dpi / 2) * 2 / RULES.dpi), dpi=RULES.dpi
-        )  # even height: MP4 needs it
+        # MP4 needs an even height.
+        size = (RULES.width, round(height * RULES.dpi / 2) * 2 / RULES.dpi)
+        figure = Figure(figsize=size, dpi=RULES.dpi)
         self._canvas = cast(Any, FigureCanvasAgg(figure))
         self._times, self._values = trajectory.times, trajectory.value
         self._arm = _Arm(figure, trajectory, problem)
@@ -233,10 +231,12 @@ class _Arm:
     def __init__(self, figure: Figure, trajectory: "Trajectory", problem: Problem) -> None:
         points = problem.robot.joint_points(trajectory.q)  # (N, points, 3)
         low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
+        # Planar arms lie in two axes.
         flat = np.flatnonzero(high - low < RULES.flat)
         shown = np.delete(np.arange(3), flat[-1]) if flat.size else np.arange(3)
         axes = _build_axes(figure, low[shown], high[shown], ["xyz"[i] for i in shown])
         self._points, self._targets = points[..., shown], _compute_tip_targets(trajectory, problem)[:, shown]
+        # The base stands still; path, arm and target are placed anew in each picture.
         zero = np.zeros((len(shown), 0))
         axes.plot(*self._points[0, :1].T, "s", color=_ARM, markersize=9)
         self._lines: list[Any] = [
@@ -283,6 +283,7 @@ def _build_axes(figure: Figure, low: Array, high: Array, names: list[str]) -> An
     centres, extent = (low + high) / 2, high - low + 2 * RULES.margin * longest
     if len(names) == 2:
         axes: Any = figure.add_axes((0.075, 0.17, 0.445, 0.74))
+        # One scale for both axes, whatever the shape of the panel.
         shape = figure.get_size_inches() * axes.get_position().size
         extent = (extent / shape).max() * shape
         axes.grid(alpha=0.3)

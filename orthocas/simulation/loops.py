@@ -336,6 +336,7 @@ def _build_integrator(loop: ClosedLoop, reference: Reference, tolerance: float) 
     x, s = kind.sym("x", state_size), kind.sym("s")
     p = kind.sym("p", 2 + p_size + load_size)
     length, since, parameters, load = p[0], p[1], p[2 : 2 + p_size], p[2 + p_size :]
+    # In s from 0 to 1, so that one integrator serves intervals of all lengths.
     ode = length * rate(x, since + s * length, parameters, load)
     grid = np.arange(1, RULES.outputs + 1) / RULES.outputs
     return ca.integrator(
@@ -412,7 +413,15 @@ def build_held_plant(loop: ClosedLoop, length: float, tolerance: float) -> ca.Fu
 def _build_ticks(loop: ClosedLoop, period: float, k: int, tolerance: float) -> Ticks:
     # CasADi may lose Ctrl-C while it builds functions.
     with deferred(), building:
-        ticks = _build_tick(loop, period, k, tolerance).mapaccum(RULES.ticks)
+        # State, reference with derivatives (3 k, 1), noise, load -> state after the tick, command, status.
+        size = loop.plant_rate.size1_in(0)
+        plant = build_held_plant(loop, period, tolerance)
+        x, reference = ca.MX.sym("state", size), ca.MX.sym("reference", 3 * k)
+        noise, load = ca.MX.sym("noise", size), ca.MX.sym("load", loop.loads.size)
+        command, status = loop.commanded(x + noise, (reference[:k], reference[k : 2 * k], reference[2 * k :]))
+        end = plant(x0=x, p=ca.vertcat(command, load))["xf"]
+        tick = ca.Function("tick", [x, reference, noise, load], [end, command, status])
+        ticks = tick.mapaccum(RULES.ticks)
 
     def run(state: Array, *columns: Array) -> tuple[Array, Array, Array]:
         # The last row is repeated until there are as many rows as one call takes.
@@ -423,14 +432,3 @@ def _build_ticks(loop: ClosedLoop, period: float, k: int, tolerance: float) -> T
         return states, commands, status
 
     return run
-
-
-def _build_tick(loop: ClosedLoop, length: float, k: int, tolerance: float) -> ca.Function:
-    """state, reference with derivatives (3 k, 1), noise, load -> state after the tick, command, status."""
-    size = loop.plant_rate.size1_in(0)
-    plant = build_held_plant(loop, length, tolerance)
-    state, reference = ca.MX.sym("state", size), ca.MX.sym("reference", 3 * k)
-    noise, load = ca.MX.sym("noise", size), ca.MX.sym("load", loop.loads.size)
-    command, status = loop.commanded(state + noise, (reference[:k], reference[k : 2 * k], reference[2 * k :]))
-    end = plant(x0=state, p=ca.vertcat(command, load))["xf"]
-    return ca.Function("tick", [state, reference, noise, load], [end, command, status])

@@ -464,8 +464,10 @@ class MuJoCoPlant(Shown):
         """
         M = np.zeros((self.model.nv,) * 2)
         mujoco().mj_fullM(self.model, self.data, M)
+        # The largest eigenvalues of M^-1 D and M^-1 K.
         damped, squared = (
-            self._timestep * _compute_largest_eigenvalue(M, part) for part in self._compute_dampers_and_springs()
+            self._timestep * float(np.linalg.eigvals(np.linalg.solve(M, part)).real.max()) if part.any() else 0.0
+            for part in self._compute_dampers_and_springs()
         )
         parts = max(
             min(ceil(min(damped, RULES.most_parts + 1)), RULES.most_parts), ceil(sqrt(self._timestep * squared)), 1
@@ -559,8 +561,3 @@ class MuJoCoPlant(Shown):
         steps = max(1, ceil(count))
         self.model.opt.timestep = seconds / steps
         return steps
-
-
-def _compute_largest_eigenvalue(M: Array, K: Array) -> float:
-    """Of M^-1 K, for symmetric M > 0 and K >= 0."""
-    return float(np.linalg.eigvals(np.linalg.solve(M, K)).real.max()) if K.any() else 0.0

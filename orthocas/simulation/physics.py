@@ -161,10 +161,12 @@ def run_physics(
         elasticity=scene.elasticity,
     )
     plant.reset(start[: loop.n], start[loop.n :])
+    # What each tick needs: targets with derivatives, errors of the sensors, and the share of it that each push lasts.
     ticks = int(np.floor(reference.duration * rate + 1e-9))
     times = np.arange(ticks) / rate
     target, errors = np.hstack(reference.sample(times)), noise.sample(ticks, loop.n)
     shares = loop.loads.shares(times, 1 / rate)
+    # CasADi may lose Ctrl-C while it builds functions.
     with deferred(), building:
         law = _law(loop, len(reference.labels)) if supervised is None else supervised.tick
     if supervised is not None:

@@ -147,7 +147,13 @@ def prepare(controller: Controller, reference: Reference, q_start: ArrayLike, se
     robot, scene = _read_plant(settings.plant, controller)
     loop = ClosedLoop(controller, robot, friction or Friction(), Loads(robot.tree, settings.pushes), settings.stops)
     _check_settings(loop, reference, settings, scene)
-    start = _build_start(loop, q_start, settings.dq_start)
+    start, dq_start = as_point("q_start", q_start, loop.n), settings.dq_start
+    if loop.torque:
+        dq = np.zeros(loop.n) if dq_start is None else as_point("dq_start", dq_start, loop.n)
+        start = np.concatenate([start, dq])
+    elif dq_start is not None:
+        expected = "None, because velocity is not a state with a velocity controller"
+        raise InvalidValueError("dq_start", dq_start, expected)
     if settings.must_be_reachable:
         controller.require_reachable(reference, start[: loop.n])
     compiled = CompiledLoop(loop, reference) if settings.compiled else None
@@ -272,17 +278,6 @@ def _check_settings(loop: ClosedLoop, reference: Reference, settings: Settings, 
             raise InvalidValueError(argument, received, expected)
 
 
-def _build_start(loop: ClosedLoop, q_start: ArrayLike, dq_start: ArrayLike | None) -> Array:
-    q = as_point("q_start", q_start, loop.n)
-    if not loop.torque:
-        if dq_start is not None:
-            raise InvalidValueError(
-                "dq_start", dq_start, "None, because velocity is not a state with a velocity controller"
-            )
-        return q
-    return np.concatenate([q, np.zeros(loop.n) if dq_start is None else as_point("dq_start", dq_start, loop.n)])
-
-
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """A closed loop that is ready to run, once."""
@@ -336,9 +331,9 @@ class Prepared:
         unknown = [np.full((len(times), 1), np.nan)] * 2
         storage, power = unknown if energy is None else self._evaluate("energy", q, dq, *target)
         value, chart = self._evaluate("measured", q)[0], controller.chart
-        if chart is not None and controller.labels == chart.labels and chart.turns.any():
+        if chart is not None and controller.labels == chart.labels and chart.parts.turns.any():
             # Circle-valued quantities with the whole turns that bring them nearest to the reference.
-            value = np.asarray(target[0] + wrap_shortest(value - target[0], chart.turns))
+            value = np.asarray(target[0] + wrap_shortest(value - target[0], chart.parts.turns))
         run = Trajectory(
             controller=controller.name,
             kind=controller.command,

@@ -225,6 +225,7 @@ class Trajectory(Shown):
         path = as_path("path", path)
         header, arrays = read_run_file(path, _VERSION, _REQUIRED, _LATER)
         try:
+            # The header first: it says which shapes the arrays must have.
             names: dict[str, Any] = {name: tuple(get_part(header, name, list)) for name in ("labels", "joint_names")}
             _check_names(names)
             require_known("kind of command", get_part(header, "kind", str), ("torque", "velocity"))
@@ -287,7 +288,13 @@ def find_loss(run: Trajectory, controller: Controller, pushes: Sequence[Push], s
         pushes: that acted on the arm.
         supervised: whether its supervised form ran.
     """
-    outside, what = _find_outside(run, controller)
+    # At which instants the arm is outside what the law respects, (N,).
+    if controller.chart is not None:
+        outside, what = np.asarray(~controller.problem.domain.contains(run.q)), "the domain of the chart"
+    else:
+        robot = controller.problem.robot
+        beyond = (run.q < robot.lower - RULES.beyond) | (run.q > robot.upper + RULES.beyond)
+        outside, what = np.asarray(beyond.any(axis=1)), "the joint limits"
     held = supervised and run.status[-1] in (ControlStatus.CAUGHT, ControlStatus.RETURNING)
     if (outside[-1] and not held) or (outside.any() and not supervised):
         first, _ = next(_find_stretches(outside))
@@ -305,15 +312,6 @@ def find_loss(run: Trajectory, controller: Controller, pushes: Sequence[Push], s
             joint = run.joint_names[int(np.argmax(at_limit[first : last + 1].sum(axis=0)))]
             return f"from t = {since:.4g} s to {until:.4g} s joint '{joint}' was at its limit, and errors grew"
     return ""
-
-
-def _find_outside(run: Trajectory, controller: Controller) -> tuple[NDArray[np.bool_], str]:
-    """At which instants the arm is outside what the law respects, (N,), and what that is."""
-    if controller.chart is not None:
-        return np.asarray(~controller.problem.domain.contains(run.q)), "the domain of the chart"
-    robot = controller.problem.robot
-    beyond = (run.q < robot.lower - RULES.beyond) | (run.q > robot.upper + RULES.beyond)
-    return np.asarray(beyond.any(axis=1)), "the joint limits"
 
 
 def _find_stretches(true: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
@@ -366,7 +364,7 @@ def coupling_index(chart: Chart, reference: Reference, trajectory: Trajectory) -
     if reference.labels != chart.labels:
         raise InvalidValueError("labels of the reference", reference.labels, f"those of the chart {chart.labels}")
     wanted = reference.sample(np.minimum(trajectory.times, reference.duration))[0]
-    away = np.abs(wrap_shortest(chart.phi(trajectory.q) - wanted, chart.turns))
+    away = np.abs(wrap_shortest(chart.phi(trajectory.q) - wanted, chart.parts.turns))
     # Between two steps of the reference, only the commanded coordinates should move.
     steps = np.diff(np.vstack([reference.start, reference.targets]), axis=0)
     index = np.full((chart.n, chart.n), np.nan)

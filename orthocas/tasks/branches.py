@@ -12,11 +12,10 @@ from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, SingularTaskError, UnknownNameError
 from orthocas.robots.robot import Robot
-from orthocas.tasks.clear_box import compute_row_scale
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem, relative_singular_values
 from orthocas.tasks.regular_box import find_joint_range
-from orthocas.tasks.samples import sample_evenly
+from orthocas.tasks.samples import compute_row_scale, sample_evenly
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, as_point, require_kind
 from orthocas.tools.display import Shown, listed, percent

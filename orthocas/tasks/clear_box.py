@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocas.errors import DomainError, InvalidValueError, SingularTaskError
 from orthocas.tasks.domains import Box, Domain, StopKind, Wall, register_domain, require_within_limits
-from orthocas.tasks.samples import sample_evenly, sample_uniform
+from orthocas.tasks.samples import compute_row_scale, sample_evenly, sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
@@ -108,8 +108,11 @@ class ClearBox(Box):
     def heading(self) -> str:
         """The condition in one line, with the lengths by which rows are divided."""
         rows = "J_x" if self.jacobian_function is self.task.jacobian_function else "the frame Jacobian"
-        sizes = f"(rows of {rows} over {_list_sizes(self.scale, self.task.units)})"
-        return f"relative singular value of the task above {self.least_singular_value:g} {sizes}"
+        # For example '0.41 m, 1.53 rad'; one number for each row if units are unknown or their numbers differ.
+        sizes = [f"{size:.3g} {unit}".strip() for size, unit in zip(self.scale, self.task.units, strict=True)]
+        lengths = ", ".join(dict.fromkeys(sizes) if all(self.task.units) else sizes)
+        bound = f"relative singular value of the task above {self.least_singular_value:g}"
+        return f"{bound} (rows of {rows} over {lengths})"
 
     @property
     def condition(self) -> Self:
@@ -247,22 +250,6 @@ class ClearBox(Box):
         return compute_row_scale(J[finite], self.task.units)
 
 
-def compute_row_scale(J: Array, units: tuple[str, ...]) -> Array:
-    """Root mean square length of the rows of each unit, (m,). It does not depend on how axes are turned; 1 if zero.
-
-    Args:
-        J: task Jacobians at samples, (N, m, n).
-        units: units of the task components; rows with the same unit share one scale, rows of unknown unit have their
-            own.
-    """
-    squares = (J**2).sum(axis=2).mean(axis=0)
-    groups = [unit or f"own {i}" for i, unit in enumerate(units)]
-    means = [
-        np.mean([square for square, other in zip(squares, groups, strict=True) if other == mine]) for mine in groups
-    ]
-    return np.sqrt([mean if mean > 0 else 1.0 for mean in means])
-
-
 def exclude_singular(domain: Domain, task: Task, least_singular_value: float | None) -> Domain:
     """The part of a domain where a task is clear of singular positions: a ClearBox of this task, if a bound is given.
 
@@ -277,9 +264,3 @@ def exclude_singular(domain: Domain, task: Task, least_singular_value: float | N
     if isinstance(domain, ClearBox) and domain.task is not task:
         return ClearBox(domain, task, domain.least_singular_value, rows=domain.rows)
     return domain
-
-
-def _list_sizes(scale: Array, units: tuple[str, ...]) -> str:
-    """For example '0.41 m, 1.53 rad'; one number for each row if units are unknown or their numbers differ."""
-    sizes = [f"{size:.3g} {unit}".strip() for size, unit in zip(scale, units, strict=True)]
-    return ", ".join(dict.fromkeys(sizes) if all(units) else sizes)

@@ -385,13 +385,6 @@ class Torus(Domain):
         return cls(task.robot.n)
 
 
-def contains(domain: Domain, q: ArrayLike) -> Any:
-    """Whether points (n,) or (N, n) lie in the domain: a bool, or (N,). Finite angles always lie on a torus."""
-    if not isinstance(domain, Domain):
-        raise InvalidValueError("domain", f"a {type(domain).__name__}", "a Box, a Torus or another Domain")
-    return domain.contains(q)
-
-
 def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: ArrayLike | None = None) -> Box:
     """A box inside the joint limits.
 

@@ -80,8 +80,9 @@ class Metric(HoldsFunctions):
         Example:
             >>> import casadi as ca
             >>> import orthocas as oc
+            >>> from orthocas.tasks.metric import Metric
             >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[3.0, 3.0])
-            >>> metric = oc.Metric.custom(robot, "stiff elbow", lambda q: ca.diag(ca.vertcat(1, 2 + ca.cos(q[1]))))
+            >>> metric = Metric.custom(robot, "stiff elbow", lambda q: ca.diag(ca.vertcat(1, 2 + ca.cos(q[1]))))
             >>> oc.Problem(robot, oc.Task.position(robot, "x"), metric).metric.name
             'stiff elbow'
         """

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from orthocas.errors import InvalidValueError, MetricError, NotRedundantError, SingularTaskError
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import KinematicTree
-from orthocas.tasks.clear_box import compute_row_scale, exclude_singular
+from orthocas.tasks.clear_box import exclude_singular
 from orthocas.tasks.domains import Domain, domain_from_data, require_within_limits
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.regular_box import regular_box
-from orthocas.tasks.samples import sample_uniform
+from orthocas.tasks.samples import compute_row_scale, sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.archive import Stored
 from orthocas.tools.checks import Array, require_kind, require_shape, require_text
@@ -310,7 +310,7 @@ def read_problem(header: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Pro
 def _write_task(task: Task) -> dict[str, Any]:
     """A task as plain data, with the expressions of custom ones."""
     data = _add_tape(task.recipe, task.function)
-    return data | {"parts": [_write_task(get_part) for get_part in task.parts]} if task.parts else data
+    return data | {"parts": [_write_task(part) for part in task.parts]} if task.parts else data
 
 
 def _add_tape(recipe: Mapping[str, Any], function: ca.Function) -> dict[str, Any]:

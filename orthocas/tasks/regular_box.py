@@ -9,9 +9,8 @@ from numpy.typing import ArrayLike
 from orthocas.errors import DomainError, InvalidValueError, NotRedundantError, degrees_hint
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM
-from orthocas.tasks.clear_box import compute_row_scale
 from orthocas.tasks.domains import Box, default_box, default_half_width
-from orthocas.tasks.samples import sample_evenly
+from orthocas.tasks.samples import compute_row_scale, sample_evenly
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array, as_number, as_point

@@ -269,6 +269,20 @@ def find_idle_joints(problem: "Problem", samples: Samples) -> list[int]:
     return [int(k) for k in np.flatnonzero(idle)]
 
 
+def compute_row_scale(J: Array, units: tuple[str, ...]) -> Array:
+    """Root mean square length of the rows of each unit, (m,). It does not depend on how axes are turned; 1 if zero.
+
+    Args:
+        J: task Jacobians at samples, (N, m, n).
+        units: units of the task components; rows with the same unit share one scale, rows of unknown unit have their
+            own.
+    """
+    squares = (J**2).sum(axis=2).mean(axis=0)
+    groups = np.array([unit or f"own {i}" for i, unit in enumerate(units)])
+    means = np.array([squares[groups == mine].mean() for mine in groups])
+    return np.sqrt(np.where(means > 0, means, 1.0))
+
+
 def compute_directions(problem: "Problem", joints: Sequence[int], points: Array) -> Array:
     """Compute what a symmetry of the joints keeps: A^-1, and the projector on the task gradients.
 

@@ -160,6 +160,7 @@ def _check_header(source: Path, kind: Kind, text: bytes) -> dict[str, Any]:
     sums = header.get("sha256") if isinstance(header, dict) else None
     if not isinstance(sums, dict) or not {"format", "version"} <= header.keys():
         raise kind.error(f"{source} is not an orthocas {kind.name} file")
+    # One of our files: of which kind, and not from a later version.
     name, version = header["format"], header["version"]
     if name != kind.format:
         raise kind.error(f"{source} has format '{name}', expected '{kind.format}'")

@@ -81,13 +81,21 @@ def ended_in_order() -> Iterator[Callable[[], int]]:
     if one has come, even if its exception got lost, else 0. Python says nothing of exceptions of signals that it loses
     itself, in callbacks of weak references.
     """
+    # Handlers of the program's own stay.
     memory = _Note()
     _ends.append(memory)
     before = {number: signal.getsignal(number) for number in _ENDING}
     for number, handler in before.items():
         if handler is signal.SIG_DFL:
             signal.signal(number, _end)
-    complain, sys.unraisablehook = sys.unraisablehook, _without_signals(sys.unraisablehook)
+    # Exceptions of signals that Python loses are remembered, and need no complaint.
+    complain = sys.unraisablehook
+
+    def complain_of_others(lost: Any) -> None:
+        if not issubclass(lost.exc_type, KeyboardInterrupt | SystemExit):
+            complain(lost)
+
+    sys.unraisablehook = complain_of_others
     try:
         yield lambda: 0 if memory.number is None else 128 + memory.number
     finally:
@@ -95,16 +103,6 @@ def ended_in_order() -> Iterator[Callable[[], int]]:
         _ends.remove(memory)
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _without_signals(complain: Callable[[Any], object]) -> Callable[[Any], object]:
-    """A `sys.unraisablehook` for all but exceptions of signals."""
-
-    def hook(lost: Any) -> None:
-        if not issubclass(lost.exc_type, KeyboardInterrupt | SystemExit):
-            complain(lost)
-
-    return hook
 
 
 @contextmanager
@@ -120,7 +118,7 @@ def remembered() -> Iterator[Callable[[], bool]]:
     memory, before = _Note(), signal.getsignal(signal.SIGINT)
     _memories.append(memory)
     if before is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _interrupt)
+        signal.signal(signal.SIGINT, lambda number, frame: _raise(number))
     try:
         yield lambda: memory.number is not None
     finally:
@@ -134,10 +132,6 @@ def check_remembered() -> None:
         for memories in (_ends, _memories):
             if memories and (number := memories[-1].number) is not None:
                 _raise(number)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
-    _raise(number)
 
 
 def _end(number: int, frame: FrameType | None) -> NoReturn:

@@ -51,10 +51,11 @@ class ChartPage:
     def _add_sliders(self) -> dict[str, Any]:
         """One slider for each component of phi: coordinates first."""
         gui, chart, m = self._server.gui, self._chart, self._chart.m
-        phi, sizes = chart.phi(self.session.home), chart.phi_sizes
+        phi, sizes = chart.phi(self.session.home), chart.parts.phi_sizes
         sliders = {}
         with gui.add_folder("Coordinates: the task stays"):
-            for label, name, value in zip(chart.labels[m:], chart.named_coordinates, phi[m:].tolist(), strict=True):
+            names = chart.parts.named_coordinates
+            for label, name, value in zip(chart.labels[m:], names, phi[m:].tolist(), strict=True):
                 hint = f"Moves the joints along {label}, and keeps the task and the other coordinates."
                 sliders[label] = self._add_slider(name, value, 0.5, hint, label)
         with gui.add_folder("Task: the coordinates stay"):
@@ -85,8 +86,12 @@ class ChartPage:
         self._add_button("Home", "home", self._go_home)
         self._undo = self._add_button("Undo", "arrow-back-up", self._undo_move)
         with gui.add_folder("What a coordinate reaches"):
+            # First the coordinate that moves the joints farthest.
+            self._fans = [fan_along(self._chart, self.session.q, k) for k in range(self._chart.r)]
+            sweeps = [self._chart.problem.robot.joint_points(fan.spread(5)) for fan in self._fans]
+            widest = self._fans[int(np.argmax([np.ptp(points, axis=0).max() for points in sweeps]))].label
             labels = self._chart.labels[self._chart.m :]
-            self._chosen = gui.add_dropdown("coordinate", (*labels, _NONE), initial_value=self._find_widest())
+            self._chosen = gui.add_dropdown("coordinate", (*labels, _NONE), initial_value=widest)
             self._sweep = self._add_button("Sweep", "repeat", self._toggle_sweep)
         if self._chart.problem.domain.room_to_fold is not None:
             self._branches = gui.add_folder("Other branches: the tip stays")
@@ -96,12 +101,6 @@ class ChartPage:
 
     async def _choose_coordinate(self, event: Any) -> None:
         self._loop.ask("fan", self._show_fan)
-
-    def _find_widest(self) -> str:
-        """The coordinate that moves the joints farthest."""
-        robot = self._chart.problem.robot
-        self._fans = [fan_along(self._chart, self.session.q, k) for k in range(self._chart.r)]
-        return max(self._fans, key=lambda fan: float(np.ptp(robot.joint_points(fan.spread(5)), axis=0).max())).label
 
     def _add_button(self, label: str, icon: str, job: Callable[[], None]) -> Any:
         button = self._server.gui.add_button(label, icon=icon)
@@ -140,6 +139,7 @@ class ChartPage:
         handle = self._server.scene.add_transform_controls(
             "/tool", scale=size, active_axes=axes, disable_rotations=True, depth_test=False, opacity=0.8
         )
+        # Axes that the task leaves free stay where they are.
         moved = [axis for axis, active in zip("xyz", axes, strict=True) if active]
 
         async def dragged(event: Any) -> None:
@@ -259,12 +259,10 @@ class ChartPage:
             if fan is None:
                 self._ghosts.hide()
             else:
-                few, many = (self._filter_allowed(fan.spread(count)) for count in (RULES.ghosts, 4 * RULES.ghosts))
+                # What the arm can have of the fan.
+                fans = (fan.spread(RULES.ghosts), fan.spread(4 * RULES.ghosts))
+                few, many = (self.session.mirror(q[self.session.find_allowed(q)]) for q in fans)
                 self._ghosts.show(few, many)
-
-    def _filter_allowed(self, q: Array) -> Array:
-        """What the arm can have of positions of the chart (N, n)."""
-        return self.session.mirror(q[self.session.find_allowed(q)])
 
     def _show_failure(self, error: Exception) -> None:
         self._rest()

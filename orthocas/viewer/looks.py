@@ -212,10 +212,16 @@ def _decimate(solid: Solid, count: int) -> Solid:
 def build_stick_arm(tree: KinematicTree, thickness: float = 1.0, facets: int = RULES.facets) -> Look:
     """Drums about the joint axes and tapered rods between the frames, thinner or thicker than usual by a factor."""
     look: Look = [[] for _ in range(tree.n + 2)]
-    radii = thickness * _compute_radii(tree)
+    # Radii of the rods that begin at the base and at each body, (n + 1,).
+    total, run = compute_chain_length(tree), np.zeros(tree.n + 1)
+    for i, parent in enumerate(tree.parents):
+        run[i + 1] = run[parent + 1] + np.linalg.norm(tree.translations[i])
+    radii = thickness * RULES.rod * total * (1 - RULES.taper * np.clip(run / total, 0.0, 1.0))
     for i, parent in enumerate(tree.parents):
         r = radii[i + 1]
-        look[i + 1].append(_build_joint(tree, i, r, facets))
+        # A drum about the axis of a revolute joint, or a slim rail along that of a prismatic one.
+        size = (0.8 * r, 2.2 * r) if tree.prismatic[i] else (1.18 * r, 1.3 * r)
+        look[i + 1].append(build_drum(*size, RULES.joint, facets))
         _add_rod(look[parent + 1], tree.translations[i], (radii[parent + 1], r), facets)
     r = radii[tree.tip_parent + 1]
     _add_rod(look[tree.tip_parent + 1], tree.tip_translation, (r, 0.75 * r), facets)
@@ -236,22 +242,6 @@ def compute_chain_length(tree: KinematicTree) -> float:
         steps = [frame.translation, *tree.translations[tree.carriers(frame.parent)]]
         lengths.append(float(sum(np.linalg.norm(step) for step in steps)))
     return max(lengths)
-
-
-def _compute_radii(tree: KinematicTree) -> Array:
-    """Radius of the rods that begin at the base and at each body, (n + 1,)."""
-    total = compute_chain_length(tree)
-    run = np.zeros(tree.n + 1)
-    for i, parent in enumerate(tree.parents):
-        run[i + 1] = run[parent + 1] + np.linalg.norm(tree.translations[i])
-    return np.asarray(RULES.rod * total * (1 - RULES.taper * np.clip(run / total, 0.0, 1.0)))
-
-
-def _build_joint(tree: KinematicTree, i: int, r: float, facets: int) -> Solid:
-    """A drum about the axis of a revolute joint, or a slim rail along that of a prismatic one."""
-    if tree.prismatic[i]:
-        return build_drum(0.8 * r, 2.2 * r, RULES.joint, facets)
-    return build_drum(1.18 * r, 1.3 * r, RULES.joint, facets)
 
 
 def _add_rod(solids: list[Solid], end: Array, radii: tuple[float, float], facets: int) -> None:
@@ -287,7 +277,11 @@ def read_urdf_look(path: Path, tree: KinematicTree, locked: Mapping[str, float] 
     _check_same(path, model, tree)
     # Frames of our tree have the joint's axis as z; Pinocchio's have those of the file.
     turns = [np.eye(3), *(rotate_z_to(find_axis(model, i)[1]) for i in range(1, model.njoints))]
-    colours = _read_materials(root)
+    colours = {
+        material.get("name", ""): colour
+        for material in root.iter("material")
+        if (colour := _read_colour(material)) is not None and material.get("name")
+    }
     look: Look = [[] for _ in range(tree.n + 2)]
     missing: list[str] = []
     for link in root.findall("link"):
@@ -316,16 +310,6 @@ def _check_same(path: Path, model: pin.Model, tree: KinematicTree) -> None:
         raise RobotError(f"{path} places joint '{joint}' elsewhere, expected the robot file that the chart was made of")
 
 
-def _read_materials(root: ElementTree.Element) -> dict[str, Colour]:
-    """Colours of the named materials of a file."""
-    colours = {}
-    for material in root.iter("material"):
-        colour = _read_colour(material)
-        if colour is not None and material.get("name"):
-            colours[material.get("name", "")] = colour
-    return colours
-
-
 def _read_colour(material: ElementTree.Element) -> Colour | None:
     """The colour that a material defines itself."""
     element = material.find("color")
@@ -341,6 +325,7 @@ def _build_solid(
     path: Path, visual: ElementTree.Element, colours: Mapping[str, Colour], missing: list[str]
 ) -> Solid | None:
     """The geometry of a visual element in its own frame; None if there is none to show."""
+    # A colour of its own, that of a named material, or the default.
     material = visual.find("material")
     colour = RULES.shell
     if material is not None:

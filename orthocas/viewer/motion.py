@@ -133,7 +133,11 @@ def cyclic_motions(chart: Chart, path: Array | None = None, cycles: int = 3) -> 
     """
     require_kind("chart", chart, Chart)
     require_count("cycles", cycles, most=RULES.most_cycles)
-    times, fractions = _build_times(cycles)
+    # Instants [s], and the share of a cycle that is done: from rest to rest in each cycle.
+    t = np.linspace(0.0, 1.0, RULES.cycle_points + 1)
+    fraction = t**3 * (10 - 15 * t + 6 * t**2)
+    times = RULES.cycle * np.concatenate([[0.0], *(k + t[1:] for k in range(cycles))])
+    fractions = np.concatenate([[0.0], *(fraction[1:] for _ in range(cycles))])
     start = chart.problem.domain.centre
     if path is None:
         along, q = _find_largest_circle(chart, start, fractions)
@@ -150,18 +154,11 @@ def cyclic_motions(chart: Chart, path: Array | None = None, cycles: int = 3) -> 
     )
 
 
-def _build_times(cycles: int) -> tuple[Array, Array]:
-    """Instants [s], and the share of a cycle that is done: from rest to rest in each cycle."""
-    t = np.linspace(0.0, 1.0, RULES.cycle_points + 1)
-    fraction = t**3 * (10 - 15 * t + 6 * t**2)
-    times = RULES.cycle * np.concatenate([[0.0], *(k + t[1:] for k in range(cycles))])
-    return times, np.concatenate([[0.0], *(fraction[1:] for _ in range(cycles))])
-
-
 def _find_largest_circle(chart: Chart, start: Array, fractions: Array) -> tuple[Place, Array]:
     """A circle in the first two components of the task, or a line in one, as large as the chart can follow."""
+    # Smaller and smaller circles, until the chart can follow one.
     x0, m = chart.task(start), min(chart.m, 2)
-    radius = RULES.circle * float(chart.phi_sizes[:m].min())
+    radius = RULES.circle * float(chart.parts.phi_sizes[:m].min())
     while True:
 
         def along(fraction: Array, radius: float = radius) -> Array:
@@ -173,14 +170,14 @@ def _find_largest_circle(chart: Chart, start: Array, fractions: Array) -> tuple[
             return along, _follow_with_constant_xi(chart, along(fractions), start)
         except PathError:
             radius /= 1.3
-            if radius < RULES.smallest_circle * float(chart.phi_sizes[:m].min()):
+            if radius < RULES.smallest_circle * float(chart.parts.phi_sizes[:m].min()):
                 raise
 
 
 def _build_polygon(chart: Chart, path: Array) -> Place:
     """Straight lines between waypoints."""
     points, _ = as_point_set("path", path, chart.m)
-    sizes = chart.phi_sizes[: chart.m]
+    sizes = chart.parts.phi_sizes[: chart.m]
     if len(points) < 3 or np.abs((points[-1] - points[0]) / sizes).max() > RULES.same_ends:
         raise PathError(f"the path of {len(points)} waypoints is not closed, expected its last to be its first")
     lengths = np.linalg.norm(np.diff(points, axis=0) / sizes, axis=1)

@@ -62,6 +62,7 @@ class Readers:
         chart = self._chart
         phi = chart.phi(q)
         quality = chart.quality(q)
+        # Where the joints are in the domain, from -1 to 1, and how far they may still move; endless ones have no end.
         inside = (q - self._middle) / self._half_width
         room = np.where(self._free, np.inf, self._half_width - np.abs(q - self._middle))
         return Readings(

@@ -243,12 +243,14 @@ def show_chart(chart: Chart, look: Look, server: Any) -> tuple[float, Callable[[
     fans = [fan_along(chart, home, k) for k in range(chart.r)]
     arm, ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
     place_scene(server, robot, np.concatenate([fan.spread(5) for fan in fans]))
+    # The label stands above the highest joint.
     above = robot.joint_points(home).max(axis=0) @ compute_up(robot) + 0.12 * compute_chain_length(robot.tree)
     label = server.scene.add_label("/label", "", position=tuple(above * compute_up(robot)), anchor="bottom-center")
     task, drawn = ", ".join(chart.labels[: chart.m]), -1
 
     def show(seconds: float) -> None:
         nonlocal drawn
+        # The coordinate whose turn it is; its ghosts are drawn once.
         k = min(int(seconds / RULES.recorded_sweep), chart.r - 1)
         if k != drawn:
             ghosts.show(fans[k].spread(RULES.ghosts), fans[k].spread(4 * RULES.ghosts))

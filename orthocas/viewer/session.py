@@ -182,7 +182,7 @@ class Session:
 
     def _find_far(self, here: Array) -> NDArray[np.bool_]:
         """Which components of phi are not yet what is wished for, (n,)."""
-        return np.asarray(np.abs((self._target - here) / self.chart.phi_sizes) > RULES.reached)
+        return np.asarray(np.abs((self._target - here) / self.chart.parts.phi_sizes) > RULES.reached)
 
     def _find_reason(self) -> str:
         if self._limited:

@@ -10,8 +10,8 @@ from conftest import ROBOTS, robot_data
 from programs import Run
 
 import orthocas as oc
-from orthocas import problems
-from orthocas.bases import parse_parametrisation
+from orthocas import bases, problems
+from orthocas.bases import cyclic_joints, parse_parametrisation
 from orthocas.charts.chart_file import CHART
 from orthocas.codegen.check import check_c
 from orthocas.control import ControlStatus, Kinematic, PDPlus
@@ -39,7 +39,7 @@ def endless() -> oc.Chart:
 @pytest.mark.parametrize("metric", ["euclidean", "inertia"])
 def test_base_rotation_of_a_position_task_is_cyclic(metric: str) -> None:
     known = problems.get("iiwa")
-    assert oc.cyclic_joints(oc.Problem(known.robot, known.task, metric, known.domain)) == ("A1",)
+    assert cyclic_joints(oc.Problem(known.robot, known.task, metric, known.domain)) == ("A1",)
 
 
 @pytest.mark.parametrize(
@@ -59,15 +59,15 @@ def test_a_joint_is_cyclic_if_and_only_if_task_and_metric_stay_alike(
     task: object, metric: object, wanted: tuple[str, ...]
 ) -> None:
     known = problems.get("planar_3r_xy")
-    assert oc.cyclic_joints(oc.Problem(known.robot, task(known.robot), metric, known.domain)) == wanted
+    assert cyclic_joints(oc.Problem(known.robot, task(known.robot), metric, known.domain)) == wanted
 
 
 @pytest.mark.slow
 def test_lifting_torso_is_cyclic_for_a_pose() -> None:
     file, tip = ROBOTS["tiago with its prismatic torso"]
     robot = oc.Robot.from_urdf(robot_data(file), tip)
-    assert oc.cyclic_joints(oc.Problem(robot, oc.Task.position(robot))) == ("torso_lift_joint", "arm_1_joint")
-    assert oc.cyclic_joints(oc.Problem(robot, oc.Task.pose(robot))) == ("torso_lift_joint",)
+    assert cyclic_joints(oc.Problem(robot, oc.Task.position(robot))) == ("torso_lift_joint", "arm_1_joint")
+    assert cyclic_joints(oc.Problem(robot, oc.Task.pose(robot))) == ("torso_lift_joint",)
 
 
 def test_basis_keeps_one_term_of_a_cyclic_joint() -> None:
@@ -80,8 +80,8 @@ def test_basis_keeps_one_term_of_a_cyclic_joint() -> None:
         assert len(terms) == kind.term_count(7)
 
 
-def _space(problem: oc.Problem) -> oc.bases.JointSpace:
-    return oc.bases.JointSpace.of(problem)
+def _space(problem: oc.Problem) -> bases.JointSpace:
+    return bases.JointSpace.of(problem)
 
 
 @pytest.mark.slow
@@ -120,10 +120,10 @@ def test_joint_without_limits_becomes_unbounded(endless: oc.Chart) -> None:
     assert (lower[0], upper[0]) == (-np.inf, np.inf)
     q = np.tile(domain.centre, (3, 1))
     q[:, 0] = (0.1, 0.1 + 2 * np.pi, -40.0)
-    assert oc.contains(domain, q).all()
+    assert domain.contains(q).all()
     np.testing.assert_allclose(endless.jacobian(q)[0], endless.jacobian(q)[1], atol=1e-9)
     q[:, 1] += 2.0
-    assert not oc.contains(domain, q).any()
+    assert not domain.contains(q).any()
 
 
 def test_guard_of_controllers_follows_the_unbounded_joint(endless: oc.Chart) -> None:
@@ -200,7 +200,7 @@ def test_torus_keeps_its_full_turns() -> None:
         ("polynomial:3", oc.Polynomial(3)),
     ],
 )
-def test_labels_name_cyclic_joints(label: str, wanted: oc.bases.Parametrisation) -> None:
+def test_labels_name_cyclic_joints(label: str, wanted: bases.Parametrisation) -> None:
     assert parse_parametrisation(label) == wanted
     assert wanted.label == label
 

@@ -10,6 +10,7 @@ import pytest
 from conftest import robot_data
 
 import orthocas as oc
+from orthocas.certificates import check_certificate
 from orthocas.codegen import check_c, generate_c
 from orthocas.errors import CertifyError, InvalidValueError, OrthocasError
 from orthocas.tools.checks import Array
@@ -130,7 +131,7 @@ def test_no_fold_is_proved_for_every_place_and_heading(robot: oc.Robot, chart: o
     """And determinants by the tip's velocities have one sign at 20,000 places, half of the arms near the boundary."""
     certificate = oc.certify(chart, time_limit=60)
     assert certificate.proved
-    assert oc.check_certificate(chart, certificate)
+    assert check_certificate(chart, certificate)
     assert certificate.injective is None
     rng = np.random.default_rng(8)
     u = rng.uniform(-1, 1, (20_000, 7))
@@ -171,7 +172,7 @@ def test_tasks_that_do_not_turn_with_the_base_are_not_proved_so(robot: oc.Robot)
 @pytest.mark.slow
 def test_files_and_c_are_the_chart(chart: oc.Chart, tmp_path: Path) -> None:
     chart.save(tmp_path / "mobile.orthocas")
-    back = oc.Chart.load(tmp_path / "mobile.orthocas")
+    back = oc.load(tmp_path / "mobile.orthocas")
     q = HOME + 0.1
     np.testing.assert_array_equal(back.phi(q), chart.phi(q))
     law = oc.control.PDPlus(back, stiffness=100.0)

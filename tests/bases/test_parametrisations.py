@@ -236,7 +236,7 @@ def test_labels_are_read_back(label: str) -> None:
         ("fourier:-1", InvalidValueError, "degree is -1"),
         ("polynomial:3:joints=0", InvalidValueError, "joints is 0"),
         ("polynomial:3:joints=two", InvalidValueError, "whole numbers"),
-        ("polynomial:3:cyclic:joints=2", InvalidValueError, "'joints=2', then 'cyclic'"),
+        ("polynomial:3:cyclic:joints=2", InvalidValueError, "after the degree 'joints=2', then 'cyclic'"),
         ("mlp:64x", InvalidValueError, "whole numbers"),
         ("mlp:0", InvalidValueError, "hidden is 0"),
         ("sew:left", UnknownNameError, "known: conventional, stereographic"),

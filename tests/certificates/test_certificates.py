@@ -16,7 +16,8 @@ from typer.testing import CliRunner
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.charts.certificate import OPEN, PROVED, Subdivision
+from orthocas.certificates import check_certificate
+from orthocas.charts.certificate import OPEN, PROVED, Certificate, Subdivision
 from orthocas.charts.coordinates import Coordinates
 from orthocas.cli.commands import build_app
 from orthocas.errors import CertifyError, ChartFileError, Interrupted, InvalidValueError, SchedulerError
@@ -34,7 +35,7 @@ def test_a_certificate_is_void_when_one_coefficient_changes(tmp_path: Path) -> N
         replace(known, coordinates=replace(coordinates, theta=theta))
     changed = replace(known, coordinates=replace(coordinates, theta=theta), certificate=None)
     with pytest.raises(CertifyError, match="void"):
-        oc.check_certificate(changed, certified())
+        check_certificate(changed, certified())
     replace(known, notes={"new": "note"}).save(tmp_path / "a.chart")  # notes are no part of the proof
     assert oc.load(tmp_path / "a.chart").certificate is not None
 
@@ -45,7 +46,7 @@ def test_files_keep_certificates(tmp_path: Path) -> None:
     again = oc.load(tmp_path / "a.chart")
     assert again.certificate is not None
     assert again.certificate.facts() == certified().facts()
-    assert oc.check_certificate(again)
+    assert check_certificate(again)
 
 
 @pytest.mark.slow
@@ -55,13 +56,13 @@ def test_a_forged_certificate_does_not_hold() -> None:
     wide = chart(0.4)
     honest = certified(0.4)
     forged = replace(honest, regular=Subdivision(honest.regular.low, honest.regular.high, whole.codes)).seal()
-    assert not oc.check_certificate(wide, forged)
+    assert not check_certificate(wide, forged)
     other = replace(honest, regular=known.regular).seal()
     with pytest.raises(CertifyError, match="another domain"):
-        oc.check_certificate(wide, other)
+        check_certificate(wide, other)
     with pytest.raises(CertifyError, match="method"):
-        oc.check_certificate(wide, replace(honest, method="guess/1").seal())
-    assert not oc.check_certificate(wide, replace(honest, conditioning=0.99).seal())
+        check_certificate(wide, replace(honest, method="guess/1").seal())
+    assert not check_certificate(wide, replace(honest, conditioning=0.99).seal())
 
 
 @pytest.mark.parametrize(
@@ -82,7 +83,7 @@ def test_a_forged_certificate_does_not_hold() -> None:
 def test_a_change_of_any_number_is_seen(change: dict[str, Any]) -> None:
     changed = replace(certified(), **change)
     with pytest.raises(CertifyError, match="changed since|no digest"):
-        oc.check_certificate(chart(), changed)
+        check_certificate(chart(), changed)
     if "digest" not in change:
         with pytest.raises(CertifyError, match="changed since"):
             replace(chart(), certificate=changed)
@@ -92,31 +93,31 @@ def test_what_is_printed_is_computed_again() -> None:
     """With a digest that fits: it protects against accidents, and the check against the rest."""
     known, honest = chart(), certified()
     centre = tuple(known.problem.domain.centre)
-    assert not oc.check_certificate(known, replace(honest, fold=(centre, centre)).seal())
+    assert not check_certificate(known, replace(honest, fold=(centre, centre)).seal())
     with pytest.raises(CertifyError, match="leaves out singular values up to 0.3, the domain 0"):
-        oc.check_certificate(known, replace(honest, least_singular_value=0.3).seal())
+        check_certificate(known, replace(honest, least_singular_value=0.3).seal())
     box = honest.injective
     assert box is not None
     shifted = replace(box, low=box.low + 0.01, high=box.high + 0.01)
-    assert not oc.check_certificate(known, replace(honest, injective=shifted).seal())
+    assert not check_certificate(known, replace(honest, injective=shifted).seal())
 
 
 def test_a_bound_under_another_metric_is_refused() -> None:
     linear = oc.fit(planar(), oc.Linear()).chart
     found = oc.certify(linear)
     with pytest.raises(CertifyError, match="bound is 0.1 with metric inertia"):
-        oc.check_certificate(linear, replace(found, bound=0.1).seal())
+        check_certificate(linear, replace(found, bound=0.1).seal())
 
 
 def test_a_fold_is_checked_at_its_two_points() -> None:
     folding = oc.fit(planar(), oc.Linear()).chart
     found = oc.certify(folding)
     assert len(found.fold) == 2
-    assert oc.check_certificate(folding, found)
-    assert not oc.check_certificate(folding, replace(found, fold=found.fold[:1] * 2).seal())
+    assert check_certificate(folding, found)
+    assert not check_certificate(folding, replace(found, fold=found.fold[:1] * 2).seal())
     domain = folding.problem.domain
     outside = tuple(domain.centre + 3 * (np.array(found.fold[1]) - domain.centre))
-    assert not oc.check_certificate(folding, replace(found, fold=(found.fold[0], outside)).seal())
+    assert not check_certificate(folding, replace(found, fold=(found.fold[0], outside)).seal())
 
 
 @pytest.mark.parametrize("codes", [[0], [0, PROVED], [PROVED, PROVED], [7, PROVED, PROVED], []])
@@ -154,14 +155,14 @@ def test_ctrl_c_returns_what_is_proved_so_far() -> None:
     with pytest.raises(Interrupted) as stopped:
         oc.certify(chart(), monitor=stop)
     result = stopped.value.result
-    assert isinstance(result, oc.Certificate)
+    assert isinstance(result, Certificate)
     assert oc.certify(chart(), resume=result).proved
 
 
 def test_an_executor_finds_the_same_parts() -> None:
     with ThreadPoolExecutor(2) as executor:
         shared = oc.certify(chart(), executor=executor)
-        assert oc.check_certificate(chart(), shared, executor=executor)
+        assert check_certificate(chart(), shared, executor=executor)
     assert shared.regular.codes.tolist() == certified().regular.codes.tolist()
 
 
@@ -187,7 +188,7 @@ def test_boxes_of_processes_that_died_are_judged_again() -> None:
         shared = oc.certify(chart(), executor=executor)
         assert executor.deaths == 0
         executor.deaths = 2
-        assert oc.check_certificate(chart(), shared, executor=executor)
+        assert check_certificate(chart(), shared, executor=executor)
         assert executor.deaths == 0
     assert shared.regular.codes.tolist() == certified().regular.codes.tolist()
 
@@ -197,7 +198,7 @@ def test_boxes_that_processes_die_over_stay_unproved(caplog: pytest.LogCaptureFi
     with Dying(100) as executor:
         found = oc.certify(chart(), executor=executor)
         with pytest.raises(CertifyError, match="one of its processes died"):
-            oc.check_certificate(chart(), certified(), executor=executor)
+            check_certificate(chart(), certified(), executor=executor)
     assert (found.proved, found.regular.open_count > 0) == (False, True)
     assert len(caplog.messages) == 1
     assert "worker processes died over them" in caplog.text
@@ -261,7 +262,7 @@ def test_numbers_that_no_check_covers_are_left_out_of_certificates(tmp_path: Pat
         resealed(path, header)
         if honest:
             assert "dead" not in oc.load(path).certificate.as_dict()  # type: ignore[union-attr]
-            assert oc.check_certificate(oc.load(path))
+            assert check_certificate(oc.load(path))
         else:
             with pytest.raises(ChartFileError, match="void"):
                 oc.load(path)

@@ -10,6 +10,7 @@ from public_objects import fitted, given, network, planar
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.certificates import certified_box, check_certificate
 from orthocas.charts.certificate import PROVED
 from orthocas.charts.point_quality import worst_points
 from orthocas.errors import CertifyError, InvalidValueError
@@ -22,7 +23,7 @@ def test_regular_charts_are_certified_and_checked(build: Callable[[], oc.Chart])
     certificate = oc.certify(known)
     assert certificate.proved
     assert certificate.share == 1.0
-    assert oc.check_certificate(known, certificate)
+    assert check_certificate(known, certificate)
 
 
 @pytest.mark.slow
@@ -102,7 +103,7 @@ def test_a_certified_box_of_a_folding_chart_holds_no_fold() -> None:
     domain = oc.Box([0.6, 0.8, 0.8], 0.9)
     folding = oc.fit(oc.Problem(arm.robot, arm.task, domain=domain), oc.Linear()).chart
     assert oc.evaluate(folding, samples=20_000).folded_samples > 0
-    box = oc.certified_box(folding, time_limit=20)
+    box = certified_box(folding, time_limit=20)
     assert 0.1 < box.half_width[0] < 0.9
     inside = box.centre + box.half_width * np.random.default_rng(5).uniform(-1, 1, (100_000, 3))
     signs = np.sign(np.linalg.det(folding.jacobian(inside)))
@@ -114,7 +115,7 @@ def test_a_bound_of_the_conditioning_is_proved_below_the_sampled_minimum() -> No
     certificate = oc.certify(chart(), 0.5)
     assert certificate.proved
     assert 0.5 <= certificate.conditioning <= oc.evaluate(chart(), samples=5000).conditioning.min
-    assert oc.check_certificate(chart(), certificate)
+    assert check_certificate(chart(), certificate)
     with pytest.raises(InvalidValueError, match="bound is 1.5, expected a number from 0 to below 1"):
         oc.certify(chart(), 1.5)
     with pytest.raises(CertifyError, match="metric inertia"):
@@ -142,4 +143,4 @@ def test_what_cannot_be_certified_is_refused() -> None:
     with pytest.raises(CertifyError, match="cannot be certified"):
         oc.certify(kinked)
     with pytest.raises(CertifyError, match="no certificate"):
-        oc.check_certificate(chart())
+        check_certificate(chart())

@@ -10,6 +10,7 @@ from public_objects import planar
 
 import orthocas as oc
 from orthocas.bases.family import JointSpace
+from orthocas.certificates import check_certificate
 from orthocas.certificates.box_checks import NEVER
 from orthocas.certificates.determinant import (
     SERIES_DEGREE,
@@ -25,6 +26,7 @@ from orthocas.certificates.outside import OutsideCheck, choose_check, choose_ins
 from orthocas.certificates.rows import build_chart_rows
 from orthocas.charts.certificate import COFACTORS, ELIMINATION, OPEN, PROVED, Subdivision, halve_interval
 from orthocas.charts.coordinates import Coordinates
+from orthocas.charts.regular_part import RegularPart
 from orthocas.errors import CertifyError
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
@@ -57,7 +59,7 @@ def folding() -> oc.Chart:
     box = oc.Box([0.0, 0.8, 0.8], [3.0, 2.3, 2.3])
     problem = oc.Problem(known.robot, known.task, domain=box, least_singular_value=0.1)
     chart = oc.fit(problem, oc.Linear()).chart
-    domain = oc.RegularPart(chart.problem.domain, cubic(chart), 0.05)
+    domain = RegularPart(chart.problem.domain, cubic(chart), 0.05)
     return oc.Chart(oc.Problem(known.robot, known.task, domain=domain), cubic(chart))
 
 
@@ -204,23 +206,23 @@ def test_the_domain_keeps_folds_out_of_what_is_not_proved(tmp_path: Path) -> Non
     rng = np.random.default_rng(8)
     points = rng.uniform(low, high, (200, *low.shape)).reshape(-1, 3)
     domain = chart.problem.domain
-    assert isinstance(domain, oc.RegularPart)
+    assert isinstance(domain, RegularPart)
     clear = domain.singular_values(points) > domain.least_singular_value
     assert (domain.volumes(points[clear]) > 0).all()
     replace(chart, certificate=found).save(tmp_path / "a.chart")
     again = oc.load(tmp_path / "a.chart")
     assert again.certificate is not None
     assert again.certificate.as_dict() == found.as_dict()
-    assert oc.check_certificate(again)
-    assert not oc.check_certificate(chart, replace(found, clear_share=0.9999).seal())
+    assert check_certificate(again)
+    assert not check_certificate(chart, replace(found, clear_share=0.9999).seal())
     with pytest.raises(CertifyError, match="by another volume"):
-        oc.check_certificate(chart, replace(found, least_volume=0.2).seal())
+        check_certificate(chart, replace(found, least_volume=0.2).seal())
 
 
 def test_what_the_domain_keeps_out_is_not_halved() -> None:
     chart = folding()
     domain = chart.problem.domain
-    assert isinstance(domain, oc.RegularPart)
+    assert isinstance(domain, RegularPart)
     points = sample_uniform(oc.Box(domain.centre, domain.half_width), 2000, 1)
     kept_out = points[(domain.volumes(points) < -0.1) & (domain.singular_values(points) > 0.2)][:20]
     assert len(kept_out) > 5

@@ -12,6 +12,7 @@ from public_objects import network, planar
 from random_arms import random_arm, second_solutions
 
 import orthocas as oc
+from orthocas.certificates import check_certificate
 from orthocas.certificates.jets import Jets
 from orthocas.certificates.one_to_one import OneToOneCheck, choose_one_to_one_check
 from orthocas.certificates.rows import build_chart_rows
@@ -158,7 +159,7 @@ def test_one_to_one_boxes_of_networks_and_planar_arms_are_checked() -> None:
     for known in (network(), oc.fit(planar("euclidean"), oc.Fourier(2), samples=300).chart):
         certificate = oc.certify(known)
         assert certificate.injective is not None
-        assert oc.check_certificate(known, certificate)
+        assert check_certificate(known, certificate)
         pairs = second_solutions(known, certificate.injective.low, certificate.injective.high, 2000, 2)
         assert not len(pairs)
 
@@ -169,14 +170,14 @@ def test_one_to_one_part_of_an_older_method_is_void() -> None:
     assert old.injective is None
     assert "certify the chart again" in old.facts()["one-to-one"]
     with pytest.raises(oc.errors.CertifyError, match="taylor-3/1, expected taylor-3/2 or .*: certify it again"):
-        oc.check_certificate(chart(), old)
+        check_certificate(chart(), old)
 
 
 @pytest.mark.slow
 def test_forged_one_to_one_box_in_one_part_does_not_pass_the_check() -> None:
     regular = certified(0.4).regular
     box = Subdivision(regular.low, regular.high, np.array([PROVED], dtype=np.uint8))
-    assert not oc.check_certificate(chart(0.4), replace(certified(0.4), injective=box).seal())
+    assert not check_certificate(chart(0.4), replace(certified(0.4), injective=box).seal())
 
 
 def test_angle_of_a_whole_turn_is_no_difference() -> None:

@@ -10,6 +10,7 @@ from charts import planar_2r
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.charts.chart import GrownChart
 from orthocas.charts.chart_file import CHART
 from orthocas.errors import (
     ChartFileError,
@@ -120,7 +121,7 @@ def test_inverse_leads_back(chart: oc.Chart) -> None:
 def test_files_hold_everything(chart: oc.Chart, tmp_path: Path) -> None:
     chart.save(tmp_path / "grown.orthocas")
     again = oc.load(tmp_path / "grown.orthocas")
-    assert isinstance(again, oc.GrownChart)
+    assert isinstance(again, GrownChart)
     assert again.notes == chart.notes
     points = known_points(chart, 20)
     np.testing.assert_array_equal(again.phi(points), chart.phi(points))

@@ -45,7 +45,7 @@ def test_rows_do_not_depend_on_each_other(iiwa_fit: Fit) -> None:
     assert np.isnan(solutions.q[7]).all()
     assert np.isfinite(np.delete(solutions.q, 7, axis=0)).all()
     assert solutions.error[3] == pytest.approx(
-        np.abs((phi[3] - chart.phi(solutions.q[3])) / (chart.phi_sizes + 1e-5 * np.abs(phi[3]))).max()
+        np.abs((phi[3] - chart.phi(solutions.q[3])) / (chart.parts.phi_sizes + 1e-5 * np.abs(phi[3]))).max()
     )
 
 
@@ -78,8 +78,8 @@ def test_what_is_found_lies_inside_and_solves(planar_arm: oc.Chart) -> None:
     solutions = planar_arm.solve(wide)
     assert 100 < solutions.found.sum() < 1000
     q, found = solutions.q, solutions.found
-    assert oc.contains(planar_arm.problem.domain, q[found]).all()
-    assert not oc.contains(planar_arm.problem.domain, q[np.isin(solutions.status, BEYOND)]).any()
+    assert planar_arm.problem.domain.contains(q[found]).all()
+    assert not planar_arm.problem.domain.contains(q[np.isin(solutions.status, BEYOND)]).any()
     np.testing.assert_allclose(planar_arm.phi(q[found]), wide[found], atol=1e-8)
 
 
@@ -150,7 +150,7 @@ def test_corner_heavy_round_trips_of_a_ready_chart_are_found(name: str, inside: 
     solutions = chart.solve(phi, inside=inside)
     assert solutions.found.all()
     np.testing.assert_allclose(chart.phi(solutions.q), phi, atol=1e-8)
-    assert oc.contains(domain, solutions.q).all()
+    assert domain.contains(solutions.q).all()
 
 
 @pytest.mark.slow
@@ -163,7 +163,7 @@ def test_a_certified_chart_has_all_the_solutions_that_newton_finds() -> None:
         phi = chart.phi(q)
         found = chart.solutions(phi)
         np.testing.assert_allclose(chart.phi(found), np.tile(phi, (len(found), 1)), atol=1e-8)
-        assert oc.contains(domain, found).all()
+        assert domain.contains(found).all()
         tried = chart.solve(np.tile(phi, (len(starts), 1)), starts)
         away = np.abs(tried.q[tried.found][:, None] - found).max(axis=2)
         assert away.min(axis=1).max() < 1e-5
@@ -211,10 +211,10 @@ def test_inverse_refuses_what_lies_outside_and_has_the_nearest_inside() -> None:
     nearest = caught.value.nearest
     assert nearest is not None
     assert nearest.shape == (chart.n,)
-    assert oc.contains(domain, nearest)
+    assert domain.contains(nearest)
     np.testing.assert_array_equal(nearest, chart.solve(phi, centre, inside=True).q[0])
     beyond = chart.inverse(phi, centre, outside=True)
-    assert not oc.contains(domain, beyond)
+    assert not domain.contains(beyond)
     np.testing.assert_allclose(chart.phi(beyond), phi, atol=1e-7)
     with pytest.raises(InverseError, match=r"rows \[1\]") as caught:
         chart.inverse([chart.phi(centre), phi], centre)

@@ -14,6 +14,7 @@ from orthocas import problems, solvers
 from orthocas.bases import JointSpace, Parametrisation
 from orthocas.errors import UnknownNameError
 from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.loss import loss
 from orthocas.fitting.network_objective import GraphObjective
 from orthocas.fitting.terms import Weights
 from orthocas.tasks.samples import Samples, sample_evenly, sample_problem
@@ -105,7 +106,7 @@ def test_default_is_the_metric_for_the_mass_matrix_and_orientations(planar_x: oc
         assert Weights().for_problem(problem).angles == angles
     theta = np.random.default_rng(0).normal(size=18)
     by_default, in_metric, paper = (
-        float(oc.loss(planar_x, oc.Polynomial(2), samples=30, weights=weights, start=theta)(theta))
+        float(loss(planar_x, oc.Polynomial(2), samples=30, weights=weights, start=theta)(theta))
         for weights in (Weights(), Weights(angles="metric"), Weights(angles="paper"))
     )
     assert by_default == in_metric != paper

@@ -10,7 +10,9 @@ import ready_charts
 from programs import Run, nightly
 
 import orthocas as oc
+from orthocas.certificates import check_certificate
 from orthocas.charts.chart_file import fingerprint
+from orthocas.charts.regular_part import RegularPart
 from orthocas.errors import UnknownNameError
 from orthocas.tasks.samples import sample_uniform
 
@@ -46,7 +48,7 @@ def test_wide_chart_holds_on_its_branch(name: str) -> None:
     """Volumes have one sign at all positions of the domain, from finite differences of poses and coordinates."""
     chart, card = oc.charts.load(name), oc.charts.card(name)
     domain = chart.problem.domain
-    assert isinstance(domain, oc.RegularPart)
+    assert isinstance(domain, RegularPart)
     assert fingerprint(chart.problem, chart.coordinates) == card.fingerprint
     assert card.regular_share > 0.99
     assert oc.branches(chart.problem.robot, chart.problem.task).of(domain.centre).name == card.branch
@@ -128,7 +130,7 @@ def test_a_cyclic_joint_may_be_anywhere() -> None:
 @pytest.mark.slow
 def test_a_proof_holds_when_it_is_checked_again() -> None:
     chart = oc.charts.load("xarm7-pose")
-    assert oc.check_certificate(chart, chart.certificate)
+    assert check_certificate(chart, chart.certificate)
 
 
 def test_cards_keep_all_they_have_as_text() -> None:

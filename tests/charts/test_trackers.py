@@ -13,6 +13,7 @@ from scipy.optimize import minimize
 
 import orthocas as oc
 from orthocas.charts.regular_part import RegularPart
+from orthocas.charts.trackers import TrackerStatus
 from orthocas.codegen.library import CompiledLibrary, compile_shared
 from orthocas.errors import DomainError, InvalidValueError, NoExpressionError, ShapeError
 from orthocas.fitting.fit import Fit
@@ -36,7 +37,7 @@ def test_a_tracker_follows_a_stream_and_comes_back(iiwa_fit: Fit) -> None:
     q = []
     for phi in path:
         q.append(tracker.step(phi))
-        assert tracker.status == oc.TrackerStatus.OK
+        assert tracker.status == TrackerStatus.OK
     np.testing.assert_allclose(chart.phi(np.array(q)), path, atol=1e-9)
     np.testing.assert_allclose(q[-1], start, atol=1e-9)
     np.testing.assert_allclose(tracker.q, q[-1], atol=0)
@@ -59,7 +60,7 @@ def test_a_tracker_keeps_the_last_position_where_it_must_not_go(planar_arm: oc.C
         np.testing.assert_array_equal(follower.step(phi), last)
         assert follower.status.name == name
     q = tracker.step(planar_arm.phi(start + 0.01))
-    assert tracker.status == oc.TrackerStatus.OK
+    assert tracker.status == TrackerStatus.OK
     np.testing.assert_allclose(q, start + 0.01, atol=1e-9)
     tracker.reset(edge)
     np.testing.assert_array_equal(tracker.q, edge)
@@ -73,16 +74,16 @@ def test_a_tracker_stops_at_a_singular_position_and_clear_of_it() -> None:
     tracker = chart.tracker([0.05, 0.0], largest_step=1.0)
     xi = chart.xi([0.0, 0.0])[0]
     tracker.step([0.0, xi])
-    assert tracker.status in (oc.TrackerStatus.SINGULAR, oc.TrackerStatus.LOST)
+    assert tracker.status in (TrackerStatus.SINGULAR, TrackerStatus.LOST)
     bounded = clear()
     q = bounded.problem.domain.centre.copy()
     follower, last = bounded.tracker(q), q
     for _ in range(200):  # straighten the arm
         q = q - [0.0, 0.01, 0.01]
         last = follower.step(bounded.phi(q))
-        if follower.status != oc.TrackerStatus.OK:
+        if follower.status != TrackerStatus.OK:
             break
-    assert follower.status == oc.TrackerStatus.OUTSIDE_DOMAIN
+    assert follower.status == TrackerStatus.OUTSIDE_DOMAIN
     assert bounded.problem.domain.contains(last)
     assert not bounded.problem.domain.contains(q)
 
@@ -107,7 +108,7 @@ def wide_chart() -> oc.Chart:
 
 def cost(chart: oc.Chart, phi: np.ndarray, q: np.ndarray) -> float:
     """What a tracker of the nearest x makes small."""
-    e = chart.parts.phi_map.difference(phi, chart.phi(q)) / chart.phi_sizes
+    e = chart.parts.phi_map.difference(phi, chart.phi(q)) / chart.parts.phi_sizes
     return float((e[: chart.m] ** 2).sum() + 9e-8 * (e[chart.m :] ** 2).sum())
 
 
@@ -143,7 +144,7 @@ def metres_nearer(chart: oc.Chart, phi: np.ndarray, q: np.ndarray) -> float:
     )
     if not domain.contains(np.clip(found.x, low, high)) and rooms(found.x).min() < -1e-7:
         return 0.0
-    return float((np.sqrt(cost(chart, phi, q)) - np.sqrt(cost(chart, phi, found.x))) * chart.phi_sizes[0])
+    return float((np.sqrt(cost(chart, phi, q)) - np.sqrt(cost(chart, phi, found.x))) * chart.parts.phi_sizes[0])
 
 
 def led_along_the_border(chart: oc.Chart, away: float, aside: float, ticks: int) -> np.ndarray:
@@ -171,7 +172,7 @@ def test_trackers_follow_along_the_border_and_come_to_rest_where_nothing_is_near
     q = np.array([tracker.step(phi) for phi in targets])
     assert domain.contains(q).all()
     assert (np.abs(np.diff(q, axis=0)) <= step * (1 + 1e-9)).all()
-    assert tracker.status == oc.TrackerStatus.NEAREST
+    assert tracker.status == TrackerStatus.NEAREST
     np.testing.assert_array_equal(q[-1], q[-20])
     places = chart.task(q)[:, :3]
     assert np.linalg.norm(places[-1] - places[ticks - 1]) > 0.02  # one that froze at the border moves by 0
@@ -185,11 +186,11 @@ def test_a_tracker_that_stands_at_no_minimum_says_so(planar_arm: oc.Chart) -> No
     away = planar_arm.phi(start) + np.array([9.0, 1.0, 0.0])
     tracker, costs = planar_arm.tracker(start, 0.01, nearest=True), [cost(planar_arm, away, start)]
     tracker.step(away)
-    assert tracker.status == oc.TrackerStatus.NEARER
-    while tracker.status == oc.TrackerStatus.NEARER:
+    assert tracker.status == TrackerStatus.NEARER
+    while tracker.status == TrackerStatus.NEARER:
         costs.append(cost(planar_arm, away, tracker.step(away)))
         assert costs[-1] <= costs[-2]
-    assert tracker.status == oc.TrackerStatus.NEAREST
+    assert tracker.status == TrackerStatus.NEAREST
     assert len(costs) > 20
     assert metres_nearer(planar_arm, away, tracker.q) < 1e-6
 
@@ -224,8 +225,8 @@ def test_trackers_go_to_the_nearest_x_and_come_back(make: Callable[[], oc.Chart]
         statuses.append(tracker.status)
         if away == out[-1]:
             farthest = q
-    assert statuses[0] == statuses[-1] == oc.TrackerStatus.OK
-    assert oc.TrackerStatus.NEAREST in statuses
+    assert statuses[0] == statuses[-1] == TrackerStatus.OK
+    assert TrackerStatus.NEAREST in statuses
     np.testing.assert_allclose(q, start, atol=1e-9)
     assert metres_nearer(chart, home + out[-1] * direction, farthest) < 1e-5
 
@@ -236,7 +237,7 @@ def test_xi_gives_way_to_x(planar_arm: oc.Chart) -> None:
     reach = planar_arm.xi_range(home)[0]
     for xi in np.linspace(phi[2], reach.high + 1.0, 100):
         q = tracker.step([phi[0], phi[1], xi])
-    assert tracker.status == oc.TrackerStatus.NEAREST
+    assert tracker.status == TrackerStatus.NEAREST
     np.testing.assert_allclose(planar_arm.phi(q)[:2], phi[:2], atol=1e-5)
     assert planar_arm.xi(q)[0] == pytest.approx(reach.high, abs=1e-4 * (reach.high - reach.low))
     again = pickle.loads(pickle.dumps(tracker))
@@ -253,7 +254,7 @@ def test_it_rests_where_a_target_pushes_it_against_the_boundary() -> None:
     for _ in range(1200):
         xi = chart.xi(tracker.q) + 0.01
         path.append(tracker.step(np.concatenate([x, xi])).copy())
-    assert tracker.status == oc.TrackerStatus.NEAREST
+    assert tracker.status == TrackerStatus.NEAREST
     room = np.minimum(path[-1] - robot.lower, robot.upper - path[-1]).min()
     assert 0 <= room < 1e-6
     assert np.ptp(path[-300:], axis=0).max() < 1e-6
@@ -284,7 +285,7 @@ def test_c_goes_to_the_same_nearest_x(make: Callable[[], oc.Chart], tmp_path: Pa
     domain = chart.problem.domain
     q = domain.centre
     home, tracker = chart.phi(q), chart.tracker(q, largest_step=0.1, nearest=True)
-    known = {0: oc.TrackerStatus.OK, 1: oc.TrackerStatus.NEAREST, 12: oc.TrackerStatus.NEARER}
+    known = {0: TrackerStatus.OK, 1: TrackerStatus.NEAREST, 12: TrackerStatus.NEARER}
     found, alike = set(), []
     for s in np.linspace(0.0, 1.0, 800):
         phi = home + np.sin(np.pi * s) * np.array([4.0, 0.5 * np.sin(6 * s), 0.3])

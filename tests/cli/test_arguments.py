@@ -14,8 +14,14 @@ from public_objects import CHARTS, circle, fitted, impedance, planar, points_of,
 
 import orthocas as oc
 from orthocas import control, problems, simulation, solvers
+from orthocas.charts.figures import quality_figure
+from orthocas.charts.singularities import jumps, singular_points
 from orthocas.codegen import check_c
 from orthocas.errors import InvalidValueError, NoExpressionError, OrthocasError, ShapeError, UnknownNameError
+from orthocas.exact.involutivity import lie_bracket
+from orthocas.fitting.loss import loss
+from orthocas.tasks.domains import default_box
+from orthocas.tasks.metric import Metric
 from orthocas.tools.checks import as_float_array, as_point, as_point_set
 
 ELSEWHERE = (  # arguments that are checked later, refused for another reason first, or not used by this task
@@ -126,11 +132,11 @@ WRONG: dict[str, Callable[[], Any]] = {
     "problem of check": lambda: oc.check(fitted().chart),  # type: ignore[arg-type]
     "problem of involutivity": lambda: oc.involutivity(fitted().chart),  # type: ignore[arg-type]
     "problem of grow": lambda: oc.grow(fitted().chart),  # type: ignore[arg-type]
-    "problem of singular_points": lambda: oc.singular_points(fitted().chart),  # type: ignore[arg-type]
+    "problem of singular_points": lambda: singular_points(fitted().chart),  # type: ignore[arg-type]
     "problem of a chart": lambda: oc.Chart("iiwa", fitted().chart.coordinates),  # type: ignore[arg-type]
     "chart of evaluate": lambda: oc.evaluate(planar()),  # type: ignore[arg-type]
     "chart of distil": lambda: oc.distil(planar()),  # type: ignore[arg-type]
-    "chart of jumps": lambda: oc.jumps(planar()),  # type: ignore[arg-type]
+    "chart of jumps": lambda: jumps(planar()),  # type: ignore[arg-type]
     "chart of generate_c": lambda: oc.generate_c(planar(), "unused"),  # type: ignore[arg-type]
     "chart of Impedance": lambda: control.Impedance(planar(), 1.0),  # type: ignore[arg-type]
     "chart of Kinematic": lambda: control.Kinematic(planar(), 1.0),  # type: ignore[arg-type]
@@ -145,18 +151,17 @@ WRONG: dict[str, Callable[[], Any]] = {
     "pushes of simulate": lambda: oc.simulate(impedance(), steps(), [0, 0, 0], pushes=[1]),  # type: ignore[list-item]
     "friction of simulate": lambda: oc.simulate(impedance(), steps(), [0, 0, 0], friction=1.0),  # type: ignore[arg-type]
     "plant of simulate": lambda: oc.simulate(impedance(), steps(), [0, 0, 0], plant=planar()),  # type: ignore[arg-type]
-    "f of lie_bracket": lambda: oc.lie_bracket(planar(), 2, ca.SX.sym("q", 3)),  # type: ignore[arg-type]
-    "f of lie_bracket in other symbols": lambda: oc.lie_bracket(ca.SX(3, 1), ca.SX(3, 1), ca.MX.sym("q", 3)),
+    "f of lie_bracket": lambda: lie_bracket(planar(), 2, ca.SX.sym("q", 3)),  # type: ignore[arg-type]
+    "f of lie_bracket in other symbols": lambda: lie_bracket(ca.SX(3, 1), ca.SX(3, 1), ca.MX.sym("q", 3)),
     "homes of a robot": lambda: oc.Robot(planar().robot.tree, np.eye(3)),  # type: ignore[arg-type]
     "axis of Task.axis": lambda: oc.Task.axis(planar().robot, None),  # type: ignore[arg-type]
     "axis of Task.position_and_axis": lambda: oc.Task.position_and_axis(planar().robot, None),  # type: ignore[arg-type]
-    "domain of contains": lambda: oc.contains(planar(), [0, 0, 0]),  # type: ignore[arg-type]
-    "robot of default_box": lambda: oc.default_box(planar()),  # type: ignore[arg-type]
-    "robot of a metric": lambda: oc.Metric.from_spec(planar(), "inertia"),  # type: ignore[arg-type]
-    "problem of loss": lambda: oc.loss("iiwa", oc.Linear()),  # type: ignore[arg-type]
+    "robot of default_box": lambda: default_box(planar()),  # type: ignore[arg-type]
+    "robot of a metric": lambda: Metric.from_spec(planar(), "inertia"),  # type: ignore[arg-type]
+    "problem of loss": lambda: loss("iiwa", oc.Linear()),  # type: ignore[arg-type]
     "model of a robot": lambda: oc.Robot.from_model(planar(), "tip"),  # type: ignore[arg-type]
     "coordinates of a chart": lambda: oc.Chart(planar(), planar()),  # type: ignore[arg-type]
-    "report of a figure": lambda: oc.plotting.quality_figure(planar()),  # type: ignore[arg-type]
+    "report of a figure": lambda: quality_figure(planar()),  # type: ignore[arg-type]
     "trajectory of a breakdown": lambda: simulation.task_acceleration_breakdown(fitted().chart, planar()),  # type: ignore[arg-type]
     "labels of a reference": lambda: control.Reference.through(planar(), [0, 1], [[0], [1]]),  # type: ignore[arg-type]
     "chart of check_c": lambda: check_c(None, planar()),  # type: ignore[arg-type]
@@ -201,7 +206,7 @@ def test_numbers_too_large_to_work_with_are_refused_at_once() -> None:
         lambda: oc.Given.from_function("g", 10**18, lambda q: q),
         lambda: oc.simulate(impedance(), steps(), [0, 0, 0], control_rate=1e18),
         lambda: oc.simulate(impedance(), steps(), [0, 0, 0], step=np.full(3, np.nan)),  # type: ignore[arg-type]
-        lambda: oc.loss(planar(), oc.Linear(), samples=10**18),
+        lambda: loss(planar(), oc.Linear(), samples=10**18),
         lambda: oc.Box([10**400], 1.0),
         lambda: oc.check(planar(), samples=10**9),
         lambda: impedance().check_damping(samples=10**60),

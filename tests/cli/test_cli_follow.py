@@ -13,7 +13,6 @@ from public_objects import clear
 
 import orthocas as oc
 from orthocas.errors import PathFileError
-from orthocas.paths import joint_motion
 from orthocas.paths.tool_path import read_path
 
 LIMITS = ("--velocity-limit", "1,1.5,2", "--acceleration-limit", "4")
@@ -131,11 +130,12 @@ def test_path_files_with_a_byte_order_mark_spaces_and_empty_lines(tmp_path: Path
 
 
 def test_ctrl_c_leaves_nothing_half_written(run: Run, chart: oc.Chart, monkeypatch: pytest.MonkeyPatch) -> None:
-    def pressed(motion: object) -> str:
+    def press(file: Path, text: str, **how: object) -> int:
+        file.write_bytes(text[: len(text) // 2].encode())
         os.kill(os.getpid(), signal.SIGINT)
-        return "half"
+        return 0
 
-    monkeypatch.setattr(joint_motion.JointMotion, "_format_text", pressed)
+    monkeypatch.setattr(Path, "write_text", press)
     code, _, err = run("follow", "a.orthocas", "p.csv", *LIMITS, "--out", "q.csv")
     assert (code, err) == (130, "orthocas: interrupted\n")
     assert sorted(file.name for file in Path().iterdir()) == ["a.orthocas", "p.csv"]

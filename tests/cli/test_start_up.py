@@ -48,10 +48,6 @@ def test_every_stated_name_is_what_its_module_has() -> None:
         assert public in (sys.modules.get(f"{home}.{own_name}"), getattr(sys.modules[home], own_name, None)), name
 
 
-def test_former_names_of_packages_lead_to_the_new_ones() -> None:
-    assert (oc.parametrisations, oc.following) == (oc.bases, oc.paths)
-
-
 @pytest.mark.slow
 def test_functions_stay_functions_beside_modules_of_their_names() -> None:
     code = (

@@ -182,7 +182,7 @@ def test_other_libraries_agree_and_differentiate(tmp_path: Path, library: str, n
 def differences(chart: oc.Chart, phi: Array, q: Array, weights: Array) -> Array:
     """d(weights . q)/dphi of solutions by central differences of fourth order."""
     found = np.zeros_like(phi)
-    for k, aside in enumerate(1e-3 * np.diag(chart.phi_sizes)):
+    for k, aside in enumerate(1e-3 * np.diag(chart.parts.phi_sizes)):
         for factor, times in ((8, 1), (-8, -1), (-1, 2), (1, -2)):
             moved = chart.solve(phi + times * aside, q)
             assert (moved.error < 1e-9).all()

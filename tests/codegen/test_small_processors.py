@@ -85,8 +85,8 @@ def test_inverse_stops_when_it_has_to(law: PDPlus, states: States, found: Found)
     stopped = found.status["inverse"] == ControlStatus.STOPPED_EARLY
     assert 0 < stopped.sum() < len(stopped)
     wanted = law.chart.phi(states.q)
-    error = np.abs((law.chart.phi(found.values["inverse"]) - wanted) / law.chart.phi_sizes).max(axis=1)
-    before = np.abs((law.chart.phi(states.start) - wanted) / law.chart.phi_sizes).max(axis=1)
+    error = np.abs((law.chart.phi(found.values["inverse"]) - wanted) / law.chart.parts.phi_sizes).max(axis=1)
+    before = np.abs((law.chart.phi(states.start) - wanted) / law.chart.parts.phi_sizes).max(axis=1)
     assert error[~stopped].max() < 1e-4
     assert (error[stopped] < before[stopped]).all()
 

@@ -22,7 +22,7 @@ from orthocas.errors import (
     NoExpressionError,
     UnreachableReferenceError,
 )
-from orthocas.problems.arms import urdf_path
+from orthocas.problems import urdf_path
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
@@ -146,7 +146,7 @@ def test_damping_check_finds_indefinite_designs(planar_xy: oc.Problem) -> None:
     found = Impedance(chart, [1.0, 1e4, 1.0], 0.7, damping="square_root").check_damping(500)
     assert found.smallest_eigenvalue < -1e-3
     assert 0 < found.indefinite_share <= 1
-    assert oc.contains(planar_xy.domain, found.worst_point)
+    assert planar_xy.domain.contains(found.worst_point)
     assert Impedance(chart, [1.0, 1e4, 1.0], 0.7).check_damping(500).indefinite_share == 0
 
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 import orthocas as oc
 from orthocas.errors import InvalidValueError
-from orthocas.problems.arms import urdf_path
+from orthocas.problems import urdf_path
 from orthocas.tools.checks import Array
 
 

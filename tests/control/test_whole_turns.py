@@ -219,7 +219,7 @@ def test_a_path_around_a_turn_says_what_it_leaves_over(chart: oc.Chart, axis: st
     assert motion.left_over == pytest.approx(apart, abs=1e-6)
     assert not motion.closed
     assert motion.kind.startswith("path around a turn: x and xi end where they began, joint 'j")
-    assert chart.left_over(HOME, tracker.q) == pytest.approx(apart, abs=1e-6)
+    assert chart.parts.left_over(HOME, tracker.q) == pytest.approx(apart, abs=1e-6)
     assert tracker.left_over == pytest.approx(apart, abs=1e-6)
     assert pickle.loads(pickle.dumps(tracker)).left_over == pytest.approx(apart, abs=1e-6)
     tracker.step(np.r_[path[-2], chart.xi(HOME)])
@@ -237,7 +237,7 @@ def test_a_loop_that_can_be_shrunk_closes_and_an_open_path_leaves_nothing_to_say
 
 
 def test_what_a_turn_adds_to_xi_is_said(chart: oc.Chart) -> None:
-    shifts = chart.turn_shifts
+    shifts = chart.xi_range(HOME).turn_shifts
     assert list(shifts) == ["j1", "j7"]
     for name, k in (("j1", 0), ("j7", 6)):
         q = BENT + 2 * np.pi * np.eye(7)[k]

@@ -16,7 +16,8 @@ from scipy.linalg import inv, sqrtm
 import orthocas as oc
 from orthocas import problems
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
-from orthocas.problems.arms import urdf_path
+from orthocas.exact.involutivity import lie_bracket
+from orthocas.problems import urdf_path
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
@@ -165,7 +166,7 @@ def brackets_by_definition(problem: oc.Problem) -> ca.Function:
     G = ca.inv(A) @ J.T
     P = ca.SX.eye(problem.n) - G @ ca.inv(J @ G) @ J
     W = ca.inv(ca.chol(J @ G)).T  # W (J G) W^T = I
-    B = {(i, j): P @ oc.lie_bracket(G[:, i], G[:, j], q) for i, j in combinations(range(m), 2)}
+    B = {(i, j): P @ lie_bracket(G[:, i], G[:, j], q) for i, j in combinations(range(m), 2)}
     squared = ca.SX(0)
     for a, b in combinations(range(m), 2):
         T = sum((W[a, i] * W[b, j] - W[a, j] * W[b, i]) * B[i, j] for i, j in B)
@@ -234,7 +235,7 @@ def test_lie_bracket_is_the_commutator_of_flows() -> None:
     g = ca.vertcat(ca.cos(q[2]), q[0] * q[1], q[1] ** 2)
     fields = {+1: ca.Function("f", [q], [f]), +2: ca.Function("g", [q], [g])}
     start = np.array([0.3, -0.5, 0.8])
-    bracket = np.array(ca.Function("b", [q], [oc.lie_bracket(f, g, q)])(start)).ravel()
+    bracket = np.array(ca.Function("b", [q], [lie_bracket(f, g, q)])(start)).ravel()
 
     def commutator(t: float) -> Array:
         point = start
@@ -251,16 +252,16 @@ def test_lie_bracket_is_the_commutator_of_flows() -> None:
 def test_lie_bracket_is_skew_and_vanishes_for_coordinate_fields() -> None:
     q = ca.MX.sym("q", 2)
     f, g = ca.vertcat(q[1] ** 2, q[0]), ca.vertcat(ca.sin(q[0]), q[1])
-    total = ca.Function("s", [q], [oc.lie_bracket(f, g, q) + oc.lie_bracket(g, f, q)])
+    total = ca.Function("s", [q], [lie_bracket(f, g, q) + lie_bracket(g, f, q)])
     np.testing.assert_allclose(np.array(total([0.3, 0.4])), 0, atol=1e-15)
-    constant = oc.lie_bracket(ca.MX([1, 2]), ca.MX([0, 1]), q)
+    constant = lie_bracket(ca.MX([1, 2]), ca.MX([0, 1]), q)
     np.testing.assert_array_equal(np.array(ca.Function("c", [q], [constant])([0.3, 0.4])), 0)
 
 
 def test_lie_bracket_of_other_shapes_is_refused() -> None:
     q = ca.SX.sym("q", 2)
     with pytest.raises(ShapeError, match=r"g has shape \(1, 2\), expected \(2, 1\)"):
-        oc.lie_bracket(q, q.T, q)
+        lie_bracket(q, q.T, q)
 
 
 def test_planar_arm_with_two_components_has_no_exact_coordinates(planar_xy: oc.Problem) -> None:

@@ -9,7 +9,7 @@ from charts import with_metric
 from conftest import robot_data
 
 import orthocas as oc
-from orthocas import solvers
+from orthocas import bases, solvers
 from orthocas.errors import Interrupted, InvalidValueError, MemoryNeedError, ShapeError, UnknownNameError
 from orthocas.fitting.fit import Fit
 from orthocas.solvers.protocol import Objective, SolveResult, Status
@@ -233,7 +233,7 @@ def test_bad_settings_are_refused(planar_x: oc.Problem) -> None:
     with pytest.raises(InvalidValueError, match="precision is 'single' with max_mutual_deg"):
         oc.fit(planar_x, max_mutual_deg=3.0, precision="single")
     with pytest.raises(InvalidValueError, match="precision is 'single' with circle:mlp:3"):
-        oc.fit(planar_x, oc.bases.Circle(oc.MLP((3,))), samples=50, precision="single")
+        oc.fit(planar_x, bases.Circle(oc.MLP((3,))), samples=50, precision="single")
     with pytest.raises(InvalidValueError, match="samples is 0"):
         oc.fit(planar_x, samples=0)
     with pytest.raises(InvalidValueError, match="parametrisation is 'polynomial:3'"):

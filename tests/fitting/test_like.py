@@ -43,7 +43,7 @@ def test_first_coordinate_follows_a_joint(fit: oc.Fit) -> None:
     assert np.sqrt(np.mean(np.square(angles))) == pytest.approx(fit.like["A3 [rad]"], rel=0.15)
     assert fit.like["A3 [rad]"] < 15
     assert chart.xi(problem.domain.centre)[0] == pytest.approx(problem.domain.centre[2], abs=1e-12)
-    assert chart.named_coordinates[0] == "xi1: like A3 [rad]"
+    assert chart.parts.named_coordinates[0] == "xi1: like A3 [rad]"
     plain = oc.fit(problem, oc.Polynomial(2), samples=1500).chart
     rows = plain.jacobian(problem.domain.centre)[3:]
     wanted = projected(problem, np.eye(7)[2], problem.domain.centre)
@@ -83,7 +83,8 @@ def test_a_task_of_lower_priority() -> None:
     robot = problem.robot
     fit = oc.fit(problem, oc.Polynomial(3), like=oc.Task.position(robot, "y"), samples=800)
     assert set(fit.like) == {"y [m]"}
-    assert fit.chart.named_coordinates == ("xi1: like y [m]", "xi2")  # not y itself: gradients are near to its own only
+    # Not y itself: gradients are near to its own only.
+    assert fit.chart.parts.named_coordinates == ("xi1: like y [m]", "xi2")
     chart, centre = fit.chart, problem.domain.centre
     wanted = projected(problem, np.asarray(oc.Task.position(robot, "y").jacobian_function(centre))[0], centre)
     B = np.linalg.inv(np.asarray(problem.metric.function(centre)))
@@ -153,4 +154,4 @@ def test_the_command_takes_meanings(run: Run) -> None:
     code, out, _ = run("fit", "iiwa", *words)
     assert code == 0
     assert "A3 [rad]" in out
-    assert oc.Chart.load("a.orthocas").named_coordinates[:2] == ("xi1: like A3 [rad]", "xi2: like A1 [rad]")
+    assert oc.load("a.orthocas").parts.named_coordinates[:2] == ("xi1: like A3 [rad]", "xi2: like A1 [rad]")

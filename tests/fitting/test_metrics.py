@@ -104,4 +104,4 @@ def test_joint_that_moves_no_mass_is_named_when_inertia_is_the_metric() -> None:
 
 def test_function_that_divides_by_zero_is_refused(planar_x: oc.Problem) -> None:
     with pytest.raises(InvalidValueError, match="metric is failing"):
-        oc.Metric.custom(planar_x.robot, "broken", lambda q: 1 / 0)
+        Metric.custom(planar_x.robot, "broken", lambda q: 1 / 0)

@@ -13,7 +13,7 @@ from conftest import robot_data
 import orthocas as oc
 from orthocas.bases.given import SEW_KINDS, sew_angle
 from orthocas.errors import RobotError, UnknownNameError
-from orthocas.problems.arms import CENTRE, iiwa_robot, urdf_path
+from orthocas.problems import CENTRE, iiwa_robot, urdf_path
 from orthocas.robots import pinocchio_model, urdf
 
 Z = np.array([0.0, 0.0, 1.0])

@@ -9,6 +9,7 @@ from objectives import START, Bowl, SmoothValley, TwoFaced, Valley
 import orthocas as oc
 from orthocas import problems, solvers
 from orthocas.bases import JointSpace
+from orthocas.charts.quality import Report
 from orthocas.errors import InvalidValueError, SolveError
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.starts import find_spectral_start
@@ -105,7 +106,7 @@ PAIRS = [
 
 
 @pytest.fixture(scope="module")
-def linear(planar_xy: oc.Problem) -> oc.Report:
+def linear(planar_xy: oc.Problem) -> Report:
     """The quality of linear coordinates."""
     return oc.evaluate(oc.fit(planar_xy, oc.Linear()).chart, 2000)
 
@@ -115,7 +116,7 @@ def linear(planar_xy: oc.Problem) -> oc.Report:
     ("parametrisation", "solver"), PAIRS, ids=lambda value: getattr(value, "label", getattr(value, "name", ""))
 )
 def test_every_pair_that_makes_sense_beats_linear_coordinates(
-    planar_xy: oc.Problem, linear: oc.Report, parametrisation: object, solver: Solver
+    planar_xy: oc.Problem, linear: Report, parametrisation: object, solver: Solver
 ) -> None:
     weights = oc.Weights(angles="paper")  # the figure below
     fit = oc.fit(planar_xy, parametrisation, solver, weights=weights, samples=300)

@@ -10,6 +10,7 @@ import orthocas as oc
 from orthocas.bases import JointSpace, Parametrisation
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.loss import loss
 from orthocas.fitting.network_objective import GraphObjective
 from orthocas.tasks.samples import evaluate_samples, sample_evenly
 
@@ -35,7 +36,7 @@ def test_fast_objectives_have_its_value_and_gradient(
     theta = family.initial(3)
     fast = BasisObjective if parametrisation.linear else GraphObjective
     value, gradient = fast(family, evaluate_samples(problem, points), weights, theta, None).value_and_gradient(theta)
-    L = oc.loss(problem, parametrisation, weights=weights, samples=points, start=theta)
+    L = loss(problem, parametrisation, weights=weights, samples=points, start=theta)
     x = ca.MX.sym("x", family.size)
     slope = ca.Function("slope", [x], [ca.gradient(L(x), x)])
     np.testing.assert_allclose(float(L(theta)), value, rtol=1e-12)
@@ -46,7 +47,7 @@ def test_hessian_of_a_basis_is_the_fast_one(planar_x: oc.Problem) -> None:
     points = sample_evenly(planar_x.domain, 40, 1)
     family = oc.Polynomial(2).family(JointSpace.of(planar_x), 2)
     theta = family.initial(3)
-    L = oc.loss(planar_x, oc.Polynomial(2), weights=EVERY_TERM, samples=points, start=theta)
+    L = loss(planar_x, oc.Polynomial(2), weights=EVERY_TERM, samples=points, start=theta)
     x = ca.MX.sym("x", family.size)
     H = ca.Function("H", [x], [ca.hessian(L(x), x)[0]])(theta).full()
     fast = BasisObjective(family, evaluate_samples(planar_x, points), EVERY_TERM, theta, None).hessian(theta)
@@ -55,7 +56,7 @@ def test_hessian_of_a_basis_is_the_fast_one(planar_x: oc.Problem) -> None:
 
 def test_hessian_of_a_network_is_that_of_differences_and_ipopt_takes_it(planar_xy: oc.Problem) -> None:
     """A network of 22 parameters: second derivatives by CasADi, taken by Ipopt."""
-    L = oc.loss(planar_xy, oc.MLP((3,)), samples=60, seed=2)
+    L = loss(planar_xy, oc.MLP((3,)), samples=60, seed=2)
     theta = np.random.default_rng(5).normal(size=L.size1_in(0))
     x = ca.MX.sym("x", theta.size)
     slope, H = ca.Function("s", [x], [ca.gradient(L(x), x)]), ca.Function("H", [x], [ca.hessian(L(x), x)[0]])
@@ -72,11 +73,11 @@ def test_hessian_of_a_network_is_that_of_differences_and_ipopt_takes_it(planar_x
 
 def test_drawn_samples_are_seeded_and_bad_settings_are_refused(planar_x: oc.Problem) -> None:
     theta = np.random.default_rng(0).normal(size=18)
-    values = [float(oc.loss(planar_x, oc.Polynomial(2), samples=30, seed=seed)(theta)) for seed in (1, 1, 2)]
+    values = [float(loss(planar_x, oc.Polynomial(2), samples=30, seed=seed)(theta)) for seed in (1, 1, 2)]
     assert values[0] == values[1] != values[2]
     with pytest.raises(InvalidValueError, match="parametrisation"):
-        oc.loss(planar_x, "polynomial:2")  # type: ignore[arg-type]
+        loss(planar_x, "polynomial:2")  # type: ignore[arg-type]
     with pytest.raises(ShapeError, match="start"):
-        oc.loss(planar_x, oc.Polynomial(2), start=np.zeros(3))
+        loss(planar_x, oc.Polynomial(2), start=np.zeros(3))
     with pytest.raises(ShapeError, match="samples"):
-        oc.loss(planar_x, oc.Polynomial(2), samples=np.zeros((4, 2)))
+        loss(planar_x, oc.Polynomial(2), samples=np.zeros((4, 2)))

@@ -22,6 +22,8 @@ from orthocas.bases.family import JointSpace, LinearFamily, component_gradients
 from orthocas.bases.given import sew_angle
 from orthocas.charts.certificate import PROVED
 from orthocas.charts.coordinates import Coordinates
+from orthocas.charts.regular_part import RegularPart
+from orthocas.charts.trackers import TrackerStatus
 from orthocas.cli.fit import _format_fit
 from orthocas.cli.output import format_report_rows
 from orthocas.codegen import check_c
@@ -41,9 +43,10 @@ from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.like import QuadraticTerm
 from orthocas.fitting.network_objective import ArrayObjective
 from orthocas.fitting.stages import Resampled
+from orthocas.fitting.wide import WideFit
 from orthocas.fitting.wide_search import Search, WideSettings, sample_frames, search_families
 from orthocas.solvers.protocol import Status
-from orthocas.tasks.branches import _Arm
+from orthocas.tasks.branches import Branch, Branches, _Arm
 from orthocas.tasks.domains import StopKind
 from orthocas.tasks.regular_box import find_joint_range
 from orthocas.tasks.samples import sample_boundary_weighted, sample_uniform
@@ -65,16 +68,16 @@ def panda() -> oc.Robot:
 
 
 @cache
-def branches() -> oc.Branches:
+def branches() -> Branches:
     return oc.branches(iiwa())
 
 
-def home_branch() -> oc.Branch:
+def home_branch() -> Branch:
     return branches()["shoulder+ elbow- wrist+"]
 
 
 @cache
-def wide_pose() -> oc.WideFit:
+def wide_pose() -> WideFit:
     return oc.fit_wide(iiwa(), oc.Task.pose(iiwa()), home_branch(), parametrisation=oc.Polynomial(4, ["A1", "A7"]))
 
 
@@ -89,12 +92,12 @@ def without_the_roll() -> oc.Chart:
 def narrower() -> oc.Chart:
     """The same coordinates where their volume is above 0.4, which is not everywhere."""
     chart = wide_pose().chart
-    domain = oc.RegularPart(chart.problem.domain, wide_pose().chart.coordinates, 0.4)  # type: ignore[arg-type]
+    domain = RegularPart(chart.problem.domain, wide_pose().chart.coordinates, 0.4)  # type: ignore[arg-type]
     return oc.Chart(oc.Problem(iiwa(), chart.problem.task, domain=domain), chart.coordinates)
 
 
 @cache
-def wide_plane() -> oc.WideFit:
+def wide_plane() -> WideFit:
     known = oc.problems.get("planar_3r_xy")
     return oc.fit_wide(known.robot, known.task, BENT)
 
@@ -216,7 +219,7 @@ def test_one_polynomial_is_regular_on_a_whole_branch() -> None:
     fit = wide_pose()
     assert fit.regular_share > 0.995
     chart, domain = fit.chart, fit.chart.problem.domain
-    assert isinstance(domain, oc.RegularPart)
+    assert isinstance(domain, RegularPart)
     assert domain.half_width[1] > 0.99 * iiwa().upper[1] / 2  # from the cut to the limit
     q = sample_boundary_weighted(domain, 3000, 8)
     slopes = np.einsum("sn,sn->s", chart.coordinates.jacobian(q)[:, 0], self_motions(iiwa(), q))
@@ -228,7 +231,7 @@ def test_one_polynomial_is_regular_on_a_whole_branch() -> None:
 @pytest.mark.slow
 def test_volumes_are_those_of_orthonormal_rows() -> None:
     domain = narrower().problem.domain
-    assert isinstance(domain, oc.RegularPart)
+    assert isinstance(domain, RegularPart)
     q = sample_uniform(oc.Box(domain.centre, domain.half_width), 500, 4)
     z = self_motions(iiwa(), q)
     gradients = wide_pose().chart.coordinates.jacobian(q)[:, 0]
@@ -464,11 +467,11 @@ def test_coordinates_mean_what_is_asked(like: str) -> None:
     tracker, phi = chart.tracker(q), chart.phi(q)
     for moved in (0.1, 0.2, 0.3):
         there = tracker.step(phi + np.append(np.zeros(6), moved))
-        assert tracker.status is oc.TrackerStatus.OK
+        assert tracker.status is TrackerStatus.OK
         assert abs(float(value(there)) - float(value(q)) - moved) < 0.01
         np.testing.assert_allclose(iiwa().tip_position(there), iiwa().tip_position(q), atol=1e-9)
     name = "swivel" if like == "swivel" else "A3"
-    assert chart.named_coordinates == (f"xi1: like {name} at home [rad]",)
+    assert chart.parts.named_coordinates == (f"xi1: like {name} at home [rad]",)
     points = sample_uniform(chart.problem.domain, 4000, 21)
     z, step = self_motions(iiwa(), points), 1e-6
     z /= np.linalg.norm(z, axis=1)[:, None]
@@ -539,7 +542,7 @@ def test_several_coordinates_follow_several_quantities() -> None:
     middle = fits[0].chart.problem.domain.centre
     np.testing.assert_allclose(fits[0].chart.xi(middle)[:2], [middle[2], float(height(ca.DM(middle)))], atol=1e-9)
     assert list(fits[0].like) == ["q3 [rad]", "height"]
-    assert fits[0].chart.named_coordinates == ("xi1: like q3 [rad]", "xi2: like height", "xi3")
+    assert fits[0].chart.parts.named_coordinates == ("xi1: like q3 [rad]", "xi2: like height", "xi3")
 
 
 @pytest.mark.parametrize("metric", ["euclidean", "inertia"])
@@ -650,7 +653,7 @@ def test_c_knows_where_coordinates_are_regular(tmp_path: Path) -> None:
 def test_laws_stop_where_coordinates_end() -> None:
     chart = narrower()
     domain = chart.problem.domain
-    assert isinstance(domain, oc.RegularPart)
+    assert isinstance(domain, RegularPart)
     q = sample_boundary_weighted(oc.Box(domain.centre, domain.half_width), 20_000, 3)
     clear = domain.singular_values(q) > 1.05 * domain.least_singular_value
     bad = q[clear & (domain.volumes(q) < domain.least_volume)][0]
@@ -876,7 +879,7 @@ def test_terms_and_weights_of_users_reach_wide_fits() -> None:
     oc.register_loss_term(Evenness())
     oc.register_loss_term(Evenness())
 
-    def fit(**settings: Any) -> oc.WideFit:
+    def fit(**settings: Any) -> WideFit:
         return oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.Polynomial(3), samples=2000, **settings)
 
     def share(chart: oc.Chart) -> float:
@@ -971,9 +974,9 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
 
 def test_regular_part_refuses_coordinates_that_fold_at_its_centre() -> None:
     domain = wide_plane().chart.problem.domain
-    assert isinstance(domain, oc.RegularPart)
+    assert isinstance(domain, RegularPart)
     with pytest.raises(DomainError, match="coordinates have the volume .* at the centre"):
-        oc.RegularPart(domain, domain.coordinates, 0.999999)
+        RegularPart(domain, domain.coordinates, 0.999999)
 
 
 @pytest.mark.slow
@@ -995,7 +998,7 @@ def test_nearly_all_of_a_branch_is_proved_and_holds() -> None:
     chosen = rng.choice(len(low), 100_000)
     points = rng.uniform(low[chosen], high[chosen])
     domain = chart.problem.domain
-    assert isinstance(domain, oc.RegularPart)
+    assert isinstance(domain, RegularPart)
     clear = domain.singular_values(points) > domain.least_singular_value
     assert clear.sum() > 5000  # enough to look at; how many depends on how far the proof got
     assert (domain.volumes(points[clear]) > 0).all()

@@ -67,7 +67,9 @@ READERS = {  #: functions that read files, by module and name, with the campaign
 }
 RESULTS = {  #: public classes whose objects only the library makes, with the campaign that makes and reads them
     **dict.fromkeys(("Branch", "Branches", "Comparison", "Fit", "WideFit", "Involutivity", "Report"), "calls"),
-    **dict.fromkeys(("Solutions", "Tracker", "InverseStatus", "TrackerStatus"), "calls"),
+    **dict.fromkeys(
+        ("Solutions", "Tracker", "ReachingTracker", "InverseStatus", "TrackerStatus", "MeaningError"), "calls"
+    ),
     **dict.fromkeys(("Breakdown", "Coupling", "DampingCheck", "JointMotion", "Margins", "Modes", "Setting"), "calls"),
     **dict.fromkeys(("Card", "Model", "Trajectory", "View"), "calls"),
     "Certificate": "certificates",

@@ -18,6 +18,7 @@ import public_objects
 import orthocas as oc
 from fuzz.child import Finding, run, verdict
 from fuzz.mutants import Rng, entries_of, npy, packed, pick, sealed
+from orthocas.certificates import check_certificate
 from orthocas.tools.archive import read_npy
 
 _ARM = "planar_3r_xy"
@@ -63,7 +64,7 @@ def write_originals(folder: Path) -> None:
     """One chart file of each kind, with its certificate."""
     for name, build in CHARTS.items():
         chart = build()
-        assert oc.check_certificate(chart), name
+        assert check_certificate(chart), name
         chart.save(folder / f"{name}.chart")
 
 
@@ -84,7 +85,7 @@ def judge(originals: Path, seed: int) -> str | None:
         path = Path(folder) / "mutant"
         path.write_bytes(content)
         chart = oc.load(path)
-        if oc.check_certificate(chart):
+        if check_certificate(chart):
             assert said(chart) == _said_by(original), f"{original.stem}: {where} is changed, and the check holds"
 
     with TemporaryDirectory() as folder:

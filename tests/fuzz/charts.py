@@ -16,7 +16,9 @@ import orthocas as oc
 from fuzz.child import Finding, run
 from fuzz.mutants import Rng, entries_of, npy, packed, pick, sealed
 from fuzz.sealed_files import bomb, judged, mutant
+from orthocas.charts.chart import GrownChart
 from orthocas.errors import OrthocasError
+from orthocas.paths import corridor_problem
 from orthocas.tasks.samples import sample_uniform
 
 
@@ -39,7 +41,7 @@ def _iiwa() -> oc.Chart:
 
 def _corridor() -> oc.Chart:
     path = np.linspace([0.0, 0.6, 0.8], [0.8, 1.4, 0.8], 9)
-    problem = oc.corridor_problem(oc.problems.get("planar_3r_xy"), path)
+    problem = corridor_problem(oc.problems.get("planar_3r_xy"), path)
     return oc.fit(problem, oc.Polynomial(2), samples=100).chart
 
 
@@ -94,7 +96,7 @@ def _evaluate(chart: oc.Chart) -> None:
     phi, J = chart.phi(q[0]), chart.jacobian(q[0])
     assert phi.shape == (chart.n,)
     assert J.shape == (chart.n, chart.n)
-    if isinstance(chart, oc.GrownChart):  # NaN where the flow does not reach the leaf
+    if isinstance(chart, GrownChart):  # NaN where the flow does not reach the leaf
         return
     if not (np.isfinite(phi).all() and np.isfinite(J).all()):  # a singular point?
         assert np.isfinite(chart.phi(q)).all(axis=1).any(), "phi is not finite"

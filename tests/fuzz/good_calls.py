@@ -24,9 +24,20 @@ from public_objects import (
 )
 
 import orthocas as oc
-from orthocas import bases, control, learn, plotting, problems, simulation, solvers, viewer
+from orthocas import bases, control, learn, problems, simulation, solvers, viewer
+from orthocas.bases import cyclic_joints
+from orthocas.certificates import certified_box, check_certificate
+from orthocas.charts.chart import GrownChart
+from orthocas.charts.figures import quality_figure, self_motion_figure
+from orthocas.charts.regular_part import RegularPart
+from orthocas.charts.singularities import jumps, singular_points
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.errors import CompileError
+from orthocas.exact.involutivity import lie_bracket
+from orthocas.fitting.loss import loss
+from orthocas.paths import corridor_problem
+from orthocas.tasks.domains import default_box
+from orthocas.tasks.metric import Metric
 from orthocas.viewer.session import Session
 
 Call = tuple[Callable[..., Any], dict[str, Any]]  # a function, and arguments that it takes
@@ -51,7 +62,7 @@ def _searches() -> dict[str, Call]:
             {"box": problem.domain, "task": task, "least_singular_value": 0.1, "scale": None, "rows": "frame"},
         ),
         "RegularPart": (
-            oc.RegularPart,
+            RegularPart,
             {"box": wide_box, "coordinates": chart.coordinates, "least_volume": 0.05},
         ),
         "fit_wide": (
@@ -129,7 +140,7 @@ def _views() -> dict[str, Call]:
         "cyclic_motions": (viewer.cyclic_motions, {"chart": chart, "path": [x, x + 0.05, x], "cycles": 1}),
         "Session": (Session, {"chart": chart, "q": q}),
         "session.wish": (session.wish, {"values": {"xi1": 0.1}}),
-        "chart.plot": (lambda postures: plotting.self_motion_figure(chart, postures, None), {"postures": 3}),
+        "chart.plot": (lambda postures: self_motion_figure(chart, postures, None), {"postures": 3}),
     }
 
 
@@ -187,7 +198,7 @@ def _makers() -> dict[str, Call]:
         "Box": (oc.Box, {"centre": q, "half_width": 0.3, "unbounded": [0]}),
         "Corridor": (oc.Corridor, {"box": oc.Box(q, 0.5), "postures": [q, q + 0.1], "radius": 0.2}),
         "corridor_problem": (
-            oc.corridor_problem,
+            corridor_problem,
             {"problem": planar(), "postures": [q, q + 0.1], "radius": 0.2, "margin_deg": 1.0},
         ),
         "Box.from_limits": (oc.Box.from_limits, {"lower": -q, "upper": q}),
@@ -203,14 +214,14 @@ def _makers() -> dict[str, Call]:
             oc.Given.from_function,
             {"name": "g", "n": 3, "function": lambda q: column(q[0], q[1])},
         ),
-        "Metric.from_spec": (oc.Metric.from_spec, {"robot": robot, "spec": np.eye(3)}),
-        "Metric.custom": (oc.Metric.custom, {"robot": robot, "name": "m", "function": lambda q: ca.diag(2 + q**2)}),
+        "Metric.from_spec": (Metric.from_spec, {"robot": robot, "spec": np.eye(3)}),
+        "Metric.custom": (Metric.custom, {"robot": robot, "name": "m", "function": lambda q: ca.diag(2 + q**2)}),
         "Problem": (
             oc.Problem,
             {"robot": robot, "task": problem.task, "metric": "inertia", "domain": problem.domain, "name": "p"},
         ),
         "Chart": (oc.Chart, {"problem": problem, "coordinates": fitted().chart.coordinates, "notes": {"a": 1.0}}),
-        "GrownChart": (oc.GrownChart, {"problem": circle().problem, "coordinates": circle().coordinates, "notes": {}}),
+        "GrownChart": (GrownChart, {"problem": circle().problem, "coordinates": circle().coordinates, "notes": {}}),
         "Weights": (
             oc.Weights,
             {"task": 1.0, "regularity": 1.0, "length": 1.0, "folds": 1.0, "extra": {}, "angles": "paper"},
@@ -267,11 +278,10 @@ def _functions() -> dict[str, Call]:
         ),
         "bounded fit": (oc.fit, {**box, "solver": None, "samples": 50, "max_mutual_deg": None}),
         "certify": (oc.certify, {"chart": chart, "bound": 0.0, "time_limit": 0.0, "executor": None, "resume": None}),
-        "certified_box": (oc.certified_box, {"chart": chart, "bound": 0.0, "time_limit": 5.0, "executor": None}),
-        "check_certificate": (oc.check_certificate, {"chart": chart, "certificate": None, "executor": None}),
+        "certified_box": (certified_box, {"chart": chart, "bound": 0.0, "time_limit": 5.0, "executor": None}),
+        "check_certificate": (check_certificate, {"chart": chart, "certificate": None, "executor": None}),
         "check": (oc.check, {"problem": problem, "samples": 50, "seed": 1}),
-        "contains": (oc.contains, {"domain": problem.domain, "q": q}),
-        "cyclic_joints": (oc.cyclic_joints, {"problem": problem}),
+        "cyclic_joints": (cyclic_joints, {"problem": problem}),
         "suggest_domain": (
             oc.suggest_domain,
             {
@@ -285,7 +295,7 @@ def _functions() -> dict[str, Call]:
                 "seed": 0,
             },
         ),
-        "default_box": (oc.default_box, {"robot": problem.robot, "centre": q, "half_width": 0.2}),
+        "default_box": (default_box, {"robot": problem.robot, "centre": q, "half_width": 0.2}),
         "distil": (
             oc.distil,
             {"chart": circle(), "parametrisation": oc.Polynomial(1), "solver": None, "samples": 30, "seed": 0},
@@ -304,18 +314,17 @@ def _functions() -> dict[str, Call]:
         ),
         "grow linear": (oc.grow, {"problem": planar("euclidean"), "leaf": "linear", "level": 0.5, "region": None}),
         "involutivity": (oc.involutivity, {"problem": problem, "samples": 30, "seed": 1}),
-        "jumps": (oc.jumps, {"chart": circle(), "radius": 0.02}),
-        "lie_bracket": (oc.lie_bracket, {"f": symbol, "g": symbol**2, "q": symbol}),
+        "jumps": (jumps, {"chart": circle(), "radius": 0.02}),
+        "lie_bracket": (lie_bracket, {"f": symbol, "g": symbol**2, "q": symbol}),
         "load": (oc.load, {"path": "no.orthocas"}),
         "charts.load": (oc.charts.load, {"name": "ur5-position"}),
         "charts.card": (oc.charts.card, {"name": "ur5-position"}),
-        "Chart.load": (oc.Chart.load, {"path": "no.orthocas"}),
-        "loss": (oc.loss, {**box, "weights": (1, 1), "samples": 20, "seed": 0, "start": None}),
+        "loss": (loss, {**box, "weights": (1, 1), "samples": 20, "seed": 0, "start": None}),
         "compare": (
             oc.compare,
             {"problem": problem, "parametrisations": [], "solvers": None, "seeds": 1, "samples": 50, "held_out": 50},
         ),
-        "singular_points": (oc.singular_points, {"problem": problems.get("planar_2r"), "seed": 0}),
+        "singular_points": (singular_points, {"problem": problems.get("planar_2r"), "seed": 0}),
         "register_parametrisation": (
             oc.register_parametrisation,
             {"name": "polynomial", "kind": oc.MLP, "parse": None},
@@ -326,8 +335,8 @@ def _functions() -> dict[str, Call]:
         "to data": (bases.parametrisation_to_data, {"parametrisation": oc.Polynomial(2)}),
         "solvers.get": (solvers.get, {"name": "lbfgs"}),
         "problems.get": (problems.get, {"name": "planar_2r"}),
-        "self_motion_figure": (plotting.self_motion_figure, {"chart": chart, "postures": 2, "reach": 0.1}),
-        "quality_figure": (plotting.quality_figure, {"report": None}),
+        "self_motion_figure": (self_motion_figure, {"chart": chart, "postures": 2, "reach": 0.1}),
+        "quality_figure": (quality_figure, {"report": None}),
     }
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import orthocas as oc
 from fuzz.child import Finding, run, verdict
 from fuzz.words import NAMES, NUMBERS, VECTORS, Rng, pick
+from orthocas.tasks.domains import default_box
 from orthocas.viewer.looks import read_urdf_look
 
 _EVALUATED = 30  # joints of robots whose dynamics are built: it takes long for many
@@ -67,7 +68,7 @@ def use(path: Path, tip: str | None, locked: dict[str, float]) -> None:
         return
     if path.suffix == ".urdf":
         read_urdf_look(path, robot.tree, locked)
-    middle = oc.default_box(robot).centre
+    middle = default_box(robot).centre
     for q in (middle, middle + 0.1):
         values = (robot.tip_position(q), robot.mass_matrix(q), robot.gravity(q), robot.bias(q, q))
         if not all(np.isfinite(value).all() for value in values):

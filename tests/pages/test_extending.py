@@ -21,10 +21,11 @@ def run(folder: Path, *blocks: str) -> list[list[float]]:
 def test_basis_fits_saves_loads_distils_and_compares(tmp_path: Path) -> None:
     more = """
 from concurrent.futures import ThreadPoolExecutor
+from orthocas import bases
 assert [stage.result.status.value for stage in fit.stages] == ["converged"]
 assert fit.chart.notes["solver"] == "gauss_newton"
 assert oc.load("radial.orthocas").coordinates.parametrisation == Radial(60)
-assert oc.bases.parse_parametrisation("radial:7") == Radial(7)
+assert bases.parse_parametrisation("radial:7") == Radial(7)
 points = problem.domain.centre + 0.1 * np.random.default_rng(1).normal(size=(3, 3))
 J = fit.chart.jacobian(points)
 step = 1e-6 * np.eye(3)
@@ -71,6 +72,7 @@ except InvalidValueError as error:
 def test_loss_term_acts_and_its_gauss_newton_matrix_and_hessian_are_right(tmp_path: Path) -> None:
     more = """
 from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.loss import loss
 from orthocas.bases import JointSpace
 from orthocas.tasks.samples import evaluate_samples
 from orthocas.tasks.samples import sample_evenly
@@ -79,7 +81,7 @@ points = np.repeat(sample_evenly(problem.domain, 30, 3), 2, axis=0)  # every sec
 family = oc.Polynomial(2).family(JointSpace.of(problem), 2)
 theta = family.initial(1)
 fast = BasisObjective(family, evaluate_samples(problem, points), weights, theta, None)
-slow = oc.loss(problem, oc.Polynomial(2), weights=weights, samples=points, start=theta)
+slow = loss(problem, oc.Polynomial(2), weights=weights, samples=points, start=theta)
 x = ca.MX.sym("x", family.size)
 H, g, value = ca.hessian(slow(x), x)[0], ca.gradient(slow(x), x), slow(x)
 exact = ca.Function("exact", [x], [value, g, H])

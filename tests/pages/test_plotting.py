@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import orthocas as oc
+from orthocas.charts.figures import quality_figure, self_motion_figure
 from orthocas.errors import InverseError
 from orthocas.fitting.fit import Fit
-from orthocas.plotting import quality_figure, self_motion_figure
 
 
 @pytest.mark.slow

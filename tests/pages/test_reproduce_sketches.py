@@ -10,6 +10,7 @@ from paper.pose_map import joints, pose, pose_jacobian
 from programs import nightly
 
 import orthocas as oc
+from orthocas import bases
 from orthocas.bases import JointSpace
 
 pytestmark = pytest.mark.slow
@@ -80,7 +81,7 @@ def test_raw_inputs_give_a_network_that_is_not_periodic() -> None:
     layers = np.tanh(W2 @ np.tanh(W1 @ q + b1[:, None]) + b2[:, None])
     assert np.asarray(family.expression(ca.DM(q), ca.DM(theta))) == pytest.approx(W3 @ layers + b3[:, None])
     assert network.label == "mlp:3x2:raw"
-    assert oc.bases.parse_parametrisation(network.label) == network
+    assert bases.parse_parametrisation(network.label) == network
 
 
 def test_arm_has_the_angles_of_the_paper(drawings: dict[str, Drawing]) -> None:

@@ -10,7 +10,7 @@ from conftest import ROBOTS, arm, pinocchio_position, robot_data
 
 import orthocas as oc
 from orthocas.errors import RobotError
-from orthocas.problems.arms import iiwa_robot
+from orthocas.problems import iiwa_robot
 from orthocas.robots import pinocchio_model, urdf
 
 

@@ -9,7 +9,7 @@ from conftest import one_joint, robot_data
 
 import orthocas as oc
 from orthocas.errors import InvalidValueError, RobotError, UnknownNameError
-from orthocas.problems.arms import iiwa_robot
+from orthocas.problems import iiwa_robot
 
 
 @pytest.mark.slow

@@ -180,7 +180,7 @@ def test_files_keep_frames_and_tasks(baxter: oc.Robot, tmp_path: Path) -> None:
         problem = oc.Problem(baxter, task, domain=oc.Box(centre, 0.1))
         chart = oc.fit(problem, oc.Polynomial(1), samples=200, weights=oc.Weights(folds=0)).chart
         chart.save(tmp_path / "arms.orthocas")
-        back = oc.Chart.load(tmp_path / "arms.orthocas")
+        back = oc.load(tmp_path / "arms.orthocas")
         assert back.problem.robot.tips == (LEFT, RIGHT)
         q = centre + 0.05
         np.testing.assert_array_equal(back.phi(q), chart.phi(q))
@@ -273,7 +273,7 @@ def test_two_hands_on_one_object_move_it_by_the_names_of_coordinates(baxter: oc.
     home = np.array([0.3, -0.4, -0.5, 1.2, 0.2, 0.8, 0.1, -0.3, -0.4, 0.5, 1.2, -0.2, 0.8, -0.1])
     problem = oc.Problem(baxter, oc.Task.relative_pose(baxter, LEFT, RIGHT), domain=oc.Box(home, 0.3))
     chart = oc.fit(problem, oc.Polynomial(1), like=oc.Task.position(baxter), samples=600).chart
-    assert chart.named_coordinates[:4] == ("xi1: like x [m]", "xi2: like y [m]", "xi3: like z [m]", "xi4")
+    assert chart.parts.named_coordinates[:4] == ("xi1: like x [m]", "xi2: like y [m]", "xi3: like z [m]", "xi4")
     wanted = chart.phi(home)
     np.testing.assert_allclose(wanted[6:9], baxter.tip_position(home), atol=1e-9)
     wanted[6] += 0.05

@@ -6,6 +6,7 @@ from public_objects import planar
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.charts.certificate import Certificate
 
 
 @cache
@@ -17,7 +18,7 @@ def chart(width: float = 0.2) -> oc.Chart:
 
 
 @cache
-def certified(width: float = 0.2) -> oc.Certificate:
+def certified(width: float = 0.2) -> Certificate:
     return oc.certify(chart(width), time_limit=20)
 
 

@@ -15,11 +15,16 @@ import casadi as ca
 import numpy as np
 
 import orthocas as oc
-from orthocas import control, problems, solvers
+from orthocas import control, paths, problems, solvers
+from orthocas.charts.certificate import Certificate
+from orthocas.charts.chart import GrownChart
+from orthocas.charts.singularities import jumps, singular_points
+from orthocas.charts.trackers import Tracker
 from orthocas.codegen.compiled_inverse import CompiledInverse
 from orthocas.control import Controller, Reference
 from orthocas.fitting.compare import Comparison
 from orthocas.fitting.fit import ClearPart, Fit
+from orthocas.fitting.wide import WideFit
 from orthocas.robots.tree import place_on_base
 from orthocas.simulation import (
     Elasticity,
@@ -34,6 +39,7 @@ from orthocas.simulation import (
     coupling_index,
     simulate,
 )
+from orthocas.tasks.branches import Branches
 from orthocas.tasks.metric import Metric
 from orthocas.tasks.samples import sample_problem, sample_uniform
 from orthocas.tools.batch import Batched
@@ -100,7 +106,7 @@ BENT = oc.Box([0.0, 1.3, 1.3], [3.0, 1.2, 1.2])
 
 
 @cache
-def wide() -> oc.WideFit:
+def wide() -> WideFit:
     known = problems.get("planar_3r_xy")
     return oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.Polynomial(3, ["q1"]))
 
@@ -175,17 +181,17 @@ def generated_c() -> Any:
 
 
 @cache
-def branches() -> oc.Branches:
+def branches() -> Branches:
     return oc.branches(problems.get("iiwa").robot)
 
 
 @cache
-def certificate() -> oc.Certificate:
+def certificate() -> Certificate:
     return oc.certify(fitted().chart)
 
 
 @cache
-def joint_motion() -> oc.paths.JointMotion:
+def joint_motion() -> paths.JointMotion:
     x = fitted().chart.task(planar().domain.centre)
     return oc.follow(fitted().chart, [x, x + 0.05, x], velocity_limits=1.0, period=0.05)
 
@@ -294,8 +300,8 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "tracker": lambda: fitted().chart.tracker(planar().domain.centre),
     "nearest tracker": lambda: fitted().chart.tracker(planar().domain.centre, nearest=True),
     "involutivity": lambda: oc.involutivity(planar(), 100),
-    "singular point": lambda: oc.singular_points(problems.get("planar_2r"))[0],
-    "jump": lambda: oc.jumps(circle())[0],
+    "singular point": lambda: singular_points(problems.get("planar_2r"))[0],
+    "jump": lambda: jumps(circle())[0],
     "distilled": distilled,
     "steps": steps,
     "spline": lambda: Reference.through(("a", "b"), [0.0, 1.0, 2.0], [[0.0, 1.0], [1.0, 0.5], [0.0, 2.0]]),
@@ -358,7 +364,7 @@ def _of_chart(chart: oc.Chart) -> Iterator[Any]:
     yield from (phi, chart.xi(q[0]), chart.jacobian(q), chart.labels, str(dict(chart.notes)))
     known = np.isfinite(phi).all(axis=1)
     yield chart.inverse(phi[known], q[known] + 1e-3)
-    if not isinstance(chart, oc.GrownChart):
+    if not isinstance(chart, GrownChart):
         yield from (np.asarray(chart.function(name)(q[0])) for name in ("xi", "phi", "jacobian"))
 
 
@@ -371,7 +377,7 @@ def _of_compiled(inverse: CompiledInverse) -> Iterator[Any]:
 
 
 @_numbers.register
-def _of_tracker(tracker: oc.Tracker) -> Iterator[Any]:
+def _of_tracker(tracker: Tracker) -> Iterator[Any]:
     q = tracker.q
     yield from (q, tracker.step(fitted().chart.phi(q) + 1e-3), tracker.status, tracker.largest_step)
     tracker.reset(q)

@@ -19,6 +19,7 @@ from public_objects import (
 )
 
 import orthocas as oc
+from orthocas.charts.chart import GrownChart
 from orthocas.control import Controller, Kinematic, Remembering
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array
@@ -41,7 +42,7 @@ def calls_of_chart(chart: oc.Chart) -> list[Call]:
         lambda k: chart.inverse(phi[k % 6], q[k % 6] + 0.02),
         lambda k: chart.solve(phi[k % 6 :]).q,
         lambda k: chart.problem.robot.mass_matrix(q[k % 6]),
-        *([] if isinstance(chart, oc.GrownChart) else fitted_calls),
+        *([] if isinstance(chart, GrownChart) else fitted_calls),
     ]
 
 

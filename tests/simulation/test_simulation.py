@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 import orthocas as oc
 from orthocas.control import ControlStatus, Impedance, Kinematic, PDPlus, Reference
 from orthocas.errors import InvalidValueError
-from orthocas.problems.arms import urdf_path
+from orthocas.problems import urdf_path
 from orthocas.robots.pinocchio_model import build_planar
 from orthocas.simulation import (
     Outcome,

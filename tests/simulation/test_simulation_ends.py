@@ -32,7 +32,7 @@ def test_unreachable_reference_is_reported_before_the_run(planar_chart: oc.Chart
     assert run.outcome is Outcome.LOST
     first = np.flatnonzero(run.status == ControlStatus.OUTSIDE_DOMAIN)[0]
     assert run.reason == f"the arm left the domain of the chart at t = {run.times[first]:.4g} s"
-    assert not oc.contains(planar_chart.problem.domain, run.q[first])
+    assert not planar_chart.problem.domain.contains(run.q[first])
     assert np.isfinite(run.command).all()
 
 

@@ -9,8 +9,10 @@ from supervised import TICK, Arm, at_rest, moving, run
 
 import orthocas as oc
 from orthocas.charts.coordinates import Coordinates
+from orthocas.charts.regular_part import RegularPart
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.control import ControlStatus, PDPlus, Safety
+from orthocas.paths import corridor_problem
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
@@ -83,7 +85,7 @@ def test_the_end_of_coordinates_is_a_boundary_with_a_zone_before_it(tmp_path: Pa
     )
     clear, coordinates, bound = wide.chart.problem.domain, wide.chart.coordinates, 0.9
     assert isinstance(coordinates, Coordinates)
-    domain = oc.RegularPart(clear, coordinates, bound)
+    domain = RegularPart(clear, coordinates, bound)
     chart = oc.Chart(oc.Problem(robot, wide.chart.problem.task, domain=domain), coordinates)
     law = PDPlus.on_chart(chart)
     library = CompiledLibrary(compile_shared(oc.generate_c(chart, tmp_path, law, "arm"), tmp_path), "arm", 3)
@@ -124,7 +126,7 @@ RADIUS = 0.3
 @pytest.fixture(scope="module")
 def in_corridor(planar_xy: oc.Problem, tmp_path_factory: pytest.TempPathFactory) -> tuple[PDPlus, CompiledLibrary]:
     """A law near a path of postures; joint 1 is cyclic, so its distance to the path does not count."""
-    problem = oc.corridor_problem(planar_xy, PATH, RADIUS)
+    problem = corridor_problem(planar_xy, PATH, RADIUS)
     law = PDPlus.on_chart(oc.fit(problem, oc.Polynomial(2, "auto"), samples=400).chart)
     out = tmp_path_factory.mktemp("corridor")
     generated = oc.generate_c(law.chart, out, law, "arm")

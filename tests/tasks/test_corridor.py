@@ -11,10 +11,12 @@ from programs import Run
 
 import orthocas as oc
 from orthocas import codegen, problems
+from orthocas.certificates import check_certificate
 from orthocas.certificates.outside import choose_check
 from orthocas.certificates.rows import build_chart_rows
 from orthocas.control import ControlStatus
 from orthocas.errors import DomainError, InvalidValueError, ShapeError, UnreachableReferenceError
+from orthocas.paths import corridor_problem
 from orthocas.tasks.samples import sample_boundary_weighted, sample_uniform
 from orthocas.tools.checks import Array
 
@@ -58,7 +60,7 @@ def loop() -> tuple[oc.Problem, Array, Array]:
 @pytest.fixture(scope="module")
 def chart(loop: tuple[oc.Problem, Array, Array]) -> oc.Chart:
     problem, _, postures = loop
-    return oc.fit(oc.corridor_problem(problem, postures, 0.3), oc.Polynomial(3, "auto"), samples=400).chart
+    return oc.fit(corridor_problem(problem, postures, 0.3), oc.Polynomial(3, "auto"), samples=400).chart
 
 
 def test_positions_inside_are_those_near_the_lines_between_postures() -> None:
@@ -111,7 +113,7 @@ def test_certificate_covers_the_corridor_and_leaves_out_nothing_of_it(chart: oc.
     domain = chart.problem.domain
     certificate = oc.certify(chart)
     assert certificate.proved
-    assert oc.check_certificate(chart, certificate)
+    assert check_certificate(chart, certificate)
     judge = choose_check(chart, build_chart_rows(chart), 0.0)
     rng = np.random.default_rng(7)
     middle = rng.uniform(-1, 1, (200, 3))
@@ -157,7 +159,7 @@ def test_file_holds_the_corridor(chart: oc.Chart, tmp_path: Path) -> None:
 
 def test_cyclic_and_idle_joints_take_all_positions() -> None:
     iiwa = problems.get("iiwa")
-    found = oc.corridor_problem(iiwa, iiwa.domain.centre[None], 0.2).domain
+    found = corridor_problem(iiwa, iiwa.domain.centre[None], 0.2).domain
     assert isinstance(found, oc.Corridor)
     assert np.isinf(found.radius).tolist() == [True, False, False, False, False, False, True]
     assert found.half_width[[0, 6]].min() > 2.9
@@ -182,7 +184,7 @@ def test_wrong_corridors_are_refused() -> None:
         oc.Problem(known.robot, known.task, domain=corridor(), least_singular_value=0.1)
     iiwa = problems.get("iiwa")
     with pytest.raises(DomainError, match="range of joint"):
-        oc.corridor_problem(iiwa, iiwa.domain.centre[None] + 10.0)
+        corridor_problem(iiwa, iiwa.domain.centre[None] + 10.0)
 
 
 @pytest.mark.slow

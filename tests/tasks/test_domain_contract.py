@@ -10,7 +10,7 @@ import pytest
 import orthocas as oc
 from orthocas import problems
 from orthocas.charts.self_motion import Interval, Stop
-from orthocas.charts.trackers import RULES
+from orthocas.charts.trackers import RULES, TrackerStatus
 from orthocas.errors import DomainError
 from orthocas.tasks.domains import StopKind
 from orthocas.tasks.samples import sample_uniform
@@ -268,23 +268,23 @@ def test_trackers_go_to_the_end_of_a_range_and_stay(kind: str, axes: str) -> Non
             span, row = end - phi[chart.m + k], chart.m + k
             for point in walk(chart, q, k, end)[0]:
                 last, reached = tracker.q, tracker.step(chart.phi(point))
-                if kind == "torus" and tracker.status is not oc.TrackerStatus.OK:  # nearly singular: steps are large
+                if kind == "torus" and tracker.status is not TrackerStatus.OK:  # nearly singular: steps are large
                     np.testing.assert_array_equal(reached, last)
                     break
-                assert tracker.status is oc.TrackerStatus.OK
+                assert tracker.status is TrackerStatus.OK
                 np.testing.assert_allclose(reached, point, atol=1e-7)
             last = tracker.q
             phi[row] += 1.001 * span
             np.testing.assert_array_equal(tracker.step(phi), last)
             if kind == "torus":
-                assert tracker.status is not oc.TrackerStatus.OUTSIDE_DOMAIN
+                assert tracker.status is not TrackerStatus.OUTSIDE_DOMAIN
             elif stop.kind is not StopKind.FOLD:
-                assert tracker.status is oc.TrackerStatus.OUTSIDE_DOMAIN
+                assert tracker.status is TrackerStatus.OUTSIDE_DOMAIN
 
 
 def cost(chart: oc.Chart, phi: Array, q: Array) -> Array:
     """What a tracker with `nearest=True` lowers, at points (N, n)."""
-    weights = np.where(np.arange(3) < chart.m, 1 / chart.phi_sizes, RULES.xi_weight)
+    weights = np.where(np.arange(3) < chart.m, 1 / chart.parts.phi_sizes, RULES.xi_weight)
     return np.asarray(((chart.parts.phi_map.difference(phi, chart.phi(q)) * weights) ** 2).sum(axis=1))
 
 
@@ -302,9 +302,9 @@ def test_reaching_trackers_rest_where_no_neighbour_is_nearer(kind: str, axes: st
             for _ in range(80):
                 reached = tracker.step(phi)
                 assert domain.contains(reached)
-                if tracker.status in (oc.TrackerStatus.NEAREST, oc.TrackerStatus.OK):
+                if tracker.status in (TrackerStatus.NEAREST, TrackerStatus.OK):
                     break
-            if tracker.status is oc.TrackerStatus.NEAREST:
+            if tracker.status is TrackerStatus.NEAREST:
                 around = reached + 10.0 ** rng.uniform(-4, -1.5, (1000, 1)) * rng.normal(size=(1000, 3))
                 around = around[domain.contains(around)]
                 here = cost(chart, phi, reached[None])[0]

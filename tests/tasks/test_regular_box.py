@@ -6,7 +6,7 @@ import pytest
 from conftest import ROBOTS, robot_data
 
 import orthocas as oc
-from orthocas.problems.arms import iiwa_robot
+from orthocas.problems import iiwa_robot
 from orthocas.tasks.domains import default_box, require_within_limits
 from orthocas.tasks.regular_box import regular_box
 

@@ -8,7 +8,7 @@ from conftest import arm, robot_data
 
 import orthocas as oc
 from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
-from orthocas.problems.arms import iiwa_robot
+from orthocas.problems import iiwa_robot
 from orthocas.tasks.domains import default_box
 from orthocas.tools.expressions import read_tape, write_tape
 

@@ -17,7 +17,7 @@ from programs import Run, python
 
 import orthocas as oc
 from orthocas.fitting.fit import Fit
-from orthocas.problems.arms import urdf_path
+from orthocas.problems import urdf_path
 from orthocas.viewer import cyclic_motions, export_page
 
 pytestmark = [

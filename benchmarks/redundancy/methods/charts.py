@@ -8,6 +8,7 @@ import numpy as np
 import orthocas as oc
 from orthocas.charts.trackers import Tracker
 from orthocas.errors import DomainError, OrthocasError
+from orthocas.paths import corridor_problem
 from orthocas.tools.checks import Array
 from redundancy.arms import TICK, Arm
 from redundancy.protocol import Target, Unsuited
@@ -137,7 +138,7 @@ class Corridor(OnChart):
         problem = oc.Problem(self.arm.robot, self.arm.task, domain=around_home(self.arm, 1.0))
         self.chart = None
         with suppress(OrthocasError):  # where the path leaves the joint limits, there is no corridor
-            near = oc.corridor_problem(problem, np.array(postures[:: self.thinned]), self.radius)
+            near = corridor_problem(problem, np.array(postures[:: self.thinned]), self.radius)
             self.chart = oc.fit(near, oc.Polynomial(3, "auto")).chart
             super().start(q, path)
         self.q = q
