@@ -40,7 +40,9 @@ class WideRules:
     network: tuple[int, ...] = (64, 64, 64)  #: layers where polynomials leave out much
     small_network: tuple[int, ...] = (24, 24)  #: layers in another metric than the identity; as fast as polynomials
 
-    alignment: float = 1.0  #: weight of the mean sin^2 of the leaks
+    alignment: float = 0.3  #: weight of the mean sin^2 of the leaks
+    alignment_in_metric: float = 1.0  #: the same in another metric than the identity
+    closer: float = 4.0  #: factor of this weight in a last descent, once coordinates are regular enough
     mutual: float = 0.15  #: weight of the mean cos^2 between gradients of different coordinates
     evenness: float = 0.03  #: weight of the mean squared logarithm of the lengths of gradients
     uniform: float = 0.5  #: fraction of samples that are uniform; the others are boundary-weighted
@@ -157,7 +159,7 @@ class Search:
 
     The loss is that of `fit`, with the terms "volume" and "metric length" in place of angles::
 
-        L = mean_q [ max(0, 1 - v(q) / t)^2 + mean_j sin^2 leak_j(q) + 0.15 mean_jk cos^2(j, k)
+        L = mean_q [ max(0, 1 - v(q) / t)^2 + a mean_j sin^2 leak_j(q) + 0.15 mean_jk cos^2(j, k)
                      + 0.03 sum_j log^2(l_j(q) / L_j) ] + meaning
 
     Terms of the user join it.
@@ -184,6 +186,8 @@ class Search:
         #: of the best: whether they miss the centre, fraction of bad positions, if too many, and minus their 1 % volume
         self.rank = (True, np.inf, np.inf)
         self.stages: list[Stage] = []
+        self._alignment = RULES.alignment if problem.metric.is_identity else RULES.alignment_in_metric
+        self._objectives: list[BasisObjective] = []
         self._sign = 1.0  # of the volumes
         # done: coordinates are as regular as they need to be
         self._done = False
@@ -212,10 +216,17 @@ class Search:
             return
         for turn in range(1, 1 + RULES.rounds):
             if self._done or self._last is not self.best:
-                return
+                break
             self._add_worst(RULES.fresh, RULES.worst, RULES.fresh_tag + turn)
             name = f"worst samples, round {turn} of {RULES.rounds}"
             self._descend(name, "volume with the worst", LBFGS(RULES.further, RULES.tolerance))
+        if self._done and self._last is self.best and not self.settings.weights:
+            # gradients nearer to self-motions, if coordinates stay regular enough; weights of a user are kept
+            self._alignment *= RULES.closer
+            volume = "volume" if len(self._samples) == 1 else "volume with the worst"
+            self._descend("smaller leaks", volume, LBFGS(RULES.further, RULES.tolerance))
+            if self._done:
+                self.best = self._last
 
     def is_enough(self, bad: float) -> bool:
         """Whether the best coordinates are regular at the centre, and at most at a fraction of samples not."""
@@ -333,7 +344,7 @@ class Search:
         if not isinstance(users, Weights):
             # coordinates that follow quantities have the angles between these
             mutual = RULES.mutual if self.settings.quantities is None else 0.0
-            angles = 2 * self.problem.m * RULES.alignment, 2 * mutual
+            angles = 2 * self.problem.m * self._alignment, 2 * mutual
             users = Weights(*angles, 0.0, 0.0, 0.0, dict(users or {}), "metric")
         return replace(users, folds=0.0, extra={**own, **users.extra}).for_problem(self.problem)
 
@@ -346,20 +357,14 @@ class Search:
         assert isinstance(self.family, LinearFamily)
         # the mean loss over all samples: first ones and worst ones by their number
         lengths = np.linalg.norm(self._last.reshape(self.problem.r, -1) @ self._factor, axis=1)
-        if len(self._samples) == 1:
-            first = BasisObjective(
-                self.family,
-                self._samples[0],
-                weights,
-                self._last,
-                self._draw,
-                gradients=self._basis,
-                orientation=self._sign,
-            )
-            self._objectives = [first]
+        if self._objectives:
+            self._objectives[0] = self._objectives[0].reweigh(weights)
         else:
-            first, own = self._objectives[0].reweigh(weights), self._weigh_regularity(volume)
-            self._objectives = [first, *self._objectives[1:], first.elsewhere(self._samples[-1], own)]
+            common = self.family, self._samples[0], weights, self._last, self._draw
+            self._objectives.append(BasisObjective(*common, gradients=self._basis, orientation=self._sign))
+        # those of the worst samples that joined since
+        for samples in self._samples[len(self._objectives) :]:
+            self._objectives.append(self._objectives[0].elsewhere(samples, self._weigh_regularity(volume)))
         count = sum(len(samples) for samples in self._samples)
         parts: list[tuple[float, Objective]] = [
             (len(samples) / count, objective)

@@ -19,7 +19,8 @@ SLIDING = JointSpace(SPACE.centre, SPACE.half_width, (False, True, False), SPACE
 GIVEN = oc.Given.from_function("by hand", 3, lambda q: ca.vertcat(ca.sin(q[0]) * q[1], q[2] + 2))
 REDUCED = [oc.Polynomial(3, cyclic=["b"]), oc.Fourier(2, cyclic=("a", "c"))]
 SPARSE = [oc.Polynomial(4, joints=2), oc.Fourier(3, ("b",), joints=1)]
-ALL = [oc.Linear(), oc.Polynomial(3), oc.Fourier(2), *REDUCED, *SPARSE, oc.MLP((5, 4)), GIVEN]
+PARTLY = oc.MLP((5, 4), raw=True, cyclic=["b"], without=["c"])
+ALL = [oc.Linear(), oc.Polynomial(3), oc.Fourier(2), *REDUCED, *SPARSE, oc.MLP((5, 4)), PARTLY, GIVEN]
 
 
 def values(parametrisation: object, space: JointSpace, points: np.ndarray, theta: np.ndarray, r: int = 2) -> np.ndarray:
@@ -218,6 +219,9 @@ def test_linear_normals_at_bad_bases_are_refused() -> None:
         "polynomial:4:joints=2",
         "fourier:2:joints=1:cyclic=a,b",
         "mlp:64x64",
+        "mlp:24x24:raw",
+        "mlp:24x24:raw:cyclic=a:without=b,c",
+        "mlp:8:without=c",
         "polynomial:4:cyclic=a:without=b,c",
         "fourier:2:without=c",
     ],
@@ -238,6 +242,7 @@ def test_labels_are_read_back(label: str) -> None:
         ("polynomial:3:joints=two", InvalidValueError, "whole numbers"),
         ("polynomial:3:cyclic:joints=2", InvalidValueError, "after the degree 'joints=2', then 'cyclic'"),
         ("mlp:64x", InvalidValueError, "whole numbers"),
+        ("mlp:64:smooth", InvalidValueError, "after the widths 'raw', then 'cyclic'"),
         ("mlp:0", InvalidValueError, "hidden is 0"),
         ("sew:left", UnknownNameError, "known: conventional, stereographic"),
         ("linear:2", InvalidValueError, "'linear' without a number"),
@@ -259,6 +264,8 @@ def test_fourier_refuses_a_prismatic_joint_by_name() -> None:
 def test_empty_mlp_is_refused() -> None:
     with pytest.raises(InvalidValueError, match="at least one hidden layer"):
         oc.MLP(())
+    with pytest.raises(InvalidValueError, match="at least one joint that enters the network"):
+        oc.MLP((3,), cyclic=["a", "b"], without=["c"]).family(SPACE, 1)
 
 
 @pytest.mark.parametrize("parametrisation", [oc.Polynomial(3, ["a"], without=["c"]), oc.Fourier(2, without=["c"])])

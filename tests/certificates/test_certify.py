@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from certified_charts import certified, chart, fourier
-from public_objects import fitted, given, network, planar
+from public_objects import fitted, given, network, partly_linear, planar
 
 import orthocas as oc
 from orthocas import problems
@@ -17,7 +17,7 @@ from orthocas.errors import CertifyError, InvalidValueError
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("build", [chart, network, given, fourier, lambda: fitted().chart])
+@pytest.mark.parametrize("build", [chart, network, partly_linear, given, fourier, lambda: fitted().chart])
 def test_regular_charts_are_certified_and_checked(build: Callable[[], oc.Chart]) -> None:
     known = build()
     certificate = oc.certify(known)

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from certified_charts import chart, fourier
-from public_objects import given, network
+from public_objects import given, network, partly_linear
 
 import orthocas as oc
 from orthocas.certificates import taylor
@@ -138,7 +138,7 @@ def test_lower_bounds_lie_below_all_values_and_are_sharp_for_parabolas() -> None
     assert lower_bound(x * x)[0] == pytest.approx(0, abs=1e-12)
 
 
-@pytest.mark.parametrize("build", [chart, network, given, fourier])
+@pytest.mark.parametrize("build", [chart, network, partly_linear, given, fourier])
 def test_models_of_the_jacobian_contain_it(build: Callable[[], oc.Chart]) -> None:
     known = build()
     rng = np.random.default_rng(5)

@@ -83,31 +83,31 @@ class Reader:
     def linear(self, q: Array, theta: Array, **_: Any) -> Array:
         return theta.reshape(-1, len(q)) @ (q - self.arrays["domain_centre"][self.active])
 
-    def polynomial(self, q: Array, theta: Array, degree: int, cyclic: list[str]) -> Array:
+    def polynomial(self, q: Array, theta: Array, degree: int, cyclic: list[str], without: Any = ()) -> Array:
         u = (q - self.arrays["domain_centre"][self.active]) / self.arrays["domain_half_width"][self.active]
         P = np.array([np.polynomial.legendre.legval(u, np.eye(degree + 1)[k]) for k in range(degree + 1)])
         return self.products(
-            P * np.sqrt(2 * np.arange(degree + 1) + 1)[:, None], range(degree + 1), degree, cyclic, theta
+            P * np.sqrt(2 * np.arange(degree + 1) + 1)[:, None], range(degree + 1), degree, cyclic, without, theta
         )
 
-    def fourier(self, q: Array, theta: Array, degree: int, cyclic: list[str]) -> Array:
+    def fourier(self, q: Array, theta: Array, degree: int, cyclic: list[str], without: Any = ()) -> Array:
         waves = [np.sqrt(2) * wave(k * q) for k in range(1, degree + 1) for wave in (np.cos, np.sin)]
         for i in self.places(cyclic):
             waves[0][i] = q[i] - self.arrays["domain_centre"][self.active][i]
         degrees = [0, *(k for k in range(1, degree + 1) for _ in range(2))]
-        return self.products(np.array([np.ones(len(q)), *waves]), degrees, degree, cyclic, theta)
+        return self.products(np.array([np.ones(len(q)), *waves]), degrees, degree, cyclic, without, theta)
 
-    def places(self, cyclic: list[str]) -> list[int]:
-        return [i for i, joint in enumerate(self.active) if self.names[joint] in cyclic]
+    def places(self, names: Any) -> list[int]:
+        return [i for i, joint in enumerate(self.active) if self.names[joint] in names]
 
-    def products(self, f: Array, degrees: Any, total: int, cyclic: list[str], theta: Array) -> Array:
-        n, linear = f.shape[1], self.places(cyclic)
+    def products(self, f: Array, degrees: Any, total: int, cyclic: Any, without: Any, theta: Array) -> Array:
+        n, linear, none = f.shape[1], self.places(cyclic), self.places(without)
 
         def terms(joint: int, left: int) -> Iterator[tuple[int, ...]]:
             if joint == n:
                 yield ()
                 return
-            for k, degree in enumerate([0] if joint in linear else degrees):
+            for k, degree in enumerate([0] if joint in linear + none else degrees):
                 if degree <= left:
                     yield from ((k, *rest) for rest in terms(joint + 1, left - degree))
 
@@ -116,17 +116,19 @@ class Reader:
         psi = np.array([np.prod(f[list(term), range(n)]) for term in chosen])
         return theta.reshape(-1, len(psi)) @ psi
 
-    def mlp(self, q: Array, theta: Array, hidden: list[int], raw: bool) -> Array:
+    def mlp(self, q: Array, theta: Array, hidden: list[int], raw: bool, cyclic: Any = (), without: Any = ()) -> Array:
         kinds = [self.header["robot"]["joint_kinds"][i] for i in self.active]
-        turning = [i for i, kind in enumerate(kinds) if kind == "revolute" and not raw]
-        direct = [i for i in range(len(q)) if i not in turning]
+        linear = self.places(cyclic)
+        inputs = [i for i in range(len(q)) if i not in linear + self.places(without)]
+        turning = [i for i in inputs if kinds[i] == "revolute" and not raw]
+        direct = [i for i in inputs if i not in turning]
         y, used = np.concatenate([np.sin(q[turning]), np.cos(q[turning]), q[direct]]), 0
         widths = [len(y), *hidden, len(self.arrays["offset"])]
         for layer, (width, out) in enumerate(pairwise(widths)):
             W = theta[used : used + out * width].reshape(width, out).T
             y = W @ y + theta[used + out * width :][:out]
             y, used = y if layer == len(hidden) else np.tanh(y), used + out * (width + 1)
-        return y
+        return y + theta[used:].reshape(len(linear), len(y)).T @ q[linear]
 
 
 def require_equal(path: Path, chart: oc.Chart) -> None:
@@ -158,11 +160,15 @@ def test_reader_from_the_page_gives_the_tasks(kind: str, iiwa: oc.Problem, tmp_p
     require_equal(tmp_path / "arm.orthocas", chart)
 
 
-def test_reader_from_the_page_reads_terms_of_cyclic_joints(planar_xy: oc.Problem, tmp_path: Path) -> None:
+def test_reader_from_the_page_reads_joints_that_enter_linearly_or_not_at_all(
+    planar_xy: oc.Problem, tmp_path: Path
+) -> None:
     robot = planar_xy.robot
     problem = oc.Problem(robot, oc.Task.position(robot, "xy"), domain=oc.Box([0.6, 0.8, 0.8], [0.3, 0.2, 0.2]))
-    for family in (oc.Polynomial(3, cyclic="auto"), oc.Fourier(2, cyclic="auto")):
+    rest: dict[str, Any] = {"cyclic": "auto", "without": ["q3"]}
+    for family in (oc.Polynomial(3, **rest), oc.Fourier(2, **rest), oc.MLP((4, 3), **rest)):
         chart = oc.fit(problem, family, samples=100).chart
         chart.save(tmp_path / f"{family.label[:4]}.orthocas")
-        assert Reader(tmp_path / f"{family.label[:4]}.orthocas").header["coordinates"]["settings"]["cyclic"] == ["q1"]
+        settings = Reader(tmp_path / f"{family.label[:4]}.orthocas").header["coordinates"]["settings"]
+        assert (settings["cyclic"], settings["without"]) == (["q1"], ["q3"])
         require_equal(tmp_path / f"{family.label[:4]}.orthocas", chart)

@@ -154,13 +154,26 @@ def test_arrays_of_a_network_agree_with_its_graph(problem: oc.Problem, network: 
             np.testing.assert_allclose(slopes, gradient, rtol=0, atol=error * np.abs(gradient).max())
 
 
-def test_arrays_of_prismatic_joints_agree_with_their_graph() -> None:
+@pytest.mark.parametrize("rest", [{}, {"cyclic": ["a", "c"]}, {"without": ["b"]}, {"cyclic": ["c"], "without": ["a"]}])
+def test_arrays_of_other_joints_agree_with_their_graph(rest: dict[str, list[str]]) -> None:
+    """A prismatic joint, joints that enter linearly, and joints that do not enter; combinations of outputs, too."""
     space = JointSpace(np.zeros(3), np.ones(3), (False, True, False), ("a", "b", "c"))
-    family = oc.MLP((5, 4)).family(space, 2)
-    theta, points = family.initial(0), np.random.default_rng(1).normal(size=(6, 3))
-    q = ca.MX.sym("q", 3, 6)
-    wanted = ca.Function("J", [q], family.jacobian(q, ca.DM(theta)))(points.T)
-    np.testing.assert_allclose(family.pullback(points, theta)[0].transpose(1, 2, 0), wanted, atol=1e-14)
+    family, rng = oc.MLP((5, 4), **rest).family(space, 2), np.random.default_rng(1)  # type: ignore[arg-type]
+    theta, points, weights = rng.normal(size=family.size), rng.normal(size=(6, 3)), rng.normal(size=(6, 2, 3))
+    q, p = ca.MX.sym("q", 3, 6), ca.MX.sym("theta", family.size)
+    gradients = family.jacobian(q, p)
+    weighted = sum(ca.dot(ca.DM(weights[:, j].T), gradients[j]) for j in range(2))
+    wanted, slopes = (np.array(part) for part in _split(q, p, gradients, ca.gradient(weighted, p))(points.T, theta))
+    J, back = family.pullback(points, theta)
+    np.testing.assert_allclose(J, wanted.reshape(2, 3, 6).transpose(2, 0, 1), atol=1e-14)
+    np.testing.assert_allclose(back(weights, np.empty(family.size)), slopes[:, 0], atol=1e-12)
+    B = rng.normal(size=(2, 2))
+    mixed = family.pullback(points, family.combined(theta, B))[0]
+    np.testing.assert_allclose(mixed, B @ J, atol=1e-13)
+
+
+def _split(q: ca.MX, p: ca.MX, gradients: list[ca.MX], slopes: ca.MX) -> ca.Function:
+    return ca.Function("both", [q, p], [ca.vertcat(*gradients), slopes])
 
 
 def test_single_precision_of_a_basis_changes_the_last_digits(problem: oc.Problem) -> None:

@@ -48,7 +48,7 @@ from orthocas.fitting.wide_search import Search, WideSettings, sample_frames, se
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.branches import Branch, Branches, _Arm
 from orthocas.tasks.domains import StopKind
-from orthocas.tasks.regular_box import find_joint_range
+from orthocas.tasks.regular_box import find_joint_range, regular_box
 from orthocas.tasks.samples import sample_boundary_weighted, sample_uniform
 from orthocas.tools.display import number_list, percent
 from orthocas.tools.progress import Progress
@@ -313,13 +313,27 @@ def test_a_hand_that_rolls_moves_no_other_joint_and_closes_its_turns() -> None:
 @pytest.mark.slow
 def test_coordinates_without_the_roll_are_tried_first(tmp_path: Path) -> None:
     fit = oc.fit_wide(iiwa(), oc.Task.pose(iiwa()), home_branch(), samples=4000)
-    assert fit.chart.coordinates.label == "polynomial:6:without=A1,A7"
-    assert fit.regular_share > 0.995
+    assert fit.chart.coordinates.label == "polynomial:6:cyclic=A1:without=A7"
+    assert fit.regular_share > 0.999
     fit.chart.save(tmp_path / "wide.orthocas")
     q = sample_uniform(fit.chart.problem.domain, 50, 1)
     np.testing.assert_array_equal(oc.load(tmp_path / "wide.orthocas").xi(q), fit.chart.xi(q))
     bent = oc.fit_wide(iiwa(), oc.Task.pose(iiwa()), home_branch(), like="A7", samples=1000).chart
     assert "without" not in bent.coordinates.label
+
+
+def test_the_first_families_leave_out_the_turn_of_the_tool_and_of_a_base_that_turns_fully() -> None:
+    """In the inertia metric networks come first; the base of the iiwa has limits, that of the other arm has none."""
+    endless = oc.Robot.from_urdf(Path(__file__).parents[1] / "data" / "robots" / "four_endless_joints.urdf")
+    for robot, metric, expected in (
+        (iiwa(), "euclidean", ["polynomial:6:cyclic=A1:without=A7"]),
+        (iiwa(), "inertia", ["mlp:24x24:raw:cyclic=A1:without=A7", "polynomial:6:cyclic=A1:without=A7"]),
+        (endless, "euclidean", ["polynomial:6:without=j1,j7", "polynomial:6:cyclic=j1:without=j7"]),
+    ):
+        task = oc.Task.pose(robot)
+        problem = oc.Problem(robot, task, metric, regular_box(robot, task))
+        labels = [family.label for family in wide_fits._choose_families(problem, None)]
+        assert [label for label in labels if "without" in label] == expected
 
 
 def planar_values(robot: oc.Robot, q: Numbers) -> Numbers:
@@ -579,7 +593,7 @@ def test_the_loss_has_volumes_angles_and_lengths_and_its_slopes_are_differences(
             else np.broadcast_to(np.eye(4), (len(points), 4, 4))
         )
         rows, losses = np.concatenate([J, G], axis=1), np.zeros(len(points))
-        for B, bound in ((np.eye(4), 0.05), (A, 0.3)) if metric == "inertia" else ((A, 0.3),):
+        for B, bound in ((np.eye(4), 0.02), (A, 0.3)) if metric == "inertia" else ((A, 0.3),):
             gram = rows @ np.linalg.inv(B) @ rows.transpose(0, 2, 1)
             lengths = np.linalg.det(gram[:, :2, :2]) * gram[:, 2, 2] * gram[:, 3, 3]
             v = -np.sign(np.linalg.det(rows)) * np.sqrt(np.linalg.det(gram) / lengths)
@@ -589,7 +603,8 @@ def test_the_loss_has_volumes_angles_and_lengths_and_its_slopes_are_differences(
         if points is q[0]:  # the worst samples only ask for regular coordinates
             along = np.linalg.solve(gram[:, :2, :2], gram[:, :2, 2:])
             sines = np.einsum("saj,saj->sj", gram[:, :2, 2:], along) / gram[:, [2, 3], [2, 3]]
-            losses += 0.3 * sines.mean(axis=1) + 0.15 * gram[:, 2, 3] ** 2 / (gram[:, 2, 2] * gram[:, 3, 3])
+            alignment = 1.0 if metric == "inertia" else 0.3
+            losses += alignment * sines.mean(axis=1) + 0.15 * gram[:, 2, 3] ** 2 / (gram[:, 2, 2] * gram[:, 3, 3])
         parts.append(losses)
     assert abs(value - np.concatenate(parts).mean() - (C[0] @ held.E @ C[0] - 2 * held.g @ C[0] + 0.3)) < 1e-6
     moved = rng.normal(size=(6, len(theta)))

@@ -68,6 +68,14 @@ def network() -> oc.Chart:
 
 
 @cache
+def partly_linear() -> oc.Chart:
+    """A network of one joint; the base enters linearly, and the last joint not at all."""
+    known = problems.get("planar_3r_xy")
+    network = oc.MLP((6, 6), raw=True, cyclic=["q1"], without=["q3"])
+    return oc.fit(known, network, solvers.LBFGS(max_iterations=10), samples=300).chart
+
+
+@cache
 def with_idle_joint() -> oc.Chart:
     known = problems.get("planar_3r_x")
     task = oc.Task.custom(known.robot, "bent", lambda q: ca.sin(q[0]) + q[2] ** 2 * q[0])
@@ -211,6 +219,7 @@ CHARTS: dict[str, Callable[[], oc.Chart]] = {
     "Fourier chart": lambda: oc.fit(planar(), oc.Fourier(1), samples=300).chart,
     "circle-valued chart": ring,
     "network chart": network,
+    "network beside linear joints": partly_linear,
     "given chart": given,
     "chart with an idle joint": with_idle_joint,
     "cyclic chart": cyclic,
