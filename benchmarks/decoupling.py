@@ -1,4 +1,4 @@
-"""What task and extra coordinate feel of each other, A = I against A = M, in MuJoCo: three tables (20 min).
+"""What task and extra coordinate feel of each other, A = I against A = M, in MuJoCo: three tables (10 min of one core).
 
 Ready wide charts of poses (A = I) against `fit_wide(..., metric="inertia")` on the same branch of the same arm (A = M).
 Ten starts of each arm, drawn from both domains. Either the elbow moves while the hand should rest: xi goes to the
@@ -178,10 +178,11 @@ def outcome(
 
 def draw_motions(pair: Pair, count: int) -> list[tuple[Motion, Motion]]:
     """Starts at which both kinds of motion are possible."""
-    rng, found = np.random.default_rng(0), []
-    for q in common_points(pair):
+    rng, found, points, robot = np.random.default_rng(0), [], common_points(pair), pair[0].problem.robot
+    held = (np.abs(robot.with_payload(LOADS[-1]).gravity(points)) < robot.effort_limits).all(axis=1)
+    for q, is_held in zip(points, held, strict=True):
         turn, way = rng.choice([-TURN, TURN]), rng.normal(size=3)
-        elbow = turn_elbow(pair, q, turn)
+        elbow = turn_elbow(pair, q, turn) if is_held else None
         hand = None if elbow is None else move_hand(pair, q, WAY * way / np.linalg.norm(way))
         if elbow is not None and hand is not None:
             found.append((elbow, hand))
