@@ -59,6 +59,7 @@ SCRIPTS = (
     "held_loads",
     "following",
     "operational_space",
+    "decoupling",
     "redundancy_benchmark",
     "xi_in_qp",
     "xi_in_solvers",
