@@ -102,7 +102,8 @@ def fit_wide(
        each other at a distance. A network begins at random and descends with Adam on some of the samples at a time. It
        takes several times as long to evaluate, and is not tried with `like` or with slides without limits.
     4. The best ones go on: as long as they are not regular enough at other samples, and get better, the worst of many
-       fresh samples join. Once they are, leaks weigh more in a last descent, kept if coordinates stay regular enough.
+       fresh samples join. Once they are, and with r = 1, leaks weigh more in a last descent, kept if coordinates stay
+       regular enough.
 
     The best result is kept: regular at the centre, with the fewest bad positions, then with the largest 1 % quantile of
     the volume. The domain of the chart is the part of the branch where coordinates are regular with a margin in the

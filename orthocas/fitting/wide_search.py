@@ -219,8 +219,8 @@ class Search:
             self._add_worst(RULES.fresh, RULES.worst, RULES.fresh_tag + turn)
             name = f"worst samples, round {turn} of {RULES.rounds}"
             self._descend(name, "volume with the worst", LBFGS(RULES.further, RULES.tolerance))
-        if self._done and self._last is self.best and not self.settings.weights:
-            # gradients nearer to self-motions, if coordinates stay regular enough; weights of a user are kept
+        if self._done and self._last is self.best and self.problem.r == 1 and not self.settings.weights:
+            # the gradient nearer to self-motions, if it stays regular enough; weights of a user are kept
             self._alignment *= RULES.closer
             volume = "volume" if len(self._samples) == 1 else "volume with the worst"
             self._descend("smaller leaks", volume, LBFGS(RULES.further, RULES.tolerance))
