@@ -27,6 +27,7 @@ from orthocas.cli.options import (
     parse_number,
     parse_weights,
     parse_whole_number,
+    parse_wide_weights,
 )
 from orthocas.cli.output import (
     build_reach_data,
@@ -148,10 +149,9 @@ def fit(
     bounds = {"leak_deg": leak_deg, "conditioning": conditioning}
     kind, branch = _check_domain(domain, corridor, bounds)
     if kind == _BRANCH:
-        loss_text = None if weights == WEIGHTS_TEXT else weights
-        own = {"solver": solver, "max-mutual-deg": max_mutual_deg, "weights": loss_text, "angles": angles}
+        own = {"solver": solver, "max-mutual-deg": max_mutual_deg}
         if given := [name for name, value in own.items() if value is not None]:
-            raise OptionError(f"--domain branch has a solver and a loss of its own: leave out --{given[0]}")
+            raise OptionError(f"--domain branch has a solver of its own: leave out --{given[0]}")
 
     # What can be refused is refused before anything takes time.
     built = None if kind else _build_problem(problem, words, corridor)
@@ -160,7 +160,7 @@ def fit(
     param = _IN_CORRIDOR if param is None and corridor is not None else param
     parametrisation = None if param is None else parse_parametrisation(param)
     minimiser = None if solver is None else get_solver(solver)
-    loss = parse_weights(weights, angles)
+    loss, wide_loss = parse_weights(weights, angles), parse_wide_weights(weights, angles) if kind == _BRANCH else None
     quantities = None if like is None else [word.strip() for word in like.split(",")]
 
     suggestion, result = None, None
@@ -174,7 +174,7 @@ def fit(
                 if same and (minimiser, samples, max_mutual_deg, like) == (None,) * 4:
                     result = replace(suggestion.fit, chart=replace(suggestion.fit.chart, problem=built))
             elif kind == _BRANCH:
-                result = _fit_wide(problem, words, branch, quantities, parametrisation, samples, seed, monitor)
+                result = _fit_wide(problem, words, branch, quantities, parametrisation, wide_loss, samples, seed, monitor)
             if result is None:
                 assert built is not None
                 result = fit_chart(
@@ -261,6 +261,7 @@ def _fit_wide(
     branch: str,
     like: list[str] | None,
     parametrisation: Parametrisation | None,
+    weights: Weights | Mapping[str, float] | None,
     samples: int | None,
     seed: int,
     monitor: Monitor,
@@ -282,6 +283,7 @@ def _fit_wide(
             parametrisation=parametrisation,
             home=words.home if base is None else centre,
             like=like[0] if like and len(like) == 1 else like,
+            weights=weights,
             samples=samples,
             seed=seed,
             monitor=monitor,
@@ -324,7 +326,7 @@ def _save_and_report(
 def _format_fit(result: Fit, report: Report, target: Path) -> dict[str, str]:
     """What a fit prints."""
     coordinates, robot = result.chart.coordinates, result.chart.problem.robot
-    # Wide fits have no --weights.
+    # The advice is on weights of tight fits.
     rows = report.facts() if isinstance(result, WideFit) else format_report_rows(report)
     rows["robot"] = f"{robot.n} joints, {'tip' if len(robot.tips) == 1 else 'tips'} {listed(robot.tips)}"
     rows["fit"] = f"{coordinates.label}, {result.seconds:.2f} s, {result.status.value}"

@@ -291,6 +291,17 @@ _WEIGHTS = ("task", "mutual", "regularity", "length", "folds")
 WEIGHTS_TEXT = ",".join(f"{getattr(DEFAULT_WEIGHTS, name):g}" for name in _WEIGHTS)
 
 
+def parse_wide_weights(text: str, angles: str | None) -> Weights | Mapping[str, float] | None:
+    """Read the weights of a wide fit: numbers take the place of its own weights, terms by name alone join these."""
+    numbers = text != WEIGHTS_TEXT and any("=" not in word for word in text.split(","))
+    if angles is not None and not numbers:
+        raise OptionError("--angles requires the numbers of --weights with --domain branch, such as --weights 12,0.3")
+    if text == WEIGHTS_TEXT:
+        return None
+    weights = parse_weights(text, angles)
+    return weights if numbers else weights.extra
+
+
 def parse_weights(text: str, angles: str | None) -> Weights:
     """Read two to five numbers and terms by name, such as "1000,30,quiet=5", with the kind of angles."""
     words = [word.strip() for word in text.split(",")]
