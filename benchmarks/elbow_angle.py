@@ -7,11 +7,14 @@ cosines compare d xi with one task gradient at a time, and are smaller. Fits hav
 leak, and the speed of the joints with xi held over the least one, for nine in ten velocities of the task.
 """
 
+import casadi as ca
 import numpy as np
 from benchmark import run, table
 from wide_charts import robot_of
 
 import orthocas as oc
+from orthocas.bases.given import DIRECTIONS, SEW_KINDS, compute_elbow_angle
+from orthocas.robots.kinematics import build_body_poses
 from orthocas.tasks.samples import sample_uniform
 
 COORDINATES = {
@@ -37,12 +40,23 @@ def leaks(chart: oc.Chart, points: np.ndarray) -> np.ndarray:
     return np.asarray(np.degrees(np.arcsin(np.minimum(1, within / np.linalg.norm(gradient, axis=1)))))
 
 
+def through_origins(robot: oc.Robot, kind: str) -> oc.Given:
+    """The angle with S, E, W at the origins of joints 2, 4 and 6: baxter's axes do not meet, as `oc.SEW` requires."""
+
+    def angle(q: ca.SX) -> ca.SX:
+        S, E, W = (build_body_poses(robot.tree, q)[joint][1] for joint in (1, 3, 5))
+        return compute_elbow_angle(E - S, W - S, *(ca.SX(ca.DM(axis)) for axis in DIRECTIONS[kind]))
+
+    return oc.Given.from_function(f"{kind} SEW", robot.n, angle)
+
+
 def whole_branch(name: str, metric: str, quick: bool) -> str:
     """One row: the wide chart of the home's branch with default settings, and both angles on its domain."""
     robot = robot_of(name)
-    polynomial = oc.Polynomial(2, ["A1"], without=["A7"]) if quick else None
+    polynomial = oc.Polynomial(2) if quick else None
     wide = oc.fit_wide(robot, oc.Task.pose(robot), metric=metric, parametrisation=polynomial).chart
-    angles = [oc.fit(wide.problem, oc.SEW(kind)).chart for kind in ("conventional", "stereographic")]
+    own = [through_origins(robot, kind) if name == "baxter, left" else oc.SEW(kind) for kind in SEW_KINDS]
+    angles = [oc.fit(wide.problem, angle).chart for angle in own]
     reports = [oc.evaluate(chart, 2_000 if quick else 20_000) for chart in (wide, *angles)]
     cells = [f"{report.leak.rms:.1f}" for report in reports] + [f"{report.held_speed:.2f}" for report in reports]
     return f"| {name} | {'A = I' if metric == 'euclidean' else 'A = M'} | {' | '.join(cells)} |"

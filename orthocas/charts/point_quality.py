@@ -119,9 +119,9 @@ def in_the_metric(samples: Samples, J: Array) -> tuple[Array, Array, Array]:
 def measure_held_speeds(problem: Problem, points: Array, J: Array, seed: int) -> Array:
     """How much faster than with least norm the joints move to hold xi, where the task moves at random velocities, (N,).
 
-    |J_phi^-1 (u, 0)|_A / |J_x^+ u|_A at each q, with a random unit velocity u and the pseudo-inverse J_x^+ in the metric.
-    For r = 1 it is sqrt(1 + (d xi J_x^+ u)^2 / ((d xi z)^2 |J_x^+ u|_A^2)) with the unit self-motion z, and at most
-    1 / cos(leak).
+    |J_phi^-1 (u, 0)|_A / |J_x^+ u|_A at each q, with a random unit velocity u (of positions and twists, SI) and the
+    pseudo-inverse J_x^+ in the metric. For r = 1 it is sqrt(1 + (d xi J_x^+ u)^2 / ((d xi z)^2 |J_x^+ u|_A^2)) with the
+    unit self-motion z, and at most 1 / cos(leak).
 
     Args:
         problem: problem of the coordinates.

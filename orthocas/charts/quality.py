@@ -251,7 +251,7 @@ class Report(Shown):
         return {
             "problem": f"n = {self.n} joints, m = {self.m} task, r = {self.r} extra, metric {self.metric}",
             **self._angles(),
-            "xi held": f"joints at most {self.held_speed:.3g} times as fast as with least norm, for 90 % of task velocities",
+            "xi held": f"joints at most {self.held_speed:.3g} times as fast as with least norm, for 90 % of velocities",
             "conditioning": f"mean {values.mean:.3f}, 1 % quantile {values.p01:.3f}, min {values.min:.3g}",
             **({} if self.worst is None else {"searched": f"least conditioning {self.worst.explained}"}),
             **self._faults(),
@@ -310,7 +310,9 @@ class Report(Shown):
             **angles.as_dict(),
             **collect_attributes(self, "idle_joints", "without_idle", "conditioning", "worst_point"),
             "least_conditioning_searched": None if self.worst is None else self.worst.least,
-            **collect_attributes(self, "singular_samples", "folded_samples", "held_speed", "length_ratio", "degenerate"),
+            **collect_attributes(
+                self, "singular_samples", "folded_samples", "held_speed", "length_ratio", "degenerate"
+            ),
         }
         return dict(clean(data))
 

@@ -21,7 +21,6 @@ from orthocas.cli.options import (
     ProblemName,
     ProblemOptions,
     SampleCount,
-    WeightsText,
     add_problem_options,
     is_robot_file,
     parse_number,
@@ -122,7 +121,14 @@ def fit(
     seed: Annotated[
         int, typer.Option("--seed", parser=parse_whole_number, help="Seed of the samples and of random starts.")
     ] = 0,
-    weights: WeightsText = WEIGHTS_TEXT,
+    weights: Annotated[
+        str,
+        typer.Option(
+            "--weights",
+            help='"lambda1,lambda2", up to lambda5; "NAME=WEIGHT" for terms of your own. With --domain branch the '
+            "first two weigh leaks and mutual angles, and its own weights are the default.",
+        ),
+    ] = WEIGHTS_TEXT,
     angles: Annotated[
         str | None,
         typer.Option(
@@ -174,7 +180,9 @@ def fit(
                 if same and (minimiser, samples, max_mutual_deg, like) == (None,) * 4:
                     result = replace(suggestion.fit, chart=replace(suggestion.fit.chart, problem=built))
             elif kind == _BRANCH:
-                result = _fit_wide(problem, words, branch, quantities, parametrisation, wide_loss, samples, seed, monitor)
+                result = _fit_wide(
+                    problem, words, branch, quantities, parametrisation, wide_loss, samples, seed, monitor
+                )
             if result is None:
                 assert built is not None
                 result = fit_chart(

@@ -48,9 +48,6 @@ SampleCount = Annotated[
         "--samples", parser=parse_whole_number, help="Number of training samples; default: from the problem size."
     ),
 ]
-WeightsText = Annotated[
-    str, typer.Option("--weights", help='"lambda1,lambda2", up to lambda5; "NAME=WEIGHT" for terms of your own.')
-]
 Limit = Annotated[
     str | None,
     typer.Option(
