@@ -16,6 +16,7 @@ import orthocas as oc
 from orthocas.bases.given import DIRECTIONS, SEW_KINDS, compute_elbow_angle
 from orthocas.robots.kinematics import build_body_poses
 from orthocas.tasks.samples import sample_uniform
+from orthocas.tools.display import percent
 
 COORDINATES = {
     "conventional SEW": oc.SEW("conventional"),
@@ -26,8 +27,10 @@ COORDINATES = {
 METRICS = ("euclidean", "inertia")
 ARMS = ("iiwa", "panda", "baxter, left")
 WIDE = (
-    "| arm | metric | fitted, leak rms [deg] | conventional SEW, leak rms [deg] | stereographic SEW, leak rms [deg] "
-    "| fitted, speed | conventional SEW, speed | stereographic SEW, speed |\n|" + " --- |" * 8
+    "| arm, metric | regular share | fitted, leak rms [deg] | conventional SEW, leak rms [deg] "
+    "| stereographic SEW, leak rms [deg] | fitted, speed | conventional SEW, speed | stereographic SEW, speed |\n|"
+    + " --- |"
+    * 8
 )
 WEIGHTS = oc.Weights(folds=0.0, angles="paper")
 
@@ -54,12 +57,14 @@ def whole_branch(name: str, metric: str, quick: bool) -> str:
     """One row: the wide chart of the home's branch with default settings, and both angles on its domain."""
     robot = robot_of(name)
     polynomial = oc.Polynomial(2) if quick else None
-    wide = oc.fit_wide(robot, oc.Task.pose(robot), metric=metric, parametrisation=polynomial).chart
+    fit = oc.fit_wide(robot, oc.Task.pose(robot), metric=metric, parametrisation=polynomial)
+    wide = fit.chart
     own = [through_origins(robot, kind) if name == "baxter, left" else oc.SEW(kind) for kind in SEW_KINDS]
     angles = [oc.fit(wide.problem, angle).chart for angle in own]
     reports = [oc.evaluate(chart, 2_000 if quick else 20_000) for chart in (wide, *angles)]
     cells = [f"{report.leak.rms:.1f}" for report in reports] + [f"{report.held_speed:.2f}" for report in reports]
-    return f"| {name} | {'A = I' if metric == 'euclidean' else 'A = M'} | {' | '.join(cells)} |"
+    names = f"{name}, {'A = I' if metric == 'euclidean' else 'A = M'}"
+    return f"| {names} | {percent(fit.regular_share, 3)} | {' | '.join(cells)} |"
 
 
 def main(quick: bool = False) -> dict[str, dict[str, float]]:
