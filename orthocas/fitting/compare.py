@@ -536,8 +536,20 @@ class Comparison(Shown):
         return len({result.weights for result in self.results}) > 1
 
 
-_COLUMNS = ("parametrisation", "solver", "weights", "parameters", "task std", "mutual std", "leak rms", "cond 1 %")
-_COLUMNS += ("regular share", "folded", "seconds", "control tick")
+_COLUMNS = (
+    "parametrisation",
+    "solver",
+    "weights",
+    "parameters",
+    "task std",
+    "mutual std",
+    "leak rms",
+    "cond 1 %",
+    "regular share",
+    "folded",
+    "seconds",
+    "control tick",
+)
 _ANGLES = ("task_std_deg", "mutual_std_deg", "leak_rms_deg", "conditioning_p01")
 _MEDIANS = (*_ANGLES, "seconds", "regular_share", "control_tick_us")
 

@@ -55,7 +55,7 @@ def test_panels_hold_the_numbers_and_escape_names() -> None:
 
 def test_panels_of_one_coordinate_show_what_holding_it_takes() -> None:
     chart = oc.fit(oc.problems.get("planar_3r_xy"), oc.Linear()).chart
-    session = Session(chart)
+    session = Session(chart, chart.problem.domain.centre + np.array([0.1, 0.3, -0.3]))
     page = ChartPanel(chart).format_html(session.readings)
     shown = dict(re.findall(r'data-oc="([^"]+)" data-value="([^"]+)"', page))
     J, q = chart.coordinates.jacobian(session.q[None]), np.tile(session.q, (2000, 1))
