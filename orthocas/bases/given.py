@@ -22,7 +22,7 @@ SEWKind = Literal["conventional", "stereographic"]
 SEW_KINDS: tuple[SEWKind, ...] = ("conventional", "stereographic")
 # (e_t, e_r) in the world. The singular half-line e_t points down into the base. With e_r = -x, an arm that reaches
 # along +x with its elbow up has psi = 0, far from the jump at +-pi.
-_DIRECTIONS = {
+DIRECTIONS = {
     "conventional": ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
     "stereographic": ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0)),
 }
@@ -190,11 +190,11 @@ def sew_angle(robot: Robot, kind: str) -> ca.Function:
     q = ca.SX.sym("q", robot.n)
     poses = build_body_poses(robot.tree, q)
     S, E, W = (_project_on_axis(poses[k], height) for k, height in _find_points(robot.tree))
-    e_t, e_r = (ca.SX(ca.DM(direction)) for direction in _DIRECTIONS[kind])
-    return dense_function("sew_angle", [q], [_compute_angle(E - S, W - S, e_t, e_r)])
+    e_t, e_r = (ca.SX(ca.DM(direction)) for direction in DIRECTIONS[kind])
+    return dense_function("sew_angle", [q], [compute_elbow_angle(E - S, W - S, e_t, e_r)])
 
 
-def _compute_angle(p_SE: ca.SX, p_SW: ca.SX, e_t: ca.SX, e_r: ca.SX) -> ca.SX:
+def compute_elbow_angle(p_SE: ca.SX, p_SW: ca.SX, e_t: ca.SX, e_r: ca.SX) -> ca.SX:
     """psi of columns (3, 1). atan2 needs no unit k_x."""
     e_SW = p_SW / ca.norm_2(p_SW)
     k_r = ca.cross(e_SW - e_t, e_r)

@@ -36,6 +36,8 @@ class WorstRules:
     last_step: float = 1e-4  #: half-widths
     moved: float = 0.4  #: fraction of the joints that move in a step
 
+    velocities: int = 3  #: seed tag of random velocities of the task
+
 
 WORST = WorstRules()
 
@@ -112,6 +114,41 @@ def in_the_metric(samples: Samples, J: Array) -> tuple[Array, Array, Array]:
     """Sines of the leaks (N, r), conditioning (N,) and signs of det J (N,), for gradients J (N, r, n) without zeros."""
     found = judge(samples, J)
     return found["leak_sines"], found["conditioning"], found["signs"]
+
+
+def measure_held_speeds(problem: Problem, points: Array, J: Array, seed: int) -> Array:
+    """How much faster than with least norm the joints move to hold xi, where the task moves at random velocities, (N,).
+
+    |J_phi^-1 (u, 0)|_A / |J_x^+ u|_A at each q, with a random unit velocity u (of positions and twists, SI) and the
+    pseudo-inverse J_x^+ in the metric. For r = 1 it is sqrt(1 + (d xi J_x^+ u)^2 / ((d xi z)^2 |J_x^+ u|_A^2)) with the
+    unit self-motion z, and at most 1 / cos(leak).
+
+    Args:
+        problem: problem of the coordinates.
+        points: q, (N, n).
+        J: J_xi there, (N, r, n), without zeros.
+        seed: seed of the velocities.
+
+    Returns:
+        Factors >= 1; inf where det J_phi = 0.
+
+    Source:
+        ours, docs/explanation/angles.md.
+    """
+    (N, r, n), inverse = J.shape, evaluate_samples(problem, points).metric_inverse
+    rows = problem.task.batched_frame_jacobian(points)[0].reshape(N, n - r, n)
+    whole = np.concatenate([rows, J], axis=1)
+    if inverse is not None:
+        whole = whole @ np.linalg.cholesky(inverse)  # A^-1 = W W^T, and |W^-1 dq| = |dq|_A
+    u = np.random.default_rng((seed, WORST.velocities)).normal(size=(N, n - r))
+    velocity = np.concatenate([u / np.linalg.norm(u, axis=1, keepdims=True), np.zeros((N, r))], axis=1)
+    regular, speeds = np.linalg.det(whole) != 0, np.full(N, np.inf)
+    held = np.linalg.solve(whole[regular], velocity[regular, :, None])
+    # the motion of least norm is its part in the span of the task gradients
+    span = np.linalg.qr(whole[regular, : n - r].transpose(0, 2, 1))[0]
+    least = span.transpose(0, 2, 1) @ held
+    speeds[regular] = np.linalg.norm(held, axis=(1, 2)) / np.linalg.norm(least, axis=(1, 2))
+    return speeds
 
 
 @dataclass(frozen=True, eq=False, repr=False)

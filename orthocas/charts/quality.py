@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocas.charts.angles import pairs
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
-from orthocas.charts.point_quality import Judged, WorstPoints, worst_points
+from orthocas.charts.point_quality import Judged, WorstPoints, measure_held_speeds, worst_points
 from orthocas.errors import InvalidValueError, SingularTaskError
 from orthocas.tasks.samples import evaluate_samples, find_idle_joints, sample_uniform
 from orthocas.tools.batch import run_in_threads
@@ -33,6 +33,8 @@ class ReportRules:
     seed: int = 1  #: by default
     telling: int = 200  #: samples by which idle joints are found
     alone: float = 1e-10  #: fraction of a gradient that counts as zero
+    held: int = 20_000  #: most samples at which joints move with xi held
+    mostly: float = 0.9  #: quantile of their speeds there that is reported
 
 
 RULES = ReportRules()
@@ -226,6 +228,7 @@ class Report(Shown):
     worst_point: tuple[float, ...]  #: the joint position with the smallest conditioning, of samples and search
     worst: WorstPoints | None  #: found by a search; None on a torus, at given joint positions, and for grown charts
     singular_samples: int  #: samples left out: a gradient vanishes, or a grown coordinate has no value
+    held_speed: float  #: of the joints with xi held, over the least one: 90 % quantile, see `measure_held_speeds`
     length_ratio: float  #: 99 % over 1 % quantile of the gradient length, for the worst coordinate
     folded_samples: int  #: samples where det J has the opposite sign of most samples: the chart folds over
     idle_joints: tuple[str, ...]  #: names of joints that are exact coordinates themselves
@@ -248,6 +251,7 @@ class Report(Shown):
         return {
             "problem": f"n = {self.n} joints, m = {self.m} task, r = {self.r} extra, metric {self.metric}",
             **self._angles(),
+            "xi held": f"joints at most {self.held_speed:.3g} times as fast as with least norm, for 90 % of velocities",
             "conditioning": f"mean {values.mean:.3f}, 1 % quantile {values.p01:.3f}, min {values.min:.3g}",
             **({} if self.worst is None else {"searched": f"least conditioning {self.worst.explained}"}),
             **self._faults(),
@@ -306,7 +310,9 @@ class Report(Shown):
             **angles.as_dict(),
             **collect_attributes(self, "idle_joints", "without_idle", "conditioning", "worst_point"),
             "least_conditioning_searched": None if self.worst is None else self.worst.least,
-            **collect_attributes(self, "singular_samples", "folded_samples", "length_ratio", "degenerate"),
+            **collect_attributes(
+                self, "singular_samples", "folded_samples", "held_speed", "length_ratio", "degenerate"
+            ),
         }
         return dict(clean(data))
 
@@ -391,11 +397,19 @@ def _report(chart: Chart, points: Array, seed: int | None, worst: WorstPoints | 
         worst_point=tuple(_worst_point(judged, worst).tolist()),
         worst=worst,
         singular_samples=len(points) - len(judged.points),
+        held_speed=_held_speed(chart, judged, seed or 0),
         length_ratio=float((long / short).max()),
         folded_samples=int(min((judged.signs > 0).sum(), (judged.signs <= 0).sum())),
         idle_joints=tuple(name for name in idle.values() if name not in floating),
         without_idle=without_idle if idle and others else None,
     )
+
+
+def _held_speed(chart: Chart, judged: Judged, seed: int) -> float:
+    """The speed with xi held at some of the points, for nine in ten of them."""
+    some = slice(RULES.held)
+    speeds = measure_held_speeds(chart.problem, judged.points[some], judged.jacobian[some], seed)
+    return float(np.quantile(speeds, RULES.mostly))
 
 
 def _worst_point(judged: Judged, worst: WorstPoints | None) -> Array:

@@ -12,18 +12,16 @@ from orthocas.charts.chart import load
 from orthocas.charts.figures import quality_figure, self_motion_figure
 from orthocas.charts.quality import evaluate
 from orthocas.cli.options import (
-    WEIGHTS_TEXT,
     AsJson,
     Force,
     ProblemOptions,
     SampleCount,
-    WeightsText,
     is_robot_file,
     parse_weights,
     parse_whole_number,
 )
 from orthocas.cli.output import format_reach_rows, note, print_json, print_table, terminal_monitor
-from orthocas.errors import Interrupted, printable
+from orthocas.errors import Interrupted, InvalidValueError, printable
 from orthocas.fitting.compare import Comparison
 from orthocas.fitting.compare import compare as compare_fits
 from orthocas.fitting.comparison_figures import convergence_figure, front_figure
@@ -31,6 +29,8 @@ from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
 from orthocas.solvers import get as get_solver
 from orthocas.solvers.protocol import Solver
+from orthocas.tasks.branches import Branch, branches
+from orthocas.tasks.problem import Problem
 from orthocas.tools.files import open_output_folder, publish, require_replaceable_files
 from orthocas.tools.interrupts import INTERRUPTED
 
@@ -56,7 +56,18 @@ def compare(
             "--held-out", parser=parse_whole_number, help="Number of held-out samples that every fit is evaluated on."
         ),
     ] = 100_000,
-    weights: WeightsText = WEIGHTS_TEXT,
+    domain: Annotated[
+        str | None,
+        typer.Option(
+            "--domain",
+            help="branch: wide fits on the branch of the problem's centre, with the front of leak and regular share; "
+            "branch:NAME: of another one.",
+        ),
+    ] = None,
+    weights: Annotated[
+        list[str] | None,
+        typer.Option("--weights", help='"lambda1,lambda2", up to lambda5, as in fit; repeat for a front.'),
+    ] = None,
     jobs: Annotated[
         int | None,
         typer.Option(
@@ -73,7 +84,8 @@ def compare(
     built = ProblemOptions().build_problem(problem) if is_name else load(problem).problem
     parametrisations = [parse_parametrisation(name) for name in param or _PARAMETRISATIONS]
     minimisers: list[Solver] | None = [get_solver(name) for name in solver] if solver else None
-    loss = parse_weights(weights, None)
+    branch = _choose_branch(domain, built)
+    losses = [parse_weights(text, None) for text in weights] if weights else None
     with open_output_folder("--out", out) as folder, open_output_folder("--out", folder / "charts") as charts:
         require_replaceable_files(folder, _FILES, force)
         try:
@@ -82,8 +94,9 @@ def compare(
                     built,
                     parametrisations,
                     minimisers,
+                    branch=branch,
                     seeds=seeds,
-                    weights=loss,
+                    weights=losses,
                     samples=samples,
                     held_out=held_out,
                     jobs=jobs,
@@ -106,6 +119,17 @@ def compare(
     if comparison.interrupted:
         note(f"interrupted after {len(comparison.results)} fits")
         raise typer.Exit(INTERRUPTED)
+
+
+def _choose_branch(domain: str | None, problem: Problem) -> Branch | None:
+    """The branch that --domain names, that of the problem's centre by default; None without the option."""
+    if domain is None:
+        return None
+    kind, _, name = domain.partition(":")
+    if kind != "branch":
+        raise InvalidValueError("--domain", repr(domain), "branch or branch:NAME")
+    parts = branches(problem.robot, problem.task)
+    return parts[name.strip()] if name else parts.of(problem.domain.centre) or parts[0]
 
 
 def write_comparison(comparison: Comparison, folder: Path, force: bool) -> None:

@@ -21,12 +21,12 @@ from orthocas.cli.options import (
     ProblemName,
     ProblemOptions,
     SampleCount,
-    WeightsText,
     add_problem_options,
     is_robot_file,
     parse_number,
     parse_weights,
     parse_whole_number,
+    parse_wide_weights,
 )
 from orthocas.cli.output import (
     build_reach_data,
@@ -128,7 +128,14 @@ def fit(
     seed: Annotated[
         int, typer.Option("--seed", parser=parse_whole_number, help="Seed of the samples and of random starts.")
     ] = 0,
-    weights: WeightsText = WEIGHTS_TEXT,
+    weights: Annotated[
+        str,
+        typer.Option(
+            "--weights",
+            help='"lambda1,lambda2", up to lambda5; "NAME=WEIGHT" for terms of your own. With --domain branch the '
+            "first two weigh leaks and mutual angles, and its own weights are the default.",
+        ),
+    ] = WEIGHTS_TEXT,
     angles: Annotated[
         str | None,
         typer.Option(
@@ -157,10 +164,9 @@ def fit(
     if exact and (kind != _BRANCH or like is None):
         raise OptionError("--exact requires --domain branch and --like")
     if kind == _BRANCH:
-        loss_text = None if weights == WEIGHTS_TEXT else weights
-        own = {"solver": solver, "max-mutual-deg": max_mutual_deg, "weights": loss_text, "angles": angles}
+        own = {"solver": solver, "max-mutual-deg": max_mutual_deg}
         if given := [name for name, value in own.items() if value is not None]:
-            raise OptionError(f"--domain branch has a solver and a loss of its own: leave out --{given[0]}")
+            raise OptionError(f"--domain branch has a solver of its own: leave out --{given[0]}")
 
     # What can be refused is refused before anything takes time.
     built = None if kind else _build_problem(problem, words, corridor)
@@ -169,7 +175,7 @@ def fit(
     param = _IN_CORRIDOR if param is None and corridor is not None else param
     parametrisation = None if param is None else parse_parametrisation(param)
     minimiser = None if solver is None else get_solver(solver)
-    loss = parse_weights(weights, angles)
+    loss, wide_loss = parse_weights(weights, angles), parse_wide_weights(weights, angles) if kind == _BRANCH else None
     quantities = None if like is None else [word.strip() for word in like.split(",")]
 
     suggestion, result = None, None
@@ -184,7 +190,16 @@ def fit(
                     result = replace(suggestion.fit, chart=replace(suggestion.fit.chart, problem=built))
             elif kind == _BRANCH:
                 result = _fit_wide(
-                    problem, words, branch, quantities, exact or None, parametrisation, samples, seed, monitor
+                    problem,
+                    words,
+                    branch,
+                    quantities,
+                    exact or None,
+                    parametrisation,
+                    wide_loss,
+                    samples,
+                    seed,
+                    monitor,
                 )
             if result is None:
                 assert built is not None
@@ -273,6 +288,7 @@ def _fit_wide(
     like: list[str] | None,
     exact: bool | None,
     parametrisation: Parametrisation | None,
+    weights: Weights | Mapping[str, float] | None,
     samples: int | None,
     seed: int,
     monitor: Monitor,
@@ -295,6 +311,7 @@ def _fit_wide(
             home=words.home if base is None else centre,
             like=like[0] if like and len(like) == 1 else like,
             exact=exact,
+            weights=weights,
             samples=samples,
             seed=seed,
             monitor=monitor,
@@ -337,7 +354,7 @@ def _save_and_report(
 def _format_fit(result: Fit, report: Report, target: Path) -> dict[str, str]:
     """What a fit prints."""
     coordinates, robot = result.chart.coordinates, result.chart.problem.robot
-    # Wide fits have no --weights.
+    # The advice is on weights of tight fits.
     rows = report.facts() if isinstance(result, WideFit) else format_report_rows(report)
     rows["robot"] = f"{robot.n} joints, {'tip' if len(robot.tips) == 1 else 'tips'} {listed(robot.tips)}"
     rows["fit"] = f"{coordinates.label}, {result.seconds:.2f} s, {result.status.value}"

@@ -48,9 +48,6 @@ SampleCount = Annotated[
         "--samples", parser=parse_whole_number, help="Number of training samples; default: from the problem size."
     ),
 ]
-WeightsText = Annotated[
-    str, typer.Option("--weights", help='"lambda1,lambda2", up to lambda5; "NAME=WEIGHT" for terms of your own.')
-]
 Limit = Annotated[
     str | None,
     typer.Option(
@@ -289,6 +286,17 @@ def parse_one_or_all(option: str, text: str) -> Array | float:
 
 _WEIGHTS = ("task", "mutual", "regularity", "length", "folds")
 WEIGHTS_TEXT = ",".join(f"{getattr(DEFAULT_WEIGHTS, name):g}" for name in _WEIGHTS)
+
+
+def parse_wide_weights(text: str, angles: str | None) -> Weights | Mapping[str, float] | None:
+    """Read the weights of a wide fit: numbers take the place of its own weights, terms by name alone join these."""
+    numbers = text != WEIGHTS_TEXT and any("=" not in word for word in text.split(","))
+    if angles is not None and not numbers:
+        raise OptionError("--angles requires the numbers of --weights with --domain branch, such as --weights 12,0.3")
+    if text == WEIGHTS_TEXT:
+        return None
+    weights = parse_weights(text, angles)
+    return weights if numbers else weights.extra
 
 
 def parse_weights(text: str, angles: str | None) -> Weights:

@@ -1,4 +1,4 @@
-"""Comparisons: a grid of parametrisations, solvers and seeds, fitted and evaluated on the same held-out samples."""
+"""Comparisons: a grid of parametrisations, solvers, weights and seeds, all evaluated on the same held-out samples."""
 
 import csv
 import io
@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields, replace
 from itertools import product
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from orthocas.bases.family import Parametrisation
 from orthocas.bases.registry import require_savable
@@ -22,16 +22,19 @@ from orthocas.charts.chart_file import CHART
 from orthocas.charts.quality import evaluate
 from orthocas.codegen.library import control_tick
 from orthocas.errors import ChartFileError, Interrupted, InvalidValueError, OrthocasError
-from orthocas.fitting.fit import fit
+from orthocas.fitting.fit import Fit, fit
 from orthocas.fitting.settings import choose_solver
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
+from orthocas.fitting.wide import WideFit, fit_wide
 from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.protocol import Solver, Status
+from orthocas.tasks.branches import Branch, branches
+from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem
 from orthocas.tools.archive import require_free
 from orthocas.tools.batch import THREADS
 from orthocas.tools.checks import as_path, require_count, require_kind
-from orthocas.tools.display import Shown
+from orthocas.tools.display import Shown, percent
 from orthocas.tools.files import open_draft_folder, publish, require_writable, write_temporary
 from orthocas.tools.interrupts import deferred
 from orthocas.tools.json import clean, write_json
@@ -41,6 +44,8 @@ from orthocas.tools.progress import Monitor, Progress, silent
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_UNSAFE = r"[^\w.-]"  # in names of files
+WIDE = "wide"  #: in place of the name of a solver
 HELD_OUT_SEED = 2**31  #: seed of the held-out samples; no fit of a grid uses it
 
 
@@ -49,8 +54,9 @@ def compare(
     parametrisations: Sequence[Parametrisation],
     solvers: Sequence[Solver] | None = None,
     *,
+    branch: Branch | Box | str | None = None,
     seeds: int = 1,
-    weights: Weights | WeightNumbers = DEFAULT_WEIGHTS,
+    weights: Weights | WeightNumbers | Sequence[Weights | WeightNumbers] | None = None,
     samples: int | None = None,
     held_out: int = 100_000,
     executor: Executor | None = None,
@@ -60,19 +66,24 @@ def compare(
     monitor: Monitor = silent,
     force: bool = False,
 ) -> "Comparison":
-    """Fit every parametrisation with every solver and seed, and evaluate all on the same held-out samples.
+    """Fit every parametrisation with every solver, weights and seed, and evaluate all on the same held-out samples.
 
     If a fit fails, the result says so and the others continue. Coordinates in closed form need no solver and no seed,
     so they are evaluated once.
 
+    With a branch the fits are those of `fit_wide`, each evaluated on its own domain. Several weights then show what
+    less leak costs: regular share of the branch and conditioning, as a front (`plot`) and as a table (`rows`).
+
     In scripts, call it under `if __name__ == "__main__"`: it starts processes.
 
     Args:
-        problem: robot, task, metric and domain.
+        problem: robot, task, metric and domain. A branch takes the place of the domain.
         parametrisations: the parametrisations to fit.
-        solvers: the solvers to use. Default: for each parametrisation the default of `fit`.
+        solvers: the solvers to use. Default: for each parametrisation the default of `fit`. Wide fits have their own.
+        branch: fit wide charts of it; a branch of `orthocas.branches`, its name, or a box, as in `fit_wide`.
         seeds: number of seeds 0, 1, ... of samples and random starts.
-        weights: weights of the loss; see `fit`.
+        weights: weights of the loss, or several of them; see `fit`, and `fit_wide` for a branch: there 2 m a weighs
+            leaks a times as much as the default. Default: those of these functions.
         samples: number of training samples. Default: grows with the number of parameters.
         held_out: number of held-out samples.
         executor: any `concurrent.futures.Executor` (processes, threads, Dask, MPI, ...). Default: processes on this
@@ -85,7 +96,9 @@ def compare(
         force: replace files in the folder for charts that are no charts.
 
     Raises:
-        InvalidValueError: if the grid is empty, or two of its parametrisations or solvers have the same name.
+        InvalidValueError: if the grid is empty, two of its parametrisations, solvers or weights are the same, or there
+            are solvers for wide fits.
+        UnknownNameError: if there is no such branch.
         ChartFileError: if the folder for charts cannot be written, or has another file with the name of a chart.
         Interrupted: after Ctrl-C; its `result` is the comparison of the finished fits.
 
@@ -105,9 +118,13 @@ def compare(
         ['linear', 'polynomial:2']
     """
     require_kind("problem", problem, Problem)
-    seeds, held_out, loss = require_count("seeds", seeds), require_count("held_out", held_out), Weights.of(weights)
+    seeds, held_out = require_count("seeds", seeds), require_count("held_out", held_out)
+    losses = _list_weights(weights, None if branch is not None else DEFAULT_WEIGHTS)
     jobs = None if jobs is None else require_count("jobs", jobs)
     _check_grid(parametrisations, solvers)
+    part = branches(problem.robot, problem.task)[branch] if isinstance(branch, str) else branch
+    if part is not None and solvers is not None:
+        raise InvalidValueError("solvers", "given with a branch", "no solvers: wide fits have their own")
     folder = None if charts is None else as_path("charts", charts)
     if folder is not None:
         require_writable(folder / "chart", ChartFileError)
@@ -116,20 +133,11 @@ def compare(
     elif control_ticks:
         raise InvalidValueError("charts", None, "a folder for charts: control_ticks are measured on them")
 
-    # Coordinates in closed form need neither solver nor seed.
-    cells = []
-    for parametrisation in parametrisations:
-        closed = parametrisation.closed_form is not None
-        fitting = [choose_solver(parametrisation, problem)] if closed or solvers is None else solvers
-        for solver, seed in product(fitting, range(1 if closed else seeds)):
-            name = re.sub(r"[^\w.-]", "-", f"{parametrisation.label}_{solver.name}_{seed}.orthocas")
-            file = None if folder is None else folder / name
-            if file is not None:
-                require_free(file, CHART, force)
-            cells.append(Cell(problem, parametrisation, solver, seed, loss, samples, held_out, file, force))
+    first = Cell(problem, parametrisations[0], None, 0, losses[0], samples, held_out, None, force, part)
+    cells = _build_cells(first, parametrisations, solvers, losses, seeds, folder)
 
     # Results arrive in any order, and return in that of the grid.
-    order = {(cell.parametrisation.label, cell.solver_name, cell.seed): k for k, cell in enumerate(cells)}
+    order = {cell.names: k for k, cell in enumerate(cells)}
     results: list[CellResult] = []
     interrupted = False
     try:
@@ -138,11 +146,55 @@ def compare(
             results = measure_control_ticks(results, cells, monitor)
     except KeyboardInterrupt:
         interrupted = True
-    results.sort(key=lambda result: order[result.parametrisation, result.solver, result.seed])
+    results.sort(key=lambda result: order[result.names])
     comparison = Comparison(tuple(results), interrupted)
     if interrupted:
         raise Interrupted(comparison)
     return comparison
+
+
+def _list_weights(
+    weights: Weights | WeightNumbers | Sequence[Weights | WeightNumbers] | None, default: Weights | None
+) -> list[Weights | None]:
+    """The weights of a grid, one or several."""
+    if weights is None:
+        return [default]
+    if isinstance(weights, Weights) or not any(isinstance(each, Weights | Sequence) for each in weights):
+        return [Weights.of(cast(Weights | WeightNumbers, weights))]
+    several = [Weights.of(cast(Weights | WeightNumbers, each)) for each in weights]
+    labels = [each.label for each in several]
+    if twice := [label for label in labels if labels.count(label) > 1]:
+        raise InvalidValueError("weights", f"a list with {twice[0]} twice", "different ones")
+    return list(several)
+
+
+def _build_cells(
+    first: "Cell",
+    parametrisations: Sequence[Parametrisation],
+    solvers: Sequence[Solver] | None,
+    losses: Sequence[Weights | None],
+    seeds: int,
+    folder: Path | None,
+) -> list["Cell"]:
+    """The cells of a grid, with all else like the first one. Coordinates in closed form need neither solver nor seed.
+
+    Raises:
+        ChartFileError: if a file has the name of a chart, and is not to be replaced.
+    """
+    cells = []
+    for parametrisation in parametrisations:
+        closed = parametrisation.closed_form is not None
+        fitting = [choose_solver(parametrisation, first.problem)] if closed or solvers is None else solvers
+        for solver, loss, seed in product(fitting, losses[:1] if closed else losses, range(1 if closed else seeds)):
+            cell = replace(first, parametrisation=parametrisation, solver=solver, weights=loss, seed=seed)
+            if folder is not None:
+                words = [parametrisation.label, solver.name if first.branch is None else WIDE, str(seed)]
+                words += [cell.weights_label] if len(losses) > 1 else []
+                file = folder / f"{re.sub(_UNSAFE, '-', '_'.join(words))}.orthocas"
+                require_free(file, CHART, first.force)
+                cell = replace(cell, chart_file=file)
+            cells.append(cell)
+    return cells
 
 
 def _check_grid(parametrisations: Sequence[Parametrisation], solvers: Sequence[Solver] | None) -> None:
@@ -171,23 +223,45 @@ class Cell:
 
     problem: Problem
     parametrisation: Parametrisation
-    solver: Solver
+    solver: Solver | None  #: None for the default, and for wide fits
     seed: int
-    weights: Weights
+    weights: Weights | None  #: None for those of a wide fit
     samples: int | None
     held_out: int
     chart_file: Path | None  #: file to save the chart in
     force: bool = False  #: replace a file there that is not a chart
+    branch: Branch | Box | None = None  #: of a wide fit
 
     @property
     def solver_name(self) -> str:
         """Name of the solver. Coordinates in closed form need none."""
+        if self.branch is not None:
+            return WIDE
+        assert self.solver is not None
         return self.solver.name if self.parametrisation.closed_form is None else "closed form"
 
     def fail(self, error: str) -> "CellResult":
         """The result if the fit failed."""
-        names = (self.problem.name, self.parametrisation.label, self.solver_name)
-        return CellResult(*names, self.seed, Status.FAILED.value, " ".join(error.split()))
+        return CellResult(*self.names, Status.FAILED.value, " ".join(error.split()))
+
+    @property
+    def weights_label(self) -> str:
+        """The weights as commands take them; empty for those of a wide fit."""
+        return "" if self.weights is None else self.weights.label
+
+    @property
+    def names(self) -> tuple[str, str, str, str, int]:
+        """What tells a cell from others: problem, parametrisation, solver, weights, seed."""
+        return self.problem.name, self.parametrisation.label, self.solver_name, self.weights_label, self.seed
+
+    def fit(self, monitor: Monitor) -> Fit:
+        """Fit the chart."""
+        settings: dict[str, Any] = {"weights": self.weights, "samples": self.samples, "seed": self.seed}
+        if self.branch is None:
+            return fit(self.problem, self.parametrisation, self.solver, monitor=monitor, **settings)
+        robot, task, metric = self.problem.robot, self.problem.task, self.problem.metric
+        settings |= {"parametrisation": self.parametrisation, "monitor": monitor}
+        return fit_wide(robot, task, self.branch, metric, **settings)
 
 
 @dataclass(frozen=True)
@@ -197,6 +271,7 @@ class CellResult:
     problem: str
     parametrisation: str
     solver: str
+    weights: str  #: as commands take them; empty for those of wide fits
     seed: int
     status: str
     error: str = ""
@@ -212,9 +287,15 @@ class CellResult:
     conditioning_p01: float = float("nan")
     conditioning_mean: float = float("nan")
     folded_samples: int = 0
+    regular_share: float = float("nan")  #: of the branch, for wide fits
     control_tick_us: float = float("nan")  #: a tick of decoupled PD+ as generated C; NaN if not measured
     #: seconds since the start of the fit, and training loss, in its last stage
     history: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def names(self) -> tuple[str, str, str, str, int]:
+        """Those of its cell."""
+        return self.problem, self.parametrisation, self.solver, self.weights, self.seed
 
     @property
     def failed(self) -> bool:
@@ -236,25 +317,14 @@ def run_cell(cell: Cell) -> CellResult:
             history.append((time.perf_counter() - start, progress.value))
 
     try:
-        result = fit(
-            cell.problem,
-            cell.parametrisation,
-            cell.solver,
-            weights=cell.weights,
-            samples=cell.samples,
-            seed=cell.seed,
-            monitor=record,
-        )
+        result = cell.fit(record)
         if cell.chart_file is not None:
             result.chart.save(cell.chart_file, cell.force)
         report = evaluate(result.chart, cell.held_out, HELD_OUT_SEED)
     except Exception as error:
         return cell.fail(f"{type(error).__name__}: {error}")
     return CellResult(
-        problem=cell.problem.name,
-        parametrisation=cell.parametrisation.label,
-        solver=cell.solver_name,
-        seed=cell.seed,
+        *cell.names,
         status=result.status.value,
         seconds=result.seconds,
         parameters=result.chart.coordinates.size,
@@ -268,6 +338,7 @@ def run_cell(cell: Cell) -> CellResult:
         conditioning_p01=report.conditioning.p01,
         conditioning_mean=report.conditioning.mean,
         folded_samples=report.folded_samples,
+        regular_share=result.regular_share if isinstance(result, WideFit) else math.nan,
         history=tuple(history),
     )
 
@@ -367,10 +438,11 @@ def measure_control_ticks(results: Sequence[CellResult], cells: Sequence[Cell], 
 
 @dataclass(frozen=True)
 class Summary:
-    """One parametrisation and solver over all seeds: medians, and the relative spread of both angles."""
+    """One parametrisation, solver and weights over all seeds: medians, and the relative spread of both angles."""
 
     parametrisation: str
     solver: str
+    weights: str
     seeds: int
     failed: int
     error: str  #: error of the first failed seed
@@ -380,6 +452,7 @@ class Summary:
     mutual_std_deg: float
     leak_rms_deg: float  #: in the metric; the two above are the paper's
     conditioning_p01: float
+    regular_share: float  #: of the branch, for wide fits
     folded_samples: int
     control_tick_us: float  #: duration of a decoupled PD+ tick as generated C
     task_spread: float  #: (largest - smallest) / median
@@ -393,13 +466,19 @@ class Comparison(Shown):
     results: tuple[CellResult, ...]
     interrupted: bool = False  #: whether Ctrl-C stopped it before all fits were done
 
+    @property
+    def wide(self) -> bool:
+        """Whether the fits are wide ones."""
+        return any(result.solver == WIDE for result in self.results)
+
     def summaries(self) -> list[Summary]:
-        """One summary per parametrisation and solver, best task angle first, failed ones last."""
-        groups: dict[tuple[str, str], list[CellResult]] = {}
+        """One per parametrisation, solver and weights, best task angle (wide: leak) first, failed ones last."""
+        groups: dict[tuple[str, str, str], list[CellResult]] = {}
         for result in self.results:
-            groups.setdefault((result.parametrisation, result.solver), []).append(result)
+            groups.setdefault((result.parametrisation, result.solver, result.weights), []).append(result)
+        angle = "leak_rms_deg" if self.wide else "task_std_deg"
         summaries = [summarise(results) for results in groups.values()]
-        return sorted(summaries, key=lambda s: (math.isnan(s.task_std_deg), s.task_std_deg))
+        return sorted(summaries, key=lambda s: (math.isnan(getattr(s, angle)), getattr(s, angle)))
 
     def write(self, folder: Path, force: bool = False) -> None:
         """Write comparison.csv (one line per fit) and comparison.json (with histories).
@@ -427,32 +506,56 @@ class Comparison(Shown):
         }
 
     def facts(self) -> dict[str, str]:
-        """The summaries, best task angle first."""
+        """The summaries, the best one first."""
         failed = sum(result.failed for result in self.results)
         ended = ", interrupted" if self.interrupted else ""
         return {
             "comparison": f"{len(self.results)} fits, {failed} failed{ended}",
-            **{f"{s.parametrisation}, {s.solver}": _describe(s) for s in self.summaries()},
+            **{
+                ", ".join([s.parametrisation, s.solver] + [s.weights] * self._several): _describe(s)
+                for s in self.summaries()
+            },
         }
 
     def plot(self) -> "Figure":
-        """Errors of all fits over what they cost, as a matplotlib figure; see `comparison_figures.front_figure`."""
+        """Angles of all fits, or leaks over what they cost, as a figure; see `comparison_figures.front_figure`."""
         from orthocas.fitting.comparison_figures import front_figure  # with matplotlib, which takes long to import
 
         return front_figure(self)
 
     def rows(self) -> list[list[str]]:
         """The rows of a readable table, with the header first."""
-        head = ["parametrisation", "solver", "parameters", "task std", "mutual std", "leak rms", "cond 1 %", "folded"]
-        head += ["seconds", "control tick"]
-        return [head, *(_row(summary) for summary in self.summaries())]
+        rows = [_row(summary) for summary in self.summaries()]
+        hidden = {name for name, shown in (("weights", self._several), ("regular share", self.wide)) if not shown}
+        return [[name for name in _COLUMNS if name not in hidden]] + [
+            [text for name, text in row.items() if name not in hidden] for row in rows
+        ]
+
+    @property
+    def _several(self) -> bool:
+        return len({result.weights for result in self.results}) > 1
 
 
-_MEDIANS = ("seconds", "task_std_deg", "mutual_std_deg", "leak_rms_deg", "conditioning_p01", "control_tick_us")
+_COLUMNS = (
+    "parametrisation",
+    "solver",
+    "weights",
+    "parameters",
+    "task std",
+    "mutual std",
+    "leak rms",
+    "cond 1 %",
+    "regular share",
+    "folded",
+    "seconds",
+    "control tick",
+)
+_ANGLES = ("task_std_deg", "mutual_std_deg", "leak_rms_deg", "conditioning_p01")
+_MEDIANS = (*_ANGLES, "seconds", "regular_share", "control_tick_us")
 
 
 def summarise(results: Sequence[CellResult]) -> Summary:
-    """Medians over the seeds of one parametrisation and solver."""
+    """Medians over the seeds of one parametrisation, solver and weights."""
     good = [result for result in results if not result.failed]
     first = (good or results)[0]
 
@@ -466,6 +569,7 @@ def summarise(results: Sequence[CellResult]) -> Summary:
     return Summary(
         parametrisation=first.parametrisation,
         solver=first.solver,
+        weights=first.weights,
         seeds=len(results),
         failed=len(results) - len(good),
         error=next((result.error for result in results if result.failed), ""),
@@ -480,13 +584,19 @@ def summarise(results: Sequence[CellResult]) -> Summary:
 def _describe(s: Summary) -> str:
     if s.failed == s.seeds:
         return f"failed: {s.error}"
+    if s.solver == WIDE:
+        share = percent(s.regular_share, 3)
+        return f"leak rms {s.leak_rms_deg:.2f} deg, conditioning 1 % {s.conditioning_p01:.3f}, regular {share}"
     angles = f"task std {s.task_std_deg:.3f}, mutual std {s.mutual_std_deg:.3f}, leak rms {s.leak_rms_deg:.3f} deg"
     return f"{angles}, {s.seconds:.2f} s"
 
 
-def _row(s: Summary) -> list[str]:
+def _row(s: Summary) -> dict[str, str]:
+    """The cells of a row by their columns; the last one of a short row may be long."""
+    failed = f" ({s.failed} of {s.seeds} failed)" if 0 < s.failed < s.seeds else ""
+    names = {"parametrisation": s.parametrisation, "solver": s.solver + failed, "weights": s.weights}
     if s.failed == s.seeds:
-        return [s.parametrisation, s.solver, f"failed: {s.error}"]
+        return {**names, "error": f"failed: {s.error}"}
     several = s.seeds - s.failed > 1
 
     def angle(value: float, spread: float) -> str:
@@ -494,15 +604,15 @@ def _row(s: Summary) -> list[str]:
             return "-"
         return f"{value:.3f} ±{50 * spread:.1f} %" if several else f"{value:.3f}"
 
-    return [
-        s.parametrisation,
-        s.solver + (f" ({s.failed} of {s.seeds} failed)" if s.failed else ""),
+    cells = (
         str(s.parameters),
         angle(s.task_std_deg, s.task_spread),
         angle(s.mutual_std_deg, s.mutual_spread),
         f"{s.leak_rms_deg:.3f}",
         f"{s.conditioning_p01:.3f}",
+        percent(s.regular_share, 3) if math.isfinite(s.regular_share) else "-",
         str(s.folded_samples),
         f"{s.seconds:.2f}",
         "-" if math.isnan(s.control_tick_us) else f"{s.control_tick_us:.3g} us",
-    ]
+    )
+    return {**names, **dict(zip(_COLUMNS[len(names) :], cells, strict=True))}

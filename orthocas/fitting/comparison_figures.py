@@ -30,7 +30,12 @@ def front_figure(comparison: "Comparison") -> Figure:
     parametrisation has one label, at its least task angle. A grey line connects the fits that no other one beats in
     both directions (medians over seeds). With one extra coordinate there is no mutual angle, so the axis shows the 1 %
     quantile of the conditioning.
+
+    Wide fits are shown by their leak against what it costs: the part of the branch where coordinates are not regular,
+    and the conditioning. Lines connect the weights of one parametrisation, which stand at the points.
     """
+    if comparison.wide:
+        return _wide_front_figure(comparison)
     summaries = [summary for summary in comparison.summaries() if summary.failed < summary.seeds]
     figure = Picture(figsize=(8.6, 5.2), layout="constrained")
     axes = figure.add_subplot()
@@ -57,6 +62,31 @@ def front_figure(comparison: "Comparison") -> Figure:
     axes.set_title(f"{_problem(comparison)}: held-out quality; size is the number of parameters", fontsize=10)
     axes.grid(alpha=0.3, which="both")
     _label(axes, summaries, single, colours)
+    return figure
+
+
+def _wide_front_figure(comparison: "Comparison") -> Figure:
+    """The leak of wide fits against what of the branch they leave out, above, and their conditioning, below."""
+    figure = Picture(figsize=(8.6, 5.2), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    summaries = [summary for summary in comparison.summaries() if summary.failed < summary.seeds]
+    colours = _colours([result for result in comparison.results if not result.failed])
+    for name, colour in colours.items():
+        own = [summary for summary in summaries if summary.parametrisation == name]
+        leaks = [summary.leak_rms_deg for summary in own]
+        left_out = [100 * (1 - summary.regular_share) for summary in own]
+        for axes, values in ((upper, left_out), (lower, [summary.conditioning_p01 for summary in own])):
+            axes.plot(leaks, values, "o-", color=colour, label=name)
+            for summary, *place in zip(own, leaks, values, strict=True):
+                axes.annotate(summary.weights, place, xytext=(5, 4), textcoords="offset points", fontsize=7)
+    upper.set(ylabel="not regular [% of the branch]")
+    lower.set(xlabel="leak, root mean square [deg]", ylabel="conditioning, 1 % quantile")
+    upper.set_title(f"{_problem(comparison)}: what less leak costs, by weights", fontsize=10)
+    upper.legend(fontsize=8)
+    for axes in (upper, lower):
+        axes.set_ylim(0, 1.2 * axes.get_ylim()[1])
+        axes.margins(x=0.12)
+        axes.grid(alpha=0.3)
     return figure
 
 
@@ -113,8 +143,8 @@ def _place(summary: "Summary", single: bool) -> tuple[float, float]:
     return summary.task_std_deg, summary.conditioning_p01 if single else summary.mutual_std_deg
 
 
-def _key(summary: "Summary") -> tuple[str, str]:
-    return summary.parametrisation, summary.solver
+def _key(summary: "Summary") -> tuple[str, str, str]:
+    return summary.parametrisation, summary.solver, summary.weights
 
 
 def _draw_front(axes: Axes, summaries: "Sequence[Summary]", single: bool) -> None:
@@ -135,7 +165,7 @@ def _label(axes: Axes, summaries: "Sequence[Summary]", single: bool, colours: Ma
     axes.margins(x=0.12)
     axes.figure.draw_without_rendering()  # type: ignore[union-attr]  # so that places in points are known
     scale = 72 / axes.figure.dpi
-    points = {(s.parametrisation, s.solver): scale * axes.transData.transform(_place(s, single)) for s in summaries}
+    points = {_key(s): scale * axes.transData.transform(_place(s, single)) for s in summaries}
     # Left, right and height of what is there.
     boxes = [(x - _HIGH / 2, x + _HIGH / 2, y) for x, y in points.values()]
     frame = axes.get_window_extent()

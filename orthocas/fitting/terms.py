@@ -465,6 +465,14 @@ class Weights:
         return replace(self, angles="metric" if turns or problem.metric.is_inertia else "paper")
 
     @property
+    def label(self) -> str:
+        """The numbers without the last zeros, and terms by name, as commands take them: '1000,30,quiet=5'."""
+        numbers = [self.task, self.mutual, self.regularity, self.length, self.folds]
+        while len(numbers) > 2 and numbers[-1] == 0:
+            numbers.pop()
+        return ",".join([f"{number:g}" for number in numbers] + [f"{name}={w:g}" for name, w in self.extra.items()])
+
+    @property
     def by_name(self) -> dict[str, float]:
         """The weights by the names of their terms, without the fold term; without angles, those of the paper."""
         kind = "metric " if self.angles == "metric" else ""

@@ -108,6 +108,9 @@ class ChartPanel:
             format_bar(label, degrees / 15, f"{degrees:.2f}°", choose_colour(-degrees, -2, -6), value=degrees)
             for label, degrees in zip(self._labels[m:], readings.leak_deg.tolist(), strict=True)
         ]
+        if len(leaks) == 1:
+            most = 1 / float(np.cos(np.radians(readings.leak_deg[0])))
+            leaks.append(format_row("speed to hold it", most, "of the least, at most"))
         joint, fraction = readings.nearest, readings.boundary / self._half_width
         label = f"boundary {self._joints.shown[joint]}" if np.isfinite(readings.boundary) else "boundary"
         text, colour = self._joints.format_value(joint, readings.boundary), choose_colour(fraction, 0.15, 0.04)

@@ -11,6 +11,7 @@ from programs import Run
 
 import orthocas as oc
 from orthocas.charts.angles import judge_by_columns, judge_by_lapack
+from orthocas.charts.point_quality import measure_held_speeds
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
 from orthocas.fitting.fit import Fit
 from orthocas.tasks.samples import evaluate_samples, sample_uniform
@@ -48,6 +49,62 @@ def test_leaks_are_those_of_a_least_squares_projection(charts: dict[str, oc.Char
     np.testing.assert_allclose(leak.max, want.max(), atol=1e-5)
     assert leak.histogram.sum() == want.size
     assert leak.histogram[round(10 * want.max())] >= 1
+
+
+def held_speed_by_hand(chart: oc.Chart, q: np.ndarray, u: np.ndarray) -> float:
+    """|dq|_A of the motion with xi held, over the least |dq|_A, by the optimality conditions of the latter."""
+    n, m = chart.n, chart.m
+    A = np.eye(n) if chart.problem.metric.is_identity else np.asarray(chart.problem.metric.function(q))
+    J = chart.jacobian(q)
+    conditions = np.block([[A, J[:m].T], [J[:m], np.zeros((m, m))]])
+    least = np.linalg.solve(conditions, np.concatenate([np.zeros(n), u]))[:n]
+    held = np.linalg.solve(J, np.concatenate([u, np.zeros(n - m)]))
+    if chart.r == 1:  # the formula for one coordinate
+        z = scipy.linalg.null_space(J[:m])[:, 0]
+        leaning = (J[m] @ least) ** 2 / ((J[m] @ z) ** 2 / (z @ A @ z)) / (least @ A @ least)
+        np.testing.assert_allclose(held @ A @ held / (least @ A @ least), 1 + leaning, rtol=1e-9)
+    return float(np.sqrt(held @ A @ held / (least @ A @ least)))
+
+
+def test_speed_with_xi_held_is_that_of_the_optimality_conditions(charts: dict[str, oc.Chart]) -> None:
+    """For m = 1 it is the same for all velocities of the task."""
+    chart = charts["planar_x"]
+    assert (chart.m, chart.r) == (1, 2)
+    points = sample_uniform(chart.problem.domain, 200, 5)
+    want = np.array([held_speed_by_hand(chart, q, np.array([-0.3])) for q in points])
+    assert want.max() > 1.001
+    found = measure_held_speeds(chart.problem, points, chart.coordinates.jacobian(points), 0)
+    np.testing.assert_allclose(found, want, rtol=1e-9)
+    assert oc.evaluate(chart, points=points).held_speed == pytest.approx(np.quantile(want, 0.9), rel=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["planar_xy", "iiwa, A = M"])
+def test_speed_with_xi_held_is_a_quantile_over_velocities_of_the_task(charts: dict[str, oc.Chart], name: str) -> None:
+    """For r = 1 no velocity takes more than 1 / cos(leak), and some take nearly that."""
+    chart, rng = charts[name], np.random.default_rng(3)
+    points = sample_uniform(chart.problem.domain, 3000, 5)
+    velocities = rng.normal(size=(len(points), chart.m))
+    want = np.array([held_speed_by_hand(chart, q, u) for q, u in zip(points, velocities, strict=True)])
+    report = oc.evaluate(chart, points=points)
+    assert report.held_speed - 1 == pytest.approx(np.quantile(want, 0.9) - 1, rel=0.1)  # sampling: 3 to 4 %
+    assert report.as_dict()["held_speed"] == report.held_speed
+    assert f"at most {report.held_speed:.3g} times as fast as with least norm" in report.facts()["xi held"]
+    if chart.r == 1:
+        q = points[np.argmax(chart.quality(points).leak_deg[:, 0])]
+        many = measure_held_speeds(chart.problem, np.tile(q, (500, 1)), np.tile(chart.jacobian(q)[2:], (500, 1, 1)), 0)
+        most = 1 / np.cos(np.radians(chart.quality(q).leak_deg[0]))
+        assert most * (1 - 1e-3) < many.max() < most * (1 + 1e-9)
+
+
+def test_nothing_holds_coordinates_that_are_functions_of_the_task(planar_xy: oc.Problem) -> None:
+    """Exactly singular Jacobians give inf, no error."""
+    task = planar_xy.task.evaluate_jacobian(points := sample_uniform(planar_xy.domain, 4, 0))
+    regular = np.array([0.0, 0.0, 1.0])
+    J = np.stack([task[0, :1], task[1, :1], regular[None], regular[None]])
+    speeds = measure_held_speeds(planar_xy, points, J, 0)
+    assert (speeds[:2] > 1e9).all()
+    assert np.isfinite(speeds[2:]).all()
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import json
 import os
 import pty
+import re
 import signal
 import subprocess
 import sys
@@ -355,12 +356,38 @@ def test_compare_writes_tables_pictures_and_charts(run: Run, tmp_path: Path) -> 
     assert json.loads(out)["summaries"][0]["solver"] == "closed form"
 
 
+@pytest.mark.slow
+def test_compare_shows_the_front_of_wide_fits(run: Run, tmp_path: Path) -> None:
+    fits = (
+        "--domain",
+        "branch",
+        "--param",
+        "polynomial:3",
+        "--samples",
+        "1000",
+        "--weights",
+        "4,0",
+        "--weights",
+        "400,0",
+    )
+    code, out, err = run("compare", "planar_3r_xy", *fits, "--held-out", "500", "--jobs", "1", "--out", "front")
+    assert (code, err) == (0, "")
+    assert re.search(r"parametrisation +solver +weights .* regular share", out)
+    assert re.search(r"polynomial:3 +wide +400,0 .* [0-9.]+%", out)
+    data = json.loads((tmp_path / "front" / "comparison.json").read_text())["fits"]
+    assert data[1]["leak_rms_deg"] < data[0]["leak_rms_deg"] - 5.0
+    chart = oc.load(tmp_path / "front" / "charts" / "polynomial-3_wide_0_400-0.orthocas")
+    assert chart.notes["share of the branch"] == data[1]["regular_share"]
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (("compare", "iiwa", "--param", "spline:2"), "unknown parametrisation 'spline'"),
         (("compare", "iiwa", "--solver", "sgd"), "unknown solver 'sgd'"),
         (("compare", "iiwa", "--seeds", "0"), "seeds is 0"),
+        (("compare", "iiwa", "--domain", "auto"), "--domain is 'auto', expected branch or branch:NAME"),
+        (("compare", "iiwa", "--weights", "1000"), "two to five numbers"),
         (("compare", "iiwa", "--out", "file"), "--out is file, expected a folder"),
     ],
 )

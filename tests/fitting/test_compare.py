@@ -23,11 +23,12 @@ from programs import python
 import orthocas as oc
 from orthocas import solvers
 from orthocas.bases import register_parametrisation
-from orthocas.errors import ArchiveError, ChartFileError, Interrupted, InvalidValueError
+from orthocas.errors import ArchiveError, ChartFileError, Interrupted, InvalidValueError, UnknownNameError
 from orthocas.fitting.compare import HELD_OUT_SEED, Cell, CellResult, Comparison, run_cell, run_cells
 from orthocas.fitting.comparison_figures import convergence_figure, front_figure
 from orthocas.fitting.terms import Weights
 from orthocas.tools import batch, processes
+from orthocas.tools.display import percent
 from orthocas.tools.progress import Progress
 
 QUICK: dict[str, Any] = {"samples": 150, "held_out": 500}
@@ -218,6 +219,51 @@ def test_front_of_one_coordinate_shows_the_conditioning(planar_xy: oc.Problem) -
 
 
 @pytest.mark.slow
+def test_several_weights_are_a_front(planar_x: oc.Problem, tmp_path: Path) -> None:
+    """Of tight fits: a larger lambda2 buys mutual angles with task angles."""
+    weights = [(1000.0, 1.0), oc.Weights(1000.0, 1000.0, 0.0, 0.0, 0.0)]
+    families, places = [oc.Polynomial(2), oc.Linear()], {"charts": tmp_path, "executor": InThisThread()}
+    found = oc.compare(planar_x, families, weights=weights, **places, **QUICK)
+    assert [(r.parametrisation, r.weights) for r in found.results] == [
+        ("polynomial:2", "1000,1"),
+        ("polynomial:2", "1000,1000"),
+        ("linear", "1000,1"),
+    ]
+    little, much, _ = found.results
+    assert much.mutual_std_deg < little.mutual_std_deg
+    assert much.task_std_deg > little.task_std_deg
+    assert len(found.summaries()) == len(found.facts()) - 1 == 3
+    for result, file in ((little, "1000-1"), (much, "1000-1000")):
+        chart = oc.load(tmp_path / f"polynomial-2_gauss_newton_0_{file}.orthocas")
+        assert result.task_std_deg == oc.evaluate(chart, 500, HELD_OUT_SEED).task_angle.std
+
+
+@pytest.mark.slow
+def test_front_of_wide_fits_trades_leak_for_the_rest() -> None:
+    robot = oc.Robot.planar([1.0, 1.0, 1.0], [3.0, 3.0, 3.0])
+    task = oc.Task.position(robot, "xy")
+    problem, settings = oc.Problem(robot, task), {"executor": InThisThread(), "samples": 1000, "held_out": 1000}
+    weights = [(40.0, 0.0), (1e-6, 0.0)]
+    found = oc.compare(problem, [oc.Polynomial(3)], branch="whole", weights=weights, **settings)
+    aligned, leaning = found.results
+    assert (aligned.weights, aligned.solver, leaning.weights) == ("40,0", "wide", "1e-06,0")
+    assert aligned.leak_rms_deg < leaning.leak_rms_deg - 10.0
+    direct = oc.fit_wide(
+        robot, task, "whole", parametrisation=oc.Polynomial(3), weights=Weights.of((40, 0)), samples=1000
+    )
+    assert aligned.regular_share == direct.regular_share
+    assert aligned.leak_rms_deg == oc.evaluate(direct.chart, 1000, HELD_OUT_SEED).leak.rms
+    head, best, worst = found.rows()
+    assert [row[head.index("weights")] for row in (best, worst)] == ["40,0", "1e-06,0"]
+    assert best[head.index("regular share")] == percent(aligned.regular_share, 3)
+    upper, lower = front_figure(found).axes
+    places = [(r.leak_rms_deg, 100 * (1 - r.regular_share)) for r in found.results]
+    np.testing.assert_allclose(upper.lines[0].get_xydata(), places)
+    np.testing.assert_allclose(lower.lines[0].get_ydata(), [r.conditioning_p01 for r in found.results])
+    assert [text.get_text() for text in lower.texts] == ["40,0", "1e-06,0"]
+
+
+@pytest.mark.slow
 def test_process_that_dies_fails_alone(planar_x: oc.Problem) -> None:
     told: list[Progress] = []
     found = oc.compare(
@@ -248,7 +294,8 @@ def test_processes_use_one_thread_each_and_leave_the_environment_alone(monkeypat
 def test_full_disk_for_temporary_files_is_named() -> None:
     """A limit on the size of files stands for a full disk."""
     code = """
-import resource, orthocas as oc
+import resource, sys, orthocas as oc
+sys.dont_write_bytecode = True  # truncated files would break later imports
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 try:
     oc.compare(oc.problems.get("planar_3r_x"), [oc.Linear()], samples=30, held_out=50)
@@ -331,9 +378,13 @@ def test_bad_settings_are_refused(planar_x: oc.Problem) -> None:
         ({"parametrisations": [oc.Linear(), oc.Linear((0.6, 0.8, 0.8))]}, "two called 'linear'"),
         ({"solvers": []}, "solvers is empty"),
         ({"solvers": [solvers.LBFGS(), solvers.LBFGS(memory=5)]}, "two called 'lbfgs'"),
+        ({"weights": [(1.0, 0.5), oc.Weights(1.0, 0.5, 0.0, 0.0, 0.0)]}, "weights is a list with 1,0.5 twice"),
+        ({"solvers": [solvers.LBFGS()], "branch": planar_x.domain}, "wide fits have their own"),
     ):
         with pytest.raises(InvalidValueError, match=message):
             oc.compare(planar_x, **{"parametrisations": [oc.Linear()], **grid})
+    with pytest.raises(UnknownNameError, match="unknown branch 'up', known: whole"):
+        oc.compare(planar_x, [oc.Polynomial(2)], branch="up")
     with pytest.raises(ChartFileError, match="folder missing does not exist"):
         oc.compare(planar_x, [oc.Linear()], charts="missing")
     for settings in ({"seeds": 0}, {"jobs": 0}, {"held_out": 0}, {"weights": (0.0, 1.0)}):

@@ -747,11 +747,35 @@ def test_command_fits_a_branch(run: Run) -> None:
     code, out, _ = run(*words, "--domain", "branch:shoulder+ elbow- wrist+", "--samples", "3000", "--force")
     assert code == 0
     assert ": xi1: like swivel [rad]" in out
-    for option, value in (("--solver", "lbfgs"), ("--weights", "1,1"), ("--angles", "paper")):
-        message = f"orthocas: --domain branch has a solver and a loss of its own: leave out {option}\n"
-        assert run(*words, "--domain", "branch", option, value)[::2] == (2, message)
+    message = "orthocas: --domain branch has a solver of its own: leave out --solver\n"
+    assert run(*words, "--domain", "branch", "--solver", "lbfgs")[::2] == (2, message)
     message = "orthocas: no such option: --branch; the branch is named by --domain branch:NAME\n"
     assert run("fit", "iiwa", "--branch", "up")[::2] == (2, message)
+
+
+def test_command_weighs_the_terms_of_a_wide_fit(run: Run) -> None:
+    """Numbers are weights of leaks in the metric; terms by name join the weights that wide fits have of their own."""
+    words = ("fit", "planar_3r_xy", "--metric", "euclidean", "--domain", "branch", "--param", "polynomial:3")
+    words = (*words, "--samples", "1000", "--json")
+
+    def weights(*more: str) -> tuple[dict[str, object], float]:
+        code, out, err = run(*words, "--out", "a.orthocas", "--force", *more)
+        assert (code, err) == (0, "")
+        notes, leak = oc.load("a.orthocas").notes, json.loads(out)["leak_deg"]["rms"]
+        return {name: value for name, value in notes.items() if name.startswith("weight")}, leak
+
+    plain, leaning = weights(), weights("--weights", "1e-6,0")
+    assert plain[0] == {}
+    assert leaning[0] == {"weight of metric task": 1e-6}
+    assert plain[1] < leaning[1] - 1.0
+    assert weights("--weights", "length=0.1")[0] == {"weight of length": 0.1}
+    assert weights("--weights", "12,0,length=0.1", "--angles", "paper")[0] == {
+        "weight of task": 12.0,
+        "weight of length": 0.1,
+    }
+    message = "orthocas: --angles requires the numbers of --weights with --domain branch, such as --weights 12,0.3\n"
+    assert run(*words, "--angles", "paper")[::2] == (2, message)
+    assert "unknown loss term 'calm'" in run(*words, "--weights", "calm=3")[2]
 
 
 def test_command_notes_what_a_chart_leaves_out_of_its_branch(run: Run) -> None:

@@ -370,6 +370,12 @@ def test_the_elbow_angle_leans_farther_into_the_task_than_fitted_coordinates() -
     assert oc.evaluate(chart, points=points).leak.rms == pytest.approx(
         np.sqrt((elbow_angle.leaks(chart, points) ** 2).mean()), rel=1e-6
     )
+    panda = wide_charts.robot_of("panda")
+    problem = oc.Problem(panda, oc.Task.pose(panda))
+    points = sample_uniform(problem.domain, 50, 2)
+    for kind in ("conventional", "stereographic"):
+        own, same = (oc.fit(problem, angle).chart for angle in (oc.SEW(kind), elbow_angle.through_origins(panda, kind)))
+        np.testing.assert_allclose(same.xi(points), own.xi(points), atol=1e-12)
 
 
 @pytest.mark.slow

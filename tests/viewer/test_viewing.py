@@ -15,6 +15,7 @@ from public_objects import circle, fitted, joint_motion, trajectory
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.charts.point_quality import measure_held_speeds
 from orthocas.errors import InvalidValueError, MissingExtraError, NoExpressionError, ViewError
 from orthocas.tools import checks
 from orthocas.viewer import Motion, export_page, window
@@ -50,6 +51,17 @@ def test_panels_hold_the_numbers_and_escape_names() -> None:
     assert float(shown["conditioning"]) == float(quality.conditioning)
     assert float(shown["xi1"]) == quality.leak_deg[0]
     assert float(shown["boundary"]) == float(quality.boundary_distance)
+
+
+def test_panels_of_one_coordinate_show_what_holding_it_takes() -> None:
+    chart = oc.fit(oc.problems.get("planar_3r_xy"), oc.Linear()).chart
+    session = Session(chart, chart.problem.domain.centre + np.array([0.1, 0.3, -0.3]))
+    page = ChartPanel(chart).format_html(session.readings)
+    shown = dict(re.findall(r'data-oc="([^"]+)" data-value="([^"]+)"', page))
+    J, q = chart.coordinates.jacobian(session.q[None]), np.tile(session.q, (2000, 1))
+    speeds = measure_held_speeds(chart.problem, q, np.repeat(J, 2000, axis=0), 0)
+    assert float(shown["speed to hold it"]) == pytest.approx(speeds.max(), rel=1e-4)
+    assert speeds.max() > 1.001
 
 
 def test_panels_of_charts_without_boundaries() -> None:
