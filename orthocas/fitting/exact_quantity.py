@@ -11,7 +11,7 @@ from orthocas.charts.regular_part import RegularPart
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.like import Like, Likeness
 from orthocas.fitting.settings import require_parametrisation
-from orthocas.fitting.terms import RULES as LOSS
+from orthocas.fitting.terms import find_least_volume
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import sample_problem
 from orthocas.tools.checks import Array, require_kind
@@ -86,7 +86,7 @@ def take_exactly(problem: Problem, quantities: Like, exact: bool | None, counted
     coordinates, domain = _build(quantities, problem), problem.domain
     inside = counted[domain.contains(counted)]
     try:
-        regular = RegularPart(domain, coordinates, LOSS.least_volume / problem.r)
+        regular = RegularPart(domain, coordinates, find_least_volume(problem))
     except DomainError:
         if not exact:
             return None

@@ -38,8 +38,8 @@ class LikeRules:
 
     weight: float = 300.0  #: of the term of `fit`, between task (1000) and mutual angles (30)
     weight_of_one: float = 1.0  #: of the mean squared distance to the gradient of a quantity in wide fits, with r = 1
-    along_task: float = 0.1  #: of the squares of what gradients have along the task
     weight_of_several: float = 0.01  #: the same with r > 1
+    along_task: float = 0.1  #: of the squares of what gradients have along the task, relative to the rest
     still: float = 1e-9  #: of the largest projected gradient
     still_motion: float = 1e-3  #: least change of a quantity for a unit self-motion, over the length of its gradient
     scaled_against: float = 0.1  #: share of positions against the swivel up to which it gives a scale

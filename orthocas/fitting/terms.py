@@ -365,6 +365,11 @@ def register_loss_term(term: LossTerm) -> None:
     _TERMS[term.name] = term
 
 
+def find_least_volume(problem: Problem) -> float:
+    """The bound of the domain of a wide chart: least volume of coordinates in the identity metric."""
+    return (RULES.least_volume if problem.metric.is_identity else RULES.least_in_metric) / problem.r
+
+
 def find_term(name: str) -> LossTerm:
     """The term with this name.
 

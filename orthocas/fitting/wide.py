@@ -24,14 +24,13 @@ from orthocas.fitting.exact_quantity import choose_quantities, take_exactly
 from orthocas.fitting.fit import Fit, fix_gauge, normalise
 from orthocas.fitting.like import Like, Likeness, MeaningError
 from orthocas.fitting.settings import require_parametrisation
-from orthocas.fitting.terms import Weights, find_term
+from orthocas.fitting.terms import Weights, find_least_volume, find_term
 from orthocas.fitting.wide_search import (
     RULES,
     Search,
     WideSettings,
     WideSolution,
     find_best,
-    find_least_volume,
     is_on_side_of_centre,
     search_families,
 )
@@ -74,26 +73,26 @@ def fit_wide(
 
     The parameters theta of a family minimise, over samples q of the branch that are clear of singular positions::
 
-        L = mean_q [ max(0, 1 - v / t)^2 + 0.3 mean_j sin^2 a_j + 0.15 mean_jk cos^2 b_jk
+        L = mean_q [ max(0, 1 - v / t)^2 + w mean_j sin^2 a_j + 0.15 mean_jk cos^2 b_jk
                      + 0.03 sum_j log^2(l_j / L_j) + terms of `weights` ]
 
-    a_j(q) is the leak of coordinate j, b_jk the angle between the gradients of two coordinates. v(q) is the volume of
-    coordinates: det of an orthonormal basis of the task's gradients and of the unit gradients of xi, all in the
-    metric. Coordinates are regular where v is not zero; for r = 1 it is the cosine between the gradient and the self-
-    motion. With another metric than the identity, the same term for the volume in the identity metric and a small t
-    joins. The first term keeps coordinates regular, the next ones make them as orthogonal as that permits. l_j(q) is
-    the length of the gradient of xi_j, L_j its mean where the descent begins: xi is a similar motion everywhere. Half
-    of the samples are uniform, half boundary-weighted. The numbers are those of
-    `orthocas.fitting.wide_search.WideRules`.
+    w is 0.3 with A = I and 1 otherwise, a_j(q) the leak of coordinate j, b_jk the angle between the gradients of two
+    coordinates. v(q) is the volume of coordinates: det of an orthonormal basis of the task's gradients and of the unit
+    gradients of xi, all in the metric. Coordinates are regular where v is not zero; for r = 1 it is the cosine between
+    the gradient and the self-motion. With another metric than the identity, the same term for the volume in the
+    identity metric and a small t joins. The first term keeps coordinates regular, the next ones make them as orthogonal
+    as that permits. l_j(q) is the length of the gradient of xi_j, L_j its mean where the descent begins: xi is a
+    similar motion everywhere. Half of the samples are uniform, of networks 70 %, the others boundary-weighted. The
+    numbers are those of `orthocas.fitting.wide_search.WideRules`.
 
     The stages are these:
 
-    1. Under a whole pose or orientation, families without the last joint, and linear in the first one; if the first one
-       can turn fully, before them families without both: xi stays while base or tool turn about their own axes, so full
-       turns close, and rolling the hand moves no other joint. They are polynomials; in another metric than the
-       identity and with r = 1, MLP((24, 24), raw=True) is tried before each, as fast in C, with leaks 3 to 8 degrees
-       smaller, and without a proof in a useful time. They are kept if they leave out little of the branch after all
-       rounds of 4.
+    1. Under a whole pose or orientation, families without the last joint, and linear in the first one, come first. If
+       the first one can turn fully, families without both come before these. Then xi stays while base or tool turn
+       about their own axes: full turns close, and rolling the hand moves no other joint. The families are polynomials.
+       In another metric than the identity and with r = 1, MLP((24, 24), raw=True) is tried before each polynomial: its
+       leaks are smaller, but it has no proof in a useful time. A family is kept if it leaves out little of the branch
+       after all rounds of 4.
     2. Polynomials that are linear in each joint on whose position self-motions do not depend, such as the first and the
        last one, descend with L-BFGS from linear coordinates across the task at the centre of the branch. They are best
        to prove, and hold at any turn of these joints. They ask that self-motions turn base and tool in one direction.
@@ -143,10 +142,11 @@ def fit_wide(
         exact: whether xi is the quantity itself, xi = y(q), on the part of the branch where it is regular. With True it
             is, however small the part; with False it never is. Default: where the part has 99.5 % of the nonsingular
             positions, if no `parametrisation` is given. A parametrisation without parameters, such as `SEW` or
-            `Given`, is a quantity that is taken with True.
+            `Given`, is a quantity that is taken with True. Nothing is fitted then, so `weights` and `samples` do not
+            count.
         weights: weights of terms that join the loss, such as `{"name": 0.1}` for a term of `register_loss_term`; or
             `Weights`, which also take the place of those of leaks and mutual angles: `Weights(task=10.0, mutual=1.0)`.
-            They are weights of angles in the metric by default; without them, task is 2 m and mutual 0.3.
+            They are weights of angles in the metric by default; without them, task is 2 m w and mutual 0.3.
             They are means over the first samples; the worst ones of polynomials only ask for regular coordinates. A
             search for folds has no place here. Default: none.
         samples: number of samples. Default: 30 for each function, 5,000 to 20,000; 100,000 for a network.
@@ -194,8 +194,8 @@ def fit_wide(
     finish = partial(_finish, settings=settings, branch=chosen, posture=posture, counted=counted, start=start)
 
     with remembered() as pressed:
-        if (known := _solve_at_once(problem, quantities, parametrisation, exact, counted, seed)) is not None:
-            result = finish(known, interrupted=pressed())
+        if (solution := _solve_at_once(problem, quantities, parametrisation, exact, counted, seed)) is not None:
+            result = finish(solution, interrupted=pressed())
         else:
             # families to try; the domain of each covers all positions of its cyclic joints
             families = _choose_families(problem, like) if parametrisation is None else (parametrisation,)
@@ -273,11 +273,9 @@ def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomia
     turns = [k for k in base if not slides[k] and robot.upper[k] - robot.lower[k] >= 2 * np.pi]
     names, fewer = (tuple(robot.joint_names[k] for k in part) for part in (free, endless))
     families: list[Polynomial | MLP] = []
-    for left_out in ([*tool, *turns], tool) if tool and turns else (tool,) if tool else ():
-        linear, without = (
-            tuple(robot.joint_names[k] for k in part)
-            for part in ([k for k in base if k not in left_out], sorted(left_out))
-        )
+    for left_out in [[*tool, *turns]] * bool(tool and turns) + [tool] * bool(tool):
+        linear = tuple(robot.joint_names[k] for k in base if k not in left_out)
+        without = tuple(robot.joint_names[k] for k in sorted(left_out))
         if len(linear) + len(without) < robot.n - problem.r:
             if like is None and not problem.metric.is_identity and problem.r == 1:
                 families.append(MLP(RULES.small_network, True, linear, without))
@@ -322,17 +320,17 @@ def _solve_at_once(
     seed: int,
 ) -> WideSolution | None:
     """Coordinates that need no fit: quantities, or joints that do not move the task; None if there are none."""
-    known: Coordinates | None
+    coordinates: Coordinates | None
     if quantities is not None:
-        known = take_exactly(problem, quantities, exact, counted)
+        coordinates = take_exactly(problem, quantities, exact, counted)
     else:
         idle = find_idle_joints(problem, sample_problem(problem, RULES.first, (seed, RULES.first_tag)))[-problem.r :]
         if len(idle) < problem.r or parametrisation is not None:
             return None
         problem, family = _prepare(problem, _choose_families(problem, None)[0], None)
         none = np.zeros(0)
-        known = Coordinates(family, JointSpace.of(problem), tuple(idle), none, none, none)
-    return None if known is None else WideSolution(problem, known, "none", 0, ())
+        coordinates = Coordinates(family, JointSpace.of(problem), tuple(idle), none, none, none)
+    return None if coordinates is None else WideSolution(problem, coordinates, "none", 0, ())
 
 
 def _finish(
@@ -440,12 +438,15 @@ class WideFit(Fit):
         facts = super().facts()
         branch = "" if self.branch is None else self.branch.name
         share = percent(self.regular_share, 2)
-        named, exact = self.chart.parts.named_coordinates[0], "exact" in self.chart.notes
-        meaning = "" if self.meaning is None else f"{self.meaning.explained}: {named}"
+        named, meaning = self.chart.parts.named_coordinates, ""
+        if "exact" in self.chart.notes:
+            meaning = f"{'; '.join(named)}, exactly"
+        elif self.meaning is not None:
+            meaning = f"{self.meaning.explained}: {named[0]}"
         own = {
             "branch": branch,
             "regular": f"{share} of the branch's clear positions (samples); the domain is this part",
             **({"left out": self.left_out} if self.left_out else {}),
-            **({"meaning": f"{named}, exactly" if exact else meaning} if exact or meaning else {}),
+            **({"meaning": meaning} if meaning else {}),
         }
         return {"fit": facts.pop("fit"), "problem": facts.pop("problem"), **own, **facts}

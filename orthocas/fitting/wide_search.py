@@ -16,7 +16,7 @@ from orthocas.fitting.like import Like, QuadraticTerm
 from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
 from orthocas.fitting.stages import Resampled, Stage, WeightedSum
 from orthocas.fitting.terms import RULES as LOSS
-from orthocas.fitting.terms import Weights
+from orthocas.fitting.terms import Weights, find_least_volume
 from orthocas.solvers.adam import Adam
 from orthocas.solvers.lbfgs import LBFGS
 from orthocas.solvers.protocol import Objective, Solver, SolveResult
@@ -46,7 +46,7 @@ class WideRules:
     mutual: float = 0.15  #: weight of the mean cos^2 between gradients of different coordinates
     evenness: float = 0.03  #: weight of the mean squared logarithm of the lengths of gradients
     uniform: float = 0.5  #: fraction of samples that are uniform; the others are boundary-weighted
-    uniform_of_networks: float = 0.7
+    uniform_of_networks: float = 0.7  #: the same of networks
     per_term: int = 30  #: samples for each basis function
     least_samples: int = 5000
     most_samples: int = 20_000
@@ -123,7 +123,7 @@ def search_families(searches: Sequence["Search"]) -> "Search":
     A family that leaves out joints is taken if it leaves out little of the branch. Of the others, the first one is
     taken, or the best of those that follow if it is poor.
     """
-    symmetric = [search for search in searches if search.symmetric]
+    symmetric = [search for search in searches if search.left_out]
     for search in symmetric:
         search.begin(f"{_STAGE}, {search.parametrisation.label}")
         most = RULES.poor_without_turns if len(search.left_out) > 1 else RULES.poor_without_tool
@@ -161,7 +161,7 @@ class Search:
         L = mean_q [ max(0, 1 - v(q) / t)^2 + a mean_j sin^2 leak_j(q) + 0.15 mean_jk cos^2(j, k)
                      + 0.03 sum_j log^2(l_j(q) / L_j) ] + meaning
 
-    Terms of the user join it.
+    a is 0.3 in the identity metric, 1 in others, and four times as much in a last descent. Terms of the user join it.
     Families that are linear in their parameters descend with L-BFGS from linear coordinates, in variables in which the
     basis functions have orthonormal gradients in the mean. All others descend with Adam from a random start.
 
@@ -177,7 +177,6 @@ class Search:
         self.linear = isinstance(self.family, LinearFamily)
         #: names of joints that coordinates do not depend on
         self.left_out: tuple[str, ...] = getattr(parametrisation, "without", ())
-        self.symmetric = bool(self.left_out)
         wide = int(np.clip(RULES.per_term * self.family.width, RULES.least_samples, RULES.most_samples))
         self.samples = settings.samples or (wide if self.linear else RULES.network_samples)
         self.solver: Solver = LBFGS(RULES.iterations, RULES.tolerance) if self.linear else _ADAM
@@ -219,13 +218,14 @@ class Search:
             self._add_worst(RULES.fresh, RULES.worst, RULES.fresh_tag + turn)
             name = f"worst samples, round {turn} of {RULES.rounds}"
             self._descend(name, "volume with the worst", LBFGS(RULES.further, RULES.tolerance))
-        if self._done and self._last is self.best and self.problem.r == 1 and not self.settings.weights:
-            # the gradient nearer to self-motions, if it stays regular enough; weights of a user are kept
+        # The gradient comes nearer to self-motions, if it stays regular enough. A user's balance of terms is kept.
+        balanced = self.settings.weights or self.settings.quantities
+        if self._done and self._last is self.best and self.problem.r == 1 and not balanced:
             self._alignment *= RULES.closer
             volume = "volume" if len(self._samples) == 1 else "volume with the worst"
-            self._descend("smaller leaks", volume, LBFGS(RULES.further, RULES.tolerance))
+            rank = self._descend("smaller leaks", volume, LBFGS(RULES.further, RULES.tolerance))
             if self._done:
-                self.best = self._last
+                self.best, self.rank = self._last, rank
 
     def is_enough(self, bad: float) -> bool:
         """Whether the best coordinates are regular at the centre, and at most at a fraction of samples not."""
@@ -307,8 +307,8 @@ class Search:
         volumes = np.concatenate([self._sign * self._evaluate_volumes(self._last, part) for part in parts])
         self._samples.append(sample_frames(self.problem, points[np.argsort(volumes)[:worst]]))
 
-    def _descend(self, name: str, volume: str, solver: Solver) -> None:
-        """Minimise from the last parameters, and keep the result if it is the best so far."""
+    def _descend(self, name: str, volume: str, solver: Solver) -> tuple[bool, float, float]:
+        """Minimise from the last parameters, and keep the result if it is the best so far; returns its rank."""
         count = sum(len(samples) for samples in self._samples)
         with one_blas_thread():
             if self.linear:
@@ -322,7 +322,7 @@ class Search:
                     resampled = self._build_resampled(self._choose_weights(volume))
                 result = solver.minimise(resampled, self._last, Watch(self.settings.monitor, name))
                 self._last = result.theta
-        self._take(name, replace(result, theta=self._last), count)
+        return self._take(name, replace(result, theta=self._last), count)
 
     def _weigh_regularity(self, volume: str) -> dict[str, float]:
         """Weights of the terms that keep coordinates regular, with the name of that of the volume.
@@ -387,8 +387,8 @@ class Search:
         points = sample_uniform(self.problem.domain, count, (self.settings.seed, RULES.tag, *seed))
         return sample_frames(self.problem, points)
 
-    def _take(self, name: str, result: SolveResult, samples: int) -> None:
-        """Take the result of a stage, and keep its parameters if they are the best so far."""
+    def _take(self, name: str, result: SolveResult, samples: int) -> tuple[bool, float, float]:
+        """Take the result of a stage, keep its parameters if they are the best so far, and return its rank."""
         theta, bound = result.theta, find_least_volume(self.problem)
         self.stages.append(Stage(name, theta.size, samples, result))
         # regular at the centre, and at all but few of other samples
@@ -400,8 +400,9 @@ class Search:
         rank = missed, max(bad, RULES.enough), -low
         if self.best is None or rank < self.rank:
             self.best, self.rank = theta, rank
-        self._done = bad <= RULES.enough and low >= RULES.well / self.problem.r
+        self._done = not missed and bad <= RULES.enough and low >= RULES.well / self.problem.r
         result.require_finished()
+        return rank
 
     def _evaluate_volumes(self, theta: Array, samples: Samples) -> Array:
         """The volumes of `RegularPart` in the identity metric, (N,)."""
@@ -433,11 +434,6 @@ class Search:
     def _held_out(self) -> Samples:
         """Samples that evaluate coordinates."""
         return sample_frames(self.problem, self.sample(RULES.held_out, RULES.held_out_tag))
-
-
-def find_least_volume(problem: Problem) -> float:
-    """The bound of the domain of a wide chart: least volume of coordinates in the identity metric."""
-    return (LOSS.least_volume if problem.metric.is_identity else LOSS.least_in_metric) / problem.r
 
 
 def is_on_side_of_centre(problem: Problem, points: Array) -> NDArray[np.bool_]:
