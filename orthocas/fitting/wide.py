@@ -131,7 +131,7 @@ def fit_wide(
         clearance: least relative singular value of the task, > 0; see `orthocas.ClearBox`.
         parametrisation: a family, as in `fit`. Those that are not linear in their parameters descend like networks;
             those without parameters, such as `SEW` or `Given`, are taken as they are.
-            Default: Polynomial(6) without the first and the last joint, or another one, see above.
+            Default: the first of those above that leaves out little.
         home: posture whose branch is meant, (n,) or its name. Default: as for `suggest_domain`.
         like: what coordinates are to be, or to be like: a function of an SX column q, the name of a joint, or "swivel",
             the angle of the elbow about the line from shoulder to wrist [rad]; with r > 1, several, or a task of lower

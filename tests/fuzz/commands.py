@@ -136,7 +136,12 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
     "fit --domain branch": (
         ("planar_3r_xy", *_PROBLEMS),
         {"--param": "polynomial:1", "--samples": "30", "--out": "new.orthocas"},
-        (*_PROBLEM_OPTIONS, "--task", "--metric", "--home", "--like", "--seed"),
+        (*_PROBLEM_OPTIONS, "--task", "--metric", "--home", "--like", "--weights", "--seed"),
+    ),
+    "fit --domain branch --like q3 --exact": (
+        ("planar_3r_xy", *_PROBLEMS),
+        {"--out": "new.orthocas"},
+        (*_PROBLEM_OPTIONS, "--task", "--metric", "--home", "--param", "--weights", "--seed"),
     ),
     "info --branches": ((*_PROBLEMS, *_FILES), {}, (*_PROBLEM_OPTIONS, "--task")),
     "certify": (_FILES, {"--seconds": "0.5", "--out": "new.orthocas"}, ("--bound", "--workers")),
@@ -146,7 +151,7 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
     "compare": (
         _PROBLEMS,
         {"--param": "polynomial:1", "--samples": "30", "--held-out": "50", "--jobs": "0"},
-        ("--solver", "--seeds", "--weights", "--out"),
+        ("--solver", "--seeds", "--weights", "--domain", "--out"),
     ),
     "simulate": (
         _FILES,

@@ -209,7 +209,7 @@ def _makers() -> dict[str, Call]:
         "Torus": (oc.Torus, {"n": 3}),
         "Polynomial": (oc.Polynomial, {"degree": 2, "cyclic": ["q1"]}),
         "Fourier": (oc.Fourier, {"degree": 2, "cyclic": "auto"}),
-        "MLP": (oc.MLP, {"hidden": (3, 3), "raw": True}),
+        "MLP": (oc.MLP, {"hidden": (3, 3), "raw": True, "cyclic": ["q1"], "without": ["q3"]}),
         "Mobile": (oc.Mobile, {"arm": oc.Polynomial(1), "base": ("a", "b", "c")}),
         "Circle": (oc.Circle, {"pairs": oc.Fourier(1)}),
         "SEW": (oc.SEW, {"kind": "stereographic"}),
@@ -326,7 +326,16 @@ def _functions() -> dict[str, Call]:
         "loss": (loss, {**box, "weights": (1, 1), "samples": 20, "seed": 0, "start": None}),
         "compare": (
             oc.compare,
-            {"problem": problem, "parametrisations": [], "solvers": None, "seeds": 1, "samples": 50, "held_out": 50},
+            {
+                "problem": problem,
+                "parametrisations": [],
+                "solvers": None,
+                "branch": None,
+                "weights": [(1.0, 0.1), (1.0, 1.0)],
+                "seeds": 1,
+                "samples": 50,
+                "held_out": 50,
+            },
         ),
         "singular_points": (singular_points, {"problem": problems.get("planar_2r"), "seed": 0}),
         "register_parametrisation": (
