@@ -98,7 +98,7 @@ class FitSettings:
         require_parametrisation(parametrisation)
         bound = parametrisation.for_problem(problem)
         if max_mutual_deg is not None:
-            _require_bound(bound, max_mutual_deg)
+            max_mutual_deg = _check_bound(bound, max_mutual_deg)
         # the solver; only Ipopt knows bounds
         if solver is None:
             solver = choose_solver(bound, problem) if max_mutual_deg is None else Ipopt()
@@ -168,10 +168,11 @@ def require_solver(value: object) -> None:
         raise InvalidValueError("solver", repr(value), "an object such as GaussNewton()")
 
 
-def _require_bound(parametrisation: Parametrisation, max_mutual_deg: float) -> None:
+def _check_bound(parametrisation: Parametrisation, max_mutual_deg: float) -> float:
     if parametrisation.closed_form is not None:
         raise InvalidValueError("max_mutual_deg", f"given with {parametrisation.label}", "a parametrisation to fit")
-    if not RULES.least_bound_deg <= as_number("max_mutual_deg", max_mutual_deg) < 90:
-        raise InvalidValueError(
-            "max_mutual_deg", max_mutual_deg, f"an angle from {RULES.least_bound_deg:g} to below 90 degrees"
-        )
+    bound = as_number("max_mutual_deg", max_mutual_deg)
+    if not RULES.least_bound_deg <= bound < 90:
+        expected = f"an angle from {RULES.least_bound_deg:g} to below 90 degrees"
+        raise InvalidValueError("max_mutual_deg", max_mutual_deg, expected)
+    return bound

@@ -1,5 +1,6 @@
 """SX expressions as data: tapes for files, their structure, scalar code, and users' functions of q."""
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -277,7 +278,9 @@ def call_user(what: str, expected: str, function: Callable[..., Any], *arguments
     try:
         return function(*arguments)
     except (RuntimeError, TypeError, ValueError, LookupError, ArithmeticError, AttributeError) as error:
-        reason = " ".join(str(error).split())[:120]
+        # without the places in CasADi's sources and its lists of prototypes
+        reason, *_ = " ".join(str(error).split()).partition(" Possible prototypes")
+        reason = re.sub(r"\S*\.[ch]pp:\d+: ?|\S*\w::\w\S* ?", "", reason)[:120]
         raise InvalidValueError(what, f"failing ({reason})", expected) from None
 
 

@@ -1,5 +1,8 @@
 """Tasks: Jacobians against finite differences, orientation against rotation vectors, polar against Cartesian."""
 
+import re
+from typing import Any
+
 import casadi as ca
 import numpy as np
 import pinocchio as pin
@@ -262,3 +265,18 @@ def test_the_distance_from_half_a_turn_is_that_of_rotation_matrices(kind: str) -
     assert task.turn is not None
     found = task.turn.measure_half_turn_distance(task.batched(points)[0].reshape(50, -1))
     np.testing.assert_allclose(found, wanted, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("function", "reason"),
+    [
+        (lambda q: ca.sin("x"), "Wrong number or type of arguments for overloaded function 'sin'"),
+        (lambda q: q[7], "Assertion .* out of bounds"),
+        (lambda q: 1 / 0, "division by zero"),
+    ],
+)
+def test_a_function_that_fails_is_named_without_places_in_libraries(function: Any, reason: str) -> None:
+    robot = oc.Robot.planar([1.0, 1.0, 1.0], [1.0, 1.0, 1.0])
+    with pytest.raises(InvalidValueError, match=rf"task 'mine' is failing \({reason}") as error:
+        oc.Task.custom(robot, "mine", function)
+    assert not re.search(r"prototype|\.cpp|::", str(error.value))
