@@ -173,7 +173,8 @@ def _fit(
             solution = Solution((), settings.parametrisation, None)
             coordinates = _evaluate_closed_form(problem, settings.parametrisation, samples)
         else:
-            solution, coordinates = _solve(problem, settings, monitor, samples, align_to, begin)
+            singular = problem_check.singular_samples > 0
+            solution, coordinates = _solve(problem, settings, monitor, samples, align_to, begin, singular)
         # the chart, with what a reader of the fit asks first: idle joints, worst points, a smaller domain
         joints = [i for i in coordinates.idle if i not in problem.robot.tree.floating]
         result = Fit(
@@ -224,6 +225,7 @@ def _solve(
     samples: Samples,
     align_to: Chart | None,
     begin: Begin | None,
+    singular: bool,
 ) -> tuple[Solution, Coordinates]:
     """Run the stages, and choose scale, order and signs. Joints that the task does not feel become coordinates."""
     idle = tuple(find_idle_joints(problem, samples)[-problem.r :]) if settings.split_idle else ()
@@ -236,7 +238,7 @@ def _solve(
     active = [i for i in range(problem.n) if i not in idle]
     like = None if settings.like is None else settings.like.build_term(problem, active)
     settings = settings if like is None else settings.add_term(like)
-    folds = FoldSearch(problem, active, settings.fold_weight(problem))
+    folds = FoldSearch(problem, active, settings.fold_weight(problem), singular)
     runner = StageRunner(problem, settings, active, monitor, folds, like)
     solution = Continuation(runner, r, begin).run()
     # angles leave free where xi is zero, how long its gradient is, the order and the signs

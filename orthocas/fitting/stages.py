@@ -78,8 +78,8 @@ class Continuation:
     """Solves a low degree from a spectral start, embeds the result, and solves the next degree.
 
     The worst points of each degree join the loss of the next one. The last degree is solved again until its least
-    conditioning is large enough or, without a fold, no longer grows. If folds remain after some rounds, the domain
-    forces them: then the last stage leaves the fold term out.
+    conditioning is large enough or, without a fold, no longer grows. If folds remain after some rounds, or at once where
+    the domain holds singular positions, the domain forces them: then the last stage leaves the fold term out.
 
     Args:
         runner: runs single stages.
@@ -146,7 +146,8 @@ class Continuation:
         """Solve the last step again until there is no point of small conditioning."""
         folds, before = self._runner.folds, 0.0
         for k in range(2, 2 + RULES.rounds):
-            if folds.least >= LOSS_RULES.least_conditioning or 0 <= folds.least < before + RULES.least_gain:
+            forced = folds.least < 0 and folds.singular
+            if forced or folds.least >= LOSS_RULES.least_conditioning or 0 <= folds.least < before + RULES.least_gain:
                 break
             before = folds.least
             self._solve(step, f"{step.label}, round {k}", final=True)
@@ -163,10 +164,11 @@ class FoldSearch:
         problem: problem of the fit.
         active: joints that are not coordinates themselves.
         weight: weight of the fold term; with 0 nothing is searched.
+        singular: whether samples of the domain are near singular positions of the task. Folds there are the domain's.
     """
 
-    def __init__(self, problem: Problem, active: list[int], weight: float) -> None:
-        self._problem, self._active, self._weight = problem, active, weight
+    def __init__(self, problem: Problem, active: list[int], weight: float, singular: bool) -> None:
+        self._problem, self._active, self._weight, self.singular = problem, active, weight, singular
         self._points = np.zeros((0, problem.n))
         self.worst: WorstPoints | None = None  #: of the last search
 
