@@ -93,9 +93,8 @@ class _IpoptRun:
             if not self.best.found:
                 raise
             return self.best.result(Status.INTERRUPTED)
-        return self._outcome(_STATUS.get(solver.stats()["return_status"], Status.STALLED))
-
-    def _outcome(self, status: Status) -> SolveResult:
+        # The best point that meets the constraints, or else the one with the smallest violation.
+        status = _STATUS.get(solver.stats()["return_status"], Status.STALLED)
         if self.best.found or not np.isfinite(self._least[0]):
             return self.best.result(status)
         self.best.theta = self._least[1]
@@ -156,7 +155,11 @@ class _IpoptRun:
             value, gradient = self.objective.value_and_gradient(theta)
             self.best.evaluations += 1
             self._at, self._current = (key, value, gradient), theta
-            violation = self._violation(theta) if np.isfinite(value) else np.inf
+            # The largest constraint violation; 0 without constraints.
+            violation = 0.0 if np.isfinite(value) else np.inf
+            if self.constrained and np.isfinite(value):
+                (lower, upper), values = self.constrained.bounds, self._constraints(theta)[0]
+                violation = float(np.maximum(np.maximum(lower - values, values - upper), 0).max())
             if violation < self._least[0]:
                 self._least = violation, theta
             if violation <= RULES.feasible:
@@ -170,14 +173,6 @@ class _IpoptRun:
         if self._constraints_at is None or self._constraints_at[0] != key:
             self._constraints_at = key, *self.constrained.constraints(theta)
         return self._constraints_at[1], self._constraints_at[2]
-
-    def _violation(self, theta: Array) -> float:
-        """Largest constraint violation; 0 without constraints."""
-        if self.constrained is None:
-            return 0.0
-        lower, upper = self.constrained.bounds
-        values = self._constraints(theta)[0]
-        return float(np.maximum(np.maximum(lower - values, values - upper), 0).max())
 
     def _hessian(self, theta: Array, factor: Array, multipliers: Array) -> list[Array]:
         if self.constrained:
@@ -261,12 +256,18 @@ class _Flow:
 
     def iterate(self) -> Status:
         best, limit = self.best, self.settings.max_iterations
-        status = self._start()
-        if status is not None:
-            return status
+        # The first stretch moves theta by a small part of its length; without a gradient there is nowhere to flow.
+        self.value, gradient = best.value_and_gradient(self.theta)
+        if not np.isfinite(self.value):
+            return Status.FAILED
+        if not np.any(gradient):
+            return Status.CONVERGED
+        length = max(float(np.linalg.norm(self.theta)), 1e-3)
+        self.stretch = RULES.first_interval * length / float(np.linalg.norm(gradient))
         with deferred(), building:
             node = self._flow_node()
             integrator = self._integrator(node)
+        # Intervals along the flow, each twice as long as the one before, until the value falls no more.
         while best.iterations < limit:
             if not self._advance(integrator, node):
                 return Status.STALLED
@@ -281,18 +282,6 @@ class _Flow:
             if converged:
                 return Status.CONVERGED
         return Status.ITERATION_LIMIT
-
-    def _start(self) -> Status | None:
-        """Choose the first stretch; a status if there is nowhere to flow."""
-        self.value, gradient = self.best.value_and_gradient(self.theta)
-        if not np.isfinite(self.value):
-            return Status.FAILED
-        if not np.any(gradient):
-            return Status.CONVERGED
-        self.stretch = (
-            RULES.first_interval * max(float(np.linalg.norm(self.theta)), 1e-3) / float(np.linalg.norm(gradient))
-        )
-        return None
 
     def _advance(self, integrator: ca.Function, node: "ArrayNode") -> bool:
         """Follow the flow for one interval, and return whether the integrator reached the end."""
@@ -420,7 +409,13 @@ class ArrayNode(ca.Callback):
             return 1
         try:
             check()
-            results = self._compute(*(self._array(i, memory) for i, memory in enumerate(arg)))
+            # CasADi passes None for zeros.
+            results = self._compute(
+                *(
+                    np.zeros(count) if memory is None else np.frombuffer(memory).copy()
+                    for count, memory in zip(self._rows, arg, strict=True)
+                )
+            )
             for memory, result in zip(res, results, strict=True):
                 if memory is not None:
                     np.frombuffer(memory)[:] = np.asarray(result, dtype=float).ravel(order="F")
@@ -428,10 +423,6 @@ class ArrayNode(ca.Callback):
             self.error = error
             return 1
         return 0
-
-    def _array(self, i: int, memory: Any) -> Array:
-        """Input i as an array; CasADi passes None for zeros."""
-        return np.zeros(self._rows[i]) if memory is None else np.frombuffer(memory).copy()
 
     def has_jacobian(self) -> bool:
         """Whether a derivative was given."""

@@ -12,7 +12,6 @@ from orthocas.errors import InvalidValueError
 from orthocas.robots.kinematics import TipTurn
 from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.domains import Box
-from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem import Problem, is_regular
 from orthocas.tasks.samples import NEGLIGIBLE, sample_uniform
 from orthocas.tasks.task import Task
@@ -165,9 +164,20 @@ def keeps_self_motions(problem: Problem, joint: int) -> bool:
     Rotations are taken as rotations; those of a robot's file are up to rounding. False where no proof is found: the
     joint may still be cyclic.
     """
-    return _has_constant_metric(problem.metric, problem.robot.tree, joint) and (
-        _has_motion_of_task(problem.task, joint) or _is_no_part_of_gradients(problem.task, joint)
-    )
+    # The inertia M does not depend on a joint that moves all it carries as one rigid body in a world at rest.
+    tree, metric, task = problem.robot.tree, problem.metric, problem.task
+    at_rest, q = _is_turn_of_rest(tree, joint), ca.SX.sym("q", tree.n)
+    rigid = metric.recipe["kind"] == "inertia" and at_rest
+    if not rigid and ca.depends_on(metric.function(q), q[joint]):
+        return False
+    # By the kinematics, h(q + t e_k) = g_t(h(q)).
+    kind = task.recipe["kind"]
+    turned = TipTurn.from_kind(kind) is not None or _is_turn_of_components(tree, joint, kind)
+    if turns_tool(task, joint) or (task.of_tip and at_rest and turned):
+        return True
+    # By the steps of h, J_x does not depend on the joint.
+    rows = find_gradient_dependences(write_tape(task.smooth_function))
+    return all(joint not in joints for row in rows for joints in row.values())
 
 
 def turns_tool(task: Task, joint: int) -> bool:
@@ -177,37 +187,6 @@ def turns_tool(task: Task, joint: int) -> bool:
     """
     turn = TipTurn.from_kind(task.recipe["kind"])
     return task.of_tip and turn is not None and turn.whole and joint == task.robot.tree.tip_parent
-
-
-def _has_motion_of_task(task: Task, joint: int) -> bool:
-    """Whether the kinematics show that h(q + t e_k) = g_t(h(q))."""
-    tree, kind = task.robot.tree, task.recipe["kind"]
-    if not task.of_tip:
-        return False
-    if turns_tool(task, joint):
-        return True
-    turn = TipTurn.from_kind(kind)
-    return _is_turn_of_rest(tree, joint) and (turn is not None or _is_turn_of_components(tree, joint, kind))
-
-
-def _is_no_part_of_gradients(task: Task, joint: int) -> bool:
-    """Whether the steps of h show that J_x does not depend on a joint."""
-    return all(
-        joint not in joints
-        for row in find_gradient_dependences(write_tape(task.smooth_function))
-        for joints in row.values()
-    )
-
-
-def _has_constant_metric(metric: Metric, tree: KinematicTree, joint: int) -> bool:
-    """Whether A is proved not to depend on a joint.
-
-    The inertia M does not depend on a joint that moves all it carries as one rigid body in a world at rest.
-    """
-    if metric.recipe["kind"] == "inertia" and _is_turn_of_rest(tree, joint):
-        return True
-    q = ca.SX.sym("q", tree.n)
-    return not ca.depends_on(metric.function(q), q[joint])
 
 
 def _is_turn_of_rest(tree: KinematicTree, joint: int) -> bool:
@@ -312,15 +291,11 @@ def resolved(cyclic: Cyclic, problem: "Problem") -> tuple[str, ...]:
     known, names = cyclic_joints(problem), problem.robot.joint_names
     if cyclic == "auto":
         return known
-    wrong = [name for name in cyclic if name not in known and not _keeps_leaves(problem, name)]
+    keeps = (name in names and keeps_self_motions(problem, names.index(name)) for name in cyclic)
+    wrong = [name for name, kept in zip(cyclic, keeps, strict=True) if name not in known and not kept]
     if wrong:
         raise InvalidValueError("cyclic", repr(wrong[0]), f"one of the cyclic joints: {', '.join(known) or 'none'}")
     return tuple(name for name in names if name in cyclic)
-
-
-def _keeps_leaves(problem: "Problem", name: str) -> bool:
-    names = problem.robot.joint_names
-    return name in names and keeps_self_motions(problem, names.index(name))
 
 
 def indices(cyclic: Cyclic, space: JointSpace) -> list[int]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from orthocas.bases.family import TURN, ClosedForm, Expression, JointSpace, component_gradients
 from orthocas.errors import InvalidValueError, RobotError
-from orthocas.robots.kinematics import Pose, build_body_poses
+from orthocas.robots.kinematics import build_body_poses
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.problem import Problem
@@ -189,7 +189,8 @@ def sew_angle(robot: Robot, kind: str) -> ca.Function:
     _require_seven_revolute(robot.tree)
     q = ca.SX.sym("q", robot.n)
     poses = build_body_poses(robot.tree, q)
-    S, E, W = (_project_on_axis(poses[k], height) for k, height in _find_points(robot.tree))
+    # Each point lies on a joint's axis, the z of its body, at a fixed height above the body's origin.
+    S, E, W = (poses[k][1] + poses[k][0][:, 2] * height for k, height in _find_points(robot.tree))
     e_t, e_r = (ca.SX(ca.DM(direction)) for direction in DIRECTIONS[kind])
     return dense_function("sew_angle", [q], [compute_elbow_angle(E - S, W - S, e_t, e_r)])
 
@@ -200,12 +201,6 @@ def compute_elbow_angle(p_SE: ca.SX, p_SW: ca.SX, e_t: ca.SX, e_r: ca.SX) -> ca.
     k_r = ca.cross(e_SW - e_t, e_r)
     k_x = ca.cross(k_r, p_SW)
     return ca.atan2(ca.dot(e_SW, ca.cross(k_x, p_SE)), ca.dot(k_x, p_SE))
-
-
-def _project_on_axis(pose: Pose, height: float) -> ca.SX:
-    """The point of a joint's axis (z of its body) at a height above the body's origin, (3, 1) in the world."""
-    R, p = pose
-    return p + R[:, 2] * height
 
 
 def _find_points(tree: KinematicTree) -> tuple[tuple[int, float], ...]:

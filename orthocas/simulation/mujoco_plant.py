@@ -462,12 +462,18 @@ class MuJoCoPlant(Shown):
         first order takes eighths. Springs K need steps of at most 1 / frequency with both, the root of the largest
         eigenvalue of M^-1 K.
         """
-        M = np.zeros((self.model.nv,) * 2)
+        # The largest eigenvalues of M^-1 D and M^-1 K, of all joints and rotors.
+        M, D = np.zeros((self.model.nv,) * 2), np.diag(self.model.dof_damping)
         mujoco().mj_fullM(self.model, self.data, M)
-        # The largest eigenvalues of M^-1 D and M^-1 K.
+        K = np.zeros_like(D)
+        if self.elasticity is not None:
+            stiffness, _, damping = self.elasticity.numbers(self.robot.n)
+            across, rows = np.zeros((self.robot.n, self.model.nv)), np.arange(self.robot.n)
+            across[rows, self._motors], across[rows, self._dofs] = 1.0, -1.0
+            D, K = D + across.T * damping @ across, across.T * stiffness @ across
         damped, squared = (
             self._timestep * float(np.linalg.eigvals(np.linalg.solve(M, part)).real.max()) if part.any() else 0.0
-            for part in self._compute_dampers_and_springs()
+            for part in (D, K)
         )
         parts = max(
             min(ceil(min(damped, RULES.most_parts + 1)), RULES.most_parts), ceil(sqrt(self._timestep * squared)), 1
@@ -479,18 +485,6 @@ class MuJoCoPlant(Shown):
     def _find_dofs(self, names: Iterable[str]) -> NDArray[np.intp]:
         """Where joints stand among all."""
         return np.array([self.model.joint(name).dofadr[0] for name in names])
-
-    def _compute_dampers_and_springs(self) -> tuple[Array, Array]:
-        """D and K of all joints and rotors."""
-        D = np.diag(self.model.dof_damping)
-        K = np.zeros_like(D)
-        if self.elasticity is not None:
-            stiffness, _, damping = self.elasticity.numbers(self.robot.n)
-            across = np.zeros((self.robot.n, self.model.nv))
-            rows = np.arange(self.robot.n)
-            across[rows, self._motors], across[rows, self._dofs] = 1.0, -1.0
-            D, K = D + across.T * damping @ across, across.T * stiffness @ across
-        return D, K
 
     def push(self, force: ArrayLike, link: Link = None, point: ArrayLike = (0.0, 0.0, 0.0)) -> None:
         """Push from now on, in addition to other pushes, until `release`.
@@ -540,7 +534,13 @@ class MuJoCoPlant(Shown):
         data = self.data
         data.ctrl[:] = self._check("torque", torque)
         data.qfrc_applied[self._dofs] = 0.0 if loads is None else self._check("loads", loads)
-        self._step(self.model, data, self._divide(seconds))
+        # Equal steps of the physics. A tick that is a whole number of steps, but for rounding, gets no further one.
+        count = as_number("seconds", seconds) / self._longest - 1e-9
+        if not -1e-9 < count <= RULES.most_steps:
+            raise InvalidValueError("seconds", seconds, f"a number > 0, at most {RULES.most_steps * self._longest:g}")
+        steps = max(1, ceil(count))
+        self.model.opt.timestep = seconds / steps
+        self._step(self.model, data, steps)
         if not data.qvel @ data.qvel < RULES.runaway**2:
             raise SimulationError(f"MuJoCo gave up at {self.time:g} s: joint velocities beyond {RULES.runaway:g}")
 
@@ -551,13 +551,3 @@ class MuJoCoPlant(Shown):
         if not np.abs(value).max() < RULES.largest:
             raise InvalidValueError(name, value.tolist(), f"numbers up to {RULES.largest:g}")
         return value
-
-    def _divide(self, seconds: float) -> int:
-        """Into how many steps of the physics a tick is divided; sets their length."""
-        # A tick that is a whole number of steps, but for rounding, gets no further one.
-        count = as_number("seconds", seconds) / self._longest - 1e-9
-        if not -1e-9 < count <= RULES.most_steps:
-            raise InvalidValueError("seconds", seconds, f"a number > 0, at most {RULES.most_steps * self._longest:g}")
-        steps = max(1, ceil(count))
-        self.model.opt.timestep = seconds / steps
-        return steps

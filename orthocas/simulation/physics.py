@@ -1,7 +1,7 @@
 """Closed loops with MuJoCo as plant, and with the supervised law of generated C."""
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -47,7 +47,14 @@ class SupervisedLaw:
         if controller.chart is None:
             raise InvalidValueError("safety", "given", f"none with {controller.name} without a chart")
         self._resume_after, self._period, self._caught_for = resume_after, period, 0.0
-        self._law = _compile(controller, safety)
+        # The law in C, which stays loaded when its folder is gone.
+        from orthocas import codegen  # few runs need a code generator and a compiler
+
+        with open_draft_folder() as folder:
+            generated = codegen.generate_c(controller.chart, folder / "law", controller, "law", safety=safety)
+            library = codegen.compile_shared(generated, generated.folder)
+            compiled = codegen.CompiledLibrary(library, "law", controller.problem.n)
+            self._law: Supervisor = codegen.Supervisor(compiled, controller)
 
     def start(self, q: Array) -> None:
         """Begin at joint positions (n,)."""
@@ -83,21 +90,6 @@ class LawWithMemory:
         """[command; status; no cause], (n + 2,), for a reference with two derivatives (3 k,)."""
         command, status = self._ticks.tick(q, dq, reference.reshape(3, -1), self._period)
         return np.concatenate([command, [status, ControlStatus.OK]])
-
-
-def _compile(controller: Controller, safety: Safety) -> "Supervisor":
-    """The supervised law in C. It stays loaded when its folder is gone."""
-    from orthocas import codegen  # few runs need a code generator and a compiler
-
-    # Laws without one have no supervised form, and were refused before.
-    chart: Any = controller.chart
-    with open_draft_folder() as folder:
-        generated = codegen.generate_c(chart, folder / "law", controller, "law", safety=safety)
-        library = codegen.compile_shared(generated, generated.folder)
-        supervisor: Supervisor = codegen.Supervisor(
-            codegen.CompiledLibrary(library, "law", controller.problem.n), controller
-        )
-        return supervisor
 
 
 def run_supervised(
