@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -46,7 +46,7 @@ def front_figure(comparison: "Comparison") -> Figure:
         axes.scatter(
             result.task_std_deg,
             result.conditioning_p01 if single else result.mutual_std_deg,
-            s=_size(result.parameters),
+            s=30 + 25 * math.log10(1 + result.parameters),
             color=colours[result.parametrisation],
             marker=markers[result.solver],
             alpha=0.8,
@@ -109,7 +109,10 @@ def convergence_figure(comparison: "Comparison") -> Figure:
     axes.set_xlabel("time [s]")
     axes.set_ylabel("training loss")
     axes.set_title(f"{_problem(comparison)}: training loss over time", fontsize=10)
-    _legends(axes, colours, styles)
+    # One legend for parametrisations and solvers, beside the plot.
+    handles = [Line2D([], [], color=colour, linewidth=3, label=name) for name, colour in colours.items()]
+    handles += [Line2D([], [], linestyle=style, color="0.3", label=name) for name, style in styles.items()]
+    axes.legend(handles=handles, fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0)
     axes.grid(alpha=0.3, which="both")
     return figure
 
@@ -132,10 +135,6 @@ def _colours(results: "Sequence[CellResult]") -> dict[str, Colour]:
         for k, name in enumerate(names):
             colours[name] = mpl.colormaps[_HUES.get(kind, "Reds")](0.35 + 0.6 * (k + 1) / len(names))
     return colours
-
-
-def _size(parameters: int) -> float:
-    return 30 + 25 * math.log10(1 + parameters)
 
 
 def _place(summary: "Summary", single: bool) -> tuple[float, float]:
@@ -208,10 +207,3 @@ def _scale(axes: Axes, *values: Sequence[float]) -> None:
             axis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
             axis.set_major_formatter(StrMethodFormatter("{x:g}"))
             axis.set_minor_formatter(NullFormatter())
-
-
-def _legends(axes: Axes, colours: Mapping[str, Colour], styles: Mapping[str, Any]) -> None:
-    """One legend for parametrisations and solvers, beside the plot."""
-    handles = [Line2D([], [], color=colour, linewidth=3, label=name) for name, colour in colours.items()]
-    handles += [Line2D([], [], linestyle=style, color="0.3", label=name) for name, style in styles.items()]
-    axes.legend(handles=handles, fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0)

@@ -211,14 +211,11 @@ class ClearBox(Box):
         J = self.jacobian_function(q) / ca.repmat(ca.DM(self.scale), 1, len(self.centre))
         return dense_function("gram", [q], [J @ J.T])
 
-    @property
+    @cached_property
     def pivots(self) -> ca.Function:
         """q (n, 1) -> the pivots (m, 1) of D^-1 J J^T D^-1 - bound^2 I; all are > 0 just where q is clear."""
-        return self._clear_pivots
-
-    @cached_property
-    def _clear_pivots(self) -> ca.Function:
         q = ca.SX.sym("q", len(self.centre))
+
         # A product, because ** raises OverflowError for the bounds of some files.
         square = self.least_singular_value * self.least_singular_value
         left = self.gram(q) - square * ca.SX.eye(self.task.m)

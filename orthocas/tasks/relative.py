@@ -145,7 +145,7 @@ class Relative:
         x, x_d = self._make_symbols("x", "x_d")
         w, v = self._compute_turn(x, self._compute_quaternion(x_d))
         slope = ca.SX.eye(self.task.m)
-        slope[self.first :, self.first :] = self._reorder(w * ca.SX.eye(3) + skew(v))
+        slope[self.first :, self.first :] = self._order @ (w * ca.SX.eye(3) + skew(v)) @ self._order.T
         e = ca.vertcat(x[: self.first] - x_d[: self.first], self._order @ (2 * v))
         return dense_function("relative", [x, x_d], [e, slope], ["x", "x_d"])
 
@@ -180,9 +180,6 @@ class Relative:
     def _order(self) -> ca.SX:
         assert self.task.turn is not None
         return ca.SX(ca.sparsify(ca.DM(self.task.turn.order)))
-
-    def _reorder(self, matrix: ca.SX) -> ca.SX:
-        return self._order @ matrix @ self._order.T
 
     def _compute_quaternion(self, x: ca.SX) -> ca.SX:
         quaternion: ca.SX = self.task.quaternion_function(x)

@@ -83,8 +83,8 @@ class ChartPage:
 
     def _add_buttons(self) -> None:
         gui = self._server.gui
-        self._add_button("Home", "home", self._go_home)
-        self._undo = self._add_button("Undo", "arrow-back-up", self._undo_move)
+        self._add_button("Home", "home", partial(self._change, self.session.go_home))
+        self._undo = self._add_button("Undo", "arrow-back-up", partial(self._change, self.session.undo))
         with gui.add_folder("What a coordinate reaches"):
             # First the coordinate that moves the joints farthest.
             self._fans = [fan_along(self._chart, self.session.q, k) for k in range(self._chart.r)]
@@ -97,18 +97,11 @@ class ChartPage:
             self._branches = gui.add_folder("Other branches: the tip stays")
             with self._branches:
                 self._search = self._add_button("Search", "arrows-split", self._find_branches)
-        self._chosen.on_update(self._choose_coordinate)
-
-    async def _choose_coordinate(self, event: Any) -> None:
-        self._loop.ask("fan", self._show_fan)
+        self._chosen.on_update(self._loop.build_handler("fan", self._show_fan))
 
     def _add_button(self, label: str, icon: str, job: Callable[[], None]) -> Any:
         button = self._server.gui.add_button(label, icon=icon)
-
-        async def clicked(event: Any) -> None:
-            self._loop.ask(label, job)
-
-        button.on_click(clicked)
+        button.on_click(self._loop.build_handler(label, job))
         return button
 
     def _find_branches(self) -> None:
@@ -119,13 +112,15 @@ class ChartPage:
         self._search.remove()
         with self._branches:
             for cut in branching.mirrors:
-                self._add_button(f"Flip the {branching.cuts[cut].part}", "arrows-left-right", partial(self._flip, cut))
+                flip = partial(self._change, partial(self.session.flip, cut))
+                self._add_button(f"Flip the {branching.cuts[cut].part}", "arrows-left-right", flip)
             if not branching.mirrors:
                 self._server.gui.add_markdown("No mirror image of this arm has the same pose of its tip.")
 
-    def _flip(self, cut: int) -> None:
+    def _change(self, change: Callable[[], None]) -> None:
+        """Another position of the session, which ends a sweep."""
         self._rest()
-        self.session.flip(cut)
+        change()
         self._show()
 
     def _add_handle(self) -> Any:
@@ -163,16 +158,6 @@ class ChartPage:
         if not self._gesture:
             self.session.remember()
             self._gesture = True
-
-    def _go_home(self) -> None:
-        self._rest()
-        self.session.go_home()
-        self._show()
-
-    def _undo_move(self) -> None:
-        self._rest()
-        self.session.undo()
-        self._show()
 
     def _toggle_sweep(self) -> None:
         """Move the chosen coordinate to its ends and back, until something else is wished for; or end that."""
@@ -218,9 +203,11 @@ class ChartPage:
             self._show_arm(readings.q)
             shown = replace(readings, q=self.session.mirror(readings.q[None])[0])
             self._readings.content = self._panel.format_html(shown)
-            for label, value in zip(self._chart.labels, np.concatenate([readings.x, readings.xi]), strict=True):
-                if label not in moved:
-                    self._set(self._sliders[label], float(value))
+            values = np.concatenate([readings.x, readings.xi]).tolist()
+            for label, value in zip(self._chart.labels, values, strict=True):
+                slider = self._sliders[label]
+                if label not in moved and np.isfinite(value):
+                    slider.value = min(max(round(value, 3), slider.min), slider.max)
             self._undo.disabled = not self.session.can_undo
 
     def _show_arm(self, q: Array) -> None:
@@ -229,10 +216,6 @@ class ChartPage:
             self._arm.show(self.session.mirror(q[None])[0])
             if self._handle is not None and not self._dragging:
                 self._handle.position = tuple(self._chart.problem.robot.tip_position(q))
-
-    def _set(self, slider: Any, value: float) -> None:
-        if np.isfinite(value):
-            slider.value = min(max(round(value, 3), slider.min), slider.max)
 
     def _settle(self) -> None:
         """After a gesture: ranges of the sliders, the fan, and values that were not reached."""

@@ -75,28 +75,21 @@ class PlayerPage:
         self._now = 0.0
         place_scene(server, robot, np.concatenate([pick_few(motion.q) for motion in motions]), self._stage.shifts)
         self._readings = place_panels(server)
-        self._add_controls()
+        # Play and pause, the time, the speed, and whether to begin again.
+        gui, longest = server.gui, max(round(self._stage.duration, 2), RULES.time_step)
+        self._playing = False
+        self._play = gui.add_button("Play", icon="player-play")
+        self._time = gui.add_slider("time [s]", 0.0, longest, RULES.time_step, 0.0)
+        self._speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1x")
+        self._again = gui.add_checkbox("repeat", initial_value=True)
+        self._play.on_click(self._loop.build_handler("play", self._toggle))
+        self._time.on_update(self._slide)
         self._show(0.0)
         self._loop.start()
 
     def close(self) -> None:
         """End the thread of the page."""
         self._loop.stop()
-
-    def _add_controls(self) -> None:
-        gui = self._server.gui
-        self._play = gui.add_button("Play", icon="player-play")
-        self._time = gui.add_slider(
-            "time [s]", 0.0, max(round(self._stage.duration, 2), RULES.time_step), RULES.time_step, 0.0
-        )
-        self._speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1x")
-        self._again = gui.add_checkbox("repeat", initial_value=True)
-        self._playing = False
-        self._play.on_click(self._start_or_stop)
-        self._time.on_update(self._slide)
-
-    async def _start_or_stop(self, event: Any) -> None:
-        self._loop.ask("play", self._toggle)
 
     async def _slide(self, event: Any) -> None:
         # Otherwise the page itself moved it.
@@ -197,11 +190,8 @@ class RobotPage:
             robot.joint_names[i], low, high, RULES.slider_step, min(max(round(centre, 3), low), high)
         )
 
-        slider.on_update(self._move)
+        slider.on_update(self._loop.build_handler("joints", self._show))
         return slider
-
-    async def _move(self, event: Any) -> None:
-        self._loop.ask("joints", self._show)
 
     async def _go_home(self, event: Any) -> None:
         for slider, value in zip(self._sliders, self._home.tolist(), strict=True):

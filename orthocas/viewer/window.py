@@ -78,9 +78,8 @@ class Inbox:
         kind = message.pop("type", None) if isinstance(message, dict) else None
         if not isinstance(kind, str) or kind not in (_CAMERA, _INPUT, *_HANDLE):
             return f"pages send no {_shorten(kind)}"
-        return _check_fields(message, kind) or self._check_content(message, kind)
-
-    def _check_content(self, message: dict[str, Any], kind: str) -> str | None:
+        if (fault := _check_fields(message, kind)) is not None:
+            return fault
         if kind == _CAMERA:
             return _check_numbers(message, _CAMERA_NUMBERS)
         if kind == _INPUT:
@@ -226,10 +225,23 @@ class Loop:
             self._tick, self._begun = tick, time.monotonic()
             self._wake.notify()
 
+    def build_handler(self, what: str, job: Job) -> Callable[[Any], Awaitable[None]]:
+        """A callback for events of viser that asks for a job."""
+
+        async def handle(event: Any) -> None:
+            self.ask(what, job)
+
+        return handle
+
     def _run(self) -> None:
         settled = True
         while self._running:
-            jobs, tick = self._take_next(settled)
+            # Wait until there is something to do.
+            with self._wake:
+                if not self._jobs and self._running:
+                    self._wake.wait(RULES.tick if self._tick else None if settled else RULES.quiet)
+                jobs, self._jobs, tick = list(self._jobs.values()), {}, self._tick
+            # The page settles once after a while without jobs.
             if not jobs and tick is None and not settled:
                 jobs, settled = [self._settle], True
             elif jobs or tick is not None:
@@ -238,14 +250,6 @@ class Loop:
                 self._do(job)
             if tick is not None:
                 self._do(lambda tick=tick: self._advance(tick))  # type: ignore[misc]
-
-    def _take_next(self, settled: bool) -> tuple[list[Job], Tick | None]:
-        """What to do now; waits until there is something."""
-        with self._wake:
-            if not self._jobs and self._running:
-                self._wake.wait(RULES.tick if self._tick else None if settled else RULES.quiet)
-            jobs, self._jobs = list(self._jobs.values()), {}
-            return jobs, self._tick
 
     def _advance(self, tick: Tick) -> None:
         """One tick of an animation."""
@@ -419,8 +423,7 @@ def open_window(host: str, port: int, title: str) -> tuple[Any, str]:
     """
     package = viser()
     require_free(host, port)
-    # It announces itself.
-    # viser starts its server with our guard before it.
+    # viser starts its server with our guard before it, and announces itself.
     with guard_server(host) as guard, contextlib.redirect_stdout(io.StringIO()):
         server = package.ViserServer(host=host, port=port, label=title, verbose=False)
     inputs = getattr(server.gui, "_gui_input_handle_from_uuid", None)
@@ -431,9 +434,9 @@ def open_window(host: str, port: int, title: str) -> tuple[Any, str]:
     if port not in (0, server.get_port()):
         close_window(server)
         raise _build_taken_error(host, port)
-    # Nobody but this machine, unless the host says so: no sharing through a server of others.
+    # No sharing through a server of others, which any page in the browser could ask for.
     guard.inbox.input_of = inputs.get
-    server.request_share_url = _refuse_sharing
+    server.request_share_url = lambda verbose=True: None
     server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=RULES.brand)
     server.scene.configure_environment_map(None)
     # `place_lights` has lights without shadows.
@@ -475,7 +478,11 @@ def require_free(host: str, port: int) -> None:
         try:
             trial.bind(address)
         except OSError as error:
-            raise _build_refusal(host, port, error) from None
+            if error.errno == errno.EADDRINUSE:
+                raise _build_taken_error(host, port) from None
+            if error.errno == errno.EACCES:
+                raise ViewError(f"port is {port}, which this user may not open; expected one from 1024 on") from None
+            raise ViewError(f"host is {host[:80]!r}, expected an address of this machine, such as {LOCAL}") from None
 
 
 def build_url(host: str, port: int) -> str:
@@ -634,18 +641,6 @@ def compute_up(robot: Robot) -> Array:
     gravity = robot.tree.gravity
     strength = float(np.linalg.norm(gravity))
     return np.array([0.0, 0.0, 1.0]) if strength < RULES.flat else -gravity / strength
-
-
-def _refuse_sharing(verbose: bool = True) -> None:
-    """In place of viser's tunnel to a server of others, which any page in the browser could ask for."""
-
-
-def _build_refusal(host: str, port: int, error: OSError) -> ViewError:
-    if error.errno == errno.EADDRINUSE:
-        return _build_taken_error(host, port)
-    if error.errno == errno.EACCES:
-        return ViewError(f"port is {port}, which this user may not open; expected one from 1024 on")
-    return ViewError(f"host is {host[:80]!r}, expected an address of this machine, such as {LOCAL}")
 
 
 def _build_taken_error(host: str, port: int) -> ViewError:
