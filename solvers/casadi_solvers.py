@@ -106,8 +106,8 @@ class _IpoptRun:
         both = self._node("grad_f", [self.size], [(1, 1), (self.size, 1)], self._evaluate)
         problem: dict[str, Any] = {"x": x, "f": value(x)}
         options: dict[str, Any] = {"grad_f": ca.Function("nlp_grad_f", [x, p], list(both(x)))}
+        rows = len(self.constrained.bounds[0]) if self.constrained else 0
         if self.constrained:
-            rows = len(self.constrained.bounds[0])
             constraints, jacobian = (
                 self._node("g", [self.size], [(rows, 1)], lambda theta: [self._constraints(theta)[0]]),
                 self._node("jac_g", [self.size], [(rows, 1), (rows, self.size)], self._constraints),
@@ -115,8 +115,13 @@ class _IpoptRun:
             problem["g"] = constraints(x)
             options["jac_g"] = ca.Function("nlp_jac_g", [x, p], list(jacobian(x)))
         options |= self._hessian_options(x, p)
+        # Ipopt calls the watcher at the start and after every iteration; an error there stops it.
+        lengths = {"x": self.size, "f": 1, "g": rows, "lam_x": self.size, "lam_g": rows}
+        names = [ca.nlpsol_out(i) for i in range(ca.nlpsol_n_out())]
+        watcher = ArrayNode("watch", [lengths.get(name, 0) for name in names], [(1, 1)], self._iterated)
+        self._nodes.append(watcher)
         options |= {
-            "iteration_callback": self._watcher(),
+            "iteration_callback": watcher,
             "print_time": False,
             "error_on_fail": False,
             "show_eval_warnings": False,
@@ -179,17 +184,6 @@ class _IpoptRun:
             return [self.constrained.lagrangian_hessian(theta, float(factor[0]), multipliers)]
         assert isinstance(self.objective, SmoothObjective)
         return [factor[0] * self.objective.hessian(theta)]
-
-    def _watcher(self) -> ca.Callback:
-        """A callback that Ipopt calls at the start and after every iteration; an error stops Ipopt."""
-        rows = [ca.nlpsol_out(i) for i in range(ca.nlpsol_n_out())]
-        lengths = {"x": self.size, "f": 1, "g": self._rows(), "lam_x": self.size, "lam_g": self._rows()}
-        node = ArrayNode("watch", [lengths.get(name, 0) for name in rows], [(1, 1)], self._iterated)
-        self._nodes.append(node)
-        return node
-
-    def _rows(self) -> int:
-        return len(self.constrained.bounds[0]) if self.constrained else 0
 
     def _iterated(self, *_: Array) -> list[float]:
         if self._count:
@@ -265,8 +259,7 @@ class _Flow:
         length = max(float(np.linalg.norm(self.theta)), 1e-3)
         self.stretch = RULES.first_interval * length / float(np.linalg.norm(gradient))
         with deferred(), building:
-            node = self._flow_node()
-            integrator = self._integrator(node)
+            integrator, node = self._build_integrator()
         # Intervals along the flow, each twice as long as the one before, until the value falls no more.
         while best.iterations < limit:
             if not self._advance(integrator, node):
@@ -296,18 +289,30 @@ class _Flow:
         self.theta = np.asarray(end.nonzeros())
         return bool(np.isfinite(self.theta).all())
 
-    def _flow_node(self) -> "ArrayNode":
-        """-grad L as a CasADi function, with a Jacobian."""
-        size = self.theta.size
-        if not self.direct:
+    def _build_integrator(self) -> tuple[ca.Function, "ArrayNode"]:
+        """CVODES for dtheta/ds = -stretch grad L from s = 0 to 1, and the node of -grad L, with a Jacobian."""
+        size, jacobian, along = self.theta.size, None, None
+        if self.direct:
+            jacobian = ArrayNode("flow_jacobian", [size], [(size, size)], lambda theta: [-self._curvature(theta)])
+        else:
             along = ArrayNode("flow_along", [size, size], [(size, 1)], lambda *at: [self._curvature_along(*at)])
-            return ArrayNode("flow", [size], [(size, 1)], lambda theta: [self._descent(theta)], forward=along)
-        jacobian = ArrayNode("flow_jacobian", [size], [(size, size)], lambda theta: [-self._curvature(theta)])
-        return ArrayNode("flow", [size], [(size, 1)], lambda theta: [self._descent(theta)], jacobian=jacobian)
+        node = ArrayNode("flow", [size], [(size, 1)], self._descend, jacobian=jacobian, forward=along)
+        x, stretch = ca.MX.sym("x", size), ca.MX.sym("stretch")
+        system: dict[str, Any] = {"x": x, "p": stretch, "ode": stretch * node(x)}
+        options: dict[str, Any] = {
+            "reltol": self.settings.accuracy,
+            "abstol": self.settings.accuracy * 1e-2 * self.scale,
+            "newton_scheme": "direct" if self.direct else "gmres",
+            "max_num_steps": self.settings.max_steps or (500 if self.direct else 50),
+            "disable_internal_warnings": True,
+        }
+        if self.direct:
+            options["linear_solver"] = "lapacklu"
+        return ca.integrator("flow", "cvodes", system, 0.0, 1.0, options), node
 
-    def _descent(self, theta: Array) -> Array:
+    def _descend(self, theta: Array) -> list[Array]:
         self._last = theta, -self.best.value_and_gradient(theta)[1]
-        return self._last[1]
+        return [self._last[1]]
 
     def _curvature(self, theta: Array) -> Array:
         """The Hessian or the Gauss-Newton matrix at theta, or near it. CVODES asks for it twice in a row."""
@@ -336,20 +341,6 @@ class _Flow:
         change: Array = (-self.best.value_and_gradient(theta + step * direction)[1] - here) / step
         return change
 
-    def _integrator(self, node: "ArrayNode") -> ca.Function:
-        x, stretch = ca.MX.sym("x", self.theta.size), ca.MX.sym("stretch")
-        system: dict[str, Any] = {"x": x, "p": stretch, "ode": stretch * node(x)}
-        options: dict[str, Any] = {
-            "reltol": self.settings.accuracy,
-            "abstol": self.settings.accuracy * 1e-2 * self.scale,
-            "newton_scheme": "direct" if self.direct else "gmres",
-            "max_num_steps": self.settings.max_steps or (500 if self.direct else 50),
-            "disable_internal_warnings": True,
-        }
-        if self.direct:
-            options["linear_solver"] = "lapacklu"
-        return ca.integrator("flow", "cvodes", system, 0.0, 1.0, options)
-
 
 class ArrayNode(ca.Callback):
     """A function of columns whose outputs are computed in NumPy.
@@ -362,7 +353,6 @@ class ArrayNode(ca.Callback):
         rows: length of each input column.
         shapes: shape of each output.
         compute: maps arrays (rows,) to one array per output.
-        options: options of the CasADi function.
         jacobian: derivative of the single output with respect to the single input, for solvers that need it.
         forward: directional derivative, as a function of input and direction; avoids a dense Jacobian.
     """
@@ -373,7 +363,6 @@ class ArrayNode(ca.Callback):
         rows: Sequence[int],
         shapes: Sequence[tuple[int, int]],
         compute: Callable[..., Sequence[Any]],
-        options: dict[str, Any] | None = None,
         jacobian: "ArrayNode | None" = None,
         forward: "ArrayNode | None" = None,
     ) -> None:
@@ -381,7 +370,7 @@ class ArrayNode(ca.Callback):
         self._rows, self._shapes, self._compute, self._jacobian = tuple(rows), tuple(shapes), compute, jacobian
         self._forward = forward
         self.error: BaseException | None = None
-        self.construct(name, options or {})
+        self.construct(name, {})
 
     def get_n_in(self) -> int:
         """Number of input columns."""

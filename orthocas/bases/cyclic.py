@@ -164,9 +164,12 @@ def keeps_self_motions(problem: Problem, joint: int) -> bool:
     Rotations are taken as rotations; those of a robot's file are up to rounding. False where no proof is found: the
     joint may still be cyclic.
     """
-    # The inertia M does not depend on a joint that moves all it carries as one rigid body in a world at rest.
+    # M does not depend on a joint that moves all it carries as one rigid body in a world at rest: all joints below it
+    # in the tree are prismatic and, if it is revolute, exactly along its axis.
     tree, metric, task = problem.robot.tree, problem.metric, problem.task
-    at_rest, q = _is_turn_of_rest(tree, joint), ca.SX.sym("q", tree.n)
+    below, q = tree.carriers(tree.parents[joint]), ca.SX.sym("q", tree.n)
+    along = tree.prismatic[joint] or all(_is_axis(_fit_rotation(tree, joint, i)[:, 2], 2) for i in below)
+    at_rest = along and all(tree.prismatic[i] for i in below)
     rigid = metric.recipe["kind"] == "inertia" and at_rest
     if not rigid and ca.depends_on(metric.function(q), q[joint]):
         return False
@@ -187,14 +190,6 @@ def turns_tool(task: Task, joint: int) -> bool:
     """
     turn = TipTurn.from_kind(task.recipe["kind"])
     return task.of_tip and turn is not None and turn.whole and joint == task.robot.tree.tip_parent
-
-
-def _is_turn_of_rest(tree: KinematicTree, joint: int) -> bool:
-    """Whether all joints below one in the tree are prismatic and, if it is revolute, exactly along its axis."""
-    below = tree.carriers(tree.parents[joint])
-    if not all(tree.prismatic[i] for i in below):
-        return False
-    return bool(tree.prismatic[joint]) or all(_is_axis(_fit_rotation(tree, joint, i)[:, 2], 2) for i in below)
 
 
 def _is_turn_of_components(tree: KinematicTree, joint: int, kind: str) -> bool:
@@ -291,10 +286,9 @@ def resolved(cyclic: Cyclic, problem: "Problem") -> tuple[str, ...]:
     known, names = cyclic_joints(problem), problem.robot.joint_names
     if cyclic == "auto":
         return known
-    keeps = (name in names and keeps_self_motions(problem, names.index(name)) for name in cyclic)
-    wrong = [name for name, kept in zip(cyclic, keeps, strict=True) if name not in known and not kept]
-    if wrong:
-        raise InvalidValueError("cyclic", repr(wrong[0]), f"one of the cyclic joints: {', '.join(known) or 'none'}")
+    for name in cyclic:
+        if name not in known and not (name in names and keeps_self_motions(problem, names.index(name))):
+            raise InvalidValueError("cyclic", repr(name), f"one of the cyclic joints: {', '.join(known) or 'none'}")
     return tuple(name for name in names if name in cyclic)
 
 

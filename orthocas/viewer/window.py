@@ -78,8 +78,12 @@ class Inbox:
         kind = message.pop("type", None) if isinstance(message, dict) else None
         if not isinstance(kind, str) or kind not in (_CAMERA, _INPUT, *_HANDLE):
             return f"pages send no {_shorten(kind)}"
-        if (fault := _check_fields(message, kind)) is not None:
-            return fault
+        # viser ends a connection at fields that it does not know, and at those that are missing.
+        known = fields(getattr(import_module("viser._messages"), kind))
+        needed = {field.name for field in known if field.default is MISSING}
+        if not needed <= set(message) <= {field.name for field in known}:
+            return f"its fields are {_shorten(list(message))}, expected {', '.join(sorted(needed))}"
+
         if kind == _CAMERA:
             return _check_numbers(message, _CAMERA_NUMBERS)
         if kind == _INPUT:
@@ -113,15 +117,6 @@ class Inbox:
             await handler(connection)
 
         return handle
-
-
-def _check_fields(message: dict[Any, Any], kind: str) -> str | None:
-    """viser ends a connection at fields that it does not know, and at those that are missing."""
-    names = fields(getattr(import_module("viser._messages"), kind))
-    needed = {field.name for field in names if field.default is MISSING}
-    if needed <= set(message) <= {field.name for field in names}:
-        return None
-    return f"its fields are {_shorten(list(message))}, expected {', '.join(sorted(needed))}"
 
 
 def _check_words(message: dict[str, Any], *names: str) -> str | None:
