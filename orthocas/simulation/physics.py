@@ -38,6 +38,8 @@ class SupervisedLaw:
     """
 
     def __init__(self, controller: Controller, safety: Safety, resume_after: float, period: float) -> None:
+        from orthocas import codegen  # few runs need a code generator and a compiler
+
         require_kind("safety", safety, Safety)
         if not as_number("resume_after", resume_after) >= 0:
             raise InvalidValueError("resume_after", resume_after, "a number >= 0 or infinity")
@@ -48,8 +50,6 @@ class SupervisedLaw:
             raise InvalidValueError("safety", "given", f"none with {controller.name} without a chart")
         self._resume_after, self._period, self._caught_for = resume_after, period, 0.0
         # The law in C, which stays loaded when its folder is gone.
-        from orthocas import codegen  # few runs need a code generator and a compiler
-
         with open_draft_folder() as folder:
             generated = codegen.generate_c(controller.chart, folder / "law", controller, "law", safety=safety)
             library = codegen.compile_shared(generated, generated.folder)
