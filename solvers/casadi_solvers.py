@@ -280,6 +280,7 @@ class _Flow:
         """Follow the flow for one interval, and return whether the integrator reached the end."""
         self._uses = RULES.most_uses  # a new Jacobian
         try:
+            # An error of ours comes out as one of CasADi; only without one has the integrator given up.
             with deferred():
                 end = integrator(x0=self.theta, p=self.stretch)["xf"]
         except RuntimeError:
@@ -292,11 +293,13 @@ class _Flow:
     def _build_integrator(self) -> tuple[ca.Function, "ArrayNode"]:
         """CVODES for dtheta/ds = -stretch grad L from s = 0 to 1, and the node of -grad L, with a Jacobian."""
         size, jacobian, along = self.theta.size, None, None
+        # Newton's method in CVODES takes a matrix, and Krylov methods its product with a direction.
         if self.direct:
             jacobian = ArrayNode("flow_jacobian", [size], [(size, size)], lambda theta: [-self._curvature(theta)])
         else:
             along = ArrayNode("flow_along", [size, size], [(size, 1)], lambda *at: [self._curvature_along(*at)])
         node = ArrayNode("flow", [size], [(size, 1)], self._descend, jacobian=jacobian, forward=along)
+        # The stretch scales time, so that each interval ends at s = 1.
         x, stretch = ca.MX.sym("x", size), ca.MX.sym("stretch")
         system: dict[str, Any] = {"x": x, "p": stretch, "ode": stretch * node(x)}
         options: dict[str, Any] = {
@@ -316,6 +319,7 @@ class _Flow:
 
     def _curvature(self, theta: Array) -> Array:
         """The Hessian or the Gauss-Newton matrix at theta, or near it. CVODES asks for it twice in a row."""
+        # The last matrix serves near its place, a few times.
         at, kept = self._kept
         self._uses += 1
         if self._uses <= RULES.most_uses and np.linalg.norm(theta - at) <= RULES.moved * np.linalg.norm(theta):
@@ -334,6 +338,7 @@ class _Flow:
         length = float(np.linalg.norm(direction))
         if length == 0:
             return np.zeros_like(direction)
+        # A difference along a step that is short beside theta.
         step = RULES.difference * max(float(np.linalg.norm(theta)), 1.0) / length
         at, here = self._last
         if not np.array_equal(at, theta):

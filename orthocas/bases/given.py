@@ -222,6 +222,7 @@ def _find_common_normal(tree: KinematicTree, i: int) -> tuple[float, float, floa
     """Ends of the common normal of axes i and i + 1, as heights on the two axes, and its length [m]."""
     # of joint i + 1 in body i, whose axis is z
     origin, axis = tree.translations[i + 1], tree.rotations[i + 1][:, 2]
+    # Seen along the first axis, the foot on the second one is where that line is nearest to the origin.
     across = axis[:2]
     if np.linalg.norm(across) < RULES.parallel:
         names = tree.joint_names

@@ -475,6 +475,7 @@ def _report_search(monitor: Monitor, stage: str, *, guarded: bool = False) -> Lo
 
 def _check_parts(check: BoxCheck, parts: Subdivision, mapped: Mapped, monitor: Monitor) -> list[BoxResults]:
     # In pieces, whose results come in order.
+    # Leaves of the tree that count as proved, in pieces for the workers.
     low, high = parts.leaves(PROVED)
     pieces = [slice(k, k + RULES.at_once) for k in range(0, len(low), RULES.at_once)]
     results = []

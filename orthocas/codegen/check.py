@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from orthocas.charts.chart import Chart
 from orthocas.codegen.generate import GeneratedC
 from orthocas.codegen.library import CompiledLibrary, compile_shared, find_compilers, gain_numbers
-from orthocas.codegen.precision import DOUBLE, SINGLE, Precision, find_bounds_inside
+from orthocas.codegen.rendering import DOUBLE, SINGLE, Precision, find_bounds_inside
 from orthocas.control.controller import (
     FROM_THE_LAW,
     Controller,

@@ -248,6 +248,7 @@ def _count_rooms(domain: Domain) -> int:
 def _build_rooms(chart: Chart) -> list[Form]:
     """The function `_room` of columns q (n, N) -> (rooms, N), for what a domain asks beside its box."""
     domain = chart.problem.domain
+    # Bounds on singular values, and on folds where there are any.
     if (bound := domain.singular_bound) is not None:
         fold = domain.fold_bound
         summary = "Rows that must not be singular, one by one, (m n, N)."
@@ -255,6 +256,7 @@ def _build_rooms(chart: Chart) -> list[Form]:
         values = {"kind": "clear", "squared_bound": bound.least_singular_value**2, "folds": fold is not None}
         tables = {"row_scale": bound.scale[:, None], "unit": np.eye(chart.m)}
         return [Form("room", values, rows, tables, {}), *([] if fold is None else [_build_room_to_fold(chart, fold)])]
+    # The distance to the path of a corridor.
     if (path := domain.path_bound) is not None:
         starts, axes, squares = path.lines
         tables = {
@@ -264,6 +266,7 @@ def _build_rooms(chart: Chart) -> list[Form]:
             "path_lengths": np.sqrt(squares)[:, None],
         }
         return [Form("room", {"kind": "path"}, "", tables, {"path_joints": path.counted.tolist()})]
+    # Other conditions by their expression; boxes have none.
     if domain.condition is None:
         return [Form("room", {"kind": "box"}, "", {}, {})]
     summary = "Numbers (k, N) that are positive at columns q that meet the condition of the domain."
@@ -278,6 +281,7 @@ def _build_room_to_fold(chart: Chart, fold: FoldBound) -> Form:
     own = chart.coordinates.jacobian(points)
     units = [rows / np.linalg.norm(rows, axis=2, keepdims=True) for rows in (theirs, own)]
     same = bool(np.abs(units[0] - units[1]).max() < _PARALLEL)
+    # Gradients that are those of the chart need no code of their own.
     values = {
         "kind": "fold",
         "least_volume": fold.least_volume,

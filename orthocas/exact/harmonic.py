@@ -144,6 +144,7 @@ class _Sheet:
             centre = (a + b) / 2
             same = ((self._evaluate_gap(centre) < 0) == below)[:, None]
             a, b = np.where(same, centre, a), np.where(same, b, centre)
+        # Of the two ends, the one nearer to the level; where h jumps, neither is near.
         points: Array = np.where((np.abs(self._evaluate_gap(a)) < np.abs(self._evaluate_gap(b)))[:, None], a, b)
         off = np.flatnonzero(np.abs(self._evaluate_gap(points)) > self.tolerance)
         if len(off):
@@ -168,6 +169,7 @@ def _sample_gap(h: Function, level: float, axes: list[Array]) -> tuple[NDArray[n
         values = _evaluate_checked(h, grid.reshape(-1, 3), "h", ())
         lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
         gap[start : start + slab] = (values - level).reshape(grid.shape[:3])
+    # Without a value on both sides there is no surface.
     if not lowest < level < highest:
         raise InvalidValueError("level", level, f"a value of h in the box, found {lowest:.6g} to {highest:.6g}")
     return gap, max(abs(lowest), abs(highest))

@@ -276,9 +276,11 @@ def _flip(vertices: Array, faces: Indices, keys: Indices, first: Indices, second
     face, corner = first % len(faces), first // len(faces)
     i, j, k = (faces[face, (corner + shift) % 3] for shift in (1, 2, 0))
     quads = np.stack([i, j, k, faces[second % len(faces), second // len(faces)]], axis=1)
+    # Flips that are allowed, and of those that share a triangle the first.
     allowed = _is_allowed(vertices, quads, keys)
     quads, face, other = quads[allowed], first[allowed] % len(faces), second[allowed] % len(faces)
     chosen = _select_independent(quads, face, other, len(vertices))
+    # The edge k - n takes the place of i - j.
     i, j, k, n = quads[chosen].T
     faces[face[chosen]] = np.stack([i, n, k], axis=1)
     faces[other[chosen]] = np.stack([n, j, k], axis=1)

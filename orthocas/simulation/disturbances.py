@@ -112,6 +112,7 @@ class Push:
         link: Link = None,
         point: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
+        # Two instants, then forces, and where the force acts.
         for name, value, want in (("start", start, ">= 0"), ("duration", duration, "> 0")):
             number = as_float_array(f"{name} of a push", value)
             require_shape(f"{name} of a push", number.shape, ())
@@ -177,6 +178,7 @@ class Stops:
 
     def torque(self, tree: KinematicTree, q: ca.SX, dq: ca.SX) -> ca.SX:
         """Torque of the stops on the joints, (n, 1)."""
+        # A spring and a damper at each finite limit, which push and never pull.
         stiffness = positive_gains("stiffness of stops", self.stiffness, tree.n)
         damping = non_negative_gains("damping of stops", self.damping, tree.n)
         torque = ca.SX(tree.n, 1)
@@ -321,9 +323,11 @@ def read_steps(path: str | Path, chart: Chart) -> Plan:
 
 
 def _read_step_reference(reader: Reader, data: Mapping[str, Any], labels: tuple[str, ...], start: Array) -> Reference:
+    # The time that the run takes, and the filter that rounds its steps off.
     duration = reader.number(data.get("duration"), "duration", least=RULES.shortest)
     frequency = reader.number(data.get("natural_frequency", NATURAL_FREQUENCY), "natural_frequency", above=0.0)
     ratio = reader.number(data.get("damping_ratio", DAMPING_RATIO), "damping_ratio", least=0.0)
+    # Steps in their order; quantities that a step does not name keep their targets.
     changes, before = [], 0.0
     targets = dict(zip(labels, start.tolist(), strict=True))
     for k, entry in enumerate(reader.items(data["steps"], "steps")):

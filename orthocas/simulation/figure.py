@@ -126,10 +126,12 @@ def shade_fallback(axes: Axes, trajectory: "Trajectory") -> None:
 
 def _draw_others(panels: Array, trajectory: "Trajectory", units: Mapping[str, str]) -> None:
     """Draw joints, commands and, for torque controllers, the storage."""
+    # Units of joints that turn, slide, or both.
     torque = trajectory.kind == "torque"
     unit = " or ".join(sorted({units.get(name, "rad or m") for name in trajectory.joint_names}, reverse=True))
     force = " or ".join({"rad": "N m", "m": "N"}[part] for part in unit.split(" or "))
     speed = " or ".join(f"{part}/s" for part in unit.split(" or "))
+    # Joints and commands, and for torques the storage of the law.
     panels[0].plot(trajectory.times, trajectory.q, linewidth=1.3, label=trajectory.joint_names)
     panels[0].set_ylabel(f"joints q [{unit}]", fontsize=9)
     names = len(trajectory.joint_names)
@@ -152,6 +154,7 @@ def _set_style(axes: Axes, trajectory: "Trajectory") -> None:
 
 
 def _build_title(trajectory: "Trajectory") -> str:
+    # How the run ended, then how long something other than the law was in charge, and how long it was cut.
     text = f"{trajectory.controller}, {trajectory.times[-1]:.4g} s"
     if trajectory.outcome.value != "complete":
         text += f": {trajectory.outcome.value}, {trajectory.reason or 'run ended early'}"

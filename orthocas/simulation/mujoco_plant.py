@@ -255,8 +255,10 @@ def _place_inertia(body: Any, scale: float) -> None:
 
 
 def _add_joint(mj: ModuleType, body: Any, tree: KinematicTree, i: int, stops: bool) -> Any:
+    # Turns or slides, with the inertia of its own rotor.
     kind = mj.mjtJoint.mjJNT_SLIDE if tree.joint_kinds[i] == "prismatic" else mj.mjtJoint.mjJNT_HINGE
     joint = body.add_joint(name=tree.joint_names[i], type=kind, axis=(0, 0, 1), armature=tree.armatures[i])
+    # Stops at limits, if the scene has them.
     ends = np.array([tree.lower[i], tree.upper[i]])
     limited = stops and bool(np.isfinite(ends).any())
     joint.limited = mj.mjtLimited.mjLIMITED_TRUE if limited else mj.mjtLimited.mjLIMITED_FALSE
@@ -269,12 +271,14 @@ def _add_joint(mj: ModuleType, body: Any, tree: KinematicTree, i: int, stops: bo
 def _add_rotor(mj: ModuleType, spec: Any, joint: Any, i: int, numbers: tuple[Array, Array, Array]) -> Any:
     """A joint of its own in the world, with the inertia of a rotor, and a spring between it and the robot's joint."""
     stiffness, inertia, damping = (float(part[i]) for part in numbers)
+    # A body that gravity does not pull, with the inertia of the rotor.
     body = spec.worldbody.add_body(name=f"rotor_body{i}", gravcomp=1.0)
     body.explicitinertial = True
     body.mass, body.inertia = inertia, (inertia, inertia, inertia)
     rotor = body.add_joint(name=rotor_name(joint.name), type=joint.type, axis=(0, 0, 1))
     rotor.limited = mj.mjtLimited.mjLIMITED_FALSE
     joint.armature = 0.0
+    # The spring keeps the two angles equal.
     gear = spec.add_tendon(name=f"gear{i}", springlength=(0.0, 0.0))
     gear.stiffness[0], gear.damping[0] = stiffness, damping
     gear.wrap_joint(rotor.name, 1.0)
@@ -463,6 +467,7 @@ class MuJoCoPlant(Shown):
         eigenvalue of M^-1 K.
         """
         # The largest eigenvalues of M^-1 D and M^-1 K, of all joints and rotors.
+        # D and K of all joints and rotors, and the largest eigenvalues of M^-1 D and M^-1 K.
         M, D = np.zeros((self.model.nv,) * 2), np.diag(self.model.dof_damping)
         mujoco().mj_fullM(self.model, self.data, M)
         K = np.zeros_like(D)
@@ -475,6 +480,7 @@ class MuJoCoPlant(Shown):
             self._timestep * float(np.linalg.eigvals(np.linalg.solve(M, part)).real.max()) if part.any() else 0.0
             for part in (D, K)
         )
+        # Steps of a length at which the method is stable.
         parts = max(
             min(ceil(min(damped, RULES.most_parts + 1)), RULES.most_parts), ceil(sqrt(self._timestep * squared)), 1
         )

@@ -175,6 +175,7 @@ def run_physics(
 
 def apply_pushes(plant: MuJoCoPlant, loads: Loads, shares: Array) -> Array | None:
     """Apply the forces of the pushes for a tick of which they last a share each. Returns their joint torques (n,)."""
+    # Pushes act by their shares of the tick; joint torques come beside the law's.
     plant.release()
     if not shares.any():
         return None

@@ -369,6 +369,7 @@ class Prepared:
 
     def _evaluate(self, name: str, *arguments: Array) -> list[Array]:
         """`command`, `energy` or `measured` of the law for N rows of arguments."""
+        # Compiled runs have the functions of the law in C, others those of CasADi.
         if self.compiled is not None:
             return self.compiled.rows(name, *arguments)
         controller = self.loop.controller

@@ -201,6 +201,7 @@ class Trajectory(Shown):
         target = as_path("path", path)
         require_writable(target, TrajectoryFileError)
         require_replaceable(target, is_numpy_archive(target, ("header", *_REQUIRED)), force, TrajectoryFileError)
+        # A header for what is no array, beside the arrays.
         header = {
             "version": _VERSION,
             "controller": self.controller,
@@ -249,12 +250,14 @@ class Trajectory(Shown):
 
 def _check_arrays(arrays: Mapping[str, Any], n: int, k: int) -> dict[str, Any]:
     """The arrays of a run of n joints and k quantities, with shapes that fit and instants that increase."""
+    # One row for each instant, as wide as its kind of quantity.
     N = arrays["times"].size
     checked: dict[str, Any] = {}
     for name, array in arrays.items():
         checked[name] = as_float_array(name, array)
         width = () if name in _SINGLE else (n,) if name in _OF_JOINTS else (k,)
         require_shape(name, checked[name].shape, (N, *width))
+    # Files of early versions have no causes.
     checked.setdefault("cause", np.zeros(N))
     for name in ("status", "cause"):
         checked[name] = freeze_indices(name, checked[name], (N,), len(ControlStatus))

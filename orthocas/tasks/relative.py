@@ -163,11 +163,13 @@ class Relative:
         """x, x_d, dx_d, ddx_d, rates of dq, rates of w, dJ/dt w -> d/dt (E J w + de/dt of an arm at rest)."""
         names = ("x", "x_d", "dx_d", "ddx_d", "here", "there", "change")
         x, x_d, dx_d, ddx_d, here, there, change = symbols = self._make_symbols(*names)
+        # The rotation from the target, and its rates: w, v are a unit quaternion.
         p, omega, alpha = self._differentiate_target(x_d, dx_d, ddx_d)
         w, v = self._compute_turn(x, p)
         turning, along, changing = (self._order.T @ rate[self.first :] for rate in (here, there, change))
         dv = (w * (turning - omega) + ca.cross(v, turning + omega)) / 2
         dw = -ca.dot(v, turning - omega) / 2
+        # The rate of E times the velocity, and that of what the moving target adds.
         moved = dw * along + ca.cross(dv, along) + w * changing + ca.cross(v, changing)
         left = dw * omega + w * alpha - ca.cross(dv, omega) - ca.cross(v, alpha)
         straight = change[: self.first] - ddx_d[: self.first]

@@ -102,6 +102,7 @@ class NumpyGraph:
 
         Large graphs need large scratch memory. Every thread keeps its own from call to call.
         """
+        # Memory of this thread, built at its first call.
         if not hasattr(self._memory, "buffer"):
             self._memory.buffer, self._memory.evaluate = self.function.buffer()
         buffer, evaluate = self._memory.buffer, self._memory.evaluate

@@ -23,12 +23,14 @@ class ChartPage:
     """The page of a chart on a viser server."""
 
     def __init__(self, server: Any, session: Session, look: Look) -> None:
+        # State of the page, and the thread that works for it.
         self.session = session
         self._server = server
         self._panel = ChartPanel(session.chart, session.place)
         self._loop = Loop(self._settle, self._show_failure)
         self._gesture = self._dragging = self._sweeping = False
         self._fans: list[Fan] = []
+        # The scene, then what the user moves, then what it shows first.
         robot = session.chart.problem.robot
         self._arm, self._ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
         place_scene(server, robot, self.session.home[None])
@@ -53,6 +55,7 @@ class ChartPage:
         gui, chart, m = self._server.gui, self._chart, self._chart.m
         phi, sizes = chart.phi(self.session.home), chart.parts.phi_sizes
         sliders = {}
+        # Coordinates move within half a unit at first; `_settle` gives them the range that they have.
         with gui.add_folder("Coordinates: the task stays"):
             names = chart.parts.named_coordinates
             for label, name, value in zip(chart.labels[m:], names, phi[m:].tolist(), strict=True):
@@ -110,6 +113,7 @@ class ChartPage:
         problem = self._chart.problem
         branching = self.session.branches = branches(problem.robot, problem.task)
         self._search.remove()
+        # A button for each mirror in place of the search.
         with self._branches:
             for cut in branching.mirrors:
                 flip = partial(self._change, partial(self.session.flip, cut))
@@ -221,6 +225,7 @@ class ChartPage:
         """After a gesture: ranges of the sliders, the fan, and values that were not reached."""
         self._gesture = self._dragging = False
         self._fans = [fan_along(self._chart, self.session.q, k) for k in range(self._chart.r)]
+        # Whole steps of the sliders inside the range.
         for fan in self._fans:
             slider = self._sliders[fan.label]
             low, high = (

@@ -331,6 +331,7 @@ def _build_solid(
     if material is not None:
         colour = _read_colour(material) or colours.get(material.get("name", ""), RULES.shell)
     shape = next(iter(visual.find("geometry") if visual.find("geometry") is not None else ()), None)  # type: ignore[arg-type]
+    # Shapes as URDF files name them; others are not shown.
     if shape is None:
         return None
     if shape.tag == "box":
@@ -368,6 +369,7 @@ def _locate(path: Path, name: str) -> Path | None:
     name = unquote(name)
     scheme, _, rest = name.rpartition("://")
     folder = path.resolve().parent
+    # Packages lie above the file, or where ROS looks for them.
     if scheme in ("package", "model"):
         package, _, inside = rest.partition("/")
         roots = [*folder.parents, folder, *map(Path, filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(":")))]

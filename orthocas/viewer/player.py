@@ -43,6 +43,7 @@ class Stage:
         size = compute_chain_length(robot.tree)
         for k, (motion, shift) in enumerate(zip(motions, self.shifts, strict=True)):
             self._arms.append(Arm(scene, f"/arm{k}", robot, look, shift))
+            # The way of each tip, in few enough points.
             rows = np.unique(np.linspace(0, len(motion.q) - 1, RULES.path_points).astype(int))
             ways = [robot.frame_position(motion.q[rows], tip) + shift for tip in robot.tips]
             ends = np.concatenate([np.stack([way[:-1], way[1:]], axis=1) for way in ways])
@@ -99,6 +100,7 @@ class PlayerPage:
 
     def _toggle(self) -> None:
         """Play from where the slider is, or stop."""
+        # A second click stops; at the end, playing begins anew.
         if self._playing:
             self._pause()
             return
@@ -109,6 +111,7 @@ class PlayerPage:
 
         def tick(seconds: float) -> bool:
             nonlocal last
+            # The speed may change while it plays, so time is summed up.
             speed = float(self._speed.value.removesuffix("x"))
             now, last = self._now + speed * (seconds - last), seconds
             if now >= self._stage.duration and not self._again.value:
@@ -183,6 +186,7 @@ class RobotPage:
 
     def _add_slider(self, i: int) -> Any:
         robot, centre = self._robot, float(self._home[i])
+        # Rounded inwards, so that the ends are within the limits.
         low, high = np.clip([robot.lower[i], robot.upper[i]], centre - RULES.endless, centre + RULES.endless).tolist()
         low, high = round(low + 4.9e-4, 3), round(high - 4.9e-4, 3)
         high = max(low, high)
@@ -198,6 +202,7 @@ class RobotPage:
             slider.value = min(max(round(value, 3), slider.min), slider.max)
 
     def _show(self) -> None:
+        # Values that are no numbers do not move the arm; the sliders go back, and the page says so.
         q = np.array([slider.value for slider in self._sliders])
         good = np.isfinite(q)
         for slider, value in zip(self._sliders, self._q.tolist(), strict=True):
@@ -271,10 +276,12 @@ def show_robot(robot: Robot, look: Look, server: Any) -> tuple[float, Callable[[
 
 def _find_position(chart: Chart, fan: Fan, fraction: float) -> Array:
     """The joint position (n,) after a fraction of a sweep, exactly on the curve: from home to both ends and back."""
+    # A sine through the present value, over nearly the whole range.
     here = np.interp(0.0, fan.arc_length, fan.xi)
     centre, half = (fan.xi[-1] + fan.xi[0]) / 2, (fan.xi[-1] - fan.xi[0]) / 2
     phase = np.arcsin(np.clip((here - centre) / max(half, 1e-12), -1, 1))
     target = centre + 0.99 * half * np.sin(2 * np.pi * fraction + phase)
+    # From the nearest stored position, exactly onto the curve.
     order = np.argsort(fan.xi)
     near = np.array([np.interp(target, fan.xi[order], column[order]) for column in fan.q.T])
     phi = chart.phi(chart.problem.domain.centre)

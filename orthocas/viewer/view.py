@@ -98,6 +98,7 @@ def view(
         NoExpressionError: for grown charts.
         RobotError: if the robot file is another robot's.
     """
+    # What is shown decides which page it gets.
     arm, motions = read_subject(shown, robot)
     shape = build_shape(arm, robot_file, locked)
     server, url = open_window(host, port, "orthocas")
@@ -141,6 +142,7 @@ def export_page(
     """
     target = as_path("path", path)
     require_page(target, force)
+    # What is shown decides which scene is recorded.
     arm, motions = read_subject(shown, robot)
     shape = build_shape(arm, robot_file, locked)
     scene: Scene

@@ -306,8 +306,10 @@ class Guard:
             return False
         name = match["name"].strip("[]")
         own = is_local(self.host)
+        # By name: this machine's own, or the one that the server was told.
         if name in ("localhost", self.host.lower()):
             return True
+        # By number: this machine, or any if others may reach it.
         try:
             return ipaddress.ip_address(name).is_loopback or not own
         except ValueError:
@@ -360,6 +362,7 @@ def _add_guard(serve: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
             if any(future.done() for future in events):
                 await super().handshake(*arguments, **options)
 
+    # viser's server gets the guard, with limits of messages, before its own answers.
     def serve_guarded(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
         if getattr(handler, "__module__", None) != _VISER:
             return serve(handler, *arguments, process_request=process_request, **options)
@@ -510,6 +513,7 @@ def place_camera(server: Any, robot: Robot, q: Array, shift: Array | None = None
         (low + high) / 2,
         max(float(np.linalg.norm(high - low)) / 2, 0.4 * compute_chain_length(robot.tree)),
     )
+    # The camera is far enough away for that sphere, and moves with the shape of the picture.
     up = compute_up(robot)
     server.scene.set_up_direction(tuple(up))
     frame = Framing(centre, compute_camera_direction(robot), RULES.room * radius / np.sin(RULES.view_angle / 2))
