@@ -130,8 +130,21 @@ class BasisObjective:
         """L(theta) and dL/dtheta."""
         # J_xi = T X block by block; the loss and its slopes there; and the slopes times X^T, which are dL/dT
         T, columns, parts = self._table(theta), build_loss_columns(self._loss), self._parts
+        arrays = (self.X, self._share, *self._data)
+
+        def sum_part(run: Run, part: slice) -> tuple[float, Array]:
+            value, gradient = 0.0, np.zeros(T.shape)
+            losses, slopes = np.empty(COLUMNS), np.empty((self.n * self.r, COLUMNS))
+            # one block at a time, so that X leaves memory only once
+            for X, share, *data in zip(*(array[part] for array in arrays), strict=True):
+                run([_to_double(T @ X), *data], [losses, slopes])
+                value += float(losses @ share)
+                shared = (slopes * share).astype(X.dtype, copy=False).reshape(*T.shape[:2], -1)
+                gradient += shared @ X.transpose(0, 2, 1)
+            return value, gradient
+
         with columns.borrow(min(count_threads(), len(parts))) as runs:
-            sums = run_in_threads_with(runs, lambda run, part: self._sum_part(T, run, part), parts)
+            sums = run_in_threads_with(runs, sum_part, parts)
         slopes = self._gradients.collect(np.sum([gradient for _, gradient in sums], axis=0))
         return sum(value for value, _ in sums), slopes[self.kept]
 
@@ -233,18 +246,6 @@ class BasisObjective:
         """The blocks of samples in parts."""
         return [slice(start, start + RULES.blocks) for start in range(0, len(self.X), RULES.blocks)]
 
-    def _sum_part(self, T: Array, run: Run, part: slice) -> tuple[float, Array]:
-        """Share of some blocks in the loss, and in its slopes with respect to T."""
-        value, gradient = 0.0, np.zeros(T.shape)
-        losses, slopes = np.empty(COLUMNS), np.empty((self.n * self.r, COLUMNS))
-        arrays = (self.X, self._share, *self._data)
-        # block by block, so that X leaves memory only once
-        for X, share, *data in zip(*(array[part] for array in arrays), strict=True):
-            run([_to_double(T @ X), *data], [losses, slopes])
-            value += float(losses @ share)
-            gradient += (slopes * share).astype(X.dtype, copy=False).reshape(*T.shape[:2], -1) @ X.transpose(0, 2, 1)
-        return value, gradient
-
     def _evaluate_jacobians(self, theta: Array) -> Array:
         """J_xi, (B, n r, c)."""
         T = self._table(theta)
@@ -264,21 +265,16 @@ class BasisObjective:
                 blocks = derivative.reshape(len(derivative), self.n, -1, derivative.shape[2])
                 by_coordinate.append(split_by_sample(blocks, self.N, stride).astype(np.float32))
             H = build_normal_matrix(by_coordinate, gradients, shared) / len(gradients[0])
+        # hinge residuals couple all coordinates, but act at few samples; the padding of the last block is none
         hinges = derivatives[self.r :]
         for residual, derivative in zip(hinges[::2], hinges[1::2], strict=True):
-            H += self._sum_hinges(residual, derivative)
+            block, column = np.nonzero((residual[:, 0] > 0) & (self._share > 0))
+            D = derivative[block, :, column].reshape(-1, self.n, self.r).transpose(0, 2, 1).astype(np.float32)
+            chosen = self.X[block, :, :, column]  # (active, g, S)
+            G = self._gradients.expand(chosen.transpose(1, 2, 0)[None], len(chosen))
+            active = (D @ G.astype(np.float32))[:, self.kept]
+            H += (active.T @ active).astype(float) / self.N
         return H
-
-    def _sum_hinges(self, residual: Array, derivative: Array) -> Array:
-        """Gauss-Newton matrix of a hinge residual. It couples all coordinates, but acts at few samples."""
-        # only samples at which the hinge acts, without the padding of the last block
-        block, column = np.nonzero((residual[:, 0] > 0) & (self._share > 0))
-        D = derivative[block, :, column].reshape(-1, self.n, self.r).transpose(0, 2, 1).astype(np.float32)
-        chosen: Array = self.X[block, :, :, column]  # (active, g, S)
-        G = self._gradients.expand(chosen.transpose(1, 2, 0)[None], len(chosen))
-        rows = (D @ G.astype(np.float32))[:, self.kept]
-        product: Array = (rows.T @ rows).astype(float) / self.N
-        return product
 
 
 def _to_double(products: Array) -> Array:

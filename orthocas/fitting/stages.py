@@ -95,23 +95,33 @@ class Continuation:
 
     def run(self) -> Solution:
         """Run all stages. After Ctrl-C, the last one is marked as interrupted."""
-        steps = self._list_steps(self._runner.settings.parametrisation)
+        runner, folds = self._runner, self._runner.folds
+        # degree by degree, if the family has degrees
+        target = runner.settings.parametrisation
+        steps: list[Parametrisation] = [target]
+        if isinstance(target, GradedParametrisation):
+            runner.require_memory(target, self._r)
+            steps = [target.of_degree(degree) for degree in range(min(target.degree, 2), target.degree + 1)]
         try:
             for step in steps:
                 self._solve(step, step.label, final=step is steps[-1])
-            self._solve_until_unfolded(steps[-1])
+            # the last one again, until there is no point of small conditioning, or its conditioning no longer grows
+            last, before = steps[-1], 0.0
+            for k in range(2, 2 + RULES.rounds):
+                if folds.least >= LOSS_RULES.least_conditioning or 0 <= folds.least < before + RULES.least_gain:
+                    break
+                before = folds.least
+                self._solve(last, f"{last.label}, round {k}", final=True)
+            # the domain forces folds: their term would only spoil the rest
+            if folds.least < 0:
+                folds.give_up()
+                self._solve(last, f"{last.label}, with folds", final=True)
         except KeyboardInterrupt:  # also between minimisations
             if self._reached is None:
                 raise
             self._stages[-1] = self._stages[-1].mark_interrupted()
         assert self._reached is not None
         return Solution(tuple(self._stages), self._reached[0], self._runner.folds.worst)
-
-    def _list_steps(self, target: Parametrisation) -> Sequence[Parametrisation]:
-        if not isinstance(target, GradedParametrisation):
-            return [target]
-        self._runner.require_memory(target, self._r)
-        return [target.of_degree(degree) for degree in range(min(target.degree, 2), target.degree + 1)]
 
     def _solve(self, step: Parametrisation, label: str, final: bool) -> None:
         """Run a stage, and search the worst points of its result."""
@@ -141,19 +151,6 @@ class Continuation:
         assert isinstance(family, GradedFamily)
         assert isinstance(before, GradedFamily)
         return family.embed(theta, before)
-
-    def _solve_until_unfolded(self, step: Parametrisation) -> None:
-        """Solve the last step again until there is no point of small conditioning."""
-        folds, before = self._runner.folds, 0.0
-        for k in range(2, 2 + RULES.rounds):
-            if folds.least >= LOSS_RULES.least_conditioning or 0 <= folds.least < before + RULES.least_gain:
-                break
-            before = folds.least
-            self._solve(step, f"{step.label}, round {k}", final=True)
-        # the domain forces folds: their term would only spoil the rest
-        if folds.least < 0:
-            folds.give_up()
-            self._solve(step, f"{step.label}, with folds", final=True)
 
 
 class FoldSearch:

@@ -1,6 +1,5 @@
 """Where fits begin: the spectral start of bases, and a second start from the mirrored gradients."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, permutations, product
 
@@ -182,24 +181,19 @@ def find_mirror(problem: Problem, active: list[int]) -> Mirror | None:
     u = np.random.default_rng(RULES.seed).uniform(-1.0, 1.0, (RULES.points, space.n))
     left = [np.array(signs) for signs in product((1.0, -1.0), repeat=space.n)][1:]
     for points in (u[:1], u[1:]):
-        left = _keep_symmetric(problem, active, points, left)
+        # task directions and metric at S u must be the mirror images of those at u
+        tensors = _evaluate_tensors(problem, active, np.concatenate([points, *(signs * points for signs in left)]))
+        here, *there = tensors.reshape(1 + len(left), len(points), *tensors.shape[1:])
+        left = [
+            signs
+            for signs, image in zip(left, there, strict=True)
+            if np.abs(image - signs[:, None] * here * signs).max() <= RULES.tolerance
+        ]
     for signs in left:
         parities = _find_parities(problem, active, signs, u)
         if parities is not None:
             return Mirror(space, signs, parities)
     return None
-
-
-def _keep_symmetric(problem: Problem, active: list[int], u: Array, choices: Sequence[Array]) -> list[Array]:
-    """The choices of signs for which task directions and metric at S u are the mirror images of those at u."""
-    images = np.concatenate([u, *(signs * u for signs in choices)])
-    tensors = _evaluate_tensors(problem, active, images)
-    here, *there = tensors.reshape(1 + len(choices), len(u), *tensors.shape[1:])
-    return [
-        signs
-        for signs, image in zip(choices, there, strict=True)
-        if np.abs(image - signs[:, None] * here * signs).max() <= RULES.tolerance
-    ]
 
 
 def _evaluate_tensors(problem: Problem, active: list[int], u: Array) -> Array:
