@@ -265,16 +265,21 @@ class BasisObjective:
                 blocks = derivative.reshape(len(derivative), self.n, -1, derivative.shape[2])
                 by_coordinate.append(split_by_sample(blocks, self.N, stride).astype(np.float32))
             H = build_normal_matrix(by_coordinate, gradients, shared) / len(gradients[0])
-        # hinge residuals couple all coordinates, but act at few samples; the padding of the last block is none
         hinges = derivatives[self.r :]
         for residual, derivative in zip(hinges[::2], hinges[1::2], strict=True):
-            block, column = np.nonzero((residual[:, 0] > 0) & (self._share > 0))
-            D = derivative[block, :, column].reshape(-1, self.n, self.r).transpose(0, 2, 1).astype(np.float32)
-            chosen = self.X[block, :, :, column]  # (active, g, S)
-            G = self._gradients.expand(chosen.transpose(1, 2, 0)[None], len(chosen))
-            active = (D @ G.astype(np.float32))[:, self.kept]
-            H += (active.T @ active).astype(float) / self.N
+            H += self._sum_hinges(residual, derivative)
         return H
+
+    def _sum_hinges(self, residual: Array, derivative: Array) -> Array:
+        """Gauss-Newton matrix of a hinge residual. It couples all coordinates, but acts at few samples."""
+        # only samples at which the hinge acts, without the padding of the last block
+        block, column = np.nonzero((residual[:, 0] > 0) & (self._share > 0))
+        D = derivative[block, :, column].reshape(-1, self.n, self.r).transpose(0, 2, 1).astype(np.float32)
+        chosen: Array = self.X[block, :, :, column]  # (active, g, S)
+        G = self._gradients.expand(chosen.transpose(1, 2, 0)[None], len(chosen))
+        rows = (D @ G.astype(np.float32))[:, self.kept]
+        product: Array = (rows.T @ rows).astype(float) / self.N
+        return product
 
 
 def _to_double(products: Array) -> Array:
