@@ -186,11 +186,19 @@ def sew_angle(robot: Robot, kind: str) -> ca.Function:
         as the case e_t = 0.
     """
     require_known("SEW angle", kind, SEW_KINDS)
-    _require_seven_revolute(robot.tree)
+    # A chain of seven revolute joints.
+    tree = robot.tree
+    if tree.n != 7:
+        raise RobotError(f"the robot has {tree.n} joints, expected 7 for a shoulder-elbow-wrist angle")
+    for i, name in enumerate(tree.joint_names):
+        if tree.joint_kinds[i] != "revolute":
+            raise RobotError(f"joint '{name}' is {tree.joint_kinds[i]}, expected 7 revolute joints")
+        if tree.parents[i] != i - 1:
+            raise RobotError(f"joint '{name}' does not follow joint '{tree.joint_names[i - 1]}', expected a chain")
     q = ca.SX.sym("q", robot.n)
-    poses = build_body_poses(robot.tree, q)
+    poses = build_body_poses(tree, q)
     # Each point lies on a joint's axis, the z of its body, at a fixed height above the body's origin.
-    S, E, W = (poses[k][1] + poses[k][0][:, 2] * height for k, height in _find_points(robot.tree))
+    S, E, W = (poses[k][1] + poses[k][0][:, 2] * height for k, height in _find_points(tree))
     e_t, e_r = (ca.SX(ca.DM(direction)) for direction in DIRECTIONS[kind])
     return dense_function("sew_angle", [q], [compute_elbow_angle(E - S, W - S, e_t, e_r)])
 
@@ -232,17 +240,6 @@ def _find_common_normal(tree: KinematicTree, i: int) -> tuple[float, float, floa
     height = -float(origin[:2] @ across) / float(across @ across)
     end = origin + height * axis
     return float(end[2]), height, float(np.linalg.norm(end[:2]))
-
-
-def _require_seven_revolute(tree: KinematicTree) -> None:
-    """Raise RobotError unless the tree is a chain of seven revolute joints."""
-    if tree.n != 7:
-        raise RobotError(f"the robot has {tree.n} joints, expected 7 for a shoulder-elbow-wrist angle")
-    for i, name in enumerate(tree.joint_names):
-        if tree.joint_kinds[i] != "revolute":
-            raise RobotError(f"joint '{name}' is {tree.joint_kinds[i]}, expected 7 revolute joints")
-        if tree.parents[i] != i - 1:
-            raise RobotError(f"joint '{name}' does not follow joint '{tree.joint_names[i - 1]}', expected a chain")
 
 
 @dataclass(frozen=True)

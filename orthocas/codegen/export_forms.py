@@ -304,11 +304,18 @@ def write_function(name: str, summary: str, *functions: ca.Function) -> str:
 
 def _write_tape(tape: Tape) -> list[str]:
     """The lines that compute a tape's output from columns q (n, N), and return it as (k, N)."""
-    lines: list[str] = []
-    # Constants in slots of the work array stay words.
+    steps, lines = tape["steps"], list[str]()
+    # How many operands of later steps each step's result is.
+    uses, writer = [0] * len(steps), dict[int, int]()
+    for k, (name, into, *of) in enumerate(steps):
+        for slot in () if name in ("const", "input") else of:
+            uses[writer[slot]] += 1
+        if name != "output":
+            writer[into] = k
+    # Constants in slots of the work array stay words; results of several uses are computed once.
     constants: dict[int, str] = {}
     results: dict[int, str] = {}
-    for (name, into, *of), uses in zip(tape["steps"], _count_uses(tape["steps"]), strict=True):
+    for (name, into, *of), count in zip(steps, uses, strict=True):
         if name == "const":
             # Exactly; in brackets where an operator beside it would take its sign.
             value = float(of[0])
@@ -320,19 +327,8 @@ def _write_tape(tape: Tape) -> list[str]:
         else:
             text = f"q[{of[0]}]" if name == "input" else _write_operation(name, of, constants)
             constants.pop(into, None)
-            lines.append(f"w{into} = _shared({text}, q)" if uses > 1 and name != "input" else f"w{into} = {text}")
+            lines.append(f"w{into} = _shared({text}, q)" if count > 1 and name != "input" else f"w{into} = {text}")
     return [*lines, f"return np.stack([{', '.join(results[k] for k in range(len(results)))}])"]
-
-
-def _count_uses(steps: Sequence[Sequence[Any]]) -> list[int]:
-    """How many operands of later steps each step's result is."""
-    result, writer = [0] * len(steps), dict[int, int]()
-    for k, (name, into, *of) in enumerate(steps):
-        for slot in () if name in ("const", "input") else of:
-            result[writer[slot]] += 1
-        if name != "output":
-            writer[into] = k
-    return result
 
 
 _OPERATORS = {

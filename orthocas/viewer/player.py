@@ -172,10 +172,20 @@ class RobotPage:
         self._loop = Loop(lambda: None, partial(show_error, server))
         place_scene(server, robot, self._home[None])
         self._readings = place_panels(server)
+        # A slider for each joint around the centre, rounded inwards, so that its ends are within the limits.
+        self._sliders = []
         with server.gui.add_folder("Joints"):
-            self._sliders = [self._add_slider(i) for i in range(robot.n)]
+            for name, centre, *limits in zip(
+                robot.joint_names, self._home.tolist(), robot.lower, robot.upper, strict=True
+            ):
+                low, high = np.clip(limits, centre - RULES.endless, centre + RULES.endless).tolist()
+                low, high = round(low + 4.9e-4, 3), round(high - 4.9e-4, 3)
+                high = max(low, high)
+                start = min(max(round(centre, 3), low), high)
+                slider = server.gui.add_slider(name, low, high, RULES.slider_step, start)
+                slider.on_update(self._loop.build_handler("joints", self._show))
+                self._sliders.append(slider)
         home = server.gui.add_button("Home", icon="home")
-
         home.on_click(self._go_home)
         self._show()
         self._loop.start()
@@ -183,19 +193,6 @@ class RobotPage:
     def close(self) -> None:
         """End the thread of the page."""
         self._loop.stop()
-
-    def _add_slider(self, i: int) -> Any:
-        robot, centre = self._robot, float(self._home[i])
-        # Rounded inwards, so that the ends are within the limits.
-        low, high = np.clip([robot.lower[i], robot.upper[i]], centre - RULES.endless, centre + RULES.endless).tolist()
-        low, high = round(low + 4.9e-4, 3), round(high - 4.9e-4, 3)
-        high = max(low, high)
-        slider = self._server.gui.add_slider(
-            robot.joint_names[i], low, high, RULES.slider_step, min(max(round(centre, 3), low), high)
-        )
-
-        slider.on_update(self._loop.build_handler("joints", self._show))
-        return slider
 
     async def _go_home(self, event: Any) -> None:
         for slider, value in zip(self._sliders, self._home.tolist(), strict=True):
