@@ -108,10 +108,8 @@ class _IpoptRun:
         options: dict[str, Any] = {"grad_f": ca.Function("nlp_grad_f", [x, p], list(both(x)))}
         rows = len(self.constrained.bounds[0]) if self.constrained else 0
         if self.constrained:
-            constraints, jacobian = (
-                self._node("g", [self.size], [(rows, 1)], lambda theta: [self._constraints(theta)[0]]),
-                self._node("jac_g", [self.size], [(rows, 1), (rows, self.size)], self._constraints),
-            )
+            constraints = self._node("g", [self.size], [(rows, 1)], lambda theta: [self._constraints(theta)[0]])
+            jacobian = self._node("jac_g", [self.size], [(rows, 1), (rows, self.size)], self._constraints)
             problem["g"] = constraints(x)
             options["jac_g"] = ca.Function("nlp_jac_g", [x, p], list(jacobian(x)))
         options |= self._hessian_options(x, p)

@@ -22,10 +22,7 @@ SEWKind = Literal["conventional", "stereographic"]
 SEW_KINDS: tuple[SEWKind, ...] = ("conventional", "stereographic")
 # (e_t, e_r) in the world. The singular half-line e_t points down into the base. With e_r = -x, an arm that reaches
 # along +x with its elbow up has psi = 0, far from the jump at +-pi.
-DIRECTIONS = {
-    "conventional": ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-    "stereographic": ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0)),
-}
+DIRECTIONS = {"conventional": ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), "stereographic": ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0))}
 
 
 @dataclass(frozen=True, slots=True)

@@ -185,11 +185,7 @@ def certified_box(
 
 
 def check_certificate(
-    chart: Chart,
-    certificate: Certificate | None = None,
-    *,
-    executor: Executor | None = None,
-    monitor: Monitor = silent,
+    chart: Chart, certificate: Certificate | None = None, *, executor: Executor | None = None, monitor: Monitor = silent
 ) -> bool:
     """Whether a certificate holds: all that it says of the chart is computed once more.
 

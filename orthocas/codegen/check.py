@@ -52,11 +52,7 @@ class AgreementCheck:
 
 
 def check_c(
-    generated: GeneratedC,
-    chart: Chart,
-    controller: Controller | None = None,
-    states: int = 1000,
-    seed: int = 0,
+    generated: GeneratedC, chart: Chart, controller: Controller | None = None, states: int = 1000, seed: int = 0
 ) -> AgreementCheck:
     """Compile with gcc and clang (C99, warnings as errors), if installed, and compare with Python.
 

@@ -331,11 +331,7 @@ def _write_tape(tape: Tape) -> list[str]:
     return [*lines, f"return np.stack([{', '.join(results[k] for k in range(len(results)))}])"]
 
 
-_OPERATORS = {
-    **ARITHMETIC,
-    "pow": "{0} ** {1}",
-    "constpow": "{0} ** {1}",
-}
+_OPERATORS = {**ARITHMETIC, "pow": "{0} ** {1}", "constpow": "{0} ** {1}"}
 _CONDITIONS = {
     "not": "{0} == 0",
     "lt": "{0} < {1}",

@@ -23,12 +23,7 @@ from orthocas.codegen.rendering import (
     render,
 )
 from orthocas.codegen.rows import render_rows
-from orthocas.codegen.supervision import (
-    build_supervision_kernels,
-    describe_law,
-    describe_supervision,
-    find_condition,
-)
+from orthocas.codegen.supervision import build_supervision_kernels, describe_law, describe_supervision, find_condition
 from orthocas.control.controller import Controller, require_controller
 from orthocas.control.safety import Safety
 from orthocas.errors import ArchiveError, InvalidValueError

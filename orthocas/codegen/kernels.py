@@ -367,9 +367,7 @@ def _open_call(called: ca.Function, arguments: list[ca.MX], but: Collection[int]
 
 
 def _replace_calls(
-    function: ca.Function,
-    form: Callable[[ca.Function, list[ca.MX]], ca.MX | None],
-    more: list[ca.MX] | None = None,
+    function: ca.Function, form: Callable[[ca.Function, list[ca.MX]], ca.MX | None], more: list[ca.MX] | None = None
 ) -> ca.Function | None:
     """A graph with other expressions for what it calls at its first input; None if there are none.
 

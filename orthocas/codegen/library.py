@@ -259,11 +259,9 @@ class Supervisor:
         OK, NEAR_BOUNDARY if the target lies beyond the boundary, so that the stream stops before it, or NOT_FINITE.
         """
         numbers = self._reference(reference)
-        goal, speed, time = (
-            self._numbers("target", target, self._k),
-            as_number("omega", omega),
-            as_number("period", period),
-        )
+        goal = self._numbers("target", target, self._k)
+        speed = as_number("omega", omega)
+        time = as_number("period", period)
         status = self._functions["stream"](self._here, _pointer(numbers), _pointer(goal), speed, time)
         reference[:] = numbers
         return ControlStatus(status)

@@ -500,10 +500,7 @@ class Comparison(Shown):
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON. NaN becomes None."""
-        return {
-            "summaries": clean(self.summaries()),
-            "fits": clean(self.results),
-        }
+        return {"summaries": clean(self.summaries()), "fits": clean(self.results)}
 
     def facts(self) -> dict[str, str]:
         """The summaries, the best one first."""

@@ -79,12 +79,7 @@ class ClearBox(Box):
     rows: str
 
     def __init__(
-        self,
-        box: Box,
-        task: Task,
-        least_singular_value: float,
-        scale: ArrayLike | None = None,
-        rows: str = "frame",
+        self, box: Box, task: Task, least_singular_value: float, scale: ArrayLike | None = None, rows: str = "frame"
     ) -> None:
         require_kind("box", box, Box)
         require_kind("task", task, Task)

@@ -204,10 +204,5 @@ def read_postures(path: Path, robot: Robot) -> Array:
         PathFileError: names the file, the line, and what is wrong there.
     """
     return read_table(
-        path,
-        "postures file",
-        "postures",
-        _MOST_IN_FILE,
-        lambda names: find_columns(names, robot.joint_names),
-        least=1,
+        path, "postures file", "postures", _MOST_IN_FILE, lambda names: find_columns(names, robot.joint_names), least=1
     )

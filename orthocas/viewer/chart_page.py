@@ -228,10 +228,8 @@ class ChartPage:
         # Whole steps of the sliders inside the range.
         for fan in self._fans:
             slider = self._sliders[fan.label]
-            low, high = (
-                np.ceil(fan.xi[0] / RULES.slider_step) * RULES.slider_step,
-                np.floor(fan.xi[-1] / RULES.slider_step) * RULES.slider_step,
-            )
+            low = np.ceil(fan.xi[0] / RULES.slider_step) * RULES.slider_step
+            high = np.floor(fan.xi[-1] / RULES.slider_step) * RULES.slider_step
             if np.isfinite([low, high]).all():
                 slider.min, slider.max = round(float(min(low, high)), 3), round(float(max(low, high)), 3)
         self._show()

@@ -128,10 +128,8 @@ def build_capsule(
 ) -> Solid:
     """A rod with round ends from one point (3,) to another, with a radius at each end [m]."""
     length = float(np.linalg.norm(end - start))
-    low, high = (
-        _build_arc(radii[0], -np.pi / 2, 0.0, facets),
-        _build_arc(radii[1], 0.0, np.pi / 2, facets) + np.array([0.0, length]),
-    )
+    low = _build_arc(radii[0], -np.pi / 2, 0.0, facets)
+    high = _build_arc(radii[1], 0.0, np.pi / 2, facets) + np.array([0.0, length])
     axis = np.array([0.0, 0.0, 1.0]) if length == 0 else (end - start) / length
     return _revolve(np.concatenate([low, high]), colour, facets).move(rotate_z_to(axis), start)
 

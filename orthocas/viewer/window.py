@@ -98,22 +98,19 @@ class Inbox:
         # Viser drops what is gone.
         return None if handle is None else _check_value(handle, updates["value"])
 
-    def filter_messages(self, receive: Callable[[], Awaitable[Any]]) -> Callable[[], Awaitable[Any]]:
-        """`receive`, which passes over messages that have a fault."""
-
-        async def receive_good() -> Any:
-            while (fault := self.find_fault(raw := await receive())) is not None:
-                _log.warning("view: a message from a browser was dropped: %s", fault)
-            return raw
-
-        return receive_good
-
     def guard_handler(self, handler: Callable[[Any], Awaitable[None]]) -> Callable[[Any], Awaitable[None]]:
-        """viser's handler of a connection, with sorted messages, and with one line for what fails nevertheless."""
+        """viser's handler of a connection, without faulty messages, and with one line for what fails nevertheless."""
 
         async def handle(connection: Any) -> None:
             asyncio.get_running_loop().set_exception_handler(_report)
-            connection.recv = self.filter_messages(connection.recv)
+            receive = connection.recv
+
+            async def receive_good() -> Any:
+                while (fault := self.find_fault(raw := await receive())) is not None:
+                    _log.warning("view: a message from a browser was dropped: %s", fault)
+                return raw
+
+            connection.recv = receive_good
             await handler(connection)
 
         return handle
@@ -509,10 +506,8 @@ def place_camera(server: Any, robot: Robot, q: Array, shift: Array | None = None
     points = robot.joint_points(q).reshape(-1, 3)
     points = np.concatenate([points, *(points + other for other in ([] if shift is None else shift))])
     low, high = points.min(axis=0), points.max(axis=0)
-    centre, radius = (
-        (low + high) / 2,
-        max(float(np.linalg.norm(high - low)) / 2, 0.4 * compute_chain_length(robot.tree)),
-    )
+    centre = (low + high) / 2
+    radius = max(float(np.linalg.norm(high - low)) / 2, 0.4 * compute_chain_length(robot.tree))
     # The camera is far enough away for that sphere, and moves with the shape of the picture.
     up = compute_up(robot)
     server.scene.set_up_direction(tuple(up))
