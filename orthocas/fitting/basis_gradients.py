@@ -207,6 +207,7 @@ class SparseGradients(BasisGradients):
         """The numbers in their places."""
         B, n, _, c = X.shape
         assert c % every == 0
+        # each joint's numbers, at the places that its functions have among those asked for
         place = np.cumsum(kept) - 1
         dense = np.zeros((B, c // every, n, kept.sum()), dtype=X.dtype if dtype is None else dtype)
         for i, functions in enumerate(self.terms_of_joints):

@@ -169,6 +169,7 @@ class BasisObjective:
         (curvature,) = build_curvature_columns(self._loss)(self._evaluate_jacobians(theta), *self._data)
         W = split_by_sample(curvature.reshape(-1, n * r, n * r, curvature.shape[2]), self.N).reshape(-1, n, r, n, r)
         G, H = self._dense, np.zeros((r, K, r, K))
+        # each pair of coordinates is a block, filled by one thread
 
         def fill(pair: tuple[int, int]) -> None:
             i, j = pair
@@ -179,6 +180,7 @@ class BasisObjective:
             H[j, :, i] = H[i, :, j].T
 
         run_in_threads(fill, [(i, j) for i in range(r) for j in range(i + 1)])
+        # coefficients that may differ from zero
         free = self.kept.ravel()
         block: Array = H.reshape(r * K, r * K)[np.ix_(free, free)]
         return block
@@ -411,6 +413,7 @@ def _add(
             for row, other in rows_of[i, j]:
                 H[places[i], places[j]] += X[start, i][:, row].T @ X[start, j][:, other]
 
+    # rows of samples times gradients first, then squares and mixed products of them, each a block of the matrix
     r = len(derivatives)
     rows_of: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for i, j, row, other in shared:

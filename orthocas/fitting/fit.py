@@ -336,11 +336,13 @@ def offer_clear_part(problem: Problem, check: ProblemCheck, worst: WorstPoints |
     Returns:
         The offer; None if nothing is wrong, if charts fail elsewhere too, or if the centre itself would be left out.
     """
+    # positions with a small conditioning, if the search found some
     domain = problem.domain
     failed = np.zeros((0, problem.n)) if worst is None else worst.below(RULES.failed)
     clear = domain.singular_bound
     if not (isinstance(domain, Box) and (domain.is_box or clear)) or not (len(failed) or check.singular_samples):
         return None
+    # the bound that leaves most of them out, in whole steps, unless it is too large
     try:
         measured = clear or ClearBox(domain, problem.task, RULES.any_bound)
         values = measured.singular_values(failed)

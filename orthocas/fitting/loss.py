@@ -115,6 +115,7 @@ def loss(
 def _build_jacobians(family: Family, points: Array, theta: ca.MX) -> ca.MX:
     """J_xi of every sample column by column, (r n, N)."""
     N, n = points.shape
+    # bases are linear in theta: their gradients at the samples are numbers
     if isinstance(family, LinearFamily):
         q = ca.SX.sym("q", n)
         slopes = ca.Function("slopes", [q], [ca.densify(ca.jacobian(family.basis(q), q))])  # (K, n)
@@ -122,6 +123,7 @@ def _build_jacobians(family: Family, points: Array, theta: ca.MX) -> ca.MX:
         C = ca.reshape(theta, family.width, family.outputs).T
         linear: ca.MX = ca.reshape(C @ G, family.outputs * n, N)
         return linear
+    # other families as they differentiate themselves
     place = ca.MX.sym("q", n, N)
     gradients = ca.Function("gradients", [place, theta], family.jacobian(place, theta))
     by_component: list[Any] = gradients.call([ca.MX(ca.DM(points.T)), theta])

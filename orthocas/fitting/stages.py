@@ -126,11 +126,13 @@ class Continuation:
     def _solve(self, step: Parametrisation, label: str, final: bool) -> None:
         """Run a stage, and search the worst points of its result."""
         runner, degree = self._runner, step.degree if isinstance(step, GradedParametrisation) else 0
+        # the family on the active joints, from the last result; only the last degree is solved exactly
         family = runner.family(step, self._r)
         solver = runner.settings.solver if final else runner.settings.solver.coarser()
         stage = runner.run(Plan(label, family, self._start(family), solver, degree, final))
         self._stages.append(stage)
         self._reached = step, family
+        # the worst points of low degrees differ from those of the last one
         if stage.result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         if final or degree >= RULES.searched:
@@ -366,6 +368,7 @@ class StageRunner:
     ) -> tuple[BasisObjective, Array]:
         """The loss of a family that is linear in its parameters, and the start in those that a mirror leaves free."""
         kept = None if mirror is None else mirror.kept(family)
+        # the start as components, which a mirror leaves even or odd, and of these the free ones
         if theta is None:
             theta = self._start_spectral(family, len(samples), kept)
         elif mirror is not None:

@@ -159,6 +159,7 @@ class Mirror:
         return {}
 
     def _find_allowed(self, family: LinearFamily) -> NDArray[np.bool_] | None:
+        # the basis at points and at their images
         q = ca.SX.sym("q", self.space.n)
         basis = ca.Function("basis", [q], [ca.densify(family.basis(q))])
         u = np.random.default_rng(RULES.seed).uniform(-1.0, 1.0, (self.space.n, RULES.points))
@@ -166,6 +167,7 @@ class Mirror:
             np.array(basis(self.space.centre[:, None] + self.space.half_width[:, None] * side))
             for side in (u, self.signs[:, None] * u)
         )
+        # each function is even, odd, or neither
         size = np.abs(here).max(axis=1)
         even, odd = (np.abs(there - sign * here).max(axis=1) <= RULES.tolerance * size for sign in (1, -1))
         allowed: NDArray[np.bool_] = np.where(even, 1, -1) == self.parities[:, None]
@@ -208,11 +210,13 @@ def _find_parities(problem: Problem, active: list[int], signs: Array, u: Array) 
     The null space of J_x is mapped to itself where S q = q, and trace(S) on it is the number of even coordinates less
     that of odd ones.
     """
+    # on the mirror itself, S maps the null space to itself, and its trace counts parities
     tensors = _evaluate_tensors(problem, active, np.where(signs > 0, u, 0.0))
     inverse, projector = tensors[:, 0], tensors[:, 1]
     along_task = np.einsum("sii,i->s", np.linalg.solve(inverse, projector.transpose(0, 2, 1)), signs)
     differences = signs.sum() - along_task
     r = len(active) - problem.m
+    # a whole number of even coordinates, the same everywhere
     even = np.round((r + differences.mean()) / 2)
     if np.abs(2 * even - r - differences).max() > 0.01 or not 0 <= even <= r:
         return None
