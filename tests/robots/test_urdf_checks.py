@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import orthocas as oc
-from orthocas.errors import RobotError
+from orthocas.errors import RobotError, TipWarning
 
 ARM = """<robot name="r"><link name="base"/><link name="a"/>
 <joint name="j" type="{kind}"><parent link="base"/><child link="a"/>{axis}
@@ -179,8 +179,9 @@ def test_shapes_for_collision_checks_are_no_default_tips_and_lists_of_tips_have_
     assert oc.Robot.from_urdf(path).tips == ("flange",)
     more = [fixed.format("c", "grasp"), JOINT.format("l", "a", "d"), '<link name="d"/></robot>']
     path.write_text(path.read_text().replace("</robot>", "".join(more)))
-    with pytest.raises(RobotError, match="has 2 chains, name the tip frame: grasp, flange; d$"):
-        oc.Robot.from_urdf(path)
+    told = r"has 2 chains; taken is tip='grasp', with 2 joints, the longest. Other tips to name: d$"
+    with pytest.warns(TipWarning, match=told):
+        assert oc.Robot.from_urdf(path).tips == ("grasp",)
 
 
 def test_joint_that_shares_its_name_with_a_link_can_be_locked(tmp_path: Path) -> None:
