@@ -163,15 +163,22 @@ def _fit(
     """Fit with settings that are checked."""
     start = time.perf_counter()
     # the domain that the family asks for, and whether the task can be regular there
-    warn_unless_savable(settings.parametrisation)
-    problem = _choose_domain(problem, settings)
+    parametrisation = settings.parametrisation
+    warn_unless_savable(parametrisation)
+    if isinstance(parametrisation, CyclicParametrisation):
+        problem = widen_over_cyclic_joints(problem, tuple(parametrisation.cyclic))
+    if problem.robot.tree.floating and (parametrisation.closed_form is not None or not settings.split_idle):
+        expected = "one to fit in the arms' joints, such as Polynomial(1), with split_idle: the base floats"
+        raise InvalidValueError("parametrisation", parametrisation.label, expected)
+    if isinstance(parametrisation, Mobile):
+        problem = anywhere(problem, parametrisation.base)
     with remembered() as pressed:
         problem_check = check(problem, seed=settings.seed)
         samples = sample_problem(problem, RULES.first, (settings.seed, RULES.first_tag))
         # closed forms need no minimisation; others run the stages of `orthocas.fitting.stages`
-        if settings.parametrisation.closed_form is not None:
-            solution = Solution((), settings.parametrisation, None)
-            coordinates = _evaluate_closed_form(problem, settings.parametrisation, samples)
+        if parametrisation.closed_form is not None:
+            solution = Solution((), parametrisation, None)
+            coordinates = _evaluate_closed_form(problem, parametrisation, samples)
         else:
             singular = problem_check.singular_samples > 0
             solution, coordinates = _solve(problem, settings, monitor, samples, align_to, begin, singular)
@@ -190,21 +197,6 @@ def _fit(
         if result.status is Status.INTERRUPTED or pressed():
             raise Interrupted(result)
     return result
-
-
-def _choose_domain(problem: Problem, settings: FitSettings) -> Problem:
-    """The problem on the domain that its parametrisation asks for.
-
-    Raises:
-        InvalidValueError: if the base floats, and the family has no joints of the arms to fit.
-    """
-    parametrisation = settings.parametrisation
-    if isinstance(parametrisation, CyclicParametrisation):
-        problem = widen_over_cyclic_joints(problem, tuple(parametrisation.cyclic))
-    if problem.robot.tree.floating and (parametrisation.closed_form is not None or not settings.split_idle):
-        expected = "one to fit in the arms' joints, such as Polynomial(1), with split_idle: the base floats"
-        raise InvalidValueError("parametrisation", parametrisation.label, expected)
-    return anywhere(problem, parametrisation.base) if isinstance(parametrisation, Mobile) else problem
 
 
 def _evaluate_closed_form(problem: Problem, parametrisation: Parametrisation, samples: Samples) -> Coordinates:
@@ -364,11 +356,13 @@ def offer_clear_part(problem: Problem, check: ProblemCheck, worst: WorstPoints |
     Returns:
         The offer; None if nothing is wrong, if charts fail elsewhere too, or if the centre itself would be left out.
     """
+    # positions with a small conditioning, if the search found some
     domain = problem.domain
     failed = np.zeros((0, problem.n)) if worst is None else worst.below(RULES.failed)
     clear = domain.singular_bound
     if not (isinstance(domain, Box) and (domain.is_box or clear)) or not (len(failed) or check.singular_samples):
         return None
+    # the bound that leaves most of them out, in whole steps, unless it is too large
     try:
         measured = clear or ClearBox(domain, problem.task, RULES.any_bound)
         values = measured.singular_values(failed)
