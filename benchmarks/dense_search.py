@@ -3,11 +3,12 @@
 import numpy as np
 
 import orthocas as oc
+from orthocas.tools.checks import Array
 
 STARTS = 4000
 
 
-def positions_at(chart: oc.Chart, x: np.ndarray, pool: np.ndarray) -> np.ndarray:
+def positions_at(chart: oc.Chart, x: Array, pool: Array) -> Array:
     """Positions of the domain with the task value x (m,) to which damped least squares lead from a pool (S, n)."""
     m, sizes, (low, high) = chart.m, chart.parts.phi_sizes[: chart.m], chart.problem.domain.bounds
     q, wanted = pool.copy(), np.broadcast_to(x, (len(pool), m))
@@ -19,6 +20,7 @@ def positions_at(chart: oc.Chart, x: np.ndarray, pool: np.ndarray) -> np.ndarray
         step = (J.transpose(0, 2, 1) @ np.linalg.solve(gram, e[:, :, None]))[:, :, 0]
         q += step * np.minimum(1.0, 0.7 / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-300))
     e = chart.parts.relative.difference(wanted, chart.task(q)) / sizes
-    q = low + (q - low) % (2 * np.pi)
-    q = q[(np.abs(e).max(axis=1) < 1e-9) & (q <= high).all(axis=1)]
+    turning = ~np.array(chart.problem.robot.tree.prismatic) & np.isfinite(low)
+    q[:, turning] = low[turning] + (q[:, turning] - low[turning]) % (2 * np.pi)
+    q = q[(np.abs(e).max(axis=1) < 1e-9) & (q >= low).all(axis=1) & (q <= high).all(axis=1)]
     return np.asarray(q[chart.problem.domain.contains(q)])
