@@ -1,7 +1,6 @@
 """The self-motion curves of many task values at once, whatever the limits: ways to x, and the curves there."""
 
 from dataclasses import dataclass
-from itertools import product
 
 import casadi as ca
 import numpy as np
@@ -60,33 +59,6 @@ class Traces:
         row, q, tangent, count = (array[curves] for array in vars(self).values())
         longest = count.max(initial=1)
         return Traces(row, q[:, :longest], tangent[:, :longest], count)
-
-
-@dataclass(frozen=True, eq=False)
-class Steps:
-    """S steps of curves around the domain."""
-
-    row: Indices  #: number of the target, (S,)
-    q: Array  #: both ends, (S, 2, n)
-    tangent: Array  #: unit tangents there, (S, 2, n)
-    follows: NDArray[np.bool_]  #: whether a step begins where the one before it ends, (S,)
-
-    def part(self, which: NDArray[np.bool_]) -> "Steps":
-        """Some of the steps (S,)."""
-        row, q, tangent, follows = (array[which] for array in vars(self).values())
-        follows[1:] &= np.diff(np.flatnonzero(which)) == 1
-        follows[:1] = False
-        return Steps(row, q, tangent, follows)
-
-    def point(self, steps: Indices, share: Array) -> Array:
-        """Points of some steps (K,) at shares of the way (K,), on cubic curves, (K, n)."""
-        return _on_cubics(self.q[steps], self.tangent[steps], share[:, None])[:, 0]
-
-    def divided(self) -> tuple[Array, Array]:
-        """`RULES.parts` + 1 points on each step, on cubic curves, and directions there, (S, parts + 1, n) each."""
-        s = np.broadcast_to(np.arange(RULES.parts + 1) / RULES.parts, (len(self.q), RULES.parts + 1))
-        along = (1 - s[:, :, None]) * self.tangent[:, :1] + s[:, :, None] * self.tangent[:, 1:]
-        return _on_cubics(self.q, self.tangent, s), along
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,49 +131,6 @@ class CurveTracer:
         bounded = np.isfinite(low)
         centre, half = np.where(bounded, (low + high) / 2, 0.0), np.where(bounded, (high - low) / 2, np.inf)
         return np.asarray((np.abs(without_turns(q - centre, self.turning)) - half).max(axis=2).clip(0.0))
-
-    def steps(self, traces: Traces, own: Array, winding: NDArray[np.bool_]) -> "Steps":
-        """The steps of curves in and around the box of the domain, after all full turns that bring them there.
-
-        Joints without boundaries turn to within half a turn of given positions (K, n), or one and a half for those that
-        wind, (n,).
-        """
-        curve, shift = self._sheets(traces, own, winding)
-        low, high = self.boxed.domain.bounds
-        moved = traces.q[curve] + shift[:, None]
-        near = np.asarray(((moved >= low - RULES.step) & (moved <= high + RULES.step)).all(axis=2))
-        at, place = np.nonzero((near[:, :-1] | near[:, 1:]) & (np.arange(1, near.shape[1]) < traces.count[curve, None]))
-        of, turn = curve[at], shift[at]
-        q = np.stack([traces.q[of, place] + turn, traces.q[of, place + 1] + turn], axis=1)
-        t = np.stack([traces.tangent[of, place], traces.tangent[of, place + 1]], axis=1)
-        follows = np.diff(at * near.shape[1] + place, prepend=-2) == 1
-        return Steps(traces.row[of], q, t, follows)
-
-    def _sheets(self, traces: Traces, own: Array, winding: NDArray[np.bool_]) -> tuple[Indices, Array]:
-        """Which curves (of K) pass the box of the domain after which full turns: curve (L,), and shifts (L, n)."""
-        low, high = self.boxed.domain.bounds
-        turn, room, bounded = 2 * np.pi, RULES.step, np.isfinite(low)
-        low = np.where(bounded, low - room, own - np.where(winding, 3 * np.pi, np.pi))[:, None]
-        high = np.where(bounded, high + room, np.inf)
-        first = np.where(self.turning, np.ceil((low - traces.q) / turn), 0.0)
-        at = traces.q + turn * first
-        passed = np.ones(at.shape[:2], dtype=bool)
-        passed[:, 1:] = (first[:, 1:] != first[:, :-1]).any(axis=2)
-        width = np.where(bounded, (high - low[0, 0]) // turn, np.where(winding, 2, 0))
-        choices = [range(1 + int(k)) for k in np.where(self.turning, width, 0)]
-        near = [
-            [(at[:, :, j] >= low[:, :, j]) & (at[:, :, j] <= high[j] - turn * k) for k in choices[j]]
-            for j in range(len(high))
-        ]
-        found = []
-        for extra in product(*choices):
-            close = np.all([near[j][k] for j, k in enumerate(extra)], axis=0)
-            changes = np.asarray(close & passed)
-            changes[:, 1:] |= close[:, 1:] & ~close[:, :-1]
-            curve, place = np.nonzero(changes)
-            found.append(np.column_stack([curve, first[curve, place] + np.array(extra)]))
-        sheets = np.unique(np.concatenate(found), axis=0)
-        return sheets[:, 0].astype(np.int64), turn * sheets[:, 1:]
 
     def correct(self, x: Array, q: Array, t: Array) -> tuple[Array, Array]:
         """Newton's steps to x across directions t (K, n), and tangents with t . tangent = 1, (K, n) each."""
@@ -325,13 +254,6 @@ class CurveTracer:
 def without_turns(difference: Array, turning: NDArray[np.bool_]) -> Array:
     """Differences of joint positions (..., n) without full turns of revolute joints."""
     return np.asarray(wrap_shortest(difference, np.where(turning, 2 * np.pi, 0.0)))
-
-
-def _on_cubics(q: Array, t: Array, share: Array) -> Array:
-    """Points on cubic curves with ends q and unit tangents t (K, 2, n), at shares (K, G) of the way, (K, G, n)."""
-    s, step = share[:, :, None], q[:, 1:] - q[:, :1]
-    bend = (s - 2 * s**2 + s**3) * t[:, :1] + (s**3 - s**2) * t[:, 1:]
-    return np.asarray(q[:, :1] + (3 * s**2 - 2 * s**3) * step + np.linalg.norm(step, axis=2, keepdims=True) * bend)
 
 
 def solutions_of(A: Array, right: Array) -> Array:

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.charts.curve_tracer import RULES, CurveTracer, Steps, Traces, solutions_of
+from orthocas.charts.curve_tracer import RULES, CurveTracer, Traces, solutions_of
 from orthocas.charts.descent import BoxedPhi
 from orthocas.charts.phi import largest
 from orthocas.charts.search import Starts
@@ -123,7 +124,7 @@ class SelfMotionCurves:
                 of = left[at]
             traces = self.tracer.trace(targets[rows[of], : self.boxed.m], q[of, start], rows[of])
             known[of, start] = True
-            steps = self.tracer.steps(traces, own[traces.row], self.boxed.winding)
+            steps = self._steps(traces, own[traces.row])
             xi_left = self._take_crossed(targets, steps, tolerance, best)
             more = best.distance[steps.row] > 0
             arcs = self._arcs(targets, steps.part(more), xi_left[more])
@@ -141,7 +142,20 @@ class SelfMotionCurves:
         q, arrived = self.tracer.reach(x, starts.transpose(1, 0, 2).reshape(-1, n))
         return q.reshape(N, S, n), ~arrived.reshape(N, S)
 
-    def _take_crossed(self, targets: Array, steps: Steps, tolerance: float, best: Nearest) -> Array:
+    def _steps(self, traces: Traces, own: Array) -> "Steps":
+        """The steps of curves in and around the box of the domain, after all full turns that bring them there."""
+        curve, shift = self._sheets(traces, own)
+        low, high = self.boxed.domain.bounds
+        moved = traces.q[curve] + shift[:, None]
+        near = np.asarray(((moved >= low - RULES.step) & (moved <= high + RULES.step)).all(axis=2))
+        at, place = np.nonzero((near[:, :-1] | near[:, 1:]) & (np.arange(1, near.shape[1]) < traces.count[curve, None]))
+        of, turn = curve[at], shift[at]
+        q = np.stack([traces.q[of, place] + turn, traces.q[of, place + 1] + turn], axis=1)
+        t = np.stack([traces.tangent[of, place], traces.tangent[of, place + 1]], axis=1)
+        follows = np.diff(at * near.shape[1] + place, prepend=-2) == 1
+        return Steps(traces.row[of], q, t, follows)
+
+    def _take_crossed(self, targets: Array, steps: "Steps", tolerance: float, best: Nearest) -> Array:
         """Solutions of phi(q) = phi on steps along which xi passes its target, in or near the box.
 
         Returns:
@@ -152,7 +166,7 @@ class SelfMotionCurves:
         self._take_solutions(targets, steps.row[step], steps.point(step, share), tolerance, best)
         return left
 
-    def _xi_left_of(self, targets: Array, steps: Steps) -> Array:
+    def _xi_left_of(self, targets: Array, steps: "Steps") -> Array:
         """xi - xi(q) at both ends of steps, (S, 2); NaN far from the box."""
         left, low, high = np.full(steps.q.shape[:2], np.nan), *self.boxed.domain.bounds
         slack = RULES.step / RULES.parts
@@ -172,7 +186,7 @@ class SelfMotionCurves:
         a, b = a[crossed], b[crossed]
         return crossed, np.where(a == b, 0.0, a / np.where(a == b, 1.0, a - b))
 
-    def _arcs(self, targets: Array, steps: Steps, left: Array) -> "Arcs":
+    def _arcs(self, targets: Array, steps: "Steps", left: Array) -> "Arcs":
         """Points on the steps that may hold a root, an end of an arc, or a place where xi turns back."""
         steps = steps.part(self._matters(steps, left))
         low, high = self.boxed.domain.bounds
@@ -194,7 +208,7 @@ class SelfMotionCurves:
         passing[arc, place] = first < last
         return Arcs(steps.row, q, inside, passing, xi_left)
 
-    def _matters(self, steps: Steps, left: Array) -> NDArray[np.bool_]:
+    def _matters(self, steps: "Steps", left: Array) -> NDArray[np.bool_]:
         """Steps (S,) that pass the target or a boundary, their neighbours, and those where xi turns back.
 
         Along the others, xi only moves from one end to the other, and both ends lie in the domain; or they lie outside
@@ -221,6 +235,36 @@ class SelfMotionCurves:
         around[1:] |= changes[:-1] & steps.follows[1:]
         around[:-1] |= changes[1:] & after[:-1]
         return np.asarray(around & ~(none & ~changes))
+
+    def _sheets(self, traces: Traces, own: Array) -> tuple[Indices, Array]:
+        """Which curves (of K) pass the box of the domain after which full turns: curve (L,), and shifts (L, n).
+
+        Joints without boundaries turn to within half a turn of the caller's starts (K, n), or one and a half where
+        turns change xi.
+        """
+        low, high = self.boxed.domain.bounds
+        turn, room, bounded = 2 * np.pi, RULES.step, np.isfinite(low)
+        low = np.where(bounded, low - room, own - np.where(self.boxed.winding, 3 * np.pi, np.pi))[:, None]
+        high = np.where(bounded, high + room, np.inf)
+        first = np.where(self.tracer.turning, np.ceil((low - traces.q) / turn), 0.0)
+        at = traces.q + turn * first
+        passed = np.ones(at.shape[:2], dtype=bool)
+        passed[:, 1:] = (first[:, 1:] != first[:, :-1]).any(axis=2)
+        width = np.where(bounded, (high - low[0, 0]) // turn, np.where(self.boxed.winding, 2, 0))
+        choices = [range(1 + int(k)) for k in np.where(self.tracer.turning, width, 0)]
+        near = [
+            [(at[:, :, j] >= low[:, :, j]) & (at[:, :, j] <= high[j] - turn * k) for k in choices[j]]
+            for j in range(len(high))
+        ]
+        found = []
+        for extra in product(*choices):
+            close = np.all([near[j][k] for j, k in enumerate(extra)], axis=0)
+            changes = np.asarray(close & passed)
+            changes[:, 1:] |= close[:, 1:] & ~close[:, :-1]
+            curve, place = np.nonzero(changes)
+            found.append(np.column_stack([curve, first[curve, place] + np.array(extra)]))
+        sheets = np.unique(np.concatenate(found), axis=0)
+        return sheets[:, 0].astype(np.int64), turn * sheets[:, 1:]
 
     def _take_roots(self, targets: Array, arcs: "Arcs", tolerance: float, best: Nearest) -> None:
         """Solutions of phi(q) = phi on arcs."""
@@ -351,6 +395,33 @@ class SelfMotionCurves:
 
 
 @dataclass(frozen=True, eq=False)
+class Steps:
+    """S steps of curves around the domain."""
+
+    row: Indices  #: number of the target, (S,)
+    q: Array  #: both ends, (S, 2, n)
+    tangent: Array  #: unit tangents there, (S, 2, n)
+    follows: NDArray[np.bool_]  #: whether a step begins where the one before it ends, (S,)
+
+    def part(self, which: NDArray[np.bool_]) -> "Steps":
+        """Some of the steps (S,)."""
+        row, q, tangent, follows = (array[which] for array in vars(self).values())
+        follows[1:] &= np.diff(np.flatnonzero(which)) == 1
+        follows[:1] = False
+        return Steps(row, q, tangent, follows)
+
+    def point(self, steps: Indices, share: Array) -> Array:
+        """Points of some steps (K,) at shares of the way (K,), on cubic curves, (K, n)."""
+        return _on_cubics(self.q[steps], self.tangent[steps], share[:, None])[:, 0]
+
+    def divided(self) -> tuple[Array, Array]:
+        """`RULES.parts` + 1 points on each step, on cubic curves, and directions there, (S, parts + 1, n) each."""
+        s = np.broadcast_to(np.arange(RULES.parts + 1) / RULES.parts, (len(self.q), RULES.parts + 1))
+        along = (1 - s[:, :, None]) * self.tangent[:, :1] + s[:, :, None] * self.tangent[:, 1:]
+        return _on_cubics(self.q, self.tangent, s), along
+
+
+@dataclass(frozen=True, eq=False)
 class Arcs:
     """S steps of curves around the domain, by G points each, close to one another."""
 
@@ -379,3 +450,10 @@ class Ends:
         """Both."""
         parts = zip(vars(self).values(), vars(other).values(), strict=True)
         return Ends(*(np.concatenate(pair) for pair in parts))
+
+
+def _on_cubics(q: Array, t: Array, share: Array) -> Array:
+    """Points on cubic curves with ends q and unit tangents t (K, 2, n), at shares (K, G) of the way, (K, G, n)."""
+    s, step = share[:, :, None], q[:, 1:] - q[:, :1]
+    bend = (s - 2 * s**2 + s**3) * t[:, :1] + (s**3 - s**2) * t[:, 1:]
+    return np.asarray(q[:, :1] + (3 * s**2 - 2 * s**3) * step + np.linalg.norm(step, axis=2, keepdims=True) * bend)

@@ -7,9 +7,10 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.charts.curve_tracer import CurveTracer, Traces
+from orthocas.charts.curve_tracer import CurveTracer, Traces, without_turns
 from orthocas.charts.descent import RULES as DESCENT
 from orthocas.charts.descent import BoxedPhi, descend
+from orthocas.charts.newton import inverses
 from orthocas.charts.search import Starts
 from orthocas.charts.slide import RULES as SLIDE
 from orthocas.charts.slide import slide
@@ -26,18 +27,19 @@ class InsideRules:
     near_phi: int = 2  #: stored positions near each phi, from which curves are sought on each slice
     near_x: int = 4  #: the same near each x
     places: tuple[float, ...] = (-1.0, -0.5, 0.0, 0.5, 1.0)  #: of the first held joint on slices, in half-widths
+    stride: int = 3  #: of the points inside on curves, those taken, from where a curve enters the domain
     slack: float = 0.1  #: [rad] or [m]: points of curves so far outside the box are moved to its face
     probes: int = 64  #: positions at which the speeds of joints are measured
-    near: int = 5  #: stored positions near each phi from which slides start
-    short: int = 14  #: points on curves from which slides start
+    near: int = 2  #: stored positions near each phi from which slides start
+    short: int = 10  #: points on curves from which slides start
     steps: int = 4  #: of these slides
     long: int = 4  #: longer slides from the best of these
     more: int = 8  #: steps of these slides
-    settled: float = 1e-5  #: error of x from which a slide to the end may start
+    settled: float = 1e-5  #: error of x up to which their ends are compared
     last: int = 1  #: slides to the end
+    again: int = 24  #: stored positions near phi, and as many near x, for rows with nothing inside until then
     most: int = 100  #: points nearest to xi, of which those are chosen
     apart: float = 0.2  #: their least distance from one another, in half-widths
-    arrived: float = 2e-2  #: error of x from which a long slide may start
     nearly: float = 1e-4  #: distance in xi after a short slide from which a long one most probably ends at a solution
     rows: int = 1024  #: whose points are held in memory
 
@@ -92,23 +94,48 @@ class Inside:
     def _nearest(self, targets: Array, q: Array) -> tuple[Array, Array]:
         """The same for few rows: short slides from many points, long ones from the best of their ends."""
         N, n = q.shape
-        near = np.concatenate([q[None], self.starts.nearest(targets, RULES.near, n)]).reshape(-1, n)
-        points = self._turned(targets, Points.of(np.tile(np.arange(N), len(near) // N), self.boxed.of_points(near)), q)
-        ends = self._slid(targets, points, RULES.steps, RULES.arrived)
-        open_to = ends.best(N)[1] > RULES.nearly
-        on_slices = self._turned(targets, self._slices.points(targets, q, np.flatnonzero(open_to)), q)
-        ends = ends.joined(self._slid(targets, on_slices.apart(N, RULES.short), RULES.steps, RULES.arrived))
-        ends = self._slid(targets, ends.apart(N, RULES.long), RULES.more, RULES.settled)
-        ends = self._slid(targets, ends.apart(N, RULES.last), SLIDE.most, SLIDE.kept)
+        near = np.concatenate([q[None], self.starts.nearest(targets, RULES.near, n)])
+        ends = self._slid(targets, self._turned(targets, Points.of(near, self.boxed), q), RULES.steps)
+        left = np.flatnonzero(ends.best(N)[1] > RULES.nearly)
+        if left.size:
+            on_slices = self._ranked(targets, self._slices.points(targets, q, left), q)
+            ends = ends.joined(self._slid(targets, on_slices.apart(N, RULES.short), RULES.steps))
+        ends = self._to_end(targets, ends, N)
+        left = np.flatnonzero(np.isinf(ends.best(N)[1]))
+        if left.size:
+            ends = ends.joined(self._to_end(targets, self._again(targets, q, left), N))
         (place, distance), u = ends.best(N), self.boxed.of_points(q)
         found = np.isfinite(distance)
         u[found] = ends.u[place[found]]
         return self.boxed.points(u), distance
 
-    def _slid(self, targets: Array, points: "Points", most: int, arrived: float) -> "Points":
-        """Where slides from points end; with infinite distances where x is not reached, or the domain left."""
+    def _to_end(self, targets: Array, ends: "Points", N: int) -> "Points":
+        """Where long slides from the best of some ends, and slides to the end from the best of those, keep x."""
+        ends = self._slid(targets, ends.apart(N, RULES.long), RULES.more)
+        return ends.joined(self._slid(targets, ends.apart(N, RULES.last, RULES.settled), SLIDE.most)).kept()
+
+    def _again(self, targets: Array, q: Array, left: Indices) -> "Points":
+        """Points inside for rows that are left: where slides and descents from many stored positions end."""
+        n, m = q.shape[1], self.boxed.m
+        near = self.starts.nearest(targets[left], RULES.again, n), self.starts.nearest(targets[left], RULES.again, m)
+        points = Points.of(np.concatenate([q[None, left], *near]), self.boxed, left)
+        slid = self._slid(targets, points, RULES.more)
+        end = descend(self.boxed.task_equations, targets[points.row], points.u)
+        kept = (end.error <= DESCENT.kept) & self.boxed.domain.contains(self.boxed.points(end.u))
+        return slid.joined(self._ranked(targets, Points(points.row[kept], end.u[kept], *np.zeros((2, kept.sum()))), q))
+
+    def _slid(self, targets: Array, points: "Points", most: int) -> "Points":
+        """Where slides from points end."""
         end = slide(self.boxed, targets[points.row], points.u, most)
-        return Points(points.row, end.u, np.where(end.error <= arrived, end.distance, np.inf))
+        return Points(points.row, end.u, end.distance, end.error)
+
+    def _ranked(self, targets: Array, points: "Points", q: Array) -> "Points":
+        """Points after full turns, and about how far joints have to move from there to xi."""
+        points = self._turned(targets, points, q)
+        J = self.boxed.phi_map.jacobian(self.boxed.points(points.u)) * self.boxed.domain.half_width
+        with np.errstate(all="ignore"):
+            reach = np.linalg.norm(inverses(J)[0][:, :, self.boxed.m :], axis=(1, 2))
+        return Points(points.row, points.u, points.away * reach, np.zeros(len(points.row)))
 
     def _turned(self, targets: Array, points: "Points", q: Array) -> "Points":
         """Points after the full turns near those of q (N, n) that bring xi nearest to targets (N, n)."""
@@ -117,7 +144,7 @@ class Inside:
             turns.any(axis=0), turn * np.round((points.u - self.boxed.of_points(q)[points.row]) / turn), 0.0
         )
         away = np.linalg.norm(self.boxed.xi_errors(targets[points.row], u)[:, None] - shifts, axis=2)
-        return Points(points.row, u + turn * turns[np.argmin(away, axis=1)], away.min(axis=1))
+        return Points(points.row, u + turn * turns[np.argmin(away, axis=1)], away.min(axis=1), points.error)
 
     @cached_property
     def _slices(self) -> "Slices":
@@ -137,30 +164,44 @@ class Points:
 
     row: Indices  #: (P,)
     u: Array  #: (P, n)
-    away: Array  #: |xi - xi(q)|, (P,)
+    away: Array  #: |xi - xi(q)|, or what points are chosen by, (P,); infinite outside the domain
+    error: Array  #: largest error of x, (P,)
 
     @classmethod
-    def of(cls, row: Indices, u: Array) -> "Points":
-        """Points whose xi is not known yet."""
-        return cls(row, u, np.full(len(row), np.nan))
+    def of(cls, q: Array, boxed: BoxedPhi, rows: Indices | None = None) -> "Points":
+        """S positions of each of N rows, q (S, N, n), which may be some of more rows."""
+        row = np.tile(np.arange(q.shape[1]) if rows is None else rows, len(q))
+        return cls(row, boxed.of_points(q.reshape(-1, q.shape[2])), *np.full((2, len(row)), np.nan))
+
+    def part(self, which: NDArray[np.bool_] | Indices) -> "Points":
+        """Some of them."""
+        return Points(*(array[which] for array in vars(self).values()))
+
+    def kept(self) -> "Points":
+        """Those inside that have x."""
+        return self.part((self.error <= SLIDE.kept) & np.isfinite(self.away))
 
     def joined(self, other: "Points") -> "Points":
         """Both."""
         return Points(*(np.concatenate(pair) for pair in zip(vars(self).values(), vars(other).values(), strict=True)))
 
     def best(self, N: int) -> tuple[Indices, Array]:
-        """Which point is the nearest of each of N rows, and how near it is, (N,); infinite for none."""
-        order, distance = np.argsort(-self.away, kind="stable"), np.full(N, np.inf)
+        """Which point with nearly x is the nearest of each of N rows, and how near it is, (N,); infinite for none."""
+        away = np.where(self.error <= SLIDE.bent, self.away, np.inf)
+        order, distance = np.argsort(-away, kind="stable"), np.full(N, np.inf)
         place = np.zeros(N, dtype=np.int64)
-        place[self.row[order]], distance[self.row[order]] = order, self.away[order]  # what is written last stays
+        place[self.row[order]], distance[self.row[order]] = order, away[order]  # what is written last stays
         return place, distance
 
-    def apart(self, N: int, count: int) -> "Points":
-        """Up to so many of the nearest points of each of N rows that lie apart; one alone of rows nearly solved."""
-        order = np.lexsort((self.away, self.row))
+    def apart(self, N: int, count: int, settled: float = SLIDE.bent) -> "Points":
+        """Up to so many of the best points of each of N rows that lie apart; one alone of rows nearly solved.
+
+        Points with errors of x up to `settled` come first, then those with the least distance.
+        """
+        order = np.lexsort((self.away, self.error > settled, self.row))
         order = order[np.isfinite(self.away[order])]
         if not order.size:
-            return Points(self.row[order], self.u[order], self.away[order])
+            return self.part(order)
         row = self.row[order]
         rank = np.arange(len(row)) - np.searchsorted(row, np.arange(N))[row]
         order, row, rank = (array[rank < RULES.most] for array in (order, row, rank))
@@ -175,9 +216,9 @@ class Points:
             best = place[rows, first[rows]]
             chosen.append(best)
             left[rows] &= np.abs(u[rows] - self.u[best][:, None]).max(axis=2) >= RULES.apart
-            left[rows[self.away[best] <= RULES.nearly]] = False
+            left[rows[(self.away[best] <= RULES.nearly) & (self.error[best] <= settled)]] = False
         which = np.concatenate(chosen)
-        return Points(self.row[which], self.u[which], self.away[which])
+        return self.part(which)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,21 +234,28 @@ class Slices:
     starts: Starts
 
     def points(self, targets: Array, own: Array, rows: Indices) -> Points:
-        """Points in or near the box with x nearly as in some rows of targets (N, n).
+        """Points of the domain with x nearly as in some rows of targets (N, n).
 
         Joints without boundaries are turned towards given positions (N, n), or towards the centre of the domain, and
         once more to both sides, where their turns change xi unevenly.
         """
-        low, high = self.boxed.domain.bounds
-        uneven = ~self.boxed.even
-        towards, found = np.where(uneven, self.boxed.domain.centre, own)[rows], [Points.of(rows[:0], own[:0])]
+        domain, (low, high), turning = self.boxed.domain, self.boxed.domain.bounds, self.tracer.turning
+        endless, uneven = ~np.isfinite(low), ~self.boxed.even
+        several = turning & np.where(endless, uneven, domain.half_width > np.pi)
+        turns = 2 * np.pi * np.array(list(product(*((-1, 0, 1) if more else (0,) for more in several))))
+        found = [Points.of(own[:0, None], self.boxed)]
         with np.errstate(all="ignore"):
             for traces in self._curves(targets[rows]):
-                steps = self.tracer.steps(traces, towards[traces.row // len(RULES.places)], uneven)
-                q = steps.q[:, 0]
-                near = ((q >= low - RULES.slack) & (q <= high + RULES.slack)).all(axis=1)
-                row = rows[steps.row[near] // len(RULES.places)]
-                found.append(Points.of(row, self.boxed.of_points(q[near])))
+                curve, place = np.nonzero(np.arange(traces.q.shape[1]) < traces.count[:, None])
+                row, q = rows[traces.row[curve] // len(RULES.places)], traces.q[curve, place]
+                towards = np.where(endless & ~uneven, own[row], domain.centre)
+                q = turns[:, None] + towards + without_turns(q - towards, turning)
+                inside = np.asarray(((q >= low - RULES.slack) & (q <= high + RULES.slack)).all(axis=2))
+                number = np.arange(inside.size).reshape(inside.shape)
+                enters = inside & ~np.roll(inside, 1, axis=1)
+                inside &= (number - np.maximum.accumulate(np.where(enters, number, 0), axis=1)) % RULES.stride == 0
+                inside[inside] = domain.contains(np.clip(q[inside], low, high))
+                found.append(Points.of(q[None, inside], self.boxed, np.broadcast_to(row, inside.shape)[inside]))
         return reduce(Points.joined, found)
 
     def _curves(self, targets: Array) -> list[Traces]:

@@ -29,7 +29,10 @@ class SlideRules:
     foreseen: float = 0.75  #: the same from which the next step may be longer
     converged: float = 1e-10  #: relative decrease that a minimum may still promise
     rounded: float = 1e-22  #: squared distance that is rounding
-    least: float = 1e-15  #: decrease that is rounding
+    least: float = 1e-14  #: decrease that is rounding, relative to 1 + |xi - xi(q)|^2
+    still: float = 1e-13  #: change of joints that is rounding
+    aligned: float = 0.95  #: cosine between steps from which their lengths tell how boundaries bend
+    stretch: float = 10.0  #: most that steps get longer or shorter for that
     penalty: float = 1e5  #: of squared excess of bounds, relative to the squared distance in xi
     rounds: int = 30  #: guesses which bounds hold
     room: float = 1e-9  #: to the ends of the conditions of the domain
@@ -44,7 +47,7 @@ class Slide:
 
     u: Array  #: points of the box, (N, n)
     error: Array  #: largest error of x, (N,)
-    distance: Array  #: |xi - xi(q)|, (N,); infinite where x is not kept, or the domain left
+    distance: Array  #: |xi - xi(q)|, (N,); infinite outside the domain
 
 
 def slide(boxed: BoxedPhi, targets: Array, start: Array, most: int = RULES.most) -> Slide:
@@ -71,9 +74,8 @@ def slide(boxed: BoxedPhi, targets: Array, start: Array, most: int = RULES.most)
             if not rows.size:
                 break
             rows = run.advance(rows)
-        error = largest(run.gap[:, : boxed.m])
-        good = (error <= RULES.bent) & boxed.domain.contains(boxed.points(run.u))
-        return Slide(run.u, error, np.where(good, np.linalg.norm(run.gap[:, boxed.m :], axis=1), np.inf))
+        error, inside = largest(run.gap[:, : boxed.m]), boxed.domain.contains(boxed.points(run.u))
+        return Slide(run.u, error, np.where(inside, np.linalg.norm(run.gap[:, boxed.m :], axis=1), np.inf))
 
 
 class _Run:
@@ -85,6 +87,7 @@ class _Run:
         self.u = start.copy()
         self.gap = self._gaps(np.arange(len(start)), start)  #: phi - phi(q), x relative to sizes, (N, n)
         self._longest = np.full(len(start), RULES.longest)
+        self._before = np.zeros((len(start), 2, start.shape[1] - boxed.m))  # the last z, as projected and as taken
         self._meets = np.zeros(len(start), dtype=bool)  # rows that met the end of a condition
 
     def advance(self, rows: Indices) -> Indices:
@@ -93,57 +96,87 @@ class _Run:
         J = boxed.phi_map.jacobian(boxed.points(u)) * boxed.domain.half_width / self._sizes[:, None]
         H = inverses(J)[0]
         P, B, left = H[:, :, :m], H[:, :, m:], gap[:, m:]
-        longest, walls = self._longest[rows, None], self._walls(rows)
+        longest, walls = self._longest[rows, None], self._walls(rows, u)
         back = _times(P, gap[:, :m])
         wanted = left * np.minimum(1.0, longest / _size(_times(B, left)))
         z = walls.project(B, back, wanted)
+        stretch, plain = self._stretches(rows, z), z
+        some = np.flatnonzero(stretch != 1)
+        if some.size:
+            z = z.copy()
+            z[some] = walls.part(some).project(B[some], back[some], stretch[some, None] * z[some])
         d = back + _times(B, z)
         part = np.minimum(1.0, longest / _size(d))
-        d = np.clip(part * d, boxed.low - u, boxed.high - u)
-        new, after = self._corrected(rows, u + d, P, B, walls)
+        d, z = np.clip(part * d, boxed.low - u, boxed.high - u), part * z
+        new, after = self._corrected(rows, u + d, P, B, walls.slopes)
         error, before = largest(after[:, :m]), largest(gap[:, :m])
-        square, promised = (left**2).sum(axis=1), (left**2).sum(axis=1) - ((left - part * z) ** 2).sum(axis=1)
+        square = (left**2).sum(axis=1)
+        promised = 2 * (left * z).sum(axis=1) - (z**2).sum(axis=1) / stretch
         gain, size = square - (after[:, m:] ** 2).sum(axis=1), np.abs(promised)
         good = (error < RULES.bent) | (error < 0.9 * before)
-        good &= (gain > promised - (1 - RULES.gains) * size - RULES.least) | (before > RULES.bent)
+        good &= (
+            (gain > promised - (1 - RULES.gains) * size - RULES.least * (1 + square))
+            | (before > RULES.bent)
+            | ((before > RULES.kept) & (error < before / 2))
+        )
         inside = good.copy()
         inside[good] = boxed.domain.contains(boxed.points(new[good]))
         met = good & ~inside & ~self._meets[rows] & boxed.has_rooms
         self._meets[rows[met]] = True
         moved = rows[inside]
         self.u[moved], self.gap[moved] = new[inside], after[inside]
+        self._before[moved] = np.stack([plain, z], axis=1)[inside]
         foreseen = (error < RULES.straight) | (gain > promised - (1 - RULES.foreseen) * size)
         longer = np.where(foreseen, np.minimum(2 * longest[:, 0], RULES.longest), longest[:, 0])
         shorter = np.minimum(longest[:, 0], np.abs(d).max(axis=1)) / 3
         self._longest[rows] = np.where(inside, longer, np.where(met, longest[:, 0], shorter))
-        ended = (size <= RULES.converged * square + RULES.rounded) & (before <= RULES.kept) & ~met
+        ended = (size <= RULES.converged * square + RULES.rounded) | (np.abs(d).max(axis=1) <= RULES.still)
+        ended &= (before <= RULES.kept) & ~met
         return np.asarray(rows[~ended & (self._longest[rows] > RULES.shortest)])
 
-    def _corrected(self, rows: Indices, new: Array, P: Array, B: Array, walls: "Walls") -> tuple[Array, Array]:
-        """Points after a second step to x, and what is left of phi there, where this is less, (rows, n) each."""
+    def _stretches(self, rows: Indices, z: Array) -> Array:
+        """How much longer steps z (rows, r) should be, or shorter, where boundaries bend: Barzilai and Borwein's rule.
+
+        Only where the last step went the same way.
+        """
+        plain, taken = self._before[rows].swapaxes(0, 1)
+        along, size = (taken * z).sum(axis=1), (taken**2).sum(axis=1)
+        same = along > RULES.aligned * np.sqrt(size * (z**2).sum(axis=1))
+        stretch = size / (taken * (plain - z)).sum(axis=1)
+        good = same & (stretch > 0) & np.isfinite(stretch)
+        return np.where(good, np.clip(stretch, 1 / RULES.stretch, RULES.stretch), 1.0)
+
+    def _corrected(self, rows: Indices, new: Array, P: Array, B: Array, slopes: Array) -> tuple[Array, Array]:
+        """Points after a second step to x, and into the domain, and what is left of phi there, (rows, n) each.
+
+        Only where x is nearer after it. Conditions bend, so they are evaluated again.
+        """
         m, boxed = self._boxed.m, self._boxed
         after = self._gaps(rows, new)
         error = largest(after[:, :m])
-        some = np.flatnonzero((error > RULES.kept) & (error < RULES.corrected * RULES.bent))
+        some = np.flatnonzero(((error > RULES.kept) | self._meets[rows]) & (error < RULES.corrected * RULES.bent))
         if some.size:
-            back = _times(P[some], after[some, :m])
-            z = walls.at(new - self.u[rows]).part(some).project(B[some], back, np.zeros((len(some), B.shape[2])))
+            back, walls = _times(P[some], after[some, :m]), self._walls(rows[some], new[some], slopes[some])
+            z = walls.project(B[some], back, np.zeros((len(some), B.shape[2])))
             again = np.clip(new[some] + back + _times(B[some], z), boxed.low, boxed.high)
             gaps = self._gaps(rows[some], again)
-            better = largest(gaps[:, :m]) < error[some]
+            better = largest(gaps[:, :m]) < np.maximum(error[some], RULES.kept)
             new[some[better]], after[some[better]] = again[better], gaps[better]
         return new, after
 
-    def _walls(self, rows: Indices) -> "Walls":
-        """The boundaries as seen from some rows."""
-        boxed, u = self._boxed, self.u[rows]
+    def _walls(self, rows: Indices, u: Array, slopes: Array | None = None) -> "Walls":
+        """The boundaries as seen from points u of some rows; the slopes of conditions may be those of other points."""
+        boxed = self._boxed
         low, high = boxed.low - u, boxed.high - u
         meets = np.flatnonzero(self._meets[rows])
         if not meets.size:
             return Walls(low, high, np.zeros((len(rows), 0, u.shape[1])))
         near, change = boxed.rooms(u[meets])
-        rooms, slopes = np.full((len(rows), near.shape[1]), np.inf), np.zeros((len(rows), *change.shape[1:]))
-        rooms[meets], slopes[meets] = near - RULES.room, change
+        rooms = np.full((len(rows), near.shape[1]), np.inf)
+        rooms[meets] = near - RULES.room
+        if slopes is None:
+            slopes = np.zeros((len(rows), *change.shape[1:]))
+            slopes[meets] = change
         return Walls(np.hstack([low, -rooms]), np.hstack([high, np.full_like(rooms, np.inf)]), slopes)
 
     def _gaps(self, rows: Indices, u: Array) -> Array:
@@ -164,11 +197,6 @@ class Walls:
     def part(self, rows: Indices) -> "Walls":
         """Those of some rows."""
         return Walls(self.low[rows], self.high[rows], self.slopes[rows])
-
-    def at(self, d: Array) -> "Walls":
-        """Bounds of further steps after steps d (N, n)."""
-        gone = self._values(d)
-        return Walls(self.low - gone, self.high - gone, self.slopes)
 
     def project(self, B: Array, back: Array, wanted: Array) -> Array:
         """The z (N, r) nearest to wanted ones for which d = back + B z keeps the bounds, as far as any z does."""
