@@ -114,7 +114,7 @@ def nearest(name: str, count: int) -> str:
     """One row of the third table."""
     chart = oc.charts.load(name)
     domain = chart.problem.domain
-    wishes, x = sample_uniform(domain, count, 0), chart.task(sample_uniform(domain, count, 1000))
+    wishes, x = sample_uniform(domain, count, 0), chart.x(sample_uniform(domain, count, 1000))
     seconds = []
     for solver in (oc.compile_inverse(chart), chart):
         solver.nearest_xi(wishes[:20], x[:20])
