@@ -1,6 +1,5 @@
 """The self-motion curves of many task values at once, r = 1, and the points on them whose xi is nearest."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 from typing import Protocol
@@ -64,8 +63,6 @@ class SelfMotionCurves:
 
     boxed: BoxedPhi
     starts: Starts
-    xi: Callable[[Array], Array]  #: coordinates (N, 1) of points (N, n)
-
     @cached_property
     def tracer(self) -> CurveTracer:
         """Traces the curves."""
@@ -384,8 +381,7 @@ class SelfMotionCurves:
 
     def _xi_left(self, targets: Array, q: Array) -> Array:
         """xi - xi(q), (N,)."""
-        left = targets[:, self.boxed.m :] - self.xi(q)
-        return np.asarray(wrap_shortest(left, self.boxed.phi_map.difference.turns[self.boxed.m :])[:, 0])
+        return self.boxed.xi_gaps(targets, q)[:, 0]
 
     @cached_property
     def _period(self) -> float:

@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 
 from orthocas.charts.phi import ROUNDING, PhiMap, largest
 from orthocas.tasks.domains import Domain
+from orthocas.tasks.relative import Relative
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.columns import BlockedFunction
+from orthocas.tools.expressions import wrap_shortest
 
 Flags = NDArray[np.bool_]
 
@@ -218,6 +220,7 @@ class BoxedPhi:
     task: Task
     domain: Domain
     phi_map: PhiMap
+    xi: Callable[[Array], Array]  #: coordinates (N, r) of points (N, n)
 
     @property
     def m(self) -> int:
@@ -254,10 +257,22 @@ class BoxedPhi:
         """h(q) = x."""
         return Equations(self._task_errors, self._task_jacobians, self.low, self.high)
 
-    def xi_errors(self, targets: Array, u: Array) -> Array:
+    def gaps(self, targets: Array, u: Array) -> Array:
+        """phi - phi(q), (N, n), for targets (N, n), by the shorter way around."""
+        q, gaps = self.points(u), np.empty_like(u)
+        self._task_gaps.into(gaps[:, : self.m], q, targets[:, : self.m])
+        gaps[:, self.m :] = self.xi_gaps(targets, q)
+        return gaps
+
+    def xi_gaps(self, targets: Array, q: Array) -> Array:
         """xi - xi(q), (N, r), for targets (N, n) of phi."""
-        errors: Array = self.phi_map.difference(targets, self.phi_map.phi(self.points(u)))[:, self.m :]
-        return errors
+        return np.asarray(wrap_shortest(targets[:, self.m :] - self.xi(q), self.phi_map.difference.turns[self.m :]))
+
+    @cached_property
+    def _task_gaps(self) -> BlockedFunction:
+        """q, x -> x - h(q)."""
+        q, x = ca.SX.sym("q", len(self.domain.centre)), ca.SX.sym("x", self.m)
+        return BlockedFunction(dense_function("gap", [q, x], [Relative(self.task).difference(x, self.task.function(q))]))
 
     @cached_property
     def turned(self) -> Array:
@@ -265,7 +280,7 @@ class BoxedPhi:
         n, endless = len(self.low), ~np.array(self.task.robot.tree.prismatic) & ~np.isfinite(self.low)
         q = sample_uniform(self.domain, RULES.probes, 0)
         turned = (q + 2 * np.pi * np.diag(endless)[:, None]).reshape(-1, n)
-        moved = self.phi_map.difference(self.phi_map.phi(turned), np.tile(self.phi_map.phi(q), (n, 1)))[:, self.m :]
+        moved = self.xi_gaps(self.phi_map.phi(turned), np.tile(q, (n, 1)))
         return np.asarray(moved.reshape(n, len(q), -1).transpose(1, 0, 2))
 
     @property
@@ -283,19 +298,24 @@ class BoxedPhi:
         """Whether the domain has conditions with expressions."""
         return self.domain.known_condition is not None
 
-    def rooms(self, u: Array) -> tuple[Array, Array]:
-        """How far the conditions of the domain are from their ends, (N, k), and how that changes with u, (N, k, n)."""
-        n = len(self.low)
-        found = self._rooms(self.points(u))[0].reshape(len(u), n + 1, -1)
-        return found[:, 0], found[:, 1:].transpose(0, 2, 1) * self.domain.half_width
+    def rooms(self, u: Array) -> Array:
+        """How far the conditions of the domain are from their ends, (N, k)."""
+        found: Array = self._rooms[0](self.points(u))[0]
+        return found
+
+    def room_slopes(self, u: Array) -> Array:
+        """How that changes with u, (N, k, n)."""
+        found: Array = self._rooms[1](self.points(u))[0].reshape(len(u), -1, len(self.low))
+        return found * self.domain.half_width
 
     @cached_property
-    def _rooms(self) -> BlockedFunction:
-        """q -> the rooms of the conditions, and their derivatives column by column, in one column."""
-        q = ca.SX.sym("q", len(self.domain.centre))
-        x = ca.MX.sym("q", len(self.domain.centre))
+    def _rooms(self) -> tuple[BlockedFunction, BlockedFunction]:
+        """q -> the rooms of the conditions, and their derivatives row by row, in a column."""
+        q, x = ca.SX.sym("q", len(self.low)), ca.MX.sym("q", len(self.low))
         rooms = ca.Function("rooms", [x], [rooms_of(self.domain, x)])(q)
-        return BlockedFunction(dense_function("rooms", [q], [ca.cse(ca.vertcat(rooms, ca.vec(ca.jacobian(rooms, q))))]))
+        slopes = ca.vec(ca.jacobian(rooms, q).T)
+        near, far = (dense_function(name, [q], [ca.cse(found)]) for name, found in (("rooms", rooms), ("slopes", slopes)))
+        return BlockedFunction(near), BlockedFunction(far)
 
     def _phi_errors(self, targets: Array, u: Array) -> Array:
         errors = self.phi_map.residual(targets, self.points(u))
@@ -306,9 +326,8 @@ class BoxedPhi:
         return np.where(np.isfinite(J), J, 0.0)
 
     def _task_errors(self, targets: Array, u: Array) -> Array:
-        x, relative = targets[:, : self.m], self.phi_map.difference.task
-        assert relative is not None
-        errors = relative.difference(x, self.task.batched(self.points(u))[0]) / self._scale(x)
+        x = targets[:, : self.m]
+        errors = self._task_gaps(self.points(u), x)[0] / self._scale(x)
         return np.where(np.isfinite(errors), errors, np.inf)
 
     def _task_jacobians(self, targets: Array, u: Array) -> Array:

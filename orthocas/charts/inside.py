@@ -37,7 +37,7 @@ class InsideRules:
     more: int = 8  #: steps of these slides
     settled: float = 1e-5  #: error of x up to which their ends are compared
     last: int = 1  #: slides to the end
-    again: int = 24  #: stored positions near phi, and as many near x, for rows with nothing inside until then
+    again: int = 8  #: stored positions near phi, and as many near x, for rows with nothing inside until then
     most: int = 100  #: points nearest to xi, of which those are chosen
     apart: float = 0.2  #: their least distance from one another, in half-widths
     nearly: float = 1e-4  #: distance in xi after a short slide from which a long one most probably ends at a solution
@@ -143,7 +143,7 @@ class Inside:
         u = points.u - np.where(
             turns.any(axis=0), turn * np.round((points.u - self.boxed.of_points(q)[points.row]) / turn), 0.0
         )
-        away = np.linalg.norm(self.boxed.xi_errors(targets[points.row], u)[:, None] - shifts, axis=2)
+        away = np.linalg.norm(self.boxed.xi_gaps(targets[points.row], self.boxed.points(u))[:, None] - shifts, axis=2)
         return Points(points.row, u + turn * turns[np.argmin(away, axis=1)], away.min(axis=1), points.error)
 
     @cached_property
@@ -277,7 +277,8 @@ class Slices:
             first = np.argmin(np.where(known[left], np.inf, away[left]), axis=1)
             found.append(self.tracer.trace(x[left, first], q[left, first], left))
             known[left, first] = True
-            known[left] |= self.tracer.on_curves(q[left], found[-1])
+            on = np.flatnonzero(~known[left].all(axis=1))
+            known[left[on]] |= self.tracer.on_curves(q[left[on]], found[-1].part(on))
         return found
 
     @cached_property

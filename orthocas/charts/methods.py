@@ -427,12 +427,12 @@ class ChartParts:
         starts = Starts(phi_map, domain)
         if isinstance(chart.coordinates, InvertibleMap):
             return Inverse(chart.problem, phi_map, OwnInverse(chart.coordinates, phi_map), starts)
-        boxed = BoxedPhi(chart.problem.task, domain, phi_map)
+        boxed = BoxedPhi(chart.problem.task, domain, phi_map, chart.xi)
         local, brief = (
             FewRows(phi_map, self.point_functions, Newton(phi_map, k)) for k in (NEWTON.halvings, NEWTON.brief)
         )
         in_domain, inside = InDomain(boxed, Cells(boxed)), Inside(boxed, starts)
-        curves = SelfMotionCurves(boxed, starts, chart.xi) if chart.r == 1 else None
+        curves = SelfMotionCurves(boxed, starts) if chart.r == 1 else None
         return Inverse(chart.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves, brief)
 
     @cached_property

@@ -171,19 +171,17 @@ class _Run:
         meets = np.flatnonzero(self._meets[rows])
         if not meets.size:
             return Walls(low, high, np.zeros((len(rows), 0, u.shape[1])))
-        near, change = boxed.rooms(u[meets])
+        near = boxed.rooms(u[meets]) - RULES.room
         rooms = np.full((len(rows), near.shape[1]), np.inf)
-        rooms[meets] = near - RULES.room
+        rooms[meets] = near
         if slopes is None:
-            slopes = np.zeros((len(rows), *change.shape[1:]))
-            slopes[meets] = change
+            slopes = np.zeros((*rooms.shape, u.shape[1]))
+            slopes[meets] = boxed.room_slopes(u[meets])
         return Walls(np.hstack([low, -rooms]), np.hstack([high, np.full_like(rooms, np.inf)]), slopes)
 
     def _gaps(self, rows: Indices, u: Array) -> Array:
         """phi - phi(q), x relative to sizes, (rows, n)."""
-        boxed = self._boxed
-        gaps: Array = boxed.phi_map.difference(self._targets[rows], boxed.phi_map.phi(boxed.points(u))) / self._sizes
-        return gaps
+        return self._boxed.gaps(self._targets[rows], u) / self._sizes
 
 
 @dataclass(frozen=True, eq=False)
