@@ -38,7 +38,7 @@ class CurveRules:
     halvings: int = 5  #: of chords that pass the box between points outside
     narrow: float = 1e-10  #: [rad] or [m]: brackets of an end of the domain
     narrowings: int = 100  #: halvings until then at most
-    few: int = 64  #: rows up to which all starts are followed at once, though some lie on one curve
+    few: int = 16  #: rows up to which all starts are followed at once, though some lie on one curve
     prismatic: float = 1.0  #: half-widths that a sliding joint may leave its range by
 
 
@@ -111,8 +111,10 @@ class CurveTracer:
 
     def on_curves(self, q: Array, traces: Traces) -> NDArray[np.bool_]:
         """Which of the positions q (K, S, n) lie on the curves, up to full turns, (K, S)."""
-        mine, points = self._on_circles(q), self._on_circles(traces.q)
-        squares = (points**2).sum(axis=2)[:, None] - 2 * mine @ points.transpose(0, 2, 1)
+        mine, exists = self._on_circles(q), np.arange(traces.q.shape[1]) < traces.count[:, None]
+        points = np.zeros((*exists.shape, mine.shape[2]))
+        points[exists] = self._on_circles(traces.q[exists])
+        squares = np.where(exists, (points**2).sum(axis=2), np.inf)[:, None] - 2 * mine @ points.transpose(0, 2, 1)
         nearest = np.argmin(squares, axis=2)
         found = np.zeros(nearest.shape, dtype=bool)
         for place in (np.maximum(nearest - 1, 0), nearest):

@@ -38,6 +38,7 @@ class InsideRules:
     settled: float = 1e-5  #: error of x up to which their ends are compared
     last: int = 1  #: slides to the end
     again: int = 8  #: stored positions near phi, and as many near x, for rows with nothing inside until then
+    descent: int = 16  #: iterations to x from these
     most: int = 100  #: points nearest to xi, of which those are chosen
     apart: float = 0.2  #: their least distance from one another, in half-widths
     nearly: float = 1e-4  #: distance in xi after a short slide from which a long one most probably ends at a solution
@@ -60,15 +61,15 @@ class Inside:
         Returns:
             q (N, n), and which of them have the task values, (N,).
         """
-        u, error = self.boxed.of_points(q), np.full(len(q), np.inf)
-        left = np.arange(len(q))
-        for start in [q, *self.starts.nearest(targets, RULES.starts, self.boxed.m)] if len(q) else []:
-            end = descend(self.boxed.task_equations, targets[left], self.boxed.of_points(start[left]))
-            better = end.error < error[left]
-            u[left[better]], error[left[better]] = end.u[better], end.error[better]
-            left = left[error[left] > DESCENT.kept]
-            if not left.size:
-                break
+        end = descend(self.boxed.task_equations, targets, self.boxed.of_points(q))
+        u, error = end.u, end.error
+        left = np.flatnonzero(error > DESCENT.kept)
+        if left.size:
+            points = Points.of(self.starts.nearest(targets[left], RULES.starts, self.boxed.m), self.boxed, left)
+            end = descend(self.boxed.task_equations, targets[points.row], points.u)
+            farthest_first = np.argsort(-end.error, kind="stable")  # what is written last stays
+            better = farthest_first[end.error[farthest_first] < error[points.row[farthest_first]]]
+            u[points.row[better]], error[points.row[better]] = end.u[better], end.error[better]
         return self.boxed.points(u), np.asarray(error <= DESCENT.kept)
 
     def nearest(self, targets: Array, q: Array) -> tuple[Array, Array]:
@@ -96,14 +97,17 @@ class Inside:
         N, n = q.shape
         near = np.concatenate([q[None], self.starts.nearest(targets, RULES.near, n)])
         ends = self._slid(targets, self._turned(targets, Points.of(near, self.boxed), q), RULES.steps)
-        left = np.flatnonzero(ends.best(N)[1] > RULES.nearly)
+        left, bare = np.flatnonzero(ends.best(N)[1] > RULES.nearly), np.zeros(0, dtype=np.int64)
         if left.size:
             on_slices = self._ranked(targets, self._slices.points(targets, q, left), q)
-            ends = ends.joined(self._slid(targets, on_slices.apart(N, RULES.short), RULES.steps))
+            bare = np.setdiff1d(left, on_slices.row)
+            starts = on_slices.apart(N, RULES.short).joined(self._again(targets, q, bare))
+            ends = ends.joined(self._slid(targets, starts, RULES.steps))
         ends = self._to_end(targets, ends, N)
-        left = np.flatnonzero(np.isinf(ends.best(N)[1]))
-        if left.size:
-            ends = ends.joined(self._to_end(targets, self._again(targets, q, left), N))
+        lost = np.setdiff1d(np.flatnonzero(np.isinf(ends.best(N)[1])), bare)
+        if lost.size:
+            more = self._slid(targets, self._again(targets, q, lost), RULES.more)
+            ends = ends.joined(self._to_end(targets, more, N))
         (place, distance), u = ends.best(N), self.boxed.of_points(q)
         found = np.isfinite(distance)
         u[found] = ends.u[place[found]]
@@ -115,14 +119,15 @@ class Inside:
         return ends.joined(self._slid(targets, ends.apart(N, RULES.last, RULES.settled), SLIDE.most)).kept()
 
     def _again(self, targets: Array, q: Array, left: Indices) -> "Points":
-        """Points inside for rows that are left: where slides and descents from many stored positions end."""
-        n, m = q.shape[1], self.boxed.m
-        near = self.starts.nearest(targets[left], RULES.again, n), self.starts.nearest(targets[left], RULES.again, m)
+        """Stored positions for some rows, and points inside to which descents from these lead."""
+        if not left.size:
+            return Points.of(q[None, left], self.boxed)
+        components = q.shape[1], self.boxed.m
+        near = [self.starts.nearest(targets[left], RULES.again, count) for count in components]
         points = Points.of(np.concatenate([q[None, left], *near]), self.boxed, left)
-        slid = self._slid(targets, points, RULES.more)
-        end = descend(self.boxed.task_equations, targets[points.row], points.u)
+        end = descend(self.boxed.task_equations, targets[points.row], points.u, RULES.descent)
         kept = (end.error <= DESCENT.kept) & self.boxed.domain.contains(self.boxed.points(end.u))
-        return slid.joined(self._ranked(targets, Points(points.row[kept], end.u[kept], *np.zeros((2, kept.sum()))), q))
+        return points.joined(Points(points.row[kept], end.u[kept], *np.zeros((2, kept.sum()))))
 
     def _slid(self, targets: Array, points: "Points", most: int) -> "Points":
         """Where slides from points end."""

@@ -88,6 +88,7 @@ class _Run:
         self.gap = self._gaps(np.arange(len(start)), start)  #: phi - phi(q), x relative to sizes, (N, n)
         self._longest = np.full(len(start), RULES.longest)
         self._before = np.zeros((len(start), 2, start.shape[1] - boxed.m))  # the last z, as projected and as taken
+        self._held = np.zeros(start.shape, dtype=np.int8)  # which bounds the last steps held
         self._meets = np.zeros(len(start), dtype=bool)  # rows that met the end of a condition
 
     def advance(self, rows: Indices) -> Indices:
@@ -99,16 +100,16 @@ class _Run:
         longest, walls = self._longest[rows, None], self._walls(rows, u)
         back = _times(P, gap[:, :m])
         wanted = left * np.minimum(1.0, longest / _size(_times(B, left)))
-        z = walls.project(B, back, wanted)
+        z, held = walls.project(B, back, wanted, self._held[rows])
         stretch, plain = self._stretches(rows, z), z
         some = np.flatnonzero(stretch != 1)
         if some.size:
             z = z.copy()
-            z[some] = walls.part(some).project(B[some], back[some], stretch[some, None] * z[some])
+            z[some] = walls.part(some).project(B[some], back[some], stretch[some, None] * z[some], held[some])[0]
         d = back + _times(B, z)
         part = np.minimum(1.0, longest / _size(d))
         d, z = np.clip(part * d, boxed.low - u, boxed.high - u), part * z
-        new, after = self._corrected(rows, u + d, P, B, walls.slopes)
+        new, after = self._corrected(rows, u + d, P, B, walls.slopes, held)
         error, before = largest(after[:, :m]), largest(gap[:, :m])
         square = (left**2).sum(axis=1)
         promised = 2 * (left * z).sum(axis=1) - (z**2).sum(axis=1) / stretch
@@ -125,6 +126,7 @@ class _Run:
         self._meets[rows[met]] = True
         moved = rows[inside]
         self.u[moved], self.gap[moved] = new[inside], after[inside]
+        self._held[rows] = held[:, : u.shape[1]]
         self._before[moved] = np.stack([plain, z], axis=1)[inside]
         foreseen = (error < RULES.straight) | (gain > promised - (1 - RULES.foreseen) * size)
         longer = np.where(foreseen, np.minimum(2 * longest[:, 0], RULES.longest), longest[:, 0])
@@ -146,7 +148,9 @@ class _Run:
         good = same & (stretch > 0) & np.isfinite(stretch)
         return np.where(good, np.clip(stretch, 1 / RULES.stretch, RULES.stretch), 1.0)
 
-    def _corrected(self, rows: Indices, new: Array, P: Array, B: Array, slopes: Array) -> tuple[Array, Array]:
+    def _corrected(
+        self, rows: Indices, new: Array, P: Array, B: Array, slopes: Array, held: NDArray[np.int8]
+    ) -> tuple[Array, Array]:
         """Points after a second step to x, and into the domain, and what is left of phi there, (rows, n) each.
 
         Only where x is nearer after it. Conditions bend, so they are evaluated again.
@@ -157,7 +161,7 @@ class _Run:
         some = np.flatnonzero(((error > RULES.kept) | self._meets[rows]) & (error < RULES.corrected * RULES.bent))
         if some.size:
             back, walls = _times(P[some], after[some, :m]), self._walls(rows[some], new[some], slopes[some])
-            z = walls.project(B[some], back, np.zeros((len(some), B.shape[2])))
+            z, _ = walls.project(B[some], back, np.zeros((len(some), B.shape[2])), held[some])
             again = np.clip(new[some] + back + _times(B[some], z), boxed.low, boxed.high)
             gaps = self._gaps(rows[some], again)
             better = largest(gaps[:, :m]) < np.maximum(error[some], RULES.kept)
@@ -196,17 +200,27 @@ class Walls:
         """Those of some rows."""
         return Walls(self.low[rows], self.high[rows], self.slopes[rows])
 
-    def project(self, B: Array, back: Array, wanted: Array) -> Array:
-        """The z (N, r) nearest to wanted ones for which d = back + B z keeps the bounds, as far as any z does."""
+    def project(
+        self, B: Array, back: Array, wanted: Array, held: NDArray[np.int8]
+    ) -> tuple[Array, NDArray[np.int8]]:
+        """The z (N, r) nearest to wanted ones for which d = back + B z keeps the bounds, as far as any z does.
+
+        From a guess which of the first bounds hold; returns those that do, (N, n + k).
+        """
+        guess = np.zeros(self.low.shape, dtype=np.int8)
+        shared = min(guess.shape[1], held.shape[1])
+        guess[:, :shared] = held[:, :shared]
         gone = self._values(back)
         whole = np.concatenate([B, self.slopes @ B], axis=1) if self.slopes.shape[1] else B
-        return project(whole, self.low - gone, self.high - gone, wanted)
+        return project(whole, self.low - gone, self.high - gone, wanted, guess)
 
     def _values(self, d: Array) -> Array:
         return np.concatenate([d, _times(self.slopes, d)], axis=1) if self.slopes.shape[1] else d
 
 
-def project(B: Array, low: Array, high: Array, wanted: Array) -> Array:
+def project(
+    B: Array, low: Array, high: Array, wanted: Array, held: NDArray[np.int8]
+) -> tuple[Array, NDArray[np.int8]]:
     """The points z (N, r) of polytopes low <= B z <= high that are nearest to wanted ones (N, r).
 
     Bounds that z breaks are penalised; which they are is guessed again and again until that does not change. Two
@@ -217,31 +231,35 @@ def project(B: Array, low: Array, high: Array, wanted: Array) -> Array:
         low: (N, k).
         high: (N, k).
         wanted: (N, r).
+        held: a guess which bounds hold, -1 low, 1 high, (N, k).
+
+    Returns:
+        z, and the bounds that hold, (N, k).
     """
-    z, held = wanted.copy(), np.zeros(low.shape, dtype=np.int8)
-    left, values = np.arange(len(z)), _times(B, z)
+    z, held, left = wanted.copy(), held.copy(), np.arange(len(wanted))
+    solve = np.flatnonzero(held.any(axis=1))
     for k in range(RULES.rounds):
-        before = held[left]
+        if solve.size:
+            A, bounds, K = _penalised(B[solve], low[solve], high[solve], held[solve])
+            pull = wanted[solve] + RULES.penalty * _times(A.transpose(0, 2, 1), bounds)
+            z[solve] = np.linalg.solve(K, pull[:, :, None])[:, :, 0]
+        values = _times(B[left], z[left])
         now = (values > high[left]) * 1 - (values < low[left]) * 1
-        changes = now != before
+        changes = now != held[left]
         if k >= RULES.rounds // 6:  # the first bound alone, so that they do not change back and forth
             changes &= np.cumsum(changes, axis=1) == 1
         some = changes.any(axis=1)
-        left = left[some]
+        held[left[some]] = np.where(changes, now, held[left])[some]
+        solve = left = left[some]
         if not left.size:
             break
-        held[left] = np.where(changes, now, before)[some]
-        A, bounds, K = _penalised(B[left], low[left], high[left], held[left])
-        pull = wanted[left] + RULES.penalty * _times(A.transpose(0, 2, 1), bounds)
-        z[left] = np.linalg.solve(K, pull[:, :, None])[:, :, 0]
-        values = _times(B[left], z[left])
     some = np.flatnonzero(held.any(axis=1))
     if some.size:
         A, bounds, K = _penalised(B[some], low[some], high[some], held[some])
         for _ in range(2):
             excess = RULES.penalty * _times(A.transpose(0, 2, 1), bounds - _times(A, z[some]))
             z[some] += np.linalg.solve(K, excess[:, :, None])[:, :, 0]
-    return z
+    return z, held
 
 
 def _penalised(B: Array, low: Array, high: Array, held: NDArray[np.int8]) -> tuple[Array, Array, Array]:

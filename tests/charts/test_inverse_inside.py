@@ -118,11 +118,16 @@ def value(programs: Programs, k: int, held: np.ndarray) -> float:
 
 
 def test_projections_are_the_nearest_points_of_polygons() -> None:
-    """In a plane, the nearest point is the wish, or its foot on one bound, or a corner: the nearest allowed of all."""
+    """In a plane, the nearest point is the wish, or its foot on one bound, or a corner: the nearest allowed of all.
+
+    Guesses which bounds hold, right or wrong, change nothing.
+    """
     rng, k = np.random.default_rng(5), 5
     B, wanted = rng.standard_normal((80, k, 2)), 3 * rng.standard_normal((80, 2))
     low, high = -rng.uniform(0, 1, (80, k)), rng.uniform(0, 1, (80, k))
-    z = project(B, low, high, wanted)
+    z, held = project(B, low, high, wanted, np.zeros((80, k), dtype=np.int8))
+    for guess in (held, rng.integers(-1, 2, (80, k), dtype=np.int8)):
+        np.testing.assert_allclose(project(B, low, high, wanted, guess)[0], z, atol=1e-8)
     values = (B @ z[:, :, None])[:, :, 0]
     assert (values >= low - 1e-9).all()
     assert (values <= high + 1e-9).all()
