@@ -63,6 +63,7 @@ class SelfMotionCurves:
 
     boxed: BoxedPhi
     starts: Starts
+
     @cached_property
     def tracer(self) -> CurveTracer:
         """Traces the curves."""

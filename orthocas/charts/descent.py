@@ -272,7 +272,8 @@ class BoxedPhi:
     def _task_gaps(self) -> BlockedFunction:
         """q, x -> x - h(q)."""
         q, x = ca.SX.sym("q", len(self.domain.centre)), ca.SX.sym("x", self.m)
-        return BlockedFunction(dense_function("gap", [q, x], [Relative(self.task).difference(x, self.task.function(q))]))
+        gap = Relative(self.task).difference(x, self.task.function(q))
+        return BlockedFunction(dense_function("gap", [q, x], [gap]))
 
     @cached_property
     def turned(self) -> Array:
@@ -314,8 +315,10 @@ class BoxedPhi:
         q, x = ca.SX.sym("q", len(self.low)), ca.MX.sym("q", len(self.low))
         rooms = ca.Function("rooms", [x], [rooms_of(self.domain, x)])(q)
         slopes = ca.vec(ca.jacobian(rooms, q).T)
-        near, far = (dense_function(name, [q], [ca.cse(found)]) for name, found in (("rooms", rooms), ("slopes", slopes)))
-        return BlockedFunction(near), BlockedFunction(far)
+        return (
+            BlockedFunction(dense_function("rooms", [q], [ca.cse(rooms)])),
+            BlockedFunction(dense_function("slopes", [q], [ca.cse(slopes)])),
+        )
 
     def _phi_errors(self, targets: Array, u: Array) -> Array:
         errors = self.phi_map.residual(targets, self.points(u))

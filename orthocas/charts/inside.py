@@ -222,8 +222,7 @@ class Points:
             chosen.append(best)
             left[rows] &= np.abs(u[rows] - self.u[best][:, None]).max(axis=2) >= RULES.apart
             left[rows[(self.away[best] <= RULES.nearly) & (self.error[best] <= settled)]] = False
-        which = np.concatenate(chosen)
-        return self.part(which)
+        return self.part(np.concatenate(chosen))
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,20 +240,22 @@ class Slices:
     def points(self, targets: Array, own: Array, rows: Indices) -> Points:
         """Points of the domain with x nearly as in some rows of targets (N, n).
 
-        Joints without boundaries are turned towards given positions (N, n), or towards the centre of the domain, and
-        once more to both sides, where their turns change xi unevenly.
+        Joints are turned towards given positions (N, n), where they can turn more than once; those without boundaries
+        whose turns change xi unevenly towards the centre of the domain, and once more to both sides.
         """
         domain, (low, high), turning = self.boxed.domain, self.boxed.domain.bounds, self.tracer.turning
-        endless, uneven = ~np.isfinite(low), ~self.boxed.even
-        several = turning & np.where(endless, uneven, domain.half_width > np.pi)
-        turns = 2 * np.pi * np.array(list(product(*((-1, 0, 1) if more else (0,) for more in several))))
+        uneven = turning & ~np.isfinite(low) & ~self.boxed.even
+        several = ~uneven & ((domain.half_width > np.pi) | ~np.isfinite(low))
+        turns = 2 * np.pi * np.array(list(product(*((-1, 0, 1) if more else (0,) for more in uneven))))
         found = [Points.of(own[:0, None], self.boxed)]
         with np.errstate(all="ignore"):
             for traces in self._curves(targets[rows]):
                 curve, place = np.nonzero(np.arange(traces.q.shape[1]) < traces.count[:, None])
                 row, q = rows[traces.row[curve] // len(RULES.places)], traces.q[curve, place]
-                towards = np.where(endless & ~uneven, own[row], domain.centre)
-                q = turns[:, None] + towards + without_turns(q - towards, turning)
+                towards = np.where(several, own[row], domain.centre)
+                q = towards + without_turns(q - towards, turning)
+                back = (q < low - RULES.slack) * 1 - (q > high + RULES.slack) * 1
+                q = turns[:, None] + q + np.where(turning, 2 * np.pi * back, 0.0)
                 inside = np.asarray(((q >= low - RULES.slack) & (q <= high + RULES.slack)).all(axis=2))
                 number = np.arange(inside.size).reshape(inside.shape)
                 enters = inside & ~np.roll(inside, 1, axis=1)

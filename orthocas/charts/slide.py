@@ -185,7 +185,8 @@ class _Run:
 
     def _gaps(self, rows: Indices, u: Array) -> Array:
         """phi - phi(q), x relative to sizes, (rows, n)."""
-        return self._boxed.gaps(self._targets[rows], u) / self._sizes
+        gaps: Array = self._boxed.gaps(self._targets[rows], u) / self._sizes
+        return gaps
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,15 +201,13 @@ class Walls:
         """Those of some rows."""
         return Walls(self.low[rows], self.high[rows], self.slopes[rows])
 
-    def project(
-        self, B: Array, back: Array, wanted: Array, held: NDArray[np.int8]
-    ) -> tuple[Array, NDArray[np.int8]]:
+    def project(self, B: Array, back: Array, wanted: Array, held: NDArray[np.int8]) -> tuple[Array, NDArray[np.int8]]:
         """The z (N, r) nearest to wanted ones for which d = back + B z keeps the bounds, as far as any z does.
 
         From a guess which of the first bounds hold; returns those that do, (N, n + k).
         """
         guess = np.zeros(self.low.shape, dtype=np.int8)
-        shared = min(guess.shape[1], held.shape[1])
+        shared = min(self.low.shape[1], held.shape[1])
         guess[:, :shared] = held[:, :shared]
         gone = self._values(back)
         whole = np.concatenate([B, self.slopes @ B], axis=1) if self.slopes.shape[1] else B
@@ -218,9 +217,7 @@ class Walls:
         return np.concatenate([d, _times(self.slopes, d)], axis=1) if self.slopes.shape[1] else d
 
 
-def project(
-    B: Array, low: Array, high: Array, wanted: Array, held: NDArray[np.int8]
-) -> tuple[Array, NDArray[np.int8]]:
+def project(B: Array, low: Array, high: Array, wanted: Array, held: NDArray[np.int8]) -> tuple[Array, NDArray[np.int8]]:
     """The points z (N, r) of polytopes low <= B z <= high that are nearest to wanted ones (N, r).
 
     Bounds that z breaks are penalised; which they are is guessed again and again until that does not change. Two
