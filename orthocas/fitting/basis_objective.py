@@ -34,6 +34,7 @@ class ObjectiveRules:
     blocks: int = 8  #: blocks of samples per thread: fixed, so that sums do not depend on the number of threads
     stride: int = 2  #: every second sample estimates the Gauss-Newton matrix, which is a mean, well enough
     most_stride: int = 16  #: of rough estimates; a divisor of the samples in a block
+    hinges: int = 1000  #: samples that estimate the Gauss-Newton matrix of a hinge, about
     rough: int = 12  #: residuals per coefficient in a rough estimate
 
     orienting: int = 200  #: samples that determine the orientation of a network's start
@@ -130,8 +131,21 @@ class BasisObjective:
         """L(theta) and dL/dtheta."""
         # J_xi = T X block by block; the loss and its slopes there; and the slopes times X^T, which are dL/dT
         T, columns, parts = self._table(theta), build_loss_columns(self._loss), self._parts
+        arrays = (self.X, self._share, *self._data)
+
+        def sum_part(run: Run, part: slice) -> tuple[float, Array]:
+            value, gradient = 0.0, np.zeros(T.shape)
+            losses, slopes = np.empty(COLUMNS), np.empty((self.n * self.r, COLUMNS))
+            # one block at a time, so that X leaves memory only once
+            for X, share, *data in zip(*(array[part] for array in arrays), strict=True):
+                run([_to_double(T @ X), *data], [losses, slopes])
+                value += float(losses @ share)
+                shared = (slopes * share).astype(X.dtype, copy=False).reshape(*T.shape[:2], -1)
+                gradient += shared @ X.transpose(0, 2, 1)
+            return value, gradient
+
         with columns.borrow(min(count_threads(), len(parts))) as runs:
-            sums = run_in_threads_with(runs, lambda run, part: self._sum_part(T, run, part), parts)
+            sums = run_in_threads_with(runs, sum_part, parts)
         slopes = self._gradients.collect(np.sum([gradient for _, gradient in sums], axis=0))
         return sum(value for value, _ in sums), slopes[self.kept]
 
@@ -156,6 +170,7 @@ class BasisObjective:
         (curvature,) = build_curvature_columns(self._loss)(self._evaluate_jacobians(theta), *self._data)
         W = split_by_sample(curvature.reshape(-1, n * r, n * r, curvature.shape[2]), self.N).reshape(-1, n, r, n, r)
         G, H = self._dense, np.zeros((r, K, r, K))
+        # each pair of coordinates is a block, filled by one thread
 
         def fill(pair: tuple[int, int]) -> None:
             i, j = pair
@@ -166,6 +181,7 @@ class BasisObjective:
             H[j, :, i] = H[i, :, j].T
 
         run_in_threads(fill, [(i, j) for i in range(r) for j in range(i + 1)])
+        # coefficients that may differ from zero
         free = self.kept.ravel()
         block: Array = H.reshape(r * K, r * K)[np.ix_(free, free)]
         return block
@@ -233,18 +249,6 @@ class BasisObjective:
         """The blocks of samples in parts."""
         return [slice(start, start + RULES.blocks) for start in range(0, len(self.X), RULES.blocks)]
 
-    def _sum_part(self, T: Array, run: Run, part: slice) -> tuple[float, Array]:
-        """Share of some blocks in the loss, and in its slopes with respect to T."""
-        value, gradient = 0.0, np.zeros(T.shape)
-        losses, slopes = np.empty(COLUMNS), np.empty((self.n * self.r, COLUMNS))
-        arrays = (self.X, self._share, *self._data)
-        # block by block, so that X leaves memory only once
-        for X, share, *data in zip(*(array[part] for array in arrays), strict=True):
-            run([_to_double(T @ X), *data], [losses, slopes])
-            value += float(losses @ share)
-            gradient += (slopes * share).astype(X.dtype, copy=False).reshape(*T.shape[:2], -1) @ X.transpose(0, 2, 1)
-        return value, gradient
-
     def _evaluate_jacobians(self, theta: Array) -> Array:
         """J_xi, (B, n r, c)."""
         T = self._table(theta)
@@ -273,11 +277,14 @@ class BasisObjective:
         """Gauss-Newton matrix of a hinge residual. It couples all coordinates, but acts at few samples."""
         # only samples at which the hinge acts, without the padding of the last block
         block, column = np.nonzero((residual[:, 0] > 0) & (self._share > 0))
+        # where it acts at most samples, some of them estimate the matrix well enough
+        stride = max(1, len(block) // RULES.hinges)
+        block, column = block[::stride], column[::stride]
         D = derivative[block, :, column].reshape(-1, self.n, self.r).transpose(0, 2, 1).astype(np.float32)
         chosen: Array = self.X[block, :, :, column]  # (active, g, S)
         G = self._gradients.expand(chosen.transpose(1, 2, 0)[None], len(chosen))
         rows = (D @ G.astype(np.float32))[:, self.kept]
-        product: Array = (rows.T @ rows).astype(float) / self.N
+        product: Array = (rows.T @ rows).astype(float) * (stride / self.N)
         return product
 
 
@@ -410,6 +417,7 @@ def _add(
             for row, other in rows_of[i, j]:
                 H[places[i], places[j]] += X[start, i][:, row].T @ X[start, j][:, other]
 
+    # rows of samples times gradients first, then squares and mixed products of them, each a block of the matrix
     r = len(derivatives)
     rows_of: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for i, j, row, other in shared:
