@@ -32,8 +32,8 @@ RECALL = "| chart | targets | solutions: mean | most | missed by 20,000 starts |
     " --- |" * 7
 )
 NEAREST = (
-    "| chart | wishes | 4,000 starts lead nearer | less near | ms a wish | in C | near ends of ranges | of these missed |\n|"
-    + " --- |" * 8
+    "| chart | wishes | 4,000 starts lead nearer | less near | ms a wish | in C | near ends of ranges "
+    "| of these missed |\n|" + " --- |" * 8
 )
 
 
