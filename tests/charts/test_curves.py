@@ -19,7 +19,8 @@ def test_no_random_start_leads_to_a_nearer_xi(name: str) -> None:
     domain = chart.problem.domain
     wishes, x = sample_uniform(domain, 24, 1), chart.x(sample_uniform(domain, 24, 2))
     near, pool = chart.nearest_xi(wishes, x), sample_uniform(domain, STARTS, 3)
-    assert {FOUND, NEAREST} == set(near.statuses)
+    assert FOUND in near.statuses
+    assert set(near.statuses) <= {FOUND, NEAREST}
     assert domain.contains(near.q).all()
     np.testing.assert_allclose(chart.parts.relative.difference(x, chart.x(near.q)), 0, atol=1e-8)
     xi = chart.xi(wishes)[:, 0]
