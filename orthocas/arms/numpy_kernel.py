@@ -1,0 +1,288 @@
+"""The search for self-motion curves in NumPy, for machines without a C compiler: templates/self_motion.c.jinja, slower."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.arms.kernel import RULES, Curve, crossing_type, evaluate_cubic
+from orthocas.arms.stored import StoredPostures
+from orthocas.tools.batch import Batched
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array
+
+_TURN = 2 * np.pi
+
+
+@dataclass(frozen=True, eq=False)
+class NumpyKernel:
+    """`orthocas.arms.kernel.Kernel` in NumPy. Threads may share it."""
+
+    equations: ca.Function
+    lower: Array
+    upper: Array
+    turning: NDArray[np.bool_]
+
+    def choose_starts(self, stored: StoredPostures, place: Array) -> Array:
+        """As `Kernel.choose_starts`."""
+        return stored.near(place, RULES.starts)
+
+    def find_curves(self, target: Array, starts: Array) -> list[Curve]:
+        """As `Kernel.find_curves`; the same curves, from other first points."""
+        reached, tangents, good = self._reach(target, starts)
+        curves: list[Curve] = []
+        quiet = 0
+        for k in range(len(starts)):
+            quiet += 1
+            if quiet > RULES.patience or len(curves) == RULES.curves:
+                break
+            if not good[k] or any(self._lies_on(curve, reached[k], tangents[k]) for curve in curves):
+                continue
+            curve = self._trace(target, reached[k], tangents[k])
+            if curve is not None:
+                curves.append(curve)
+                quiet = 0
+        return curves
+
+    def correct(self, target: Array, q: Array, tangent: Array) -> NDArray[np.bool_]:
+        """As `Kernel.correct`."""
+        row, left, good = tangent.copy(), np.arange(len(q)), np.zeros(len(q), dtype=bool)
+        for _ in range(RULES.corrections):
+            e, J = self._evaluate(q[left], target)
+            change, t = _solve_bordered(J, e, row[left], np.zeros(len(left)))
+            size = np.linalg.norm(change, axis=1)
+            kept = size < RULES.missed
+            q[left[kept]] += change[kept]
+            tangent[left[kept]] = t[kept]
+            good[left[kept & (size < 1e-7)]] = True
+            left = left[kept & ~(size < 1e-7)]
+            if not left.size:
+                break
+        good[left[: len(left)]] = True
+        return np.asarray(good & ((row * tangent).sum(axis=1) > 0))
+
+    def _reach(self, target: Array, starts: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Where damped least squares lead from starts (S, n), the tangents there, and whether they arrive."""
+        q, good, left = starts.copy(), np.zeros(len(starts), dtype=bool), np.arange(len(starts))
+        tangents = np.zeros_like(q)
+        for _ in range(RULES.reach):
+            e, J = self._evaluate(q[left], target)
+            error = np.abs(e).max(axis=1)
+            gram = J @ J.transpose(0, 2, 1)
+            damping = np.where(error > 0.1, RULES.far_damping, np.where(error > 1e-3, RULES.near_damping, 1e-14))
+            damping = damping * np.trace(gram, axis1=1, axis2=2)
+            y = np.linalg.solve(gram + (damping[:, None, None] + 1e-300) * np.eye(e.shape[1]), e[:, :, None])
+            step = (J.transpose(0, 2, 1) @ y)[:, :, 0]
+            size = np.linalg.norm(step, axis=1)
+            q[left] += np.minimum(1.0, RULES.largest / (size + 1e-300))[:, None] * step
+            done = (error <= RULES.reached) & (size < 0.1)
+            if done.any():
+                tangents[left[done]] = _find_tangents(J[done])
+                good[left[done]] = True
+            left = left[~done & np.isfinite(error)]
+            if not left.size:
+                break
+        return q, tangents, good
+
+    def _trace(self, target: Array, q: Array, t: Array) -> Curve | None:
+        """The curve through q (n,) from end to end."""
+        nodes, tangents, closed = self._follow(target, q, t, 1.0)
+        if not closed:
+            behind, back, _ = self._follow(target, q, t, -1.0)
+            nodes, tangents = behind[:0:-1] + nodes, [-part for part in back[:0:-1]] + tangents
+        if len(nodes) < 3:
+            return None
+        points, directions = np.array(nodes), np.array(tangents)
+        lengths = np.append(_length_of(points[:-1], points[1:], directions[:-1], directions[1:]), 0.0)
+        bare = Curve(points, directions, lengths, closed, np.empty(0, crossing_type(len(q))))
+        return Curve(points, directions, lengths, closed, self._find_crossings(target, bare))
+
+    def _follow(self, target: Array, q0: Array, t0: Array, sense: float) -> tuple[list[Array], list[Array], bool]:
+        """Points and tangents from q0 (n,) on, those against the tangent reversed; whether the last is the first."""
+        nodes, tangents = [q0], [sense * t0]
+        h, before = RULES.step / 3, 0.0
+        while len(nodes) < RULES.nodes:
+            q, t = nodes[-1], tangents[-1]
+            new = q + h * t
+            if before > 0:
+                new = evaluate_cubic(nodes[-2], q, tangents[-2], t, before, 1.0 + h / before)[0]
+            missed, size, good, onward = 0.0, 0.0, False, t
+            for k in range(RULES.corrections):
+                e, J = self._evaluate(new[None], target)
+                change, found = _solve_bordered(J, e, t[None], np.zeros(1))
+                size = float(np.linalg.norm(change))
+                missed = size if k == 0 else missed
+                if not size < RULES.missed:
+                    break
+                new, onward = new + change[0], sense * found[0]
+                if size < RULES.corrected:
+                    good = True
+                    break
+            turned = float(onward @ t)
+            if not (good and turned > RULES.turned):
+                h /= 2 if missed < RULES.missed and size < RULES.missed else 3
+                if h < RULES.shortest:
+                    break
+                continue
+            last = h
+            before = float(_length_of(q[None], new[None], t[None], onward[None])[0])
+            nodes.append(new)
+            tangents.append(onward)
+            step = Curve(np.array(nodes[-2:]), np.array(tangents[-2:]), np.array([before, 0.0]), False, _NONE)
+            if len(nodes) > 3 and self._lies_on(step, q0, sense * t0):
+                nodes[-1] = q0 + np.where(self.turning, _TURN * np.rint((new - q0) / _TURN), 0.0)
+                tangents[-1] = sense * t0
+                return nodes, tangents, True
+            room = RULES.prismatic * (self.upper - self.lower)
+            outside = (new < self.lower - room) | (new > self.upper + room)
+            if (outside & ~self.turning & np.isfinite(room)).any():
+                break
+            h = min(h * min(1.6, max(0.5, np.cbrt(RULES.aim / max(missed, 1e-9)))), RULES.step)
+            if turned < RULES.straight:
+                h = min(h, last)
+        return nodes, tangents, False
+
+    def _lies_on(self, curve: Curve, q: Array, t: Array) -> bool:
+        """Whether q (n,) with its tangent lies on a curve, up to full turns."""
+        away = q - curve.q[:-1]
+        away = np.where(self.turning, away - _TURN * np.rint(away / _TURN), away)
+        h = curve.length[:-1]
+        near = np.flatnonzero((away**2).sum(axis=1) <= (h + RULES.known) ** 2)
+        if not near.size:
+            return False
+        a, b = np.zeros((len(near), len(q))), curve.q[near + 1] - curve.q[near]
+        start, end, away, h = curve.tangent[near], curve.tangent[near + 1], away[near], h[near, None]
+        u = (away * start).sum(axis=1, keepdims=True) / h
+        for _ in range(3):
+            at, slope = evaluate_cubic(a, b, start, end, h, np.clip(u, 0.0, 1.0))
+            u = np.clip(u, 0.0, 1.0) + ((away - at) * slope).sum(axis=1, keepdims=True) / h
+        at, slope = evaluate_cubic(a, b, start, end, h, np.clip(u, 0.0, 1.0))
+        return bool(((((at - away) ** 2).sum(axis=1) < RULES.known**2) & (slope @ t > 0)).any())
+
+    def _find_crossings(self, target: Array, curve: Curve) -> NDArray[np.void]:
+        """Where a curve crosses limits, in order."""
+        found: list[tuple[float, Array, int, int, int, int]] = []
+        for k in range(len(curve.q) - 1):
+            step = curve.q[k], curve.q[k + 1], curve.tangent[k], curve.tangent[k + 1], float(curve.length[k])
+            self._cross_step(target, step, float(curve.places[k]), 0, found)
+        found.sort(key=lambda item: item[0])
+        result = np.zeros(len(found), crossing_type(curve.q.shape[1]))
+        for row, (place, q, joint, side, turns, rises) in zip(result, found, strict=True):
+            row["place"], row["q"], row["joint"], row["side"] = place, q, joint, side
+            row["turns"], row["rises"] = turns, rises
+        return result
+
+    def _cross_step(
+        self,
+        target: Array,
+        step: tuple[Array, Array, Array, Array, float],
+        place: float,
+        depth: int,
+        found: list[tuple[float, Array, int, int, int, int]],
+    ) -> None:
+        """Add the crossings of a step; it is divided where a joint turns back next to a limit."""
+        a, b, start, end, h = step
+        joints = [i for i in range(len(a)) if np.isfinite(self.lower[i])]
+        cubics = {i: _find_pieces(b[i] - a[i], h * start[i], h * end[i]) for i in joints}
+        graze = RULES.graze / 2 ** (4 * depth)
+        for i in joints if depth < RULES.halvings else ():
+            value, bends = cubics[i]
+            for u in bends[1:-1]:
+                gaps = np.array([a[i] + value(u) - self.lower[i], a[i] + value(u) - self.upper[i]])
+                gaps = gaps - _TURN * np.rint(gaps / _TURN) if self.turning[i] else gaps
+                if not np.abs(gaps).min() < graze or not 1e-6 < u < 1 - 1e-6:
+                    continue
+                q, t = (part[None] for part in evaluate_cubic(a, b, start, end, h, u))
+                if self.correct(target, q, t)[0]:
+                    self._cross_step(target, (a, q[0], start, t[0], u * h), place, depth + 1, found)
+                    rest = (q[0], b, t[0], end, (1 - u) * h)
+                    self._cross_step(target, rest, place + u * h, depth + 1, found)
+                    return
+        for i in joints:
+            value, bends = cubics[i]
+            values = [value(u) for u in bends]
+            for side, bound in enumerate((self.lower[i], self.upper[i])):
+                limit = bound - a[i]
+                first, last = (int(np.ceil((min(values) - limit) / _TURN)), int(np.floor((max(values) - limit) / _TURN)))
+                for turns in range(first, last + 1) if self.turning[i] else (0,):
+                    v = limit + _TURN * turns
+                    for left, right in zip(bends[:-1], bends[1:], strict=True):
+                        above = value(left) > v
+                        if above == (value(right) > v):
+                            continue
+                        low, high = left, right
+                        for _ in range(30):
+                            u = (low + high) / 2
+                            low, high = (u, high) if (value(u) > v) == above else (low, u)
+                        q = self._meet_limit(target, *evaluate_cubic(a, b, start, end, h, low), i, a[i] + v)
+                        found.append((place + low * h, q, i, side, turns, int(not above)))
+
+    def _meet_limit(self, target: Array, start: Array, t: Array, joint: int, value: float) -> Array:
+        """The exact point near one (n,) at which a joint has a value, or else on the curve."""
+        row, q, size = np.eye(len(start))[joint][None], start.copy(), np.inf
+        for _ in range(RULES.corrections):
+            e, J = self._evaluate(q[None], target)
+            change, _ = _solve_bordered(J, e, row, np.array([value - q[joint]]))
+            size = float(np.linalg.norm(change))
+            q = q + change[0]
+            if not RULES.missed > size >= 1e-9:
+                break
+        if size < 1e-6 and np.linalg.norm(q - start) < RULES.missed:
+            return q
+        points, tangents = start[None].copy(), t[None].copy()
+        self.correct(target, points, tangents)
+        return np.asarray(points[0])
+
+    def _evaluate(self, q: Array, target: Array) -> tuple[Array, Array]:
+        """e (N, m) and J (N, m, n) at q (N, n)."""
+        e, J = self._batched(np.ascontiguousarray(q), np.tile(target, (len(q), 1)))
+        return e.reshape(len(q), -1), J.reshape(len(q), -1, q.shape[1])
+
+    @cached_property
+    def _batched(self) -> Batched:
+        return Batched(self.equations)
+
+
+_NONE = np.empty(0, crossing_type(1))
+
+
+def _solve_bordered(J: Array, e: Array, rows: Array, rest: Array) -> tuple[Array, Array]:
+    """dq with J dq = e and row . dq = rest, and unit tangents with det [J; t] > 0, (N, n) each; NaN where singular."""
+    N, m, n = J.shape
+    A, right = np.concatenate([J, rows[:, None]], axis=1), np.zeros((N, n, 2))
+    right[:, :m, 0], right[:, m, 0], right[:, m, 1] = e, rest, 1.0
+    try:
+        found = np.linalg.solve(A, right)
+    except np.linalg.LinAlgError:
+        return np.full((N, n), np.nan), np.full((N, n), np.nan)
+    sign = np.sign(np.linalg.det(A))[:, None]
+    with np.errstate(all="ignore"):
+        t = found[:, :, 1] / np.linalg.norm(found[:, :, 1], axis=1, keepdims=True)
+    return found[:, :, 0], sign * t
+
+
+def _find_tangents(J: Array) -> Array:
+    """Unit tangents (N, n) with det [J; t] > 0."""
+    t = np.linalg.svd(J)[2][:, -1]
+    sign = np.sign(np.linalg.det(np.concatenate([J, t[:, None]], axis=1)))
+    return np.asarray(t * np.where(sign == 0, 1.0, sign)[:, None])
+
+
+def _length_of(a: Array, b: Array, start: Array, end: Array) -> Array:
+    """Lengths of steps (N,) with unit tangents at both ends."""
+    turn = 1.0 - np.minimum(1.0, (start * end).sum(axis=1))
+    return np.asarray(np.linalg.norm(b - a, axis=1) * (1.0 + turn / 12))
+
+
+def _find_pieces(d: float, start: float, end: float) -> tuple[Callable[[float], float], list[float]]:
+    """A component of a cubic step from 0 to d with slopes, as a function of the share; 0, where it turns, and 1."""
+    one, two, three = start, 3 * d - 2 * start - end, start + end - 2 * d
+
+    def value(u: float) -> float:
+        return float(u * (one + u * (two + u * three)))
+
+    turns = np.roots([3 * three, 2 * two, one]) if three else np.roots([2 * two, one])
+    inner = sorted(float(u.real) for u in turns if abs(u.imag) == 0 and 0 < u.real < 1)
+    return value, [0.0, *inner, 1.0]
