@@ -220,12 +220,19 @@ def build_equations(task: Task, scale: Array) -> ca.Function:
         target = ca.SX.sym("target", first + 9)
         across = ca.reshape(target[first:], 3, 3) @ R.T
         axis = ca.vertcat(across[2, 1] - across[1, 2], across[0, 2] - across[2, 0], across[1, 0] - across[0, 1]) / 2
-        sine = ca.norm_2(axis)
-        angle = ca.atan2(sine, (ca.trace(across) - 1) / 2)
-        e = ca.if_else(sine > 1e-9, angle / ca.fmax(sine, 1e-300), 1.0) * axis
+        sine = ca.sqrt(ca.sumsqr(axis) + 1e-32)  # never zero, so that derivatives are finite
+        e = ca.atan2(sine, (ca.trace(across) - 1) / 2) / sine * axis
         if first:
             e, J = ca.vertcat(target[:3] - p, e), J
         else:
             J = J[3:, :]
     parts = [ca.cse(part / ca.repmat(ca.DM(scale), 1, part.shape[1])) for part in (e, J)]
     return dense_function("task", [q, target], parts, ["q", "target"])
+
+
+def build_curvature(equations: ca.Function) -> ca.Function:
+    """q (n, 1), target -> the second derivative of |e|^2 / 2, (n, n): that of J and e of `build_equations`."""
+    q, target = (ca.SX.sym(name, equations.size1_in(i)) for i, name in enumerate(("q", "target")))
+    e, J = equations(q, target)
+    H = ca.jacobian(-J.T @ e, q)
+    return dense_function("curvature", [q, target], [ca.cse((H + H.T) / 2)], ["q", "target"])

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.arms.kernel import build_equations
+from orthocas.arms.kernel import build_curvature, build_equations
 from orthocas.arms.maps import ArmMaps
 from orthocas.charts.chart import Chart
 from orthocas.charts.newton import Bound
@@ -32,10 +32,12 @@ class TrackRules:
     posture_weight: float = 1e-4  #: of the way back to the last posture with a chart, where there is none
     step_damping: float = 1e-8  #: of squared joint steps
     error_damping: float = 0.3  #: of squared joint steps, times the squared error of x
-    grows: float = 4.0  #: damping after a step that does not lower the error
-    shrinks: float = 3.0  #: damping, divided by this, after one that does as foreseen
+    damping: float = 1e-3  #: of squared joint steps after one that does not lower the error, at least
+    grows: float = 10.0  #: damping after another one; it shrinks as much after one that does
     rounds: int = 12  #: of a call, at most
     gain: float = 1e-9  #: relative decrease of the squared error below which it is a minimum
+    near: float = 1e-3  #: error of x below which the last posture with a chart does not count
+    decrease: float = 1e-4  #: of the cost, relative to what a step promises
     changes: int = 40  #: of the joints at bounds in a quadratic program, at most
 
 
@@ -98,7 +100,10 @@ class ArmTracker(Shown):
         self._e, self._J = np.empty(maps.task.m), np.empty((n, maps.task.m))
         with deferred(), building:  # CasADi's expressions are not for several threads at a time
             equations = build_equations(maps.task, maps.scale)
+            curvature = build_curvature(equations)
         self._equations = Bound(equations, [self._at, self._to], [self._e, self._J])
+        self._H = np.empty((n, n))
+        self._curvature = Bound(curvature, [self._at, self._to], [self._H])
         self.reset(q)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -161,6 +166,8 @@ class ArmTracker(Shown):
         Raises:
             InvalidValueError: if x is no task value of this task.
         """
+        if type(x) is np.ndarray and x.shape == (self._maps.task.m,):
+            return self._go(x, None, xi)
         targets, single = self._maps.targets.read(x)
         if not single:
             raise InvalidValueError("x", f"{len(targets)} values", "one task value")
@@ -168,25 +175,33 @@ class ArmTracker(Shown):
 
     def step_to(self, target: Array, xi: float | None) -> Array:
         """As `step`, for x as `orthocas.arms.kernel.build_equations` takes it."""
-        if not np.isfinite(target).all() or (xi is not None and not np.isfinite(xi)):
+        return self._go(None, target, xi)
+
+    def _go(self, vector: Array | None, target: Array | None, xi: float | None) -> Array:
+        """The next posture for x as the task's vector or as a target, of which the chart takes the one."""
+        given = vector if vector is not None else target
+        if not np.isfinite(given).all() or (xi is not None and not np.isfinite(xi)):
             self.status = TrackStatus.BAD_INPUT
             return self._q.copy()
-        self._to[:] = target
         self._wish = self._wish if xi is None else xi
-        if self._inside and np.isfinite(self._wish) and self._step_in_chart():
-            self.status = TrackStatus.OK
-            return self._q.copy()
+        if self._inside and np.isfinite(self._wish):
+            if vector is None:
+                vector = self._maps.targets.vector(target[None])[0]
+            if self._step_in_chart(vector):
+                self.status = TrackStatus.OK
+                return self._q.copy()
+        self._to[:] = self._maps.targets.read(vector)[0][0] if target is None else target
         self.status = self._step_anywhere(asked=xi is not None)
         self._look_for_chart()
         return self._q.copy()
 
-    def _step_in_chart(self) -> bool:
+    def _step_in_chart(self, vector: Array) -> bool:
         """Whether the chart has x and xi within the bounds of this step; then the arm goes there."""
         assert self._chart is not None
         exact = self._exact
         if not np.array_equal(exact.q, self._q):
             exact.reset(self._q)
-        q = exact.step(np.append(self._maps.targets.vector(self._to[None])[0], self._wish))
+        q = exact.step(np.append(vector, self._wish))
         low, high = self._bounds()
         if exact.status != 0 or not ((q >= low) & (q <= high)).all():
             return False
@@ -199,19 +214,17 @@ class ArmTracker(Shown):
         q = self._q
         e, J = self._look(q)
         # First with the wishes, then towards x alone.
-        H, g = J.T @ J, -J.T @ e
         error = float(e @ e)
         rows, wishes, weight = self._find_wishes()
-        H = H + weight**2 * rows.T @ rows + (RULES.step_damping + RULES.error_damping * error) * np.eye(len(q))
-        g = g - weight**2 * rows.T @ wishes
-        ahead = np.clip(q + solve_in_box(H, g, low - q, high - q), low, high)
-        met, ahead = self._descend(ahead, low, high)
-        if not met:
-            # The wishes may be in the way of x.
-            other_met, other = self._descend(q, low, high)
-            if other_met or self._error_at(other) < self._error_at(ahead):
-                met, ahead = other_met, other
-            if self._error_at(ahead) >= error * (1 - RULES.gain):
+        damping = RULES.step_damping + RULES.error_damping * error
+        H = J.T @ J + weight**2 * rows.T @ rows + damping * np.eye(len(q))
+        g = -J.T @ e - weight**2 * rows.T @ wishes
+        met, ahead = self._descend(np.clip(q + solve_in_box(H, g, low - q, high - q), low, high), low, high)
+        if not met:  # wishes may be in the way
+            met, other = self._descend(q, low, high)
+            if met or self._cost_of(other) < self._cost_of(ahead):
+                ahead = other
+            if not met and self._cost_of(ahead) >= self._cost_of(q) * (1 - RULES.gain):
                 ahead = q
         moved = ahead - q
         fast = (np.abs(moved) >= (1 - 1e-9) * self._period * self._speed).any()
@@ -223,28 +236,43 @@ class ArmTracker(Shown):
         return TrackStatus.YIELDING
 
     def _descend(self, q: Array, low: Array, high: Array) -> tuple[bool, Array]:
-        """Where damped Gauss-Newton steps in a box lead from q (n,), and whether x is met there."""
+        """Where damped Newton steps in a box lead from q (n,), and whether x is met there.
+
+        They lower |e|^2 + w^2 |q - p|^2 with the last posture p that had a chart, and a tiny w: at a border of reach,
+        where two postures meet, that is the side to go back to.
+        """
         e, J = self._look(q)
-        error = float(e @ e)
-        damping = RULES.step_damping + RULES.error_damping * error
+        weight, damping = RULES.posture_weight**2, RULES.step_damping
+        away = q - self._last
+        cost = float(e @ e) + weight * float(away @ away)
         for _ in range(RULES.rounds):
+            far = np.abs(e).max() > RULES.near
             if np.abs(e).max() < RULES.met:
                 return True, q
-            g, H = -J.T @ e, J.T @ J + damping * np.eye(len(q))
+            pull = weight if far else 0.0
+            g = pull * away - J.T @ e
+            H = (self._bend(q) if far else J.T @ J) + (damping + pull) * np.eye(len(q))
             d = solve_in_box(H, g, low - q, high - q)
-            promised = -float(2 * g @ d + d @ (J.T @ (J @ d)))
-            if promised <= RULES.gain * error:
+            promised = -float(2 * g @ d + d @ H @ d)
+            if promised <= RULES.gain * cost:
                 break
             new = np.clip(q + d, low, high)
             e_new, J_new = self._look(new)
-            gained = (error - float(e_new @ e_new)) / promised
-            if gained > 1e-4:
-                q, e, J, error = new, e_new, J_new, float(e_new @ e_new)
-                damping = max(RULES.step_damping, damping / RULES.shrinks if gained > 0.75 else damping)
-                damping = min(damping, RULES.step_damping + RULES.error_damping * error)
+            away_new = new - self._last
+            before, after = (float(a @ a) + pull * float(b @ b) for a, b in ((e, away), (e_new, away_new)))
+            if (before - after) / promised > RULES.decrease:
+                q, e, J, away = new, e_new, J_new, away_new
+                cost, damping = float(e @ e) + weight * float(away @ away), max(RULES.step_damping, damping / 10)
             else:
-                damping *= RULES.grows
+                damping = max(RULES.grows * damping, RULES.damping)
         return bool(np.abs(e).max() < RULES.met), q
+
+    def _bend(self, q: Array) -> Array:
+        """The second derivative of |e|^2 / 2 at q (n,), with the signs of its eigenvalues made positive, (n, n)."""
+        self._at[:] = q
+        self._curvature.run()
+        values, vectors = np.linalg.eigh(self._H)
+        return np.asarray((vectors * np.abs(values)) @ vectors.T)
 
     def _find_wishes(self) -> tuple[Array, Array, float]:
         """Rows, values and weight of what else the step is to do: xi, or the way back to a posture with a chart."""
@@ -292,9 +320,11 @@ class ArmTracker(Shown):
         self._equations.run()
         return self._e.copy(), self._J.T.copy()
 
-    def _error_at(self, q: Array) -> float:
+    def _cost_of(self, q: Array) -> float:
+        """What `_descend` lowers, at q (n,)."""
         e, _ = self._look(q)
-        return float(e @ e)
+        away = q - self._last
+        return float(e @ e) + RULES.posture_weight**2 * float(away @ away)
 
 
 def solve_in_box(H: Array, g: Array, low: Array, high: Array) -> Array:
