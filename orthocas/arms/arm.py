@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.arms.arm_file import read_charts, write_charts
 from orthocas.arms.maps import ArmMaps
-from orthocas.arms.self_motion import Arc, Place, SelfMotions, cut_curve
+from orthocas.arms.self_motion import Arc, SelfMotions, cut_curve
 from orthocas.arms.tracker import ArmTracker, TrackStatus
 from orthocas.charts.chart import Chart
 from orthocas.charts.inverse import InverseStatus
@@ -24,8 +24,15 @@ from orthocas.tasks.regular_box import find_joint_range
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import run_in_threads
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, as_number, as_path, as_point, as_point_set, require_kind
-from orthocas.tools.checks import require_known
+from orthocas.tools.checks import (
+    Array,
+    as_float_array,
+    as_number,
+    as_path,
+    as_point_set,
+    require_kind,
+    require_known,
+)
 from orthocas.tools.display import Shown, listed, percent
 from orthocas.tools.progress import Monitor, Progress, silent
 
@@ -374,7 +381,9 @@ class Arm(Shown):
     def _read_one(self, x: Any) -> Array:
         targets, single = self.maps.targets.read(x)
         if not single or not np.isfinite(targets).all():
-            raise InvalidValueError("x", f"{len(targets)} values" if not single else "NaN or infinity", "one task value")
+            raise InvalidValueError(
+                "x", f"{len(targets)} values" if not single else "NaN or infinity", "one task value"
+            )
         return np.asarray(targets[0])
 
     def _find_motions(self, target: Array, *starts: Array) -> SelfMotions:

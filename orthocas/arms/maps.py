@@ -13,9 +13,9 @@ from orthocas.charts.self_motion import Stop
 from orthocas.errors import CompileError
 from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import Branches, branches
+from orthocas.tasks.domains import Box, StopKind
 from orthocas.tasks.regular_box import find_joint_range
 from orthocas.tasks.samples import sample_evenly
-from orthocas.tasks.domains import Box, StopKind
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched
 from orthocas.tools.cached import cached_property

@@ -205,7 +205,10 @@ class NumpyKernel:
             values = [value(u) for u in bends]
             for side, bound in enumerate((self.lower[i], self.upper[i])):
                 limit = bound - a[i]
-                first, last = (int(np.ceil((min(values) - limit) / _TURN)), int(np.floor((max(values) - limit) / _TURN)))
+                first, last = (
+                    int(np.ceil((min(values) - limit) / _TURN)),
+                    int(np.floor((max(values) - limit) / _TURN)),
+                )
                 for turns in range(first, last + 1) if self.turning[i] else (0,):
                     v = limit + _TURN * turns
                     for left, right in zip(bends[:-1], bends[1:], strict=True):

@@ -38,9 +38,7 @@ class StoredPostures:
     begins: NDArray[np.intc]  #: numbers of the first posture of each branch, and S
 
     @classmethod
-    def build(
-        cls, reader: "PlaceReader", rates: Callable[[Array], Array], branches: Branches
-    ) -> "StoredPostures":
+    def build(cls, reader: "PlaceReader", rates: Callable[[Array], Array], branches: Branches) -> "StoredPostures":
         """Postures of a robot.
 
         Args:

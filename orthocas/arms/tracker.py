@@ -88,7 +88,9 @@ class ArmTracker(Shown):
         span = as_number("period", period)
         if not 1e-5 <= span <= 10:
             raise InvalidValueError("period", period, "a time from 1e-5 to 10 s")
-        limits = as_float_array("velocity_limits", robot.velocity_limits if velocity_limits is None else velocity_limits)
+        limits = as_float_array(
+            "velocity_limits", robot.velocity_limits if velocity_limits is None else velocity_limits
+        )
         if limits.ndim:
             require_shape("velocity_limits", limits.shape, (n,))
         if not (limits > 0).all():
