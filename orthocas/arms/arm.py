@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.arms.arm_file import read_charts, write_charts
 from orthocas.arms.maps import ArmMaps
-from orthocas.arms.self_motion import Arc, SelfMotions, cut_curve
+from orthocas.arms.self_motion import Arc, SelfMotions, find_motions, cut_curve
 from orthocas.arms.tracker import ArmTracker, TrackStatus
 from orthocas.charts.chart import Chart
 from orthocas.charts.inverse import InverseStatus
@@ -224,7 +224,7 @@ class Arm(Shown):
         Raises:
             InvalidValueError: if x is no task value, or not finite.
         """
-        return self._find_motions(self._read_one(x))
+        return find_motions(self.maps, self._read_one(x))
 
     def solutions(self, x: Any, xi: float | None = None) -> tuple[Arc, ...] | Postures:
         """All postures with a task value, on all branches.
@@ -305,15 +305,18 @@ class Arm(Shown):
             return Postures(q[0], InverseStatus(int(status[0])), names[0], own[0])
         return Postures(q, status, names, own)
 
-    def tracker(self, q: ArrayLike, *, period: float = 0.01, velocity_limits: ArrayLike | None = None) -> ArmTracker:
+    def tracker(
+        self, q: ArrayLike, *, period: float = 0.01, velocity_limits: ArrayLike | None = None, detours: bool = True
+    ) -> ArmTracker:
         """A tracker of a stream of x and xi that is never lost; see `ArmTracker`.
 
         Args:
             q: posture within the joint limits, (n,).
             period: time from one call to the next [s].
             velocity_limits: (n,) or one number [rad/s] or [m/s]. Default: those of the robot's file.
+            detours: whether the arm may leave x for a while where it is stuck, to get to a posture that has it.
         """
-        return ArmTracker(self.maps, self.charts, q, period, velocity_limits)
+        return ArmTracker(self.maps, self.charts, q, period, velocity_limits, detours)
 
     def follow(
         self,
@@ -386,12 +389,6 @@ class Arm(Shown):
             )
         return np.asarray(targets[0])
 
-    def _find_motions(self, target: Array, *starts: Array) -> SelfMotions:
-        curves = self.maps.find_curves(target, *starts)
-        arcs = [arc for curve in curves for arc in cut_curve(self.maps, target, curve)]
-        arcs.sort(key=lambda arc: -arc.length)
-        return SelfMotions(self.maps, self.maps.targets.vector(target[None])[0], tuple(arcs), len(curves))
-
     def _solve_by_charts(
         self,
         targets: Array,
@@ -419,7 +416,7 @@ class Arm(Shown):
         self, target: Array, xi: float | None, start: Array | None, chosen: Sequence[int], anywhere: bool
     ) -> tuple[Array, int]:
         """The posture of one target, by its arcs."""
-        motions = self._find_motions(target, *(() if start is None else (start[None],)))
+        motions = find_motions(self.maps, target, *(() if start is None else (start[None],)))
         nothing = np.full(self.robot.n, np.nan), int(InverseStatus.NOT_FOUND)
         if not motions.components:
             return nothing

@@ -291,6 +291,14 @@ class SelfMotions(Shown):
         return Place(q, gap, k, place)
 
 
+def find_motions(maps: ArmMaps, target: Array, *starts: Array) -> SelfMotions:
+    """All self-motions of a target (k,), from starts (S, n) of one's own and from stored postures."""
+    curves = maps.find_curves(target, *starts)
+    arcs = [arc for curve in curves for arc in cut_curve(maps, target, curve)]
+    arcs.sort(key=lambda arc: -arc.length)
+    return SelfMotions(maps, maps.targets.vector(target[None])[0], tuple(arcs), len(curves))
+
+
 def cut_curve(maps: ArmMaps, target: Array, curve: Curve) -> list[Arc]:
     """The arcs of a curve within the limits: for each number of full turns of the joints, where all are inside."""
     robot, n = maps.robot, maps.robot.n

@@ -11,12 +11,13 @@ from numpy.typing import ArrayLike
 
 from orthocas.arms.kernel import build_curvature, build_equations
 from orthocas.arms.maps import ArmMaps
+from orthocas.arms.self_motion import find_motions
 from orthocas.charts.chart import Chart
 from orthocas.charts.newton import Bound
 from orthocas.errors import InvalidValueError, degrees_hint
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import building
-from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_shape
+from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind, require_shape
 from orthocas.tools.display import Shown, number_list
 from orthocas.tools.interrupts import deferred
 
@@ -38,6 +39,8 @@ class TrackRules:
     gain: float = 1e-9  #: relative decrease of the squared error below which it is a minimum
     near: float = 1e-3  #: error of x below which the last posture with a chart does not count
     decrease: float = 1e-4  #: of the cost, relative to what a step promises
+    window: float = 0.25  #: [s] in which the error of x must fall, or a detour is looked for
+    falls: float = 0.9  #: the error at its end, relative to that at its begin
     changes: int = 40  #: of the joints at bounds in a quadratic program, at most
 
 
@@ -82,6 +85,7 @@ class ArmTracker(Shown):
         q: ArrayLike,
         period: float,
         velocity_limits: ArrayLike | None,
+        detours: bool = True,
     ) -> None:
         robot = maps.robot
         n = robot.n
@@ -98,6 +102,8 @@ class ArmTracker(Shown):
         limits = np.where(np.isfinite(limits), limits, RULES.speed)
         self._maps, self._charts, self._period = maps, tuple(charts), span
         self._speed = np.array(np.broadcast_to(limits, n))
+        require_kind("detours", detours, bool)
+        self._detours, self._patience = detours, max(2, int(RULES.window / span))
         self._at, self._to = np.empty(n), np.empty(len(maps.targets_of(np.zeros((1, n)))[0]))
         self._e, self._J = np.empty(maps.task.m), np.empty((n, maps.task.m))
         with deferred(), building:  # CasADi's expressions are not for several threads at a time
@@ -111,10 +117,10 @@ class ArmTracker(Shown):
     def __getstate__(self) -> dict[str, Any]:
         """Without scratch memory."""
         parts = {"maps": self._maps, "charts": self._charts, "q": self.q}
-        return {**parts, "period": self._period, "speed": self._speed}
+        return {**parts, "period": self._period, "speed": self._speed, "detours": self._detours}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(*(state[name] for name in ("maps", "charts", "q", "period", "speed")))  # type: ignore[misc]
+        self.__init__(*(state[name] for name in ("maps", "charts", "q", "period", "speed", "detours")))  # type: ignore[misc]
 
     @property
     def q(self) -> Array:
@@ -155,6 +161,8 @@ class ArmTracker(Shown):
         self._q, self._last = np.array(point), np.array(point)
         self._chart: Chart | None = None
         self._inside, self._wish = False, float("nan")
+        self._goal: Array | None = None  # of a detour
+        self._ticks, self._error = 0, np.inf  # since x was met or the error fell, and the error then
         self.status = TrackStatus.OK  #: how the last call ended
         self._look_for_chart()
 
@@ -190,12 +198,55 @@ class ArmTracker(Shown):
             if vector is None:
                 vector = self._maps.targets.vector(target[None])[0]
             if self._step_in_chart(vector):
+                self._ticks, self._goal = 0, None
                 self.status = TrackStatus.OK
                 return self._q.copy()
-        self._to[:] = self._maps.targets.read(vector)[0][0] if target is None else target
-        self.status = self._step_anywhere(asked=xi is not None)
+        aim = self._maps.targets.read(vector)[0][0] if target is None else target
+        rests = self.status == TrackStatus.NEAREST and np.array_equal(aim, self._to)
+        self._to[:] = aim
+        if not rests or self._ticks % self._patience == 0:  # what rests would rest again
+            self.status = self._step_anywhere(asked=xi is not None)
+        if self.status in (TrackStatus.OK, TrackStatus.YIELDING):
+            self._ticks, self._goal = 0, None
+        elif self._detours:
+            self._watch_error()
         self._look_for_chart()
         return self._q.copy()
+
+    def _watch_error(self) -> None:
+        """Look for a detour where the error of x has not fallen for a while."""
+        e, _ = self._look(self._q)
+        error = float(np.linalg.norm(e))
+        if self._ticks % self._patience == 0:
+            if self._ticks and self._goal is None and error > RULES.falls * self._error:
+                self._goal = self._find_goal()
+            self._error = error
+        self._ticks += 1
+
+    def _find_goal(self) -> Array | None:
+        """The nearest posture within the limits that has x, of the tracker's chart if it holds one; None without any."""
+        motions = find_motions(self._maps, self._to.copy(), self._q[None])
+        if not motions.components:
+            return None
+        if self._chart is not None:
+            q = np.vstack([arc.q for arc in motions])
+            inside = np.flatnonzero(np.asarray(self._chart.problem.domain.contains(q)))
+            if inside.size:
+                return np.asarray(q[inside[np.argmin(np.linalg.norm(q[inside] - self._q, axis=1))]])
+        return motions.nearest(self._q).q
+
+    def _step_to_goal(self) -> TrackStatus | None:
+        """A step of a detour; None if it has no end any more."""
+        robot = self._maps.robot
+        met, goal = self._descend(np.array(self._goal), robot.lower, robot.upper)
+        if not met:
+            self._goal = None
+            return None
+        self._goal = goal
+        way = goal - self._q
+        share = float((self._speed * self._period / np.maximum(np.abs(way), 1e-300)).min())
+        self._q = goal if share >= 1 else self._q + share * way
+        return TrackStatus.YIELDING if share >= 1 else TrackStatus.BEHIND
 
     def _step_in_chart(self, vector: Array) -> bool:
         """Whether the chart has x and xi within the bounds of this step; then the arm goes there."""
@@ -212,6 +263,8 @@ class ArmTracker(Shown):
 
     def _step_anywhere(self, asked: bool) -> TrackStatus:
         """A step with x first."""
+        if self._goal is not None and (status := self._step_to_goal()) is not None:
+            return status
         low, high = self._bounds()
         q = self._q
         e, J = self._look(q)
