@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from orthocas.arms.arm_file import read_charts, write_charts
 from orthocas.arms.maps import ArmMaps
-from orthocas.arms.self_motion import Arc, SelfMotions, find_motions, cut_curve
+from orthocas.arms.self_motion import Arc, SelfMotions, find_motions
 from orthocas.arms.tracker import ArmTracker, TrackStatus
 from orthocas.charts.chart import Chart
 from orthocas.charts.inverse import InverseStatus
@@ -26,6 +26,7 @@ from orthocas.tools.batch import run_in_threads
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
     Array,
+    Indices,
     as_float_array,
     as_number,
     as_path,
@@ -46,6 +47,7 @@ class ArmRules:
     spacing: float = 0.05  #: [rad] or [m] between postures of an arc among which those with an xi are sought
     steps: int = 40  #: of a search for an xi between two postures
     met: float = 1e-11  #: error of xi that ends it
+    narrow: float = 1e-14  #: [rad] or [m] between the postures that ends it
     tolerance: float = 1e-9  #: error of xi of a posture that has it
     same: float = 1e-6  #: [rad] or [m] between postures that are the same
     rows: int = 8  #: that a thread takes at once
@@ -86,10 +88,10 @@ class Postures(Shown):
 class Arm(Shown):
     """An arm with one joint more than its task needs, and charts of the branches of its joint range.
 
-    Where a chart ends at a boundary of its domain, an arm goes on: it knows every posture of a task value x within the
-    joint limits. Without limits they are a few closed curves, which are traced from stored postures and then cut at the
-    limits: `self_motion`, `nearest`, `solve` and `solutions`. Charts give postures a number xi on each branch. `tracker`
-    follows a stream of x and xi through borders of charts, singular positions and out of reach.
+    Where a chart ends at a boundary of its domain, an arm goes on: it knows the postures of a task value x within the
+    joint limits. Without limits they are a few closed curves, which are traced from stored postures and then cut at
+    the limits: `self_motion`, `nearest`, `solve` and `solutions`. Charts give postures a number xi on each branch.
+    `tracker` follows a stream of x and xi through borders of charts, singular positions and out of reach.
 
     The curves are traced in C that is compiled on first use and kept; without a compiler, NumPy does the same, a
     hundred times slower. `Arm(task)` has no charts: it is ready at once, and knows no xi.
@@ -125,6 +127,9 @@ class Arm(Shown):
             raise NotRedundantError(self.task.m, free)
         if self.task.m + 1 != robot.n:
             raise InvalidValueError("task", f"n - m = {robot.n - self.task.m}", "one with n - m = 1, or use charts")
+        one = np.flatnonzero(np.isfinite(robot.lower) != np.isfinite(robot.upper))
+        if any(not robot.tree.prismatic[k] for k in one):
+            raise InvalidValueError("joint", f"'{robot.joint_names[one[0]]}' with one limit", "two limits, or none")
         object.__setattr__(self, "task", self.task.with_reference_at(find_joint_range(robot, 0).centre))
         for chart in self.charts:
             require_kind("charts", chart, Chart)
@@ -244,9 +249,9 @@ class Arm(Shown):
             return motions.components
         self._require_charts()
         value = as_number("xi", xi)
-        found = [item for k in range(len(self.charts)) for item in self._find_xi(motions, k, value)[0]]
+        found = [(q, name) for k, name in enumerate(self.branch_names) for q in self._find_xi(motions, k, value)[0]]
         q = np.array([q for q, _ in found]).reshape(-1, self.robot.n)
-        names = tuple(self.branch_names[k] for _, k in found)
+        names = tuple(name for _, name in found)
         status = np.full(len(q), int(InverseStatus.FOUND))
         return Postures(q, status, names, np.full(len(q), value))
 
@@ -299,7 +304,8 @@ class Arm(Shown):
 
         run_in_threads(solve_row, left.tolist())
         owners = self.find_branches(np.where(np.isfinite(q), q, 0.0))
-        names = tuple(self.branch_names[k] if k >= 0 and np.isfinite(row).all() else "" for k, row in zip(owners, q))
+        owners = [k if good else -1 for k, good in zip(owners, np.isfinite(q).all(axis=1), strict=True)]
+        names = tuple(self.branch_names[k] if k >= 0 else "" for k in owners)
         own = self._evaluate_xi(q, owners)
         if single:
             return Postures(q[0], InverseStatus(int(status[0])), names[0], own[0])
@@ -396,8 +402,8 @@ class Arm(Shown):
         starts: Array | None,
         chosen: Sequence[int],
         q: Array,
-        status: Array,
-        good: Array,
+        status: Indices,
+        good: NDArray[np.bool_],
     ) -> None:
         """Ask charts in turn for (x, xi) of good rows; q and status of those that are found are filled in."""
         vectors = self.maps.targets.vector(targets)
@@ -417,39 +423,40 @@ class Arm(Shown):
     ) -> tuple[Array, int]:
         """The posture of one target, by its arcs."""
         motions = find_motions(self.maps, target, *(() if start is None else (start[None],)))
-        nothing = np.full(self.robot.n, np.nan), int(InverseStatus.NOT_FOUND)
-        if not motions.components:
-            return nothing
-        if xi is not None:
-            exact, nearest = [], []
-            for k in chosen:
-                of_chart, near = self._find_xi(motions, k, xi)
-                exact += [q for q, _ in of_chart]
-                nearest += [near] if near is not None else []
-            if exact:
-                wish = exact[0] if start is None else start
-                return min(exact, key=lambda q: float(np.linalg.norm(q - wish))), int(InverseStatus.FOUND)
-            if nearest:
-                return min(nearest, key=lambda item: item[1])[0], int(InverseStatus.NEAREST)
-            return nothing
-        if not anywhere:
-            allowed = [self.charts[k].problem.domain for k in chosen]
-            return self._choose_inside(motions, allowed, start) or nothing
-        if start is not None:
-            return motions.nearest(start).q, int(InverseStatus.FOUND)
-        return motions.best(self._measure_room).q, int(InverseStatus.FOUND)
+        found: tuple[Array, InverseStatus] | None = None
+        if motions.components and xi is not None:
+            found = self._choose_xi(motions, xi, start, chosen)
+        elif motions.components and not anywhere:
+            found = self._choose_inside(motions, [self.charts[k].problem.domain for k in chosen], start)
+        elif motions.components:
+            place = motions.best(self._measure_room) if start is None else motions.nearest(start)
+            found = place.q, InverseStatus.FOUND
+        q, status = found or (np.full(self.robot.n, np.nan), InverseStatus.NOT_FOUND)
+        return q, int(status)
+
+    def _choose_xi(
+        self, motions: SelfMotions, xi: float, start: Array | None, chosen: Sequence[int]
+    ) -> tuple[Array, InverseStatus] | None:
+        """The posture with an xi that is nearest to the start; without any, that with the nearest xi."""
+        parts = [self._find_xi(motions, k, xi) for k in chosen]
+        exact = [q for postures, _ in parts for q in postures]
+        if exact:
+            wish = exact[0] if start is None else start
+            return min(exact, key=lambda q: float(np.linalg.norm(q - wish))), InverseStatus.FOUND
+        nearest = min((near for _, near in parts if near is not None), key=lambda item: item[1], default=None)
+        return None if nearest is None else (nearest[0], InverseStatus.NEAREST)
 
     def _choose_inside(
         self, motions: SelfMotions, domains: Sequence[Any], start: Array | None
-    ) -> tuple[Array, int] | None:
+    ) -> tuple[Array, InverseStatus] | None:
         """The posture in one of the domains that is nearest to the start, of those 0.05 rad apart on the arcs."""
-        q = np.vstack([self._spread(arc) for arc in motions])
+        q = np.vstack([arc.at(self._list_places(arc)) for arc in motions])
         inside = np.any([np.asarray(domain.contains(q)) for domain in domains], axis=0)
         if not inside.any():
             return None
         q = q[inside]
         k = np.argmax(self._measure_room(q)) if start is None else np.argmin(np.linalg.norm(q - start, axis=1))
-        return q[k], int(InverseStatus.FOUND)
+        return q[k], InverseStatus.FOUND
 
     def _measure_room(self, q: Array) -> Array:
         """Distances from the limits (N,), in half-widths of the joints' ranges."""
@@ -458,18 +465,12 @@ class Arm(Shown):
         room = np.minimum(q - low, high - q)[:, bounded] / (high - low)[bounded]
         return np.asarray(2 * room.min(axis=1, initial=1.0))
 
-    def _spread(self, arc: Arc) -> Array:
-        """Postures on an arc, at most `RULES.spacing` apart, (P, n)."""
-        return arc.at(np.linspace(0.0, arc.length, max(2, int(arc.length / RULES.spacing) + 2)))
-
-    def _find_xi(
-        self, motions: SelfMotions, k: int, xi: float
-    ) -> tuple[list[tuple[Array, int]], tuple[Array, float] | None]:
-        """Postures on the arcs where chart k has an xi, and of others the one with the nearest xi, with its distance."""
+    def _find_xi(self, motions: SelfMotions, k: int, xi: float) -> tuple[list[Array], tuple[Array, float] | None]:
+        """Postures on the arcs where chart k has an xi, and the one whose xi is nearest, with its distance."""
         chart = self.charts[k]
-        domain, box = chart.problem.domain, chart.problem.domain.bounds
+        domain, (low, high) = chart.problem.domain, chart.problem.domain.bounds
         period = float(chart.parts.turns[chart.m])
-        found: list[tuple[Array, int]] = []
+        found: list[Array] = []
         best: tuple[Array, float] | None = None
 
         def miss(q: Array) -> Array:
@@ -477,13 +478,12 @@ class Arm(Shown):
             return np.asarray(left - period * np.round(left / period) if period else left)
 
         for arc in motions:
-            places = np.linspace(0.0, arc.length, max(2, int(arc.length / RULES.spacing) + 2))
+            places = self._list_places(arc)
             q = arc.at(places)
-            near = np.flatnonzero(((q >= box[0] - RULES.spacing) & (q <= box[1] + RULES.spacing)).all(axis=1))
-            if not near.size:
-                continue
+            near = np.flatnonzero(((q >= low - RULES.spacing) & (q <= high + RULES.spacing)).all(axis=1))
             inside, left = np.zeros(len(q), dtype=bool), np.full(len(q), np.nan)
-            inside[near], left[near] = np.asarray(domain.contains(q[near])), miss(q[near])
+            if near.size:
+                inside[near], left[near] = np.asarray(domain.contains(q[near])), miss(q[near])
             if inside.any():
                 row = np.flatnonzero(inside)[np.argmin(np.abs(left[inside]))]
                 if best is None or abs(left[row]) < best[1]:
@@ -492,19 +492,21 @@ class Arm(Shown):
             if period:
                 crosses &= np.abs(left[1:] - left[:-1]) < period / 2
             for row in np.flatnonzero(crosses):
-                place, error = _find_root(lambda s, arc=arc: float(miss(arc.at(s)[None])[0]), *places[row : row + 2])
-                posture = arc.at(place)
-                known = any(np.abs(posture - other).max() < RULES.same for other, _ in found)
+                posture, error = _find_root(arc, miss, *places[row : row + 2].tolist())
+                known = any(np.abs(posture - other).max() < RULES.same for other in found)
                 if abs(error) < RULES.tolerance and not known and bool(domain.contains(posture)):
-                    found.append((posture, k))
+                    found.append(posture)
         return found, best
+
+    def _list_places(self, arc: Arc) -> Array:
+        """Places on an arc, at most `RULES.spacing` apart, (P,)."""
+        return np.linspace(0.0, arc.length, max(2, int(arc.length / RULES.spacing) + 2))
 
     def _evaluate_xi(self, q: Array, owners: Sequence[int]) -> Array:
         """xi (N,) of postures in the charts that hold them; NaN elsewhere."""
         values = np.full(len(q), np.nan)
-        own = np.where(np.isfinite(q).all(axis=1), owners, -1)
         for k, chart in enumerate(self.charts):
-            rows = np.flatnonzero(own == k)
+            rows = np.flatnonzero(np.array(owners) == k)
             if rows.size:
                 values[rows] = chart.xi(q[rows])[:, 0]
         return values
@@ -517,20 +519,21 @@ def _agree(chart: Chart, task: Task) -> bool:
     return same and bool(np.allclose(chart.problem.task.batched(q)[0], task.batched(q)[0], rtol=0, atol=1e-9))
 
 
-def _find_root(f: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
-    """A root of f between places of different signs, by regula falsi with bisection, and f there."""
-    at_low, at_high = f(low), f(high)
-    if at_low == 0.0 or at_high == 0.0:
-        return (low, at_low) if at_low == 0.0 else (high, at_high)
-    place, value = low, at_low
+def _find_root(arc: Arc, f: Callable[[Array], Array], low: float, high: float) -> tuple[Array, float]:
+    """The posture on an arc, between places where f has different signs, at which f is 0; and f there.
+
+    By regula falsi, with every third step a bisection.
+    """
+    values = [float(f(arc.at(place)[None])[0]) for place in (low, high)]
+    q, value = arc.at(low if abs(values[0]) <= abs(values[1]) else high), min(values, key=abs)
     for k in range(RULES.steps):
-        share = at_low / (at_low - at_high)
-        place = low + (high - low) * (share if k % 3 < 2 else 0.5)
-        value = f(place)
-        if abs(value) < RULES.met or high - low < 1e-14:
+        if abs(value) < RULES.met or high - low < RULES.narrow:
             break
-        if (value > 0) == (at_low > 0):
-            low, at_low = place, value
+        place = low + (high - low) * (values[0] / (values[0] - values[1]) if k % 3 < 2 else 0.5)
+        q = arc.at(place)
+        value = float(f(q[None])[0])
+        if (value > 0) == (values[0] > 0):
+            low, values[0] = place, value
         else:
-            high, at_high = place, value
-    return place, value
+            high, values[1] = place, value
+    return q, value

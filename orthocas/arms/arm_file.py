@@ -33,7 +33,7 @@ def read_charts(path: Path) -> tuple[Chart, ...]:
     """The charts of an arm file.
 
     Raises:
-        ChartFileError: if the file or one of its charts is missing, truncated, edited, foreign, or from a newer version.
+        ChartFileError: if the file or a chart in it is missing, truncated, edited, foreign, or from a newer version.
     """
     header, arrays = read_archive(path, ARM)
     count = header.get("charts")

@@ -205,8 +205,8 @@ def build_equations(task: Task, scale: Array) -> ca.Function:
     """q (n, 1), target -> e (m, 1) and J (m, n), both divided by the scale; d(e)/dt = -J dq at e = 0.
 
     For tasks of a whole orientation, the target is the position, if the task has one, and the rotation (3, 3) by
-    columns; e is the rotation vector to it in the axes of the task's frame, and J the geometric Jacobian. Others compare
-    values of x.
+    columns; e is the rotation vector to it in the axes of the task's frame, and J the geometric Jacobian. Others
+    compare values of x.
     """
     robot, turn = task.robot, task.turn
     q = ca.SX.sym("q", robot.n)
@@ -222,10 +222,7 @@ def build_equations(task: Task, scale: Array) -> ca.Function:
         axis = ca.vertcat(across[2, 1] - across[1, 2], across[0, 2] - across[2, 0], across[1, 0] - across[0, 1]) / 2
         sine = ca.sqrt(ca.sumsqr(axis) + 1e-32)  # never zero, so that derivatives are finite
         e = ca.atan2(sine, (ca.trace(across) - 1) / 2) / sine * axis
-        if first:
-            e, J = ca.vertcat(target[:3] - p, e), J
-        else:
-            J = J[3:, :]
+        e, J = (ca.vertcat(target[:3] - p, e), J) if first else (e, J[3:, :])
     parts = [ca.cse(part / ca.repmat(ca.DM(scale), 1, part.shape[1])) for part in (e, J)]
     return dense_function("task", [q, target], parts, ["q", "target"])
 

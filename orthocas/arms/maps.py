@@ -12,12 +12,12 @@ from orthocas.arms.targets import TargetReader
 from orthocas.charts.self_motion import Stop
 from orthocas.errors import CompileError
 from orthocas.robots.robot import Robot
-from orthocas.tasks.branches import Branches, branches
+from orthocas.tasks.branches import branches
 from orthocas.tasks.domains import Box, StopKind
 from orthocas.tasks.regular_box import find_joint_range
 from orthocas.tasks.samples import sample_evenly
 from orthocas.tasks.task import Task
-from orthocas.tools.batch import Batched
+from orthocas.tools.batch import Batched, use_threads
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 
@@ -66,14 +66,11 @@ class ArmMaps:
         return NumpyKernel(*parts)
 
     @cached_property
-    def branches(self) -> Branches:
-        """The branches of the joint range."""
-        return branches(self.robot, self.task)
-
-    @cached_property
     def stored(self) -> StoredPostures:
         """Postures from which searches start."""
-        return StoredPostures.build(self.places, self._evaluate_rates, self.branches)
+        # Others may wait for this value, so no other threads take part.
+        with use_threads(1):
+            return StoredPostures.build(self.places, self._evaluate_rates, branches(self.robot, self.task))
 
     @cached_property
     def places(self) -> PlaceReader:

@@ -1,7 +1,8 @@
-"""The search for self-motion curves in NumPy, for machines without a C compiler: templates/self_motion.c.jinja, slower."""
+"""The search for self-motion curves in NumPy, for machines without a C compiler: as templates/self_motion.c.jinja."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise, product
 
 import casadi as ca
 import numpy as np
@@ -14,6 +15,7 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 
 _TURN = 2 * np.pi
+Component = Callable[[float], float]  #: of a cubic step, as a function of the share of the step
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,26 +110,14 @@ class NumpyKernel:
             new = q + h * t
             if before > 0:
                 new = evaluate_cubic(nodes[-2], q, tangents[-2], t, before, 1.0 + h / before)[0]
-            missed, size, good, onward = 0.0, 0.0, False, t
-            for k in range(RULES.corrections):
-                e, J = self._evaluate(new[None], target)
-                change, found = _solve_bordered(J, e, t[None], np.zeros(1))
-                size = float(np.linalg.norm(change))
-                missed = size if k == 0 else missed
-                if not size < RULES.missed:
-                    break
-                new, onward = new + change[0], sense * found[0]
-                if size < RULES.corrected:
-                    good = True
-                    break
+            new, onward, missed, good = self._correct_step(target, new, t, sense)
             turned = float(onward @ t)
             if not (good and turned > RULES.turned):
-                h /= 2 if missed < RULES.missed and size < RULES.missed else 3
+                h /= 2 if missed < RULES.missed else 3
                 if h < RULES.shortest:
                     break
                 continue
-            last = h
-            before = float(_length_of(q[None], new[None], t[None], onward[None])[0])
+            last, before = h, float(_length_of(q[None], new[None], t[None], onward[None])[0])
             nodes.append(new)
             tangents.append(onward)
             step = Curve(np.array(nodes[-2:]), np.array(tangents[-2:]), np.array([before, 0.0]), False, _NONE)
@@ -140,9 +130,23 @@ class NumpyKernel:
             if (outside & ~self.turning & np.isfinite(room)).any():
                 break
             h = min(h * min(1.6, max(0.5, np.cbrt(RULES.aim / max(missed, 1e-9)))), RULES.step)
-            if turned < RULES.straight:
-                h = min(h, last)
+            h = min(h, last) if turned < RULES.straight else h
         return nodes, tangents, False
+
+    def _correct_step(self, target: Array, new: Array, t: Array, sense: float) -> tuple[Array, Array, float, bool]:
+        """A predicted point (n,) brought to the curve across t, the tangent, the first correction, and success."""
+        missed, onward = 0.0, t
+        for k in range(RULES.corrections):
+            e, J = self._evaluate(new[None], target)
+            change, found = _solve_bordered(J, e, t[None], np.zeros(1))
+            size = float(np.linalg.norm(change))
+            missed = size if k == 0 else missed
+            if not size < RULES.missed:
+                return new, onward, np.inf, False
+            new, onward = new + change[0], sense * found[0]
+            if size < RULES.corrected:
+                return new, onward, missed, True
+        return new, onward, missed, False
 
     def _lies_on(self, curve: Curve, q: Array, t: Array) -> bool:
         """Whether q (n,) with its tangent lies on a curve, up to full turns."""
@@ -184,43 +188,42 @@ class NumpyKernel:
     ) -> None:
         """Add the crossings of a step; it is divided where a joint turns back next to a limit."""
         a, b, start, end, h = step
-        joints = [i for i in range(len(a)) if np.isfinite(self.lower[i])]
+        joints = np.flatnonzero(np.isfinite(self.lower) | np.isfinite(self.upper)).tolist()
         cubics = {i: _find_pieces(b[i] - a[i], h * start[i], h * end[i]) for i in joints}
-        graze = RULES.graze / 2 ** (4 * depth)
-        for i in joints if depth < RULES.halvings else ():
-            value, bends = cubics[i]
-            for u in bends[1:-1]:
-                gaps = np.array([a[i] + value(u) - self.lower[i], a[i] + value(u) - self.upper[i]])
-                gaps = gaps - _TURN * np.rint(gaps / _TURN) if self.turning[i] else gaps
-                if not np.abs(gaps).min() < graze or not 1e-6 < u < 1 - 1e-6:
-                    continue
-                q, t = (part[None] for part in evaluate_cubic(a, b, start, end, h, u))
-                if self.correct(target, q, t)[0]:
-                    self._cross_step(target, (a, q[0], start, t[0], u * h), place, depth + 1, found)
-                    rest = (q[0], b, t[0], end, (1 - u) * h)
-                    self._cross_step(target, rest, place + u * h, depth + 1, found)
-                    return
-        for i in joints:
-            value, bends = cubics[i]
+        u = self._find_graze(a, cubics, RULES.graze / 2 ** (4 * depth)) if depth < RULES.halvings else -1.0
+        if u > 0.0:
+            q, t = (part[None] for part in evaluate_cubic(a, b, start, end, h, u))
+            if self.correct(target, q, t)[0]:
+                self._cross_step(target, (a, q[0], start, t[0], u * h), place, depth + 1, found)
+                rest = (q[0], b, t[0], end, (1 - u) * h)
+                self._cross_step(target, rest, place + u * h, depth + 1, found)
+                return
+        for i, (value, bends) in cubics.items():
             values = [value(u) for u in bends]
             for side, bound in enumerate((self.lower[i], self.upper[i])):
-                limit = bound - a[i]
-                first, last = (
-                    int(np.ceil((min(values) - limit) / _TURN)),
-                    int(np.floor((max(values) - limit) / _TURN)),
-                )
-                for turns in range(first, last + 1) if self.turning[i] else (0,):
-                    v = limit + _TURN * turns
-                    for left, right in zip(bends[:-1], bends[1:], strict=True):
-                        above = value(left) > v
-                        if above == (value(right) > v):
-                            continue
-                        low, high = left, right
-                        for _ in range(30):
-                            u = (low + high) / 2
-                            low, high = (u, high) if (value(u) > v) == above else (low, u)
-                        q = self._meet_limit(target, *evaluate_cubic(a, b, start, end, h, low), i, a[i] + v)
-                        found.append((place + low * h, q, i, side, turns, int(not above)))
+                ends = [(part - bound + a[i]) / _TURN for part in (min(values), max(values))]
+                numbers = range(int(np.ceil(ends[0])), int(np.floor(ends[1])) + 1) if self.turning[i] else (0,)
+                for turns, (left, right) in product(numbers, pairwise(bends)):
+                    v = bound - a[i] + _TURN * turns
+                    above = value(left) > v
+                    if above == (value(right) > v):
+                        continue
+                    low, high = left, right
+                    for _ in range(30):
+                        u = (low + high) / 2
+                        low, high = (u, high) if (value(u) > v) == above else (low, u)
+                    q = self._meet_limit(target, *evaluate_cubic(a, b, start, end, h, low), i, a[i] + v)
+                    found.append((place + low * h, q, i, side, turns, int(not above)))
+
+    def _find_graze(self, a: Array, cubics: Mapping[int, tuple[Component, list[float]]], graze: float) -> float:
+        """The share of a step at which a joint turns next to a limit; -1 where none does."""
+        for i, (value, bends) in cubics.items():
+            for u in bends[1:-1]:
+                gaps = a[i] + value(u) - np.array([self.lower[i], self.upper[i]])
+                gaps = gaps - _TURN * np.rint(gaps / _TURN) if self.turning[i] else gaps
+                if np.abs(gaps).min() < graze:
+                    return u if 1e-6 < u < 1 - 1e-6 else -1.0
+        return -1.0
 
     def _meet_limit(self, target: Array, start: Array, t: Array, joint: int, value: float) -> Array:
         """The exact point near one (n,) at which a joint has a value, or else on the curve."""
@@ -279,7 +282,7 @@ def _length_of(a: Array, b: Array, start: Array, end: Array) -> Array:
     return np.asarray(np.linalg.norm(b - a, axis=1) * (1.0 + turn / 12))
 
 
-def _find_pieces(d: float, start: float, end: float) -> tuple[Callable[[float], float], list[float]]:
+def _find_pieces(d: float, start: float, end: float) -> tuple[Component, list[float]]:
     """A component of a cubic step from 0 to d with slopes, as a function of the share; 0, where it turns, and 1."""
     one, two, three = start, 3 * d - 2 * start - end, start + end - 2 * d
 

@@ -194,7 +194,7 @@ class SelfMotions(Shown):
         places = [np.concatenate([(at[:-1] + np.diff(at) * u) for u in shares] + [at[-1:]]) for _, _, at in nodes]
         owners = np.repeat(np.arange(len(arcs)), [len(part) for part in places])
         guesses = np.vstack([arc._guess(part)[0] for arc, part in zip(arcs, places, strict=True)])
-        distances = (self._away(guesses, wish) ** 2).sum(axis=1)
+        distances = (self.measure_away(guesses, wish) ** 2).sum(axis=1)
         along, found = np.concatenate(places), []
         best = np.argsort(distances)
         for row in best[: RULES.candidates]:
@@ -260,27 +260,27 @@ class SelfMotions(Shown):
         if not self.components:
             raise InvalidValueError("x", self.x.tolist(), "a task value that a posture within the limits has")
 
-    def _away(self, q: Array, wish: Array) -> Array:
+    def measure_away(self, q: Array, wish: Array) -> Array:
         """q - wish (N, n), without full turns of joints without limits."""
         robot, turning = self.maps.robot, self.maps.turning
         free = turning & np.isinf(robot.lower) & np.isinf(robot.upper)
-        return np.asarray(wrap_shortest(q - wish, _TURN * free))
+        return np.asarray(wrap_shortest(q - wish, np.where(free, _TURN, 0.0)))
 
     def _refine(self, k: int, place: float, wish: Array) -> Place:
         """The nearest posture on an arc next to a place of it."""
         arc = self.components[k]
         length = arc.length
         q = arc.at(place)
-        gap = float(np.linalg.norm(self._away(q[None], wish)))
+        gap = float(np.linalg.norm(self.measure_away(q[None], wish)))
         for _ in range(RULES.refinements):
             at = place % length if arc.closed else place
             direction = arc._guess(np.array([at]))[1][0]
-            step = -float(self._away(q[None], wish)[0] @ direction)
+            step = -float(self.measure_away(q[None], wish)[0] @ direction)
             moved = False
             while abs(step) > RULES.refined and not moved:
                 new = (place + step) % length if arc.closed else min(max(place + step, 0.0), length)
                 tried = arc.at(new)
-                distance = float(np.linalg.norm(self._away(tried[None], wish)))
+                distance = float(np.linalg.norm(self.measure_away(tried[None], wish)))
                 moved = distance < gap
                 if moved:
                     q, place, gap = tried, new, distance
@@ -288,7 +288,7 @@ class SelfMotions(Shown):
                     step /= 3
             if not moved:
                 break
-        return Place(q, gap, k, place)
+        return Place(wish + self.measure_away(q[None], wish)[0], gap, k, place)
 
 
 def find_motions(maps: ArmMaps, target: Array, *starts: Array) -> SelfMotions:

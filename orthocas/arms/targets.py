@@ -37,9 +37,10 @@ class TargetReader:
         p, R = pose
         single = R.ndim == 2
         R = R.reshape(-1, 3, 3)
-        off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        if (off > _ORTHOGONAL).any() or (np.linalg.det(R) < 0).any():
-            raise InvalidValueError("rotation of x", R[np.nanargmax(off)].round(4).tolist(), "a rotation matrix")
+        off = np.asarray(np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)))
+        wrong = np.flatnonzero((off > _ORTHOGONAL) | (np.linalg.det(R) < 0))
+        if wrong.size:
+            raise InvalidValueError("rotation of x", R[wrong[0]].round(4).tolist(), "a rotation matrix")
         columns = R.transpose(0, 2, 1).reshape(-1, 9)
         if turn.with_position:
             p = p.reshape(-1, 3)
@@ -73,10 +74,11 @@ class TargetReader:
         """Targets (N, k) of vectors (N, m)."""
         turn = self.task.turn
         assert turn is not None
-        good = np.isfinite(values).all(axis=1)
+        good = np.asarray(np.isfinite(values).all(axis=1))
         targets = np.full((len(values), 12 if turn.with_position else 9), np.nan)
         if good.any():
-            targets[good, -9:] = self.task.orientation_of(values[good]).transpose(0, 2, 1).reshape(-1, 9)
+            R = np.asarray(self.task.orientation_of(values[good]))
+            targets[good, -9:] = R.transpose(0, 2, 1).reshape(-1, 9)
         if turn.with_position:
             targets[:, :3] = np.where(good[:, None], values[:, :3], np.nan)
         return targets

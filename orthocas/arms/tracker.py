@@ -14,6 +14,7 @@ from orthocas.arms.maps import ArmMaps
 from orthocas.arms.self_motion import find_motions
 from orthocas.charts.chart import Chart
 from orthocas.charts.newton import Bound
+from orthocas.charts.trackers import TrackerStatus
 from orthocas.errors import InvalidValueError, degrees_hint
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import building
@@ -41,7 +42,10 @@ class TrackRules:
     decrease: float = 1e-4  #: of the cost, relative to what a step promises
     window: float = 0.25  #: [s] in which the error of x must fall, or a detour is looked for
     falls: float = 0.9  #: the error at its end, relative to that at its begin
-    changes: int = 40  #: of the joints at bounds in a quadratic program, at most
+    guesses: int = 8  #: of the joints at bounds in a quadratic program, many at a time
+    changes: int = 40  #: of these joints, one at a time, at most
+    rounding: float = 1e-14  #: slope of the cost at a bound that is none
+    enough: float = 1e-2  #: relative decrease of the cost below which a far arm leaves the rest to the next call
 
 
 RULES = TrackRules()
@@ -112,6 +116,9 @@ class ArmTracker(Shown):
         self._equations = Bound(equations, [self._at, self._to], [self._e, self._J])
         self._H = np.empty((n, n))
         self._curvature = Bound(curvature, [self._at, self._to], [self._H])
+        if detours:  # compiled now rather than in a call
+            assert maps.kernel is not None
+            assert maps.stored is not None
         self.reset(q)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -189,19 +196,21 @@ class ArmTracker(Shown):
 
     def _go(self, vector: Array | None, target: Array | None, xi: float | None) -> Array:
         """The next posture for x as the task's vector or as a target, of which the chart takes the one."""
-        given = vector if vector is not None else target
-        if not np.isfinite(given).all() or (xi is not None and not np.isfinite(xi)):
+        if xi is not None and not self._charts:
+            raise InvalidValueError("xi", xi, "None, for an arm without charts")
+        parts = [np.atleast_1d(part) for part in (vector, target, xi) if part is not None]
+        if not np.isfinite(np.concatenate(parts)).all():
             self.status = TrackStatus.BAD_INPUT
             return self._q.copy()
         self._wish = self._wish if xi is None else xi
+        targets = self._maps.targets
         if self._inside and np.isfinite(self._wish):
-            if vector is None:
-                vector = self._maps.targets.vector(target[None])[0]
-            if self._step_in_chart(vector):
+            x = targets.vector(np.asarray(target)[None])[0] if vector is None else vector
+            if self._step_in_chart(x):
                 self._ticks, self._goal = 0, None
                 self.status = TrackStatus.OK
                 return self._q.copy()
-        aim = self._maps.targets.read(vector)[0][0] if target is None else target
+        aim = targets.read(vector)[0][0] if target is None else target
         rests = self.status == TrackStatus.NEAREST and np.array_equal(aim, self._to)
         self._to[:] = aim
         if not rests or self._ticks % self._patience == 0:  # what rests would rest again
@@ -224,15 +233,16 @@ class ArmTracker(Shown):
         self._ticks += 1
 
     def _find_goal(self) -> Array | None:
-        """The nearest posture within the limits that has x, of the tracker's chart if it holds one; None without any."""
+        """The nearest posture within the limits that has x, in the tracker's chart if that has one; None for none."""
         motions = find_motions(self._maps, self._to.copy(), self._q[None])
         if not motions.components:
             return None
         if self._chart is not None:
             q = np.vstack([arc.q for arc in motions])
-            inside = np.flatnonzero(np.asarray(self._chart.problem.domain.contains(q)))
-            if inside.size:
-                return np.asarray(q[inside[np.argmin(np.linalg.norm(q[inside] - self._q, axis=1))]])
+            q = self._q + motions.measure_away(q, self._q)
+            q = q[np.asarray(self._chart.problem.domain.contains(q))]
+            if len(q):
+                return np.asarray(q[np.argmin(np.linalg.norm(q - self._q, axis=1))])
         return motions.nearest(self._q).q
 
     def _step_to_goal(self) -> TrackStatus | None:
@@ -253,10 +263,13 @@ class ArmTracker(Shown):
         assert self._chart is not None
         exact = self._exact
         if not np.array_equal(exact.q, self._q):
-            exact.reset(self._q)
+            try:
+                exact.reset(self._q)
+            except InvalidValueError:  # within rounding of its boundary
+                return False
         q = exact.step(np.append(vector, self._wish))
         low, high = self._bounds()
-        if exact.status != 0 or not ((q >= low) & (q <= high)).all():
+        if exact.status != TrackerStatus.OK or not ((q >= low) & (q <= high)).all():
             return False
         self._q, self._last = q, q.copy()
         return True
@@ -268,19 +281,20 @@ class ArmTracker(Shown):
         low, high = self._bounds()
         q = self._q
         e, J = self._look(q)
-        # First with the wishes, then towards x alone.
         error = float(e @ e)
-        rows, wishes, weight = self._find_wishes()
-        damping = RULES.step_damping + RULES.error_damping * error
-        H = J.T @ J + weight**2 * rows.T @ rows + damping * np.eye(len(q))
-        g = -J.T @ e - weight**2 * rows.T @ wishes
-        met, ahead = self._descend(np.clip(q + solve_in_box(H, g, low - q, high - q), low, high), low, high)
-        if not met:  # wishes may be in the way
-            met, other = self._descend(q, low, high)
-            if met or self._cost_of(other) < self._cost_of(ahead):
-                ahead = other
-            if not met and self._cost_of(ahead) >= self._cost_of(q) * (1 - RULES.gain):
-                ahead = q
+        if self.status in (TrackStatus.BEHIND, TrackStatus.NEAREST) and np.abs(e).max() > RULES.near:
+            met, ahead = self._descend(q, low, high)
+        else:  # first with the wishes, then towards x alone
+            rows, wishes, weight = self._find_wishes()
+            damping = RULES.step_damping + RULES.error_damping * error
+            H = J.T @ J + weight**2 * rows.T @ rows + damping * np.eye(len(q))
+            g = -J.T @ e - weight**2 * rows.T @ wishes
+            met, ahead = self._descend(np.clip(q + solve_in_box(H, g, low - q, high - q), low, high), low, high)
+            if not met:  # wishes may be in the way
+                met, other = self._descend(q, low, high)
+                ahead = other if met or self._cost_of(other) < self._cost_of(ahead) else ahead
+        if not met and self._cost_of(ahead) >= self._cost_of(q) * (1 - RULES.gain):
+            ahead = q
         moved = ahead - q
         fast = (np.abs(moved) >= (1 - 1e-9) * self._period * self._speed).any()
         self._q = ahead
@@ -317,7 +331,10 @@ class ArmTracker(Shown):
             before, after = (float(a @ a) + pull * float(b @ b) for a, b in ((e, away), (e_new, away_new)))
             if (before - after) / promised > RULES.decrease:
                 q, e, J, away = new, e_new, J_new, away_new
-                cost, damping = float(e @ e) + weight * float(away @ away), max(RULES.step_damping, damping / 10)
+                cost = float(e @ e) + weight * float(away @ away)
+                damping = max(RULES.step_damping, damping / RULES.grows)
+                if far and before - after < RULES.enough * before:
+                    break
             else:
                 damping = max(RULES.grows * damping, RULES.damping)
         return bool(np.abs(e).max() < RULES.met), q
@@ -383,7 +400,10 @@ class ArmTracker(Shown):
 
 
 def solve_in_box(H: Array, g: Array, low: Array, high: Array) -> Array:
-    """The d (n,) with the least g d + d H d / 2 of those with low <= d <= high, by a primal active set from d = 0.
+    """The d (n,) with the least g d + d H d / 2 of those with low <= d <= high.
+
+    By a primal-dual active set, which changes many bounds at a time, and if that does not end soon, by a primal one
+    from d = 0, which changes one.
 
     Args:
         H: (n, n), positive definite.
@@ -391,12 +411,28 @@ def solve_in_box(H: Array, g: Array, low: Array, high: Array) -> Array:
         low: (n,), <= 0.
         high: (n,), >= 0.
     """
+    d = np.linalg.solve(H, -g)
+    below, above = d < low, d > high
+    if not (below.any() or above.any()):
+        return np.asarray(d)
+    for _ in range(RULES.guesses):
+        free = ~(below | above)
+        d = np.where(below, low, np.where(above, high, 0.0))
+        d[free] = np.linalg.solve(H[free][:, free], -(g + H @ d)[free])
+        pull = g + H @ d  # at a bound: positive where the cost falls beyond the lowest, negative beyond the highest
+        under, over = np.where(below, pull > 0, d < low), np.where(above, pull < 0, d > high)
+        if (under == below).all() and (over == above).all():
+            return np.asarray(d)
+        below, above = under, over
+    return _solve_by_steps(H, g, low, high)
+
+
+def _solve_by_steps(H: Array, g: Array, low: Array, high: Array) -> Array:
+    """As `solve_in_box`, by a primal active set."""
     d, held = np.zeros(len(g)), np.zeros(len(g))
     for _ in range(RULES.changes):
-        free = held == 0
-        way = np.zeros(len(g))
-        if free.any():
-            way[free] = np.linalg.solve(H[np.ix_(free, free)], -(g + H @ d)[free])
+        free, way = held == 0, np.zeros(len(g))
+        way[free] = np.linalg.solve(H[free][:, free], -(g + H @ d)[free])
         with np.errstate(all="ignore"):
             shares = np.where(way > 0, (high - d) / way, np.where(way < 0, (low - d) / way, np.inf))
         k = int(np.argmin(shares))
@@ -409,7 +445,7 @@ def solve_in_box(H: Array, g: Array, low: Array, high: Array) -> Array:
         # What a bound holds back: the cost would fall on the other side.
         pull = (g + H @ d) * held
         worst = int(np.argmax(pull))
-        if pull[worst] <= 1e-14:
+        if pull[worst] <= RULES.rounding:
             break
         held[worst] = 0.0
     return np.asarray(np.clip(d, low, high))
