@@ -109,7 +109,7 @@ def hand(chart: oc.Chart, seed: int) -> dict[str, float]:
     phi, q = targets[-1], path[-1]
     best, m = nearest(chart, phi, q), chart.m
     x_error, least = (float(np.linalg.norm(errors(chart, phi, end)[:m])) for end in (q, best))
-    places = chart.task(np.array(path))[:, :3]
+    places = chart.x(np.array(path))[:, :3]
     return {
         "nearer": (x_error - least) * float(chart.parts.phi_sizes[0]),
         "off": float(np.linalg.norm(places[-1] - phi[:3])),

@@ -30,7 +30,7 @@ def wishes_of(chart: oc.Chart, away: float, count: int) -> tuple[Array, Array]:
     wishes = sample_uniform(domain, count, 3)
     others = wishes + away * domain.half_width * rng.uniform(-1, 1, wishes.shape)
     kept = domain.contains(others)
-    return wishes[kept], chart.task(others[kept])
+    return wishes[kept], chart.x(others[kept])
 
 
 def compared(chart: oc.Chart, wishes: Array, x: Array, q: Array, status: Array) -> dict[str, float]:

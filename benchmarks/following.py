@@ -36,7 +36,7 @@ def iiwa(task: str, degree: int) -> oc.Chart:
 
 def circle(chart: oc.Chart, radius: float, poses: int) -> Array:
     """A closed circle of the tool in the y-z plane."""
-    angle, path = np.linspace(0, 2 * np.pi, poses), np.tile(chart.task(chart.problem.domain.centre), (poses, 1))
+    angle, path = np.linspace(0, 2 * np.pi, poses), np.tile(chart.x(chart.problem.domain.centre), (poses, 1))
     path[:, 1] += radius * np.sin(angle)
     path[:, 2] += radius * (1 - np.cos(angle))
     return path
@@ -46,7 +46,7 @@ def raster(chart: oc.Chart, poses: int) -> Array:
     """Eight lines, 24 cm long and 3 cm apart."""
     share = np.linspace(-1, 1, poses // 8)
     lines = [np.column_stack([0 * share - 0.05, 0.12 * (-1) ** k * share, 0 * share + 0.03 * k]) for k in range(8)]
-    return np.asarray(chart.task(chart.problem.domain.centre) + np.vstack(lines))
+    return np.asarray(chart.x(chart.problem.domain.centre) + np.vstack(lines))
 
 
 def row(name: str, chart: oc.Chart, path: Array, xi: str, obstacles: list[Obstacle], calls: int) -> str:
@@ -100,7 +100,7 @@ def _best(work: Callable[[], T], calls: int) -> tuple[float, T]:
 
 
 def _tool_error(chart: oc.Chart, motion: JointMotion) -> float:
-    return float(np.abs(chart.task(motion.q) - motion.x).max())
+    return float(np.abs(chart.x(motion.q) - motion.x).max())
 
 
 def _closed(motion: JointMotion) -> str:

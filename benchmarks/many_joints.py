@@ -176,7 +176,7 @@ def cycles(chart: oc.Chart, count: int) -> Iterator[str]:
     for _ in range(count):
         for tool, shift in zip(tools, shifts, strict=True):
             tracker.step(start + np.concatenate([tool, along @ shift]))
-            q += np.linalg.pinv(chart.jacobian(q)[: chart.m]) @ (start[: chart.m] + tool - chart.task(q))
+            q += np.linalg.pinv(chart.jacobian(q)[: chart.m]) @ (start[: chart.m] + tool - chart.x(q))
     for name, end in (("xi on a closed path", tracker.q), ("least-norm steps", q)):
         yield f"| {name} | {abs(end[2] - home[2]):.0e} | {np.abs(end - home).max():.0e} |"
 

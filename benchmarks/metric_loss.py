@@ -112,7 +112,7 @@ def task_error(law: Controller, chart: oc.Chart, goal: Array) -> float:
     run = oc.simulate(law, reference, chart.problem.domain.centre, step=0.02)
     if run.outcome is not Outcome.COMPLETE or run.status.any():
         raise OrthocasError(f"{law.name} did not finish")
-    moved = chart.task(run.q) - start[: chart.m]
+    moved = chart.x(run.q) - start[: chart.m]
     return float(1000 * np.sqrt((moved**2).sum(axis=1).mean()))
 
 

@@ -30,7 +30,7 @@ Moves = list[list[tuple[Array, Motion]]]
 def flange_error(chart: oc.Chart, run: Run, motion: Motion) -> float:
     """Largest distance of the flange from its reference [mm]."""
     wanted = motion.phi[: len(run.q), 0, : chart.m]
-    return float(1e3 * np.linalg.norm(chart.task(run.q) - wanted, axis=1).max())
+    return float(1e3 * np.linalg.norm(chart.x(run.q) - wanted, axis=1).max())
 
 
 def elbow_motion(chart: oc.Chart, run: Run) -> float:
@@ -45,7 +45,7 @@ def pushed(law: Law, chart: oc.Chart, starts: Array) -> Array:
     for q, row in zip(starts, found, strict=True):
         for axis, push in enumerate(PUSH * np.eye(3)):
             run = followed(law, chart.problem.robot, q, held(chart, q, 2.0), Loop(push=tuple(push)))
-            moved = 1e3 * (chart.task(run.q) - chart.task(q))
+            moved = 1e3 * (chart.x(run.q) - chart.x(q))
             across = np.linalg.norm(np.delete(moved, axis, axis=1), axis=1)
             if not run.status:
                 row[axis] = np.abs(moved[:, axis]).max(), across.max(), across[-1]

@@ -76,7 +76,7 @@ def rows(quick: bool) -> Iterator[str]:
             corners.append(chart.inverse(chart.phi(home) + change, corners[-1]))
         stiffness = matched_stiffness(chart)
         springs = stiffness[: problem.m], stiffness[problem.m : problem.m + k]
-        both = [np.concatenate([chart.task(q), value(case.second, q)]) for q in corners]
+        both = [np.concatenate([chart.x(q), value(case.second, q)]) for q in corners]
         laws: list[tuple[str, PDPlus | Projector, list[Array]]] = [
             ("PD+ in (x1, y2, xi)", PDPlus(chart, stiffness), [chart.phi(q) for q in corners]),
             ("hierarchy with projector", Projector(problem, *springs, second=case.second), both),

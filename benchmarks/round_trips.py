@@ -113,7 +113,7 @@ def nearest(name: str, count: int) -> str:
     """One row of the third table."""
     chart = oc.charts.load(name)
     domain = chart.problem.domain
-    wishes, x = sample_uniform(domain, count, 0), chart.task(sample_uniform(domain, count, 1000))
+    wishes, x = sample_uniform(domain, count, 0), chart.x(sample_uniform(domain, count, 1000))
     seconds = []
     for solver in (oc.compile_inverse(chart), chart):
         solver.nearest_xi(wishes[:20], x[:20])
@@ -142,13 +142,13 @@ def at_task_value(chart: oc.Chart, x: Array, pool: Array) -> Array:
     m, sizes, (low, high) = chart.m, chart.parts.phi_sizes[: chart.m], chart.problem.domain.bounds
     q, wanted = pool.copy(), np.broadcast_to(x, (len(pool), chart.m))
     for _ in range(15):
-        e = chart.parts.relative.difference(wanted, chart.task(q)) / sizes
+        e = chart.parts.relative.difference(wanted, chart.x(q)) / sizes
         J = chart.parts.relative.batched_rates(q)[0].reshape(-1, m, chart.n) / sizes[:, None]
         damping = np.where(np.abs(e).max(axis=1) > 0.1, 1e-3, 1e-13)
         gram = J @ J.transpose(0, 2, 1) + damping[:, None, None] * np.eye(m)
         step = (J.transpose(0, 2, 1) @ np.linalg.solve(gram, e[:, :, None]))[:, :, 0]
         q += step * np.minimum(1.0, 0.7 / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-300))
-    e = chart.parts.relative.difference(wanted, chart.task(q)) / sizes
+    e = chart.parts.relative.difference(wanted, chart.x(q)) / sizes
     turning = ~np.array(chart.problem.robot.tree.prismatic) & np.isfinite(low)
     q[:, turning] = low[turning] + (q[:, turning] - low[turning]) % (2 * np.pi)
     q = q[(np.abs(e).max(axis=1) < 1e-9) & (q >= low).all(axis=1) & (q <= high).all(axis=1)]

@@ -128,7 +128,7 @@ def with_chart(chart: oc.Chart, q: Numbers, path: Numbers) -> float:
 
 def with_schedule(chart: oc.Chart, q: Numbers, path: Numbers) -> float:
     """The same with xi chosen along the circle."""
-    x = chart.task(q)
+    x = chart.x(q)
     tips = path[STEPS // WAYPOINTS - 1 :: STEPS // WAYPOINTS]
     waypoints = np.vstack([x, np.column_stack([tips, np.tile(x[3:], (WAYPOINTS, 1))])])
     try:

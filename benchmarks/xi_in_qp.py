@@ -58,7 +58,7 @@ def followed(chart: oc.Chart, kind: str, cost: float, turns: int) -> tuple[float
         configuration.integrate_inplace(velocity, TICK)
         q: Array = np.array(configuration.q)
         if tick > TICKS:
-            error = max(error, float(np.abs(chart.task(q) - wanted).max()))
+            error = max(error, float(np.abs(chart.x(q) - wanted).max()))
         if tick % TICKS == 0:
             drift = max(drift, float(np.abs(q - home).max()))
     return drift, error, (time.perf_counter() - start) / (turns * TICKS)
@@ -77,7 +77,7 @@ def pushed(code: dict[str, Any], kind: str, weight: float, ticks: int) -> tuple[
     """Error of the tool [m], and what is missing of xi."""
     chart, model = code["chart"], code["model"]
     home = chart.problem.domain.centre
-    place, wanted = chart.task(home), chart.xi(home) + STEP * np.eye(chart.r)[0]
+    place, wanted = chart.x(home), chart.xi(home) + STEP * np.eye(chart.r)[0]
     target = wanted if kind == "xi" else chart.solve(np.concatenate([place, wanted]), home).q[0]
     q, dq, error = home, np.zeros(chart.n), 0.0
     for _ in range(ticks):
@@ -86,7 +86,7 @@ def pushed(code: dict[str, Any], kind: str, weight: float, ticks: int) -> tuple[
         )
         dq = dq + 1e-3 * pin.aba(model, code["data"], q, dq, tau)
         q = q + 1e-3 * dq
-        error = max(error, float(np.linalg.norm(chart.task(q) - place)))
+        error = max(error, float(np.linalg.norm(chart.x(q) - place)))
     return error, float(np.abs(chart.xi(q) - wanted).max())
 
 

@@ -35,7 +35,7 @@ def targets_of(code: dict[str, Any]) -> tuple[Array, Array, Array, Array]:
     """Where the motion starts, where the tool is, and what xi and the posture are to be."""
     chart = code["chart"]
     home = chart.problem.domain.centre
-    place, wanted = chart.task(home), chart.xi(home) + STEP * np.eye(chart.r)[0]
+    place, wanted = chart.x(home), chart.xi(home) + STEP * np.eye(chart.r)[0]
     return home, place, wanted, chart.solve(np.concatenate([place, wanted]), home).q[0]
 
 
@@ -61,7 +61,7 @@ def in_tsid(code: dict[str, Any], kind: str, weight: float, quick: bool) -> tupl
         dq = dq + 1e-3 * code["acceleration"](q, dq, (weight, rows))
         seconds += time.perf_counter() - start
         q = q + 1e-3 * dq
-        error = max(error, float(np.linalg.norm(chart.task(q) - place)))
+        error = max(error, float(np.linalg.norm(chart.x(q) - place)))
     return error, float(np.abs(chart.xi(q) - wanted).max()), seconds / ticks
 
 
@@ -85,7 +85,7 @@ def in_crocoddyl(code: dict[str, Any], kind: str, weight: float, quick: bool) ->
         start = time.perf_counter()
         q = code["plan"](home, place, costs, weight, 1 / (len(t) - 1))
         seconds.append(time.perf_counter() - start)
-    error = float(np.linalg.norm(chart.task(q) - place, axis=1).max())
+    error = float(np.linalg.norm(chart.x(q) - place, axis=1).max())
     return error, float(np.abs(chart.xi(q[-1]) - wanted).max()), min(seconds)
 
 

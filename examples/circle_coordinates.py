@@ -224,7 +224,7 @@ def draw(charts: dict[str, oc.Chart]) -> Figure:
         q, points = corners(240)
         cells = cell_centres(240)
         angles = deviations(chart.problem, cells, chart.jacobian(cells)[:, 1]).reshape(240, 240)
-        xi, h = (values.reshape(241, 241) for values in (chart.xi(points)[:, 0], chart.task(points)[:, 0]))
+        xi, h = (values.reshape(241, 241) for values in (chart.xi(points)[:, 0], chart.x(points)[:, 0]))
         frame = {"extent": 2 * (-np.pi, np.pi), "origin": "lower"}
         angle = column[0].imshow(xi, cmap="twilight", vmin=-np.pi, vmax=np.pi, **frame)
         column[0].contour(q, q, h, levels=np.linspace(-1.75, 1.75, 8), colors="white", linewidths=0.8, linestyles="-")

@@ -118,7 +118,7 @@ def row(world: World, query: Query, samples: int) -> str:
     joints = [places.joints(point) for point in points]
     known = np.array([q for q in joints if q is not None])
     free = sum(clear(q) > 0 for q in known)
-    error = np.abs(world.chart.task(known) - places.x).max()
+    error = np.abs(world.chart.x(known) - places.x).max()
     low, high = places.box
     inside = [region.PointInSet(xi) for xi in np.random.default_rng(0).uniform(low, high, (20_000, places.size))]
     return f"| {len(region.b())} | {seconds:.1f} | {np.mean(inside):.3f} | {percent(free / samples)} | {error:.0e} |"

@@ -86,7 +86,7 @@ def repeat(case: Case, chart: oc.Chart, cycles: int) -> Trajectory:
     angle = 2 * np.pi * np.append((share**3 * (10 - 15 * share + 6 * share**2) + np.arange(cycles)[:, None]), cycles)
     circle = RADIUS * np.stack([np.cos(angle) - 1, np.sin(angle), np.zeros_like(angle)], axis=1)
     rest = start if isinstance(case.law, KinematicProjector) else chart.xi(start)
-    points = np.hstack([chart.task(start) + circle, np.tile(rest, (len(angle), 1))])
+    points = np.hstack([chart.x(start) + circle, np.tile(rest, (len(angle), 1))])
     reference = Reference.through(case.law.labels, PERIOD / POINTS * np.arange(len(angle)), points)
     return oc.simulate(case.law, reference, start, step=0.05, tolerance=case.tolerance, must_be_reachable=False)
 

@@ -35,7 +35,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     chart = oc.fit(problem, oc.Polynomial(3 if quick else 5), samples=500 if quick else None).chart
     post = Capsule([*POST, -1.0], [*POST, 1.0], POST_RADIUS)
     angle = np.linspace(0, 2 * np.pi, 100)
-    path = chart.task(START) + RADIUS * np.column_stack([np.cos(angle) - 1, np.sin(angle)])
+    path = chart.x(START) + RADIUS * np.column_stack([np.cos(angle) - 1, np.sin(angle)])
     motions = {
         "hold": oc.follow(chart, path, velocity_limits=1.0),
         "objective": oc.follow(

@@ -74,7 +74,7 @@ def projected(spring: HiddenSpring, quick: bool) -> Trajectory:
     """Classical null-space impedance control, with the goal as the target of the posture spring."""
     controller = Projector(spring.problem, TASK_STIFFNESS, POSTURE_STIFFNESS)
     labels = controller.labels
-    start = np.concatenate([spring.chart.task(spring.start), spring.start])
+    start = np.concatenate([spring.chart.x(spring.start), spring.start])
     posture = dict(zip(labels[2:], spring.goal, strict=True))
     return run(controller, steps(labels, start, posture), spring, quick)
 

@@ -139,7 +139,7 @@ def cases(arm: Arm, name: str) -> Iterator[tuple[Impedance | Projector, Referenc
             coupling: Coupling = "decoupled" if name.endswith("decoupled") else "coupled"
             controller = Impedance(chart, np.concatenate([task, xi]), coupling=coupling, damping="double_diagonal")
             rest = chart.xi(for_rest)
-        target = np.concatenate([chart.task(for_task), rest])
+        target = np.concatenate([chart.x(for_task), rest])
         yield controller, Reference.steps(controller.labels, target, [], DURATION), start, speed
 
 

@@ -93,7 +93,7 @@ class InJoints:
             for state, q in zip(ends, (self.query.start, self.query.goal), strict=True):
                 state[0:n] = q.tolist()
         else:
-            self.constraint = OnPosition(self.world.chart, self.world.chart.task(self.query.start))
+            self.constraint = OnPosition(self.world.chart, self.world.chart.x(self.query.start))
             constrained = self.kind(space, self.constraint)
             setup = geometric.SimpleSetup(base.ConstrainedSpaceInformation(constrained))
             constrained.setDelta(STEP)
@@ -165,7 +165,7 @@ def row(name: str, world: World, queries: list[Query]) -> str:
     found = [(plan.path, query) for plan, query in zip(plans, queries, strict=True) if plan.path is not None]
     seconds = [plan.seconds for plan in plans]
     lengths = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path, _ in found]
-    errors = [np.abs(world.chart.task(path) - world.chart.task(query.start)).max() for path, query in found]
+    errors = [np.abs(world.chart.x(path) - world.chart.x(query.start)).max() for path, query in found]
     tool = f"{max(errors, default=np.nan):.0e}" if stays else ""
     return (
         f"| {name} | {len(found)} of {len(plans)} | {np.median(seconds):.3f} | {max(seconds):.2f} "

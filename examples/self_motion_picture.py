@@ -40,7 +40,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     save_trimmed(picture, out / "self_motion.png")
     elbows = robot.joint_points(curve)
     return {
-        "hand_moves": float(np.abs(chart.task(curve) - chart.task(q)).max()),
+        "hand_moves": float(np.abs(chart.x(curve) - chart.x(q)).max()),
         "elbow_moves_m": float(np.ptp(elbows, axis=0).max()),
         "largest_range_rad": float(np.ptp(curve, axis=0).max()),
     }

@@ -85,7 +85,7 @@ class Places:
 
     def __init__(self, world: World, query: Query, constant_x: bool) -> None:
         self.world, chart = world, world.chart
-        self.x = chart.task(query.start) if constant_x else np.empty(0)
+        self.x = chart.x(query.start) if constant_x else np.empty(0)
         self.size = chart.n - len(self.x)
         points = sample_uniform(world.domain, KNOWN, 0)
         moved = [self._solved(chart.phi(point)[-self.size :], point) for point in points]

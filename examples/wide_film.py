@@ -44,7 +44,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
         look = read_urdf_look(robot_file("panda_description/urdf/panda.urdf"), robot.tree).look
     draw(out / "wide_chart.gif", robot, look, swung, held, drifted, 8 if quick else 1)
     return {
-        "hand_moves": float(np.abs(chart.task(swung) - chart.task(q)).max()),
+        "hand_moves": float(np.abs(chart.x(swung) - chart.x(q)).max()),
         "elbow_moves_m": float(np.ptp(robot.joint_points(swung), axis=0).max()),
         "left_by_chart_rad": float(np.abs(held[-1] - q).max()),
         "left_by_pseudo_inverse_rad": float(np.abs(drifted[-1] - q).max()),
@@ -66,7 +66,7 @@ def swing(chart: oc.Chart, q: np.ndarray) -> np.ndarray:
 def circle(chart: oc.Chart, q: np.ndarray) -> np.ndarray:
     """Task values of all circles, at constant orientation, (N, m)."""
     angle = 2 * np.pi * np.arange(1, LOOPS * STEPS + 1) / STEPS
-    x = np.tile(chart.task(q), (len(angle), 1))
+    x = np.tile(chart.x(q), (len(angle), 1))
     x[:, 1] += RADIUS * np.sin(angle)
     x[:, 0] -= RADIUS * (1 - np.cos(angle))
     return x

@@ -20,7 +20,8 @@ def __getattr__(name: str) -> object:
     if name == "__all__":
         return sorted(_HOMES, key=lambda public: (not public.isupper(), not public[0].isupper(), public))
     if name not in homes:
-        raise AttributeError(f"module 'orthocas' has no attribute '{name}'")
+        guesses = import_module("orthocas.tools.guesses")
+        raise AttributeError(guesses.explain_missing("orthocas", name))
     home, own_name = homes[name]
     members = vars(import_module(home))
     globals()[name] = members[own_name] if own_name in members else import_module(f"{home}.{own_name}")

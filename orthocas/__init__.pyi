@@ -20,10 +20,10 @@ from orthocas.bases.products import Polynomial as Polynomial
 from orthocas.bases.registry import register_parametrisation as register_parametrisation
 from orthocas.certificates.certify import certify as certify
 from orthocas.charts.chart import Chart as Chart
-from orthocas.charts.chart import load as load
 from orthocas.charts.grow import grow as grow
 from orthocas.charts.inverse import InverseStatus as InverseStatus
 from orthocas.charts.quality import evaluate as evaluate
+from orthocas.charts.ready import load as load
 from orthocas.codegen.compiled_inverse import compile_inverse as compile_inverse
 from orthocas.codegen.export import export as export
 from orthocas.codegen.generate import generate_c as generate_c

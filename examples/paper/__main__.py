@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from orthocas.bases import parse_parametrisation
-from orthocas.charts.chart import load
+from orthocas.charts.ready import load
 from orthocas.cli.commands import run
 from orthocas.cli.options import AsJson, Force, parse_whole_number
 from orthocas.cli.output import print_json, print_rows, terminal_monitor

@@ -61,7 +61,7 @@ def draw(quick: bool) -> Drawing:
 def _draw_leaves(axes: Any, chart: Chart, steps: int) -> None:
     """Draw leaves of the task with their names, and leaves of xi, which are flow lines through the base leaf."""
     q = np.stack(np.meshgrid(*np.linspace(_LOW, _HIGH, 121).T), axis=-1)
-    h = chart.task(q.reshape(-1, 2)).reshape(121, 121)
+    h = chart.x(q.reshape(-1, 2)).reshape(121, 121)
     widths = [2.4 if level == LEVEL else 1.4 for level in _LEVELS]
     axes.contour(q[..., 0], q[..., 1], h, levels=list(_LEVELS), colors=TASK, linewidths=widths, linestyles="-")
     for level, name in _LEVELS.items():

@@ -71,7 +71,7 @@ def draw_flow(metric: str, quick: bool) -> Drawing:
 
 def _draw_plane(axes: Any, chart: Chart, curves: list[Array], starts: Array, pulls: list[Array]) -> None:
     q, points = corners(160)
-    h = chart.task(points).reshape(161, 161)
+    h = chart.x(points).reshape(161, 161)
     axes.contour(q, q, h, levels=_LEVELS, colors=TASK, linewidths=0.8, linestyles="-")
     plot_wrapped(axes, curves, color=EXTRA, linewidth=0.7)
     axes.plot(*starts.T, "+", color=GREY, markersize=4.5, markeredgewidth=0.9, zorder=3)
@@ -90,7 +90,7 @@ def _draw_torus(
     q = np.stack(np.meshgrid(around, along, indexing="ij"), axis=-1).reshape(-1, 2)
     colours = np.tile([0.12, 0.37, 0.66, 1.0], (len(_LEVELS), 1))
     scene = Scene()
-    lines = Isolines(chart.task(q)[:, 0], _LEVELS, colours, 0.035)
+    lines = Isolines(chart.x(q)[:, 0], _LEVELS, colours, 0.035)
     scene.add_surface(embedded(q), torus_faces(cells, cells // 2), "#eef1f4", lines=lines)
     for curve in curves:
         scene.add_tube(above(_thinned(curve), 0.016), 0.016, EXTRA)
@@ -147,8 +147,8 @@ def _pull_numbers(chart: Chart, pulls: list[Array], samples: int) -> dict[str, f
     moved = grown_coordinates(chart).pull(sample_uniform(chart.problem.domain, samples, 0))
     drawn = np.array([pull[-1] for pull in pulls])
     return {
-        "task_error_of_drawn_pulls": float(np.abs(chart.task(drawn) - LEVEL).max()),
-        "task_error_of_pulls": float(np.abs(chart.task(moved.points[moved.reached]) - LEVEL).max()),
+        "task_error_of_drawn_pulls": float(np.abs(chart.x(drawn) - LEVEL).max()),
+        "task_error_of_pulls": float(np.abs(chart.x(moved.points[moved.reached]) - LEVEL).max()),
         "share_that_reaches_base_leaf": float(moved.reached.mean()),
         "length_of_base_leaf": float(base_leaf(chart).length[0]),
     }

@@ -202,7 +202,7 @@ def out_of_reach(run: Run) -> float:
         foot = start + np.linalg.pinv(normals) @ (target - run.reference.start)[chart.m :]
 
         def error(s: Array, foot: Array = foot, target: Array = target) -> Array:
-            return chart.task(np.asarray(foot + s @ along)) - target[: chart.m]
+            return chart.x(np.asarray(foot + s @ along)) - target[: chart.m]
 
         nearest = grid[np.argsort(np.linalg.norm(error(grid), axis=1))[:_STARTS]]
         worst = max(worst, min(float(np.linalg.norm(least_squares(error, s).fun)) for s in nearest))

@@ -85,7 +85,7 @@ def wishes_of(arm: Arm, points: Array) -> tuple[Array, Array]:
     """What the arm is to do: task values (T, m) and elbows (T, 3) [m], for points (T, 3, 3) of a person's arm."""
     moved = points - points[:, :1]
     moved = (moved - moved[0]) * arm.length / np.linalg.norm(np.diff(points[0], axis=0), axis=1).sum()
-    x = np.tile(arm.chart.task(arm.start), (len(points), 1))
+    x = np.tile(arm.chart.x(arm.start), (len(points), 1))
     x[:, :3] += moved[:, 2]
     return x, np.array(arm.elbow(arm.start)[0]).ravel() + moved[:, 1]
 
@@ -126,7 +126,7 @@ def judge(arm: Arm, x: Array, elbows: Array, q: Array, took: Array) -> dict[str,
         "travel_mm": float(1e3 * np.linalg.norm(np.ptp(elbows, axis=0))),
         "error_mm": float(1e3 * np.sqrt((errors[some] ** 2).mean())),
         "least_error_mm": float(1e3 * np.sqrt((least**2).mean())),
-        "hand_error_m": float(np.abs(arm.chart.task(q) - x).max()),
+        "hand_error_m": float(np.abs(arm.chart.x(q) - x).max()),
         "fastest_rad_s": float(np.abs(np.diff(q, axis=0)).max() / PERIOD),
         "tick_ms": float(1e3 * np.median(took)),
     }

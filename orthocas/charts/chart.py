@@ -6,6 +6,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.certificate import Certificate
@@ -17,7 +18,7 @@ from orthocas.charts.self_motion import SelfMotion, XiRange, self_motion, xi_ran
 from orthocas.errors import InvalidValueError
 from orthocas.exact.flow import GrownCoordinates
 from orthocas.tasks.problem import Problem
-from orthocas.tools.checks import as_path, as_point_set, require_kind
+from orthocas.tools.checks import Array, as_path, as_point_set, require_kind
 from orthocas.tools.display import Shown, listed
 
 if TYPE_CHECKING:
@@ -105,6 +106,18 @@ class Chart(InverseMethods, Shown):
             found = PointQuality(found.leak_deg[0], found.conditioning[0], found.boundary_distance[0])
         return found
 
+    def manipulability(self, q: ArrayLike) -> Array:
+        """sqrt(det(J_x J_x^T)) of the task's Jacobian at q (n,), or at each row of (N, n); 0 at singular positions.
+
+        Units are mixed for poses: it compares postures of one robot and task.
+
+        Source:
+            [Y1985]
+        """
+        J = self.jacobian(q)[..., : self.m, :]
+        values = np.linalg.svd(J, compute_uv=False)
+        return np.asarray(np.prod(values, axis=-1))
+
     def xi_range(self, q: ArrayLike) -> XiRange:
         """How far each extra coordinate reaches alone from q, the task value and the other coordinates held.
 
@@ -162,7 +175,7 @@ class Chart(InverseMethods, Shown):
             >>> from orthocas import problems
             >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Linear()).chart
             >>> motion = chart.self_motion([0.6, 0.8, 0.8])
-            >>> motion.closed, motion.q.shape[1], round(float(abs(chart.task(motion.q) - motion.x).max()), 9)
+            >>> motion.closed, motion.q.shape[1], round(float(abs(chart.x(motion.q) - motion.x).max()), 9)
             (False, 3, 0.0)
         """
         return self_motion(self, q, step, samples)
@@ -209,26 +222,9 @@ class GrownChart(Chart):
         Chart.__post_init__(self)
 
 
-def load(path: str | Path) -> Chart:
-    """Read a chart file. Loading never runs code from the file. A grown chart comes back as a `GrownChart`.
-
-    Raises:
-        ChartFileError: if the file is missing, truncated, foreign, edited, or from a newer version.
-
-    Example:
-        >>> from pathlib import Path
-        >>> from tempfile import TemporaryDirectory
-        >>> import orthocas as oc
-        >>> from orthocas import problems
-        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Linear()).chart
-        >>> with TemporaryDirectory() as folder:
-        ...     path = Path(folder) / "arm.orthocas"
-        ...     chart.save(path)
-        ...     again = oc.load(path)
-        >>> bool((again.xi([0.7, 0.9, 0.6]) == chart.xi([0.7, 0.9, 0.6])).all())
-        True
-    """
-    problem, coordinates, notes, certificate = read_chart(as_path("path", path))
+def load_file(path: Path) -> Chart:
+    """Read a chart file. A grown chart comes back as a `GrownChart`."""
+    problem, coordinates, notes, certificate = read_chart(path)
     if isinstance(coordinates, GrownCoordinates):
         return GrownChart(problem, coordinates, notes)
     return Chart(problem, coordinates, notes, certificate)

@@ -1,6 +1,7 @@
 """Methods of charts around the inverse map q(phi), and the CasADi functions of a chart, the inverse among them."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -36,7 +37,9 @@ from orthocas.tools.checks import (
     require_at_least,
     require_kind,
     require_known,
+    require_shape,
 )
+from orthocas.tools.display import listed
 from orthocas.tools.expressions import choose_form
 
 FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian", "inverse")
@@ -99,9 +102,11 @@ class InverseMethods(PhiFunctions):
 
     def solve(
         self,
-        phi: ArrayLike,
+        phi: ArrayLike | None = None,
         q_start: ArrayLike | None = None,
         *,
+        x: Any = None,
+        xi: ArrayLike | None = None,
         tolerance: float = 1e-9,
         inside: bool = False,
         local: LocalSolver | None = None,
@@ -119,6 +124,8 @@ class InverseMethods(PhiFunctions):
         Args:
             phi: target values, (n,) or (N, n). Rows that are not finite get the status BAD_INPUT.
             q_start: initial guess (n,), or (N, n) with one guess per row of phi.
+            x: in place of phi, with `xi`: task values (m,) or (N, m), or poses as `Task.target` takes them.
+            xi: coordinates (r,) or (N, r); one for many x, or many for one.
             tolerance: largest remaining |phi(q) - phi|, as in `inverse`.
             inside: keep q in the domain, and so within the joint limits. Rows without a solution there, from q_start or
                 other starts, get the q inside with the same x and the nearest xi that is found, with the status
@@ -140,10 +147,11 @@ class InverseMethods(PhiFunctions):
         """
         if local is not None and not callable(local):
             raise InvalidValueError("local", repr(local)[:80], "a function of targets and starts")
+        phi = build_phi(self, phi, x, xi)
         search = self.parts.inverse if local is None else replace(self.parts.inverse, local=local, brief=local)
         return solve_with(search, self, phi, q_start, tolerance, inside)
 
-    def nearest_xi(self, q_wish: ArrayLike, x: ArrayLike | None = None, *, tolerance: float = 1e-9) -> Solutions:
+    def nearest_xi(self, q_wish: ArrayLike, x: Any = None, *, tolerance: float = 1e-9) -> Solutions:
         """Joint positions in the domain with task values x, and of these the xi nearest to that of a wished posture.
 
         For postures of a person or a demonstration, which the arm is to resemble while its hand is elsewhere. It is
@@ -151,7 +159,7 @@ class InverseMethods(PhiFunctions):
 
         Args:
             q_wish: wished joint positions, (n,) or (N, n). What lies beyond the box of the domain is moved to its face.
-            x: task values, (m,) or (N, m). Default: those of q_wish.
+            x: task values, (m,) or (N, m), or poses as `Task.target` takes them. Default: those of q_wish.
             tolerance: as in `solve`.
 
         Returns:
@@ -284,12 +292,30 @@ def solve_with(
     return search.solve(targets, starts, float(tolerance), inside)
 
 
-def targets_of_wish(chart: InverseMethods, q_wish: ArrayLike, x: ArrayLike | None) -> tuple[Array, Array]:
+def build_phi(chart: InverseMethods, phi: ArrayLike | None, x: Any, xi: ArrayLike | None) -> ArrayLike:
+    """Target values of phi: those given, or [x; xi]."""
+    if phi is not None and x is None and xi is None:
+        return phi
+    if phi is not None or x is None or xi is None:
+        given = listed(name for name, value in (("phi", phi), ("x", x), ("xi", xi)) if value is not None)
+        raise InvalidValueError("target", given or "nothing", "phi, or x and xi; `nearest_xi` takes x and a posture")
+    first, second = chart.task.target(x), as_float_array("xi", xi)
+    if second.ndim == 0 and chart.r == 1:
+        second = second[None]
+    for name, part, size in (("x", first, chart.m), ("xi", second, chart.r)):
+        require_shape(name, part.shape, (size,) if part.ndim == 1 else (None, size))
+    if first.ndim == second.ndim == 2 and len(first) != len(second) and 1 not in (len(first), len(second)):
+        raise ShapeError("xi", second.shape, (len(first), chart.r))
+    rows = np.broadcast_shapes(first.shape[:-1], second.shape[:-1])
+    return np.concatenate([np.broadcast_to(part, (*rows, part.shape[-1])) for part in (first, second)], axis=-1)
+
+
+def targets_of_wish(chart: InverseMethods, q_wish: ArrayLike, x: Any) -> tuple[Array, Array]:
     """Targets of phi for `nearest_xi`, and the wishes moved into the box of the domain, (N, n) each."""
     wishes = np.clip(rows_of(chart, "q_wish", q_wish), *chart.problem.domain.bounds)
     phi = np.array(chart.phi(wishes))
     if x is not None:
-        values = as_float_array("x", x)
+        values = chart.task.target(x)
         if values.shape not in ((chart.m,), (len(phi), chart.m)):
             raise ShapeError("x", values.shape, (len(phi), chart.m))
         phi[:, : chart.m] = values

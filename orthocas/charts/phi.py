@@ -10,8 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocas.charts.coordinates import CoordinateMap, Coordinates
 from orthocas.errors import InvalidValueError
+from orthocas.robots.robot import Robot
+from orthocas.tasks.domains import Domain
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.relative import Relative
+from orthocas.tasks.task import Task
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_point_set, require_shape
 from orthocas.tools.expressions import wrap_shortest
@@ -112,6 +115,21 @@ class PhiFunctions:
     notes: Mapping[str, str | float]
 
     @property
+    def robot(self) -> Robot:
+        """The robot."""
+        return self.problem.robot
+
+    @property
+    def task(self) -> Task:
+        """The task h; `task(q)` and `x(q)` are its values."""
+        return self.problem.task
+
+    @property
+    def domain(self) -> Domain:
+        """Where the chart is meant to be used."""
+        return self.problem.domain
+
+    @property
     def n(self) -> int:
         """Number of joints."""
         return self.problem.n
@@ -144,16 +162,12 @@ class PhiFunctions:
         return values[0] if single else values
 
     @overload
-    def task(self, q: Symbolic) -> Symbolic: ...
+    def x(self, q: Symbolic) -> Symbolic: ...
     @overload
-    def task(self, q: ArrayLike) -> Array: ...
-    def task(self, q: Any) -> Any:
+    def x(self, q: ArrayLike) -> Array: ...
+    def x(self, q: Any) -> Any:
         """Task values x = h(q), (m,) or (N, m)."""
-        if isinstance(q, ca.SX | ca.MX):
-            return self._expression("task", q)
-        points, single = as_point_set("q", q, self.n)
-        values = self.problem.task.batched(points)[0]
-        return values[0] if single else values
+        return self.task(q)
 
     @overload
     def phi(self, q: Symbolic) -> Symbolic: ...

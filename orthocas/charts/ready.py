@@ -4,11 +4,11 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib.resources import as_file, files
+from pathlib import Path
 from typing import Any, Self
 
-from orthocas.charts.chart import Chart
-from orthocas.charts.chart import load as load_file
-from orthocas.tools.checks import require_known
+from orthocas.charts.chart import Chart, load_file
+from orthocas.tools.checks import as_path, require_known
 from orthocas.tools.display import Shown, listed, number_list, percent
 
 _DATA = files(__package__) / "data"
@@ -106,23 +106,44 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(entry.name.removesuffix(_CARD) for entry in _DATA.iterdir() if entry.name.endswith(_CARD)))
 
 
-def load(name: str) -> Chart:
-    """A ready chart. It includes the robot's model and, unless it is a wide one, a proof that it does not fold.
+def load(path: str | Path) -> Chart:
+    """A chart from its file, or a ready chart by its name. Loading never runs code from a file.
+
+    Ready charts include the robot's model and, unless they are wide ones, a proof that they do not fold.
+
+    Args:
+        path: of a chart file, or the name of a ready chart where there is no such file.
+
+    Returns:
+        The chart; a grown one as a `GrownChart`.
 
     Raises:
-        UnknownNameError: if there is no chart of that name.
+        UnknownNameError: for a word that is neither a file nor the name of a ready chart.
+        ChartFileError: if the file is missing, truncated, foreign, edited, or from a newer version.
 
     Example:
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
         >>> import orthocas as oc
-        >>> chart = oc.charts.load("panda-position")
+        >>> chart = oc.load("panda-position")
         >>> chart.labels
         ('x', 'y', 'z', 'xi1', 'xi2', 'xi3', 'xi4')
         >>> chart.certificate.proved
         True
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "arm.orthocas"
+        ...     chart.save(path)
+        ...     again = oc.load(path)
+        >>> bool((again.xi(chart.domain.centre) == chart.xi(chart.domain.centre)).all())
+        True
     """
-    require_known("ready chart", name, names())
-    with as_file(_DATA / f"{name}.orthocas") as path:
-        return load_file(path)
+    file = as_path("path", path)
+    # Files come first; a word without folder and suffix that is no file is meant as a name.
+    if file.exists() or file.suffix or len(file.parts) > 1:
+        return load_file(file)
+    require_known("chart file or ready chart", file.name, names())
+    with as_file(_DATA / f"{file.name}.orthocas") as stored:
+        return load_file(stored)
 
 
 def card(name: str) -> Card:

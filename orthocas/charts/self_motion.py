@@ -67,6 +67,19 @@ class Stop:
             StopKind.ENDLESS: "nothing",
         }[self.kind]
 
+    @property
+    def brief(self) -> str:
+        """The same in a few words."""
+        if self.kind is StopKind.JOINT:
+            return f"{self.joint} at {'its limit ' if self.is_limit else ''}{self.value:.4g}"
+        return {
+            StopKind.NEAR_SINGULAR: "the task near singular",
+            StopKind.CONDITION: self.condition,
+            StopKind.FOLD: "a fold",
+            StopKind.SINGULAR: "a singularity",
+            StopKind.ENDLESS: "no end",
+        }[self.kind]
+
 
 class Walls:
     """The boundaries of a problem's domain as functions that are positive inside.
@@ -332,7 +345,7 @@ class XiRange(Shown):
             "reach": f"of {listed(interval.label for interval in self.intervals)}, one at a time",
             **{
                 interval.label: f"[{interval.low:.4g}, {interval.high:.4g}], "
-                f"stopped by {interval.low_stop} and by {interval.high_stop}"
+                f"from {interval.low_stop.brief} to {interval.high_stop.brief}"
                 for interval in self.intervals
             },
             **{f"a turn of {joint}": f"adds {number_list(shift)}" for joint, shift in self.turn_shifts.items()},
@@ -578,7 +591,7 @@ def _curve(chart: "Chart", q: Array, step: float) -> SelfMotionCurve:
     place = len(down.q) - 1
     ends = Interval(chart.labels[-1], float(xi[place, 0]), xi.min(), xi.max(), low.stop, high.stop)
     return SelfMotionCurve(
-        chart.task(q),
+        chart.x(q),
         points,
         xi,
         place,
@@ -596,7 +609,7 @@ def _set(chart: "Chart", q: Array, samples: int) -> SelfMotion:
     points = filled(chart, q, alone, samples)
     xi = chart.xi(points)
     widest = tuple(_widest(chart, points, xi, alone[k], k) for k in range(chart.r))
-    return SelfMotion(chart.task(q), points, xi, 0, XiRange(widest))
+    return SelfMotion(chart.x(q), points, xi, 0, XiRange(widest))
 
 
 def _widest(chart: "Chart", points: Array, xi: Array, alone: Interval, k: int) -> Interval:

@@ -14,7 +14,6 @@ import typer
 from orthocas.charts import quality
 from orthocas.charts.certificate import METHODS, Certificate
 from orthocas.charts.chart import Chart
-from orthocas.charts.chart import load as load_file
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.ready import Card, card, load, names
 from orthocas.cli.options import AsJson, ChartPath, Force, parse_number, parse_whole_number
@@ -87,7 +86,7 @@ def evaluate(
     json: AsJson = False,
 ) -> None:
     """Measure the quality of a chart on held-out samples of its domain."""
-    loaded = load_file(chart)
+    loaded = load(chart)
     report = quality.evaluate(loaded, samples, seed)
     if json:
         print_json({**report.as_dict(), **build_reach_data(loaded)})
@@ -130,7 +129,7 @@ def certify(
     processes = 0 if "://" in workers else require_count("--workers", parse_whole_number(workers))
     target = out or chart
     require_free(target, CHART, force)
-    loaded = load_file(chart)
+    loaded = load(chart)
     with _start_workers(processes, workers) as executor, terminal_monitor() as monitor:
         start = time.monotonic()
         # Check the proof in the file, and end.

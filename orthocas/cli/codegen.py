@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from orthocas.charts.chart import Chart, load
+from orthocas.charts.chart import Chart
+from orthocas.charts.ready import load
 from orthocas.cli.options import AsJson, ChartPath, Force, Limit, parse_one_or_all, spread_options
 from orthocas.cli.output import note, print_json, print_rows
 from orthocas.codegen.check import AgreementCheck, check_c

@@ -8,9 +8,9 @@ import typer
 from orthocas import problems
 from orthocas.bases.products import Polynomial
 from orthocas.bases.registry import parse_parametrisation
-from orthocas.charts.chart import load
 from orthocas.charts.figures import quality_figure, self_motion_figure
 from orthocas.charts.quality import evaluate
+from orthocas.charts.ready import load
 from orthocas.cli.options import (
     AsJson,
     Force,

@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from orthocas.charts.chart import Chart, load
+from orthocas.charts.chart import Chart
+from orthocas.charts.ready import load
 from orthocas.cli.options import AsJson, ChartPath, Force, parse_number, parse_numbers, parse_one_or_all
 from orthocas.cli.output import print_json, print_rows
 from orthocas.errors import InvalidValueError

@@ -68,10 +68,10 @@ def info(
 
 
 def _load_chart(target: str) -> "Chart":
-    """The chart of a file; a target that is no file but looks like a name raises an error with the known names."""
-    from orthocas.charts.chart import load  # takes long to import, and problems and robots do not need it
+    """The chart of a file or a ready one; a target that looks like a name, and is none, raises the known ones."""
+    from orthocas.charts.ready import load, names  # takes long to import, and problems and robots do not need it
 
-    if not Path(target).exists() and not Path(target).suffix:
+    if target not in names() and not Path(target).exists() and not Path(target).suffix:
         ProblemOptions().build_problem(target)
     return load(target)
 

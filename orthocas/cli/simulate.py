@@ -9,8 +9,9 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from orthocas.charts.chart import Chart, load
+from orthocas.charts.chart import Chart
 from orthocas.charts.quality import evaluate
+from orthocas.charts.ready import load
 from orthocas.cli.codegen import CONTROLLERS, add_law_options, build_controller, require_settings
 from orthocas.cli.options import AsJson, ChartPath, Force, Limit, parse_number, parse_numbers, parse_whole_number
 from orthocas.cli.output import note, print_json, print_rows, terminal_monitor

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from orthocas import problems
-from orthocas.charts.chart import Chart, load
+from orthocas.charts.chart import Chart
+from orthocas.charts.ready import load
 from orthocas.cli.options import AsJson, Force, ProblemOptions, add_problem_options, is_robot_file, parse_whole_number
 from orthocas.cli.output import note, print_json, print_rows
 from orthocas.errors import OptionError

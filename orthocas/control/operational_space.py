@@ -88,7 +88,7 @@ class _OperationalSpace(LawOfChart):
     Args:
         chart: a chart with a closed expression (not a grown one).
         stiffness: diagonal of K, > 0, (n,) or one number for all; [N/m] for positions, [J] for coordinates. With
-            `damping_stiffness`, 0 is allowed.
+            `damping_stiffness`, 0 is allowed. Default: `matched_stiffness`, modes around 6 Hz.
         damping_ratio: diagonal of Z, >= 0, (n,) or one number.
         coupling: `coupled` uses the full M_phi = (J M^-1 J^T)^-1; `decoupled` adds one controller for the task and one
             for the extra coordinates, each with its own inertia, and relies on condition (5).
@@ -149,7 +149,7 @@ class _OperationalSpace(LawOfChart):
     def __init__(
         self,
         chart: Chart,
-        stiffness: ArrayLike,
+        stiffness: ArrayLike | None = None,
         damping_ratio: ArrayLike = 0.7,
         coupling: Coupling = "coupled",
         damping: DampingDesign = "double_diagonal",
@@ -176,6 +176,8 @@ class _OperationalSpace(LawOfChart):
         if damping_stiffness is not None:
             damping_stiffness = positive_gains("damping_stiffness", damping_stiffness, n)
         model.gains(chart.problem, self.feed_forward)
+        if stiffness is None:
+            stiffness = matched_stiffness(chart)
         for name, value in {
             "chart": chart,
             "stiffness": (positive_gains if as_stiffness else non_negative_gains)("stiffness", stiffness, n),

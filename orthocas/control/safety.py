@@ -14,7 +14,7 @@ from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, as_float_array, as_number, require_count, require_shape
-from orthocas.tools.display import number_list
+from orthocas.tools.display import listed, number_list
 from orthocas.tools.interrupts import deferred
 
 UNBOUNDED = (  #: settings that may be infinite
@@ -48,7 +48,7 @@ class SafetyRules:
 RULES = SafetyRules()
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, init=False)
 class Safety:
     """Settings of the supervised law; `Safety.of(controller)` gives the default ones.
 
@@ -93,10 +93,16 @@ class Safety:
     brake_stiffness: Annotated[float, "spring of the catcher, per inertia [1/s^2]"]
     brake_yield: Annotated[Array, "largest torque of that spring, which gives way slowly beyond it [N m]"]
 
-    def __post_init__(self) -> None:
+    def __init__(self, **settings: Any) -> None:
+        names = [setting.name for setting in fields(self)]
+        if sorted(settings) != sorted(names):
+            odd = sorted(set(names) ^ set(settings))
+            came = f"{len(settings)}, which differ in {listed(odd, 3)}"
+            raise InvalidValueError("settings", came, f"all {len(names)}: use Safety.of(law)")
         # The kind of a setting is that of its annotation.
         for setting in fields(self):
-            value = getattr(self, setting.name)
+            value = settings[setting.name]
+            object.__setattr__(self, setting.name, value)
             if get_args(setting.type)[0] is int:
                 require_count(setting.name, value, least=0)
             elif get_args(setting.type)[0] is float:

@@ -34,6 +34,7 @@ class ObjectiveRules:
     blocks: int = 8  #: blocks of samples per thread: fixed, so that sums do not depend on the number of threads
     stride: int = 2  #: every second sample estimates the Gauss-Newton matrix, which is a mean, well enough
     most_stride: int = 16  #: of rough estimates; a divisor of the samples in a block
+    hinges: int = 1000  #: samples that estimate the Gauss-Newton matrix of a hinge, about
     rough: int = 12  #: residuals per coefficient in a rough estimate
 
     orienting: int = 200  #: samples that determine the orientation of a network's start
@@ -273,11 +274,14 @@ class BasisObjective:
         """Gauss-Newton matrix of a hinge residual. It couples all coordinates, but acts at few samples."""
         # only samples at which the hinge acts, without the padding of the last block
         block, column = np.nonzero((residual[:, 0] > 0) & (self._share > 0))
+        # where it acts at most samples, some of them estimate the matrix well enough
+        stride = max(1, len(block) // RULES.hinges)
+        block, column = block[::stride], column[::stride]
         D = derivative[block, :, column].reshape(-1, self.n, self.r).transpose(0, 2, 1).astype(np.float32)
         chosen: Array = self.X[block, :, :, column]  # (active, g, S)
         G = self._gradients.expand(chosen.transpose(1, 2, 0)[None], len(chosen))
         rows = (D @ G.astype(np.float32))[:, self.kept]
-        product: Array = (rows.T @ rows).astype(float) / self.N
+        product: Array = (rows.T @ rows).astype(float) * (stride / self.N)
         return product
 
 

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 from orthocas.bases.family import Parametrisation
 from orthocas.bases.registry import require_savable
-from orthocas.charts.chart import load
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.quality import evaluate
+from orthocas.charts.ready import load
 from orthocas.codegen.library import control_tick
 from orthocas.errors import ChartFileError, Interrupted, InvalidValueError, OrthocasError
 from orthocas.fitting.fit import Fit, fit

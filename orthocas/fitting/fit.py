@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import scipy
@@ -20,11 +21,14 @@ from orthocas.fitting.like import Likeness
 from orthocas.fitting.settings import RULES, FitSettings, Precision
 from orthocas.fitting.stages import Begin, Continuation, FoldSearch, Solution, Stage, StageRunner
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
+from orthocas.robots.robot import Robot
 from orthocas.solvers.protocol import Solver, Status
 from orthocas.tasks.clear_box import ClearBox
-from orthocas.tasks.domains import Box
+from orthocas.tasks.domains import Box, Domain
+from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.problem import Problem, ProblemCheck, check
 from orthocas.tasks.samples import Samples, find_idle_joints, sample_problem
+from orthocas.tasks.task import Task
 from orthocas.tools.batch import use_threads
 from orthocas.tools.checks import Array, require_count
 from orthocas.tools.display import Shown, listed, percent
@@ -33,10 +37,13 @@ from orthocas.tools.progress import Monitor, silent
 
 
 def fit(
-    problem: Problem,
-    parametrisation: Parametrisation | None = None,
+    problem: Problem | Robot,
+    task: Task | Parametrisation | None = None,
     solver: Solver | None = None,
     *,
+    parametrisation: Parametrisation | None = None,
+    metric: Metric | MetricSpec = "euclidean",
+    domain: Domain | None = None,
     weights: Weights | WeightNumbers = DEFAULT_WEIGHTS,
     samples: int | None = None,
     seed: int = 0,
@@ -68,11 +75,14 @@ def fit(
     and loops around them, end as well.
 
     Args:
-        problem: robot, task, metric and domain.
-        parametrisation: the family of coordinates. Default: polynomials of degree 5; of degree 4 for eight joints, or
-            with a bound on mutual angles; of degree 3 for more joints, and of degree 2 from twelve.
+        problem: robot, task, metric and domain; or a robot, with `task`, `metric` and `domain` as in `Problem`.
+        task: the robot's task. After a problem, the parametrisation stands here.
         solver: the minimiser. Default: GaussNewton for families linear in their parameters, QuasiNewton if they have
             more than 300 basis functions or 8 joints, and LBFGS for other families.
+        parametrisation: the family of coordinates. Default: polynomials of degree 5; of degree 4 for eight joints, or
+            with a bound on mutual angles; of degree 3 for more joints, and of degree 2 from twelve.
+        metric: for a robot and a task, as in `Problem`; so is `domain`.
+        domain: the domain. Default: a box of regular positions around the home of the robot.
         weights: weights of the loss, as `Weights` or as two to five numbers (lambda1, lambda2, ...). The field `angles`
             of `Weights` chooses between the paper's cosines and angles in the metric.
         samples: number of samples. Default: grows with the number of parameters.
@@ -113,6 +123,14 @@ def fit(
         >>> fit.chart.xi([0.6, 0.8, 0.8]).shape
         (1,)
     """
+    # a robot and its task make a problem; after a problem, the parametrisation has the second place
+    if isinstance(problem, Robot):
+        of_robot: Any = task
+        problem = Problem(problem, of_robot, metric, domain)
+    elif task is not None:
+        if parametrisation is not None or isinstance(task, Task):
+            raise InvalidValueError("task", repr(task)[:80], "none beside a problem, which has one")
+        parametrisation = task
     settings = FitSettings.check(
         problem, parametrisation, solver, weights, samples, seed, max_mutual_deg, split_idle, precision, like
     )

@@ -50,7 +50,8 @@ def follow(
 
     Args:
         chart: a fitted chart.
-        tool_path: task values of waypoints (N, m), or a function of s in [0, 1] that returns task values (m,).
+        tool_path: waypoints, or a function of s in [0, 1] that returns one: task values (N, m) and (m,), or poses as
+            `Task.target` takes them.
         xi: "hold" keeps the coordinates of `q_start`. An array (N, r) gives them at the waypoints, a function of s in
             [0, 1] along the path. "objective" chooses them: away from the boundary of the domain, from positions where
             the task is near-singular, and from obstacles, and with little motion. Circle-valued coordinates go from
@@ -77,7 +78,7 @@ def follow(
         >>> import orthocas as oc
         >>> from orthocas import problems
         >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Linear()).chart
-        >>> start = chart.task([0.6, 0.8, 0.8])
+        >>> start = chart.x([0.6, 0.8, 0.8])
         >>> angle = np.linspace(0.0, 2 * np.pi, 50)
         >>> circle = start + 0.1 * np.column_stack([np.cos(angle) - 1, np.sin(angle)])
         >>> motion = oc.follow(chart, circle, velocity_limits=1.0)
@@ -360,7 +361,7 @@ def walk(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
         for _ in range(RULES.walk_steps):
             J = chart.parts.relative.batched_rates(q[None])[0].reshape(chart.m, chart.n)
             # Towards x the step of least norm, within the null space (n, r) a damped Gauss-Newton step.
-            toward = np.linalg.pinv(J, rcond=1e-3) @ chart.parts.relative.difference(target, chart.task(q))
+            toward = np.linalg.pinv(J, rcond=1e-3) @ chart.parts.relative.difference(target, chart.x(q))
             inner = np.linalg.svd(J)[2][chart.m :].T
             residuals, gradients = (part[0] for part in costs(q[None]))
             G = gradients @ inner

@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.phi import counted_on
-from orthocas.errors import InvalidValueError, ShapeError
+from orthocas.errors import InvalidValueError, PathFileError, ShapeError
 from orthocas.robots.spatial import build_rotations
 from orthocas.tasks.relative import Relative
 from orthocas.tools.batch import Batched
@@ -72,6 +72,7 @@ class PathRules:
 
 
 RULES = PathRules()
+POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")  #: columns of poses in files: position [m] and unit quaternion
 
 
 def sample_path(name: str, path: Any, size: int, labels: tuple[str, ...]) -> Array:
@@ -224,7 +225,9 @@ class ToolPath:
     @classmethod
     def _build(cls, chart: "Chart", tool_path: Any, xi: Array, s_xi: Array | None) -> "ToolPath":
         """Splines; the coordinates are at parameters of their own, or at those of the waypoints (None)."""
-        x = sample_path("tool_path", tool_path, chart.m, chart.labels[: chart.m])
+        target = chart.task.target
+        x = (lambda s: target(tool_path(s))) if callable(tool_path) else target(tool_path)
+        x = sample_path("tool_path", x, chart.m, chart.labels[: chart.m])
         if s_xi is None and len(xi) != len(x):
             raise InvalidValueError("number of rows of xi", len(xi), f"{len(x)}, as of tool_path")
         # s grows with the length of the chords, in units of the sizes of phi.
@@ -265,19 +268,36 @@ class ToolPath:
 def read_path(path: str | Path, chart: Chart) -> tuple[Array, Array | None]:
     """Waypoints (N, m), and their coordinates (N, r) if the file has columns for them.
 
+    The columns are the chart's labels, or x, y, z, qw, qx, qy, qz for poses.
+
     Raises:
         PathFileError: names the file, the line, and what is wrong there.
     """
-    values = read_table(path, "path file", "waypoints", MOST_WAYPOINTS, lambda names: _find_columns(names, chart))
-    return values[:, : chart.m], values[:, chart.m :] if values.shape[1] > chart.m else None
+    task: tuple[str, ...] = ()
+
+    def find(names: Sequence[str]) -> list[int]:
+        nonlocal task
+        task = POSE if "qw" in names else chart.labels[: chart.m]
+        return _find_columns(names, task, chart.labels[chart.m :])
+
+    values = read_table(path, "path file", "waypoints", MOST_WAYPOINTS, find)
+    x, xi = values[:, : len(task)], values[:, len(task) :]
+    if task is POSE:
+        # Files round, to three digits and more; what is farther from length 1 is no rounded unit quaternion.
+        lengths = np.linalg.norm(x[:, 3:], axis=1)
+        if (off := np.flatnonzero(np.abs(lengths - 1) > 5e-3)).size:
+            came = f"row {off[0] + 1} has a quaternion of length {lengths[off[0]]:.4g}"
+            raise PathFileError(f"path file {path}: {came}, expected 1")
+        x[:, 3:] /= lengths[:, None]
+        x = chart.task.target((x[:, :3], x[:, 3:]))
+    return x, xi if xi.size else None
 
 
-def _find_columns(names: Sequence[str], chart: Chart) -> list[int]:
-    """The columns in the order of the chart's labels, without those of the coordinates if there are none."""
-    task, extra = chart.labels[: chart.m], chart.labels[chart.m :]
+def _find_columns(names: Sequence[str], task: tuple[str, ...], extra: tuple[str, ...]) -> list[int]:
+    """The columns of the task, then those of the coordinates if there are any."""
     columns = (*task, *extra) if set(extra) & set(names) else task
     for name in names:
-        if name not in chart.labels:
+        if name not in (*task, *extra):
             expected = f"{', '.join(task)}, and if the path has a schedule {', '.join(extra)}"
             raise ValueError(f"line 1: unknown column {name[: FILE_RULES.cell]!r}, expected {expected}")
     return find_columns(names, columns)

@@ -25,7 +25,7 @@ from orthocas.robots.pinocchio_model import (
     lock_off_chain,
     read_model_postures,
 )
-from orthocas.robots.tree import KinematicTree
+from orthocas.robots.tree import PRISMATIC_ROOM, KinematicTree
 from orthocas.robots.urdf import read_srdf_postures, read_urdf
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import BuiltOnUse, cached_property
@@ -35,6 +35,7 @@ from orthocas.tools.checks import (
     as_path,
     as_point_set,
     freeze_array,
+    require_count,
     require_kind,
     require_known,
 )
@@ -379,6 +380,39 @@ class Robot(Shown):
     def tip_jacobian(self, q: Any) -> Any:
         """Geometric Jacobian of the tip in world axes, (6, n): linear rows, then angular rows."""
         return self._call("tip_jacobian", q)
+
+    def pose(self, q: Any, frame: str | None = None) -> Any:
+        """Pose of a frame, or of the tip, in the world: (4, 4) [m], rotation and position above (0, 0, 0, 1).
+
+        Example:
+            >>> import orthocas as oc
+            >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[3.0, 3.0])
+            >>> robot.pose([0.0, 0.0])[:3, 3].tolist()
+            [2.0, 0.0, 0.0]
+        """
+        R, p = (self._call(self._find_key(part, frame, None), q) for part in ("rotation", "position"))
+        if isinstance(p, ca.SX | ca.MX):
+            return ca.vertcat(ca.horzcat(R, p), ca.DM([[0.0, 0.0, 0.0, 1.0]]))
+        pose = np.zeros((*p.shape[:-1], 4, 4))
+        pose[..., :3, :3], pose[..., :3, 3], pose[..., 3, 3] = R, p, 1.0
+        return pose
+
+    def jacobian(self, q: Any, frame: str | None = None) -> Any:
+        """Geometric Jacobian of a frame, or of the tip, in world axes, (6, n): linear rows, then angular rows."""
+        return self._call(self._find_key("jacobian", frame, None), q)
+
+    def sample(self, count: int, seed: int = 0) -> Array:
+        """Random postures within the joint limits, (count, n), uniform [rad] or [m].
+
+        Joints without limits take a whole turn, or half a metre.
+        """
+        width = np.where(self.tree.prismatic, 2 * PRISMATIC_ROOM, 2 * np.pi)
+        low = np.where(
+            np.isfinite(self.lower), self.lower, np.where(np.isfinite(self.upper), self.upper - width, -width / 2)
+        )
+        high = np.where(np.isfinite(self.upper), self.upper, low + width)
+        rng = np.random.default_rng(require_count("seed", seed, least=0))
+        return np.asarray(rng.uniform(low, high, (require_count("count", count), self.n)))
 
     def frame_position(self, q: Any, frame: str, relative_to: str | None = None) -> Any:
         """Position of a frame in the world, or in another frame, (3,) [m].

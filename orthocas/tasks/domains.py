@@ -22,6 +22,7 @@ from orthocas.tools.checks import (
     require_count,
     require_kind,
     require_known,
+    require_memory,
 )
 
 if TYPE_CHECKING:
@@ -29,6 +30,18 @@ if TYPE_CHECKING:
     from orthocas.tasks.corridor import Corridor
     from orthocas.tasks.task import Task
 
+
+@dataclass(frozen=True, slots=True)
+class SamplingRules:
+    """Numbers of the sampling of domains."""
+
+    most: int = 10**12  #: samples of one call
+    least_fraction: float = 1e-3  #: of the points of the box that must lie in the domain
+    tried: int = 10_000  #: points after which that counts
+    block: int = 1000  #: fewest points to draw at once, after the first ones
+
+
+SAMPLING = SamplingRules()
 _MOST_JOINTS = 1000
 NARROWEST = 1e-9  #: [rad] or [m]; boxes of this half-width and less drown in rounding
 WIDEST = 1e6  #: [rad] or [m]; wider boxes are mistakes, and overflow later
@@ -157,6 +170,15 @@ class Domain(ABC):
                 "on singular values or on the distance to a path"
             )
 
+    def sample(self, count: int, seed: int | tuple[int, ...] = 0) -> Array:
+        """Random positions of the domain, uniform, (count, n) [rad] or [m].
+
+        Raises:
+            DomainError: if next to no point of its box lies in the domain.
+        """
+        rng = make_generator(self, count, seed)
+        return keep_inside(self, count, lambda size: self.draw(rng, size, 1.0))
+
     def draw(self, rng: np.random.Generator, count: int, power: float) -> Array:
         """At most `count` points (M, n), of which those in the domain count: |u|^power half-widths from the centre.
 
@@ -192,6 +214,37 @@ class Domain(ABC):
     def from_data(cls, task: "Task", data: Mapping[str, Any], arrays: Mapping[str, Any]) -> "Domain":
         """The domain from what `to_data` gave; `arrays` also has centre and half_width. They may be anything."""
         raise NotImplementedError
+
+
+def make_generator(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> np.random.Generator:
+    """The generator of a seed, after checks of what is asked for."""
+    require_count("samples", samples, most=SAMPLING.most)
+    for part in seed if isinstance(seed, tuple) else (seed,):
+        require_count("seed", part, least=0)
+    require_memory(f"{samples} samples", 32.0 * samples * len(domain.centre))
+    return np.random.default_rng(seed)
+
+
+def keep_inside(domain: Domain, samples: int, draw: Callable[[int], Array]) -> Array:
+    """The first points of a sequence that lie in the domain, (samples, n); `draw` returns the next so many points.
+
+    Raises:
+        DomainError: if next to none of them does.
+    """
+    kept = [np.empty((0, len(domain.centre)))]
+    drawn, count, size = 0, 0, samples
+    while count < samples:
+        # Give up where next to no point of the box lies in the domain.
+        if drawn >= SAMPLING.tried and count < SAMPLING.least_fraction * drawn:
+            raise DomainError(
+                f"{count} of {drawn} points of its box lie in the domain, expected at least "
+                f"{SAMPLING.least_fraction:.1%}: lower least_singular_value, or raise the radius of the corridor"
+            )
+        points = draw(size)
+        kept.append(points[domain.contains(points)])
+        drawn, count = drawn + size, count + len(kept[-1])
+        size = max(samples - count, SAMPLING.block)
+    return np.concatenate(kept)[:samples]
 
 
 class Condition(Protocol):

@@ -459,6 +459,15 @@ class Task(Shown, HoldsFunctions):
         """Number of task components."""
         return len(self.labels)
 
+    def __call__(self, q: Any) -> Any:
+        """Task values x = h(q): (m,) of one joint position (n,), (N, m) of (N, n), an expression of a CasADi column."""
+        if isinstance(q, ca.SX | ca.MX):
+            require_shape("q", q.shape, (self.robot.n, 1))
+            return self.function(q)
+        points, single = as_point_set("q", q, self.robot.n)
+        values = self.batched(points)[0]
+        return values[0] if single else values
+
     def facts(self) -> dict[str, str]:
         """Name, components and robot."""
         return {"task": f"{self.name}, m = {self.m} ({listed(self.labels)})", "robot": self.robot.heading}
@@ -618,6 +627,50 @@ class Task(Shown, HoldsFunctions):
         elif position is not None:
             raise InvalidValueError("position", repr(position)[:80], f"None for the task {self.name}")
         return np.asarray(turned[0] if single else turned)
+
+    def target(self, pose: Any) -> Array:
+        """The task value x, (m,) or (N, m), of a target as people hold it.
+
+        Args:
+            pose: a pose or many of them: matrices (4, 4) or (N, 4, 4); an object with `translation` and `rotation`,
+                such as `pinocchio.SE3`, or a list of such; a pair of position and orientation as in `value`. Or task
+                values (m,) or (N, m), which come back as they are.
+
+        Raises:
+            InvalidValueError, ShapeError: if the pose has no meaning for the task, or is none.
+
+        Example:
+            >>> import numpy as np
+            >>> import orthocas as oc
+            >>> robot = oc.problems.get("iiwa").robot
+            >>> q = np.array([0.1, 0.5, 0.0, -1.2, 0.0, 0.6, 0.0])
+            >>> task = oc.Task.pose(robot, reference=robot.tip_rotation(q))
+            >>> bool(np.allclose(task.target(robot.pose(q)), task(q)))
+            True
+        """
+        rows = pose if isinstance(pose, list | tuple) and len(pose) else [pose]
+        if all(hasattr(row, "translation") and hasattr(row, "rotation") for row in rows):
+            parts = np.array([row.translation for row in rows]), np.array([row.rotation for row in rows])
+            x = self._value_of(*parts)
+            return x[0] if rows[0] is pose else x
+        # Two task values have one shape, position and orientation have two.
+        if isinstance(pose, tuple) and len(pose) == 2:
+            position, orientation = (as_float_array("target", part) for part in pose)
+            if position.ndim > 1 or position.shape != orientation.shape:
+                return self._value_of(position, orientation)
+        values = as_float_array("target", pose)
+        if values.shape[-2:] == (4, 4) and (values.ndim == 3 or self.m != 4):
+            if np.abs(values[..., 3, :] - [0.0, 0.0, 0.0, 1.0]).max(initial=0.0) > 1e-9:
+                raise InvalidValueError("target", values[..., 3, :].tolist(), "matrices with the last row (0, 0, 0, 1)")
+            return self._value_of(values[..., :3, 3], values[..., :3, :3])
+        return values
+
+    def _value_of(self, position: Array, orientation: Array) -> Array:
+        """The task value of a pose, for tasks of a position or of a whole orientation."""
+        if self.turn is None and self.recipe["kind"].startswith("position"):
+            require_finite("position", position)
+            return np.asarray(position[..., ["xyz".index(axis) for axis in self.labels]])
+        return self.value(position if self._require_whole_turn().with_position else None, orientation)
 
     def orientation_of(self, x: ArrayLike) -> Array:
         """The tip's orientation in the world, (3, 3) or (N, 3, 3), at task values x (m,) or (N, m); see `value`."""

@@ -2,8 +2,12 @@
 
 import html
 import math
+import textwrap
 from collections.abc import Iterable, Mapping
 from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
+from typing import TYPE_CHECKING, Any
+
+from orthocas.tools.guesses import GUESSES, explain_missing
 
 _WIDTH = 100  # characters per line
 _LINES = 9  # at most, including the heading
@@ -23,6 +27,13 @@ class Shown:
     def heading(self) -> str:
         """One line that describes the object."""
         return next(iter(self.facts().values()))
+
+    if not TYPE_CHECKING:  # type checkers would take every name for known
+
+        def __getattr__(self, name: str) -> Any:
+            """Say what to use where a name is one that people try first."""
+            owners = [kind.__name__ for kind in type(self).__mro__ if name in GUESSES.get(kind.__name__, ())]
+            raise AttributeError(explain_missing((owners or [type(self).__name__])[0], name), name=name, obj=self)
 
     def __repr__(self) -> str:
         return as_text(type(self).__name__, self.facts())
@@ -79,7 +90,9 @@ def number_list(values: Iterable[float], most: int = 10) -> str:
 
 
 def _cut(line: str) -> str:
-    """The line without control characters, cut to the width."""
+    """The line without control characters, cut to the width between two words, where there are any."""
     indent = line[: len(line) - len(line.lstrip())]
     words = "".join(letter if letter.isprintable() else " " for letter in line.strip())
-    return indent + (words if len(words) <= _WIDTH else words[: _WIDTH - 3] + "...")
+    if len(words) > _WIDTH:
+        words = f"{textwrap.shorten(words, _WIDTH - 4, placeholder='') or words[: _WIDTH - 4]} ..."
+    return indent + words

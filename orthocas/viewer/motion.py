@@ -150,14 +150,14 @@ def cyclic_motions(chart: Chart, path: Array | None = None, cycles: int = 3) -> 
     labels = chart.labels[: chart.m]
     return (
         Motion("constant ξ", times, q, labels, x, cycles=ends),
-        Motion("pseudo-inverse", times, other, labels, chart.task(other), cycles=ends),
+        Motion("pseudo-inverse", times, other, labels, chart.x(other), cycles=ends),
     )
 
 
 def _find_largest_circle(chart: Chart, start: Array, fractions: Array) -> tuple[Place, Array]:
     """A circle in the first two components of the task, or a line in one, as large as the chart can follow."""
     # Smaller and smaller circles, until the chart can follow one.
-    x0, m = chart.task(start), min(chart.m, 2)
+    x0, m = chart.x(start), min(chart.m, 2)
     radius = RULES.circle * float(chart.parts.phi_sizes[:m].min())
     while True:
 
@@ -209,6 +209,6 @@ def _follow_by_pseudo_inverse(chart: Chart, x: Array, start: Array) -> Array:
     for k, value in enumerate(x):
         for _ in range(RULES.corrections + 1):
             J = task.batched_jacobian(q[None])[0].reshape(chart.m, chart.n)
-            q = q + np.linalg.lstsq(J, value - chart.task(q), rcond=None)[0]
+            q = q + np.linalg.lstsq(J, value - chart.x(q), rcond=None)[0]
         positions[k] = q
     return positions

@@ -186,7 +186,7 @@ def test_solvers_find_poses_half_a_turn_away(kind: str) -> None:
 @pytest.mark.slow
 def test_self_motions_do_not_depend_on_the_reference() -> None:
     q = oc.problems.get("iiwa").domain.centre + np.pi * np.eye(7)[6]
-    assert np.linalg.norm(chart().task(q)[3:]) == pytest.approx(2, abs=1e-6)
+    assert np.linalg.norm(chart().x(q)[3:]) == pytest.approx(2, abs=1e-6)
     here, other = (known.xi_range(q)[0] for known in (chart(), chart(turned_deg=100.0)))
     assert [here.low, here.high] == pytest.approx([other.low, other.high], abs=1e-7)
     assert here.high - here.low > 0.1
@@ -217,12 +217,12 @@ def test_paths_of_two_full_turns_are_followed() -> None:
     count = min(len(motion.q) for motion in motions)
     assert abs(len(motions[0].q) - len(motions[1].q)) < 0.02 * count
     there = np.vstack([q, q[::-1][1:]])
-    back = oc.follow(chart(), chart().task(there), chart().xi(there), q_start=q[0])
+    back = oc.follow(chart(), chart().x(there), chart().xi(there), q_start=q[0])
     assert back.closed
     assert np.abs(back.q[-1] - back.q[0]).max() < 1e-7
     home, s = oc.problems.get("iiwa").domain.centre, np.linspace(0.0, 1.0, 31)[:, None]
     around = home + 2 * np.pi * s * np.eye(7)[6]
-    once = oc.follow(chart(), chart().task(around), chart().xi(around), q_start=home)
+    once = oc.follow(chart(), chart().x(around), chart().xi(around), q_start=home)
     np.testing.assert_allclose(once.q[-1] - once.q[0], 2 * np.pi * np.eye(7)[6], atol=1e-7)
     assert not once.closed  # the tool is back after a full turn, joint 7 is not
 

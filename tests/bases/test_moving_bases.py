@@ -112,7 +112,7 @@ def test_closed_paths_bring_the_base_back(chart: oc.Chart) -> None:
 def test_a_slow_base_sets_the_time_of_a_path(chart: oc.Chart) -> None:
     """By finite differences of the joint motion; with a faster base the same path takes less time."""
     shifts = np.outer(np.linspace(0, 1, 30), [0.5, 0.2])
-    tool = chart.task(HOME) + np.hstack([shifts, np.zeros((30, 4))])
+    tool = chart.x(HOME) + np.hstack([shifts, np.zeros((30, 4))])
     xi = chart.xi(HOME) + shifts @ chart.jacobian(HOME)[6:, :2].T  # of a motion of the base with all that it carries
     arm, times = np.full(7, 2.0), []
     for base in (0.05, 0.2):

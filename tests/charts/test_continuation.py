@@ -76,6 +76,6 @@ def test_orientations_go_the_shorter_way_from_a_start() -> None:
     step[:, 6] = 0.25
     inside = domain.contains(q + step)
     q, other = q[inside], (q + step)[inside]
-    seam = np.abs(chart.task(other) - chart.task(q))[:, 3:].max(axis=1) > 1.0
+    seam = np.abs(chart.x(other) - chart.x(q))[:, 3:].max(axis=1) > 1.0
     assert seam.sum() > 5
     assert chart.solve(chart.phi(other[seam]), q[seam]).found.all()

@@ -17,11 +17,11 @@ def test_no_random_start_leads_to_a_nearer_xi(name: str) -> None:
     """A wish whose x is that of another posture: a search from near the wish missed the nearest xi in one of seven."""
     chart = oc.charts.load(name)
     domain = chart.problem.domain
-    wishes, x = sample_uniform(domain, 24, 1), chart.task(sample_uniform(domain, 24, 2))
+    wishes, x = sample_uniform(domain, 24, 1), chart.x(sample_uniform(domain, 24, 2))
     near, pool = chart.nearest_xi(wishes, x), sample_uniform(domain, STARTS, 3)
     assert {FOUND, NEAREST} == set(near.statuses)
     assert domain.contains(near.q).all()
-    np.testing.assert_allclose(chart.parts.relative.difference(x, chart.task(near.q)), 0, atol=1e-8)
+    np.testing.assert_allclose(chart.parts.relative.difference(x, chart.x(near.q)), 0, atol=1e-8)
     xi = chart.xi(wishes)[:, 0]
     np.testing.assert_allclose(near.distance, np.abs(chart.xi(near.q)[:, 0] - xi), atol=1e-9)
     known = 0
@@ -59,7 +59,7 @@ def test_curves_are_cut_by_the_limits_after_full_turns() -> None:
     turn = np.array([2 * np.pi, 0.0, 0.0])
     apart = abs(chart.xi(q) - chart.xi(q - turn))[0]
     for own in (q, q - turn):
-        found = chart.nearest_xi(own, chart.task(q))
+        found = chart.nearest_xi(own, chart.x(q))
         assert found.distance[0] < 1e-9 < apart
         np.testing.assert_allclose(chart.xi(found.q[0]), chart.xi(own), atol=1e-9)
 
@@ -71,7 +71,7 @@ def test_endless_joints_count_at_every_turn_near_the_wish() -> None:
     wishes = sample_uniform(domain, 500, 3)
     others = wishes + 0.3 * domain.half_width * rng.uniform(-1, 1, wishes.shape)
     others = np.where(domain.contains(others)[:, None], others, wishes)
-    x, xi = chart.task(others), chart.xi(wishes)
+    x, xi = chart.x(others), chart.xi(wishes)
     found = chart.nearest_xi(wishes, x)
     assert (found.status <= NEAREST).all()
     assert (found.distance <= np.abs(chart.xi(others) - xi)[:, 0] + 1e-9).all()
@@ -82,7 +82,7 @@ def test_orientations_are_embedded_without_a_seam() -> None:
     chart = oc.charts.load("iiwa7-wide")
     rng = np.random.default_rng(0)
     q = sample_uniform(chart.problem.domain, 300, 4)
-    x, y = chart.task(q), chart.task(q + 1e-3 * rng.normal(size=q.shape))
+    x, y = chart.x(q), chart.x(q + 1e-3 * rng.normal(size=q.shape))
     error = np.linalg.norm(chart.parts.relative.difference(x, y)[:, 3:], axis=1)
     apart = np.linalg.norm(chart.parts.relative.embed(x) - chart.parts.relative.embed(y), axis=1)
     np.testing.assert_allclose(apart, error, rtol=1e-4, atol=1e-12)

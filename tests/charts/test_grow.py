@@ -294,7 +294,7 @@ def test_units_of_the_task_do_not_matter(leaf: str, scale: float) -> None:
     points = known_points(charts[0], 20)
     np.testing.assert_allclose(charts[1].xi(points), charts[0].xi(points), atol=1e-8)
     found = charts[1].coordinates.inverse(charts[1].phi(points), points)
-    np.testing.assert_allclose(charts[1].task(found), charts[1].task(points), rtol=1e-9, atol=1e-9 * scale)
+    np.testing.assert_allclose(charts[1].x(found), charts[1].x(points), rtol=1e-9, atol=1e-9 * scale)
     np.testing.assert_allclose(found, points, atol=1e-4)
 
 

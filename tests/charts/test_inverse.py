@@ -131,7 +131,7 @@ def test_all_solutions_of_a_folded_chart_are_found() -> None:
     for q in sample_uniform(problem.domain, 20, 4):
         line = q + np.linspace(-4, 4, 80_001)[:, None] * along  # all q with the same xi
         line = line[problem.domain.contains(line)]
-        crossings = np.count_nonzero(np.diff(np.sign(chart.task(line)[:, 0] - chart.task(q)[0] + 1e-13)))
+        crossings = np.count_nonzero(np.diff(np.sign(chart.x(line)[:, 0] - chart.x(q)[0] + 1e-13)))
         found = chart.solutions(chart.phi(q))
         assert len(found) == crossings
         np.testing.assert_allclose(chart.phi(found), np.tile(chart.phi(q), (len(found), 1)), atol=1e-9)
@@ -194,7 +194,7 @@ def test_no_tip_is_farther_away_than_beyond_reach_says() -> None:
         chart = oc.charts.load(name)
         robot = chart.problem.robot
         low, high = np.maximum(robot.lower, -4.0), np.minimum(robot.upper, 4.0)
-        x = chart.task(np.random.default_rng(0).uniform(low, high, (2000, chart.n)))
+        x = chart.x(np.random.default_rng(0).uniform(low, high, (2000, chart.n)))
         assert not beyond_reach(chart.problem.task, x).any()
         assert beyond_reach(chart.problem.task, x + np.eye(chart.m)[0] * 9.0).all()
 

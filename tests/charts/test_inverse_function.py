@@ -42,7 +42,7 @@ def test_inverse_function_is_nan_where_it_finds_nothing(
 def test_inverse_and_phi_give_the_same_optimum(planar_arm: oc.Chart) -> None:
     """The shortest joint path while the tool moves on a line: over xi with the inverse, and over q with phi."""
     start, knots = planar_arm.problem.domain.centre, 6
-    line = planar_arm.task(start) + np.linspace(0, 1, knots)[:, None] * [0.05, -0.1]
+    line = planar_arm.x(start) + np.linspace(0, 1, knots)[:, None] * [0.05, -0.1]
     by_inverse, over_q = ca.Opti(), ca.Opti()
     xi = by_inverse.variable(knots)
     inverse, guess = planar_arm.function("inverse"), ca.DM(start)
@@ -53,7 +53,7 @@ def test_inverse_and_phi_give_the_same_optimum(planar_arm: oc.Chart) -> None:
     Q = over_q.variable(3, knots)
     over_q.minimize(ca.sumsqr(Q[:, 1:] - Q[:, :-1]))
     for k in range(1, knots):
-        over_q.subject_to(planar_arm.task(Q[:, k]) == line[k])
+        over_q.subject_to(planar_arm.x(Q[:, k]) == line[k])
     over_q.subject_to(Q[:, 0] == start)
     over_q.set_initial(Q, np.tile(start[:, None], knots))
     lengths = []

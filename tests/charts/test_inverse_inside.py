@@ -23,7 +23,7 @@ def test_inside_gives_the_nearest_coordinates_that_keep_the_task(planar_arm: oc.
     assert {FOUND, NEAREST} <= set(solutions.statuses)
     kept = np.isin(solutions.status, (FOUND, NEAREST))
     assert domain.contains(solutions.q).all()
-    np.testing.assert_allclose(planar_arm.task(solutions.q[kept]), phi[kept, :2], atol=1e-8)
+    np.testing.assert_allclose(planar_arm.x(solutions.q[kept]), phi[kept, :2], atol=1e-8)
     np.testing.assert_allclose(solutions.distance, np.abs(planar_arm.xi(solutions.q) - phi[:, 2:])[:, 0], atol=1e-9)
     for k in np.flatnonzero(solutions.status != FOUND):
         inner = self_motion(planar_arm, phi[k, :2])
@@ -73,7 +73,7 @@ def test_descents_end_as_near_as_ipopt(iiwa_fit: Fit) -> None:
     phi, q = phi[in_reach], q[in_reach]
     mine, theirs = inside.nearer(phi, q), by_ipopt(chart, phi, q)
     assert chart.problem.domain.contains(mine).all()
-    np.testing.assert_allclose(chart.task(mine), phi[:, : chart.m], atol=1e-9)
+    np.testing.assert_allclose(chart.x(mine), phi[:, : chart.m], atol=1e-9)
     away, theirs_away = (np.linalg.norm(chart.xi(found) - phi[:, chart.m :], axis=1) for found in (mine, theirs))
     np.testing.assert_allclose(away, theirs_away, atol=1e-6)
 

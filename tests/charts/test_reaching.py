@@ -64,7 +64,7 @@ def test_self_motion_on_a_torus_closes() -> None:
     assert motion.closed
     turns = (motion.q[-1] - motion.q[0]) / (2 * np.pi)
     np.testing.assert_allclose(turns, np.round(turns), atol=1e-9)
-    np.testing.assert_allclose(chart.task(motion.q), np.tile(motion.x, (len(motion.q), 1)), atol=1e-9)
+    np.testing.assert_allclose(chart.x(motion.q), np.tile(motion.x, (len(motion.q), 1)), atol=1e-9)
     sides = np.sign(np.sin(motion.q[:, 1]))
     assert {-1.0, 1.0} <= set(sides)
     for side in (-1.0, 1.0):
@@ -192,14 +192,14 @@ def test_sets_keep_the_task_and_fill_the_domain(build: Callable[[], oc.Chart]) -
     q = chart.problem.domain.centre
     motion = chart.self_motion(q, samples=400)
     assert chart.problem.domain.contains(motion.q).all()
-    assert np.abs(chart.task(motion.q) - motion.x).max() < 1e-9
+    assert np.abs(chart.x(motion.q) - motion.x).max() < 1e-9
     np.testing.assert_allclose(motion.xi, chart.xi(motion.q), atol=1e-9)
     cell = (chart.xi_range(q).high - chart.xi_range(q).low) / 20
     rng, checked = np.random.default_rng(5), 0
     for start in q + chart.problem.domain.half_width * rng.uniform(-0.9, 0.9, (40, chart.n)):
         point = start
         for _ in range(20):  # onto the set x = x(q), the shortest way
-            point = point - np.linalg.pinv(chart.jacobian(point)[: chart.m]) @ (chart.task(point) - motion.x)
+            point = point - np.linalg.pinv(chart.jacobian(point)[: chart.m]) @ (chart.x(point) - motion.x)
         if np.abs(point - q).max() <= 0.95 * chart.problem.domain.half_width.max():
             checked += 1
             assert np.abs((motion.xi - chart.xi(point)) / cell).max(axis=1).min() < 1.01
@@ -255,4 +255,4 @@ def test_seven_joints() -> None:
     chart = oc.fit(problems.get("iiwa"), oc.Linear()).chart
     motion = chart.self_motion(chart.problem.domain.centre, samples=100)
     assert len(motion.q) > 50
-    assert np.abs(chart.task(motion.q) - motion.x).max() < 1e-9
+    assert np.abs(chart.x(motion.q) - motion.x).max() < 1e-9

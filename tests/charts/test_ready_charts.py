@@ -140,7 +140,7 @@ def test_cards_keep_all_they_have_as_text() -> None:
 
 @pytest.mark.parametrize("call", [oc.charts.load, oc.charts.card])
 def test_unknown_names_are_told_the_known_ones(call: object) -> None:
-    with pytest.raises(UnknownNameError, match=r"unknown ready chart 'panda'.*panda-position"):
+    with pytest.raises(UnknownNameError, match=r"ready chart 'panda'.*panda-position"):
         call("panda")  # type: ignore[operator]
 
 

@@ -174,7 +174,7 @@ def test_trackers_follow_along_the_border_and_come_to_rest_where_nothing_is_near
     assert (np.abs(np.diff(q, axis=0)) <= step * (1 + 1e-9)).all()
     assert tracker.status == TrackerStatus.NEAREST
     np.testing.assert_array_equal(q[-1], q[-20])
-    places = chart.task(q)[:, :3]
+    places = chart.x(q)[:, :3]
     assert np.linalg.norm(places[-1] - places[ticks - 1]) > 0.02  # one that froze at the border moves by 0
     assert np.linalg.norm(places[-1] - targets[-1, :3]) > 0.05
     assert metres_nearer(chart, targets[-1], q[-1]) < 1e-5
@@ -249,7 +249,7 @@ def test_it_rests_where_a_target_pushes_it_against_the_boundary() -> None:
     """The target stays a step ahead of where the arm is, as that of a stick that is held."""
     chart = oc.charts.load("panda-wide")
     robot, q = chart.problem.robot, chart.problem.domain.centre
-    tracker, x = chart.tracker(q, 0.01 * robot.velocity_limits, nearest=True), chart.task(q)
+    tracker, x = chart.tracker(q, 0.01 * robot.velocity_limits, nearest=True), chart.x(q)
     path = []
     for _ in range(1200):
         xi = chart.xi(tracker.q) + 0.01

@@ -20,7 +20,7 @@ LIMITS = ("--velocity-limit", "1,1.5,2", "--acceleration-limit", "4")
 
 def waypoints(chart: oc.Chart) -> np.ndarray:
     angle = np.linspace(0, 2 * np.pi, 20)
-    return chart.task(chart.problem.domain.centre) + 0.05 * np.column_stack([np.cos(angle) - 1, np.sin(angle)])
+    return chart.x(chart.problem.domain.centre) + 0.05 * np.column_stack([np.cos(angle) - 1, np.sin(angle)])
 
 
 @pytest.fixture

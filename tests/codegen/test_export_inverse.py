@@ -146,10 +146,10 @@ def test_poses_beyond_half_a_turn(tmp_path: Path) -> None:
     chart = pose()
     module, rng = module_of(chart, "numpy", tmp_path), np.random.default_rng(2)
     points = sample_uniform(chart.problem.domain, 20_000, 5)
-    angle = np.linalg.norm(chart.task(points)[:, 3:], axis=1)
+    angle = np.linalg.norm(chart.x(points)[:, 3:], axis=1)
     points = points[np.argsort(-angle)[:100]]
     starts = points + 0.05 * rng.uniform(-1, 1, points.shape)
-    jumped = np.abs(chart.task(points) - chart.task(starts))[:, 3:].max(axis=1)
+    jumped = np.abs(chart.x(points) - chart.x(starts))[:, 3:].max(axis=1)
     assert (jumped > 1.0).sum() > 10
     q, status = module.inverse(chart.phi(points), starts)
     np.testing.assert_array_equal(status, FOUND)

@@ -37,7 +37,7 @@ def wishes_of(chart: oc.Chart, count: int = 300, away: float = 0.3) -> tuple[Arr
     wishes = sample_uniform(domain, count, 3)
     others = wishes + away * domain.half_width * rng.uniform(-1, 1, wishes.shape)
     kept = domain.contains(others)
-    return wishes[kept], chart.task(others[kept])
+    return wishes[kept], chart.x(others[kept])
 
 
 def missed(chart: oc.Chart, wishes: Array, x: Array, q: Array) -> tuple[Array, Array]:
@@ -56,7 +56,7 @@ def something_nearer_around(chart: oc.Chart, wish: Array, x: Array, q: Array) ->
         J = chart.parts.relative.batched_rates(points)[0].reshape(-1, m, chart.n)
         step = (
             np.linalg.pinv(J)
-            @ chart.parts.relative.difference(np.tile(x, (len(points), 1)), chart.task(points))[:, :, None]
+            @ chart.parts.relative.difference(np.tile(x, (len(points), 1)), chart.x(points))[:, :, None]
         )
         points = points + step[:, :, 0]
     points = points[domain.contains(points)]
@@ -108,13 +108,13 @@ def test_scipy_finds_nothing_nearer(tmp_path: Path, name: str) -> None:
                 bounds=list(zip(*domain.bounds, strict=True)),
                 constraints={
                     "type": "eq",
-                    "fun": lambda q, k=k: chart.task(q) - x[k],
+                    "fun": lambda q, k=k: chart.x(q) - x[k],
                     "jac": lambda q: chart.jacobian(q)[: chart.m],
                 },
                 method="SLSQP",
                 options={"ftol": 1e-14, "maxiter": 200},
             )
-            feasible = np.abs(chart.task(found.x) - x[k]).max() < 1e-9
+            feasible = np.abs(chart.x(found.x) - x[k]).max() < 1e-9
             assert not feasible or np.sqrt(found.fun) > at - 1e-6
 
 
@@ -192,7 +192,7 @@ def test_single_precision_stays(tmp_path: Path, library: str) -> None:
 def test_rows_that_are_not_finite_and_other_shapes(tmp_path: Path) -> None:
     chart = fitted().chart
     module, centre = module_of(chart, "numpy", tmp_path), planar().domain.centre
-    x = chart.task(centre)
+    x = chart.x(centre)
     q, status = module.nearest_xi(np.vstack([centre, centre, centre * np.nan]), np.vstack([x, x * np.nan, x]))
     assert status.tolist() == [FOUND, BAD_INPUT, BAD_INPUT]
     assert np.isnan(q[1:]).all()
@@ -209,6 +209,6 @@ def test_wishes_beyond_the_box_count_at_its_face(tmp_path: Path) -> None:
     chart = fitted().chart
     module, domain = module_of(chart, "numpy", tmp_path), chart.problem.domain
     far, face = domain.centre + 3 * domain.half_width, domain.centre + domain.half_width
-    x = chart.task(domain.centre + 0.9 * domain.half_width)
+    x = chart.x(domain.centre + 0.9 * domain.half_width)
     np.testing.assert_array_equal(module.nearest_xi(far, x)[0], module.nearest_xi(face, x)[0])
     assert chart.nearest_xi(far, x).status[0] == InverseStatus(int(module.nearest_xi(far, x)[1]))

@@ -144,14 +144,14 @@ def test_compiled_curves_are_as_near(name: str, tmp_path: Path) -> None:
     others = {"a joint without boundaries": wide, "an angle": exact}
     chart = others[name]().chart if name in others else oc.charts.load(name)
     domain = chart.problem.domain
-    wishes, x = sample_uniform(domain, 200, 5), chart.task(sample_uniform(domain, 200, 6))
+    wishes, x = sample_uniform(domain, 200, 5), chart.x(sample_uniform(domain, 200, 6))
     mine, theirs = chart.nearest_xi(wishes, x), oc.compile_inverse(chart, tmp_path).nearest_xi(wishes, x)
     assert {FOUND, oc.InverseStatus.NEAREST} <= set(theirs.statuses)
     np.testing.assert_array_equal(theirs.status, mine.status)
     np.testing.assert_allclose(theirs.distance, mine.distance, atol=1e-8)
     ended = theirs.status <= oc.InverseStatus.NEAREST
     assert domain.contains(theirs.q[ended]).all()
-    np.testing.assert_allclose(chart.parts.relative.difference(x, chart.task(theirs.q))[ended], 0, atol=1e-8)
+    np.testing.assert_allclose(chart.parts.relative.difference(x, chart.x(theirs.q))[ended], 0, atol=1e-8)
     away = np.abs(wrap_shortest(chart.xi(theirs.q) - chart.xi(wishes), chart.parts.turns[chart.m :]))[:, 0]
     np.testing.assert_allclose(away[ended], theirs.distance[ended], atol=1e-9)
 
@@ -162,7 +162,7 @@ def test_compiled_c_finds_what_random_starts_find(tmp_path: Path) -> None:
     """The nearest xi of xarm7-wide, whose joints turn twice, against 4,000 starts of damped least squares a row."""
     chart = oc.charts.load("xarm7-wide")
     domain, count = chart.problem.domain, 16
-    wishes, x = sample_uniform(domain, count, 1), chart.task(sample_uniform(domain, count, 2))
+    wishes, x = sample_uniform(domain, count, 1), chart.x(sample_uniform(domain, count, 2))
     near, pool = oc.compile_inverse(chart, tmp_path).nearest_xi(wishes, x), sample_uniform(domain, STARTS, 3)
     for k in range(count):
         others = positions_at(chart, x[k], pool)

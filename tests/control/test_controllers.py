@@ -221,11 +221,11 @@ def test_projector_equals_equations_2_and_3(model: pin.Model, metric: str) -> No
     s = State.random(chart, model)
     A = np.eye(7) if metric == "euclidean" else s.M
     J = chart.jacobian(s.q)[:3]
-    x_d, q_d = chart.task(s.q) + 0.05, s.q + 0.1 * RNG.normal(size=7)
+    x_d, q_d = chart.x(s.q) + 0.05, s.q + 0.1 * RNG.normal(size=7)
     M_x = np.linalg.inv(J @ np.linalg.solve(s.M, J.T))
     D_x = 2 * 0.6 * np.sqrt(300.0) * sqrtm(M_x).real
     half = sqrtm(s.M).real @ np.diag(0.6 * np.sqrt(np.linspace(5, 20, 7)))
-    f_x = -300.0 * (chart.task(s.q) - x_d) - D_x @ J @ s.dq
+    f_x = -300.0 * (chart.x(s.q) - x_d) - D_x @ J @ s.dq
     posture = -np.linspace(5, 20, 7) * (s.q - q_d) - (half + half.T) @ s.dq
     sharp = np.linalg.solve(A, J.T) @ np.linalg.inv(J @ np.linalg.solve(A, J.T))
     P = np.eye(7) - sharp @ J

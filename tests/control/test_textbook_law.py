@@ -24,6 +24,6 @@ def test_textbook_law_gives_the_task_the_commanded_acceleration_whatever_the_pos
     dq, task, posture = rng.normal(size=3), rng.normal(size=(3, 2)), rng.normal(size=(2, 3))
     ddq = problem.robot.forward_dynamics(q, dq, law.command(q, dq, task, posture))
     h = 1e-4  # the motion q + t dq + t^2/2 ddq, by central differences
-    before, now, after = (chart.task(q + t * dq + t**2 / 2 * ddq) for t in (-h, 0.0, h))
+    before, now, after = (chart.x(q + t * dq + t**2 / 2 * ddq) for t in (-h, 0.0, h))
     wanted = task[2] + 7.0 * (task[1] - (after - before) / (2 * h)) + 25.0 * (task[0] - now)
     np.testing.assert_allclose((after - 2 * now + before) / h**2, wanted, rtol=1e-5, atol=1e-5)

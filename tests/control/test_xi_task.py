@@ -117,7 +117,7 @@ def kept(solve: Any, chart: oc.Chart, start: Array) -> tuple[float, float]:
         q = solve(shift)
         errors.append(
             (
-                np.abs(chart.task(q)[:3] - chart.task(start)[:3] - shift).max(),
+                np.abs(chart.x(q)[:3] - chart.x(start)[:3] - shift).max(),
                 np.abs(chart.xi(q) - chart.xi(start)).max(),
             )
         )

@@ -134,7 +134,7 @@ def test_files_solutions_and_c_of_a_swivel(tmp_path: Path) -> None:
     assert again.parts.named_coordinates == ("xi1: swivel [rad]",)
     found = again.solve(chart.phi(q))
     assert (found.status == oc.InverseStatus.FOUND).all()
-    np.testing.assert_allclose(chart.task(found.q), chart.task(q), atol=1e-8)
+    np.testing.assert_allclose(chart.x(found.q), chart.x(q), atol=1e-8)
     law = control.PDPlus.on_chart(chart)
     checked = check_c(oc.generate_c(chart, tmp_path / "c", law, "arm"), chart, law, 200)
     assert max(checked.differences.values()) < 1e-12

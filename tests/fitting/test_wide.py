@@ -301,7 +301,7 @@ def test_a_hand_that_rolls_moves_no_other_joint_and_closes_its_turns() -> None:
     q = np.array(chart.problem.domain.centre)
     tracker, xi = chart.tracker(q), chart.xi(q)
     for angle in np.linspace(0.0, np.pi / 2, 60):
-        reached = tracker.step(np.concatenate([chart.task(q + angle * roll), xi]))
+        reached = tracker.step(np.concatenate([chart.x(q + angle * roll), xi]))
         assert tracker.status.name == "OK"
         np.testing.assert_allclose(reached, q + angle * roll, atol=1e-9)
     q = sample_uniform(chart.problem.domain, 200, 4)

@@ -43,9 +43,9 @@ CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
 }
 
 READERS = {  #: functions that read files, by module and name, with the campaign that gives them mutants
-    "charts.chart.load": "charts",
+    "charts.chart.load_file": "charts",
     "charts.chart_file.read_chart": "charts",
-    "charts.ready.load": "calls",
+    "charts.ready.load": "charts",
     "codegen.compiled.load_library": "libraries",
     "paths.tool_path.read_path": "paths",
     "tasks.corridor.read_postures": "postures",

@@ -234,7 +234,7 @@ def _files() -> Path:
     steps = [{"time": 0.1, "move": {"x": 0.01}}]
     plan = json.dumps({"start": start, "duration": 0.2, "steps": steps})
     (folder / "steps.json").write_text(plan)
-    x = float(chart.task(chart.problem.domain.centre)[0])
+    x = float(chart.x(chart.problem.domain.centre)[0])
     (folder / "postures.csv").write_text("q1,q2,q3\n0,0.6,0.8\n0.1,0.8,0.8\n")
     joint_motion().save_csv(folder / "q.csv")
     (folder / "path.csv").write_text(f"x\n{x}\n{x + 0.02}\n{x}\n")

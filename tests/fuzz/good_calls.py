@@ -84,7 +84,7 @@ def _searches() -> dict[str, Call]:
             oc.fit_wide,
             {"robot": robot, "task": task, "branch": problem.domain, "like": "q1", "exact": True},
         ),
-        "chart.nearest_xi": (chart.nearest_xi, {"q_wish": q, "x": chart.task(q), "tolerance": 1e-9}),
+        "chart.nearest_xi": (chart.nearest_xi, {"q_wish": q, "x": chart.x(q), "tolerance": 1e-9}),
         "chart_along": (oc.chart_along, {"problem": problem, "postures": [q, q + 0.1], "radius": 0.2}),
         "compile_inverse": (oc.compile_inverse, {"chart": chart, "folder": "kept"}),
         **(
@@ -92,7 +92,7 @@ def _searches() -> dict[str, Call]:
                 "CompiledInverse.solve": (compiled().solve, {"phi": compiled().chart.phi(q), "tolerance": 1e-9}),
                 "CompiledInverse.nearest_xi": (
                     compiled().nearest_xi,
-                    {"q_wish": q, "x": compiled().chart.task(q), "tolerance": 1e-9},
+                    {"q_wish": q, "x": compiled().chart.x(q), "tolerance": 1e-9},
                 ),
             }
             if HAS_COMPILER
@@ -134,7 +134,7 @@ def _physics() -> dict[str, Call]:
 def _views() -> dict[str, Call]:
     """What opens pages, and what stands behind them."""
     chart, q = fitted().chart, planar().domain.centre
-    x = chart.task(q)
+    x = chart.x(q)
     session = Session(chart)
     return {
         "view": (
@@ -246,6 +246,12 @@ def _makers() -> dict[str, Call]:
         ),
         "Task.centre_of_mass": (oc.Task.centre_of_mass, {"robot": robot, "axes": "x"}),
         "Task.pointing": (oc.Task.pointing, {"robot": robot, "camera": "tip", "target": q, "axis": "x"}),
+        "robot.pose": (robot.pose, {"q": q, "frame": "tip"}),
+        "robot.jacobian": (robot.jacobian, {"q": q, "frame": "tip"}),
+        "robot.sample": (robot.sample, {"count": 3, "seed": 0}),
+        "domain.sample": (planar().domain.sample, {"count": 3, "seed": 0}),
+        "task": (planar().task, {"q": q}),
+        "task.target": (planar().task.target, {"pose": np.eye(4)}),
         "robot.frame_position": (robot.frame_position, {"q": q, "frame": "tip", "relative_to": "tip"}),
         "robot.frame_function": (
             robot.frame_function,
@@ -269,6 +275,16 @@ def _functions() -> dict[str, Call]:
     symbol = ca.SX.sym("q", 3)
     box = {"problem": problem, "parametrisation": oc.Polynomial(1)}
     return {
+        "fit of a robot": (
+            oc.fit,
+            {
+                "problem": problem.robot,
+                "task": problem.task,
+                "parametrisation": oc.Linear(),
+                "metric": "euclidean",
+                "domain": problem.domain,
+            },
+        ),
         "fit": (
             oc.fit,
             {
@@ -321,7 +337,7 @@ def _functions() -> dict[str, Call]:
         "jumps": (jumps, {"chart": circle(), "radius": 0.02}),
         "lie_bracket": (lie_bracket, {"f": symbol, "g": symbol**2, "q": symbol}),
         "load": (oc.load, {"path": "no.orthocas"}),
-        "charts.load": (oc.charts.load, {"name": "ur5-position"}),
+        "charts.load": (oc.charts.load, {"path": "ur5-position"}),
         "charts.card": (oc.charts.card, {"name": "ur5-position"}),
         "loss": (loss, {**box, "weights": (1, 1), "samples": 20, "seed": 0, "start": None}),
         "compare": (
@@ -399,7 +415,7 @@ def _methods() -> dict[str, Call]:
         ),
         "follow by objective": (
             oc.follow,
-            {"chart": chart, "tool_path": chart.task([q, q + 0.05]), "xi": "objective", "velocity_limits": 1.0},
+            {"chart": chart, "tool_path": chart.x([q, q + 0.05]), "xi": "objective", "velocity_limits": 1.0},
         ),
         "motion.save_csv": (joint_motion().save_csv, {"path": "motion.csv"}),
         "Sphere": (oc.obstacles.Sphere, {"centre": q, "radius": 0.1}),
@@ -407,6 +423,8 @@ def _methods() -> dict[str, Call]:
         "Plane": (oc.obstacles.Plane, {"normal": q, "point": q}),
         "LinkDistances": (oc.obstacles.LinkDistances, {"robot": robot, "obstacles": [], "radius": 0.1}),
         "distances": (link_distances(), {"q": q}),
+        "chart.manipulability": (chart.manipulability, {"q": q}),
+        "chart.solve x": (chart.solve, {"x": chart.x(q), "xi": chart.xi(q), "q_start": q}),
         "chart.xi_range": (chart.xi_range, {"q": q}),
         "chart.self_motion": (chart.self_motion, {"q": q, "samples": 20}),
         "curve of self_motion": (clear().self_motion, {"q": clear().problem.domain.centre, "step": 0.1}),

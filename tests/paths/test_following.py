@@ -41,7 +41,7 @@ def iiwa() -> oc.Chart:
 
 def loop(chart: oc.Chart, radius: float, waypoints: int = 60) -> Array:
     """A closed circle of the tool in the first and the last task component, from the centre of the domain."""
-    angle, x = np.linspace(0, 2 * np.pi, waypoints), chart.task(chart.problem.domain.centre)
+    angle, x = np.linspace(0, 2 * np.pi, waypoints), chart.x(chart.problem.domain.centre)
     path = np.tile(x, (waypoints, 1))
     path[:, 0] += radius * (np.cos(angle) - 1)
     path[:, -1] += radius * np.sin(angle)
@@ -57,7 +57,7 @@ def motion() -> JointMotion:
 @pytest.mark.slow
 def test_tool_and_coordinates_are_where_they_should_be() -> None:
     found, chart = motion(), planar()
-    np.testing.assert_allclose(chart.task(found.q), found.x, atol=1e-9)
+    np.testing.assert_allclose(chart.x(found.q), found.x, atol=1e-9)
     np.testing.assert_allclose(chart.xi(found.q), found.xi, atol=1e-9)
     np.testing.assert_allclose(found.xi, np.tile(chart.xi(START), (len(found.q), 1)), atol=1e-12)
     centre, x = loop(chart, 0.15)[0] - [0.15, 0.0], found.x
@@ -88,7 +88,7 @@ def test_rates_are_finite_differences_of_positions() -> None:
 def test_limits_are_kept_in_corners() -> None:
     """A zigzag of straight lines, at periods that miss the corners and at one that sees them."""
     chart = planar()
-    corners = chart.task(START) + np.array([[0.0, 0.0], [0.0, 0.1], [-0.1, 0.1], [-0.1, 0.0], [-0.2, 0.0], [-0.2, 0.1]])
+    corners = chart.x(START) + np.array([[0.0, 0.0], [0.0, 0.1], [-0.1, 0.1], [-0.1, 0.0], [-0.2, 0.0], [-0.2, 0.1]])
     path = np.vstack([np.linspace(a, b, 20, endpoint=False) for a, b in pairwise(corners)])
     seconds = []
     for period in (0.05, 0.001):
@@ -143,7 +143,7 @@ def test_schedules_go_through_their_values() -> None:
 
 def test_functions_of_s_are_followed() -> None:
     chart = planar()
-    x, xi = chart.task(START), chart.xi(START)
+    x, xi = chart.x(START), chart.xi(START)
     found = oc.follow(
         chart,
         lambda s: x + np.array([0.1 * np.sin(2 * np.pi * s), 0.05 * s]),
@@ -166,13 +166,13 @@ def test_start_settles_the_coordinates() -> None:
 @pytest.mark.slow
 def test_objective_keeps_away_from_boundaries() -> None:
     chart, q = planar(), START + np.array([0.4, -0.5, 0.4])
-    path = chart.task(q) + loop(chart, 0.1) - loop(chart, 0.1)[0]
+    path = chart.x(q) + loop(chart, 0.1) - loop(chart, 0.1)[0]
     held = oc.follow(chart, path, q_start=q, velocity_limits=1.0)
     chosen = oc.follow(chart, path, "objective", q_start=q, velocity_limits=1.0)
     assert chosen.closed
     np.testing.assert_allclose(chosen.q[-1], chosen.q[0], atol=1e-9)
     assert chosen.margins.boundary > held.margins.boundary + 0.1
-    np.testing.assert_allclose(chart.task(chosen.q), chosen.x, atol=1e-9)
+    np.testing.assert_allclose(chart.x(chosen.q), chosen.x, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -189,7 +189,7 @@ def test_objective_finds_a_way_where_holding_leaves_the_domain(offset: list[floa
 def test_walk_stays_on_the_path_and_inside() -> None:
     chart, limits, x = planar(), _limits(planar()), loop(planar(), 0.3)
     q = walk(chart, Costs(limits), x, START + np.array([0.4, -0.5, 0.4]))
-    assert np.abs(chart.task(q)[1:] - x[1:]).max() < 1e-3
+    assert np.abs(chart.x(q)[1:] - x[1:]).max() < 1e-3
     assert chart.problem.domain.contains(q).all()
 
 
@@ -214,7 +214,7 @@ def test_objective_is_that_of_ipopt() -> None:
     """The second method: the same problem with q and the spline as unknowns, costs in CasADi, by Ipopt."""
     chart, limits = planar(), _limits(planar())
     other = START + np.array([0.3, -0.4, 0.3])
-    path = ToolPath.hold(chart, chart.task(other) + loop(chart, 0.1) - loop(chart, 0.1)[0], chart.xi(other))
+    path = ToolPath.hold(chart, chart.x(other) + loop(chart, 0.1) - loop(chart, 0.1)[0], chart.xi(other))
     curve = JointCurve.trace(solver := PhiSolver(chart), path.phi, other)
     assert isinstance(curve, JointCurve)
     choice = XiChoice(path, Costs(limits), solver)
@@ -278,10 +278,10 @@ def test_pose_paths() -> None:
     known = problems.get("iiwa")
     problem = oc.Problem(known.robot, oc.Task.pose(known.robot), domain=oc.Box(known.domain.centre, 0.5))
     chart = oc.fit(problem, oc.Polynomial(2)).chart
-    x = chart.task(problem.domain.centre)
+    x = chart.x(problem.domain.centre)
     path = x + np.linspace(0, 1, 15)[:, None] * np.array([0.03, -0.02, 0.02, 0.05, 0.1, 0.0])
     found = oc.follow(chart, path)
-    np.testing.assert_allclose(chart.task(found.q[-1]), path[-1], atol=1e-9)
+    np.testing.assert_allclose(chart.x(found.q[-1]), path[-1], atol=1e-9)
     np.testing.assert_allclose(found.xi, 0 * found.xi + chart.xi(problem.domain.centre), atol=1e-9)
 
 
@@ -295,11 +295,11 @@ def test_paths_that_leave_the_reach_are_told_where_and_why() -> None:
     assert "of 0 to 59" in text
     assert "it leaves the domain, stopped by joint 'q" in text
     assert "just before, the coordinates reach xi1 in [" in text
-    far = chart.task(START) + np.linspace(0, 1, 5)[:, None] * np.array([3.0, 0.0])
+    far = chart.x(START) + np.linspace(0, 1, 5)[:, None] * np.array([3.0, 0.0])
     with pytest.raises(PathError, match="of 0 to 4"):
         oc.follow(chart, far, velocity_limits=1.0)
     with pytest.raises(PathError, match=r"at s = 0\.\d+ \(x = "):
-        oc.follow(chart, lambda s: chart.task(START) + np.array([2 * s, 0.0]), velocity_limits=1.0)
+        oc.follow(chart, lambda s: chart.x(START) + np.array([2 * s, 0.0]), velocity_limits=1.0)
     with pytest.raises(PathError, match="at waypoint 0 of 0 to 4"):
         oc.follow(chart, far + 10, velocity_limits=1.0)
 
@@ -364,9 +364,9 @@ def test_two_arms_follow_a_path_of_their_relative_pose() -> None:
     home = np.array([0.3, -0.4, -0.5, 1.2, 0.2, 0.8, 0.1, -0.3, -0.4, 0.5, 1.2, -0.2, 0.8, -0.1])
     task = oc.Task.relative_pose(robot, *tips)
     chart = oc.fit(oc.Problem(robot, task, domain=oc.Box(home, 0.3)), oc.Polynomial(2)).chart
-    path = chart.task(home) + np.linspace(0, 1, 10)[:, None] * [0.03, 0.02, 0, 0, 0, 0]
+    path = chart.x(home) + np.linspace(0, 1, 10)[:, None] * [0.03, 0.02, 0, 0, 0, 0]
     floor = oc.obstacles.Plane([0, 0, 1], [0, 0, -1.0])
     motion = oc.follow(chart, path, q_start=home, obstacles=[floor])
-    np.testing.assert_allclose(chart.task(motion.q), motion.x, atol=1e-9)
+    np.testing.assert_allclose(chart.x(motion.q), motion.x, atol=1e-9)
     np.testing.assert_allclose(motion.x[-1], path[-1], atol=1e-9)
     assert len(oc.obstacles.LinkDistances(robot, [floor]).pairs) == robot.n

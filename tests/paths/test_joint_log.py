@@ -46,7 +46,7 @@ def test_broken_logs_name_file_and_line(text: str, message: str, chart: oc.Chart
 @pytest.mark.slow
 def test_what_follow_writes_is_drawn_as_a_log(chart: oc.Chart, run_paper: Run) -> None:
     """The chart's coordinates of the log are those that were held, and the tool comes back."""
-    start = chart.task(chart.problem.domain.centre)
+    start = chart.x(chart.problem.domain.centre)
     angle = np.linspace(0, 2 * np.pi, 30)
     circle = start + 0.05 * np.column_stack([np.cos(angle) - 1, np.sin(angle)])
     oc.follow(chart, circle, velocity_limits=1.0).save_csv("joints.csv")

@@ -211,7 +211,7 @@ def certificate() -> Certificate:
 
 @cache
 def joint_motion() -> paths.JointMotion:
-    x = fitted().chart.task(planar().domain.centre)
+    x = fitted().chart.x(planar().domain.centre)
     return oc.follow(fitted().chart, [x, x + 0.05, x], velocity_limits=1.0, period=0.05)
 
 
@@ -394,7 +394,7 @@ def _of_chart(chart: oc.Chart) -> Iterator[Any]:
 @_numbers.register
 def _of_compiled(inverse: CompiledInverse) -> Iterator[Any]:
     q = points_of(inverse.chart)
-    x, wishes = inverse.chart.task(q), q[::-1] + 2.0
+    x, wishes = inverse.chart.x(q), q[::-1] + 2.0
     for solutions in (inverse.solve(inverse.chart.phi(q)), inverse.nearest_xi(wishes, x)):
         yield from (solutions.q, solutions.status)
 

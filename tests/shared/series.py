@@ -67,7 +67,7 @@ def calls_of_compiled() -> list[Call]:
     """Both searches of a compiled inverse: near starts, and along self-motion curves."""
     inverse = copy.deepcopy(compiled())
     q = points_of(inverse.chart)
-    phi, x = inverse.chart.phi(q), inverse.chart.task(q)
+    phi, x = inverse.chart.phi(q), inverse.chart.x(q)
     return [lambda k: inverse.solve(phi[k % 6 :]).q, lambda k: inverse.nearest_xi(q[::-1] + 2.0, x[k % 6]).q]
 
 

@@ -167,7 +167,7 @@ def test_self_motions_stay_inside_and_keep_x(kind: str, axes: str) -> None:
         motion = chart.self_motion(q, samples=60)
         assert len(motion.q) > 4
         assert chart.problem.domain.contains(motion.q).all()
-        np.testing.assert_allclose(chart.task(motion.q), np.tile(chart.task(q), (len(motion.q), 1)), atol=1e-9)
+        np.testing.assert_allclose(chart.x(motion.q), np.tile(chart.x(q), (len(motion.q), 1)), atol=1e-9)
         kinds = {part.low_stop.kind for part in motion.extent} | {part.high_stop.kind for part in motion.extent}
         assert kinds <= ENDS[kind] | FOLDS
 
@@ -218,13 +218,13 @@ def test_statuses_of_the_inverse_say_where_q_lies(kind: str, axes: str) -> None:
 def test_nearest_xi_is_no_farther_than_a_known_position(kind: str, axes: str) -> None:
     chart = chart_of(kind, axes)
     own, wish = starts_of(chart, 24), starts_of(chart, 24)[::-1]
-    near = chart.nearest_xi(wish, chart.task(own))
+    near = chart.nearest_xi(wish, chart.x(own))
     assert (near.status <= NEAREST).all()
     assert chart.problem.domain.contains(near.q).all()
-    np.testing.assert_allclose(chart.task(near.q), chart.task(own), atol=1e-8)
+    np.testing.assert_allclose(chart.x(near.q), chart.x(own), atol=1e-8)
     apart = chart.parts.phi_map.difference(chart.phi(wish), chart.phi(own))[:, chart.m :]
     assert (near.distance <= np.linalg.norm(apart, axis=1) + 1e-9).all()
-    assert (chart.nearest_xi(np.tile(CENTRE, (24, 1)), chart.task(own)).status <= NEAREST).all()
+    assert (chart.nearest_xi(np.tile(CENTRE, (24, 1)), chart.x(own)).status <= NEAREST).all()
 
 
 @CHARTS
@@ -236,11 +236,11 @@ def test_poses_that_only_singular_positions_have_are_said_to_lie_outside(kind: s
     stretched = np.random.default_rng(2).uniform(-0.04, 0.04, (8, 3))
     assert not domain.contains(stretched).any()
     for wish in (stretched, np.tile(CENTRE, (8, 1))):
-        near = chart.nearest_xi(wish, chart.task(stretched))
+        near = chart.nearest_xi(wish, chart.x(stretched))
         assert (near.status == oc.InverseStatus.OUTSIDE_DOMAIN).all()
         assert not domain.contains(near.q).any()
         assert (np.abs(near.q - domain.centre) <= domain.half_width + 1e-9).all()
-        np.testing.assert_allclose(chart.task(near.q), chart.task(stretched), atol=1e-8)
+        np.testing.assert_allclose(chart.x(near.q), chart.x(stretched), atol=1e-8)
         assert near.error.max() < 1e-9
         apart = np.linalg.norm(chart.xi(near.q) - chart.xi(wish), axis=1)
         np.testing.assert_allclose(near.distance, apart, atol=1e-9)

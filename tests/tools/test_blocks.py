@@ -69,7 +69,7 @@ def test_many_rows_are_those_of_the_expression(name: str) -> None:
         assert values.shape == single.shape
         np.testing.assert_allclose(values, single, rtol=0, atol=1e-13 * np.abs(single).max())
     np.testing.assert_array_equal(chart.xi(points), chart.phi(points)[:, chart.m :])
-    np.testing.assert_array_equal(chart.task(points), chart.phi(points)[:, : chart.m])
+    np.testing.assert_array_equal(chart.x(points), chart.phi(points)[:, : chart.m])
 
 
 def test_memory_does_not_grow_with_the_table_of_the_basis() -> None:

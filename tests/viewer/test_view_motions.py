@@ -55,7 +55,7 @@ def test_constant_coordinates_return_and_the_pseudo_inverse_drifts(iiwa_fit: Fit
     chart = iiwa_fit.chart
     ours, theirs = cyclic_motions(chart, cycles=2)
     for motion in (ours, theirs):
-        x = chart.task(motion.q)
+        x = chart.x(motion.q)
         assert np.abs(x - ours.values).max() < 1e-6  # both tools are on the path
         assert np.ptp(x, axis=0)[:2].min() > 0.1
     assert [k for k, _ in ours.returns(ours.duration)] == [1, 2]
@@ -64,8 +64,8 @@ def test_constant_coordinates_return_and_the_pseudo_inverse_drifts(iiwa_fit: Fit
     assert ours.returns(1.0) == []
     assert np.abs(chart.xi(ours.q) - chart.xi(ours.q[0])).max() < 1e-8
     with pytest.raises(PathError, match="not closed"):
-        cyclic_motions(chart, chart.task(chart.problem.domain.centre) + np.eye(3))
-    far = chart.task(chart.problem.domain.centre) + 3 * np.array([[0, 0, 0], [1, 0, 0], [0, 0, 0]])
+        cyclic_motions(chart, chart.x(chart.problem.domain.centre) + np.eye(3))
+    far = chart.x(chart.problem.domain.centre) + 3 * np.array([[0, 0, 0], [1, 0, 0], [0, 0, 0]])
     with pytest.raises(PathError, match="with constant xi from point"):
         cyclic_motions(chart, far)
 

@@ -47,7 +47,7 @@ def test_handle_sweep_undo_and_home(build: Callable[[], oc.Chart]) -> None:
         for phase in ("start", "update", "end"):
             asyncio.run(page._handle._impl_aux.update_cb[0](SimpleNamespace(target=page._handle, phase=phase)))
         wait(lambda: not page._undo.disabled and not page._gesture)
-        np.testing.assert_allclose(chart.task(session.q) - chart.task(home), 0.02, atol=1e-9)
+        np.testing.assert_allclose(chart.x(session.q) - chart.x(home), 0.02, atol=1e-9)
         np.testing.assert_allclose(chart.xi(session.q), chart.xi(home), atol=1e-9)
         np.testing.assert_allclose(page._handle.position, robot.tip_position(session.q), atol=1e-9)
         before = session.q
@@ -55,7 +55,7 @@ def test_handle_sweep_undo_and_home(build: Callable[[], oc.Chart]) -> None:
         wait(lambda: bool(np.abs(session.q - before).max() > 0.02))
         press(page._sweep)
         wait(lambda: page._sweep.label == "Sweep" and not page._gesture)
-        assert np.abs(chart.task(session.q) - chart.task(before)).max() < 1e-9
+        assert np.abs(chart.x(session.q) - chart.x(before)).max() < 1e-9
         press(page._undo)
         wait(lambda: bool((session.q == before).all()))
         press(page._undo)

@@ -15,12 +15,12 @@ from orthocas.viewer.session import Session
 
 def test_a_coordinate_moves_the_joints_and_holds_the_task(iiwa_fit: Fit) -> None:
     session = Session(iiwa_fit.chart)
-    x, q = iiwa_fit.chart.task(session.q), session.q
+    x, q = iiwa_fit.chart.x(session.q), session.q
     session.wish({"xi2": float(iiwa_fit.chart.xi(q)[1]) + 0.2})
     assert session.follow()
     moved = session.readings
     assert np.abs(session.q - q).max() > 0.05
-    assert np.abs(iiwa_fit.chart.task(session.q) - x).max() < 1e-9
+    assert np.abs(iiwa_fit.chart.x(session.q) - x).max() < 1e-9
     assert (moved.drift < 1e-9).all()
     np.testing.assert_allclose(moved.xi - iiwa_fit.chart.xi(q), [0, 0.2, 0, 0], atol=1e-9)
     assert moved.stop == ""
@@ -39,7 +39,7 @@ def test_a_wish_out_of_reach_ends_at_the_boundary_and_tells_the_joint() -> None:
     chart = fitted().chart
     session = Session(chart)
     reach = chart.xi_range(session.home)["xi1"]
-    x = chart.task(session.home)
+    x = chart.x(session.home)
     session.wish({"xi1": reach.high + 5})
     session.follow()
     readings = session.readings
@@ -47,7 +47,7 @@ def test_a_wish_out_of_reach_ends_at_the_boundary_and_tells_the_joint() -> None:
     assert readings.stop == f"joint '{stop.joint}' at {np.degrees(stop.value):.1f}°, the boundary of the domain"
     assert 0 <= reach.high - readings.xi[0] < 1e-2
     assert chart.problem.domain.contains(session.q)
-    assert np.abs(chart.task(session.q) - x).max() < 1e-9
+    assert np.abs(chart.x(session.q) - x).max() < 1e-9
     session.wish({"xi1": reach.here})
     assert session.follow()
     np.testing.assert_allclose(session.q, session.home, atol=1e-8)
@@ -87,7 +87,7 @@ def test_fans_reach_as_far_as_the_ranges_say(build: Callable[[], oc.Chart]) -> N
     home = chart.problem.domain.centre
     for k, reach in enumerate(chart.xi_range(home)):
         fan = fan_along(chart, home, k)
-        assert np.abs(chart.task(fan.q) - chart.task(home)).max() < 1e-8
+        assert np.abs(chart.x(fan.q) - chart.x(home)).max() < 1e-8
         if np.isfinite([reach.low, reach.high]).all():
             np.testing.assert_allclose([fan.xi[0], fan.xi[-1]], [reach.low, reach.high], atol=1e-9)
             assert (np.diff(fan.xi) > 0).all()
