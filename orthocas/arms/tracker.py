@@ -210,7 +210,7 @@ class ArmTracker(Shown):
                 self._ticks, self._goal = 0, None
                 self.status = TrackStatus.OK
                 return self._q.copy()
-        aim = targets.read(vector)[0][0] if target is None else target
+        aim = targets.build(np.asarray(vector)[None])[0] if target is None else target
         rests = self.status == TrackStatus.NEAREST and np.array_equal(aim, self._to)
         self._to[:] = aim
         if not rests or self._ticks % self._patience == 0:  # what rests would rest again
