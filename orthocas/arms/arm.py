@@ -109,7 +109,7 @@ class Arm(Shown):
 
     Example:
         >>> import orthocas as oc
-        >>> robot = oc.charts.load("panda-wide").problem.robot
+        >>> robot = oc.load("panda-wide").problem.robot
         >>> arm = oc.Arm(oc.Task.pose(robot))
         >>> motions = arm.self_motion(arm.x([0.3, 0.4, 0.1, -1.9, 0.2, 2.2, 0.5]))
         >>> len(motions), [str(stop) for stop in motions.components[0].ends][0]

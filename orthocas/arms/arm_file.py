@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from orthocas.charts.chart import Chart, load
+from orthocas.charts.chart import Chart, load_file
 from orthocas.errors import ChartFileError
 from orthocas.tools.archive import Kind, read_archive, require_free, write_archive
 from orthocas.tools.files import open_draft_folder, write_temporary
@@ -47,7 +47,7 @@ def read_charts(path: Path) -> tuple[Chart, ...]:
                 raise ChartFileError(f"{path} has no chart {k}, expected {count} of them")
             write_temporary(drafts / f"{k}.orthocas", content.tobytes())
             try:
-                charts.append(load(drafts / f"{k}.orthocas"))
+                charts.append(load_file(drafts / f"{k}.orthocas"))
             except ChartFileError as error:
                 text = str(error).replace(str(drafts / f"{k}.orthocas"), f"chart {k} of {path}")
                 raise ChartFileError(text) from None
