@@ -93,8 +93,11 @@ def evaluate_cubic(
 class Kernel(Protocol):
     """What finds curves and corrects points on them."""
 
-    def find_curves(self, target: Array, starts: Array) -> list[Curve]:
-        """All curves of a target that starts (S, n) lead to, with their crossings of limits."""
+    def find_curves(self, target: Array, starts: Array, patience: int = RULES.patience) -> list[Curve]:
+        """All curves of a target that starts (S, n) lead to, with their crossings of limits.
+
+        The search ends after `patience` starts in turn that find no new curve.
+        """
         ...
 
     def choose_starts(self, stored: StoredPostures, place: Array) -> Array:
@@ -125,14 +128,14 @@ class CompiledKernel:
     upper: Array
     turning: NDArray[np.bool_]
 
-    def find_curves(self, target: Array, starts: Array) -> list[Curve]:
+    def find_curves(self, target: Array, starts: Array, patience: int = RULES.patience) -> list[Curve]:
         """As `Kernel.find_curves`."""
         n = len(self.lower)
         nodes = np.empty((RULES.nodes, 2 * n + 1))
         ends, closed = np.zeros(RULES.curves, dtype=np.intc), np.zeros(RULES.curves, dtype=np.intc)
         used = ctypes.c_int()
         count = self._c.find_curves(
-            *(_pointer(target), _pointer(starts), len(starts), RULES.patience, _pointer(nodes), RULES.nodes),
+            *(_pointer(target), _pointer(starts), len(starts), patience, _pointer(nodes), RULES.nodes),
             *(_pointer(ends), _pointer(closed), ctypes.byref(used)),
         )
         if not count:

@@ -31,16 +31,16 @@ class NumpyKernel:
         """As `Kernel.choose_starts`."""
         return stored.near(place, RULES.starts)
 
-    def find_curves(self, target: Array, starts: Array) -> list[Curve]:
+    def find_curves(self, target: Array, starts: Array, patience: int = RULES.patience) -> list[Curve]:
         """As `Kernel.find_curves`; the same curves, from other first points."""
         reached, tangents, good = self._reach(target, starts)
         curves: list[Curve] = []
         quiet = 0
         for k in range(len(starts)):
             quiet += 1
-            if quiet > RULES.patience or len(curves) == RULES.curves:
+            if quiet > patience or len(curves) == RULES.curves:
                 break
-            if not good[k] or any(self._lies_on(curve, reached[k], tangents[k]) for curve in curves):
+            if not good[k] or any(self.lies_on(curve, reached[k], tangents[k]) for curve in curves):
                 continue
             curve = self._trace(target, reached[k], tangents[k])
             if curve is not None:
@@ -121,7 +121,7 @@ class NumpyKernel:
             nodes.append(new)
             tangents.append(onward)
             step = Curve(np.array(nodes[-2:]), np.array(tangents[-2:]), np.array([before, 0.0]), False, _NONE)
-            if len(nodes) > 3 and self._lies_on(step, q0, sense * t0):
+            if len(nodes) > 3 and self.lies_on(step, q0, sense * t0):
                 nodes[-1] = q0 + np.where(self.turning, _TURN * np.rint((new - q0) / _TURN), 0.0)
                 tangents[-1] = sense * t0
                 return nodes, tangents, True
@@ -148,7 +148,7 @@ class NumpyKernel:
                 return new, onward, missed, True
         return new, onward, missed, False
 
-    def _lies_on(self, curve: Curve, q: Array, t: Array) -> bool:
+    def lies_on(self, curve: Curve, q: Array, t: Array) -> bool:
         """Whether q (n,) with its tangent lies on a curve, up to full turns."""
         away = q - curve.q[:-1]
         away = np.where(self.turning, away - _TURN * np.rint(away / _TURN), away)
@@ -252,6 +252,7 @@ class NumpyKernel:
 
 
 _NONE = np.empty(0, crossing_type(1))
+_GAUSS = ((1 - np.sqrt(0.6)) / 2, 0.5, (1 + np.sqrt(0.6)) / 2), (5 / 18, 8 / 18, 5 / 18)  # places and weights
 
 
 def _solve_bordered(J: Array, e: Array, rows: Array, rest: Array) -> tuple[Array, Array]:
@@ -277,9 +278,14 @@ def _find_tangents(J: Array) -> Array:
 
 
 def _length_of(a: Array, b: Array, start: Array, end: Array) -> Array:
-    """Lengths of steps (N,) with unit tangents at both ends."""
+    """Lengths of steps (N,) with unit tangents at both ends: of a cubic whose slopes have the length of an arc."""
     turn = 1.0 - np.minimum(1.0, (start * end).sum(axis=1))
-    return np.asarray(np.linalg.norm(b - a, axis=1) * (1.0 + turn / 12))
+    h = np.linalg.norm(b - a, axis=1, keepdims=True) * (1.0 + turn[:, None] / 12)
+    length = np.zeros(len(a))
+    for u, weight in zip(_GAUSS[0], _GAUSS[1], strict=True):
+        slope = 6 * (u - u * u) * (b - a) + h * ((1 - 4 * u + 3 * u * u) * start + (3 * u * u - 2 * u) * end)
+        length += weight * np.linalg.norm(slope, axis=1)
+    return length
 
 
 def _find_pieces(d: float, start: float, end: float) -> tuple[Component, list[float]]:
