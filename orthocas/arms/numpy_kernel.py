@@ -79,7 +79,7 @@ class NumpyKernel:
             step = (J.transpose(0, 2, 1) @ y)[:, :, 0]
             size = np.linalg.norm(step, axis=1)
             q[left] += np.minimum(1.0, RULES.largest / (size + 1e-300))[:, None] * step
-            done = (error <= RULES.reached) & (size < 0.1)
+            done = (error <= RULES.reached) & (size < RULES.arrived)
             if done.any():
                 tangents[left[done]] = _find_tangents(J[done])
                 good[left[done]] = True
@@ -110,10 +110,10 @@ class NumpyKernel:
             new = q + h * t
             if before > 0:
                 new = evaluate_cubic(nodes[-2], q, tangents[-2], t, before, 1.0 + h / before)[0]
-            new, onward, missed, good = self._correct_step(target, new, t, sense)
+            new, onward, missed, good = self._correct_step(target, new, t, sense, h)
             turned = float(onward @ t)
             if not (good and turned > RULES.turned):
-                h /= 2 if missed < RULES.missed else 3
+                h /= 2
                 if h < RULES.shortest:
                     break
                 continue
@@ -129,22 +129,24 @@ class NumpyKernel:
             outside = (new < self.lower - room) | (new > self.upper + room)
             if (outside & ~self.turning & np.isfinite(room)).any():
                 break
-            h = min(h * min(1.6, max(0.5, np.cbrt(RULES.aim / max(missed, 1e-9)))), RULES.step)
+            h = min(h * min(1.6, max(0.5, np.cbrt(min(RULES.aim, RULES.tight * h) / max(missed, 1e-9)))), RULES.step)
             h = min(h, last) if turned < RULES.straight else h
         return nodes, tangents, False
 
-    def _correct_step(self, target: Array, new: Array, t: Array, sense: float) -> tuple[Array, Array, float, bool]:
-        """A predicted point (n,) brought to the curve across t, the tangent, the first correction, and success."""
+    def _correct_step(
+        self, target: Array, new: Array, t: Array, sense: float, h: float
+    ) -> tuple[Array, Array, float, bool]:
+        """A point (n,) predicted for a step h, on the curve across t; the tangent, first correction, and success."""
         missed, onward = 0.0, t
         for k in range(RULES.corrections):
             e, J = self._evaluate(new[None], target)
             change, found = _solve_bordered(J, e, t[None], np.zeros(1))
             size = float(np.linalg.norm(change))
             missed = size if k == 0 else missed
-            if not size < RULES.missed:
+            if not size < min(RULES.missed, RULES.loose * h):
                 return new, onward, np.inf, False
             new, onward = new + change[0], sense * found[0]
-            if size < RULES.corrected:
+            if size < min(RULES.corrected, RULES.resolved**2 * h):
                 return new, onward, missed, True
         return new, onward, missed, False
 
@@ -153,7 +155,8 @@ class NumpyKernel:
         away = q - curve.q[:-1]
         away = np.where(self.turning, away - _TURN * np.rint(away / _TURN), away)
         h = curve.length[:-1]
-        near = np.flatnonzero((away**2).sum(axis=1) <= (h + RULES.known) ** 2)
+        known = np.minimum(RULES.known, RULES.resolved * h)
+        near = np.flatnonzero((away**2).sum(axis=1) <= (h + known) ** 2)
         if not near.size:
             return False
         a, b = np.zeros((len(near), len(q))), curve.q[near + 1] - curve.q[near]
@@ -163,7 +166,7 @@ class NumpyKernel:
             at, slope = evaluate_cubic(a, b, start, end, h, np.clip(u, 0.0, 1.0))
             u = np.clip(u, 0.0, 1.0) + ((away - at) * slope).sum(axis=1, keepdims=True) / h
         at, slope = evaluate_cubic(a, b, start, end, h, np.clip(u, 0.0, 1.0))
-        return bool(((((at - away) ** 2).sum(axis=1) < RULES.known**2) & (slope @ t > 0)).any())
+        return bool(((((at - away) ** 2).sum(axis=1) < known[near] ** 2) & (slope @ t > 0)).any())
 
     def _find_crossings(self, target: Array, curve: Curve) -> NDArray[np.void]:
         """Where a curve crosses limits, in order."""
