@@ -83,17 +83,17 @@ def look(arm: oc.Arm, q: Array, pool: Array) -> Pose:
     ended = time.perf_counter()
     dense = maps.kernel.find_curves(target, np.vstack([q, pool]), len(pool) + 1)
     lengths = np.array([sum(arc.length for arc in cut_curve(maps, target, curve)) for curve in dense])
-    known = np.array([any(is_same(arm, other, curve) for other in mine) for curve in dense])
+    known = np.array([any(is_same(arm, target, other, curve) for other in mine) for curve in dense])
     gap = found.nearest(q).value if found.components else np.inf
     return Pose(middle - began, ended - middle, found.curves, float(lengths[known].sum() / lengths.sum()), gap)
 
 
-def is_same(arm: oc.Arm, curve: Curve, other: Curve) -> bool:
+def is_same(arm: oc.Arm, target: Array, curve: Curve, other: Curve) -> bool:
     """Whether points of another curve are on a curve."""
     maps = arm.maps
     kernel = NumpyKernel(build_equations(arm.task, maps.scale), arm.robot.lower, arm.robot.upper, maps.turning)
     rows = (0, len(other.q) // 3, len(other.q) // 2)
-    return all(kernel.lies_on(curve, other.q[row], other.tangent[row]) for row in rows)
+    return all(kernel.lies_on(target, curve, other.q[row], other.tangent[row]) for row in rows)
 
 
 def newton(arm: oc.Arm, target: Array, q: Array) -> Array:

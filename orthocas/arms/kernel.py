@@ -35,8 +35,9 @@ class CurveRules:
     far_damping: float = 1e-3  #: of steps with an error above 0.1, relative to the trace of J J^T
     near_damping: float = 1e-5  #: of steps with an error above 1e-3
     largest: float = 0.7  #: norm of a step to x
-    known: float = 5e-3  #: distance from a curve up to which a point with its tangent lies on it
-    resolved: float = 0.05  #: the same, in lengths of the step there
+    known: float = 0.02  #: distance from the cubic of a step up to which a point may lie on the curve
+    resolved: float = 0.2  #: the same, in lengths of the step
+    sure: float = 0.05  #: the part of that distance up to which it does, without another look
     step: float = 0.4  #: longest step along a curve
     shortest: float = 1e-6  #: a curve that needs shorter ones ends, at a singular position
     aim: float = 0.02  #: first correction of a step that its length is chosen for
@@ -44,6 +45,7 @@ class CurveRules:
     missed: float = 0.08  #: largest correction of a step
     loose: float = 0.25  #: the same, in lengths of the step
     corrected: float = 3e-4  #: correction after which the next one is rounding for most purposes, 1e-7
+    exact: float = 2.5e-3  #: the same, in lengths of the step
     corrections: int = 6  #: of a step, at most
     turned: float = 0.94  #: least cosine between the tangents at both ends of a step
     straight: float = 0.985  #: cosine from which the next step may be longer

@@ -40,7 +40,7 @@ class NumpyKernel:
             quiet += 1
             if quiet > patience or len(curves) == RULES.curves:
                 break
-            if not good[k] or any(self.lies_on(curve, reached[k], tangents[k]) for curve in curves):
+            if not good[k] or any(self.lies_on(target, curve, reached[k], tangents[k]) for curve in curves):
                 continue
             curve = self._trace(target, reached[k], tangents[k])
             if curve is not None:
@@ -121,7 +121,7 @@ class NumpyKernel:
             nodes.append(new)
             tangents.append(onward)
             step = Curve(np.array(nodes[-2:]), np.array(tangents[-2:]), np.array([before, 0.0]), False, _NONE)
-            if len(nodes) > 3 and self.lies_on(step, q0, sense * t0):
+            if len(nodes) > 3 and self.lies_on(target, step, q0, sense * t0):
                 nodes[-1] = q0 + np.where(self.turning, _TURN * np.rint((new - q0) / _TURN), 0.0)
                 tangents[-1] = sense * t0
                 return nodes, tangents, True
@@ -146,27 +146,43 @@ class NumpyKernel:
             if not size < min(RULES.missed, RULES.loose * h):
                 return new, onward, np.inf, False
             new, onward = new + change[0], sense * found[0]
-            if size < min(RULES.corrected, RULES.resolved**2 * h):
+            if size < min(RULES.corrected, RULES.exact * h):
                 return new, onward, missed, True
         return new, onward, missed, False
 
-    def lies_on(self, curve: Curve, q: Array, t: Array) -> bool:
-        """Whether q (n,) with its tangent lies on a curve, up to full turns."""
+    def lies_on(self, target: Array, curve: Curve, q: Array, t: Array) -> bool:
+        """Whether a posture q (n,) of the target, with the tangent there, lies on a curve, up to full turns."""
         away = q - curve.q[:-1]
         away = np.where(self.turning, away - _TURN * np.rint(away / _TURN), away)
-        h = curve.length[:-1]
-        known = np.minimum(RULES.known, RULES.resolved * h)
-        near = np.flatnonzero((away**2).sum(axis=1) <= (h + known) ** 2)
+        length = curve.length[:-1]
+        most = np.minimum(RULES.known, RULES.resolved * length)
+        near = np.flatnonzero((away**2).sum(axis=1) <= (length + most) ** 2)
         if not near.size:
             return False
         a, b = np.zeros((len(near), len(q))), curve.q[near + 1] - curve.q[near]
-        start, end, away, h = curve.tangent[near], curve.tangent[near + 1], away[near], h[near, None]
+        start, end, away, h = curve.tangent[near], curve.tangent[near + 1], away[near], length[near, None]
         u = (away * start).sum(axis=1, keepdims=True) / h
         for _ in range(3):
             at, slope = evaluate_cubic(a, b, start, end, h, np.clip(u, 0.0, 1.0))
             u = np.clip(u, 0.0, 1.0) + ((away - at) * slope).sum(axis=1, keepdims=True) / h
         at, slope = evaluate_cubic(a, b, start, end, h, np.clip(u, 0.0, 1.0))
-        return bool(((((at - away) ** 2).sum(axis=1) < known[near] ** 2) & (slope @ t > 0)).any())
+        gaps = np.linalg.norm(at - away, axis=1)
+        for k in np.flatnonzero((gaps < most[near]) & (slope @ t > 0)):
+            beside = curve.q[near[k]] + away[k]
+            point = at[k] - away[k] + beside
+            if gaps[k] < RULES.sure * most[near[k]] or self._is_beside(target, point, slope[k], beside, gaps[k]):
+                return True
+        return False
+
+    def _is_beside(self, target: Array, point: Array, direction: Array, q: Array, gap: float) -> bool:
+        """Whether the posture across a direction from q (n,), which one near a curve leads to, is q."""
+        for _ in range(RULES.corrections):
+            e, J = self._evaluate(point[None], target)
+            change = _solve_bordered(J, e, direction[None], np.array([direction @ (q - point)]))[0][0]
+            point = point + change
+            if not np.linalg.norm(change) >= RULES.sure * gap:
+                break
+        return bool(np.linalg.norm(q - point) < 0.1 * gap)
 
     def _find_crossings(self, target: Array, curve: Curve) -> NDArray[np.void]:
         """Where a curve crosses limits, in order."""

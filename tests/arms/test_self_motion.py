@@ -170,12 +170,12 @@ def test_best_posture_is_better_than_dense_samples() -> None:
         motions.best(lambda q: q)
 
 
-def are_same(first: list[Curve], second: list[Curve], kernel: NumpyKernel) -> bool:
+def are_same(kernel: NumpyKernel, target: Array, first: list[Curve], second: list[Curve]) -> bool:
     """Whether each curve of one list is a curve of the other."""
 
     def lies(curve: Curve, others: list[Curve]) -> bool:
         rows = (0, len(curve.q) // 3, len(curve.q) // 2)
-        return any(all(kernel.lies_on(other, curve.q[k], curve.tangent[k]) for k in rows) for other in others)
+        return any(all(kernel.lies_on(target, other, curve.q[k], curve.tangent[k]) for k in rows) for other in others)
 
     return all(lies(curve, second) for curve in first) and all(lies(curve, first) for curve in second)
 
@@ -189,7 +189,7 @@ def test_compiled_and_numpy_find_the_same_curves(seed: int) -> None:
     assert isinstance(plain.kernel, NumpyKernel)
     for target in compiled.targets_of(postures(arm, 2, seed)):
         first, second = compiled.find_curves(target), plain.find_curves(target)
-        assert are_same(first, second, plain.kernel)
+        assert are_same(plain.kernel, target, first, second)
         assert sum(len(curve.crossings) for curve in first) == sum(len(curve.crossings) for curve in second)
         lengths = [sum(arc.length for arc in find_motions(maps, target)) for maps in (compiled, plain)]
         assert lengths[0] == pytest.approx(lengths[1], rel=1e-5)
@@ -204,7 +204,7 @@ def test_no_curve_is_found_twice() -> None:
         curves = arm.maps.find_curves(target)
         for k, curve in enumerate(curves):
             others = curves[:k] + curves[k + 1 :]
-            assert not any(kernel.lies_on(other, curve.q[3], curve.tangent[3]) for other in others)
+            assert not any(kernel.lies_on(target, other, curve.q[3], curve.tangent[3]) for other in others)
 
 
 def test_out_of_reach_there_is_no_arc() -> None:
