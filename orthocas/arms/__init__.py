@@ -7,7 +7,7 @@ hold them, and `maps` holds what all of these need of the robot.
 """
 
 from orthocas.arms.arm import Arm, Postures
-from orthocas.arms.self_motion import Arc, SelfMotions
+from orthocas.arms.self_motion import Arc, Place, SelfMotions
 from orthocas.arms.tracker import ArmTracker, TrackStatus
 
-__all__ = ["Arc", "Arm", "ArmTracker", "Postures", "SelfMotions", "TrackStatus"]
+__all__ = ["Arc", "Arm", "ArmTracker", "Place", "Postures", "SelfMotions", "TrackStatus"]

@@ -15,7 +15,7 @@ from orthocas.arms.self_motion import Arc, SelfMotions, find_motions
 from orthocas.arms.tracker import ArmTracker, TrackStatus
 from orthocas.charts.chart import Chart
 from orthocas.charts.inverse import InverseStatus
-from orthocas.errors import BranchWarning, DomainError, InvalidValueError, NotRedundantError
+from orthocas.errors import BranchWarning, DomainError, InvalidValueError, NotRedundantError, ShapeError
 from orthocas.fitting.wide import fit_wide
 from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import branches
@@ -131,6 +131,8 @@ class Arm(Shown):
         if any(not robot.tree.prismatic[k] for k in one):
             raise InvalidValueError("joint", f"'{robot.joint_names[one[0]]}' with one limit", "two limits, or none")
         object.__setattr__(self, "task", self.task.with_reference_at(find_joint_range(robot, 0).centre))
+        if not isinstance(self.charts, tuple | list):
+            raise InvalidValueError("charts", repr(self.charts)[:80], "a tuple of charts")
         for chart in self.charts:
             require_kind("charts", chart, Chart)
             same = chart.problem.task.recipe == self.task.recipe or _agree(chart, self.task)
@@ -282,7 +284,8 @@ class Arm(Shown):
         """
         targets, single = self.maps.targets.read(x)
         N, n = len(targets), self.robot.n
-        starts = None if start is None else np.broadcast_to(as_point_set("start", start, n)[0], (N, n))
+        starts = None if start is None else _repeat_rows("start", as_point_set("start", start, n)[0], N)
+        require_kind("branch", branch, str)
         if branch != ANY:
             require_known("branch", branch, self.branch_names)
         chosen = [k for k, name in enumerate(self.branch_names) if branch in (ANY, name)]
@@ -291,7 +294,7 @@ class Arm(Shown):
         values = None
         if xi is not None:
             self._require_charts()
-            values = np.broadcast_to(as_float_array("xi", xi).reshape(-1), N)
+            values = _repeat_rows("xi", as_float_array("xi", xi).reshape(-1, 1), N)[:, 0]
             good &= np.isfinite(values)
             self._solve_by_charts(targets, values, starts, chosen, q, status, good)
         status[~good] = InverseStatus.BAD_INPUT
@@ -349,7 +352,7 @@ class Arm(Shown):
         tracker = self.tracker(q, period=period, velocity_limits=velocity_limits)
         values = [None] * len(targets)
         if xi is not None:
-            values = np.broadcast_to(as_float_array("xi", xi).reshape(-1), len(targets)).tolist()
+            values = _repeat_rows("xi", as_float_array("xi", xi).reshape(-1, 1), len(targets))[:, 0].tolist()
         found, statuses = np.empty((len(targets), self.robot.n)), []
         for k, (target, value) in enumerate(zip(targets, values, strict=True)):
             found[k] = tracker.step_to(target, value)
@@ -510,6 +513,13 @@ class Arm(Shown):
             if rows.size:
                 values[rows] = chart.xi(q[rows])[:, 0]
         return values
+
+
+def _repeat_rows(name: str, rows: Array, count: int) -> Array:
+    """Rows (count, k), of so many or of one for all."""
+    if len(rows) not in (1, count):
+        raise ShapeError(name, rows.shape, (count, rows.shape[1]))
+    return np.broadcast_to(rows, (count, rows.shape[1]))
 
 
 def _agree(chart: Chart, task: Task) -> bool:

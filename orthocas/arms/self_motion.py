@@ -17,7 +17,7 @@ from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, as_point, require_count
 from orthocas.tools.display import Shown
-from orthocas.tools.expressions import wrap_shortest
+from orthocas.tools.expressions import call_user, wrap_shortest
 
 _TURN = 2 * np.pi
 
@@ -30,6 +30,7 @@ class ArcRules:
     candidates: int = 3  #: of them that are refined
     refinements: int = 12  #: of a place, at most
     refined: float = 1e-10  #: change of a place that ends its refinement
+    most: int = 1_000_000  #: postures of a sample
     spacing: float = 0.05  #: of postures at which a function is evaluated
     golden: int = 40  #: steps of golden-section search for a maximum
     metric_spacing: float = 0.02  #: of postures between which the length in a metric is summed
@@ -103,7 +104,7 @@ class Arc(Shown):
             n: their number.
             metric: in which distances count: "euclidean", "inertia", a matrix, or a function, as of a `Problem`.
         """
-        require_count("n", n, least=2)
+        require_count("n", n, least=2, most=RULES.most)
         known = metric if isinstance(metric, Metric) else Metric.from_spec(self.maps.robot, metric)
         places = np.linspace(0.0, self.length, n, endpoint=not self.closed)
         if not known.is_identity:
@@ -175,7 +176,7 @@ class SelfMotions(Shown):
             n: their number.
             metric: as in `Arc.sample`, where each component by itself has equal distances.
         """
-        require_count("n", n, least=2)
+        require_count("n", n, least=2, most=RULES.most)
         counts = [max(2, round(n * arc.length / self.length)) for arc in self.components]
         parts = [arc.sample(count, metric) for arc, count in zip(self.components, counts, strict=True)]
         return np.vstack([np.empty((0, self.maps.robot.n)), *parts])
@@ -216,7 +217,7 @@ class SelfMotions(Shown):
         self._require_components()
 
         def evaluate(q: Array) -> Array:
-            values = as_float_array("what f returns", f(q))
+            values = as_float_array("what f returns", call_user("f", "a function of joint positions (N, n)", f, q))
             if values.shape != (len(q),):
                 raise InvalidValueError("what f returns", f"shape {values.shape}", f"({len(q)},)")
             return np.where(np.isnan(values), -np.inf, values)
@@ -302,7 +303,7 @@ def find_motions(maps: ArmMaps, target: Array, *starts: Array) -> SelfMotions:
 def cut_curve(maps: ArmMaps, target: Array, curve: Curve) -> list[Arc]:
     """The arcs of a curve within the limits: for each number of full turns of the joints, where all are inside."""
     robot, n = maps.robot, maps.robot.n
-    bounded, turning = np.isfinite(robot.lower), maps.turning
+    bounded, turning = np.isfinite(robot.lower) | np.isfinite(robot.upper), maps.turning
     first = curve.q[0]
     # Full turns after which each joint is within its limits at the begin.
     present: list[set[int]] = []

@@ -122,12 +122,15 @@ class ArmTracker(Shown):
         self.reset(q)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without scratch memory."""
+        """Without scratch memory and detours under way."""
         parts = {"maps": self._maps, "charts": self._charts, "q": self.q}
-        return {**parts, "period": self._period, "speed": self._speed, "detours": self._detours}
+        rules = {"period": self._period, "speed": self._speed, "detours": self._detours}
+        return {**parts, **rules, "memory": (self._wish, self._last, self.status)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(*(state[name] for name in ("maps", "charts", "q", "period", "speed", "detours")))  # type: ignore[misc]
+        names = ("maps", "charts", "q", "period", "speed", "detours")
+        self.__init__(*(state[name] for name in names))  # type: ignore[misc]
+        self._wish, self._last, self.status = state["memory"]
 
     @property
     def q(self) -> Array:
@@ -183,8 +186,8 @@ class ArmTracker(Shown):
         Raises:
             InvalidValueError: if x is no task value of this task.
         """
-        if type(x) is np.ndarray and x.shape == (self._maps.task.m,):
-            return self._go(x, None, xi)
+        if type(x) is np.ndarray and x.dtype == np.float64 and x.shape == (self._maps.task.m,):
+            return self._go(x, None, None if xi is None else as_number("xi", xi))
         targets, single = self._maps.targets.read(x)
         if not single:
             raise InvalidValueError("x", f"{len(targets)} values", "one task value")
