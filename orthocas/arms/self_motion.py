@@ -30,6 +30,8 @@ class ArcRules:
     candidates: int = 3  #: of them that are refined
     refinements: int = 12  #: of a place, at most
     refined: float = 1e-10  #: change of a place that ends its refinement
+    largest: float = 0.2  #: of its changes, and distance between candidates that are different
+    least_slope: float = 0.1  #: of half the squared distance, along an arc, by a secant
     most: int = 1_000_000  #: postures of a sample
     spacing: float = 0.05  #: of postures at which a function is evaluated
     golden: int = 40  #: steps of golden-section search for a maximum
@@ -96,6 +98,10 @@ class Arc(Shown):
             q[places <= 0.0], q[places >= self.length] = ends[0], ends[1]
         q = np.clip(q, self.maps.robot.lower, self.maps.robot.upper)
         return np.asarray(q.reshape(*s.shape, q.shape[1]))
+
+    def direction(self, place: float) -> Array:
+        """The direction of the arc (n,) at a length from its begin, to about 1e-3."""
+        return np.asarray(self._guess(np.array([min(max(place, 0.0), self.length)]))[1][0])
 
     def sample(self, n: int, metric: Metric | MetricSpec = "euclidean") -> Array:
         """Postures at equal distances along the arc, (n, joints), both ends among them; of a closed arc only one.
@@ -196,11 +202,14 @@ class SelfMotions(Shown):
         owners = np.repeat(np.arange(len(arcs)), [len(part) for part in places])
         guesses = np.vstack([arc._guess(part)[0] for arc, part in zip(arcs, places, strict=True)])
         distances = (self.measure_away(guesses, wish) ** 2).sum(axis=1)
-        along, found = np.concatenate(places), []
-        best = np.argsort(distances)
-        for row in best[: RULES.candidates]:
-            k = int(owners[row])
-            found.append(self._refine(k, float(along[row]), wish))
+        along = np.concatenate(places)
+        order, chosen = np.argsort(distances), list[int]()
+        for row in order[: RULES.parts * RULES.candidates].tolist():
+            apart = [owners[row] != owners[other] or abs(along[row] - along[other]) > RULES.largest for other in chosen]
+            near = np.sqrt(distances[row]) < np.sqrt(distances[order[0]]) + RULES.largest
+            if all(apart) and near and len(chosen) < RULES.candidates:
+                chosen.append(row)
+        found = [self._refine(int(owners[row]), float(along[row]), wish) for row in chosen]
         return min(found, key=lambda place: place.value)
 
     def best(self, f: Callable[[Array], ArrayLike]) -> Place:
@@ -268,28 +277,23 @@ class SelfMotions(Shown):
         return np.asarray(wrap_shortest(q - wish, np.where(free, _TURN, 0.0)))
 
     def _refine(self, k: int, place: float, wish: Array) -> Place:
-        """The nearest posture on an arc next to a place of it."""
+        """The nearest posture on an arc next to a place of it: secants for (q - wish) . t = 0 along the arc."""
         arc = self.components[k]
-        length = arc.length
-        q = arc.at(place)
-        gap = float(np.linalg.norm(self.measure_away(q[None], wish)))
-        for _ in range(RULES.refinements):
-            at = place % length if arc.closed else place
-            direction = arc._guess(np.array([at]))[1][0]
-            step = -float(self.measure_away(q[None], wish)[0] @ direction)
-            moved = False
-            while abs(step) > RULES.refined and not moved:
-                new = (place + step) % length if arc.closed else min(max(place + step, 0.0), length)
-                tried = arc.at(new)
-                distance = float(np.linalg.norm(self.measure_away(tried[None], wish)))
-                moved = distance < gap
-                if moved:
-                    q, place, gap = tried, new, distance
-                else:
-                    step /= 3
-            if not moved:
+        best, before, slope = Place(wish, np.inf, k, place), (0.0, 0.0), 1.0
+        for number in range(RULES.refinements):
+            q, t = arc.at(place), arc.direction(place)
+            away = self.measure_away(q[None], wish)[0]
+            gap, pull = float(np.linalg.norm(away)), float(away @ t)
+            if gap < best.value:
+                best = Place(wish + away, gap, k, place)
+            if number > 0 and place != before[0]:
+                slope = max(RULES.least_slope, (pull - before[1]) / (place - before[0]))
+            new = place - float(np.clip(pull / slope, -RULES.largest, RULES.largest))
+            new = new % arc.length if arc.closed else min(max(new, 0.0), arc.length)
+            before, place, moved = (place, pull), new, abs(new - place)
+            if moved < RULES.refined:
                 break
-        return Place(wish + self.measure_away(q[None], wish)[0], gap, k, place)
+        return best
 
 
 def find_motions(maps: ArmMaps, target: Array, *starts: Array) -> SelfMotions:

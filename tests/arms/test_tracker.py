@@ -88,6 +88,28 @@ def test_jumps_are_followed_as_fast_as_joints_may() -> None:
     assert np.abs(arm.x(tracker.q) - x).max() < 1e-8
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["iiwa7-wide", "xarm7-wide", "baxter-left-wide"])
+def test_hostile_streams_neither_break_limits_nor_lose_the_arm(name: str) -> None:
+    """Jumps, targets out of reach and behind the base, NaN: afterwards, x of the begin is met again."""
+    chart, rng = oc.load(name), np.random.default_rng(4)
+    arm, home = oc.Arm(chart.task, (chart,)), chart.domain.centre
+    tracker, low, high = arm.tracker(home, period=PERIOD), arm.robot.lower, arm.robot.upper
+    x0, most = arm.x(home), arm.robot.velocity_limits * PERIOD * (1 + 1e-9)
+    for kind in range(4):
+        jumps = arm.x(rng.uniform(np.maximum(low, -np.pi), np.minimum(high, np.pi), (8, arm.robot.n)))
+        far = x0 + np.append(1.5 * rng.normal(size=3), np.zeros(3))
+        behind = x0 * np.array([-1, -1, 1, 1, 1, 1])
+        for x in (jumps, [far] * 8, [behind] * 8, [np.full(6, np.nan), *jumps])[kind]:
+            for _ in range(20):
+                before, q = tracker.q, tracker.step(x)
+                assert (np.abs(q - before) <= most).all()
+                assert ((q >= low) & (q <= high)).all()
+        for _ in range(600):
+            tracker.step(x0)
+        assert np.abs(arm.x(tracker.q) - x0).max() < 1e-8, kind
+
+
 def test_without_detours_the_error_of_a_target_at_rest_never_rises() -> None:
     arm = panda()
     for q in np.random.default_rng(2).uniform(arm.robot.lower, arm.robot.upper, (4, 7)):
