@@ -21,8 +21,7 @@ from benchmark import run, table
 
 import orthocas as oc
 from orthocas.codegen import GeneratedC
-from orthocas.codegen.precision import DOUBLE, SINGLE
-from orthocas.codegen.rendering import write_numbers
+from orthocas.codegen.rendering import DOUBLE, SINGLE, write_numbers
 from orthocas.control import PDPlus
 from orthocas.tools.checks import Array
 

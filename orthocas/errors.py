@@ -78,6 +78,10 @@ class BranchWarning(UserWarning):
     """A wide chart leaves out a part of its branch from the start."""
 
 
+class TipWarning(UserWarning):
+    """A robot has several chains, and no tip was named."""
+
+
 class ShapeError(OrthocasError, ValueError):
     """An array has the wrong shape."""
 

@@ -61,7 +61,11 @@ class _Run:
         if not self._evaluate():
             return Status.FAILED
         while best.iterations < epochs:
-            for k, part in enumerate(self._parts(best.iterations)):
+            # The steps of an epoch: on batches of samples in turn, or on the whole objective.
+            parts: Iterable[Objective] = repeat(self.objective, self.settings.steps)
+            if isinstance(self.objective, SampledObjective):
+                parts = self.objective.batches(self.settings.batch, self.settings.steps, (best.iterations,))
+            for k, part in enumerate(parts):
                 gradient = part.value_and_gradient(self.theta)[1]
                 best.evaluations += 1
                 if not np.isfinite(gradient).all():
@@ -70,12 +74,6 @@ class _Run:
             self._evaluate()
             best.next_iteration(epochs)
         return Status.ITERATION_LIMIT
-
-    def _parts(self, epoch: int) -> Iterable[Objective]:
-        """The objectives for the steps of an epoch."""
-        if isinstance(self.objective, SampledObjective):
-            return self.objective.batches(self.settings.batch, self.settings.steps, (epoch,))
-        return repeat(self.objective, self.settings.steps)
 
     def _step(self, gradient: Array, k: int) -> None:
         """Take step k = 0, 1, ..., counted over all epochs."""

@@ -93,9 +93,8 @@ class _IpoptRun:
             if not self.best.found:
                 raise
             return self.best.result(Status.INTERRUPTED)
-        return self._outcome(_STATUS.get(solver.stats()["return_status"], Status.STALLED))
-
-    def _outcome(self, status: Status) -> SolveResult:
+        # The best point that meets the constraints, or else the one with the smallest violation.
+        status = _STATUS.get(solver.stats()["return_status"], Status.STALLED)
         if self.best.found or not np.isfinite(self._least[0]):
             return self.best.result(status)
         self.best.theta = self._least[1]
@@ -107,17 +106,20 @@ class _IpoptRun:
         both = self._node("grad_f", [self.size], [(1, 1), (self.size, 1)], self._evaluate)
         problem: dict[str, Any] = {"x": x, "f": value(x)}
         options: dict[str, Any] = {"grad_f": ca.Function("nlp_grad_f", [x, p], list(both(x)))}
+        rows = len(self.constrained.bounds[0]) if self.constrained else 0
         if self.constrained:
-            rows = len(self.constrained.bounds[0])
-            constraints, jacobian = (
-                self._node("g", [self.size], [(rows, 1)], lambda theta: [self._constraints(theta)[0]]),
-                self._node("jac_g", [self.size], [(rows, 1), (rows, self.size)], self._constraints),
-            )
+            constraints = self._node("g", [self.size], [(rows, 1)], lambda theta: [self._constraints(theta)[0]])
+            jacobian = self._node("jac_g", [self.size], [(rows, 1), (rows, self.size)], self._constraints)
             problem["g"] = constraints(x)
             options["jac_g"] = ca.Function("nlp_jac_g", [x, p], list(jacobian(x)))
         options |= self._hessian_options(x, p)
+        # Ipopt calls the watcher at the start and after every iteration; an error there stops it.
+        lengths = {"x": self.size, "f": 1, "g": rows, "lam_x": self.size, "lam_g": rows}
+        names = [ca.nlpsol_out(i) for i in range(ca.nlpsol_n_out())]
+        watcher = ArrayNode("watch", [lengths.get(name, 0) for name in names], [(1, 1)], self._iterated)
+        self._nodes.append(watcher)
         options |= {
-            "iteration_callback": self._watcher(),
+            "iteration_callback": watcher,
             "print_time": False,
             "error_on_fail": False,
             "show_eval_warnings": False,
@@ -156,7 +158,11 @@ class _IpoptRun:
             value, gradient = self.objective.value_and_gradient(theta)
             self.best.evaluations += 1
             self._at, self._current = (key, value, gradient), theta
-            violation = self._violation(theta) if np.isfinite(value) else np.inf
+            # The largest constraint violation; 0 without constraints.
+            violation = 0.0 if np.isfinite(value) else np.inf
+            if self.constrained and np.isfinite(value):
+                (lower, upper), values = self.constrained.bounds, self._constraints(theta)[0]
+                violation = float(np.maximum(np.maximum(lower - values, values - upper), 0).max())
             if violation < self._least[0]:
                 self._least = violation, theta
             if violation <= RULES.feasible:
@@ -171,30 +177,11 @@ class _IpoptRun:
             self._constraints_at = key, *self.constrained.constraints(theta)
         return self._constraints_at[1], self._constraints_at[2]
 
-    def _violation(self, theta: Array) -> float:
-        """Largest constraint violation; 0 without constraints."""
-        if self.constrained is None:
-            return 0.0
-        lower, upper = self.constrained.bounds
-        values = self._constraints(theta)[0]
-        return float(np.maximum(np.maximum(lower - values, values - upper), 0).max())
-
     def _hessian(self, theta: Array, factor: Array, multipliers: Array) -> list[Array]:
         if self.constrained:
             return [self.constrained.lagrangian_hessian(theta, float(factor[0]), multipliers)]
         assert isinstance(self.objective, SmoothObjective)
         return [factor[0] * self.objective.hessian(theta)]
-
-    def _watcher(self) -> ca.Callback:
-        """A callback that Ipopt calls at the start and after every iteration; an error stops Ipopt."""
-        rows = [ca.nlpsol_out(i) for i in range(ca.nlpsol_n_out())]
-        lengths = {"x": self.size, "f": 1, "g": self._rows(), "lam_x": self.size, "lam_g": self._rows()}
-        node = ArrayNode("watch", [lengths.get(name, 0) for name in rows], [(1, 1)], self._iterated)
-        self._nodes.append(node)
-        return node
-
-    def _rows(self) -> int:
-        return len(self.constrained.bounds[0]) if self.constrained else 0
 
     def _iterated(self, *_: Array) -> list[float]:
         if self._count:
@@ -261,12 +248,17 @@ class _Flow:
 
     def iterate(self) -> Status:
         best, limit = self.best, self.settings.max_iterations
-        status = self._start()
-        if status is not None:
-            return status
+        # The first stretch moves theta by a small part of its length; without a gradient there is nowhere to flow.
+        self.value, gradient = best.value_and_gradient(self.theta)
+        if not np.isfinite(self.value):
+            return Status.FAILED
+        if not np.any(gradient):
+            return Status.CONVERGED
+        length = max(float(np.linalg.norm(self.theta)), 1e-3)
+        self.stretch = RULES.first_interval * length / float(np.linalg.norm(gradient))
         with deferred(), building:
-            node = self._flow_node()
-            integrator = self._integrator(node)
+            integrator, node = self._build_integrator()
+        # Intervals along the flow, each twice as long as the one before, until the value falls no more.
         while best.iterations < limit:
             if not self._advance(integrator, node):
                 return Status.STALLED
@@ -282,22 +274,11 @@ class _Flow:
                 return Status.CONVERGED
         return Status.ITERATION_LIMIT
 
-    def _start(self) -> Status | None:
-        """Choose the first stretch; a status if there is nowhere to flow."""
-        self.value, gradient = self.best.value_and_gradient(self.theta)
-        if not np.isfinite(self.value):
-            return Status.FAILED
-        if not np.any(gradient):
-            return Status.CONVERGED
-        self.stretch = (
-            RULES.first_interval * max(float(np.linalg.norm(self.theta)), 1e-3) / float(np.linalg.norm(gradient))
-        )
-        return None
-
     def _advance(self, integrator: ca.Function, node: "ArrayNode") -> bool:
         """Follow the flow for one interval, and return whether the integrator reached the end."""
         self._uses = RULES.most_uses  # a new Jacobian
         try:
+            # An error of ours comes out as one of CasADi; only without one has the integrator given up.
             with deferred():
                 end = integrator(x0=self.theta, p=self.stretch)["xf"]
         except RuntimeError:
@@ -307,21 +288,36 @@ class _Flow:
         self.theta = np.asarray(end.nonzeros())
         return bool(np.isfinite(self.theta).all())
 
-    def _flow_node(self) -> "ArrayNode":
-        """-grad L as a CasADi function, with a Jacobian."""
-        size = self.theta.size
-        if not self.direct:
+    def _build_integrator(self) -> tuple[ca.Function, "ArrayNode"]:
+        """CVODES for dtheta/ds = -stretch grad L from s = 0 to 1, and the node of -grad L, with a Jacobian."""
+        size, jacobian, along = self.theta.size, None, None
+        # Newton's method in CVODES takes a matrix, and Krylov methods its product with a direction.
+        if self.direct:
+            jacobian = ArrayNode("flow_jacobian", [size], [(size, size)], lambda theta: [-self._curvature(theta)])
+        else:
             along = ArrayNode("flow_along", [size, size], [(size, 1)], lambda *at: [self._curvature_along(*at)])
-            return ArrayNode("flow", [size], [(size, 1)], lambda theta: [self._descent(theta)], forward=along)
-        jacobian = ArrayNode("flow_jacobian", [size], [(size, size)], lambda theta: [-self._curvature(theta)])
-        return ArrayNode("flow", [size], [(size, 1)], lambda theta: [self._descent(theta)], jacobian=jacobian)
+        node = ArrayNode("flow", [size], [(size, 1)], self._descend, jacobian=jacobian, forward=along)
+        # The stretch scales time, so that each interval ends at s = 1.
+        x, stretch = ca.MX.sym("x", size), ca.MX.sym("stretch")
+        system: dict[str, Any] = {"x": x, "p": stretch, "ode": stretch * node(x)}
+        options: dict[str, Any] = {
+            "reltol": self.settings.accuracy,
+            "abstol": self.settings.accuracy * 1e-2 * self.scale,
+            "newton_scheme": "direct" if self.direct else "gmres",
+            "max_num_steps": self.settings.max_steps or (500 if self.direct else 50),
+            "disable_internal_warnings": True,
+        }
+        if self.direct:
+            options["linear_solver"] = "lapacklu"
+        return ca.integrator("flow", "cvodes", system, 0.0, 1.0, options), node
 
-    def _descent(self, theta: Array) -> Array:
+    def _descend(self, theta: Array) -> list[Array]:
         self._last = theta, -self.best.value_and_gradient(theta)[1]
-        return self._last[1]
+        return [self._last[1]]
 
     def _curvature(self, theta: Array) -> Array:
         """The Hessian or the Gauss-Newton matrix at theta, or near it. CVODES asks for it twice in a row."""
+        # The last matrix serves near its place, a few times.
         at, kept = self._kept
         self._uses += 1
         if self._uses <= RULES.most_uses and np.linalg.norm(theta - at) <= RULES.moved * np.linalg.norm(theta):
@@ -340,26 +336,13 @@ class _Flow:
         length = float(np.linalg.norm(direction))
         if length == 0:
             return np.zeros_like(direction)
+        # A difference along a step that is short beside theta.
         step = RULES.difference * max(float(np.linalg.norm(theta)), 1.0) / length
         at, here = self._last
         if not np.array_equal(at, theta):
             here = -self.best.value_and_gradient(theta)[1]
         change: Array = (-self.best.value_and_gradient(theta + step * direction)[1] - here) / step
         return change
-
-    def _integrator(self, node: "ArrayNode") -> ca.Function:
-        x, stretch = ca.MX.sym("x", self.theta.size), ca.MX.sym("stretch")
-        system: dict[str, Any] = {"x": x, "p": stretch, "ode": stretch * node(x)}
-        options: dict[str, Any] = {
-            "reltol": self.settings.accuracy,
-            "abstol": self.settings.accuracy * 1e-2 * self.scale,
-            "newton_scheme": "direct" if self.direct else "gmres",
-            "max_num_steps": self.settings.max_steps or (500 if self.direct else 50),
-            "disable_internal_warnings": True,
-        }
-        if self.direct:
-            options["linear_solver"] = "lapacklu"
-        return ca.integrator("flow", "cvodes", system, 0.0, 1.0, options)
 
 
 class ArrayNode(ca.Callback):
@@ -373,7 +356,6 @@ class ArrayNode(ca.Callback):
         rows: length of each input column.
         shapes: shape of each output.
         compute: maps arrays (rows,) to one array per output.
-        options: options of the CasADi function.
         jacobian: derivative of the single output with respect to the single input, for solvers that need it.
         forward: directional derivative, as a function of input and direction; avoids a dense Jacobian.
     """
@@ -384,7 +366,6 @@ class ArrayNode(ca.Callback):
         rows: Sequence[int],
         shapes: Sequence[tuple[int, int]],
         compute: Callable[..., Sequence[Any]],
-        options: dict[str, Any] | None = None,
         jacobian: "ArrayNode | None" = None,
         forward: "ArrayNode | None" = None,
     ) -> None:
@@ -392,7 +373,7 @@ class ArrayNode(ca.Callback):
         self._rows, self._shapes, self._compute, self._jacobian = tuple(rows), tuple(shapes), compute, jacobian
         self._forward = forward
         self.error: BaseException | None = None
-        self.construct(name, options or {})
+        self.construct(name, {})
 
     def get_n_in(self) -> int:
         """Number of input columns."""
@@ -420,7 +401,13 @@ class ArrayNode(ca.Callback):
             return 1
         try:
             check()
-            results = self._compute(*(self._array(i, memory) for i, memory in enumerate(arg)))
+            # CasADi passes None for zeros.
+            results = self._compute(
+                *(
+                    np.zeros(count) if memory is None else np.frombuffer(memory).copy()
+                    for count, memory in zip(self._rows, arg, strict=True)
+                )
+            )
             for memory, result in zip(res, results, strict=True):
                 if memory is not None:
                     np.frombuffer(memory)[:] = np.asarray(result, dtype=float).ravel(order="F")
@@ -428,10 +415,6 @@ class ArrayNode(ca.Callback):
             self.error = error
             return 1
         return 0
-
-    def _array(self, i: int, memory: Any) -> Array:
-        """Input i as an array; CasADi passes None for zeros."""
-        return np.zeros(self._rows[i]) if memory is None else np.frombuffer(memory).copy()
 
     def has_jacobian(self) -> bool:
         """Whether a derivative was given."""

@@ -7,15 +7,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from orthocas.bases.family import (
-    TURN,
-    CombinableFamily,
-    Expression,
-    Family,
-    JointSpace,
-    LinearFamily,
-    Parametrisation,
-)
+from orthocas.bases.family import TURN, CombinableFamily, Expression, Family, JointSpace, LinearFamily, Parametrisation
 from orthocas.errors import InvalidValueError
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array

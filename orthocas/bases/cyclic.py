@@ -12,7 +12,6 @@ from orthocas.errors import InvalidValueError
 from orthocas.robots.kinematics import TipTurn
 from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.domains import Box
-from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem import Problem, is_regular
 from orthocas.tasks.samples import NEGLIGIBLE, sample_uniform
 from orthocas.tasks.task import Task
@@ -78,6 +77,7 @@ def widen_over_cyclic_joints(problem: Problem, names: tuple[str, ...]) -> Proble
     robot, domain = problem.robot, problem.domain
     if not names or domain.full_turns:
         return problem
+    # Each named joint takes its whole range; between infinite limits, any position counts.
     centre, half_width, unbounded = domain.centre.copy(), domain.half_width.copy(), set(domain.unbounded)
     for k in map(robot.joint_names.index, names):
         low, high = _find_range(problem, k)
@@ -86,6 +86,7 @@ def widen_over_cyclic_joints(problem: Problem, names: tuple[str, ...]) -> Proble
             unbounded.add(k)
         else:
             centre[k] = (low + high) / 2
+    # Domains that are parts of boxes keep their conditions.
     wider = domain.apply_to(Box(centre, half_width, sorted(unbounded)))
     return Problem(robot, problem.task, problem.metric, wider, problem.name)
 
@@ -102,14 +103,18 @@ def _find_range(problem: Problem, k: int) -> tuple[float, float]:
 def _is_cyclic(problem: Problem, points: Array, k: int) -> bool:
     """Whether nothing that matters changes when joint k moves."""
     robot, (low, high) = problem.robot, _find_range(problem, k)
+    # Without limits, a slide is tried within a few metres.
     if robot.tree.prismatic[k] and np.isinf([robot.lower[k], robot.upper[k]]).any():
         low, high = -RULES.largest_slide, RULES.largest_slide
+    # Each sample with the joint elsewhere, at several places.
     places = low + (high - low) * np.random.default_rng((RULES.seed, k)).uniform(size=(RULES.positions, len(points)))
     moved = np.repeat(points[None], RULES.positions, axis=0)
     moved[:, :, k] = places
+    # A joint that does not move the task does not count.
     J, A = _evaluate_task_and_metric(problem, points)
     if not np.abs(J[:, :, k]).max() > NEGLIGIBLE * np.abs(J).max():
         return False
+    # Nothing that matters may change: the metric, then the span and its sizes.
     J_there, A_there = _evaluate_task_and_metric(problem, moved.reshape(-1, problem.n))
     if not (np.isfinite(J_there).all() and np.isfinite(A_there).all() and _is_same(A, A_there)):
         return False
@@ -165,9 +170,23 @@ def keeps_self_motions(problem: Problem, joint: int) -> bool:
     Rotations are taken as rotations; those of a robot's file are up to rounding. False where no proof is found: the
     joint may still be cyclic.
     """
-    return _has_constant_metric(problem.metric, problem.robot.tree, joint) and (
-        _has_motion_of_task(problem.task, joint) or _is_no_part_of_gradients(problem.task, joint)
-    )
+    # M does not depend on a joint that moves all it carries as one rigid body in a world at rest: all joints below it
+    # in the tree are prismatic and, if it is revolute, exactly along its axis.
+    tree, metric, task = problem.robot.tree, problem.metric, problem.task
+    below, q = tree.carriers(tree.parents[joint]), ca.SX.sym("q", tree.n)
+    along = tree.prismatic[joint] or all(_is_axis(_fit_rotation(tree, joint, i)[:, 2], 2) for i in below)
+    at_rest = along and all(tree.prismatic[i] for i in below)
+    rigid = metric.recipe["kind"] == "inertia" and at_rest
+    if not rigid and ca.depends_on(metric.function(q), q[joint]):
+        return False
+    # By the kinematics, h(q + t e_k) = g_t(h(q)).
+    kind = task.recipe["kind"]
+    turned = TipTurn.from_kind(kind) is not None or _is_turn_of_components(tree, joint, kind)
+    if turns_tool(task, joint) or (task.of_tip and at_rest and turned):
+        return True
+    # By the steps of h, J_x does not depend on the joint.
+    rows = find_gradient_dependences(write_tape(task.smooth_function))
+    return all(joint not in joints for row in rows for joints in row.values())
 
 
 def turns_tool(task: Task, joint: int) -> bool:
@@ -177,45 +196,6 @@ def turns_tool(task: Task, joint: int) -> bool:
     """
     turn = TipTurn.from_kind(task.recipe["kind"])
     return task.of_tip and turn is not None and turn.whole and joint == task.robot.tree.tip_parent
-
-
-def _has_motion_of_task(task: Task, joint: int) -> bool:
-    """Whether the kinematics show that h(q + t e_k) = g_t(h(q))."""
-    tree, kind = task.robot.tree, task.recipe["kind"]
-    if not task.of_tip:
-        return False
-    if turns_tool(task, joint):
-        return True
-    turn = TipTurn.from_kind(kind)
-    return _is_turn_of_rest(tree, joint) and (turn is not None or _is_turn_of_components(tree, joint, kind))
-
-
-def _is_no_part_of_gradients(task: Task, joint: int) -> bool:
-    """Whether the steps of h show that J_x does not depend on a joint."""
-    return all(
-        joint not in joints
-        for row in find_gradient_dependences(write_tape(task.smooth_function))
-        for joints in row.values()
-    )
-
-
-def _has_constant_metric(metric: Metric, tree: KinematicTree, joint: int) -> bool:
-    """Whether A is proved not to depend on a joint.
-
-    The inertia M does not depend on a joint that moves all it carries as one rigid body in a world at rest.
-    """
-    if metric.recipe["kind"] == "inertia" and _is_turn_of_rest(tree, joint):
-        return True
-    q = ca.SX.sym("q", tree.n)
-    return not ca.depends_on(metric.function(q), q[joint])
-
-
-def _is_turn_of_rest(tree: KinematicTree, joint: int) -> bool:
-    """Whether all joints below one in the tree are prismatic and, if it is revolute, exactly along its axis."""
-    below = tree.carriers(tree.parents[joint])
-    if not all(tree.prismatic[i] for i in below):
-        return False
-    return bool(tree.prismatic[joint]) or all(_is_axis(_fit_rotation(tree, joint, i)[:, 2], 2) for i in below)
 
 
 def _is_turn_of_components(tree: KinematicTree, joint: int, kind: str) -> bool:
@@ -311,16 +291,12 @@ def resolved(cyclic: Cyclic, problem: "Problem") -> tuple[str, ...]:
         return ()
     known, names = cyclic_joints(problem), problem.robot.joint_names
     if cyclic == "auto":
+        # Names that were not found at samples may still be proved.
         return known
-    wrong = [name for name in cyclic if name not in known and not _keeps_leaves(problem, name)]
-    if wrong:
-        raise InvalidValueError("cyclic", repr(wrong[0]), f"one of the cyclic joints: {', '.join(known) or 'none'}")
+    for name in cyclic:
+        if name not in known and not (name in names and keeps_self_motions(problem, names.index(name))):
+            raise InvalidValueError("cyclic", repr(name), f"one of the cyclic joints: {', '.join(known) or 'none'}")
     return tuple(name for name in names if name in cyclic)
-
-
-def _keeps_leaves(problem: "Problem", name: str) -> bool:
-    names = problem.robot.joint_names
-    return name in names and keeps_self_motions(problem, names.index(name))
 
 
 def indices(cyclic: Cyclic, space: JointSpace) -> list[int]:
@@ -377,11 +353,13 @@ class Mobile:
     closed_form = None
 
     def __post_init__(self) -> None:
+        # A parametrisation to fit, without joints of its own that are cyclic.
         fitted = isinstance(self.arm, Parametrisation) and not isinstance(self.arm, type)
         if not fitted or self.arm.closed_form is not None or isinstance(self.arm, Mobile):
             raise InvalidValueError("arm", repr(self.arm)[:80], "a parametrisation to fit, such as Polynomial(2)")
         if getattr(self.arm, "cyclic", ()):
             raise InvalidValueError("arm", self.arm.label, "a parametrisation without cyclic joints")
+        # Three joints of the base, by their names.
         names = tuple(self.base) if isinstance(self.base, tuple | list) else ()
         if len({*names}) != RULES.on_plane or not all(isinstance(name, str) for name in names):
             raise InvalidValueError("base", repr(self.base)[:80], "names of three joints: x, y and the heading")
@@ -402,6 +380,7 @@ class Mobile:
         missing = [name for name in self.base if name not in tree.joint_names]
         if missing:
             raise InvalidValueError("base", repr(missing[0]), f"joints of {', '.join(tree.joint_names)}")
+        # From the world on: x, y and the heading, each exactly along its axis of the world.
         R, parent = np.eye(3), -1
         for name, kind, axis in zip(self.base, ("prismatic", "prismatic", "revolute"), range(3), strict=True):
             k = tree.joint_names.index(name)
@@ -458,10 +437,12 @@ class MobileFamily:
 
     def expression(self, q: Expression, theta: Expression) -> Expression:
         """xi, (r, N), for q (n, N)."""
+        # The arm's coordinates, the first two of them in the axes of the base.
         own, rest = theta[: self.arm.size], theta[self.arm.size :]
         f = self.arm.expression(q[list(self.joints), :], own)
         x, y, heading = (q[i, :] for i in self.places)
         ahead, aside = f[0, :] + rest[0], f[1, :] + rest[1]
+        # Turned by the heading and shifted by the place, they are those of the world.
         c, s = ca.cos(heading), ca.sin(heading)
         rows = [x + c * ahead - s * aside, y + s * ahead + c * aside, heading + f[2, :]]
         rows += [rest[k - 1] * heading + f[k, :] for k in range(RULES.on_plane, self.outputs)]

@@ -9,7 +9,7 @@ import numpy as np
 
 from orthocas.bases.family import TURN, ClosedForm, Expression, JointSpace, component_gradients
 from orthocas.errors import InvalidValueError, RobotError
-from orthocas.robots.kinematics import Pose, build_body_poses
+from orthocas.robots.kinematics import build_body_poses
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.problem import Problem
@@ -22,10 +22,7 @@ SEWKind = Literal["conventional", "stereographic"]
 SEW_KINDS: tuple[SEWKind, ...] = ("conventional", "stereographic")
 # (e_t, e_r) in the world. The singular half-line e_t points down into the base. With e_r = -x, an arm that reaches
 # along +x with its elbow up has psi = 0, far from the jump at +-pi.
-DIRECTIONS = {
-    "conventional": ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-    "stereographic": ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0)),
-}
+DIRECTIONS = {"conventional": ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), "stereographic": ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0))}
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,10 +183,19 @@ def sew_angle(robot: Robot, kind: str) -> ca.Function:
         as the case e_t = 0.
     """
     require_known("SEW angle", kind, SEW_KINDS)
-    _require_seven_revolute(robot.tree)
+    # A chain of seven revolute joints.
+    tree = robot.tree
+    if tree.n != 7:
+        raise RobotError(f"the robot has {tree.n} joints, expected 7 for a shoulder-elbow-wrist angle")
+    for i, name in enumerate(tree.joint_names):
+        if tree.joint_kinds[i] != "revolute":
+            raise RobotError(f"joint '{name}' is {tree.joint_kinds[i]}, expected 7 revolute joints")
+        if tree.parents[i] != i - 1:
+            raise RobotError(f"joint '{name}' does not follow joint '{tree.joint_names[i - 1]}', expected a chain")
     q = ca.SX.sym("q", robot.n)
-    poses = build_body_poses(robot.tree, q)
-    S, E, W = (_project_on_axis(poses[k], height) for k, height in _find_points(robot.tree))
+    poses = build_body_poses(tree, q)
+    # Each point lies on a joint's axis, the z of its body, at a fixed height above the body's origin.
+    S, E, W = (poses[k][1] + poses[k][0][:, 2] * height for k, height in _find_points(tree))
     e_t, e_r = (ca.SX(ca.DM(direction)) for direction in DIRECTIONS[kind])
     return dense_function("sew_angle", [q], [compute_elbow_angle(E - S, W - S, e_t, e_r)])
 
@@ -200,12 +206,6 @@ def compute_elbow_angle(p_SE: ca.SX, p_SW: ca.SX, e_t: ca.SX, e_r: ca.SX) -> ca.
     k_r = ca.cross(e_SW - e_t, e_r)
     k_x = ca.cross(k_r, p_SW)
     return ca.atan2(ca.dot(e_SW, ca.cross(k_x, p_SE)), ca.dot(k_x, p_SE))
-
-
-def _project_on_axis(pose: Pose, height: float) -> ca.SX:
-    """The point of a joint's axis (z of its body) at a height above the body's origin, (3, 1) in the world."""
-    R, p = pose
-    return p + R[:, 2] * height
 
 
 def _find_points(tree: KinematicTree) -> tuple[tuple[int, float], ...]:
@@ -227,6 +227,7 @@ def _find_common_normal(tree: KinematicTree, i: int) -> tuple[float, float, floa
     """Ends of the common normal of axes i and i + 1, as heights on the two axes, and its length [m]."""
     # of joint i + 1 in body i, whose axis is z
     origin, axis = tree.translations[i + 1], tree.rotations[i + 1][:, 2]
+    # Seen along the first axis, the foot on the second one is where that line is nearest to the origin.
     across = axis[:2]
     if np.linalg.norm(across) < RULES.parallel:
         names = tree.joint_names
@@ -236,17 +237,6 @@ def _find_common_normal(tree: KinematicTree, i: int) -> tuple[float, float, floa
     height = -float(origin[:2] @ across) / float(across @ across)
     end = origin + height * axis
     return float(end[2]), height, float(np.linalg.norm(end[:2]))
-
-
-def _require_seven_revolute(tree: KinematicTree) -> None:
-    """Raise RobotError unless the tree is a chain of seven revolute joints."""
-    if tree.n != 7:
-        raise RobotError(f"the robot has {tree.n} joints, expected 7 for a shoulder-elbow-wrist angle")
-    for i, name in enumerate(tree.joint_names):
-        if tree.joint_kinds[i] != "revolute":
-            raise RobotError(f"joint '{name}' is {tree.joint_kinds[i]}, expected 7 revolute joints")
-        if tree.parents[i] != i - 1:
-            raise RobotError(f"joint '{name}' does not follow joint '{tree.joint_names[i - 1]}', expected a chain")
 
 
 @dataclass(frozen=True)

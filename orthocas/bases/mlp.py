@@ -298,6 +298,7 @@ class MLPFamily:
         self, q: Expression, layers: list[tuple[Expression, Expression]]
     ) -> tuple[Expression, list[Expression]]:
         """Outputs of the network (r, N), and the derivatives 1 - tanh^2 of the hidden layers, (width, N) each."""
+        # The network takes sines and cosines of joints that turn, and others as they are.
         angles = q[self.turning, :]
         layer = ca.vertcat(ca.sin(angles), ca.cos(angles), q[self.direct, :])
         slopes = []

@@ -53,6 +53,7 @@ class ProductFamily(BasisFamily):
     @cached_property
     def derivatives(self) -> list[tuple[Array, NDArray[np.int_], NDArray[np.int_]]]:
         """Entries of D_i with d (1, psi) / d q_i = D_i (1, psi): values, rows and columns for every joint."""
+        # Each derivative of a term is a sum of terms with another function of that joint.
         terms = ((0,) * self.space.n, *self.terms)
         places = {term: k for k, term in enumerate(terms)}
         found = []
@@ -258,6 +259,7 @@ class Polynomial(Products):
     def family(self, space: JointSpace, outputs: int) -> ProductFamily:
         """Polynomials in u_i = (q_i - centre_i) / half_width_i."""
 
+        # Legendre polynomials by their recursion, of length 1 over the domain.
         def legendre(q: Any) -> list[Any]:
             centre, half_width = (ca.repmat(ca.DM(v), 1, q.shape[1]) for v in (space.centre, space.half_width))
             u = (q - centre) / half_width
@@ -272,6 +274,7 @@ class Polynomial(Products):
             values: Array = np.sqrt((2 * a + 1) * (2 * b + 1)) * ((a > b) & ((a - b) % 2 == 1)) / space.half_width[i]
             return values
 
+        # Functions that each joint may bring, and their products up to the degree.
         none = cyclic_choice.indices(self.without, space)
         degrees = [[0] if i in none else list(range(self.degree + 1)) for i in range(space.n)]
         terms = reduce_terms(degrees, self.degree, cyclic_choice.indices(self.cyclic, space), self.joints)
@@ -318,6 +321,7 @@ class Fourier(Products):
             )
         linear = cyclic_choice.indices(self.cyclic, space)
 
+        # Waves of length 1; a cyclic joint has a linear function in place of its first one.
         def waves(q: Any) -> list[Any]:
             out = [sqrt(2) * wave(k * q) for k in range(1, self.degree + 1) for wave in (ca.cos, ca.sin)]
             rows = (q[i, :] - space.centre[i] if i in linear else out[0][i, :] for i in range(space.n))
@@ -332,6 +336,7 @@ class Fourier(Products):
                 D[2 * k - 1, 2 * k], D[2 * k, 2 * k - 1] = -k, k
             return D
 
+        # Functions that each joint may bring, and their products up to the degree.
         none = cyclic_choice.indices(self.without, space)
         of_joint = [0, *(k for k in range(1, self.degree + 1) for _ in range(2))]
         degrees = [[0] if i in none else of_joint for i in range(space.n)]
@@ -403,6 +408,7 @@ class Linear:
             SingularTaskError: if the gradients are linearly dependent at the base.
             InvalidValueError: if normals is "paper" and n is not 3.
         """
+        # The null space of the task's gradients at the base.
         m, n = gradients.shape
         values, vectors = np.linalg.svd(gradients)[1:]
         normals = vectors[m:]
@@ -410,6 +416,7 @@ class Linear:
             raise SingularTaskError("the task is singular at the base of linear coordinates, expected a regular base")
         if self.normals == "orthonormal":
             return normals
+        # The paper's vectors are not orthonormal, and exist for three joints only.
         if n != 3:
             raise InvalidValueError("n", n, "3 joints for the paper's normal vectors")
         if m == 2:

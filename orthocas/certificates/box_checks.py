@@ -85,24 +85,22 @@ class EliminationCheck:
 
     def __call__(self, low: Array, high: Array) -> BoxResults:
         """Evaluate boxes between corners (boxes, n)."""
-        # Products are small, and with one thread their rounding is the same everywhere.
+        # Products are small, and with one thread their rounding is the same everywhere. On some boxes, bounds are
+        # infinite.
+        parts = []
         with one_blas_thread():
             J = self.rows(low, high)
-            starts = range(0, J.remainder.shape[-1], _AT_ONCE)
-            parts = [self._check_few(select_boxes(J, slice(k, k + _AT_ONCE))) for k in starts]
-        proved, regular, sign, conditioning, influences = (np.concatenate(each) for each in zip(*parts, strict=True))
-        return BoxResults(proved, regular, sign, conditioning, find_most_influential(influences, J.variables))
-
-    def _check_few(self, J: TaylorModel) -> tuple[Array, ...]:
-        # On some boxes, bounds are infinite.
-        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            turned, signs = rotate_to_singular_basis(J)
-            regular = have_positive_pivots(compute_pivots(turned)) & (signs != 0)
-        conditioning = np.zeros(len(signs))
-        if self.bound > 0 and regular.any():
-            conditioning[regular] = bound_conditioning(select_boxes(J, regular), self.rows.m)
-        proved = regular & (conditioning >= self.bound)
-        return proved, regular, signs, conditioning, compute_influences(turned)
+            for k in range(0, J.remainder.shape[-1], _AT_ONCE):
+                few = select_boxes(J, slice(k, k + _AT_ONCE))
+                with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+                    turned, signs = rotate_to_singular_basis(few)
+                    regular = have_positive_pivots(compute_pivots(turned)) & (signs != 0)
+                level = np.zeros(len(signs))
+                if self.bound > 0 and regular.any():
+                    level[regular] = bound_conditioning(select_boxes(few, regular), self.rows.m)
+                parts.append((regular & (level >= self.bound), regular, signs, level, compute_influences(turned)))
+        proved, regular, signs, conditioning, influences = (np.concatenate(each) for each in zip(*parts, strict=True))
+        return BoxResults(proved, regular, signs, conditioning, find_most_influential(influences, J.variables))
 
 
 def rotate_to_singular_basis(J: TaylorModel) -> tuple[TaylorModel, Array]:

@@ -185,11 +185,7 @@ def certified_box(
 
 
 def check_certificate(
-    chart: Chart,
-    certificate: Certificate | None = None,
-    *,
-    executor: Executor | None = None,
-    monitor: Monitor = silent,
+    chart: Chart, certificate: Certificate | None = None, *, executor: Executor | None = None, monitor: Monitor = silent
 ) -> bool:
     """Whether a certificate holds: all that it says of the chart is computed once more.
 
@@ -475,6 +471,7 @@ def _report_search(monitor: Monitor, stage: str, *, guarded: bool = False) -> Lo
 
 def _check_parts(check: BoxCheck, parts: Subdivision, mapped: Mapped, monitor: Monitor) -> list[BoxResults]:
     # In pieces, whose results come in order.
+    # Leaves of the tree that count as proved, in pieces for the workers.
     low, high = parts.leaves(PROVED)
     pieces = [slice(k, k + RULES.at_once) for k in range(0, len(low), RULES.at_once)]
     results = []

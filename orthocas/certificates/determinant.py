@@ -301,6 +301,7 @@ def _plan_products(n: int, degree: int) -> tuple[tuple[bool, int, slice, NDArray
     place = {m: k for k, m in enumerate(every)}
     starts = [len(list_indices(n, d - 1)) if d else 0 for d in range(max(SERIES_DEGREE, degree) + 2)]
     plan = []
+    # Pairs whose degrees add up to no more than is kept, each taken once.
     for k, one in enumerate(every):
         own = len(one)
         for of_a, least, most in ((True, own, SERIES_DEGREE - own), (False, own + 1, min(degree, SERIES_DEGREE - own))):

@@ -270,12 +270,14 @@ class TipJets:
     def build(cls, rows: TipRows, tree: KinematicTree, columns: tuple[int, ...], domain: Domain) -> "TipJets":
         """For boxes within a domain."""
         # From the tip inwards, each joint's distance is at most the length of the chain behind it.
+        # Rounding of the kinematics, relative to the reach of the arm.
         doubt = 64 * (tree.n + 8) * bound_rotation_error(tree) * bound_reach(tree, domain)
         chain = tree.carriers(tree.tip_parent)
         slides = np.where(tree.prismatic, np.abs(domain.centre) + domain.half_width, 0.0)
         steps = np.linalg.norm(tree.translations, axis=1) + slides
         beyond = float(np.linalg.norm(tree.tip_translation))
         longer = 1 + 16 * tree.n * bound_rotation_error(tree)
+        # From the tip inwards: the farthest that each joint can move it.
         lengths = dict.fromkeys(columns, 0.0)
         for i in reversed(chain):
             lengths[i] = 1.0 if tree.prismatic[i] else beyond
@@ -305,6 +307,7 @@ class TipJets:
             nested = _nest_products(outer, first, around.order)
             parts.append([np.einsum("bxk,mxb->mkb", across, each) for each in nested])
             rests.append(np.repeat(self._bound_rest_of_turns(around, turning & carried)[None], 2, axis=0))
+        # Derivatives of all parts, in the order of their rows.
         n = len(self.columns)
         derivatives = tuple(
             np.concatenate([part[order][find_neighbours(n, order + 1)] for part in parts], axis=2).transpose(2, 0, 1, 3)
@@ -362,6 +365,7 @@ def _nest_rotations(axes: Array, highest: int) -> list[Array]:
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         crosses[:, j, i], crosses[:, i, j] = axes[:, k], -axes[:, k]
+    # Products of one more axis for each order, of which the skew part counts.
     nested, product = [], crosses
     for order in range(1, highest + 2):
         if order > 1:

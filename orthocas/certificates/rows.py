@@ -254,10 +254,12 @@ class TipRows:
         kind = task.recipe["kind"]
         if task.robot.tree.tip_parent < 0 or not task.of_tip:
             return None
+        # Rows of a position, or of some of its components.
         if kind == "polar":
             return cls((0, 1))
         if kind.startswith("position:"):
             return cls(tuple(map("xyz".index, kind.removeprefix("position:"))))
+        # Rows of an orientation, of a pose, or of one axis.
         if (turned := TipTurn.from_kind(kind)) is None:
             return None
         whole = turned.whole or turned.axis is None
@@ -405,9 +407,11 @@ class ProductRows:
     def __call__(self, boxes: list[TaylorModel], half_widths: Array, variables: Variables) -> TaylorModel:
         """J_xi, (r, n, boxes), for models of the joints on boxes of the given half-widths (n, boxes)."""
         # Taylor's series: derivatives at the centre, and the next order on the whole box for the remainder.
+        # Values of the basis at the centres, with their errors.
         points = [TaylorModel.constant(box.centre) for box in boxes]
         values, errors = self._evaluate_basis(self.functions(points))
         parts, left_out = [], np.zeros((self.r, len(boxes), half_widths.shape[1]))
+        # Derivatives up to the degree of the models; the next one bounds what they leave out.
         for order in range(1, DEGREE + 2):
             derivatives, doubt = self._evaluate_derivatives(order, values, errors)
             weights = compute_powers(half_widths, order - 1)

@@ -194,22 +194,19 @@ class TaylorModel:
             out[where] += a[i] * b[1:end]
         for j, where in enumerate(table.quadratic_by, 1):
             out[where] += b[j] * a[starts[2] : starts[3]]
-        return TaylorModel(table.variables, out, self._bound_remainder(other))
+        # The remainder: degrees above 3, the remainders of the factors, and rounding, from their sizes by degree.
+        a, b = self.sum_sizes(), other.sum_sizes()
+        all_a, all_b = a.sum(axis=0), b.sum(axis=0)
+        high = a[3] * (b[1] + b[2] + b[3]) + a[2] * (b[2] + b[3]) + a[1] * b[3]
+        carried = self.remainder * (all_b + other.remainder) + other.remainder * all_a
+        remainder = (high + carried + sum_error(_PRODUCTS) * (all_a * all_b)) * UP + TINY
+        return TaylorModel(table.variables, out, np.asarray(remainder))
 
     def _multiply_constant(self, factor: "TaylorModel") -> "TaylorModel":
         """The product with a model without variables."""
         exact = self.multiply_by(factor.centre)
         doubt = factor.remainder * (np.abs(self.coefficients).sum(axis=0) + self.remainder)
         return _widen(exact, doubt)
-
-    def _bound_remainder(self, other: "TaylorModel") -> Array:
-        """The remainder of a product: degrees above 3, the remainders of the factors, and rounding."""
-        # Sizes by degree.
-        a, b = self.sum_sizes(), other.sum_sizes()
-        all_a, all_b = a.sum(axis=0), b.sum(axis=0)
-        high = a[3] * (b[1] + b[2] + b[3]) + a[2] * (b[2] + b[3]) + a[1] * b[3]
-        carried = self.remainder * (all_b + other.remainder) + other.remainder * all_a
-        return np.asarray((high + carried + sum_error(_PRODUCTS) * (all_a * all_b)) * UP + TINY)
 
     def compose(self, series: "Series") -> "TaylorModel":
         """The model of f(self), for the series of f about the centre."""

@@ -10,19 +10,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.certificate import Certificate
-from orthocas.charts.chart_file import fingerprint, read_chart, write_chart
 from orthocas.charts.coordinates import CoordinateMap
 from orthocas.charts.methods import InverseMethods
 from orthocas.charts.point_quality import PointQuality, point_quality
 from orthocas.charts.self_motion import SelfMotion, XiRange, self_motion, xi_range
 from orthocas.errors import InvalidValueError
-from orthocas.exact.flow import GrownCoordinates
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, as_path, as_point_set, require_kind
 from orthocas.tools.display import Shown, listed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from orthocas.exact.flow import GrownCoordinates
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -59,7 +59,13 @@ class Chart(InverseMethods, Shown):
         require_kind("notes", self.notes, Mapping)
         object.__setattr__(self, "notes", MappingProxyType(dict(self.notes)))
         if self.certificate is not None:
-            self.certificate.require_for(fingerprint(self.problem, self.coordinates))
+            self._check_certificate(self.certificate)
+
+    def _check_certificate(self, certificate: Certificate) -> None:
+        """Raise CertifyError for a proof of another chart."""
+        from orthocas.charts.chart_file import fingerprint  # all that files may hold, which a fit does not need
+
+        certificate.require_for(fingerprint(self.problem, self.coordinates))
 
     def __reduce__(self) -> tuple[type[Self], tuple[Any, ...]]:
         """Pickle and copy the fields, with the notes as a plain dict: a read-only mapping supports neither."""
@@ -200,6 +206,8 @@ class Chart(InverseMethods, Shown):
             ChartFileError: if the folder is missing or cannot be written, if there is a file that is no chart, or a
                 symbolic link.
         """
+        from orthocas.charts.chart_file import write_chart  # all that files may hold, which a fit does not need
+
         write_chart(as_path("path", path), self.problem, self.coordinates, self.notes, self.certificate, force)
 
 
@@ -210,9 +218,11 @@ class GrownChart(Chart):
     `coordinates.leaf` is the base leaf. `coordinates.pull` gives the point of it that each q flows to, with a status.
     """
 
-    coordinates: GrownCoordinates
+    coordinates: "GrownCoordinates"
 
     def __post_init__(self) -> None:
+        from orthocas.exact.flow import GrownCoordinates  # flows and meshes, which fitted charts do not need
+
         if not isinstance(self.coordinates, GrownCoordinates):
             raise InvalidValueError(
                 "chart",
@@ -224,6 +234,9 @@ class GrownChart(Chart):
 
 def load_file(path: Path) -> Chart:
     """Read a chart file. A grown chart comes back as a `GrownChart`."""
+    from orthocas.charts.chart_file import read_chart  # all that files may hold, which a fit does not need
+    from orthocas.exact.flow import GrownCoordinates
+
     problem, coordinates, notes, certificate = read_chart(path)
     if isinstance(coordinates, GrownCoordinates):
         return GrownChart(problem, coordinates, notes)

@@ -1,9 +1,10 @@
 """Collects the commands, and turns errors into one line and exit code 2."""
 
 import sys
+import warnings
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -16,7 +17,7 @@ COMMANDS = {
     "fit": "Fit extra coordinates to a problem and save the chart.",
     "evaluate": "Measure the quality of a chart on held-out samples of its domain.",
     "certify": "Prove that a chart does not fold anywhere on its domain, and keep the proof in its file.",
-    "info": "Show a chart file, a named problem, or a robot file.",
+    "info": "Show a chart, a named problem, or a robot.",
     "compare": "Fit a grid of parametrisations, solvers and seeds; write tables, pictures and charts.",
     "simulate": "Run a controller in a chart's coordinates; write the run, pictures, an animation and a report.",
     "follow": "Follow a tool path; write joint positions, velocities and accelerations on time stamps.",
@@ -64,7 +65,8 @@ def _options(
 
 def run(app: typer.Typer) -> int:
     """Run a command line. Bad input gives one line on standard error and exit code 2, a signal its own code."""
-    with ended_in_order() as ended, remembered() as pressed:
+    with ended_in_order() as ended, remembered() as pressed, warnings.catch_warnings():
+        warnings.showwarning = _show_warning
         try:
             code = app(prog_name="orthocas", standalone_mode=False) or 0
         except KeyboardInterrupt:
@@ -79,6 +81,11 @@ def run(app: typer.Typer) -> int:
                 typer.echo(f"orthocas: {line[:1000]}{'...' if len(line) > 1000 else ''}", err=True)
             code = 2
         return ended() or (report_interrupt() if pressed() or code == INTERRUPTED else code)
+
+
+def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    """Print a warning as a note in one line, those of other libraries too."""
+    typer.echo(f"note: {one_line(str(message))}", err=True)
 
 
 def _format_error(error: Exception) -> str:

@@ -37,7 +37,7 @@ def info(
     ] = False,
     json: AsJson = False,
 ) -> None:
-    """Show a chart file, a named problem, or a robot file."""
+    """Show a chart, a named problem, or a robot."""
     if is_robot_file(target):
         robot = words.build_robot(target)
         data = {

@@ -12,6 +12,7 @@ import typer
 
 from orthocas.errors import InvalidValueError, OptionError, UnknownNameError
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Angles, Weights
+from orthocas.robots.named import list_robot_files
 from orthocas.robots.robot import Robot
 from orthocas.tasks.domains import default_box
 from orthocas.tasks.problem import Problem
@@ -165,7 +166,8 @@ class ProblemOptions:
         tool = None if self.tool is None else parse_numbers("--tool", self.tool)
         gravity = None if self.gravity is None else parse_numbers("--gravity", self.gravity)
         tips = [name.strip() for name in (self.tip or "").split(",") if name.strip()]
-        return Robot.from_file(path, None, self.parse_locks(), tool, tips=tips, base=self.base, gravity=gravity)
+        build = Robot.from_name if is_robot_name(path) else Robot.from_file
+        return build(path, None, self.parse_locks(), tool, tips=tips, base=self.base, gravity=gravity)
 
     def build_problem(self, name: str) -> Problem:
         """Build the problem of a name, or of a robot file.
@@ -184,7 +186,7 @@ class ProblemOptions:
             box = default_box(robot, centre, self.parse_half_width())
             return Problem(robot, task, self.metric or "euclidean", box, Path(name).stem, self.least_singular_value)
         if name not in problems.names():
-            raise UnknownNameError("problem", name, (*problems.names(), "or a FILE.urdf"))
+            raise UnknownNameError("problem or robot", name, (*problems.names(), *list_robot_files(), "or a FILE.urdf"))
         # A named problem, with what the options change.
         base: Problem = problems.get(name)
         if all(value in (None, ()) for value in astuple(self)):
@@ -221,8 +223,16 @@ class ProblemOptions:
 
 
 def is_robot_file(name: str) -> bool:
-    """Whether a PROBLEM argument means a robot file."""
-    return Path(name).suffix.lower() in (".urdf", ".xml", ".xacro")
+    """Whether a PROBLEM argument means a robot: a file of one, or a name of an installed package."""
+    return Path(name).suffix.lower() in (".urdf", ".xml", ".xacro") or is_robot_name(name)
+
+
+def is_robot_name(name: str) -> bool:
+    """Whether a PROBLEM argument is no file and no problem, but a robot that `Robot.from_name` knows."""
+    from orthocas import problems  # builds arms, which commands on files do not need
+
+    plain = Path(name).name == name and not Path(name).suffix and name not in problems.names()
+    return plain and name in list_robot_files() and not Path(name).exists()
 
 
 def add_problem_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from orthocas.charts.chart import Chart
 from orthocas.codegen.generate import GeneratedC
 from orthocas.codegen.library import CompiledLibrary, compile_shared, find_compilers, gain_numbers
-from orthocas.codegen.precision import DOUBLE, SINGLE, Precision, find_bounds_inside
+from orthocas.codegen.rendering import DOUBLE, SINGLE, Precision, find_bounds_inside
 from orthocas.control.controller import (
     FROM_THE_LAW,
     Controller,
@@ -52,11 +52,7 @@ class AgreementCheck:
 
 
 def check_c(
-    generated: GeneratedC,
-    chart: Chart,
-    controller: Controller | None = None,
-    states: int = 1000,
-    seed: int = 0,
+    generated: GeneratedC, chart: Chart, controller: Controller | None = None, states: int = 1000, seed: int = 0
 ) -> AgreementCheck:
     """Compile with gcc and clang (C99, warnings as errors), if installed, and compare with Python.
 

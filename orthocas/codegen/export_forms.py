@@ -248,6 +248,7 @@ def _count_rooms(domain: Domain) -> int:
 def _build_rooms(chart: Chart) -> list[Form]:
     """The function `_room` of columns q (n, N) -> (rooms, N), for what a domain asks beside its box."""
     domain = chart.problem.domain
+    # Bounds on singular values, and on folds where there are any.
     if (bound := domain.singular_bound) is not None:
         fold = domain.fold_bound
         summary = "Rows that must not be singular, one by one, (m n, N)."
@@ -255,6 +256,7 @@ def _build_rooms(chart: Chart) -> list[Form]:
         values = {"kind": "clear", "squared_bound": bound.least_singular_value**2, "folds": fold is not None}
         tables = {"row_scale": bound.scale[:, None], "unit": np.eye(chart.m)}
         return [Form("room", values, rows, tables, {}), *([] if fold is None else [_build_room_to_fold(chart, fold)])]
+    # The distance to the path of a corridor.
     if (path := domain.path_bound) is not None:
         starts, axes, squares = path.lines
         tables = {
@@ -264,6 +266,7 @@ def _build_rooms(chart: Chart) -> list[Form]:
             "path_lengths": np.sqrt(squares)[:, None],
         }
         return [Form("room", {"kind": "path"}, "", tables, {"path_joints": path.counted.tolist()})]
+    # Other conditions by their expression; boxes have none.
     if domain.condition is None:
         return [Form("room", {"kind": "box"}, "", {}, {})]
     summary = "Numbers (k, N) that are positive at columns q that meet the condition of the domain."
@@ -278,6 +281,7 @@ def _build_room_to_fold(chart: Chart, fold: FoldBound) -> Form:
     own = chart.coordinates.jacobian(points)
     units = [rows / np.linalg.norm(rows, axis=2, keepdims=True) for rows in (theirs, own)]
     same = bool(np.abs(units[0] - units[1]).max() < _PARALLEL)
+    # Gradients that are those of the chart need no code of their own.
     values = {
         "kind": "fold",
         "least_volume": fold.least_volume,
@@ -300,11 +304,18 @@ def write_function(name: str, summary: str, *functions: ca.Function) -> str:
 
 def _write_tape(tape: Tape) -> list[str]:
     """The lines that compute a tape's output from columns q (n, N), and return it as (k, N)."""
-    lines: list[str] = []
-    # Constants in slots of the work array stay words.
+    steps, lines = tape["steps"], list[str]()
+    # How many operands of later steps each step's result is.
+    uses, writer = [0] * len(steps), dict[int, int]()
+    for k, (name, into, *of) in enumerate(steps):
+        for slot in () if name in ("const", "input") else of:
+            uses[writer[slot]] += 1
+        if name != "output":
+            writer[into] = k
+    # Constants in slots of the work array stay words; results of several uses are computed once.
     constants: dict[int, str] = {}
     results: dict[int, str] = {}
-    for (name, into, *of), uses in zip(tape["steps"], _count_uses(tape["steps"]), strict=True):
+    for (name, into, *of), count in zip(steps, uses, strict=True):
         if name == "const":
             # Exactly; in brackets where an operator beside it would take its sign.
             value = float(of[0])
@@ -316,26 +327,11 @@ def _write_tape(tape: Tape) -> list[str]:
         else:
             text = f"q[{of[0]}]" if name == "input" else _write_operation(name, of, constants)
             constants.pop(into, None)
-            lines.append(f"w{into} = _shared({text}, q)" if uses > 1 and name != "input" else f"w{into} = {text}")
+            lines.append(f"w{into} = _shared({text}, q)" if count > 1 and name != "input" else f"w{into} = {text}")
     return [*lines, f"return np.stack([{', '.join(results[k] for k in range(len(results)))}])"]
 
 
-def _count_uses(steps: Sequence[Sequence[Any]]) -> list[int]:
-    """How many operands of later steps each step's result is."""
-    result, writer = [0] * len(steps), dict[int, int]()
-    for k, (name, into, *of) in enumerate(steps):
-        for slot in () if name in ("const", "input") else of:
-            result[writer[slot]] += 1
-        if name != "output":
-            writer[into] = k
-    return result
-
-
-_OPERATORS = {
-    **ARITHMETIC,
-    "pow": "{0} ** {1}",
-    "constpow": "{0} ** {1}",
-}
+_OPERATORS = {**ARITHMETIC, "pow": "{0} ** {1}", "constpow": "{0} ** {1}"}
 _CONDITIONS = {
     "not": "{0} == 0",
     "lt": "{0} < {1}",

@@ -12,15 +12,18 @@ import numpy as np
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
 from orthocas.codegen.kernels import Kernels, generate_kernels, share_calls, share_sines
-from orthocas.codegen.precision import DOUBLE, SINGLE, Precision, find_bounds_inside
-from orthocas.codegen.rendering import clean_word, clean_words, is_generated, render
-from orthocas.codegen.rows import render_rows
-from orthocas.codegen.supervision import (
-    build_supervision_kernels,
-    describe_law,
-    describe_supervision,
-    find_condition,
+from orthocas.codegen.rendering import (
+    DOUBLE,
+    SINGLE,
+    Precision,
+    clean_word,
+    clean_words,
+    find_bounds_inside,
+    is_generated,
+    render,
 )
+from orthocas.codegen.rows import render_rows
+from orthocas.codegen.supervision import build_supervision_kernels, describe_law, describe_supervision, find_condition
 from orthocas.control.controller import Controller, require_controller
 from orthocas.control.safety import Safety
 from orthocas.errors import ArchiveError, InvalidValueError

@@ -154,6 +154,7 @@ def _compact_work_arrays(blocks: dict[str, str], functions: list[ca.Function]) -
     changed = dict(blocks)
     needed: dict[str, int] = {}
 
+    # A function needs what its callees need, and then its own slots.
     def need(function: ca.Function) -> int:
         name = names[hash(function)]
         if name not in needed:
@@ -196,6 +197,7 @@ def _move_slots(block: str, function: ca.Function, below: int) -> tuple[str, int
     if re.search(r"\bw\b", re.sub(rf"{_CALL.pattern}\(arg1, res1, iw, w, 0\)", "", body)):
         return block, function.sz_w()
     sizes = _measure_slots(function)
+    # Slots must not overlap in CasADi's own layout; then all move by the same shift.
     places = sorted((int(offset), sizes[int(place)]) for place, offset in _PLACE.findall(block))
     for (offset, size), (following, _) in pairwise(places):
         if offset + size > following:
@@ -341,6 +343,7 @@ def share_sines(functions: list[ca.Function]) -> list[ca.Function]:
     at = ca.SX.sym("q", max((function.size1_in(0) for function in functions), default=0))
     turns = ca.Function("turns", [at], [ca.sin(at), ca.cos(at)])
 
+    # Calls that take q from a graph take its sines and cosines, too.
     def take_given(called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
         if called.size1_in(0) != at.shape[0]:
             return None
@@ -349,6 +352,7 @@ def share_sines(functions: list[ca.Function]) -> list[ca.Function]:
         form = made[hash(called)]
         return None if form is None else form(*turns(arguments[0]), *arguments)
 
+    # Open calls until nothing inside calls anything, so that all places are seen.
     def rewrite(function: ca.Function) -> ca.Function:
         within = _replace_calls(function, _open_call)
         return (_replace_calls(function, take_given) or function) if within is None else rewrite(within)
@@ -363,9 +367,7 @@ def _open_call(called: ca.Function, arguments: list[ca.MX], but: Collection[int]
 
 
 def _replace_calls(
-    function: ca.Function,
-    form: Callable[[ca.Function, list[ca.MX]], ca.MX | None],
-    more: list[ca.MX] | None = None,
+    function: ca.Function, form: Callable[[ca.Function, list[ca.MX]], ca.MX | None], more: list[ca.MX] | None = None
 ) -> ca.Function | None:
     """A graph with other expressions for what it calls at its first input; None if there are none.
 

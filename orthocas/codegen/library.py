@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
 from orthocas.codegen.generate import GeneratedC, generate_c
-from orthocas.codegen.precision import DOUBLE, SINGLE, Precision
-from orthocas.codegen.rendering import get_template
+from orthocas.codegen.rendering import DOUBLE, SINGLE, Precision, get_template
 from orthocas.control.controller import Controller, ControlStatus, require_controller
 from orthocas.control.memory import find_memory
 from orthocas.control.operational_space import PDPlus
@@ -260,11 +259,9 @@ class Supervisor:
         OK, NEAR_BOUNDARY if the target lies beyond the boundary, so that the stream stops before it, or NOT_FINITE.
         """
         numbers = self._reference(reference)
-        goal, speed, time = (
-            self._numbers("target", target, self._k),
-            as_number("omega", omega),
-            as_number("period", period),
-        )
+        goal = self._numbers("target", target, self._k)
+        speed = as_number("omega", omega)
+        time = as_number("period", period)
         status = self._functions["stream"](self._here, _pointer(numbers), _pointer(goal), speed, time)
         reference[:] = numbers
         return ControlStatus(status)
@@ -322,6 +319,7 @@ def _build_state(
     if has_spring:
         layout |= dict.fromkeys(("load", "drive", "speed"), joints) | {"inertia": number * n**2}
         layout |= dict.fromkeys(("expected", "unexplained"), joints)
+    # Laws that remember have their fields before the last reference.
     if memory._fields_:
         layout["memory"] = memory
     layout |= dict.fromkeys(("value", "velocity", "acceleration"), quantities)

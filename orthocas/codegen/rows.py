@@ -11,8 +11,7 @@ from orthocas.bases.family import LinearFamily
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.codegen.kernels import write_power
-from orthocas.codegen.precision import Precision
-from orthocas.codegen.rendering import render, write_number
+from orthocas.codegen.rendering import Precision, render, write_number
 from orthocas.errors import InvalidValueError
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import ARITHMETIC, expand_scalars, write_tape

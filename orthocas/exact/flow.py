@@ -236,10 +236,12 @@ class TaskFlow:
     @cached_property
     def _with_tangents(self) -> "BatchedFlow":
         """The flow with r tangent vectors, stored as directions u with |u| = 1 and logarithms of lengths."""
+        # The state: q, then r directions, then the logarithms of their lengths.
         n, m, r = self.problem.n, self.problem.m, self.problem.r
         y, dx = ca.SX.sym("y", n + r * (n + 1)), ca.SX.sym("dx", m)
         q, directions = y[:n], ca.reshape(y[n : n + r * n], n, r)
         dq = self.field(q, dx)
+        # Along the flow a vector changes by df/dq v: the part along itself stretches it, and the rest turns it.
         turning = ca.jacobian(dq, q) @ directions
         stretching = ca.sum1(directions * turning) / ca.sum1(directions**2)
         rates = turning - directions * ca.repmat(stretching, n, 1)
@@ -310,12 +312,14 @@ class BatchedFlow:
     def _step(self) -> ca.Function:
         """One step: y, step size, p -> new y and its estimated error in units of the tolerance."""
         # Slopes at the stages, each from those before, then the step and two estimates of its error.
+        # Stages of the method of Dormand and Prince of order 8, as SciPy has its coefficients.
         k = self.field.size1_in(0)
         y, step, p = ca.SX.sym("y", k), ca.SX.sym("step"), ca.SX.sym("p", self.field.size1_in(1))
         method, slopes = scipy.integrate.DOP853, list[Any]()
         for i in range(RULES.stages):
             slopes.append(self.field(y + step * _sum_weighted(method.A[i, :i], slopes), p) if i else self.field(y, p))
         moved = y + step * _sum_weighted(method.B, slopes)
+        # Its error combines those of orders 5 and 3.
         scale = ca.DM(self.scale)
         fifth = ca.sumsqr(_sum_weighted(method.E5[: RULES.stages], slopes) / scale)
         third = ca.sumsqr(_sum_weighted(method.E3[: RULES.stages], slopes) / scale)

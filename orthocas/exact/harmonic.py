@@ -144,6 +144,7 @@ class _Sheet:
             centre = (a + b) / 2
             same = ((self._evaluate_gap(centre) < 0) == below)[:, None]
             a, b = np.where(same, centre, a), np.where(same, b, centre)
+        # Of the two ends, the one nearer to the level; where h jumps, neither is near.
         points: Array = np.where((np.abs(self._evaluate_gap(a)) < np.abs(self._evaluate_gap(b)))[:, None], a, b)
         off = np.flatnonzero(np.abs(self._evaluate_gap(points)) > self.tolerance)
         if len(off):
@@ -168,28 +169,18 @@ def _sample_gap(h: Function, level: float, axes: list[Array]) -> tuple[NDArray[n
         values = _evaluate_checked(h, grid.reshape(-1, 3), "h", ())
         lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
         gap[start : start + slab] = (values - level).reshape(grid.shape[:3])
+    # Without a value on both sides there is no surface.
     if not lowest < level < highest:
         raise InvalidValueError("level", level, f"a value of h in the box, found {lowest:.6g} to {highest:.6g}")
     return gap, max(abs(lowest), abs(highest))
 
 
 def _march_cubes(gap: NDArray[np.float32], axes: list[Array]) -> tuple[Array, Indices, Mask, Array]:
-    """Marching cubes: vertices (V, 3), faces (F, 3), free axes (V, 3), and the ends of their grid edges (2, V, 3)."""
-    # Vertices lie on grid edges, between the grid points around them.
-    _push_from_zero(gap)
-    index, faces, _, _ = skimage.measure.marching_cubes(gap, 0.0, gradient_direction="descent")
-    corners = np.stack([np.floor(index), np.ceil(index)]).astype(int)
-    ends = np.stack([axis[corners[:, :, i]] for i, axis in enumerate(axes)], axis=2)
-    points = ends[0] + (index - corners[0]) * (ends[1] - ends[0])
-    return points, faces.astype(np.int64), (index > 0) & (index < np.array(gap.shape) - 1), ends
+    """Marching cubes: vertices (V, 3), faces (F, 3), free axes (V, 3), and the ends of their grid edges (2, V, 3).
 
-
-def _push_from_zero(gap: NDArray[np.float32]) -> None:
-    """Keep the surface away from grid points, where marching cubes triangles shrink to zero size.
-
-    In place, |h - level| becomes at least `clearance` times the largest change to a neighbour. Zeros become positive.
+    First the surface moves away from grid points, where triangles shrink to zero size. In place, |h - level| becomes at
+    least `clearance` times the largest change to a neighbour, along each axis and both ways. Zeros become positive.
     """
-    # The largest change to a neighbour, along each axis and both ways.
     change = np.zeros_like(gap)
     for axis in range(3):
         step = np.abs(np.diff(gap, axis=axis))
@@ -198,6 +189,12 @@ def _push_from_zero(gap: NDArray[np.float32]) -> None:
             np.maximum(part, step, out=part)
     change *= RULES.clearance
     np.copyto(gap, np.where(gap < 0, -change, change), where=np.abs(gap) < change)
+    # Vertices lie on grid edges, between the grid points around them.
+    index, faces, _, _ = skimage.measure.marching_cubes(gap, 0.0, gradient_direction="descent")
+    corners = np.stack([np.floor(index), np.ceil(index)]).astype(int)
+    ends = np.stack([axis[corners[:, :, i]] for i, axis in enumerate(axes)], axis=2)
+    points = ends[0] + (index - corners[0]) * (ends[1] - ends[0])
+    return points, faces.astype(np.int64), (index > 0) & (index < np.array(gap.shape) - 1), ends
 
 
 def _evaluate_checked(function: Function, points: Array, name: str, shape: tuple[int, ...]) -> Array:

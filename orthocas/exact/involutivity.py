@@ -188,6 +188,7 @@ def lie_bracket(f: ca.SX, g: ca.SX, q: ca.SX) -> ca.SX:
         >>> lie_bracket(ca.vertcat(1, 0), ca.vertcat(0, q[0]), q)
         SX([0, 1])
     """
+    # Symbols, and fields of the same kind over them.
     if not isinstance(q, ca.SX | ca.MX) or not q.is_valid_input():
         raise InvalidValueError("q", f"a {type(q).__name__}", "a column of symbols")
     for name, field in (("f", f), ("g", g)):

@@ -101,6 +101,7 @@ class DiskLeaf:
 
     def __post_init__(self) -> None:
         # Arrays may come from a file: check shapes and indices, and that points lie on disk and leaf.
+        # Arrays of the right shapes, copied and frozen.
         count = len(self.vertices)
         shapes: dict[str, tuple[int | None, ...]] = {
             "level": (1,),
@@ -112,6 +113,7 @@ class DiskLeaf:
         for name, shape in shapes.items():
             object.__setattr__(self, name, freeze_array(name, getattr(self, name), shape))
         object.__setattr__(self, "faces", freeze_indices("faces", self.faces, (None, 3), count))
+        # A mesh on the leaf, with an image in the disk.
         if not len(self.faces):
             raise InvalidValueError("faces", "empty", "at least one triangle")
         if np.linalg.norm(self.disk, axis=1).max() > 1 + 1e-9:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from weakref import finalize
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, NotADiskError
 from orthocas.tools.cached import cached_property
@@ -271,37 +271,29 @@ def compute_smoothing_steps(points: Array, faces: Indices) -> Array:
 
 
 def _flip(vertices: Array, faces: Indices, keys: Indices, first: Indices, second: Indices) -> bool:
-    """Flip edges that do not share a triangle, in place, and return whether any was flipped."""
+    """Flip edges in place, the worst first, and return whether any was flipped.
+
+    An edge is flipped if the new one does not exist, and the new triangles face the same way as the old ones. Of flips
+    with a common triangle or new edge, the first is done.
+    """
     # Edges i -> j, with the opposite corners k in the first triangle and n in the second, as rows (N, 4).
     face, corner = first % len(faces), first // len(faces)
     i, j, k = (faces[face, (corner + shift) % 3] for shift in (1, 2, 0))
     quads = np.stack([i, j, k, faces[second % len(faces), second // len(faces)]], axis=1)
-    allowed = _is_allowed(vertices, quads, keys)
-    quads, face, other = quads[allowed], first[allowed] % len(faces), second[allowed] % len(faces)
-    chosen = _select_independent(quads, face, other, len(vertices))
+    # The edge k - n is new, and the normals of i n k and n j k point as the sum of the old ones does.
+    new = number_edges(quads[:, 2], quads[:, 3], len(vertices))
+    place = np.minimum(np.searchsorted(keys, new), len(keys) - 1)
+    p, q, r, s = (vertices[quads[:, c]] for c in range(4))
+    normal = np.cross(q - p, r - p) + np.cross(p - q, s - q)
+    one, two = (np.einsum("nd,nd->n", np.cross(a, b), normal) for a, b in ((s - p, r - p), (q - s, r - s)))
+    allowed = (keys[place] != new) & (one > 0) & (two > 0)
+    quads, face, other, new = quads[allowed], face[allowed], (second % len(faces))[allowed], new[allowed]
+    # The first at both of its triangles and at its new edge: `np.unique` names the first of equal ones.
+    _, at_face = np.unique(np.stack([face, other], axis=1), return_index=True)
+    wins = np.bincount(at_face // 2, minlength=len(face)) == 2
+    chosen = wins & np.isin(np.arange(len(face)), np.unique(new, return_index=True)[1])
+    # The edge k - n takes the place of i - j.
     i, j, k, n = quads[chosen].T
     faces[face[chosen]] = np.stack([i, n, k], axis=1)
     faces[other[chosen]] = np.stack([n, j, k], axis=1)
     return bool(chosen.any())
-
-
-def _is_allowed(vertices: Array, quads: Indices, keys: Indices) -> NDArray[np.bool_]:
-    """Whether the edge k - n is new and the triangles i n k and n j k face the same way as the old ones."""
-    # The new edge must not exist; normals of the new triangles must point as the sum of the old ones does.
-    new = number_edges(quads[:, 2], quads[:, 3], len(vertices))
-    place = np.minimum(np.searchsorted(keys, new), len(keys) - 1)
-    p, q, r, s = (vertices[quads[:, c]] for c in range(4))
-    one, other = np.cross(s - p, r - p), np.cross(q - s, r - s)
-    normal = np.cross(q - p, r - p) + np.cross(p - q, s - q)
-    ahead = (np.einsum("nd,nd->n", one, normal) > 0) & (np.einsum("nd,nd->n", other, normal) > 0)
-    return np.asarray((keys[place] != new) & ahead)
-
-
-def _select_independent(quads: Indices, face: Indices, other: Indices, count: int) -> NDArray[np.bool_]:
-    """Which flips, given best first, are the first at both of their triangles and at their new edge."""
-    # `np.unique` names the first of equal ones.
-    number = np.arange(len(face))
-    _, at_face = np.unique(np.stack([face, other], axis=1), return_index=True)
-    wins = np.bincount(at_face // 2, minlength=len(face)) == 2
-    new_edge = np.unique(number_edges(quads[:, 2], quads[:, 3], count), return_index=True)[1]
-    return np.asarray(wins & np.isin(number, new_edge))

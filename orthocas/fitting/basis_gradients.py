@@ -146,7 +146,11 @@ class ProductGradients(BasisGradients):
         assert X.shape[3] % every == 0
         kind = X.dtype if dtype is None else np.dtype(dtype)
         values = X[:, 0, :, ::every].transpose(1, 0, 2).reshape(X.shape[2], -1)[:, : -(-samples // every)]
-        dense = self._part(kept, kind) @ values.astype(kind, copy=False)  # (n kept, samples)
+        # the rows of these functions in all D_i, (n kept, S), kept for the next time
+        key = kept.tobytes(), kind.str
+        if key not in self._parts:
+            self._parts[key] = self._upright[np.tile(kept, self.n)].astype(kind)
+        dense = self._parts[key] @ values.astype(kind, copy=False)  # (n kept, samples)
         return np.ascontiguousarray(dense.T).reshape(dense.shape[1], self.n, int(kept.sum()))
 
     def differentiate_along(self, X: Array, directions: Array) -> Array:
@@ -159,13 +163,6 @@ class ProductGradients(BasisGradients):
             if D.nnz:
                 total += D @ (values * directions[:, i])
         return np.ascontiguousarray(total.T)
-
-    def _part(self, kept: NDArray[np.bool_], kind: "np.dtype[Any]") -> Any:
-        """The rows of some functions in all D_i, (n kept, S)."""
-        key = kept.tobytes(), kind.str
-        if key not in self._parts:
-            self._parts[key] = self._upright[np.tile(kept, self.n)].astype(kind)
-        return self._parts[key]
 
     def _numbers(self, q: ca.SX) -> ca.SX:
         return ca.vertcat(1, self.family.basis(q))[self._places.tolist()]
@@ -210,6 +207,7 @@ class SparseGradients(BasisGradients):
         """The numbers in their places."""
         B, n, _, c = X.shape
         assert c % every == 0
+        # each joint's numbers, at the places that its functions have among those asked for
         place = np.cumsum(kept) - 1
         dense = np.zeros((B, c // every, n, kept.sum()), dtype=X.dtype if dtype is None else dtype)
         for i, functions in enumerate(self.terms_of_joints):

@@ -131,8 +131,21 @@ class BasisObjective:
         """L(theta) and dL/dtheta."""
         # J_xi = T X block by block; the loss and its slopes there; and the slopes times X^T, which are dL/dT
         T, columns, parts = self._table(theta), build_loss_columns(self._loss), self._parts
+        arrays = (self.X, self._share, *self._data)
+
+        def sum_part(run: Run, part: slice) -> tuple[float, Array]:
+            value, gradient = 0.0, np.zeros(T.shape)
+            losses, slopes = np.empty(COLUMNS), np.empty((self.n * self.r, COLUMNS))
+            # one block at a time, so that X leaves memory only once
+            for X, share, *data in zip(*(array[part] for array in arrays), strict=True):
+                run([_to_double(T @ X), *data], [losses, slopes])
+                value += float(losses @ share)
+                shared = (slopes * share).astype(X.dtype, copy=False).reshape(*T.shape[:2], -1)
+                gradient += shared @ X.transpose(0, 2, 1)
+            return value, gradient
+
         with columns.borrow(min(count_threads(), len(parts))) as runs:
-            sums = run_in_threads_with(runs, lambda run, part: self._sum_part(T, run, part), parts)
+            sums = run_in_threads_with(runs, sum_part, parts)
         slopes = self._gradients.collect(np.sum([gradient for _, gradient in sums], axis=0))
         return sum(value for value, _ in sums), slopes[self.kept]
 
@@ -157,6 +170,7 @@ class BasisObjective:
         (curvature,) = build_curvature_columns(self._loss)(self._evaluate_jacobians(theta), *self._data)
         W = split_by_sample(curvature.reshape(-1, n * r, n * r, curvature.shape[2]), self.N).reshape(-1, n, r, n, r)
         G, H = self._dense, np.zeros((r, K, r, K))
+        # each pair of coordinates is a block, filled by one thread
 
         def fill(pair: tuple[int, int]) -> None:
             i, j = pair
@@ -167,6 +181,7 @@ class BasisObjective:
             H[j, :, i] = H[i, :, j].T
 
         run_in_threads(fill, [(i, j) for i in range(r) for j in range(i + 1)])
+        # coefficients that may differ from zero
         free = self.kept.ravel()
         block: Array = H.reshape(r * K, r * K)[np.ix_(free, free)]
         return block
@@ -233,18 +248,6 @@ class BasisObjective:
     def _parts(self) -> list[slice]:
         """The blocks of samples in parts."""
         return [slice(start, start + RULES.blocks) for start in range(0, len(self.X), RULES.blocks)]
-
-    def _sum_part(self, T: Array, run: Run, part: slice) -> tuple[float, Array]:
-        """Share of some blocks in the loss, and in its slopes with respect to T."""
-        value, gradient = 0.0, np.zeros(T.shape)
-        losses, slopes = np.empty(COLUMNS), np.empty((self.n * self.r, COLUMNS))
-        arrays = (self.X, self._share, *self._data)
-        # block by block, so that X leaves memory only once
-        for X, share, *data in zip(*(array[part] for array in arrays), strict=True):
-            run([_to_double(T @ X), *data], [losses, slopes])
-            value += float(losses @ share)
-            gradient += (slopes * share).astype(X.dtype, copy=False).reshape(*T.shape[:2], -1) @ X.transpose(0, 2, 1)
-        return value, gradient
 
     def _evaluate_jacobians(self, theta: Array) -> Array:
         """J_xi, (B, n r, c)."""
@@ -414,6 +417,7 @@ def _add(
             for row, other in rows_of[i, j]:
                 H[places[i], places[j]] += X[start, i][:, row].T @ X[start, j][:, other]
 
+    # rows of samples times gradients first, then squares and mixed products of them, each a block of the matrix
     r = len(derivatives)
     rows_of: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for i, j, row, other in shared:

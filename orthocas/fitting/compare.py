@@ -159,8 +159,10 @@ def _list_weights(
     """The weights of a grid, one or several."""
     if weights is None:
         return [default]
+    # one set of weights may be numbers or an object
     if isinstance(weights, Weights) or not any(isinstance(each, Weights | Sequence) for each in weights):
         return [Weights.of(cast(Weights | WeightNumbers, weights))]
+    # several are told apart by their labels
     several = [Weights.of(cast(Weights | WeightNumbers, each)) for each in weights]
     labels = [each.label for each in several]
     if twice := [label for label in labels if labels.count(label) > 1]:
@@ -308,6 +310,7 @@ def run_cell(cell: Cell) -> CellResult:
     history: list[tuple[float, float]] = []
     stages: list[str] = []
     start = time.perf_counter()
+    # losses over time, of the last stage only
 
     def record(progress: Progress) -> None:
         if progress.stage not in stages:
@@ -316,6 +319,7 @@ def run_cell(cell: Cell) -> CellResult:
         if math.isfinite(progress.value):
             history.append((time.perf_counter() - start, progress.value))
 
+    # a failure of any kind is a result of its cell, and leaves the others alone
     try:
         result = cell.fit(record)
         if cell.chart_file is not None:
@@ -488,6 +492,7 @@ class Comparison(Shown):
         Raises:
             ArchiveError: if there are others, or symbolic links.
         """
+        # the table for programs that read CSV, and everything as JSON
         names = [field.name for field in fields(CellResult) if field.name != "history"]
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, names)
@@ -500,10 +505,7 @@ class Comparison(Shown):
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON. NaN becomes None."""
-        return {
-            "summaries": clean(self.summaries()),
-            "fits": clean(self.results),
-        }
+        return {"summaries": clean(self.summaries()), "fits": clean(self.results)}
 
     def facts(self) -> dict[str, str]:
         """The summaries, the best one first."""
@@ -558,6 +560,7 @@ def summarise(results: Sequence[CellResult]) -> Summary:
     """Medians over the seeds of one parametrisation, solver and weights."""
     good = [result for result in results if not result.failed]
     first = (good or results)[0]
+    # medians of the seeds that worked, and how far these lie apart
 
     def compute_median(name: str) -> float:
         return median(float(getattr(result, name)) for result in good) if good else math.nan
@@ -593,11 +596,13 @@ def _describe(s: Summary) -> str:
 
 def _row(s: Summary) -> dict[str, str]:
     """The cells of a row by their columns; the last one of a short row may be long."""
+    # failed seeds are counted beside the solver; if all failed, the row ends with the reason
     failed = f" ({s.failed} of {s.seeds} failed)" if 0 < s.failed < s.seeds else ""
     names = {"parametrisation": s.parametrisation, "solver": s.solver + failed, "weights": s.weights}
     if s.failed == s.seeds:
         return {**names, "error": f"failed: {s.error}"}
     several = s.seeds - s.failed > 1
+    # values with their spread over seeds
 
     def angle(value: float, spread: float) -> str:
         if math.isnan(value):

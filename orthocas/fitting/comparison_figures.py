@@ -42,11 +42,12 @@ def front_figure(comparison: "Comparison") -> Figure:
     good = [result for result in comparison.results if not result.failed]
     single = all(math.isnan(result.mutual_std_deg) for result in good)
     colours, markers = _colours(good), dict(zip(_names(good, "solver"), _MARKERS * 3, strict=False))
+    # A point for each fit.
     for result in good:
         axes.scatter(
             result.task_std_deg,
             result.conditioning_p01 if single else result.mutual_std_deg,
-            s=_size(result.parameters),
+            s=30 + 25 * math.log10(1 + result.parameters),
             color=colours[result.parametrisation],
             marker=markers[result.solver],
             alpha=0.8,
@@ -56,7 +57,13 @@ def front_figure(comparison: "Comparison") -> Figure:
     axes.set_xlabel("task angle, standard deviation [deg]")
     axes.set_ylabel("conditioning, 1 % quantile (1 is best)" if single else "mutual angle, standard deviation [deg]")
     _scale(axes, [r.task_std_deg for r in good], [] if single else [r.mutual_std_deg for r in good])
-    _draw_front(axes, summaries, single)
+    # A line through the points that no other one beats in both directions; the least task angle comes first.
+    front: list[tuple[float, float]] = []
+    for summary in summaries:
+        x, y = _place(summary, single)
+        if not front or (y > front[-1][1] if single else y < front[-1][1]):
+            front.append((x, y))
+    axes.plot(*zip(*front, strict=True), color="0.6", linewidth=1.0, zorder=0)
     handles = [Line2D([], [], marker=m, linestyle="", color="0.4", label=name) for name, m in markers.items()]
     axes.legend(handles=handles, fontsize=8)
     axes.set_title(f"{_problem(comparison)}: held-out quality; size is the number of parameters", fontsize=10)
@@ -95,7 +102,7 @@ def convergence_figure(comparison: "Comparison") -> Figure:
     figure = Picture(figsize=(8.6, 5.2), layout="constrained")
     axes = figure.add_subplot()
     drawn = [result for result in comparison.results if result.history]
-    colours, styles = _colours(drawn), dict(zip(_names(drawn, "solver"), _STYLES * 3, strict=False))
+    colours, styles = _colours(drawn), dict[str, Any](zip(_names(drawn, "solver"), _STYLES * 3, strict=False))
     for result in drawn:
         seconds, loss = zip(*result.history, strict=True)
         colour = colours[result.parametrisation]
@@ -109,7 +116,10 @@ def convergence_figure(comparison: "Comparison") -> Figure:
     axes.set_xlabel("time [s]")
     axes.set_ylabel("training loss")
     axes.set_title(f"{_problem(comparison)}: training loss over time", fontsize=10)
-    _legends(axes, colours, styles)
+    # One legend for parametrisations and solvers, beside the plot.
+    handles = [Line2D([], [], color=colour, linewidth=3, label=name) for name, colour in colours.items()]
+    handles += [Line2D([], [], linestyle=style, color="0.3", label=name) for name, style in styles.items()]
+    axes.legend(handles=handles, fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0)
     axes.grid(alpha=0.3, which="both")
     return figure
 
@@ -134,10 +144,6 @@ def _colours(results: "Sequence[CellResult]") -> dict[str, Colour]:
     return colours
 
 
-def _size(parameters: int) -> float:
-    return 30 + 25 * math.log10(1 + parameters)
-
-
 def _place(summary: "Summary", single: bool) -> tuple[float, float]:
     """Where a summary lies in the picture."""
     return summary.task_std_deg, summary.conditioning_p01 if single else summary.mutual_std_deg
@@ -145,16 +151,6 @@ def _place(summary: "Summary", single: bool) -> tuple[float, float]:
 
 def _key(summary: "Summary") -> tuple[str, str, str]:
     return summary.parametrisation, summary.solver, summary.weights
-
-
-def _draw_front(axes: Axes, summaries: "Sequence[Summary]", single: bool) -> None:
-    """Connect the points that no other one beats in both directions; summaries have the least task angle first."""
-    front: list[tuple[float, float]] = []
-    for summary in summaries:
-        x, y = _place(summary, single)
-        if not front or (y > front[-1][1] if single else y < front[-1][1]):
-            front.append((x, y))
-    axes.plot(*zip(*front, strict=True), color="0.6", linewidth=1.0, zorder=0)
 
 
 def _label(axes: Axes, summaries: "Sequence[Summary]", single: bool, colours: Mapping[str, Colour]) -> None:
@@ -208,10 +204,3 @@ def _scale(axes: Axes, *values: Sequence[float]) -> None:
             axis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
             axis.set_major_formatter(StrMethodFormatter("{x:g}"))
             axis.set_minor_formatter(NullFormatter())
-
-
-def _legends(axes: Axes, colours: Mapping[str, Colour], styles: Mapping[str, Any]) -> None:
-    """One legend for parametrisations and solvers, beside the plot."""
-    handles = [Line2D([], [], color=colour, linewidth=3, label=name) for name, colour in colours.items()]
-    handles += [Line2D([], [], linestyle=style, color="0.3", label=name) for name, style in styles.items()]
-    axes.legend(handles=handles, fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0)

@@ -180,11 +180,13 @@ def _sample_targets(chart: Chart, points: Array) -> _Targets:
 
 
 def _evaluate(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> Distilled:
+    # fresh samples that the fit has not seen
     held_out = sample_uniform(chart.problem.domain, min(count, RULES.held_out), RULES.held_out_seed)
     held_out_targets = _sample_targets(chart, held_out)
     errors = wrap_shortest(
         distilled.coordinates.xi(held_out_targets.points) - held_out_targets.xi, distilled.parts.turns[chart.m :]
     )
+    # angles between gradients, as lengths of differences over the lengths
     gradients = held_out_targets.gradients / held_out_targets.weight
     turned = np.linalg.norm(distilled.coordinates.jacobian(held_out_targets.points) - gradients, axis=2)
     relative = turned / np.linalg.norm(gradients, axis=2)
@@ -200,10 +202,12 @@ def _evaluate(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> 
 
 def _solve_least_squares(family: LinearFamily, targets: _Targets, watch: Watch) -> tuple[Array, Array]:
     """Coefficients and offset of the best linear combination, by normal equations over chunks of samples."""
+    # values and gradients of the basis at a sample, with a column for the constant
     n, K = targets.points.shape[1], family.width
     q = ca.SX.sym("q", n)
     basis = family.basis(q)
     both = Batched(dense_function("basis", [q], [basis, ca.jacobian(basis, q)]))
+    # normal equations, summed up part by part so that no part fills the memory
     normal, right = np.zeros((K + 1, K + 1)), np.zeros((K + 1, family.outputs))
     for start in range(0, len(targets.points), RULES.chunk):
         part = slice(start, start + RULES.chunk)
@@ -225,6 +229,7 @@ class _Distance:
     def __init__(self, family: Family, targets: _Targets) -> None:
         N, n = targets.points.shape
         r = family.outputs
+        # the mean square distance of values and weighted gradients, and its gradient after theta
         theta, q = ca.MX.sym("theta", family.size), ca.MX.sym("q", n, N)
         values, slopes = ca.MX.sym("values", r, N), ca.MX.sym("slopes", r * n, N)
         gradients = ca.vertcat(*family.jacobian(q, theta)) * targets.weight
@@ -233,6 +238,7 @@ class _Distance:
         gradient = ca.jtimes(distance, theta, ca.MX(1), True)
         self._value = NumpyGraph("distance", inputs, [distance])
         self._both = NumpyGraph("distance_and_gradient", inputs, [distance, ca.densify(gradient)])
+        # the data of the samples, as NumPy's products take them
         self._data = [np.ascontiguousarray(part) for part in (targets.points, targets.xi, targets.gradients)]
         self._data[2] = self._data[2].reshape(N, r * n)
 

@@ -163,17 +163,25 @@ def _fit(
     """Fit with settings that are checked."""
     start = time.perf_counter()
     # the domain that the family asks for, and whether the task can be regular there
-    warn_unless_savable(settings.parametrisation)
-    problem = _choose_domain(problem, settings)
+    parametrisation = settings.parametrisation
+    warn_unless_savable(parametrisation)
+    if isinstance(parametrisation, CyclicParametrisation):
+        problem = widen_over_cyclic_joints(problem, tuple(parametrisation.cyclic))
+    if problem.robot.tree.floating and (parametrisation.closed_form is not None or not settings.split_idle):
+        expected = "one to fit in the arms' joints, such as Polynomial(1), with split_idle: the base floats"
+        raise InvalidValueError("parametrisation", parametrisation.label, expected)
+    if isinstance(parametrisation, Mobile):
+        problem = anywhere(problem, parametrisation.base)
     with remembered() as pressed:
         problem_check = check(problem, seed=settings.seed)
         samples = sample_problem(problem, RULES.first, (settings.seed, RULES.first_tag))
         # closed forms need no minimisation; others run the stages of `orthocas.fitting.stages`
-        if settings.parametrisation.closed_form is not None:
-            solution = Solution((), settings.parametrisation, None)
-            coordinates = _evaluate_closed_form(problem, settings.parametrisation, samples)
+        if parametrisation.closed_form is not None:
+            solution = Solution((), parametrisation, None)
+            coordinates = _evaluate_closed_form(problem, parametrisation, samples)
         else:
-            solution, coordinates = _solve(problem, settings, monitor, samples, align_to, begin)
+            singular = problem_check.singular_samples > 0
+            solution, coordinates = _solve(problem, settings, monitor, samples, align_to, begin, singular)
         # the chart, with what a reader of the fit asks first: idle joints, worst points, a smaller domain
         joints = [i for i in coordinates.idle if i not in problem.robot.tree.floating]
         result = Fit(
@@ -189,21 +197,6 @@ def _fit(
         if result.status is Status.INTERRUPTED or pressed():
             raise Interrupted(result)
     return result
-
-
-def _choose_domain(problem: Problem, settings: FitSettings) -> Problem:
-    """The problem on the domain that its parametrisation asks for.
-
-    Raises:
-        InvalidValueError: if the base floats, and the family has no joints of the arms to fit.
-    """
-    parametrisation = settings.parametrisation
-    if isinstance(parametrisation, CyclicParametrisation):
-        problem = widen_over_cyclic_joints(problem, tuple(parametrisation.cyclic))
-    if problem.robot.tree.floating and (parametrisation.closed_form is not None or not settings.split_idle):
-        expected = "one to fit in the arms' joints, such as Polynomial(1), with split_idle: the base floats"
-        raise InvalidValueError("parametrisation", parametrisation.label, expected)
-    return anywhere(problem, parametrisation.base) if isinstance(parametrisation, Mobile) else problem
 
 
 def _evaluate_closed_form(problem: Problem, parametrisation: Parametrisation, samples: Samples) -> Coordinates:
@@ -224,6 +217,7 @@ def _solve(
     samples: Samples,
     align_to: Chart | None,
     begin: Begin | None,
+    singular: bool,
 ) -> tuple[Solution, Coordinates]:
     """Run the stages, and choose scale, order and signs. Joints that the task does not feel become coordinates."""
     idle = tuple(find_idle_joints(problem, samples)[-problem.r :]) if settings.split_idle else ()
@@ -236,7 +230,7 @@ def _solve(
     active = [i for i in range(problem.n) if i not in idle]
     like = None if settings.like is None else settings.like.build_term(problem, active)
     settings = settings if like is None else settings.add_term(like)
-    folds = FoldSearch(problem, active, settings.fold_weight(problem))
+    folds = FoldSearch(problem, active, settings.fold_weight(problem), singular)
     runner = StageRunner(problem, settings, active, monitor, folds, like)
     solution = Continuation(runner, r, begin).run()
     # angles leave free where xi is zero, how long its gradient is, the order and the signs
@@ -362,11 +356,13 @@ def offer_clear_part(problem: Problem, check: ProblemCheck, worst: WorstPoints |
     Returns:
         The offer; None if nothing is wrong, if charts fail elsewhere too, or if the centre itself would be left out.
     """
+    # positions with a small conditioning, if the search found some
     domain = problem.domain
     failed = np.zeros((0, problem.n)) if worst is None else worst.below(RULES.failed)
     clear = domain.singular_bound
     if not (isinstance(domain, Box) and (domain.is_box or clear)) or not (len(failed) or check.singular_samples):
         return None
+    # the bound that leaves most of them out, in whole steps, unless it is too large
     try:
         measured = clear or ClearBox(domain, problem.task, RULES.any_bound)
         values = measured.singular_values(failed)

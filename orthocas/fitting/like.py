@@ -54,12 +54,14 @@ RULES = LikeRules()
 def build_quantity(robot: Robot, like: Quantity | str) -> tuple[str, ca.Function]:
     """Its name with a unit, and q (n, 1) -> the quantity (1, 1): a joint, the swivel, or a function of q."""
     q = ca.SX.sym("q", robot.n)
+    # by name: the swivel angle, or a joint
     if isinstance(like, str):
         require_known("like", like, (SWIVEL, *robot.joint_names))
         if like == SWIVEL:
             return f"{SWIVEL} [rad]", sew_angle(robot, "conventional")
         k = robot.joint_names.index(like)
         return f"{like} [{'m' if robot.tree.prismatic[k] else 'rad'}]", dense_function("like", [q], [q[k]])
+    # or any function of q with one value
     value = build_expression("like", like, q)
     require_shape("like", value.shape, (1, 1))
     name = str(getattr(like, "__name__", ""))
@@ -101,6 +103,7 @@ class Like:
         """
         robot = problem.robot
         q = ca.SX.sym("q", robot.n)
+        # a task stands for its components, relative to the centre of the domain
         if isinstance(like, Task):
             if like.robot.joint_names != robot.joint_names:
                 raise InvalidValueError("like", "a task of another robot", "one of the problem's robot")
@@ -108,6 +111,7 @@ class Like:
             labels = zip(like.labels, like.units, strict=True)
             names = tuple(f"{label} [{unit}]" if unit else label for label, unit in labels)
             return cls(names, _require_arms(robot, q, like.smooth_function(q)))
+        # all else is one quantity, or several
         parts = [like] if isinstance(like, str) or not isinstance(like, Sequence) else like
         quantities = [build_quantity(robot, part) for part in parts]
         if not quantities:

@@ -26,7 +26,7 @@ from orthocas.fitting.terms import (
     find_term,
 )
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.samples import Samples, evaluate_samples, sample_evenly
+from orthocas.tasks.samples import evaluate_samples, sample_evenly
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_point_set, freeze_array, require_count, require_kind
 from orthocas.tools.columns import COLUMNS, ColumnFunction, Run
@@ -78,34 +78,44 @@ def loss(
     require_kind("problem", problem, Problem)
     require_parametrisation(parametrisation)
     family = parametrisation.for_problem(problem).family(JointSpace.of(problem), problem.r)
-    drawn = _draw(problem, samples, seed)
-    theta0 = _start(family, drawn, seed) if start is None else freeze_array("start", start, (family.size,))
-    # J_xi of all samples as expressions of theta, then the loss of one sample on each column
-    theta = ca.MX.sym("theta", family.size)
-    J = _build_jacobians(family, drawn.points, theta)  # (r n, N), each J_xi column by column
-    identity = drawn.metric_inverse is None
-    chosen = Weights.of(weights).for_problem(problem)
-    of_sample = Loss.of(Sizes(problem.n, problem.m, problem.r, identity), chosen.by_name)
-    orientation = _orientation(drawn, ca.Function("J", [theta], [J])(theta0).full(), problem.r)
-    data = [_columns(part) for part in drawn.collect_data(of_sample.data, orientation)]
-    mean = ca.sum2(_map_loss(of_sample, len(drawn))(J, *data)) / len(drawn)
-    return ca.Function("loss", [theta], [mean], ["theta"], ["loss"])
-
-
-def _draw(problem: Problem, samples: int | ArrayLike, seed: int) -> Samples:
+    # samples that are drawn evenly, or given
     if isinstance(samples, int | np.integer):
-        count = require_count("samples", int(samples))
-        return evaluate_samples(problem, sample_evenly(problem.domain, count, require_count("seed", seed, least=0)))
-    return evaluate_samples(problem, as_point_set("samples", samples, problem.n)[0])
-
-
-def _start(family: Family, samples: Samples, seed: int) -> Array:
-    return find_spectral_start(family, samples) if isinstance(family, LinearFamily) else family.initial(seed)
+        count, seed = require_count("samples", int(samples)), require_count("seed", seed, least=0)
+        points = sample_evenly(problem.domain, count, seed)
+    else:
+        points = as_point_set("samples", samples, problem.n)[0]
+    drawn = evaluate_samples(problem, points)
+    # parameters whose orientation counts: those that are given, or where a fit starts
+    if start is not None:
+        theta0 = freeze_array("start", start, (family.size,))
+    elif isinstance(family, LinearFamily):
+        theta0 = find_spectral_start(family, drawn)
+    else:
+        theta0 = family.initial(seed)
+    # J_xi of all samples as expressions of theta, (r n, N), each column by column
+    theta = ca.MX.sym("theta", family.size)
+    J = _build_jacobians(family, drawn.points, theta)
+    gradients = ca.Function("J", [theta], [J])(theta0).full().T.reshape(len(drawn), -1, problem.r)
+    orientation = drawn.orientation(gradients.transpose(0, 2, 1))
+    # the loss of one sample, for all of them side by side
+    sizes = Sizes(problem.n, problem.m, problem.r, drawn.metric_inverse is None)
+    of_sample = Loss.of(sizes, Weights.of(weights).for_problem(problem).by_name)
+    one, column = build_sample_loss(of_sample), ca.SX.sym("J", problem.r * problem.n)
+    parts = [ca.SX.sym(name, one.numel_in(1 + k)) for k, name in enumerate(of_sample.data)]
+    shaped = [ca.reshape(part, *one.size_in(1 + k)) for k, part in enumerate(parts)]
+    value = one(ca.reshape(column, problem.r, problem.n), *shaped)
+    losses = ca.Function("losses", [column, *parts], [value]).map(len(drawn))
+    # its mean, with the data of the samples as columns (entries, N), matrices column by column
+    data = drawn.collect_data(of_sample.data, orientation)
+    flat = [(part.transpose(0, 2, 1) if part.ndim == 3 else part).reshape(len(part), -1).T for part in data]
+    mean = ca.sum2(losses(J, *map(ca.DM, flat))) / len(drawn)
+    return ca.Function("loss", [theta], [mean], ["theta"], ["loss"])
 
 
 def _build_jacobians(family: Family, points: Array, theta: ca.MX) -> ca.MX:
     """J_xi of every sample column by column, (r n, N)."""
     N, n = points.shape
+    # bases are linear in theta: their gradients at the samples are numbers
     if isinstance(family, LinearFamily):
         q = ca.SX.sym("q", n)
         slopes = ca.Function("slopes", [q], [ca.densify(ca.jacobian(family.basis(q), q))])  # (K, n)
@@ -113,32 +123,12 @@ def _build_jacobians(family: Family, points: Array, theta: ca.MX) -> ca.MX:
         C = ca.reshape(theta, family.width, family.outputs).T
         linear: ca.MX = ca.reshape(C @ G, family.outputs * n, N)
         return linear
+    # other families as they differentiate themselves
     place = ca.MX.sym("q", n, N)
     gradients = ca.Function("gradients", [place, theta], family.jacobian(place, theta))
     by_component: list[Any] = gradients.call([ca.MX(ca.DM(points.T)), theta])
     stacked: ca.MX = ca.vertcat(*(gradient[i, :] for i in range(n) for gradient in by_component))
     return stacked
-
-
-def _map_loss(loss_of: "Loss", count: int) -> ca.Function:
-    """The loss of `count` samples side by side: J_xi (r n, N) and data as columns -> (1, N)."""
-    one = build_sample_loss(loss_of)
-    J = ca.SX.sym("J", loss_of.sizes.r * loss_of.sizes.n)
-    data = [ca.SX.sym(name, one.numel_in(1 + k)) for k, name in enumerate(loss_of.data)]
-    shaped = [ca.reshape(part, *one.size_in(1 + k)) for k, part in enumerate(data)]
-    value = one(ca.reshape(J, loss_of.sizes.r, loss_of.sizes.n), *shaped)
-    return ca.Function("losses", [J, *data], [value]).map(count)
-
-
-def _columns(part: Array) -> ca.DM:
-    """Data of samples (N, rows, columns) or (N, rows) as columns (entries, N), matrices column by column."""
-    flat = (part.transpose(0, 2, 1) if part.ndim == 3 else part).reshape(len(part), -1)
-    return ca.DM(flat.T)
-
-
-def _orientation(samples: Samples, J: Array, r: int) -> float:
-    """Orientation of coordinates with gradients J_xi, (r n, N)."""
-    return samples.orientation(J.T.reshape(len(samples), -1, r).transpose(0, 2, 1))
 
 
 @dataclass(frozen=True)

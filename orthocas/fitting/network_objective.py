@@ -64,6 +64,7 @@ class ArrayObjective:
         self._memories = Memories()
         self._loss = Loss.of(Sizes(self.n, m, self.r, samples.metric_inverse is None), weights.by_name)
         self._orientation = orientation
+        # the start orients coordinates, at some of the samples
         if orientation is None and (self._loss.oriented or weights.folds > 0):
             some = samples[: RULES.orienting]
             self._orientation = some.orientation(family.pullback(some.points, start)[0])
@@ -84,6 +85,7 @@ class ArrayObjective:
 
         def part(tools: tuple[Run, ArrayMemory], work: tuple[_Piece, Array]) -> float:
             (run, memory), (piece, result) = tools, work
+            # forward through the network, the loss of each sample on its gradients, and back
             J, back = self._family.pullback(piece.points, small, memory)
             entries = arrange_blocks(J)
             losses, slopes = np.empty(piece.shares.shape), np.empty_like(entries)
@@ -94,6 +96,7 @@ class ArrayObjective:
             back(split_by_sample(by_entry, len(J)), result)
             return float(np.vdot(losses, piece.shares))
 
+        # pieces of samples are shared by threads, and their gradients are added in one order
         threads = min(count_threads(), len(self._pieces))
         with columns.borrow(threads) as runs, self._memories.borrow(threads + 1) as (results, *memories):
             gradients = [results.array(f"piece {k}", small.shape, small.dtype) for k in range(len(self._pieces))]

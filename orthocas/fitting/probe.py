@@ -232,6 +232,7 @@ class Prober:
         """Least conditioning of the last coordinates on another domain, by descent; 1 if a fit finds it as soon."""
         if self._start is None or self.outputs < RULES.many:
             return 1.0
+        # coordinates of the last trial, as a chart would have them
         parametrisation = Polynomial(RULES.degree, self.cyclic)
         family = parametrisation.family(JointSpace.of(problem).restricted_to(self.active), self.outputs)
         idle = tuple(k for k in range(problem.n) if k not in self.active)
@@ -258,6 +259,7 @@ class Prober:
 
     def _fit(self, problem: Problem, family: ProductFamily) -> Array:
         """Parameters, (size,)."""
+        # even samples for the start, and more near faces and corners, where charts fail first
         even = sample_evenly(problem.domain, RULES.training, RULES.seed)
         heavy = sample_boundary_weighted(problem.domain, RULES.near_faces, RULES.seed + 1)
         samples = evaluate_samples(problem, np.vstack([even, heavy])).restricted_to(self.active)
@@ -300,6 +302,7 @@ def evaluate_chart(chart: Chart, samples: int, seed: int) -> Quality:
     """Quality of a fitted chart, without its idle joints, on samples of its domain, many near faces and corners."""
     coordinates = chart.coordinates
     assert isinstance(coordinates, Coordinates)
+    # coordinates that were fitted, in the joints that they depend on
     fitted, active = len(coordinates.offset), coordinates.active
 
     def jacobian(points: Array) -> Array:

@@ -78,8 +78,8 @@ class Continuation:
     """Solves a low degree from a spectral start, embeds the result, and solves the next degree.
 
     The worst points of each degree join the loss of the next one. The last degree is solved again until its least
-    conditioning is large enough or, without a fold, no longer grows. If folds remain after some rounds, the domain
-    forces them: then the last stage leaves the fold term out.
+    conditioning is large enough or, without a fold, no longer grows. If folds remain after some rounds, or at once
+    where the domain holds singular positions, the domain forces them: then the last stage leaves the fold term out.
 
     Args:
         runner: runs single stages.
@@ -95,11 +95,29 @@ class Continuation:
 
     def run(self) -> Solution:
         """Run all stages. After Ctrl-C, the last one is marked as interrupted."""
-        steps = self._list_steps(self._runner.settings.parametrisation)
+        runner, folds = self._runner, self._runner.folds
+        # degree by degree, if the family has degrees
+        target = runner.settings.parametrisation
+        steps: list[Parametrisation] = [target]
+        if isinstance(target, GradedParametrisation):
+            runner.require_memory(target, self._r)
+            steps = [target.of_degree(degree) for degree in range(min(target.degree, 2), target.degree + 1)]
         try:
             for step in steps:
                 self._solve(step, step.label, final=step is steps[-1])
-            self._solve_until_unfolded(steps[-1])
+            # the last one again, until there is no point of small conditioning, or its conditioning no longer grows
+            last, before = steps[-1], 0.0
+            for k in range(2, 2 + RULES.rounds):
+                unfolded = folds.least >= LOSS_RULES.least_conditioning
+                settled = 0 <= folds.least < before + RULES.least_gain
+                if unfolded or settled or (folds.least < 0 and folds.singular):
+                    break
+                before = folds.least
+                self._solve(last, f"{last.label}, round {k}", final=True)
+            # the domain forces folds: their term would only spoil the rest
+            if folds.least < 0:
+                folds.give_up()
+                self._solve(last, f"{last.label}, with folds", final=True)
         except KeyboardInterrupt:  # also between minimisations
             if self._reached is None:
                 raise
@@ -107,20 +125,16 @@ class Continuation:
         assert self._reached is not None
         return Solution(tuple(self._stages), self._reached[0], self._runner.folds.worst)
 
-    def _list_steps(self, target: Parametrisation) -> Sequence[Parametrisation]:
-        if not isinstance(target, GradedParametrisation):
-            return [target]
-        self._runner.require_memory(target, self._r)
-        return [target.of_degree(degree) for degree in range(min(target.degree, 2), target.degree + 1)]
-
     def _solve(self, step: Parametrisation, label: str, final: bool) -> None:
         """Run a stage, and search the worst points of its result."""
         runner, degree = self._runner, step.degree if isinstance(step, GradedParametrisation) else 0
+        # the family on the active joints, from the last result; only the last degree is solved exactly
         family = runner.family(step, self._r)
         solver = runner.settings.solver if final else runner.settings.solver.coarser()
         stage = runner.run(Plan(label, family, self._start(family), solver, degree, final))
         self._stages.append(stage)
         self._reached = step, family
+        # the worst points of low degrees differ from those of the last one
         if stage.result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         if final or degree >= RULES.searched:
@@ -142,19 +156,6 @@ class Continuation:
         assert isinstance(before, GradedFamily)
         return family.embed(theta, before)
 
-    def _solve_until_unfolded(self, step: Parametrisation) -> None:
-        """Solve the last step again until there is no point of small conditioning."""
-        folds, before = self._runner.folds, 0.0
-        for k in range(2, 2 + RULES.rounds):
-            if folds.least >= LOSS_RULES.least_conditioning or 0 <= folds.least < before + RULES.least_gain:
-                break
-            before = folds.least
-            self._solve(step, f"{step.label}, round {k}", final=True)
-        # the domain forces folds: their term would only spoil the rest
-        if folds.least < 0:
-            folds.give_up()
-            self._solve(step, f"{step.label}, with folds", final=True)
-
 
 class FoldSearch:
     """The worst points that were found so far.
@@ -163,10 +164,11 @@ class FoldSearch:
         problem: problem of the fit.
         active: joints that are not coordinates themselves.
         weight: weight of the fold term; with 0 nothing is searched.
+        singular: whether samples of the domain are near singular positions of the task. Folds there are the domain's.
     """
 
-    def __init__(self, problem: Problem, active: list[int], weight: float) -> None:
-        self._problem, self._active, self._weight = problem, active, weight
+    def __init__(self, problem: Problem, active: list[int], weight: float, singular: bool) -> None:
+        self._problem, self._active, self._weight, self.singular = problem, active, weight, singular
         self._points = np.zeros((0, problem.n))
         self.worst: WorstPoints | None = None  #: of the last search
 
@@ -369,6 +371,7 @@ class StageRunner:
     ) -> tuple[BasisObjective, Array]:
         """The loss of a family that is linear in its parameters, and the start in those that a mirror leaves free."""
         kept = None if mirror is None else mirror.kept(family)
+        # the start as components, which a mirror leaves even or odd, and of these the free ones
         if theta is None:
             theta = self._start_spectral(family, len(samples), kept)
         elif mirror is not None:

@@ -1,6 +1,5 @@
 """Where fits begin: the spectral start of bases, and a second start from the mirrored gradients."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, permutations, product
 
@@ -160,6 +159,7 @@ class Mirror:
         return {}
 
     def _find_allowed(self, family: LinearFamily) -> NDArray[np.bool_] | None:
+        # the basis at points and at their images
         q = ca.SX.sym("q", self.space.n)
         basis = ca.Function("basis", [q], [ca.densify(family.basis(q))])
         u = np.random.default_rng(RULES.seed).uniform(-1.0, 1.0, (self.space.n, RULES.points))
@@ -167,6 +167,7 @@ class Mirror:
             np.array(basis(self.space.centre[:, None] + self.space.half_width[:, None] * side))
             for side in (u, self.signs[:, None] * u)
         )
+        # each function is even, odd, or neither
         size = np.abs(here).max(axis=1)
         even, odd = (np.abs(there - sign * here).max(axis=1) <= RULES.tolerance * size for sign in (1, -1))
         allowed: NDArray[np.bool_] = np.where(even, 1, -1) == self.parities[:, None]
@@ -182,24 +183,19 @@ def find_mirror(problem: Problem, active: list[int]) -> Mirror | None:
     u = np.random.default_rng(RULES.seed).uniform(-1.0, 1.0, (RULES.points, space.n))
     left = [np.array(signs) for signs in product((1.0, -1.0), repeat=space.n)][1:]
     for points in (u[:1], u[1:]):
-        left = _keep_symmetric(problem, active, points, left)
+        # task directions and metric at S u must be the mirror images of those at u
+        tensors = _evaluate_tensors(problem, active, np.concatenate([points, *(signs * points for signs in left)]))
+        here, *there = tensors.reshape(1 + len(left), len(points), *tensors.shape[1:])
+        left = [
+            signs
+            for signs, image in zip(left, there, strict=True)
+            if np.abs(image - signs[:, None] * here * signs).max() <= RULES.tolerance
+        ]
     for signs in left:
         parities = _find_parities(problem, active, signs, u)
         if parities is not None:
             return Mirror(space, signs, parities)
     return None
-
-
-def _keep_symmetric(problem: Problem, active: list[int], u: Array, choices: Sequence[Array]) -> list[Array]:
-    """The choices of signs for which task directions and metric at S u are the mirror images of those at u."""
-    images = np.concatenate([u, *(signs * u for signs in choices)])
-    tensors = _evaluate_tensors(problem, active, images)
-    here, *there = tensors.reshape(1 + len(choices), len(u), *tensors.shape[1:])
-    return [
-        signs
-        for signs, image in zip(choices, there, strict=True)
-        if np.abs(image - signs[:, None] * here * signs).max() <= RULES.tolerance
-    ]
 
 
 def _evaluate_tensors(problem: Problem, active: list[int], u: Array) -> Array:
@@ -214,11 +210,13 @@ def _find_parities(problem: Problem, active: list[int], signs: Array, u: Array) 
     The null space of J_x is mapped to itself where S q = q, and trace(S) on it is the number of even coordinates less
     that of odd ones.
     """
+    # on the mirror itself, S maps the null space to itself, and its trace counts parities
     tensors = _evaluate_tensors(problem, active, np.where(signs > 0, u, 0.0))
     inverse, projector = tensors[:, 0], tensors[:, 1]
     along_task = np.einsum("sii,i->s", np.linalg.solve(inverse, projector.transpose(0, 2, 1)), signs)
     differences = signs.sum() - along_task
     r = len(active) - problem.m
+    # a whole number of even coordinates, the same everywhere
     even = np.round((r + differences.mean()) / 2)
     if np.abs(2 * even - r - differences).max() > 0.01 or not 0 <= even <= r:
         return None

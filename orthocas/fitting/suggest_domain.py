@@ -135,6 +135,7 @@ def suggest_domain(
 
 
 def _check_bounds(robot: Robot, task: Task, leak_deg: float, conditioning: float, seed: int) -> Bounds:
+    # a robot with joints that are all driven, a task, and bounds that can be met
     require_kind("robot", robot, Robot)
     require_driven("suggesting a domain", robot.tree)
     require_kind("task", task, Task)
@@ -179,6 +180,7 @@ class _Joints:
         robot, domain = problem.robot, problem.domain
         limited = _measure_room(robot, domain.centre) <= _bound_widths(robot)
         widths = []
+        # the first that applies, of whole ranges, bounds and limits
         for k, name in enumerate(self.names):
             reason: Reason = "joint limit" if limited[k] else "unlimited"
             if broken.get(k):
@@ -326,6 +328,7 @@ class WidestBox:
     def _grow(self, widths: Array) -> tuple[Array, dict[int, list[Miss]]]:
         """Widen each joint alone while the bounds are kept, and say what breaks then. Its first step may need a fit."""
         broken: dict[int, list[Miss]] = {k: [] for k in self.free}
+        # joint after joint, in steps that grow while the bounds are kept, and begin small again where they are not
         begin = self._fraction
         for done, k in enumerate(self.free, 1):
             self._next = begin + (1 - begin) * done / len(self.free), 2

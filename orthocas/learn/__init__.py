@@ -66,6 +66,7 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
         require_kind("env", env, gymnasium.Env)
         super().__init__(env)
         require_kind("chart", chart, Chart)
+        # The environment takes joint positions, and observes a row of numbers.
         inner, outer = env.action_space, cast(Any, env.observation_space)
         if getattr(inner, "shape", None) != (chart.n,):
             raise InvalidValueError("actions of env", str(inner)[:80], f"{chart.n} joint positions")
@@ -73,6 +74,7 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
             raise InvalidValueError("observations of env", str(outer)[:80], "a row of numbers")
         if not callable(positions):
             raise InvalidValueError("positions", repr(positions)[:80], "a function of an environment")
+        # Which observations are joints, and how far one action moves each.
         self.chart, self._positions = chart, positions
         places = range(chart.n) if joints is None else joints
         self._joints = freeze_indices("joints", places, (chart.n,), 2**31)
@@ -81,6 +83,7 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
             raise InvalidValueError("step", sizes.tolist(), f"one finite number or {chart.n}, > 0")
         self._step = np.broadcast_to(sizes, chart.n)
         self._tracker: Tracker | None = None
+        # Actions are changes of phi; observations get xi and the distance to the boundary.
         more = np.full(chart.r + 1, np.inf)
         low, high = (np.asarray(end, dtype=float) for end in (outer.low, outer.high))
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (chart.n,), np.float64)

@@ -1,12 +1,13 @@
 """`pin.Model`: its joints and frames as a `KinematicTree`, locked joints, default tips, postures, and planar arms."""
 
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pinocchio as pin
 
-from orthocas.errors import InvalidValueError, RobotError, degrees_hint
+from orthocas.errors import InvalidValueError, RobotError, TipWarning, degrees_hint
 from orthocas.robots.spatial import rotate_z_to, snap
 from orthocas.robots.tree import BASE_JOINTS, JointKind, KinematicTree, place_on_base
 from orthocas.tools.checks import Array, freeze_array, require_known
@@ -17,6 +18,7 @@ _GRIPPER = re.compile("gripper|finger|jaw", re.IGNORECASE)
 _FINGER = re.compile("finger|jaw", re.IGNORECASE)
 _SHAPE = re.compile("_sc$|collision", re.IGNORECASE)  #: frames of shapes that stand for links in collision checks
 _TOOL = re.compile("tool|tcp|end_?effector|eef|(^|_)ee(_|$)", re.IGNORECASE)
+_SHORTEST_ARM = 3  #: joints before the fingers of a hand, more than that
 WORLD = "universe"  #: Pinocchio's name for what does not move
 TIP = "tip"
 GRAVITY = 9.81  #: [m/s^2]
@@ -238,23 +240,40 @@ def set_position(model: pin.Model, i: int, value: float, position: Array) -> Non
 
 
 def find_default_tip(model: pin.Model) -> str:
-    """The end of the arm of a robot with a single chain, apart from joints of a gripper, which is not moved.
+    """The end of the longest arm: of the chain with most joints, of equal ones the first.
 
-    Of the frames there it is the last one that is called a tool or an end effector; otherwise the last one that is no
-    part of a finger and no shape for collision checks.
+    Joints of a gripper or of the fingers of a hand are not moved and not counted. Of the frames at the end it is the
+    last one that is called a tool or an end effector; otherwise the last one that is no part of a finger and no shape
+    for collision checks. On robots with several chains a TipWarning names the others.
 
     Raises:
-        RobotError: if the robot branches. The message lists the frames to choose from, chain by chain.
+        RobotError: if no joint moves.
     """
     ids = [i for i in range(1, model.njoints) if not _is_of_gripper(model, i)] or list(range(1, model.njoints))
+    ids = [i for i in ids if not any(_carries_fingers(model, k) for k in model.supports[i] if k not in (0, i))]
     carriers = {model.parents[i] for i in ids}
-    ends = [_list_ends(model, i) for i in ids if i not in carriers]
+    ends = [i for i in ids if i not in carriers]
     if not ends:
         raise RobotError("the robot has no movable joint, expected at least one")
+    # The first of the longest chains, with a word about the others.
+    longest = max(ends, key=lambda i: (len(model.supports[i]), -i))
+    names = {i: _list_ends(model, i) for i in ends}
     if len(ends) > 1:
-        listing = "; ".join(", ".join(names) for names in ends)
-        raise RobotError(f"the robot has {len(ends)} chains, name the tip frame: {listing}")
-    return ends[0][0]
+        listing = "; ".join(", ".join(names[i]) for i in ends if i != longest)
+        taken = f"tip='{names[longest][0]}', with {len(model.supports[longest]) - 1} joints, the longest"
+        chains = f"the robot has {len(ends)} chains; taken is {taken}. Other tips to name: {listing}"
+        warnings.warn(chains, TipWarning, stacklevel=2)
+    return names[longest][0]
+
+
+def _carries_fingers(model: pin.Model, i: int) -> bool:
+    """Whether a hand begins behind a joint: chains side by side, none longer than the arm before it."""
+    above, below = list(model.supports[i]), [k for k in range(i + 1, model.njoints) if i in model.supports[k]]
+    branching = [k for k in above[:-1] if sum(parent == k for parent in model.parents) > 1]
+    arm = len(above) - 1 - (above.index(branching[-1]) if branching else 0)
+    deepest = max((len(model.supports[k]) - len(above) for k in below), default=0)
+    side_by_side = sum(model.parents[k] == i for k in below) > 1
+    return side_by_side and arm > _SHORTEST_ARM and deepest <= arm
 
 
 def _is_of_gripper(model: pin.Model, i: int) -> bool:

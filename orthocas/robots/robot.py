@@ -15,6 +15,7 @@ from orthocas.robots import dynamics, kinematics
 from orthocas.robots.dynamics import PAYLOAD, add_payload
 from orthocas.robots.kinematics import add_tool
 from orthocas.robots.mjcf import read_mjcf
+from orthocas.robots.named import find_robot_file
 from orthocas.robots.pinocchio_model import (
     TIP,
     build_planar,
@@ -95,7 +96,8 @@ class Robot(Shown):
         Args:
             path: the file. Named postures (`homes`) come from an SRDF file with the same stem, beside it or in ../srdf,
                 or from the keyframes of the MJCF file.
-            tip: name of any frame. Default: the last frame of a robot with a single chain.
+            tip: name of any frame. Default: the end of the longest arm; where there are several chains, a TipWarning
+                names the others.
             locked: joints to lock elsewhere, or on the chain to a tip, with their positions [rad] or [m]. Joints that
                 mimic them follow. A floating, spherical or planar joint is locked at its neutral position, given as 0.
             tool: pose of the tip of a massless tool in the (first) tip frame; see `with_tool`.
@@ -109,12 +111,33 @@ class Robot(Shown):
                 hangs from a ceiling. Default: (0, 0, -9.81), or that of the MJCF file.
 
         Raises:
-            RobotError: if the file cannot be read, the robot branches and no tip is given, or a joint on the chain to
-                the tip is not revolute, continuous or prismatic. The message says which one to lock.
+            RobotError: if the file cannot be read, or a joint on the chain to the tip is not revolute, continuous or
+                prismatic. The message says which one to lock.
             UnknownNameError: if the frame or a locked joint does not exist.
         """
         build = cls.from_mjcf if as_path("path", path).suffix.lower() == ".xml" else cls.from_urdf
         return build(path, tip, locked, tool, tips=tips, base=base, gravity=gravity)
+
+    @classmethod
+    def from_name(
+        cls,
+        name: str,
+        tip: str | None = None,
+        locked: Locked = None,
+        tool: Tool = None,
+        *,
+        tips: Sequence[str] = (),
+        base: str | None = None,
+        gravity: Gravity = None,
+    ) -> Self:
+        """Build a known robot, such as "panda", from a file of example-robot-data or of robot_descriptions.
+
+        One of these packages has to be installed; the other arguments are those of `from_file`.
+
+        Raises:
+            UnknownNameError: if no installed package knows the name; the error has the known ones.
+        """
+        return cls.from_urdf(find_robot_file(name), tip, locked, tool, tips=tips, base=base, gravity=gravity)
 
     @classmethod
     def from_urdf(
@@ -183,7 +206,7 @@ class Robot(Shown):
 
         Args:
             model: the model. Joints that are not locked must be revolute, continuous or prismatic.
-            tip: name of any frame of the model. Default: the last frame of a robot with a single chain.
+            tip: name of any frame of the model. Default: as in `from_file`.
             tips: names of several frames, such as two hands, in place of `tip`.
             locked: joints to lock, with their positions [rad] or [m].
             base: as in `from_file`.

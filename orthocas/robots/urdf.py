@@ -39,6 +39,8 @@ class FileRules:
     depth: int = 200  #: of nested elements
     links: int = 1000  #: links (URDF) or bodies (MJCF) of a robot
     largest: float = 1e20  #: number of an axis or of a mimic joint
+    inertia: float = 1e-2  #: of the largest moment, by which files round
+    least_inertia: float = 1e-5  #: [kg m^2], which dummies have
     shortest_axis: float = 1e-12  #: length of the vector along an axis
 
 
@@ -102,6 +104,7 @@ def read_urdf(path: str | Path, tips: Sequence[str] = (), locked: Mapping[str, f
 
     if unlimited:
         _log.warning("%s: limits of effort or velocity are missing, so there are none: %s", path, listed(unlimited))
+    _note_impossible_inertias(path, used)
     _, beside = _parse_urdf(ElementTree.tostring(root, "unicode"), mimic=False)
     if beside:
         _log.warning("%s: what kinematics does not use is left out: %s", path, beside)
@@ -183,6 +186,22 @@ def _check_urdf(path: str | Path, root: ElementTree.Element) -> None:
             _check_axis(path, f"<axis> of joint '{joint.get('name')}'", axis.get("xyz"))
         _check_numbers(path, joint)
     _check_tree(path, root)
+
+
+def _note_impossible_inertias(path: str | Path, root: ElementTree.Element) -> None:
+    """Log links with a principal moment that is negative, or larger than the sum of the others: no body has these."""
+    odd = []
+    for link in root.findall("link"):
+        inertia = link.find("inertial/inertia")
+        if inertia is not None:
+            values = (float(inertia.get(name, 0)) for name in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+            xx, yy, zz, xy, xz, yz = values
+            moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+            slack = RULES.inertia * np.abs(moments).max() + RULES.least_inertia
+            if moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack:
+                odd.append(f"'{link.get('name')}' ({', '.join(f'{moment:.3g}' for moment in moments)} kg m^2)")
+    if odd:
+        _log.warning("%s: no body has the principal moments of inertia of these links: %s", path, listed(odd, 3))
 
 
 def _check_numbers(path: str | Path, joint: ElementTree.Element) -> None:

@@ -112,6 +112,7 @@ class Push:
         link: Link = None,
         point: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
+        # Two instants, then forces, and where the force acts.
         for name, value, want in (("start", start, ">= 0"), ("duration", duration, "> 0")):
             number = as_float_array(f"{name} of a push", value)
             require_shape(f"{name} of a push", number.shape, ())
@@ -177,6 +178,7 @@ class Stops:
 
     def torque(self, tree: KinematicTree, q: ca.SX, dq: ca.SX) -> ca.SX:
         """Torque of the stops on the joints, (n, 1)."""
+        # A spring and a damper at each finite limit, which push and never pull.
         stiffness = positive_gains("stiffness of stops", self.stiffness, tree.n)
         damping = non_negative_gains("damping of stops", self.damping, tree.n)
         torque = ca.SX(tree.n, 1)
@@ -321,9 +323,11 @@ def read_steps(path: str | Path, chart: Chart) -> Plan:
 
 
 def _read_step_reference(reader: Reader, data: Mapping[str, Any], labels: tuple[str, ...], start: Array) -> Reference:
+    # The time that the run takes, and the filter that rounds its steps off.
     duration = reader.number(data.get("duration"), "duration", least=RULES.shortest)
     frequency = reader.number(data.get("natural_frequency", NATURAL_FREQUENCY), "natural_frequency", above=0.0)
     ratio = reader.number(data.get("damping_ratio", DAMPING_RATIO), "damping_ratio", least=0.0)
+    # Steps in their order; quantities that a step does not name keep their targets.
     changes, before = [], 0.0
     targets = dict(zip(labels, start.tolist(), strict=True))
     for k, entry in enumerate(reader.items(data["steps"], "steps")):
@@ -367,6 +371,7 @@ def _read_change(
 
 
 def _read_pushes(reader: Reader, data: object, joint_names: tuple[str, ...], run_ends: float) -> tuple[Push, ...]:
+    """Pushes on links or the tip (a force at a point) or on joints (a torque)."""
     pushes = []
     for k, item in enumerate(reader.items(data, "pushes")):
         where = f"pushes[{k}]"
@@ -379,20 +384,15 @@ def _read_pushes(reader: Reader, data: object, joint_names: tuple[str, ...], run
         duration = reader.number(entry.get("duration"), f"{where}.duration", least=RULES.shortest)
         force = reader.numbers(entry.get("force", [0.0] * 3), f"{where}.force", 3)
         torque = reader.numbers(entry.get("torque", [0.0] * len(joint_names)), f"{where}.torque", len(joint_names))
-        pushes.append(Push(start, duration, force, torque, *_read_place(reader, entry, where, joint_names)))
+        # The force acts at a point in the frame of a link, or of the tip.
+        for key in ("link", "point"):
+            if key in entry and "force" not in entry:
+                raise reader.fault(f"{where} has a '{key}' but no 'force', expected both or none of them")
+        link = entry.get("link")
+        whole = isinstance(link, int) and not isinstance(link, bool) and 0 <= link < len(joint_names)
+        if "link" in entry and not whole and link not in joint_names:
+            names = ", ".join(joint_names)[:200]
+            raise reader.wrong(f"{where}.link", link, f"the index of a joint from 0, or a name: {names}")
+        point = reader.numbers(entry.get("point", [0.0] * 3), f"{where}.point", 3)
+        pushes.append(Push(start, duration, force, torque, link, point))
     return tuple(pushes)
-
-
-def _read_place(
-    reader: Reader, entry: Mapping[str, Any], where: str, joint_names: tuple[str, ...]
-) -> tuple[str | int | None, Array]:
-    """Where the force of a push acts: a link (None: the tip), and a point (3,) in its frame."""
-    for key in ("link", "point"):
-        if key in entry and "force" not in entry:
-            raise reader.fault(f"{where} has a '{key}' but no 'force', expected both or none of them")
-    link = entry.get("link")
-    whole = isinstance(link, int) and not isinstance(link, bool) and 0 <= link < len(joint_names)
-    if "link" in entry and not whole and link not in joint_names:
-        names = ", ".join(joint_names)[:200]
-        raise reader.wrong(f"{where}.link", link, f"the index of a joint from 0, or a name: {names}")
-    return link, reader.numbers(entry.get("point", [0.0] * 3), f"{where}.point", 3)

@@ -126,10 +126,12 @@ def shade_fallback(axes: Axes, trajectory: "Trajectory") -> None:
 
 def _draw_others(panels: Array, trajectory: "Trajectory", units: Mapping[str, str]) -> None:
     """Draw joints, commands and, for torque controllers, the storage."""
+    # Units of joints that turn, slide, or both.
     torque = trajectory.kind == "torque"
     unit = " or ".join(sorted({units.get(name, "rad or m") for name in trajectory.joint_names}, reverse=True))
     force = " or ".join({"rad": "N m", "m": "N"}[part] for part in unit.split(" or "))
     speed = " or ".join(f"{part}/s" for part in unit.split(" or "))
+    # Joints and commands, and for torques the storage of the law.
     panels[0].plot(trajectory.times, trajectory.q, linewidth=1.3, label=trajectory.joint_names)
     panels[0].set_ylabel(f"joints q [{unit}]", fontsize=9)
     names = len(trajectory.joint_names)
@@ -152,6 +154,7 @@ def _set_style(axes: Axes, trajectory: "Trajectory") -> None:
 
 
 def _build_title(trajectory: "Trajectory") -> str:
+    # How the run ended, then how long something other than the law was in charge, and how long it was cut.
     text = f"{trajectory.controller}, {trajectory.times[-1]:.4g} s"
     if trajectory.outcome.value != "complete":
         text += f": {trajectory.outcome.value}, {trajectory.reason or 'run ended early'}"
@@ -210,19 +213,16 @@ class MovingPicture:
         """Frames of the run at the given instants, by index."""
         for index in instants:
             self._canvas.restore_region(self._background)
-            for artist in self._move(int(index)):
+            # All that moves, placed as it is at the instant, over the background.
+            now = self._times[index]
+            for i in range(self._values.shape[1]):
+                done, cursor = self._lines[2 * i : 2 * i + 2]
+                done.set_data(self._times[: index + 1], self._values[: index + 1, i])
+                cursor.set_data([now, now], cursor.axes.get_ylim())
+            self._clock.set_text(f"t = {now:.2f} s")
+            for artist in (*self._arm.moved(int(index)), *self._lines, self._clock):
                 self._canvas.figure.draw_artist(artist)
             yield np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
-
-    def _move(self, index: int) -> list[Artist]:
-        """All moving artists, placed as they are at an instant."""
-        now = self._times[index]
-        for i in range(self._values.shape[1]):
-            done, cursor = self._lines[2 * i : 2 * i + 2]
-            done.set_data(self._times[: index + 1], self._values[: index + 1, i])
-            cursor.set_data([now, now], cursor.axes.get_ylim())
-        self._clock.set_text(f"t = {now:.2f} s")
-        return [*self._arm.moved(index), *self._lines, self._clock]
 
 
 class _Arm:
@@ -242,15 +242,7 @@ class _Arm:
         self._lines: list[Any] = [
             *axes.plot(*zero, color=_TRAIL, linewidth=1.5, animated=True, label="tip path"),
             *axes.plot(*zero, "-o", color=_ARM, linewidth=3.5, markersize=5.5, animated=True),
-            *axes.plot(
-                *zero,
-                "+",
-                color=_TARGET,
-                markersize=13,
-                markeredgewidth=1.6,
-                animated=True,
-                label="target",
-            ),
+            *axes.plot(*zero, "+", color=_TARGET, markersize=13, markeredgewidth=1.6, animated=True, label="target"),
         ]
         self._shadow: list[Any] = [] if flat.size else axes.plot(*zero, color=_SHADOW, linewidth=3, animated=True)
         known = self._lines[0], self._lines[2]
@@ -351,20 +343,16 @@ def save_animation(
 
     with publish(target.parent, listed=True, force=force) as folder:
         draft = folder / target.name
-        if target.suffix == ".gif":
-            _write_gif(draft, draw(), samples)
-        else:
+        if target.suffix == ".mp4":
             _write_mp4(draft, draw(), (len(samples) // 2, samples.shape[1]))
-
-
-def _write_gif(path: Path, pictures: Iterator[Frame], samples: Frame) -> None:
-    """Write frames in the palette of the samples; each frame stores only what changes."""
-    palette = Image.fromarray(samples).quantize(RULES.colours)
-    frames = (Image.fromarray(p).quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures)
-    first = next(frames)
-    # Unlike a file that Pillow opens, this one is closed even after Ctrl-C.
-    with path.open("wb") as file:
-        first.save(file, "GIF", save_all=True, append_images=frames, duration=1000 // RULES.rate, loop=0, optimize=True)
+            return
+        # All frames in the palette of the samples; each stores only what changes.
+        palette = Image.fromarray(samples).quantize(RULES.colours)
+        frames = (Image.fromarray(p).quantize(palette=palette, dither=Image.Dither.NONE) for p in draw())
+        first, pause = next(frames), 1000 // RULES.rate
+        # Unlike a file that Pillow opens, this one is closed even after Ctrl-C.
+        with draft.open("wb") as file:
+            first.save(file, "GIF", save_all=True, append_images=frames, duration=pause, loop=0, optimize=True)
 
 
 def _write_mp4(path: Path, pictures: Iterator[Frame], size: tuple[int, int]) -> None:

@@ -305,9 +305,20 @@ def integrate(
 
 
 def _build_continuous(loop: ClosedLoop, reference: Reference, tolerance: float) -> Integrator:
+    """What CVODES runs: an interval, with states at 25 equally spaced instants."""
     # CasADi may lose Ctrl-C while it builds functions.
     with deferred(), building:
-        integrator = _build_integrator(loop, reference, tolerance)
+        rate = loop.rate(reference)
+        state_size, _, p_size, load_size = (rate.size1_in(i) for i in range(4))
+        kind: Any = ca.SX if rate.is_a("SXFunction") else ca.MX
+        x, s = kind.sym("x", state_size), kind.sym("s")
+        p = kind.sym("p", 2 + p_size + load_size)
+        length, since, parameters, load = p[0], p[1], p[2 : 2 + p_size], p[2 + p_size :]
+        # In s from 0 to 1, so that one integrator serves intervals of all lengths.
+        ode = length * rate(x, since + s * length, parameters, load)
+        system, options = {"x": x, "t": s, "p": p, "ode": ode}, list_cvodes_options(tolerance, loop.stiff)
+        grid = np.arange(1, RULES.outputs + 1) / RULES.outputs
+        integrator = ca.integrator("closed_loop", "cvodes", system, 0.0, grid, options)
 
     def run(span: tuple[float, float], since: float, parameters: Array, load: Array, state: Array) -> Array:
         p = np.concatenate([[span[1] - span[0], span[0] - since], parameters, load])
@@ -326,27 +337,6 @@ def _cut_pieces(reference: Reference, pushes: tuple[Push, ...], longest: float) 
         count = max(1, int(np.ceil((end - begin) / longest - 1e-9)))
         cuts = np.linspace(begin, end, count + 1)
         yield from pairwise(cuts)
-
-
-def _build_integrator(loop: ClosedLoop, reference: Reference, tolerance: float) -> ca.Function:
-    """x0, p = [length; time since segment start; parameters; load] -> states at 25 equally spaced instants."""
-    rate = loop.rate(reference)
-    state_size, _, p_size, load_size = (rate.size1_in(i) for i in range(4))
-    kind: Any = ca.SX if rate.is_a("SXFunction") else ca.MX
-    x, s = kind.sym("x", state_size), kind.sym("s")
-    p = kind.sym("p", 2 + p_size + load_size)
-    length, since, parameters, load = p[0], p[1], p[2 : 2 + p_size], p[2 + p_size :]
-    # In s from 0 to 1, so that one integrator serves intervals of all lengths.
-    ode = length * rate(x, since + s * length, parameters, load)
-    grid = np.arange(1, RULES.outputs + 1) / RULES.outputs
-    return ca.integrator(
-        "closed_loop",
-        "cvodes",
-        {"x": x, "t": s, "p": p, "ode": ode},
-        0.0,
-        grid,
-        list_cvodes_options(tolerance, loop.stiff),
-    )
 
 
 def run_ticks(

@@ -255,8 +255,10 @@ def _place_inertia(body: Any, scale: float) -> None:
 
 
 def _add_joint(mj: ModuleType, body: Any, tree: KinematicTree, i: int, stops: bool) -> Any:
+    # Turns or slides, with the inertia of its own rotor.
     kind = mj.mjtJoint.mjJNT_SLIDE if tree.joint_kinds[i] == "prismatic" else mj.mjtJoint.mjJNT_HINGE
     joint = body.add_joint(name=tree.joint_names[i], type=kind, axis=(0, 0, 1), armature=tree.armatures[i])
+    # Stops at limits, if the scene has them.
     ends = np.array([tree.lower[i], tree.upper[i]])
     limited = stops and bool(np.isfinite(ends).any())
     joint.limited = mj.mjtLimited.mjLIMITED_TRUE if limited else mj.mjtLimited.mjLIMITED_FALSE
@@ -269,12 +271,14 @@ def _add_joint(mj: ModuleType, body: Any, tree: KinematicTree, i: int, stops: bo
 def _add_rotor(mj: ModuleType, spec: Any, joint: Any, i: int, numbers: tuple[Array, Array, Array]) -> Any:
     """A joint of its own in the world, with the inertia of a rotor, and a spring between it and the robot's joint."""
     stiffness, inertia, damping = (float(part[i]) for part in numbers)
+    # A body that gravity does not pull, with the inertia of the rotor.
     body = spec.worldbody.add_body(name=f"rotor_body{i}", gravcomp=1.0)
     body.explicitinertial = True
     body.mass, body.inertia = inertia, (inertia, inertia, inertia)
     rotor = body.add_joint(name=rotor_name(joint.name), type=joint.type, axis=(0, 0, 1))
     rotor.limited = mj.mjtLimited.mjLIMITED_FALSE
     joint.armature = 0.0
+    # The spring keeps the two angles equal.
     gear = spec.add_tendon(name=f"gear{i}", springlength=(0.0, 0.0))
     gear.stiffness[0], gear.damping[0] = stiffness, damping
     gear.wrap_joint(rotor.name, 1.0)
@@ -462,13 +466,21 @@ class MuJoCoPlant(Shown):
         first order takes eighths. Springs K need steps of at most 1 / frequency with both, the root of the largest
         eigenvalue of M^-1 K.
         """
-        M = np.zeros((self.model.nv,) * 2)
+        # The largest eigenvalues of M^-1 D and M^-1 K, of all joints and rotors.
+        # D and K of all joints and rotors, and the largest eigenvalues of M^-1 D and M^-1 K.
+        M, D = np.zeros((self.model.nv,) * 2), np.diag(self.model.dof_damping)
         mujoco().mj_fullM(self.model, self.data, M)
-        # The largest eigenvalues of M^-1 D and M^-1 K.
+        K = np.zeros_like(D)
+        if self.elasticity is not None:
+            stiffness, _, damping = self.elasticity.numbers(self.robot.n)
+            across, rows = np.zeros((self.robot.n, self.model.nv)), np.arange(self.robot.n)
+            across[rows, self._motors], across[rows, self._dofs] = 1.0, -1.0
+            D, K = D + across.T * damping @ across, across.T * stiffness @ across
         damped, squared = (
             self._timestep * float(np.linalg.eigvals(np.linalg.solve(M, part)).real.max()) if part.any() else 0.0
-            for part in self._compute_dampers_and_springs()
+            for part in (D, K)
         )
+        # Steps of a length at which the method is stable.
         parts = max(
             min(ceil(min(damped, RULES.most_parts + 1)), RULES.most_parts), ceil(sqrt(self._timestep * squared)), 1
         )
@@ -479,18 +491,6 @@ class MuJoCoPlant(Shown):
     def _find_dofs(self, names: Iterable[str]) -> NDArray[np.intp]:
         """Where joints stand among all."""
         return np.array([self.model.joint(name).dofadr[0] for name in names])
-
-    def _compute_dampers_and_springs(self) -> tuple[Array, Array]:
-        """D and K of all joints and rotors."""
-        D = np.diag(self.model.dof_damping)
-        K = np.zeros_like(D)
-        if self.elasticity is not None:
-            stiffness, _, damping = self.elasticity.numbers(self.robot.n)
-            across = np.zeros((self.robot.n, self.model.nv))
-            rows = np.arange(self.robot.n)
-            across[rows, self._motors], across[rows, self._dofs] = 1.0, -1.0
-            D, K = D + across.T * damping @ across, across.T * stiffness @ across
-        return D, K
 
     def push(self, force: ArrayLike, link: Link = None, point: ArrayLike = (0.0, 0.0, 0.0)) -> None:
         """Push from now on, in addition to other pushes, until `release`.
@@ -540,7 +540,13 @@ class MuJoCoPlant(Shown):
         data = self.data
         data.ctrl[:] = self._check("torque", torque)
         data.qfrc_applied[self._dofs] = 0.0 if loads is None else self._check("loads", loads)
-        self._step(self.model, data, self._divide(seconds))
+        # Equal steps of the physics. A tick that is a whole number of steps, but for rounding, gets no further one.
+        count = as_number("seconds", seconds) / self._longest - 1e-9
+        if not -1e-9 < count <= RULES.most_steps:
+            raise InvalidValueError("seconds", seconds, f"a number > 0, at most {RULES.most_steps * self._longest:g}")
+        steps = max(1, ceil(count))
+        self.model.opt.timestep = seconds / steps
+        self._step(self.model, data, steps)
         if not data.qvel @ data.qvel < RULES.runaway**2:
             raise SimulationError(f"MuJoCo gave up at {self.time:g} s: joint velocities beyond {RULES.runaway:g}")
 
@@ -551,13 +557,3 @@ class MuJoCoPlant(Shown):
         if not np.abs(value).max() < RULES.largest:
             raise InvalidValueError(name, value.tolist(), f"numbers up to {RULES.largest:g}")
         return value
-
-    def _divide(self, seconds: float) -> int:
-        """Into how many steps of the physics a tick is divided; sets their length."""
-        # A tick that is a whole number of steps, but for rounding, gets no further one.
-        count = as_number("seconds", seconds) / self._longest - 1e-9
-        if not -1e-9 < count <= RULES.most_steps:
-            raise InvalidValueError("seconds", seconds, f"a number > 0, at most {RULES.most_steps * self._longest:g}")
-        steps = max(1, ceil(count))
-        self.model.opt.timestep = seconds / steps
-        return steps

@@ -1,7 +1,7 @@
 """Closed loops with MuJoCo as plant, and with the supervised law of generated C."""
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -38,6 +38,8 @@ class SupervisedLaw:
     """
 
     def __init__(self, controller: Controller, safety: Safety, resume_after: float, period: float) -> None:
+        from orthocas import codegen  # few runs need a code generator and a compiler
+
         require_kind("safety", safety, Safety)
         if not as_number("resume_after", resume_after) >= 0:
             raise InvalidValueError("resume_after", resume_after, "a number >= 0 or infinity")
@@ -47,7 +49,12 @@ class SupervisedLaw:
         if controller.chart is None:
             raise InvalidValueError("safety", "given", f"none with {controller.name} without a chart")
         self._resume_after, self._period, self._caught_for = resume_after, period, 0.0
-        self._law = _compile(controller, safety)
+        # The law in C, which stays loaded when its folder is gone.
+        with open_draft_folder() as folder:
+            generated = codegen.generate_c(controller.chart, folder / "law", controller, "law", safety=safety)
+            library = codegen.compile_shared(generated, generated.folder)
+            compiled = codegen.CompiledLibrary(library, "law", controller.problem.n)
+            self._law: Supervisor = codegen.Supervisor(compiled, controller)
 
     def start(self, q: Array) -> None:
         """Begin at joint positions (n,)."""
@@ -83,21 +90,6 @@ class LawWithMemory:
         """[command; status; no cause], (n + 2,), for a reference with two derivatives (3 k,)."""
         command, status = self._ticks.tick(q, dq, reference.reshape(3, -1), self._period)
         return np.concatenate([command, [status, ControlStatus.OK]])
-
-
-def _compile(controller: Controller, safety: Safety) -> "Supervisor":
-    """The supervised law in C. It stays loaded when its folder is gone."""
-    from orthocas import codegen  # few runs need a code generator and a compiler
-
-    # Laws without one have no supervised form, and were refused before.
-    chart: Any = controller.chart
-    with open_draft_folder() as folder:
-        generated = codegen.generate_c(chart, folder / "law", controller, "law", safety=safety)
-        library = codegen.compile_shared(generated, generated.folder)
-        supervisor: Supervisor = codegen.Supervisor(
-            codegen.CompiledLibrary(library, "law", controller.problem.n), controller
-        )
-        return supervisor
 
 
 def run_supervised(
@@ -183,6 +175,7 @@ def run_physics(
 
 def apply_pushes(plant: MuJoCoPlant, loads: Loads, shares: Array) -> Array | None:
     """Apply the forces of the pushes for a tick of which they last a share each. Returns their joint torques (n,)."""
+    # Pushes act by their shares of the tick; joint torques come beside the law's.
     plant.release()
     if not shares.any():
         return None

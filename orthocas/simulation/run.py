@@ -326,10 +326,18 @@ class Prepared:
         q = states[:, :n]
         target = self.reference.sample(np.minimum(times, self.reference.duration))
         dq = states[:, n:] if loop.torque else np.zeros_like(q)
-        command, status, cause = self._read_commands(pieces, q, dq, *target)
+        # Commands that were held, the last one also for the end; or those of the law.
+        held = [piece.held for piece in pieces if piece.held is not None]
+        if held:
+            columns = ([part.commands for part in held], [part.status for part in held], [part.cause for part in held])
+            command, status, cause = (np.concatenate([*parts, parts[-1][-1:]]) for parts in columns)
+        else:
+            command, status = self._evaluate("command", q, dq, *target)
+            cause = np.zeros(len(command))
         energy = controller.energy if self.compiled is None else controller.energy_graph
         unknown = [np.full((len(times), 1), np.nan)] * 2
         storage, power = unknown if energy is None else self._evaluate("energy", q, dq, *target)
+        # The controlled quantities.
         value, chart = self._evaluate("measured", q)[0], controller.chart
         if chart is not None and controller.labels == chart.labels and chart.parts.turns.any():
             # Circle-valued quantities with the whole turns that bring them nearest to the reference.
@@ -357,18 +365,9 @@ class Prepared:
         reason = find_loss(run, controller, loop.loads.pushes, self.supervised) if outcome is Outcome.COMPLETE else ""
         return replace(run, outcome=Outcome.LOST, reason=reason) if reason else run
 
-    def _read_commands(self, pieces: Sequence[Piece], *arguments: Array) -> tuple[Array, Array, Array]:
-        """Commands, status and causes: those that were held, the last one also for the end, or those of the law."""
-        held = [piece.held for piece in pieces if piece.held is not None]
-        if not held:
-            command, status = self._evaluate("command", *arguments)
-            return command, status, np.zeros(len(command))
-        columns = ([part.commands for part in held], [part.status for part in held], [part.cause for part in held])
-        command, status, cause = (np.concatenate([*parts, parts[-1][-1:]]) for parts in columns)
-        return command, status, cause
-
     def _evaluate(self, name: str, *arguments: Array) -> list[Array]:
         """`command`, `energy` or `measured` of the law for N rows of arguments."""
+        # Compiled runs have the functions of the law in C, others those of CasADi.
         if self.compiled is not None:
             return self.compiled.rows(name, *arguments)
         controller = self.loop.controller

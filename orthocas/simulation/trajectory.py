@@ -201,6 +201,7 @@ class Trajectory(Shown):
         target = as_path("path", path)
         require_writable(target, TrajectoryFileError)
         require_replaceable(target, is_numpy_archive(target, ("header", *_REQUIRED)), force, TrajectoryFileError)
+        # A header for what is no array, beside the arrays.
         header = {
             "version": _VERSION,
             "controller": self.controller,
@@ -227,7 +228,11 @@ class Trajectory(Shown):
         try:
             # The header first: it says which shapes the arrays must have.
             names: dict[str, Any] = {name: tuple(get_part(header, name, list)) for name in ("labels", "joint_names")}
-            _check_names(names)
+            for what, texts in names.items():
+                if not texts:
+                    raise InvalidValueError(what, "empty", "at least one name")
+                for k, text in enumerate(texts):
+                    require_text(f"{what}[{k}]", text)
             require_known("kind of command", get_part(header, "kind", str), ("torque", "velocity"))
             require_known("outcome", get_part(header, "outcome", str), [outcome.value for outcome in Outcome])
             controller = require_text("controller", get_part(header, "controller", str))
@@ -243,23 +248,16 @@ class Trajectory(Shown):
             raise TrajectoryFileError(f"{path} is inconsistent: {error}") from None
 
 
-def _check_names(names: Mapping[str, tuple[str, ...]]) -> None:
-    """Raise InvalidValueError unless there are names, all of them printable."""
-    for what, texts in names.items():
-        for k, text in enumerate(texts):
-            require_text(f"{what}[{k}]", text)
-        if not texts:
-            raise InvalidValueError(what, "empty", "at least one name")
-
-
 def _check_arrays(arrays: Mapping[str, Any], n: int, k: int) -> dict[str, Any]:
     """The arrays of a run of n joints and k quantities, with shapes that fit and instants that increase."""
+    # One row for each instant, as wide as its kind of quantity.
     N = arrays["times"].size
     checked: dict[str, Any] = {}
     for name, array in arrays.items():
         checked[name] = as_float_array(name, array)
         width = () if name in _SINGLE else (n,) if name in _OF_JOINTS else (k,)
         require_shape(name, checked[name].shape, (N, *width))
+    # Files of early versions have no causes.
     checked.setdefault("cause", np.zeros(N))
     for name in ("status", "cause"):
         checked[name] = freeze_indices(name, checked[name], (N,), len(ControlStatus))
@@ -411,21 +409,16 @@ def task_acceleration_breakdown(chart: Chart, trajectory: Trajectory) -> Breakdo
     require_kind("trajectory", trajectory, Trajectory)
     if trajectory.kind != "torque":
         raise InvalidValueError("trajectory", f"a run of '{trajectory.controller}'", "a run of a torque controller")
-    # Threads share the chart.
+    # Forces f_phi = J^-T (tau - g), and dd_x = J_x M^-1 (J^T f - C dq) + dJ_x/dt dq. Threads share the chart.
     with deferred(), building:
-        function = _build_parts(chart)
+        n, m, robot = chart.n, chart.m, chart.problem.robot
+        q, dq, tau = (ca.MX.sym(name, n) for name in ("q", "dq", "tau"))
+        J = chart.function("jacobian")(q)
+        f = ca.solve(J.T, tau - robot.gravity(q))
+        mobility = ca.solve(robot.mass_matrix(q), J[:m, :].T).T  # J_x M^-1
+        own, error = mobility @ J[:m, :].T @ f[:m], mobility @ J[m:, :].T @ f[m:]
+        curvature = chart.function("second_derivative")(q, dq, dq)[:m]
+        coriolis = -mobility @ robot.coriolis_product(q, dq, dq)
+        function = dense_function("breakdown", [q, dq, tau], [own, error, curvature, coriolis], ["q", "dq", "tau"])
     parts = Batched(function)(trajectory.q, trajectory.dq, trajectory.command)
     return Breakdown(chart.problem.task.labels, *parts)
-
-
-def _build_parts(chart: Chart) -> ca.Function:
-    n, m, robot = chart.n, chart.m, chart.problem.robot
-    q, dq, tau = (ca.MX.sym(name, n) for name in ("q", "dq", "tau"))
-    J = chart.function("jacobian")(q)
-    # Forces f_phi = J^-T (tau - g), and dd_x = J_x M^-1 (J^T f - C dq) + dJ_x/dt dq.
-    f = ca.solve(J.T, tau - robot.gravity(q))
-    mobility = ca.solve(robot.mass_matrix(q), J[:m, :].T).T  # J_x M^-1
-    own, error = mobility @ J[:m, :].T @ f[:m], mobility @ J[m:, :].T @ f[m:]
-    curvature = chart.function("second_derivative")(q, dq, dq)[:m]
-    coriolis = -mobility @ robot.coriolis_product(q, dq, dq)
-    return dense_function("breakdown", [q, dq, tau], [own, error, curvature, coriolis], ["q", "dq", "tau"])

@@ -136,6 +136,7 @@ class Branches(Shown, Sequence[Branch]):
 
         from orthocas.tools.picture import Picture, equal_axes
 
+        # A panel for each branch, with the arm at its posture.
         columns = min(len(self), 4)
         rows = -(-len(self) // columns)
         layout = ConstrainedLayoutEngine(h_pad=0.15, w_pad=0.1)
@@ -235,11 +236,13 @@ class _Arm:
     @classmethod
     def build_all(cls, robot: Robot, task: Task | None, whole: Box) -> list["_Arm"]:
         """The arm of a robot with one tip; of others, those of all tips whose joints move the task."""
+        # One tip: its last seven joints, or the task for shorter arms.
         points = sample_evenly(Box(whole.centre, whole.half_width), 2000, RULES.seed)
         if len(robot.tips) == 1:
             joints = list(range(max(0, robot.n - RULES.arm), robot.n))
             one = Task.pose(robot) if robot.n >= 6 or task is None else task
             return [cls._build(robot, one, whole, joints, points)]
+        # Several tips: each whose joints move the task.
         moved = np.ones(robot.n, dtype=bool)
         if task is not None:
             moved = np.asarray(_evaluate_jacobians(task.with_reference_at(whole.centre), points[:20]).any(axis=(0, 1)))
@@ -362,6 +365,7 @@ def sample_centres(robot: Robot, task: Task, box: Box) -> tuple[Array, Array]:
 
 def _scale_to_range(robot: Robot, task: Task) -> Callable[[Array], Array]:
     """Relative singular values of a task at points (N, n), (N,); rows are scaled over the joint range."""
+    # Rows over their sizes in the joint range, so that lengths and angles compare.
     whole = find_joint_range(robot, 0)
     centred = task.with_reference_at(whole.centre)
     samples = sample_evenly(Box(whole.centre, whole.half_width), RULES.samples, RULES.seed)
@@ -436,10 +440,12 @@ def _reflect(robot: Robot, cut: Cut, points: Array) -> Array:
 
 def _is_mirror(robot: Robot, cut: Cut, points: Array) -> bool:
     """Whether the reflection at a cut keeps the pose of the tip."""
+    # A reflection needs exact cuts, and revolute joints beside them.
     prismatic = robot.tree.prismatic
     near = [j for j in (cut.joint - 1, cut.joint, cut.joint + 1) if 0 <= j < robot.n]
     if not cut.exact or any(prismatic[j] for j in near):
         return False
+    # All tips keep their positions and rotations at the samples.
     moved = _reflect(robot, cut, points)
     same = [
         np.abs(of(points, tip) - of(moved, tip)).max() < RULES.same_pose

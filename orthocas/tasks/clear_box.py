@@ -79,22 +79,26 @@ class ClearBox(Box):
     rows: str
 
     def __init__(
-        self,
-        box: Box,
-        task: Task,
-        least_singular_value: float,
-        scale: ArrayLike | None = None,
-        rows: str = "frame",
+        self, box: Box, task: Task, least_singular_value: float, scale: ArrayLike | None = None, rows: str = "frame"
     ) -> None:
         require_kind("box", box, Box)
         require_kind("task", task, Task)
         require_known("rows", rows, ROWS)
-        # The frame Jacobian decides unless `rows` says otherwise; sizes are those of its rows on the box.
+        # The frame Jacobian decides unless `rows` says otherwise.
         super().__init__(box.centre, box.half_width, box.unbounded)
         task = task.with_reference_at(box.centre)
         object.__setattr__(self, "task", task)
         object.__setattr__(self, "rows", rows)
-        sizes = self._measure_rows() if scale is None else freeze_array("scale", scale, (task.m,))
+        # Sizes are those of its rows at samples of the box where they are finite.
+        if scale is None:
+            J = self._evaluate_jacobians(sample_uniform(Box(self.centre, self.half_width), RULES.samples, RULES.seed))
+            finite = np.isfinite(J).all(axis=(1, 2))
+            if not finite.any():
+                raise SingularTaskError(
+                    f"the Jacobian of task '{task.name}' is not finite at any of {RULES.samples} samples"
+                )
+            scale = compute_row_scale(J[finite], task.units)
+        sizes = freeze_array("scale", scale, (task.m,))
         bound = as_number("least_singular_value", least_singular_value)
         for name, value in (("least_singular_value", bound), ("scale", sizes.min())):
             if not 0 < value < np.inf:
@@ -211,14 +215,11 @@ class ClearBox(Box):
         J = self.jacobian_function(q) / ca.repmat(ca.DM(self.scale), 1, len(self.centre))
         return dense_function("gram", [q], [J @ J.T])
 
-    @property
+    @cached_property
     def pivots(self) -> ca.Function:
         """q (n, 1) -> the pivots (m, 1) of D^-1 J J^T D^-1 - bound^2 I; all are > 0 just where q is clear."""
-        return self._clear_pivots
-
-    @cached_property
-    def _clear_pivots(self) -> ca.Function:
         q = ca.SX.sym("q", len(self.centre))
+
         # A product, because ** raises OverflowError for the bounds of some files.
         square = self.least_singular_value * self.least_singular_value
         left = self.gram(q) - square * ca.SX.eye(self.task.m)
@@ -238,16 +239,6 @@ class ClearBox(Box):
         batched = self.task.batched_jacobian if self.rows == "x" else self.task.batched_frame_jacobian
         J: Array = batched(points)[0].reshape(len(points), self.task.m, len(self.centre))
         return J
-
-    def _measure_rows(self) -> Array:
-        """The scale of the rows at samples of the box, without those where they are not finite, (m,)."""
-        J = self._evaluate_jacobians(sample_uniform(Box(self.centre, self.half_width), RULES.samples, RULES.seed))
-        finite = np.isfinite(J).all(axis=(1, 2))
-        if not finite.any():
-            raise SingularTaskError(
-                f"the Jacobian of task '{self.task.name}' is not finite at any of {RULES.samples} samples"
-            )
-        return compute_row_scale(J[finite], self.task.units)
 
 
 def exclude_singular(domain: Domain, task: Task, least_singular_value: float | None) -> Domain:

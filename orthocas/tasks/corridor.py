@@ -147,15 +147,7 @@ class Corridor(Box):
         """
         u = rng.uniform(-1.0, 1.0, (count, len(self.centre)))
         q = self.centre + self.half_width * np.sign(u) * np.abs(u) ** power
-        q[:, self.counted] = self._in_cylinders(rng, count, power) * self.radius[self.counted]
-        q = q[self.contains(q)]
-        along, across = self._parts(q)
-        length = np.sqrt(self.lines[2])
-        held = (across <= 1) & (along * length >= -1) & ((along - 1) * length <= 1)
-        return np.asarray(q[rng.uniform(size=len(q)) * held.sum(axis=1) < 1])
-
-    def _in_cylinders(self, rng: np.random.Generator, count: int, power: float) -> Array:
-        """Points of cylinders of radius 1 around the lines, which are longer by 1 at both ends."""
+        # Cylinders of radius 1 around the lines, which are longer by 1 at both ends.
         starts, axes, squares = self.lines
         length, d = np.sqrt(squares), starts.shape[1]
         k = rng.choice(len(length), size=count, p=(length + 2) / (length + 2).sum())
@@ -163,8 +155,13 @@ class Corridor(Box):
         direction -= (direction * axes[k]).sum(axis=1, keepdims=True) * axes[k]
         direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-300)
         distance = rng.uniform(size=(count, 1)) ** (power / max(d - 1, 1)) if d > 1 else 0.0
-        along = rng.uniform(-1.0, length[k] + 1)[:, None]
-        return np.asarray(starts[k] + along * axes[k] + distance * direction)
+        heights = rng.uniform(-1.0, length[k] + 1)[:, None]
+        q[:, self.counted] = (starts[k] + heights * axes[k] + distance * direction) * self.radius[self.counted]
+        # Points in the corridor, those in several cylinders less often.
+        q = q[self.contains(q)]
+        along, across = self._parts(q)
+        held = (across <= 1) & (along * length >= -1) & ((along - 1) * length <= 1)
+        return np.asarray(q[rng.uniform(size=len(q)) * held.sum(axis=1) < 1])
 
     def squared_distance(self, points: Array) -> Array:
         """Squared distance of points (N, n) from the path in radii, (N,)."""
@@ -207,10 +204,5 @@ def read_postures(path: Path, robot: Robot) -> Array:
         PathFileError: names the file, the line, and what is wrong there.
     """
     return read_table(
-        path,
-        "postures file",
-        "postures",
-        _MOST_IN_FILE,
-        lambda names: find_columns(names, robot.joint_names),
-        least=1,
+        path, "postures file", "postures", _MOST_IN_FILE, lambda names: find_columns(names, robot.joint_names), least=1
     )

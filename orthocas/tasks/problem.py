@@ -232,9 +232,11 @@ def relative_singular_values(problem: Problem, points: Array) -> Array:
     """
     task, domain = problem.task, problem.domain
     J = problem.task.evaluate_jacobian(points)
+    # Each component must depend on some joint.
     idle = np.flatnonzero((J == 0).all(axis=(0, 2)))
     if idle.size:
         raise SingularTaskError(f"task component '{task.labels[idle[0]]}' does not depend on any joint")
+    # A domain that bounds singular values measures them itself; orientations have their frame Jacobian.
     if domain.singular_bound is not None:
         return np.asarray(domain.singular_bound.singular_values(points))
     if task.turn is not None or task.parts:

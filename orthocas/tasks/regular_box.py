@@ -184,10 +184,12 @@ class PostureScore:
         Rows of J_x are scaled to order one, and N is an orthonormal basis of the self-motions at the centre. The value
         is zero where the task is singular, and where coordinates along the self-motions of the centre fold over.
         """
+        # The same points of a box around each centre, the centre itself first.
         n = self.robot.n
         unit = np.vstack([np.zeros(n), sample_evenly(Box(np.zeros(n), 1.0), samples, 0)])
         points = centres[:, None] + default_half_width(self.robot, centres)[:, None] * unit
         at = np.broadcast_to(centres[:, None], points.shape)
+        # J over its sizes, completed by the null space at the centre: a square matrix, regular where J turns little.
         J = _fill_singular(self.jacobian(points.reshape(-1, n), at.reshape(-1, n))[0])
         J = J.reshape(*points.shape[:2], self.m, n) / self.scale[:, None]
         rest = np.linalg.svd(J[:, 0])[2][:, None, self.m :]

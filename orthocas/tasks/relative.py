@@ -145,7 +145,7 @@ class Relative:
         x, x_d = self._make_symbols("x", "x_d")
         w, v = self._compute_turn(x, self._compute_quaternion(x_d))
         slope = ca.SX.eye(self.task.m)
-        slope[self.first :, self.first :] = self._reorder(w * ca.SX.eye(3) + skew(v))
+        slope[self.first :, self.first :] = self._order @ (w * ca.SX.eye(3) + skew(v)) @ self._order.T
         e = ca.vertcat(x[: self.first] - x_d[: self.first], self._order @ (2 * v))
         return dense_function("relative", [x, x_d], [e, slope], ["x", "x_d"])
 
@@ -163,11 +163,13 @@ class Relative:
         """x, x_d, dx_d, ddx_d, rates of dq, rates of w, dJ/dt w -> d/dt (E J w + de/dt of an arm at rest)."""
         names = ("x", "x_d", "dx_d", "ddx_d", "here", "there", "change")
         x, x_d, dx_d, ddx_d, here, there, change = symbols = self._make_symbols(*names)
+        # The rotation from the target, and its rates: w, v are a unit quaternion.
         p, omega, alpha = self._differentiate_target(x_d, dx_d, ddx_d)
         w, v = self._compute_turn(x, p)
         turning, along, changing = (self._order.T @ rate[self.first :] for rate in (here, there, change))
         dv = (w * (turning - omega) + ca.cross(v, turning + omega)) / 2
         dw = -ca.dot(v, turning - omega) / 2
+        # The rate of E times the velocity, and that of what the moving target adds.
         moved = dw * along + ca.cross(dv, along) + w * changing + ca.cross(v, changing)
         left = dw * omega + w * alpha - ca.cross(dv, omega) - ca.cross(v, alpha)
         straight = change[: self.first] - ddx_d[: self.first]
@@ -180,9 +182,6 @@ class Relative:
     def _order(self) -> ca.SX:
         assert self.task.turn is not None
         return ca.SX(ca.sparsify(ca.DM(self.task.turn.order)))
-
-    def _reorder(self, matrix: ca.SX) -> ca.SX:
-        return self._order @ matrix @ self._order.T
 
     def _compute_quaternion(self, x: ca.SX) -> ca.SX:
         quaternion: ca.SX = self.task.quaternion_function(x)

@@ -194,6 +194,7 @@ def sample_problem(problem: "Problem", samples: int, seed: int | tuple[int, ...]
 
 def evaluate_samples(problem: "Problem", points: Array) -> Samples:
     """Samples at given joint positions (N, n)."""
+    # Samples where a task gradient vanishes are left out.
     J = problem.task.evaluate_jacobian(points)
     kept = np.all(np.einsum("sij,sij->si", J, J) > 0, axis=1)
     if not kept.all():
@@ -213,9 +214,11 @@ def find_idle_joints(problem: "Problem", samples: Samples) -> list[int]:
     The rest of the problem does not depend on joint k. So are the joints of a floating base in
     `Samples.project_to_zero_momentum`: the generalised inertia does not depend on where it is.
     """
+    # Joints that no component of the task depends on.
     J = samples.task_jacobian
     size = np.abs(J).max(axis=(0, 1))
     idle = size <= NEGLIGIBLE * size.max()
+    # Those that the metric couples with others, or that change it, are not idle.
     if samples.metric_inverse is not None:
         B = np.abs(samples.metric_inverse).max(axis=0)
         off_diagonal = (B - np.diag(B.diagonal())).max(axis=1)
@@ -252,11 +255,13 @@ def compute_directions(problem: "Problem", joints: Sequence[int], points: Array)
     Returns:
         Both matrices over the largest entry of the pair, (N, 2, k, k); NaN everywhere if a gradient vanishes at any.
     """
+    # Joints that are not given stay at the centre.
     q = np.repeat(problem.domain.centre[None], len(points), axis=0)
     q[:, list(joints)] = points
     samples = evaluate_samples(problem, q).restricted_to(list(joints))
     if len(samples) < len(points):
         return np.full((len(points), 2, len(joints), len(joints)), np.nan)
+    # A^-1 and the projector on the task's span, each over its largest entry.
     basis = samples.task_basis
     projector = basis.transpose(0, 2, 1) @ basis
     inverse = samples.metric_inverse

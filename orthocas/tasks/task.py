@@ -617,8 +617,10 @@ class Task(Shown, HoldsFunctions):
             [0.5, 0.0, 0.4, 2.0, 0.0, 0.0]
         """
         turn = self._require_whole_turn()
+        # The rotation from the reference, as the components of x.
         R, single = _read_rotations("orientation", orientation)
         turned = Batched(self.components_function)(self.reference.T @ R)[0]
+        # A pose has a position, too; an orientation has none.
         if turn.with_position:
             p = as_float_array("position", np.nan if position is None else position)
             require_shape("position", p.shape, (3,) if single else (len(R), 3))
@@ -733,6 +735,7 @@ class Task(Shown, HoldsFunctions):
             return _stack_functions(self.parts, "smooth_function")
         if turn is None:
             return self.function
+        # Components of an orientation without the seam half a turn from the reference.
         q = ca.SX.sym("q", self.robot.n)
         rotation, position = self._build_frame("rotation")(q), self._build_frame("position")(q)
         x = turn.components(ca.SX(ca.DM(self.reference.T)) @ rotation, position, True)
@@ -795,6 +798,7 @@ def _find_independent_frames(tasks: Sequence[Task]) -> list[tuple[Task, Frames]]
     A whole pose that leads from a frame with a known pose to another one is as good as the pose of the latter in the
     world. What is seen from a frame with a known pose is as good as what the world sees of it.
     """
+    # A pose with one known end settles its other end, until no more follow.
     stands: dict[int, Frames] = {}
     settled: set[str | None] = {None}  #: frames with a known pose; None: the world
     poses = [task for task in tasks if task.turn is not None and task.turn.whole and task.turn.with_position]
@@ -805,18 +809,21 @@ def _find_independent_frames(tasks: Sequence[Task]) -> list[tuple[Task, Frames]]
             if len(new) == 1:
                 stands[id(task)] = Frames(new[0])
                 settled.add(new[0])
+    # All else is seen from a known frame as from the world.
     seen = {id(task): Frames(task._frames.frame) for task in tasks if task._frames.relative_to in settled}
     return [(task, stands.get(id(task), seen.get(id(task), task._frames))) for task in tasks]
 
 
 def _read_rotations(name: str, value: ArrayLike) -> tuple[Array, bool]:
     """Rotation matrices (N, 3, 3) from such, or from unit quaternions, and whether it was one."""
+    # One rotation or several, as matrices or quaternions.
     values = as_float_array(name, value)
     require_finite(name, values)
     single = values.shape in ((4,), (3, 3))
     if not single and values.shape[1:] not in ((4,), (3, 3)):
         raise InvalidValueError(f"shape of {name}", values.shape, "(3, 3), (N, 3, 3), (4,) or (N, 4)")
     rows = values[None] if single else values
+    # Quaternions of length 1, but for rounding, which is taken out.
     if rows.ndim == 2:
         off = np.abs(np.linalg.norm(rows, axis=1) - 1)
         if len(rows) and off.max() > 1e-6:

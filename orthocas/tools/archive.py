@@ -133,22 +133,18 @@ def read_archive(path: str | Path, kind: Kind) -> tuple[dict[str, Any], dict[str
             or zipped.read(_DIGEST) != _compute_digest(text).encode()
         ):
             raise kind.error(f"{source} has been edited: its header does not match its checksum")
+        # Each entry must match its checksum, too.
         zipped.require_room(list(header["sha256"]))
-        arrays = {
-            name.removesuffix(".npy"): _read_array(zipped, name, digest) for name, digest in header["sha256"].items()
-        }
+        arrays: dict[str, Stored] = {}
+        for name, digest in header["sha256"].items():
+            content = zipped.read(name)
+            if _compute_digest(content) != digest:
+                raise kind.error(f"{source} has been edited: entry {name} does not match its checksum")
+            try:
+                arrays[name.removesuffix(".npy")] = read_npy(content)
+            except ValueError as error:
+                raise kind.error(f"{source} contains an array that cannot be read: {name}, {error}") from None
     return header, arrays
-
-
-def _read_array(zipped: "Unpacker", name: str, digest: str) -> Stored:
-    """An entry that matches its checksum, as an array."""
-    content = zipped.read(name)
-    if _compute_digest(content) != digest:
-        raise zipped.error(f"{zipped.source} has been edited: entry {name} does not match its checksum")
-    try:
-        return read_npy(content)
-    except ValueError as error:
-        raise zipped.error(f"{zipped.source} contains an array that cannot be read: {name}, {error}") from None
 
 
 def _check_header(source: Path, kind: Kind, text: bytes) -> dict[str, Any]:

@@ -102,6 +102,7 @@ class NumpyGraph:
 
         Large graphs need large scratch memory. Every thread keeps its own from call to call.
         """
+        # Memory of this thread, built at its first call.
         if not hasattr(self._memory, "buffer"):
             self._memory.buffer, self._memory.evaluate = self.function.buffer()
         buffer, evaluate = self._memory.buffer, self._memory.evaluate
@@ -149,24 +150,19 @@ class NumpyGraph:
             deps = [node.dep(i) for i in range(node.n_dep())]
             operands.append([(x.dep(0), True) if x.op() == ca.OP_TRANSPOSE else (x, False) for x in deps])
         pieces = iter(ca.graph_substitute([x for xs in operands for x, _ in xs] + outputs, heavy, cuts))
+        # In their places NumPy's nodes, for products z + x y (operands z, x, y) and for tanh.
         definitions = []
         for node, xs in zip(heavy, operands, strict=True):
-            flips = [flipped for _, flipped in xs]
-            definitions.append(self._replace(node, [next(pieces) for _ in xs], flips))
+            flips, parts = [flipped for _, flipped in xs], [next(pieces) for _ in xs]
+            first = parts[0].T if flips[0] else parts[0]
+            if node.op() == ca.OP_TANH:
+                new: NumpyNode = Tanh(node.shape)
+                result: ca.MX = new(first)
+            else:
+                new = Product(parts[1].shape, parts[2].shape, flips[1], flips[2])
+                result = new(*parts[1:])
+                result = result if parts[0].is_zero() else first + result
+            self._nodes.append(new)
+            definitions.append(result)
         _, rewritten = ca.substitute_inplace(cuts, definitions, list(pieces))
         return list(rewritten)
-
-    def _replace(self, node: ca.MX, operands: list[ca.MX], flips: list[bool]) -> ca.MX:
-        """The NumPy node for a product z + x y (operands z, x, y) or for tanh."""
-        new: NumpyNode
-        if node.op() == ca.OP_TANH:
-            new = Tanh(node.shape)
-            arguments = [operands[0].T if flips[0] else operands[0]]
-        else:
-            new = Product(operands[1].shape, operands[2].shape, flips[1], flips[2])
-            arguments = operands[1:]
-        self._nodes.append(new)
-        result: ca.MX = new(*arguments)
-        if node.op() == ca.OP_MTIMES and not operands[0].is_zero():
-            result = (operands[0].T if flips[0] else operands[0]) + result
-        return result

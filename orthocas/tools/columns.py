@@ -65,6 +65,7 @@ class ColumnFunction:
         blocks, count = len(arguments[0]), count_threads()
         results = [np.empty((blocks, *shape)) for shape in self._shapes]
 
+        # Every thread takes every n-th block, with memory of its own.
         def evaluate(run: Run, part: range) -> None:
             for b in part:
                 run([argument[b] for argument in arguments], [result[b] for result in results])

@@ -47,7 +47,14 @@ def as_text(title: str, facts: Mapping[str, str]) -> str:
     (_, heading), *others = facts.items()
     width = max((len(name) for name, _ in others), default=0) + 2
     lines = [f"{title}: {heading}", *(f"  {name:<{width}}{value}" for name, value in others[: _LINES - 1])]
-    return "\n".join(_cut(line) for line in lines)
+    # Without control characters, and cut to the width between two words, where there are any.
+    for k, line in enumerate(lines):
+        indent = line[: len(line) - len(line.lstrip())]
+        words = "".join(letter if letter.isprintable() else " " for letter in line.strip())
+        if len(words) > _WIDTH:
+            words = f"{textwrap.shorten(words, _WIDTH - 4, placeholder='') or words[: _WIDTH - 4]} ..."
+        lines[k] = indent + words
+    return "\n".join(lines)
 
 
 def as_html(title: str, facts: Mapping[str, str]) -> str:
@@ -83,16 +90,7 @@ def listed(words: Iterable[str], most: int = 10) -> str:
     return ", ".join(known[:most]) + more
 
 
-def number_list(values: Iterable[float], most: int = 10) -> str:
+def number_list(values: Iterable[float]) -> str:
     """Join numbers of four digits like `listed`. Equal numbers are shown once."""
     known = [f"{value:.4g}" for value in values]
-    return known[0] if len(set(known)) == 1 else listed(known, most)
-
-
-def _cut(line: str) -> str:
-    """The line without control characters, cut to the width between two words, where there are any."""
-    indent = line[: len(line) - len(line.lstrip())]
-    words = "".join(letter if letter.isprintable() else " " for letter in line.strip())
-    if len(words) > _WIDTH:
-        words = f"{textwrap.shorten(words, _WIDTH - 4, placeholder='') or words[: _WIDTH - 4]} ..."
-    return indent + words
+    return known[0] if len(set(known)) == 1 else listed(known)

@@ -120,6 +120,7 @@ def require_tape(tape: Tape, inputs: int) -> None:
     Raises:
         InvalidValueError: if it is not a tape of an expression of that many inputs; the step to blame is named.
     """
+    # The outer form, then each step on what earlier ones wrote.
     keys = tape.keys() if isinstance(tape, dict) else ()
     if set(keys) != {"rows", "columns", "steps"} or not isinstance(tape["steps"], list | tuple):
         raise InvalidValueError("tape", f"an object with {sorted(keys)[:5]}", "one with rows, columns and steps")

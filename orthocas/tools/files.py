@@ -295,12 +295,7 @@ def open_output_folder(name: str, out: str | Path) -> Iterator[Path]:
 
 
 def read_table(
-    path: str | Path,
-    what: str,
-    rows: str,
-    most: int,
-    columns: Callable[[Sequence[str]], Sequence[int]],
-    least: int = 2,
+    path: str | Path, what: str, rows: str, most: int, columns: Callable[[Sequence[str]], Sequence[int]], least: int = 2
 ) -> Array:
     """The chosen columns of a table, in their order, (N, k). Cells of others may hold anything.
 

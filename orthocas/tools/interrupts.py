@@ -115,6 +115,7 @@ def remembered() -> Iterator[Callable[[], bool]]:
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
+    # Python's own handler would raise an exception that compiled code may swallow; ours also notes it.
     memory, before = _Note(), signal.getsignal(signal.SIGINT)
     _memories.append(memory)
     if before is signal.default_int_handler:

@@ -78,6 +78,7 @@ class NotebookBars:
 
     def __call__(self, progress: Progress) -> None:
         """Draw, at most ten times a second."""
+        # Redraw for new stages and at their ends, otherwise not too often.
         new = progress.stage not in self._stages
         self._stages[progress.stage] = progress
         if not new and progress.fraction < 1 and time.monotonic() < self._drawn + _PAUSE:

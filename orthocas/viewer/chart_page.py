@@ -23,12 +23,14 @@ class ChartPage:
     """The page of a chart on a viser server."""
 
     def __init__(self, server: Any, session: Session, look: Look) -> None:
+        # State of the page, and the thread that works for it.
         self.session = session
         self._server = server
         self._panel = ChartPanel(session.chart, session.place)
         self._loop = Loop(self._settle, self._show_failure)
         self._gesture = self._dragging = self._sweeping = False
         self._fans: list[Fan] = []
+        # The scene, then what the user moves, then what it shows first.
         robot = session.chart.problem.robot
         self._arm, self._ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
         place_scene(server, robot, self.session.home[None])
@@ -53,6 +55,7 @@ class ChartPage:
         gui, chart, m = self._server.gui, self._chart, self._chart.m
         phi, sizes = chart.phi(self.session.home), chart.parts.phi_sizes
         sliders = {}
+        # Coordinates move within half a unit at first; `_settle` gives them the range that they have.
         with gui.add_folder("Coordinates: the task stays"):
             names = chart.parts.named_coordinates
             for label, name, value in zip(chart.labels[m:], names, phi[m:].tolist(), strict=True):
@@ -83,8 +86,8 @@ class ChartPage:
 
     def _add_buttons(self) -> None:
         gui = self._server.gui
-        self._add_button("Home", "home", self._go_home)
-        self._undo = self._add_button("Undo", "arrow-back-up", self._undo_move)
+        self._add_button("Home", "home", partial(self._change, self.session.go_home))
+        self._undo = self._add_button("Undo", "arrow-back-up", partial(self._change, self.session.undo))
         with gui.add_folder("What a coordinate reaches"):
             # First the coordinate that moves the joints farthest.
             self._fans = [fan_along(self._chart, self.session.q, k) for k in range(self._chart.r)]
@@ -97,18 +100,11 @@ class ChartPage:
             self._branches = gui.add_folder("Other branches: the tip stays")
             with self._branches:
                 self._search = self._add_button("Search", "arrows-split", self._find_branches)
-        self._chosen.on_update(self._choose_coordinate)
-
-    async def _choose_coordinate(self, event: Any) -> None:
-        self._loop.ask("fan", self._show_fan)
+        self._chosen.on_update(self._loop.build_handler("fan", self._show_fan))
 
     def _add_button(self, label: str, icon: str, job: Callable[[], None]) -> Any:
         button = self._server.gui.add_button(label, icon=icon)
-
-        async def clicked(event: Any) -> None:
-            self._loop.ask(label, job)
-
-        button.on_click(clicked)
+        button.on_click(self._loop.build_handler(label, job))
         return button
 
     def _find_branches(self) -> None:
@@ -117,15 +113,18 @@ class ChartPage:
         problem = self._chart.problem
         branching = self.session.branches = branches(problem.robot, problem.task)
         self._search.remove()
+        # A button for each mirror in place of the search.
         with self._branches:
             for cut in branching.mirrors:
-                self._add_button(f"Flip the {branching.cuts[cut].part}", "arrows-left-right", partial(self._flip, cut))
+                flip = partial(self._change, partial(self.session.flip, cut))
+                self._add_button(f"Flip the {branching.cuts[cut].part}", "arrows-left-right", flip)
             if not branching.mirrors:
                 self._server.gui.add_markdown("No mirror image of this arm has the same pose of its tip.")
 
-    def _flip(self, cut: int) -> None:
+    def _change(self, change: Callable[[], None]) -> None:
+        """Another position of the session, which ends a sweep."""
         self._rest()
-        self.session.flip(cut)
+        change()
         self._show()
 
     def _add_handle(self) -> Any:
@@ -163,16 +162,6 @@ class ChartPage:
         if not self._gesture:
             self.session.remember()
             self._gesture = True
-
-    def _go_home(self) -> None:
-        self._rest()
-        self.session.go_home()
-        self._show()
-
-    def _undo_move(self) -> None:
-        self._rest()
-        self.session.undo()
-        self._show()
 
     def _toggle_sweep(self) -> None:
         """Move the chosen coordinate to its ends and back, until something else is wished for; or end that."""
@@ -218,9 +207,11 @@ class ChartPage:
             self._show_arm(readings.q)
             shown = replace(readings, q=self.session.mirror(readings.q[None])[0])
             self._readings.content = self._panel.format_html(shown)
-            for label, value in zip(self._chart.labels, np.concatenate([readings.x, readings.xi]), strict=True):
-                if label not in moved:
-                    self._set(self._sliders[label], float(value))
+            values = np.concatenate([readings.x, readings.xi]).tolist()
+            for label, value in zip(self._chart.labels, values, strict=True):
+                slider = self._sliders[label]
+                if label not in moved and np.isfinite(value):
+                    slider.value = min(max(round(value, 3), slider.min), slider.max)
             self._undo.disabled = not self.session.can_undo
 
     def _show_arm(self, q: Array) -> None:
@@ -230,20 +221,15 @@ class ChartPage:
             if self._handle is not None and not self._dragging:
                 self._handle.position = tuple(self._chart.problem.robot.tip_position(q))
 
-    def _set(self, slider: Any, value: float) -> None:
-        if np.isfinite(value):
-            slider.value = min(max(round(value, 3), slider.min), slider.max)
-
     def _settle(self) -> None:
         """After a gesture: ranges of the sliders, the fan, and values that were not reached."""
         self._gesture = self._dragging = False
         self._fans = [fan_along(self._chart, self.session.q, k) for k in range(self._chart.r)]
+        # Whole steps of the sliders inside the range.
         for fan in self._fans:
             slider = self._sliders[fan.label]
-            low, high = (
-                np.ceil(fan.xi[0] / RULES.slider_step) * RULES.slider_step,
-                np.floor(fan.xi[-1] / RULES.slider_step) * RULES.slider_step,
-            )
+            low = np.ceil(fan.xi[0] / RULES.slider_step) * RULES.slider_step
+            high = np.floor(fan.xi[-1] / RULES.slider_step) * RULES.slider_step
             if np.isfinite([low, high]).all():
                 slider.min, slider.max = round(float(min(low, high)), 3), round(float(max(low, high)), 3)
         self._show()

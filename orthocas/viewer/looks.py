@@ -128,10 +128,8 @@ def build_capsule(
 ) -> Solid:
     """A rod with round ends from one point (3,) to another, with a radius at each end [m]."""
     length = float(np.linalg.norm(end - start))
-    low, high = (
-        _build_arc(radii[0], -np.pi / 2, 0.0, facets),
-        _build_arc(radii[1], 0.0, np.pi / 2, facets) + np.array([0.0, length]),
-    )
+    low = _build_arc(radii[0], -np.pi / 2, 0.0, facets)
+    high = _build_arc(radii[1], 0.0, np.pi / 2, facets) + np.array([0.0, length])
     axis = np.array([0.0, 0.0, 1.0]) if length == 0 else (end - start) / length
     return _revolve(np.concatenate([low, high]), colour, facets).move(rotate_z_to(axis), start)
 
@@ -331,6 +329,7 @@ def _build_solid(
     if material is not None:
         colour = _read_colour(material) or colours.get(material.get("name", ""), RULES.shell)
     shape = next(iter(visual.find("geometry") if visual.find("geometry") is not None else ()), None)  # type: ignore[arg-type]
+    # Shapes as URDF files name them; others are not shown.
     if shape is None:
         return None
     if shape.tag == "box":
@@ -368,6 +367,7 @@ def _locate(path: Path, name: str) -> Path | None:
     name = unquote(name)
     scheme, _, rest = name.rpartition("://")
     folder = path.resolve().parent
+    # Packages lie above the file, or where ROS looks for them.
     if scheme in ("package", "model"):
         package, _, inside = rest.partition("/")
         roots = [*folder.parents, folder, *map(Path, filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(":")))]
@@ -432,25 +432,20 @@ class Arm:
         self._poses = BodyPoses(robot.tree)
         self.shift = np.zeros(3) if shift is None else shift
         scene.add_frame(name, show_axes=False, position=tuple(self.shift))
-        # A body, and a bone that moves with it.
+        # A mesh for each colour; bones are bodies, and move with them.
         self._bones: list[tuple[int, Any]] = []
         colours = dict.fromkeys(solid.colour for solids in look for solid in solids)
         for k, colour in enumerate(colours):
             parts = {i: [solid for solid in solids if solid.colour == colour] for i, solids in enumerate(look)}
-            bodies = [i for i, solids in parts.items() if solids]
-            self._bones += zip(bodies, self._add_skin(scene, f"{name}/{k}", [parts[i] for i in bodies]), strict=True)
-
-    def _add_skin(self, scene: Any, name: str, parts: Look) -> Any:
-        """A mesh of the solids of some bodies in one colour; its bones, one for each body."""
-        solids = [join_solids(part, part[0].colour) for part in parts]
-        mesh = join_solids(solids, solids[0].colour)
-        weights = np.repeat(np.eye(len(solids)), [len(solid.vertices) for solid in solids], axis=0)
-        handle = scene.add_mesh_skinned(
-            name, mesh.vertices, mesh.faces, skin_weights=weights, color=mesh.colour, side="double",
-            bone_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (len(solids), 1)), bone_positions=np.zeros((len(solids), 3)),
-            cast_shadow=False, receive_shadow=False,
-        )  # fmt: skip
-        return handle.bones
+            solids = {i: join_solids(part, colour) for i, part in parts.items() if part}
+            mesh, count = join_solids(list(solids.values()), colour), len(solids)
+            weights = np.repeat(np.eye(count), [len(solid.vertices) for solid in solids.values()], axis=0)
+            handle = scene.add_mesh_skinned(
+                f"{name}/{k}", mesh.vertices, mesh.faces, skin_weights=weights, color=mesh.colour, side="double",
+                bone_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)), bone_positions=np.zeros((count, 3)),
+                cast_shadow=False, receive_shadow=False,
+            )  # fmt: skip
+            self._bones += zip(solids, handle.bones, strict=True)
 
     def show(self, q: Array) -> None:
         """Move to a joint position (n,)."""
@@ -481,26 +476,22 @@ class Ghosts:
                 flat_shading=False, cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
             self._nodes.append(node)
-        self._show_traces(curve)
+        # Lines that the joints move along, except those that stay.
+        points = self._robot.joint_points(curve)  # (M, joints, 3)
+        size = float(np.ptp(points.reshape(-1, 3), axis=0).max())
+        moving = points[:, np.ptp(points, axis=0).max(axis=1) > 0.03 * size]
+        if moving.size:
+            colours = np.repeat(compute_shades(len(curve))[:, None], moving.shape[1], axis=1)
+            ends = np.stack([moving[:-1], moving[1:]], axis=2).reshape(-1, 2, 3)
+            shade = np.stack([colours[:-1], colours[1:]], axis=2).reshape(-1, 2, 3)
+            thickness = RULES.trace * max(size, 1e-3)
+            self._nodes.append(self._scene.add_line_segments(f"{self._name}/traces", ends, shade, thickness=thickness))
 
     def hide(self) -> None:
         """Remove all."""
         for node in self._nodes:
             node.remove()
         self._nodes = []
-
-    def _show_traces(self, curve: Array) -> None:
-        """Lines that the joints move along, except those that stay."""
-        points = self._robot.joint_points(curve)  # (M, joints, 3)
-        size = float(np.ptp(points.reshape(-1, 3), axis=0).max())
-        moving = points[:, np.ptp(points, axis=0).max(axis=1) > 0.03 * size]
-        if not moving.size:
-            return
-        colours = np.repeat(compute_shades(len(curve))[:, None], moving.shape[1], axis=1)
-        ends = np.stack([moving[:-1], moving[1:]], axis=2).reshape(-1, 2, 3)
-        shade = np.stack([colours[:-1], colours[1:]], axis=2).reshape(-1, 2, 3)
-        thickness = RULES.trace * max(size, 1e-3)
-        self._nodes.append(self._scene.add_line_segments(f"{self._name}/traces", ends, shade, thickness=thickness))
 
 
 def compute_shades(count: int) -> Array:

@@ -101,6 +101,7 @@ def read_joint_motion(path: Path, robot: Robot) -> Motion:
         return find_columns(names, names)
 
     table = read_table(path, "motion file", "instants", RULES.most_instants, choose_columns)
+    # Quantities are columns that are neither time, joints nor their rates.
     rates = {f"{order}_{name}" for order in ("d", "dd") for name in robot.joint_names}
     labels = tuple(name for name in header if name not in {_TIME, *robot.joint_names, *rates})
     times, q, values = (
@@ -176,6 +177,7 @@ def _find_largest_circle(chart: Chart, start: Array, fractions: Array) -> tuple[
 
 def _build_polygon(chart: Chart, path: Array) -> Place:
     """Straight lines between waypoints."""
+    # A closed path, measured in the sizes of the task.
     points, _ = as_point_set("path", path, chart.m)
     sizes = chart.parts.phi_sizes[: chart.m]
     if len(points) < 3 or np.abs((points[-1] - points[0]) / sizes).max() > RULES.same_ends:
@@ -183,12 +185,14 @@ def _build_polygon(chart: Chart, path: Array) -> Place:
     lengths = np.linalg.norm(np.diff(points, axis=0) / sizes, axis=1)
     if not lengths.sum() > 0:
         raise InvalidValueError("path", "one point", "waypoints at different places")
+    # Places along it by their share of its length.
     place = np.append(0.0, np.cumsum(lengths)) / lengths.sum()
     return lambda fraction: np.column_stack([np.interp(fraction, place, column) for column in points.T])
 
 
 def _follow_with_constant_xi(chart: Chart, x: Array, start: Array) -> Array:
     """Joint positions (N, n) with task values x (N, m) and the coordinates of the start."""
+    # Begin at the first point, and track the others.
     xi = chart.xi(start)
     q = chart.solve(np.concatenate([x[0], xi]), start).require(inside=True).q[0]
     tracker = chart.tracker(q)

@@ -85,6 +85,7 @@ class ChartPanel:
     def __init__(self, chart: Chart, place: str = "", mirrored: bool = False) -> None:
         self.place = place
         problem = chart.problem
+        # Bars of the joints, with the domain unless the arm is mirrored out of it.
         robot, domain = problem.robot, problem.domain
         low, high = (-np.inf, np.inf) if mirrored else domain.bounds
         self._joints = JointBars(
@@ -93,6 +94,7 @@ class ChartPanel:
         )  # fmt: skip
         self._labels, self._units = chart.labels, problem.task.units
         self._half_width = float(domain.half_width.min())
+        # Whose chart it is, which does not change.
         task = ", ".join(map(escape, chart.labels[: chart.m]))
         branch = chart.notes.get("branch")
         lines = [escape(place)] if place else [f"branch {escape(branch)}"] if isinstance(branch, str) else []
@@ -103,6 +105,7 @@ class ChartPanel:
     def format_html(self, readings: Readings) -> str:
         """The page."""
         m = len(readings.x)
+        # What stopped the last motion, and the leak of each coordinate.
         stop = f'<div class="stop">stopped by {escape(readings.stop)}</div>' if readings.stop else ""
         leaks = [
             format_bar(label, degrees / 15, f"{degrees:.2f}°", choose_colour(-degrees, -2, -6), value=degrees)
@@ -111,6 +114,7 @@ class ChartPanel:
         if len(leaks) == 1:
             most = 1 / float(np.cos(np.radians(readings.leak_deg[0])))
             leaks.append(format_row("speed to hold it", most, "of the least, at most"))
+        # How near the boundary and folds are, and how far the task has moved.
         joint, fraction = readings.nearest, readings.boundary / self._half_width
         label = f"boundary {self._joints.shown[joint]}" if np.isfinite(readings.boundary) else "boundary"
         text, colour = self._joints.format_value(joint, readings.boundary), choose_colour(fraction, 0.15, 0.04)
@@ -133,6 +137,7 @@ class JointBars:
     def __init__(
         self, names: Sequence[str], prismatic: Iterable[bool], lower: Array, upper: Array, low: Array, high: Array
     ) -> None:
+        # Tracks from limit to limit, or over the domain, or a full turn; the domain is a band in them.
         low, high = np.maximum(low, lower), np.minimum(high, upper)
         ends = np.where(np.isfinite(lower), lower, np.where(np.isfinite(low), low, -np.pi))
         tops = np.where(np.isfinite(upper), upper, np.where(np.isfinite(high), high, np.pi))
@@ -155,6 +160,7 @@ class JointBars:
         self, name: str, shown_name: str, i: int, track: tuple[float, float, list[float]], value: float
     ) -> str:
         end, span, band = track
+        # Joints without limits wrap around the track.
         place = (value - end) / span if np.isfinite(value) else 0.0
         shown = place % 1 if not 0 <= place <= 1 else place
         near = min(place - band[0], band[1] - place) / max(band[1] - band[0], 1e-9)

@@ -43,6 +43,7 @@ class Stage:
         size = compute_chain_length(robot.tree)
         for k, (motion, shift) in enumerate(zip(motions, self.shifts, strict=True)):
             self._arms.append(Arm(scene, f"/arm{k}", robot, look, shift))
+            # The way of each tip, in few enough points.
             rows = np.unique(np.linspace(0, len(motion.q) - 1, RULES.path_points).astype(int))
             ways = [robot.frame_position(motion.q[rows], tip) + shift for tip in robot.tips]
             ends = np.concatenate([np.stack([way[:-1], way[1:]], axis=1) for way in ways])
@@ -75,28 +76,21 @@ class PlayerPage:
         self._now = 0.0
         place_scene(server, robot, np.concatenate([pick_few(motion.q) for motion in motions]), self._stage.shifts)
         self._readings = place_panels(server)
-        self._add_controls()
+        # Play and pause, the time, the speed, and whether to begin again.
+        gui, longest = server.gui, max(round(self._stage.duration, 2), RULES.time_step)
+        self._playing = False
+        self._play = gui.add_button("Play", icon="player-play")
+        self._time = gui.add_slider("time [s]", 0.0, longest, RULES.time_step, 0.0)
+        self._speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1x")
+        self._again = gui.add_checkbox("repeat", initial_value=True)
+        self._play.on_click(self._loop.build_handler("play", self._toggle))
+        self._time.on_update(self._slide)
         self._show(0.0)
         self._loop.start()
 
     def close(self) -> None:
         """End the thread of the page."""
         self._loop.stop()
-
-    def _add_controls(self) -> None:
-        gui = self._server.gui
-        self._play = gui.add_button("Play", icon="player-play")
-        self._time = gui.add_slider(
-            "time [s]", 0.0, max(round(self._stage.duration, 2), RULES.time_step), RULES.time_step, 0.0
-        )
-        self._speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1x")
-        self._again = gui.add_checkbox("repeat", initial_value=True)
-        self._playing = False
-        self._play.on_click(self._start_or_stop)
-        self._time.on_update(self._slide)
-
-    async def _start_or_stop(self, event: Any) -> None:
-        self._loop.ask("play", self._toggle)
 
     async def _slide(self, event: Any) -> None:
         # Otherwise the page itself moved it.
@@ -106,6 +100,7 @@ class PlayerPage:
 
     def _toggle(self) -> None:
         """Play from where the slider is, or stop."""
+        # A second click stops; at the end, playing begins anew.
         if self._playing:
             self._pause()
             return
@@ -116,6 +111,7 @@ class PlayerPage:
 
         def tick(seconds: float) -> bool:
             nonlocal last
+            # The speed may change while it plays, so time is summed up.
             speed = float(self._speed.value.removesuffix("x"))
             now, last = self._now + speed * (seconds - last), seconds
             if now >= self._stage.duration and not self._again.value:
@@ -176,10 +172,20 @@ class RobotPage:
         self._loop = Loop(lambda: None, partial(show_error, server))
         place_scene(server, robot, self._home[None])
         self._readings = place_panels(server)
+        # A slider for each joint around the centre, rounded inwards, so that its ends are within the limits.
+        self._sliders = []
         with server.gui.add_folder("Joints"):
-            self._sliders = [self._add_slider(i) for i in range(robot.n)]
+            for name, centre, *limits in zip(
+                robot.joint_names, self._home.tolist(), robot.lower, robot.upper, strict=True
+            ):
+                low, high = np.clip(limits, centre - RULES.endless, centre + RULES.endless).tolist()
+                low, high = round(low + 4.9e-4, 3), round(high - 4.9e-4, 3)
+                high = max(low, high)
+                start = min(max(round(centre, 3), low), high)
+                slider = server.gui.add_slider(name, low, high, RULES.slider_step, start)
+                slider.on_update(self._loop.build_handler("joints", self._show))
+                self._sliders.append(slider)
         home = server.gui.add_button("Home", icon="home")
-
         home.on_click(self._go_home)
         self._show()
         self._loop.start()
@@ -188,26 +194,12 @@ class RobotPage:
         """End the thread of the page."""
         self._loop.stop()
 
-    def _add_slider(self, i: int) -> Any:
-        robot, centre = self._robot, float(self._home[i])
-        low, high = np.clip([robot.lower[i], robot.upper[i]], centre - RULES.endless, centre + RULES.endless).tolist()
-        low, high = round(low + 4.9e-4, 3), round(high - 4.9e-4, 3)
-        high = max(low, high)
-        slider = self._server.gui.add_slider(
-            robot.joint_names[i], low, high, RULES.slider_step, min(max(round(centre, 3), low), high)
-        )
-
-        slider.on_update(self._move)
-        return slider
-
-    async def _move(self, event: Any) -> None:
-        self._loop.ask("joints", self._show)
-
     async def _go_home(self, event: Any) -> None:
         for slider, value in zip(self._sliders, self._home.tolist(), strict=True):
             slider.value = min(max(round(value, 3), slider.min), slider.max)
 
     def _show(self) -> None:
+        # Values that are no numbers do not move the arm; the sliders go back, and the page says so.
         q = np.array([slider.value for slider in self._sliders])
         good = np.isfinite(q)
         for slider, value in zip(self._sliders, self._q.tolist(), strict=True):
@@ -281,10 +273,12 @@ def show_robot(robot: Robot, look: Look, server: Any) -> tuple[float, Callable[[
 
 def _find_position(chart: Chart, fan: Fan, fraction: float) -> Array:
     """The joint position (n,) after a fraction of a sweep, exactly on the curve: from home to both ends and back."""
+    # A sine through the present value, over nearly the whole range.
     here = np.interp(0.0, fan.arc_length, fan.xi)
     centre, half = (fan.xi[-1] + fan.xi[0]) / 2, (fan.xi[-1] - fan.xi[0]) / 2
     phase = np.arcsin(np.clip((here - centre) / max(half, 1e-12), -1, 1))
     target = centre + 0.99 * half * np.sin(2 * np.pi * fraction + phase)
+    # From the nearest stored position, exactly onto the curve.
     order = np.argsort(fan.xi)
     near = np.array([np.interp(target, fan.xi[order], column[order]) for column in fan.q.T])
     phi = chart.phi(chart.problem.domain.centre)

@@ -137,8 +137,13 @@ class Session:
                 break
             if not self._step(here):
                 # Aim at what there is in place of what cannot be, and say what is in the way.
-                self.stop = self._find_reason()
                 self._target = np.where(self._find_far(here), here, self._target)
+                if self._limited:
+                    self.stop = "a joint limit of the mirrored arm"
+                elif self._tracker.status is not TrackerStatus.OUTSIDE_DOMAIN:
+                    self.stop = "a fold of the chart or a singular position"
+                else:
+                    self.stop = describe_stop(self._walls.worst(self.q), self.chart.problem.robot)
                 break
             moved, self.stop = True, ""
         return moved
@@ -183,13 +188,6 @@ class Session:
     def _find_far(self, here: Array) -> NDArray[np.bool_]:
         """Which components of phi are not yet what is wished for, (n,)."""
         return np.asarray(np.abs((self._target - here) / self.chart.parts.phi_sizes) > RULES.reached)
-
-    def _find_reason(self) -> str:
-        if self._limited:
-            return "a joint limit of the mirrored arm"
-        if self._tracker.status is not TrackerStatus.OUTSIDE_DOMAIN:
-            return "a fold of the chart or a singular position"
-        return describe_stop(self._walls.worst(self.q), self.chart.problem.robot)
 
     def _move_to(self, q: Array) -> None:
         self._tracker.reset(q)

@@ -98,6 +98,7 @@ def view(
         NoExpressionError: for grown charts.
         RobotError: if the robot file is another robot's.
     """
+    # What is shown decides which page it gets.
     arm, motions = read_subject(shown, robot)
     shape = build_shape(arm, robot_file, locked)
     server, url = open_window(host, port, "orthocas")
@@ -141,6 +142,7 @@ def export_page(
     """
     target = as_path("path", path)
     require_page(target, force)
+    # What is shown decides which scene is recorded.
     arm, motions = read_subject(shown, robot)
     shape = build_shape(arm, robot_file, locked)
     scene: Scene
@@ -175,26 +177,23 @@ def read_subject(shown: Any, robot: Robot | Chart | None) -> tuple[Robot, Sequen
         return shown.problem.robot, ()
     if isinstance(shown, Robot):
         return shown, ()
-    motions = _read_motions(shown)
+    # A motion, or several.
+    if isinstance(shown, Trajectory):
+        motions: tuple[Motion, ...] = (Motion.of_run(shown),)
+    elif isinstance(shown, JointMotion):
+        motions = (Motion.of_path(shown),)
+    else:
+        motions = tuple(shown) if isinstance(shown, list | tuple) else (shown,)
+    if not motions or not all(isinstance(part, Motion) for part in motions):
+        expected = f"a chart, a robot, a run or a joint motion{suggest_attribute(shown, Chart)}"
+        raise InvalidValueError("shown", f"a {type(shown).__name__}", expected)
+    # They belong to a robot.
     if not isinstance(robot, Robot | Chart):
         raise InvalidValueError("robot", repr(robot)[:80], "the robot that moved, or a chart of it")
     arm = robot if isinstance(robot, Robot) else robot.problem.robot
     if isinstance(shown, Trajectory | JointMotion):
         require_joints(shown.joint_names, arm, "the motion")
     return arm, motions
-
-
-def _read_motions(shown: Any) -> tuple[Motion, ...]:
-    """A motion, or several."""
-    if isinstance(shown, Trajectory):
-        return (Motion.of_run(shown),)
-    if isinstance(shown, JointMotion):
-        return (Motion.of_path(shown),)
-    several = shown if isinstance(shown, list | tuple) else [shown]
-    if not several or not all(isinstance(part, Motion) for part in several):
-        wanted = f"a chart, a robot, a run or a joint motion{suggest_attribute(shown, Chart)}"
-        raise InvalidValueError("shown", f"a {type(shown).__name__}", wanted)
-    return tuple(several)
 
 
 def build_shape(robot: Robot, robot_file: str | Path | None, locked: Mapping[str, float] | None) -> Shape:

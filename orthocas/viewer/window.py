@@ -78,9 +78,12 @@ class Inbox:
         kind = message.pop("type", None) if isinstance(message, dict) else None
         if not isinstance(kind, str) or kind not in (_CAMERA, _INPUT, *_HANDLE):
             return f"pages send no {_shorten(kind)}"
-        return _check_fields(message, kind) or self._check_content(message, kind)
+        # viser ends a connection at fields that it does not know, and at those that are missing.
+        known = fields(getattr(import_module("viser._messages"), kind))
+        needed = {field.name for field in known if field.default is MISSING}
+        if not needed <= set(message) <= {field.name for field in known}:
+            return f"its fields are {_shorten(list(message))}, expected {', '.join(sorted(needed))}"
 
-    def _check_content(self, message: dict[str, Any], kind: str) -> str | None:
         if kind == _CAMERA:
             return _check_numbers(message, _CAMERA_NUMBERS)
         if kind == _INPUT:
@@ -95,34 +98,22 @@ class Inbox:
         # Viser drops what is gone.
         return None if handle is None else _check_value(handle, updates["value"])
 
-    def filter_messages(self, receive: Callable[[], Awaitable[Any]]) -> Callable[[], Awaitable[Any]]:
-        """`receive`, which passes over messages that have a fault."""
-
-        async def receive_good() -> Any:
-            while (fault := self.find_fault(raw := await receive())) is not None:
-                _log.warning("view: a message from a browser was dropped: %s", fault)
-            return raw
-
-        return receive_good
-
     def guard_handler(self, handler: Callable[[Any], Awaitable[None]]) -> Callable[[Any], Awaitable[None]]:
-        """viser's handler of a connection, with sorted messages, and with one line for what fails nevertheless."""
+        """viser's handler of a connection, without faulty messages, and with one line for what fails nevertheless."""
 
         async def handle(connection: Any) -> None:
             asyncio.get_running_loop().set_exception_handler(_report)
-            connection.recv = self.filter_messages(connection.recv)
+            receive = connection.recv
+
+            async def receive_good() -> Any:
+                while (fault := self.find_fault(raw := await receive())) is not None:
+                    _log.warning("view: a message from a browser was dropped: %s", fault)
+                return raw
+
+            connection.recv = receive_good
             await handler(connection)
 
         return handle
-
-
-def _check_fields(message: dict[Any, Any], kind: str) -> str | None:
-    """viser ends a connection at fields that it does not know, and at those that are missing."""
-    names = fields(getattr(import_module("viser._messages"), kind))
-    needed = {field.name for field in names if field.default is MISSING}
-    if needed <= set(message) <= {field.name for field in names}:
-        return None
-    return f"its fields are {_shorten(list(message))}, expected {', '.join(sorted(needed))}"
 
 
 def _check_words(message: dict[str, Any], *names: str) -> str | None:
@@ -226,10 +217,23 @@ class Loop:
             self._tick, self._begun = tick, time.monotonic()
             self._wake.notify()
 
+    def build_handler(self, what: str, job: Job) -> Callable[[Any], Awaitable[None]]:
+        """A callback for events of viser that asks for a job."""
+
+        async def handle(event: Any) -> None:
+            self.ask(what, job)
+
+        return handle
+
     def _run(self) -> None:
         settled = True
         while self._running:
-            jobs, tick = self._take_next(settled)
+            # Wait until there is something to do.
+            with self._wake:
+                if not self._jobs and self._running:
+                    self._wake.wait(RULES.tick if self._tick else None if settled else RULES.quiet)
+                jobs, self._jobs, tick = list(self._jobs.values()), {}, self._tick
+            # The page settles once after a while without jobs.
             if not jobs and tick is None and not settled:
                 jobs, settled = [self._settle], True
             elif jobs or tick is not None:
@@ -238,14 +242,6 @@ class Loop:
                 self._do(job)
             if tick is not None:
                 self._do(lambda tick=tick: self._advance(tick))  # type: ignore[misc]
-
-    def _take_next(self, settled: bool) -> tuple[list[Job], Tick | None]:
-        """What to do now; waits until there is something."""
-        with self._wake:
-            if not self._jobs and self._running:
-                self._wake.wait(RULES.tick if self._tick else None if settled else RULES.quiet)
-            jobs, self._jobs = list(self._jobs.values()), {}
-            return jobs, self._tick
 
     def _advance(self, tick: Tick) -> None:
         """One tick of an animation."""
@@ -307,8 +303,10 @@ class Guard:
             return False
         name = match["name"].strip("[]")
         own = is_local(self.host)
+        # By name: this machine's own, or the one that the server was told.
         if name in ("localhost", self.host.lower()):
             return True
+        # By number: this machine, or any if others may reach it.
         try:
             return ipaddress.ip_address(name).is_loopback or not own
         except ValueError:
@@ -361,6 +359,7 @@ def _add_guard(serve: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
             if any(future.done() for future in events):
                 await super().handshake(*arguments, **options)
 
+    # viser's server gets the guard, with limits of messages, before its own answers.
     def serve_guarded(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
         if getattr(handler, "__module__", None) != _VISER:
             return serve(handler, *arguments, process_request=process_request, **options)
@@ -419,8 +418,7 @@ def open_window(host: str, port: int, title: str) -> tuple[Any, str]:
     """
     package = viser()
     require_free(host, port)
-    # It announces itself.
-    # viser starts its server with our guard before it.
+    # viser starts its server with our guard before it, and announces itself.
     with guard_server(host) as guard, contextlib.redirect_stdout(io.StringIO()):
         server = package.ViserServer(host=host, port=port, label=title, verbose=False)
     inputs = getattr(server.gui, "_gui_input_handle_from_uuid", None)
@@ -431,9 +429,9 @@ def open_window(host: str, port: int, title: str) -> tuple[Any, str]:
     if port not in (0, server.get_port()):
         close_window(server)
         raise _build_taken_error(host, port)
-    # Nobody but this machine, unless the host says so: no sharing through a server of others.
+    # No sharing through a server of others, which any page in the browser could ask for.
     guard.inbox.input_of = inputs.get
-    server.request_share_url = _refuse_sharing
+    server.request_share_url = lambda verbose=True: None
     server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=RULES.brand)
     server.scene.configure_environment_map(None)
     # `place_lights` has lights without shadows.
@@ -475,7 +473,11 @@ def require_free(host: str, port: int) -> None:
         try:
             trial.bind(address)
         except OSError as error:
-            raise _build_refusal(host, port, error) from None
+            if error.errno == errno.EADDRINUSE:
+                raise _build_taken_error(host, port) from None
+            if error.errno == errno.EACCES:
+                raise ViewError(f"port is {port}, which this user may not open; expected one from 1024 on") from None
+            raise ViewError(f"host is {host[:80]!r}, expected an address of this machine, such as {LOCAL}") from None
 
 
 def build_url(host: str, port: int) -> str:
@@ -504,10 +506,9 @@ def place_camera(server: Any, robot: Robot, q: Array, shift: Array | None = None
     points = robot.joint_points(q).reshape(-1, 3)
     points = np.concatenate([points, *(points + other for other in ([] if shift is None else shift))])
     low, high = points.min(axis=0), points.max(axis=0)
-    centre, radius = (
-        (low + high) / 2,
-        max(float(np.linalg.norm(high - low)) / 2, 0.4 * compute_chain_length(robot.tree)),
-    )
+    centre = (low + high) / 2
+    radius = max(float(np.linalg.norm(high - low)) / 2, 0.4 * compute_chain_length(robot.tree))
+    # The camera is far enough away for that sphere, and moves with the shape of the picture.
     up = compute_up(robot)
     server.scene.set_up_direction(tuple(up))
     frame = Framing(centre, compute_camera_direction(robot), RULES.room * radius / np.sin(RULES.view_angle / 2))
@@ -634,18 +635,6 @@ def compute_up(robot: Robot) -> Array:
     gravity = robot.tree.gravity
     strength = float(np.linalg.norm(gravity))
     return np.array([0.0, 0.0, 1.0]) if strength < RULES.flat else -gravity / strength
-
-
-def _refuse_sharing(verbose: bool = True) -> None:
-    """In place of viser's tunnel to a server of others, which any page in the browser could ask for."""
-
-
-def _build_refusal(host: str, port: int, error: OSError) -> ViewError:
-    if error.errno == errno.EADDRINUSE:
-        return _build_taken_error(host, port)
-    if error.errno == errno.EACCES:
-        return ViewError(f"port is {port}, which this user may not open; expected one from 1024 on")
-    return ViewError(f"host is {host[:80]!r}, expected an address of this machine, such as {LOCAL}")
 
 
 def _build_taken_error(host: str, port: int) -> ViewError:

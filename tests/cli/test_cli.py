@@ -179,11 +179,10 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
     [
         (
             ["fit", "spot"],
-            "unknown problem 'spot', known: planar_2r, planar_3r_x, planar_3r_xy, iiwa, hexarotor, or a FILE",
+            "unknown problem or robot 'spot', known: ",
         ),
         (["fit", "nowhere.urdf"], "cannot read URDF file nowhere.urdf: No such file or directory"),
         (["fit", PANDA, "--tip", "hand"], "unknown frame 'hand'"),
-        (["fit", str(robot_data("baxter_description/urdf/baxter.urdf"))], "name the tip frame"),
         (["fit", PANDA, "--tip", "panda_hand", "--task", "grasp"], "unknown task 'grasp', known: position"),
         (["fit", PANDA, "--tip", "panda_hand", "--metric", "mass"], "unknown metric 'mass', known: euclidean, inertia"),
         (["fit", PANDA, "--tip", "panda_hand", "--half-width", "9"], "inside its limits"),
@@ -204,7 +203,7 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
         (["fit", "iiwa", "--half-width", "1e300"], "half_width is 1e+300"),
         (["fit", "iiwa", "--metric", ""], "unknown metric ''"),
         (["fit", "iiwa", "--out", "x" * 300], "File name too long"),
-        (["fit", "x\n" * 300], "unknown problem 'x"),
+        (["fit", "x\n" * 300], "unknown problem or robot 'x"),
         (["info", PANDA, "--tip", "panda"], "panda_hand"),
         (["fit", "iiwa", "--samples", "0"], "samples is 0"),
         (["fit", "iiwa", "--samples", "many"], "received 'many', expected a whole number"),
@@ -250,7 +249,7 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
         (["fly"], "No such command"),
         (["evaluate", "nothing.orthocas"], "chart file nothing.orthocas does not exist"),
         (["evaluate", PANDA], "not a chart file"),
-        (["info", "nothing"], "unknown problem 'nothing', known: planar_2r"),
+        (["info", "nothing"], "unknown problem or robot 'nothing', known: "),
         (["info", "nothing.orthocas"], "does not exist"),
     ],
 )

@@ -16,7 +16,7 @@ from programs import Run, built, needs_c, output_of
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, check_c, compile_shared, gain_numbers
 from orthocas.codegen.library import find_compilers
-from orthocas.codegen.precision import SINGLE
+from orthocas.codegen.rendering import SINGLE
 from orthocas.control import Controller, ControlStatus, Impedance, Kinematic, PDPlus, Safety
 from orthocas.errors import AgreementError
 from orthocas.fitting.fit import Fit

@@ -113,11 +113,21 @@ def test_without_the_fold_term_the_same_fit_folds(iiwa: oc.Problem) -> None:
     assert worst_points(iiwa, fit.chart.coordinates).least < 0
 
 
+def test_no_rounds_on_a_domain_that_holds_singular_positions() -> None:
+    """Its folds belong to the domain; the fit offers the clear part at once."""
+    robot = oc.Robot.planar([1.0, 1.0, 1.0], [3.0, 3.0, 3.0])
+    problem = oc.Problem(robot, oc.Task.position(robot, "xy"), domain=oc.Box([0.6, 0.8, 0.4], 1.2))
+    fit = oc.fit(problem, oc.Polynomial(3))
+    assert fit.problem_check.singular_samples > 0
+    assert [stage.label for stage in fit.stages] == ["polynomial:2", "polynomial:3", "polynomial:3, with folds"]
+    assert fit.clear_part is not None
+
+
 @pytest.mark.slow
 def test_fold_term_acts_at_collected_points_with_its_exact_gradient(iiwa: oc.Problem) -> None:
     """Against central differences; and the value is weight / 2 mean(max(0.32 - det D, 0)^2) more."""
     unsafe = oc.fit(iiwa, oc.Polynomial(2), weights=Weights(folds=0))
-    folds = FoldSearch(iiwa, ACTIVE, 1000.0)
+    folds = FoldSearch(iiwa, ACTIVE, 1000.0, singular=False)
     folds.search(unsafe.stages[-1], oc.Polynomial(2), 0, lambda progress: None)
     assert folds.least < RULES.least_conditioning
     family = unsafe.chart.coordinates.family

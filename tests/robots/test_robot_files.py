@@ -11,7 +11,7 @@ import pytest
 from conftest import ROBOTS, arm, one_joint, robot_data
 
 import orthocas as oc
-from orthocas.errors import InvalidValueError, OrthocasError, RobotError, ShapeError, UnknownNameError
+from orthocas.errors import InvalidValueError, OrthocasError, RobotError, ShapeError, TipWarning, UnknownNameError
 from orthocas.robots import urdf
 from orthocas.robots.pinocchio_model import build_planar
 
@@ -70,9 +70,28 @@ def test_unknown_frame_and_joint_list_what_exists() -> None:
         oc.Robot.from_urdf(path, "tool0", {"elbow_joint": float("nan")})
 
 
-def test_branching_robot_needs_a_tip() -> None:
-    with pytest.raises(RobotError, match="name the tip frame"):
-        oc.Robot.from_urdf(robot_data("tiago_description/robots/tiago.urdf"))
+@pytest.mark.parametrize(
+    ("name", "tip", "joints", "others"),
+    [
+        # The fingers of a hand are neither moved nor counted; of two arms it is the first.
+        ("tiago", "hand_tool_link", 8, "wheel_left_link"),
+        ("g1_29dof_with_hand_rev_1_0", "left_hand_palm_link", 10, "right_hand_palm_link"),
+        ("talos_full_v2", "wrist_left_ft_tool_link", 9, "wrist_right_ft_tool_link"),
+        ("b1-z1", "gripperStator", 6, "FL_foot"),
+    ],
+)
+def test_longest_arm_of_a_branching_robot_is_taken(name: str, tip: str, joints: int, others: str) -> None:
+    with pytest.warns(TipWarning, match=rf"taken is tip='{tip}', with {joints} joints.*Other tips to name: .*{others}"):
+        robot = oc.Robot.from_name(name)
+    assert (robot.tips, robot.n) == ((tip,), joints)
+
+
+def test_robots_by_name() -> None:
+    panda = oc.Robot.from_urdf(robot_data("panda_description/urdf/panda.urdf"))
+    assert oc.Robot.from_name("panda").joint_names == panda.joint_names
+    assert oc.Robot.from_name("ur5").tips == ("tool0",)
+    with pytest.raises(UnknownNameError, match=r"unknown robot 'pandaa', known: panda, "):
+        oc.Robot.from_name("pandaa")
 
 
 @pytest.mark.parametrize(

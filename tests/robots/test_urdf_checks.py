@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import orthocas as oc
-from orthocas.errors import RobotError
+from orthocas.errors import RobotError, TipWarning
 
 ARM = """<robot name="r"><link name="base"/><link name="a"/>
 <joint name="j" type="{kind}"><parent link="base"/><child link="a"/>{axis}
@@ -179,8 +179,9 @@ def test_shapes_for_collision_checks_are_no_default_tips_and_lists_of_tips_have_
     assert oc.Robot.from_urdf(path).tips == ("flange",)
     more = [fixed.format("c", "grasp"), JOINT.format("l", "a", "d"), '<link name="d"/></robot>']
     path.write_text(path.read_text().replace("</robot>", "".join(more)))
-    with pytest.raises(RobotError, match="has 2 chains, name the tip frame: grasp, flange; d$"):
-        oc.Robot.from_urdf(path)
+    told = r"has 2 chains; taken is tip='grasp', with 2 joints, the longest. Other tips to name: d$"
+    with pytest.warns(TipWarning, match=told):
+        assert oc.Robot.from_urdf(path).tips == ("grasp",)
 
 
 def test_joint_that_shares_its_name_with_a_link_can_be_locked(tmp_path: Path) -> None:
@@ -210,3 +211,23 @@ def test_mimic_joints_follow_by_numbers(what: str, text: str, tmp_path: Path) ->
     path.write_text(path.read_text().replace("</robot>", leader))
     with pytest.raises(RobotError, match=f"{what} of <mimic> of joint 'j' is '{text}', expected a number up to 1e"):
         oc.Robot.from_urdf(path, "b")
+
+
+@pytest.mark.parametrize(
+    ("moments", "odd"), [((0.02, 0.03, 0.04), False), ((0.01, 0.02, 0.04), True), ((-0.001, 0.03, 0.03), True)]
+)
+def test_inertia_that_no_body_has_is_noted_with_its_link(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, moments: tuple[float, float, float], odd: bool
+) -> None:
+    """The largest principal moment is at most the sum of the others; products of inertia join them."""
+    path = write_joints(tmp_path, *ARM_OF_TWO)
+    xx, yy, zz = moments
+    # Turned by 45 degrees about z, the same body.
+    mean, half = (xx + yy) / 2, (yy - xx) / 2
+    inertia = f'<inertia ixx="{mean}" iyy="{mean}" izz="{zz}" ixy="{half}" ixz="0" iyz="0"/>'
+    text = path.read_text().replace(
+        '<link name="c"/>', f'<link name="c"><inertial><mass value="2"/>{inertia}</inertial></link>'
+    )
+    path.write_text(text)
+    oc.Robot.from_urdf(path)
+    assert ("no body has the principal moments of inertia of these links: 'c'" in caplog.text) == odd
