@@ -10,7 +10,7 @@ from orthocas.arms.numpy_kernel import NumpyKernel
 from orthocas.arms.stored import PlaceReader, StoredPostures
 from orthocas.arms.targets import TargetReader
 from orthocas.charts.self_motion import Stop
-from orthocas.errors import CompileError
+from orthocas.errors import CompileError, InvalidValueError
 from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import branches
 from orthocas.tasks.domains import Box, StopKind
@@ -60,7 +60,7 @@ class ArmMaps:
             kernel = CompiledKernel(*parts)
             try:
                 kernel.load()
-            except CompileError:
+            except (CompileError, InvalidValueError):  # no compiler, or no folder to keep the library
                 return NumpyKernel(*parts)
             return kernel
         return NumpyKernel(*parts)
