@@ -61,7 +61,7 @@ class Postures(Shown):
     """Joint positions with given task values; of `Arm.solve` for one value, or of several in rows."""
 
     q: Array  #: (n,) or (N, n), within the joint limits; NaN where none was found
-    status: Any  #: `InverseStatus`, or (N,) of its numbers: FOUND; NEAREST, x with another xi; NOT_FOUND; BAD_INPUT
+    status: Any  #: `InverseStatus`, or (N,) of its numbers; with NEAREST and OUTSIDE_DOMAIN, x alone is met
     branch: Any  #: name of the branch, or a tuple of names; "" on none
     xi: Array  #: of the branch's chart, () or (N,); NaN outside its domain
 
@@ -271,7 +271,8 @@ class Arm(Shown):
 
         With xi, charts are asked in turn: that of the start's branch first, or else the largest; the first that has
         (x, xi) gives the posture, by `Chart.solve`. Where none has, the posture with that x whose xi is nearest is
-        NEAREST. Without xi, it is the posture nearest to the start, or without one, far from limits.
+        NEAREST; where charts hold none, one with that x within the limits is OUTSIDE_DOMAIN. Without xi, it is the
+        posture nearest to the start, or without one, far from limits.
 
         Args:
             x: one task value, or N of them. Rows that are not finite are BAD_INPUT.
@@ -431,9 +432,9 @@ class Arm(Shown):
             found = self._choose_xi(motions, xi, start, chosen)
         elif motions.components and not anywhere:
             found = self._choose_inside(motions, [self.charts[k].problem.domain for k in chosen], start)
-        elif motions.components:
+        if found is None and motions.components and anywhere:
             place = motions.best(self._measure_room) if start is None else motions.nearest(start)
-            found = place.q, InverseStatus.FOUND
+            found = place.q, InverseStatus.FOUND if xi is None else InverseStatus.OUTSIDE_DOMAIN
         q, status = found or (np.full(self.robot.n, np.nan), InverseStatus.NOT_FOUND)
         return q, int(status)
 

@@ -71,6 +71,15 @@ def test_xi_that_no_posture_has_gives_the_nearest() -> None:
     assert found.xi >= arm.charts[0].xi(dense).max() - 0.05
 
 
+def test_where_charts_hold_no_posture_x_is_met_all_the_same() -> None:
+    arm = panda()
+    x = arm.x(arm.robot.sample(40, seed=0))
+    found = arm.solve(x, 0.2)
+    assert {InverseStatus(k).name for k in found.status} == {"FOUND", "NEAREST", "OUTSIDE_DOMAIN"}
+    assert np.abs(arm.x(found.q) - x).max() < 1e-8
+    assert [name == "" for name in found.branch] == (found.status == InverseStatus.OUTSIDE_DOMAIN).tolist()
+
+
 def test_without_xi_the_posture_is_the_nearest_to_the_start() -> None:
     arm, q = panda(), inside(panda(), 5, 3)
     found = arm.solve(arm.x(q), start=q + 0.05)
