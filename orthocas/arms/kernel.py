@@ -35,6 +35,9 @@ class CurveRules:
     far_damping: float = 1e-3  #: of steps with an error above 0.1, relative to the trace of J J^T
     near_damping: float = 1e-5  #: of steps with an error above 1e-3
     largest: float = 0.7  #: norm of a step to x
+    bridges: int = 6  #: places on a curve from which another one is sought beyond singular positions beside it
+    narrow: float = 0.2  #: least singular value of J, scaled, below which it is
+    across: float = 5.0  #: how far, times that value
     known: float = 0.02  #: distance from the cubic of a step up to which a point may lie on the curve
     resolved: float = 0.2  #: the same, in lengths of the step
     sure: float = 0.05  #: the part of that distance up to which it does, without another look

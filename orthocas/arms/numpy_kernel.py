@@ -33,19 +33,20 @@ class NumpyKernel:
 
     def find_curves(self, target: Array, starts: Array, patience: int = RULES.patience) -> list[Curve]:
         """As `Kernel.find_curves`; the same curves, from other first points."""
-        reached, tangents, good = self._reach(target, starts)
         curves: list[Curve] = []
-        quiet = 0
-        for k in range(len(starts)):
-            quiet += 1
-            if quiet > patience or len(curves) == RULES.curves:
-                break
-            if not good[k] or any(self.lies_on(target, curve, reached[k], tangents[k]) for curve in curves):
+        left, quiet = list(zip(*self._reach(target, starts), strict=True))[::-1], 0
+        bridges: list[tuple[Array, Array, np.bool_]] = []
+        while len(curves) < RULES.curves and (bridges or (left and quiet < patience)):
+            quiet += not bridges
+            q, t, good = (bridges or left).pop()
+            if not good or any(self.lies_on(target, curve, q, t) for curve in curves):
                 continue
-            curve = self._trace(target, reached[k], tangents[k])
+            curve = self._trace(target, q, t)
             if curve is not None:
                 curves.append(curve)
                 quiet = 0
+                if len(starts := self._find_bridges(target, curve)):
+                    bridges += zip(*self._reach(target, starts), strict=True)
         return curves
 
     def correct(self, target: Array, q: Array, tangent: Array) -> NDArray[np.bool_]:
@@ -64,6 +65,15 @@ class NumpyKernel:
                 break
         good[left[: len(left)]] = True
         return np.asarray(good & ((row * tangent).sum(axis=1) > 0))
+
+    def _find_bridges(self, target: Array, curve: Curve) -> Array:
+        """Starts (K, n) beyond the singular positions next to a curve, where another one may run beside it."""
+        rows = len(curve.q) * (2 * np.arange(RULES.bridges) + 1) // (2 * RULES.bridges)
+        q = curve.q[rows]
+        _, s, V = np.linalg.svd(self._evaluate(q, target)[1], full_matrices=False)
+        steps = (RULES.across * s[:, -1:] * V[:, -1])[s[:, -1] < RULES.narrow]
+        q = q[s[:, -1] < RULES.narrow]
+        return np.concatenate([q - steps, q + steps])
 
     def _reach(self, target: Array, starts: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Where damped least squares lead from starts (S, n), the tangents there, and whether they arrive."""
