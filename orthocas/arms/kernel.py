@@ -158,11 +158,11 @@ class CompiledKernel:
     def choose_starts(self, stored: StoredPostures, place: Array) -> Array:
         """As `Kernel.choose_starts`."""
         count, branches = len(stored.q), len(stored.begins) - 1
-        distance = np.empty(count, dtype=np.float32)
+        distance, single = np.empty(count, dtype=np.float32), place.astype(np.float32)
         chosen = np.empty(RULES.starts + branches, dtype=np.intc)
         total = self._c.choose_starts(
             *(_pointer(stored.places), _pointer(stored.weights), _pointer(stored.begins), branches),
-            *(len(stored.places), count, _pointer(place.astype(np.float32)), RULES.starts),
+            *(len(stored.places), count, _pointer(single), RULES.starts),
             *(_pointer(distance), _pointer(chosen)),
         )
         return stored.q[chosen[:total]]
@@ -195,6 +195,8 @@ class CompiledKernel:
 
 
 def _pointer(array: NDArray[Any]) -> ctypes.c_void_p:
+    """The place of an array that somebody else keeps until the call ends, contiguous."""
+    assert array.flags.c_contiguous
     return ctypes.c_void_p(array.ctypes.data)
 
 
