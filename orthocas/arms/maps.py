@@ -91,6 +91,12 @@ class ArmMaps:
             for name, low, high in zip(robot.joint_names, robot.lower, robot.upper, strict=True)
         )
 
+    @cached_property
+    def limits(self) -> tuple[tuple[float, float, bool], ...]:
+        """The lowest and the highest position of each joint, and whether it turns."""
+        robot = self.robot
+        return tuple(zip(robot.lower.tolist(), robot.upper.tolist(), self.turning.tolist(), strict=True))
+
     @property
     def turning(self) -> NDArray[np.bool_]:
         """Revolute joints, (n,)."""

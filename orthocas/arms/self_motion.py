@@ -1,5 +1,6 @@
 """The self-motions of a task value within the joint limits: arcs, their ends, and questions about them."""
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import product
@@ -160,9 +161,14 @@ class SelfMotions(Shown):
     """All postures within the joint limits with one task value; `Arm.self_motion` finds them."""
 
     maps: ArmMaps
-    x: Array  #: the task value, (m,)
+    target: Array  #: the task value as the kernel takes it
     components: tuple[Arc, ...]  #: the longest first
     curves: int  #: number of curves without limits, of which the components are parts
+
+    @cached_property
+    def x(self) -> Array:
+        """The task value, (m,)."""
+        return np.asarray(self.maps.targets.vector(self.target[None])[0])
 
     @property
     def length(self) -> float:
@@ -301,36 +307,30 @@ def find_motions(maps: ArmMaps, target: Array, *starts: Array) -> SelfMotions:
     curves = maps.find_curves(target, *starts)
     arcs = [arc for curve in curves for arc in cut_curve(maps, target, curve)]
     arcs.sort(key=lambda arc: -arc.length)
-    return SelfMotions(maps, maps.targets.vector(target[None])[0], tuple(arcs), len(curves))
+    return SelfMotions(maps, target, tuple(arcs), len(curves))
 
 
 def cut_curve(maps: ArmMaps, target: Array, curve: Curve) -> list[Arc]:
     """The arcs of a curve within the limits: for each number of full turns of the joints, where all are inside."""
-    robot, n = maps.robot, maps.robot.n
-    bounded, turning = np.isfinite(robot.lower) | np.isfinite(robot.upper), maps.turning
-    first = curve.q[0]
     # Full turns after which each joint is within its limits at the begin.
     present: list[set[int]] = []
-    for i in range(n):
-        if not bounded[i]:
-            present.append({0})
-        elif turning[i]:
-            lowest = int(np.ceil((robot.lower[i] - first[i]) / _TURN))
-            highest = int(np.floor((robot.upper[i] - first[i]) / _TURN))
+    for q, (low, high, turns) in zip(curve.q[0].tolist(), maps.limits, strict=True):
+        if turns and math.isfinite(low):
+            lowest, highest = math.ceil((low - q) / _TURN), math.floor((high - q) / _TURN)
             present.append(set(range(lowest, highest + 1)))
         else:
-            present.append({0} if robot.lower[i] <= first[i] <= robot.upper[i] else set())
+            present.append({0} if low <= q <= high else set())
     opened = Stop(StopKind.SINGULAR)
     seam = Stop(StopKind.ENDLESS) if curve.closed else opened
     active: dict[tuple[int, ...], tuple[float, Stop]] = dict.fromkeys(product(*present), (0.0, seam))
     pieces: list[tuple[Piece, Stop, Stop]] = []
-    found = curve.crossings
+    found, stops = curve.crossings, maps.stops
     columns = (found[name].tolist() for name in ("place", "joint", "side", "turns", "rises"))
     for place, i, side, turns, rises in zip(*columns, strict=True):
-        k, enters, stop = -turns, side != rises, maps.stops[i][side]
+        k, enters, stop = -turns, side != rises, stops[i][side]
         if enters and k not in present[i]:
             present[i].add(k)
-            others = [present[j] if j != i else {k} for j in range(n)]
+            others = [part if j != i else {k} for j, part in enumerate(present)]
             active |= dict.fromkeys(product(*others), (place, stop))
         elif not enters and k in present[i]:
             present[i].remove(k)
