@@ -326,10 +326,10 @@ class PointSolver:
         self.q, self.phi, self.target, self.reached, self._phi_reached = np.empty((5, n))
         self.errors, self.condition = np.empty(NEWTON.steps + 1), np.empty(1)
         self.iterations = 0  #: of the last solution
-        H = np.empty(n * n)
-        self._refresh = Bound(functions.inverted, [self.q], [self.phi, H, self.condition])
+        self._H = np.empty(n * n)
+        self._refresh = Bound(functions.inverted, [self.q], [self.phi, self._H, self.condition])
         results = [self.reached, self._phi_reached, self.errors]
-        self._step = Bound(functions.chord, [self.q, self.phi, H, self.target], results)
+        self._step = Bound(functions.chord, [self.q, self.phi, self._H, self.target], results)
 
     def refresh(self) -> bool:
         """Evaluate phi and J at q. Returns whether J is regular."""
@@ -340,6 +340,14 @@ class PointSolver:
         """Take steps from q with the last J. Returns whether all of them reduced the error; q stays."""
         self._step.run()
         return decreasing(self.errors.tolist())
+
+    def shorten(self) -> bool:
+        """Halve the steps with a fresh J until they reduce the error; whether they do. The next J gives whole ones."""
+        for _ in range(NEWTON.halvings):
+            self._H *= 0.5
+            if self.step():
+                return True
+        return False
 
     def accept(self) -> None:
         """Move q to where the last steps ended."""

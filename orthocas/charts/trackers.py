@@ -26,6 +26,7 @@ class TrackerRules:
 
     rounded: float = 1e-9  #: error up to which only rounding may have stopped the decrease
     returned: float = 1e-8  #: of phi, relative to its sizes: the tracker is back
+    refreshes: int = 8  #: of the Jacobian in a call
     step: float = 0.1  #: of the half-widths: default of the largest change of q in a call
 
 
@@ -168,13 +169,14 @@ class Tracker(Shown):
     def _advance(self) -> TrackerStatus:
         """Move to the solution; returns whether that is allowed."""
         solver, fresh = self._solver, False
-        for _ in range(NEWTON.refreshes):
+        for _ in range(TRACKER.refreshes):
             falls, error = solver.step(), solver.errors[-1]
             if error <= NEWTON.goal or (error <= TRACKER.rounded and not falls):
                 self._guard.run()
                 solver.accept()
                 return self._allowed()
-            if falls:
+            # far away, shorter steps lead to where whole ones converge
+            if falls or (fresh and solver.shorten()):
                 solver.accept()
             elif fresh:
                 break

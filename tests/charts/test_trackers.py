@@ -304,3 +304,18 @@ def test_c_goes_to_the_same_nearest_x(make: Callable[[], oc.Chart], tmp_path: Pa
     same, status = library.nearest(home, outside, 0.1)
     assert status == 2
     np.testing.assert_array_equal(same, outside)
+
+
+@pytest.mark.parametrize("name", ["panda-wide", "xarm7-wide"])
+def test_steps_of_a_fifth_of_a_radian_are_found(name: str) -> None:
+    """Where whole steps of Newton's method go too far, shorter ones lead to where they converge."""
+    chart, rng = oc.load(name), np.random.default_rng(0)
+    tracker, tried = chart.tracker(chart.domain.centre, largest_step=1.0), 0
+    for q in chart.domain.sample(150, seed=3):
+        step = rng.normal(size=chart.n)
+        there = q + rng.uniform(0.1, 0.3) * step / np.linalg.norm(step)
+        if chart.domain.contains(there):
+            tracker.reset(q)
+            np.testing.assert_allclose(tracker.step(chart.phi(there)), there, atol=1e-8)
+            tried += 1
+    assert tried > 100
