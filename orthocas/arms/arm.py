@@ -109,11 +109,14 @@ class Arm(Shown):
 
     Example:
         >>> import orthocas as oc
-        >>> robot = oc.load("panda-wide").problem.robot
-        >>> arm = oc.Arm(oc.Task.pose(robot))
-        >>> motions = arm.self_motion(arm.x([0.3, 0.4, 0.1, -1.9, 0.2, 2.2, 0.5]))
-        >>> len(motions), [str(stop) for stop in motions.components[0].ends][0]
-        (4, "joint 'panda_joint7' at 2.897, its limit")
+        >>> chart = oc.load("panda-wide")
+        >>> arm = oc.Arm(chart.task, (chart,))
+        >>> q = [0.3, 0.4, 0.1, -1.9, 0.2, 2.2, 0.5]
+        >>> motions = arm.self_motion(arm.robot.pose(q))
+        >>> len(motions), str(motions.components[0].ends[0])
+        (3, "joint 'panda_joint2' at 1.763, its limit")
+        >>> bool(motions.nearest(q).value < 1e-9)
+        True
     """
 
     task: Task
