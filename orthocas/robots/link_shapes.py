@@ -13,7 +13,8 @@ import numpy as np
 import pinocchio as pin
 
 from orthocas.errors import RobotError
-from orthocas.robots.pinocchio_model import find_axis, find_frame, lock_joints, lock_off_chain
+from orthocas.robots.kinematics import TOOL_SUFFIX
+from orthocas.robots.pinocchio_model import find_axis, find_frame, lock_joints, lock_others
 from orthocas.robots.spatial import rotate_z_to
 from orthocas.robots.tree import BASE_JOINTS, KinematicTree
 from orthocas.robots.urdf import read_urdf
@@ -35,7 +36,7 @@ def place_links(
 ) -> list[LinkPlace]:
     """The places of links of a URDF file on a robot that was built from it.
 
-    Joints off the chain to the tip are locked as in `Robot.from_urdf`.
+    Joints that the robot does not have are locked as in `Robot.from_urdf`.
 
     Args:
         path: the URDF file.
@@ -46,8 +47,10 @@ def place_links(
     Raises:
         RobotError: if the file cannot be read, or its joints are not those of the robot.
     """
-    tips = (tree.tip_name, *tree.tips)
-    model = lock_off_chain(lock_joints(read_urdf(path, tips, locked), locked or {}), *tips)
+    # Joints, not tips: the tip may be that of a tool, which the file does not have.
+    tips = [name.removesuffix(TOOL_SUFFIX) for name in (tree.tip_name, *tree.tips)]
+    model = lock_joints(read_urdf(path, tips, locked), locked or {})
+    model = lock_others(model, [i for i in range(1, model.njoints) if model.names[i] in tree.joint_names])
     base = sum(name in BASE_JOINTS for name in tree.joint_names)
     _require_same(path, model, tree, base)
     # Frames of our tree have the joint's axis as z; Pinocchio's have those of the file.
