@@ -281,7 +281,7 @@ class Collisions(Shown):
         """
         scratch = self._scratch
         bounds = self._bound_distances(points)
-        bounds[:, ~asked[self._owners]] = np.inf
+        bounds[:, np.flatnonzero(asked[self._owners] == 0)] = np.inf
         for i in np.flatnonzero((bounds < least).any(axis=1)).tolist():
             pin.updateGeometryPlacements(scratch.model, scratch.data, scratch.geometry, scratch.placed, points[i])
             distances: dict[int, float] = {}
