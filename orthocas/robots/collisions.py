@@ -18,7 +18,17 @@ from orthocas.robots.spatial import constant
 from orthocas.robots.tree import KinematicTree
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, Indices, as_number, as_point_set, require_kind, require_known
+from orthocas.tools.checks import (
+    Array,
+    Indices,
+    as_float_array,
+    as_number,
+    as_point_set,
+    require_count,
+    require_kind,
+    require_known,
+    require_text,
+)
 from orthocas.tools.display import Shown, listed
 
 __all__ = ["Collisions", "Contact", "LeastDistance"]
@@ -112,15 +122,16 @@ class Collisions(Shown):
         origin: str = "given",
     ) -> None:
         require_kind("tree", tree, KinematicTree)
+        require_kind("parts", parts, Sequence)
+        for part in parts:
+            require_kind("entry of parts", part, Part)
+            require_count("body of a part", part.body + 1, least=0, most=tree.n)
+        require_kind("missing", missing, Sequence)
         self.tree = tree
         self.parts = tuple(parts)
         self.missing = tuple(missing)  #: names of links with a mesh that cannot be found or read
-        self.origin = origin
-        names = dict.fromkeys(part.name for part in self.parts)
-        for pair in pairs:
-            for name in pair:
-                require_known("link or object", name, list(names))
-        self.pairs = tuple((first, second) for first, second in pairs)  #: checked pairs, by names
+        self.origin = require_text("origin", origin)
+        self.pairs = _check_pairs("pairs", pairs, [part.name for part in parts])  #: checked pairs, by names
 
     def facts(self) -> dict[str, str]:
         """Links, pairs, and what is unchecked."""
@@ -199,7 +210,10 @@ class Collisions(Shown):
         """
         points, _ = as_point_set("q", q, self.tree.n)
         gap = as_number("clearance", clearance)
-        extra = self.rates @ np.broadcast_to(np.asarray(bend, dtype=float), (self.tree.n,))
+        away = as_float_array("bend", bend)
+        if away.shape not in ((), (self.tree.n,)) or not (away >= 0).all():
+            raise InvalidValueError("bend", away.tolist(), f"one length >= 0, or {self.tree.n}")
+        extra = self.rates @ np.broadcast_to(away, (self.tree.n,))
         if not self._owners.size or not len(points):
             return None
         for start in range(0, max(len(points) - 1, 1), RULES.piece):
@@ -243,6 +257,10 @@ class Collisions(Shown):
             InvalidValueError: if a name is taken.
         """
         carrier = self.tree.frame(frame)
+        # Half-spaces have no end that a joint could move.
+        for name, solid in Scene(solids).solids.items():
+            if not solid.shape.bounded:
+                raise InvalidValueError(f"solid '{name}'", solid.heading, "one with an end, which a link can carry")
         shapes = {name: solid.shape for name, solid in Scene(solids).solids.items()}
         return self._add(
             [
@@ -255,11 +273,8 @@ class Collisions(Shown):
     def _add(self, parts: Sequence[Part], allowed: Sequence[Pair]) -> "Collisions":
         """The same with further parts, checked against all that are there and of another body."""
         bodies = {part.name: part.body for part in self.parts}
-        both = {*bodies, *(part.name for part in parts)}
-        for pair in allowed:
-            for name in pair:
-                require_known("link or object", name, sorted(both))
-        touching = {frozenset(pair) for pair in allowed}
+        both = [*bodies, *(part.name for part in parts)]
+        touching = {frozenset(pair) for pair in _check_pairs("allowed", allowed, both)}
         pairs = list(self.pairs)
         for part in parts:
             if part.name in bodies:
@@ -536,6 +551,21 @@ def _measure_segments(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
     s = np.clip((ab * t - ac) / np.where(aa > 0, aa, 1.0), 0.0, 1.0)
     gap = between + s[..., None] * a - t[..., None] * b
     return np.asarray(np.einsum("...i,...i->...", gap, gap))
+
+
+def _check_pairs(name: str, pairs: Sequence[Pair], known: Sequence[str]) -> tuple[Pair, ...]:
+    """Pairs of known names.
+
+    Raises:
+        InvalidValueError, UnknownNameError: for anything else.
+    """
+    require_kind(name, pairs, Sequence)
+    for pair in pairs:
+        if not isinstance(pair, tuple | list) or len(pair) != 2:
+            raise InvalidValueError(f"entry of {name}", repr(pair)[:80], "two names")
+        for part in pair:
+            require_known("link or object", part, known)
+    return tuple((first, second) for first, second in pairs)
 
 
 def _name_pair(pair: Pair) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 from public_objects import (
     HAS_COMPILER,
     circle,
+    collisions,
     compiled,
     disk,
     fitted,
@@ -46,6 +47,15 @@ def calls_of_chart(chart: oc.Chart) -> list[Call]:
     ]
 
 
+def calls_of_collisions() -> list[Call]:
+    """Distances, which every thread measures with memory of its own."""
+    found, q = collisions(), points_of(fitted().chart)
+    return [
+        lambda k: np.hstack([found.distance(q[k % 6 :]).distance, found.pair_distances(q[k % 6])]),
+        lambda k: found.check_free(q[: 1 + k % 6]),
+    ]
+
+
 def calls_of_law(law: Controller) -> list[Call]:
     """A law at states that change from call to call."""
     states = states_of(law)
@@ -78,5 +88,6 @@ SERIES: dict[str, tuple[Callable[[], list[Call]], int]] = {  #: of 5,000 calls
     "disk": (lambda: calls_of_chart(copy.deepcopy(disk())), 40),
     **({"compiled inverse": (calls_of_compiled, 200)} if HAS_COMPILER else {}),
     "law in ticks": (calls_of_ticks, 200),
+    "collisions": (calls_of_collisions, 300),
     "law": (lambda: calls_of_law(copy.deepcopy(impedance())), 1300),
 }
