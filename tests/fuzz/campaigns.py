@@ -50,6 +50,8 @@ READERS = {  #: functions that read files, by module and name, with the campaign
     "paths.tool_path.read_path": "paths",
     "tasks.corridor.read_postures": "postures",
     "robots.urdf.read_srdf_postures": "robots",
+    "robots.collision_files.read_collisions": "robots",
+    "robots.collision_files.read_disabled_pairs": "robots",
     "robots.robot.from_file": "robots",
     "robots.robot.from_mjcf": "robots",
     "robots.robot.from_urdf": "robots",
@@ -71,6 +73,7 @@ RESULTS = {  #: public classes whose objects only the library makes, with the ca
         ("Solutions", "Tracker", "ReachingTracker", "InverseStatus", "TrackerStatus", "MeaningError"), "calls"
     ),
     **dict.fromkeys(("Breakdown", "Coupling", "DampingCheck", "JointMotion", "Margins", "Modes", "Setting"), "calls"),
+    **dict.fromkeys(("Contact", "LeastDistance"), "calls"),
     **dict.fromkeys(("Card", "Model", "Trajectory", "View"), "calls"),
     "Certificate": "certificates",
     "Domain": "calls",
