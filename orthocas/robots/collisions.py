@@ -46,6 +46,7 @@ class CollisionRules:
     slack: float = 2e-6  #: of lower bounds [m]
     same_place: float = 1e-6  #: between the joints of two robots [m]
     parallel: float = 1e-12  #: of the squared sine between two axes
+    longest: float = 100.0  #: [rad] or [m], of a joint on the way between two postures
     resolution: float = 1e-6  #: [m]: closer pairs count as touching while a way between postures is checked
 
 
@@ -207,6 +208,9 @@ class Collisions(Shown):
 
         Returns:
             The contact, or None if the way is free.
+
+        Raises:
+            ShapeError, InvalidValueError: if an argument is invalid, or a joint moves by over 100 rad or m at once.
         """
         points, _ = as_point_set("q", q, self.tree.n)
         gap = as_number("clearance", clearance)
@@ -216,6 +220,8 @@ class Collisions(Shown):
         extra = self.rates @ np.broadcast_to(away, (self.tree.n,))
         if not self._owners.size or not len(points):
             return None
+        if np.abs(np.diff(points, axis=0)).max(initial=0.0) > RULES.longest:
+            raise InvalidValueError("q", "two postures farther apart", f"ways of at most {RULES.longest:g} rad or m")
         for start in range(0, max(len(points) - 1, 1), RULES.piece):
             some = points[start : start + RULES.piece + 1]
             bounds = self._bound_distances(some)
