@@ -35,6 +35,7 @@ ROBOTS: dict[str, tuple[str, str, str, dict[str, float]]] = {  # package, file, 
 OTHER_TASKS = {"z1": "position+axis:x"}  # of an arm with six joints and a tool that may turn about its axis
 ACROSS = ("z1", "position+axis:z")  # the axis of the tool lies across that of the last joint
 ARMS = ("iiwa", "panda", "xarm7", "baxter, left", "gen3", "sawyer", "tiago", "pr2, left", "talos, left")
+CONTROL = tuple(name for name in ARMS if name != "pr2, left")  # one coordinate, in the inertia metric
 POSITIONS = (*ARMS, "z1")
 WHOLE = (("iiwa", "pose"), ("panda", "pose"), ("xarm7", "pose"), ("iiwa", "position"), ("panda", "position"))
 NEARER = 0.05  # clearance
@@ -60,20 +61,24 @@ def robot_of(name: str) -> oc.Robot:
     return oc.Robot.from_file(path, tip, locked or None)
 
 
-def row(name: str, task: str, quick: bool, charts: dict[str, oc.Chart]) -> str:
-    """One row of the table: the chart of the home's branch, with default settings. Charts of poses are kept."""
+def row(name: str, task: str, metric: str, quick: bool, charts: dict[str, oc.Chart]) -> str:
+    """One row of the table: the chart of the home's branch, default settings. Charts of poses with A = I are kept."""
     robot, start = robot_of(name), time.process_time()
     polynomial = oc.Polynomial(3, ["A1", "A7"]) if quick else None
-    fit = oc.fit_wide(robot, oc.Task.named(robot, task), parametrisation=polynomial, samples=3000 if quick else None)
+    samples = 3000 if quick else None
+    fit = oc.fit_wide(robot, oc.Task.named(robot, task), None, metric, parametrisation=polynomial, samples=samples)
     seconds, chart, branch = time.process_time() - start, fit.chart, fit.branch
     assert branch is not None
-    if task == "pose":
+    words = f"{name}, {task}"
+    if metric == "inertia":
+        words += ", A = M"
+    elif task == "pose":
         charts[name] = chart
     report = oc.evaluate(chart, 2000 if quick else 20_000, seed=1)
     targets = chart.phi(sample_uniform(chart.problem.domain, 50 if quick else 2000, 2))
     share, regular = percent(branch.share, 0), percent(fit.regular_share, 3)
     return (
-        f"| {name}, {task} | {branch.name}, {share} | {seconds:.1f} | {regular} "
+        f"| {words} | {branch.name}, {share} | {seconds:.1f} | {regular} "
         f"| {report.leak.rms:.1f} | {report.conditioning.mean:.2f}, {report.conditioning.p01:.2f} "
         f"| {percent(chart.solve(targets).found.mean(), 2)} |"
     )
@@ -174,8 +179,9 @@ def loops(name: str, chart: oc.Chart, radius: float, starts: int) -> str:
 
 def main(quick: bool = False) -> list[str]:
     """All rows; `quick` takes one arm, cubic coordinates and few samples."""
-    cases = [(name, OTHER_TASKS.get(name, "pose")) for name in ("iiwa", *ROBOTS)]
-    cases += [ACROSS, *((name, "position") for name in POSITIONS)]
+    cases = [(name, OTHER_TASKS.get(name, "pose"), "euclidean") for name in ("iiwa", *ROBOTS)]
+    cases += [(name, "pose", "inertia") for name in CONTROL]
+    cases += [(*ACROSS, "euclidean"), *((name, "position", "euclidean") for name in POSITIONS)]
     charts: dict[str, oc.Chart] = {}
     rows = table(HEADER, (row(*case, quick, charts) for case in (cases[:1] if quick else cases)))
     rows += table(CLEARER, (nearer(name, quick) for name in (ARMS[:1] if quick else ARMS)))

@@ -8,6 +8,7 @@ from orthocas import problems as problems
 from orthocas import simulation as simulation
 from orthocas import solvers as solvers
 from orthocas import viewer as viewer
+from orthocas.arms.arm import Arm as Arm
 from orthocas.bases.circle import Circle as Circle
 from orthocas.bases.cyclic import Mobile as Mobile
 from orthocas.bases.given import SEW as SEW

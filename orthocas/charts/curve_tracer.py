@@ -1,4 +1,4 @@
-"""The self-motion curves of many task values at once, r = 1, whatever the limits: ways to x, and the curves there."""
+"""The self-motion curves of many task values at once, whatever the limits: ways to x, and the curves there."""
 
 from dataclasses import dataclass
 
@@ -38,7 +38,7 @@ class CurveRules:
     halvings: int = 5  #: of chords that pass the box between points outside
     narrow: float = 1e-10  #: [rad] or [m]: brackets of an end of the domain
     narrowings: int = 100  #: halvings until then at most
-    few: int = 64  #: rows up to which all starts are followed at once, though some lie on one curve
+    few: int = 16  #: rows up to which all starts are followed at once, though some lie on one curve
     prismatic: float = 1.0  #: half-widths that a sliding joint may leave its range by
 
 
@@ -63,9 +63,13 @@ class Traces:
 
 @dataclass(frozen=True, eq=False)
 class CurveTracer:
-    """Traces the curves of joint positions with the same task value, r = 1."""
+    """Traces the curves of joint positions with the same task value and the same positions of r - 1 held joints.
+
+    x stands for the m task values, and the positions of the held joints after these.
+    """
 
     boxed: BoxedPhi
+    held: tuple[int, ...] = ()  #: r - 1 joints
 
     def reach(self, x: Array, starts: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Where damped least squares lead from starts (M, n), whatever the limits, and whether near x (M, m), (M,)."""
@@ -79,10 +83,12 @@ class CurveTracer:
                 break
         return q, arrived
 
-    def trace(self, targets: Array, q: Array, rows: Indices) -> Traces:
-        """The curves through points q (K, n), from end to end."""
-        x = targets[:, : self.boxed.m]
-        J = self.boxed.phi_map.jacobian(q)[:, : self.boxed.m] / self.boxed.phi_map.sizes[: self.boxed.m, None]
+    def trace(self, x: Array, q: Array, rows: Indices) -> Traces:
+        """The curves through points q (K, n), from end to end, for x (K, n - 1)."""
+        m, n = self.boxed.m, q.shape[1]
+        J = np.empty((len(q), n - 1, n))
+        J[:, :m] = self.boxed.phi_map.jacobian(q)[:, :m] / self.boxed.phi_map.sizes[:m, None]
+        J[:, m:] = np.eye(n)[list(self.held)]
         t = np.linalg.qr(J.transpose(0, 2, 1), mode="complete")[0][:, :, -1]
         ahead, tangents, count, closed = self._follow(x, q, t)
         back = np.flatnonzero(~closed)
@@ -105,8 +111,10 @@ class CurveTracer:
 
     def on_curves(self, q: Array, traces: Traces) -> NDArray[np.bool_]:
         """Which of the positions q (K, S, n) lie on the curves, up to full turns, (K, S)."""
-        mine, points = self._on_circles(q), self._on_circles(traces.q)
-        squares = (points**2).sum(axis=2)[:, None] - 2 * mine @ points.transpose(0, 2, 1)
+        mine, exists = self._on_circles(q), np.arange(traces.q.shape[1]) < traces.count[:, None]
+        points = np.zeros((*exists.shape, mine.shape[2]))
+        points[exists] = self._on_circles(traces.q[exists])
+        squares = np.where(exists, (points**2).sum(axis=2), np.inf)[:, None] - 2 * mine @ points.transpose(0, 2, 1)
         nearest = np.argmin(squares, axis=2)
         found = np.zeros(nearest.shape, dtype=bool)
         for place in (np.maximum(nearest - 1, 0), nearest):
@@ -118,6 +126,13 @@ class CurveTracer:
             gap = away - np.clip(share, 0.0, 1.0)[:, :, None] * step
             found |= (gap**2).sum(axis=2) < RULES.known**2
         return found
+
+    def away(self, q: Array) -> Array:
+        """Largest distances of joints (N, S, n) from their ranges, up to full turns, (N, S)."""
+        low, high = self.boxed.domain.bounds
+        bounded = np.isfinite(low)
+        centre, half = np.where(bounded, (low + high) / 2, 0.0), np.where(bounded, (high - low) / 2, np.inf)
+        return np.asarray((np.abs(without_turns(q - centre, self.turning)) - half).max(axis=2).clip(0.0))
 
     def correct(self, x: Array, q: Array, t: Array) -> tuple[Array, Array]:
         """Newton's steps to x across directions t (K, n), and tangents with t . tangent = 1, (K, n) each."""
@@ -174,7 +189,7 @@ class CurveTracer:
 
     @property
     def equations(self) -> ca.Function:
-        """q, x -> e = (x - h(q)) / scale (m, 1), and J / scale (m, n)."""
+        """q, x -> e = (x - h(q)) / scale (n - 1, 1), and J / scale (n - 1, n)."""
         q, x, e, J = self._symbols
         return dense_function("equations", [q, x], [e, J])
 
@@ -223,16 +238,14 @@ class CurveTracer:
 
     @cached_property
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-        """q (n, 1), x (m, 1), errors (x - h(q)) / scale (m, 1), and rates J / scale (m, n)."""
-        task, scale = self.boxed.task, ca.DM(self.boxed.phi_map.sizes[: self.boxed.m])
+        """q (n, 1), x (n - 1, 1), errors (x - h(q)) / scale (n - 1, 1), and rates J / scale (n - 1, n)."""
+        task, held = self.boxed.task, list(self.held)
+        n, m, scale = task.robot.n, task.m, ca.DM(self.boxed.phi_map.sizes[: self.boxed.m])
         relative = Relative(task)
-        q, x = ca.SX.sym("q", task.robot.n), ca.SX.sym("x", task.m)
-        return (
-            q,
-            x,
-            relative.difference(x, task.function(q)) / scale,
-            relative.rates(q) / ca.repmat(scale, 1, task.robot.n),
-        )
+        q, x = ca.SX.sym("q", n), ca.SX.sym("x", n - 1)
+        e = relative.difference(x[:m, :], task.function(q)) / scale
+        J = relative.rates(q) / ca.repmat(scale, 1, n)
+        return q, x, ca.vertcat(e, x[m:, :] - q[held, :]), ca.vertcat(J, ca.SX.eye(n)[held, :])
 
     @cached_property
     def turning(self) -> NDArray[np.bool_]:

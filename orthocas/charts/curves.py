@@ -1,6 +1,5 @@
 """The self-motion curves of many task values at once, r = 1, and the points on them whose xi is nearest."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 from typing import Protocol
@@ -8,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.charts.curve_tracer import RULES, CurveTracer, Traces, solutions_of, without_turns
+from orthocas.charts.curve_tracer import RULES, CurveTracer, Traces, solutions_of
 from orthocas.charts.descent import BoxedPhi
 from orthocas.charts.phi import largest
 from orthocas.charts.search import Starts
@@ -64,7 +63,6 @@ class SelfMotionCurves:
 
     boxed: BoxedPhi
     starts: Starts
-    xi: Callable[[Array], Array]  #: coordinates (N, 1) of points (N, n)
 
     @cached_property
     def tracer(self) -> CurveTracer:
@@ -112,7 +110,7 @@ class SelfMotionCurves:
             here = np.flatnonzero(place[traces.row] >= 0)
             of = place[traces.row[here]]
             known[of] |= self.tracer.on_curves(q[of], traces.part(here))
-        away = self._away(q)
+        away = self.tracer.away(q)
         for _ in range(q.shape[1]):
             left = np.flatnonzero(~known.all(axis=1) & (best.distance[rows] > 0))
             if not left.size:
@@ -122,7 +120,7 @@ class SelfMotionCurves:
             else:
                 at, start = np.nonzero(~known[left])
                 of = left[at]
-            traces = self.tracer.trace(targets[rows[of]], q[of, start], rows[of])
+            traces = self.tracer.trace(targets[rows[of], : self.boxed.m], q[of, start], rows[of])
             known[of, start] = True
             steps = self._steps(traces, own[traces.row])
             xi_left = self._take_crossed(targets, steps, tolerance, best)
@@ -141,13 +139,6 @@ class SelfMotionCurves:
         x = np.repeat(targets[:, : self.boxed.m], S, axis=0)
         q, arrived = self.tracer.reach(x, starts.transpose(1, 0, 2).reshape(-1, n))
         return q.reshape(N, S, n), ~arrived.reshape(N, S)
-
-    def _away(self, q: Array) -> Array:
-        """Largest distances of joints (N, S, n) from their ranges, up to full turns, (N, S)."""
-        low, high = self.boxed.domain.bounds
-        bounded = np.isfinite(low)
-        centre, half = np.where(bounded, (low + high) / 2, 0.0), np.where(bounded, (high - low) / 2, np.inf)
-        return np.asarray((np.abs(without_turns(q - centre, self.tracer.turning)) - half).max(axis=2).clip(0.0))
 
     def _steps(self, traces: Traces, own: Array) -> "Steps":
         """The steps of curves in and around the box of the domain, after all full turns that bring them there."""
@@ -391,8 +382,7 @@ class SelfMotionCurves:
 
     def _xi_left(self, targets: Array, q: Array) -> Array:
         """xi - xi(q), (N,)."""
-        left = targets[:, self.boxed.m :] - self.xi(q)
-        return np.asarray(wrap_shortest(left, self.boxed.phi_map.difference.turns[self.boxed.m :])[:, 0])
+        return self.boxed.xi_gaps(targets, q)[:, 0]
 
     @cached_property
     def _period(self) -> float:

@@ -1,4 +1,4 @@
-"""One damped descent in a box, many rows at once: to phi(q) = phi, to h(q) = x, and with x kept to the nearest xi."""
+"""One damped descent in a box, many rows at once: to phi(q) = phi, and to h(q) = x."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 
 from orthocas.charts.phi import ROUNDING, PhiMap, largest
 from orthocas.tasks.domains import Domain
+from orthocas.tasks.relative import Relative
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.columns import BlockedFunction
+from orthocas.tools.expressions import wrap_shortest
 
 Flags = NDArray[np.bool_]
 
@@ -31,7 +33,6 @@ class DescentRules:
     most: int = 64  #: iterations
     patience: int = 8  #: iterations within which the error must halve, where equations alone are solved
     damping: float = 1e-6  #: of the first step of equations, relative to the mean eigenvalue of J^T J
-    damping_along: float = 1e-3  #: the same along kept equations
     least_damping: float = 1e-12  #: relative
     most_damping: float = 1e6  #: relative; rows with more end
     foreseen: float = 0.75  #: part of the promised decrease from which damping shrinks
@@ -41,13 +42,8 @@ class DescentRules:
     decrease: float = 1e-4  #: of the squared error, relative to what the model promises
     converged: float = 1e-12  #: relative decrease of the squared error that a minimum may still promise
     rounded: float = 1e-26  #: squared error that is rounding
-    longest: float = 0.3  #: change of a joint in a step along kept equations
-    near: float = 1e-2  #: error up to which a return is tried again
-    returns: int = 4  #: iterations of a return to kept equations
     rounds: int = 24  #: guesses which bounds hold, before a row is solved alone
     slack: float = 1e-13  #: of bounds
-    softness: float = 1e-15  #: A d = a - softness * multipliers, so that bounds without room for A d = a do no harm
-    room: float = 1e-9  #: to the conditions of the domain, relative
     probes: int = 32  #: positions at which full turns are tried
     same: float = 1e-9  #: change of xi that is rounding
 
@@ -63,8 +59,6 @@ class Equations:
     jacobians: Callable[[Array, Array], Array]  #: targets, u (N, n) -> d(g / scale)/du, (N, k, n)
     low: Array  #: lowest u, (n,)
     high: Array  #: highest u, (n,)
-    kept: "Equations | None" = None  #: the first equations, if they are to hold all along the way
-    domain: "BoxedPhi | None" = None  #: whose conditions are to hold as well, with `kept`
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +74,6 @@ def descend(
     equations: Equations,
     targets: Array,
     start: Array,
-    held: Flags | None = None,
     most: int = RULES.most,
     patience: int = RULES.patience,
 ) -> Descent:
@@ -90,25 +83,23 @@ def descend(
 
         |J d - e|^2 / 2 + damping |d|^2 / 2    with    low <= u + d <= high,
 
-    by Levenberg and Marquardt's rule. With `kept`, the first equations are constraints A d = 0 instead, and a few steps
-    of their own descent lead back to them; conditions of the domain join as soon as a step meets them.
+    by Levenberg and Marquardt's rule.
 
     Args:
         equations: k equations.
         targets: values of phi, (N, n).
-        start: points of the box, (N, n); with `kept`, points where these equations hold.
-        held: joints that stay at their start, (N, n).
+        start: points of the box, (N, n).
         most: iterations.
-        patience: iterations within which the error must halve; without `kept`.
+        patience: iterations within which the error must halve.
 
     Source:
         Levenberg and Marquardt's method with an active set; ours.
     """
     with np.errstate(all="ignore"):
-        run = _Run(equations, targets, start, np.zeros(start.shape, dtype=bool) if held is None else held)
+        run = _Run(equations, targets, start)
         rows, before = np.flatnonzero(np.isfinite(run.square)), run.error.copy()
         for k in range(1, most + 1):
-            if k % patience == 0 and equations.kept is None:
+            if k % patience == 0:
                 rows = rows[run.error[rows] <= before[rows] / 2]
                 before[rows] = run.error[rows]
             rows = rows[(run.error[rows] > RULES.goal) & (run.damping[rows] < RULES.most_damping) & ~run.minimal[rows]]
@@ -121,17 +112,16 @@ def descend(
 class _Run:
     """The state of all rows."""
 
-    def __init__(self, equations: Equations, targets: Array, start: Array, held: Flags) -> None:
+    def __init__(self, equations: Equations, targets: Array, start: Array) -> None:
         N, n = start.shape
-        self._equations, self._targets, self._held = equations, targets, held
+        self._equations, self._targets = equations, targets
         self.u = start.copy()
-        self._first = 0 if equations.kept is None else equations.kept.errors(targets[:1], start[:1]).shape[1]
-        self._errors = equations.errors(targets, self.u)[:, self._first :]
+        self._errors = equations.errors(targets, self.u)
         self.error, self.square = largest(self._errors), (self._errors**2).sum(axis=1)
         self.minimal = np.zeros(N, dtype=bool)
-        self.damping = np.full(N, RULES.damping if equations.kept is None else RULES.damping_along)
-        self._J = np.zeros((N, self._first + self._errors.shape[1], n))
-        self._fresh, self._meets = np.zeros((2, N), dtype=bool)  # rows whose J belongs to u, that meet a condition
+        self.damping = np.full(N, RULES.damping)
+        self._J = np.zeros((N, self._errors.shape[1], n))
+        self._fresh = np.zeros(N, dtype=bool)  # rows whose J belongs to u
         self._at = np.zeros((N, n), dtype=np.int8)  # which bounds hold: -1 low, 1 high
 
     def advance(self, rows: Indices) -> None:
@@ -148,17 +138,11 @@ class _Run:
         promised = -slope - bend / 2
         ended = promised * (1 + self.damping[rows]) <= RULES.converged * self.square[rows] + RULES.rounded
         self.minimal[rows] = ended & solved
-        u, kept = self.u[rows] + d, np.ones(len(rows), dtype=bool)
-        if self._equations.kept is None:
-            u = np.clip(u, self._equations.low, self._equations.high)
-        else:
-            part = RULES.longest / np.maximum(np.abs(d).max(axis=1), RULES.longest)
-            promised = -part * slope - part**2 * bend / 2
-            u, kept = self._return(rows, self.u[rows] + part[:, None] * d)
-        errors = self._equations.errors(self._targets[rows], u)[:, self._first :]
+        u = np.clip(self.u[rows] + d, self._equations.low, self._equations.high)
+        errors = self._equations.errors(self._targets[rows], u)
         square = (errors**2).sum(axis=1)
         gain = (self.square[rows] - square) / (2 * promised)
-        better = kept & (gain > RULES.decrease) & (promised > 0)
+        better = (gain > RULES.decrease) & (promised > 0)
         moved = rows[better]
         self.u[moved], self._errors[moved], self.square[moved] = u[better], errors[better], square[better]
         self.error[moved], self._fresh[moved] = largest(errors[better]), False
@@ -168,55 +152,22 @@ class _Run:
 
     def _programs(self, rows: Indices) -> "Programs":
         """The quadratic models of some rows."""
-        J, n = self._J[rows], self.u.shape[1]
-        A, G = J[:, : self._first], J[:, self._first :]
+        G, n = self._J[rows], self.u.shape[1]
         H = G.transpose(0, 2, 1) @ G
         mean = np.trace(H, axis1=1, axis2=2) / n + np.finfo(float).tiny
         H += (self.damping[rows] * mean)[:, None, None] * np.eye(n)
         g = -np.matmul(self._errors[rows, None], G)[:, 0]
-        low, high = self._equations.low - self.u[rows], self._equations.high - self.u[rows]
-        low, high = np.where(self._held[rows], 0.0, low), np.where(self._held[rows], 0.0, high)
-        rooms, slopes = np.full((len(rows), 0), np.inf), np.zeros((len(rows), 0, n))
-        meets = np.flatnonzero(self._meets[rows])
-        if meets.size and self._equations.domain is not None:
-            near, change = self._equations.domain.rooms(self.u[rows[meets]])
-            rooms, slopes = np.full((len(rows), near.shape[1]), np.inf), np.zeros((len(rows), *change.shape[1:]))
-            rooms[meets], slopes[meets] = np.maximum(near - RULES.room, 0.0), change
-        return Programs(H, g, A, np.concatenate([low, -rooms], axis=1), high, slopes)
-
-    def _return(self, rows: Indices, u: Array) -> tuple[Array, Flags]:
-        """Points with the kept equations near u (rows, n), and whether they were found, inside the domain."""
-        kept, domain = self._equations.kept, self._equations.domain
-        assert kept is not None
-        targets = self._targets[rows]
-        back = descend(kept, targets, np.clip(u, kept.low, kept.high), self._at[rows] != 0, RULES.returns)
-        end, error = back.u, back.error
-        missed = np.flatnonzero((error > RULES.kept) & (error < RULES.near))
-        if missed.size:  # the joints at the boundary are needed
-            again = descend(kept, targets[missed], np.clip(u[missed], kept.low, kept.high), most=RULES.returns)
-            end[missed], error[missed] = again.u, again.error
-        if domain is None:
-            return end, error <= RULES.kept
-        outside = np.flatnonzero((error <= RULES.kept) & ~domain.domain.contains(domain.points(end)))
-        if outside.size and domain.has_rooms:
-            self._meets[rows[outside]] = True
-            again = descend(domain.inner_equations, targets[outside], end[outside], most=RULES.returns)
-            end[outside], error[outside] = again.u, again.error
-        found = error <= RULES.kept
-        found[outside] &= domain.domain.contains(domain.points(end[outside]))
-        return end, found
+        return Programs(H, g, self._equations.low - self.u[rows], self._equations.high - self.u[rows])
 
 
 @dataclass(frozen=True, eq=False)
 class Programs:
-    """N programs: minimise g d + d H d / 2 with A d = 0 and low <= (d, slopes d) <= high; low <= 0 <= high."""
+    """N programs: minimise g d + d H d / 2 with low <= d <= high; low <= 0 <= high."""
 
     H: Array  #: (N, n, n), positive definite
     g: Array  #: (N, n)
-    A: Array  #: (N, m, n)
-    low: Array  #: (N, n + k)
+    low: Array  #: (N, n)
     high: Array  #: (N, n)
-    slopes: Array  #: (N, k, n): rows with a lower bound alone
 
     def part(self, rows: Indices) -> "Programs":
         """Some of them."""
@@ -227,11 +178,10 @@ def solve_programs(programs: Programs, at: NDArray[np.int8]) -> tuple[Array, NDA
     """Minima d (N, n) of programs, and which bounds of d hold there (-1 low, 1 high), from a guess of these, (N, n).
 
     Each round solves with the bounds that the last one led to: those that are broken hold, those with multipliers of
-    the wrong sign do not. Rows that go on changing are solved one by one.
+    the wrong sign do not. Rows that go on changing are not solved, (N,).
     """
-    N, n = programs.g.shape
-    k = programs.slopes.shape[1]
-    d, held, left = np.zeros((N, n)), np.concatenate([at, np.zeros((N, k), dtype=np.int8)], axis=1), np.arange(N)
+    N = len(programs.g)
+    d, held, left = np.zeros_like(programs.g), at.copy(), np.arange(N)
     for k in range(RULES.rounds):
         part = programs if len(left) == N else programs.part(left)
         d[left], now = _solve_held(part, held[left])
@@ -244,39 +194,20 @@ def solve_programs(programs: Programs, at: NDArray[np.int8]) -> tuple[Array, NDA
             break
     solved = np.ones(N, dtype=bool)
     solved[left] = False
-    return np.clip(d, programs.low[:, :n], programs.high), held[:, :n], solved
+    return np.clip(d, programs.low, programs.high), held, solved
 
 
 def _solve_held(programs: Programs, held: NDArray[np.int8]) -> tuple[Array, NDArray[np.int8]]:
-    """d (N, n) where the bounds that are held, (N, n + k), are equations, and those that hold next by d."""
-    (N, m, n), k = programs.A.shape, programs.slopes.shape[1]
-    joint, row = held[:, :n] != 0, held[:, n:] != 0
-    K = np.zeros((N, n + m + k, n + m + k))
-    K[:, :n, :n] = programs.H
-    K[:, n : n + m, :n], K[:, :n, n : n + m] = programs.A, programs.A.transpose(0, 2, 1)
-    K[:, n + m :, :n] = programs.slopes * row[:, :, None]
-    K[:, :n, n + m :] = K[:, n + m :, :n].transpose(0, 2, 1)
-    i, c = np.arange(n, n + m), np.arange(n + m, n + m + k)
-    K[:, i, i], K[:, c, c] = -RULES.softness, np.where(row, -RULES.softness, 1.0)
+    """d (N, n) where the bounds that are held, (N, n), are equations, and those that hold next by d."""
+    K, joint = programs.H.copy(), held != 0
     here, j = np.nonzero(joint)
     K[here, j], K[here, j, j] = 0.0, 1.0
-    bounds = np.where(held[:, :n] < 0, programs.low[:, :n], programs.high)
-    right = np.concatenate(
-        [np.where(joint, bounds, -programs.g), np.zeros((N, m)), np.where(row, programs.low[:, n:], 0.0)], axis=1
-    )
-    solution = np.linalg.solve(K, right[:, :, None])[:, :, 0]
-    d = solution[:, :n]
+    bounds = np.where(held < 0, programs.low, programs.high)
+    d = np.asarray(np.linalg.solve(K, np.where(joint, bounds, -programs.g)[:, :, None])[:, :, 0], dtype=float)
     slope = (programs.H @ d[:, :, None])[:, :, 0] + programs.g
-    slope += np.matmul(solution[:, None, n : n + m], programs.A)[:, 0]
-    if k:
-        slope += np.matmul(solution[:, None, n + m :], K[:, n + m :, :n])[:, 0]
-    now = np.zeros_like(held)
-    now[:, :n] = np.where(joint, held[:, :n] * (slope * held[:, :n] < 0), 0)
-    now[:, :n] += ~joint * ((d > programs.high + RULES.slack) * 1 - (d < programs.low[:, :n] - RULES.slack) * 1)
-    if k:
-        short = (programs.slopes @ d[:, :, None])[:, :, 0] < programs.low[:, n:] - RULES.slack
-        now[:, n:] = np.where(row, -1 * (solution[:, n + m :] < 0), -1 * short)
-    return d, now
+    now = np.where(joint, held * (slope * held < 0), 0)
+    now += ~joint * ((d > programs.high + RULES.slack) * 1 - (d < programs.low - RULES.slack) * 1)
+    return d, np.asarray(now, dtype=np.int8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,6 +220,7 @@ class BoxedPhi:
     task: Task
     domain: Domain
     phi_map: PhiMap
+    xi: Callable[[Array], Array]  #: coordinates (N, r) of points (N, n)
 
     @property
     def m(self) -> int:
@@ -325,51 +257,68 @@ class BoxedPhi:
         """h(q) = x."""
         return Equations(self._task_errors, self._task_jacobians, self.low, self.high)
 
-    @cached_property
-    def inner_equations(self) -> Equations:
-        """h(q) = x, and no condition of the domain falls short."""
-        return Equations(self._inner_errors, self._inner_jacobians, self.low, self.high)
+    def gaps(self, targets: Array, u: Array) -> Array:
+        """phi - phi(q), (N, n), for targets (N, n), by the shorter way around."""
+        q, gaps = self.points(u), np.empty_like(u)
+        self._task_gaps.into(gaps[:, : self.m], q, targets[:, : self.m])
+        gaps[:, self.m :] = self.xi_gaps(targets, q)
+        return gaps
 
-    @cached_property
-    def nearest_equations(self) -> Equations:
-        """xi(q) = xi, with h(q) = x and the domain kept."""
-        return Equations(
-            self._xi_errors_along, self._xi_jacobians_along, self.low, self.high, self.task_equations, self
-        )
-
-    def xi_errors(self, targets: Array, u: Array) -> Array:
+    def xi_gaps(self, targets: Array, q: Array) -> Array:
         """xi - xi(q), (N, r), for targets (N, n) of phi."""
-        errors: Array = self.phi_map.difference(targets, self.phi_map.phi(self.points(u)))[:, self.m :]
-        return errors
+        return np.asarray(wrap_shortest(targets[:, self.m :] - self.xi(q), self.phi_map.difference.turns[self.m :]))
 
     @cached_property
+    def _task_gaps(self) -> BlockedFunction:
+        """q, x -> x - h(q)."""
+        q, x = ca.SX.sym("q", len(self.domain.centre)), ca.SX.sym("x", self.m)
+        gap = Relative(self.task).difference(x, self.task.function(q))
+        return BlockedFunction(dense_function("gap", [q, x], [gap]))
+
+    @cached_property
+    def turned(self) -> Array:
+        """By how much a full turn of each joint without boundaries changes xi at some positions, (probes, n, r)."""
+        n, endless = len(self.low), ~np.array(self.task.robot.tree.prismatic) & ~np.isfinite(self.low)
+        q = sample_uniform(self.domain, RULES.probes, 0)
+        turned = (q + 2 * np.pi * np.diag(endless)[:, None]).reshape(-1, n)
+        moved = self.xi_gaps(self.phi_map.phi(turned), np.tile(q, (n, 1)))
+        return np.asarray(moved.reshape(n, len(q), -1).transpose(1, 0, 2))
+
+    @property
     def winding(self) -> Flags:
         """Joints without boundaries whose full turns change xi, (n,)."""
-        n = len(self.low)
-        q = sample_uniform(self.domain, RULES.probes, 0)
-        turned = (q + 2 * np.pi * np.eye(n)[:, None]).reshape(-1, n)
-        moved = self.phi_map.difference(self.phi_map.phi(turned), np.tile(self.phi_map.phi(q), (n, 1)))[:, self.m :]
-        moves = np.abs(moved).reshape(n, -1).max(axis=1) > RULES.same
-        return np.asarray(moves & ~np.array(self.task.robot.tree.prismatic) & ~np.isfinite(self.low))
+        return np.asarray(np.abs(self.turned).max(axis=(0, 2)) > RULES.same)
+
+    @property
+    def even(self) -> Flags:
+        """Joints whose full turns add the same to xi at all positions, (n,); nothing, for most."""
+        return np.asarray(np.ptp(self.turned, axis=0).max(axis=1) < RULES.same)
 
     @property
     def has_rooms(self) -> bool:
         """Whether the domain has conditions with expressions."""
         return self.domain.known_condition is not None
 
-    def rooms(self, u: Array) -> tuple[Array, Array]:
-        """How far the conditions of the domain are from their ends, (N, k), and how that changes with u, (N, k, n)."""
-        n = len(self.low)
-        found = self._rooms(self.points(u))[0].reshape(len(u), n + 1, -1)
-        return found[:, 0], found[:, 1:].transpose(0, 2, 1) * self.domain.half_width
+    def rooms(self, u: Array) -> Array:
+        """How far the conditions of the domain are from their ends, (N, k)."""
+        found: Array = self._rooms[0](self.points(u))[0]
+        return found
+
+    def room_slopes(self, u: Array) -> Array:
+        """How that changes with u, (N, k, n)."""
+        found: Array = self._rooms[1](self.points(u))[0].reshape(len(u), -1, len(self.low))
+        return found * self.domain.half_width
 
     @cached_property
-    def _rooms(self) -> BlockedFunction:
-        """q -> the rooms of the conditions, and their derivatives column by column, in one column."""
-        q = ca.SX.sym("q", len(self.domain.centre))
-        x = ca.MX.sym("q", len(self.domain.centre))
+    def _rooms(self) -> tuple[BlockedFunction, BlockedFunction]:
+        """q -> the rooms of the conditions, and their derivatives row by row, in a column."""
+        q, x = ca.SX.sym("q", len(self.low)), ca.MX.sym("q", len(self.low))
         rooms = ca.Function("rooms", [x], [rooms_of(self.domain, x)])(q)
-        return BlockedFunction(dense_function("rooms", [q], [ca.cse(ca.vertcat(rooms, ca.vec(ca.jacobian(rooms, q))))]))
+        slopes = ca.vec(ca.jacobian(rooms, q).T)
+        return (
+            BlockedFunction(dense_function("rooms", [q], [ca.cse(rooms)])),
+            BlockedFunction(dense_function("slopes", [q], [ca.cse(slopes)])),
+        )
 
     def _phi_errors(self, targets: Array, u: Array) -> Array:
         errors = self.phi_map.residual(targets, self.points(u))
@@ -380,9 +329,8 @@ class BoxedPhi:
         return np.where(np.isfinite(J), J, 0.0)
 
     def _task_errors(self, targets: Array, u: Array) -> Array:
-        x, relative = targets[:, : self.m], self.phi_map.difference.task
-        assert relative is not None
-        errors = relative.difference(x, self.task.batched(self.points(u))[0]) / self._scale(x)
+        x = targets[:, : self.m]
+        errors = self._task_gaps(self.points(u), x)[0] / self._scale(x)
         return np.where(np.isfinite(errors), errors, np.inf)
 
     def _task_jacobians(self, targets: Array, u: Array) -> Array:
@@ -391,23 +339,6 @@ class BoxedPhi:
         J = relative.batched_rates(self.points(u))[0].reshape(len(u), self.m, -1)
         J = J * self.domain.half_width / self._scale(x)[:, :, None]
         return np.where(np.isfinite(J), J, 0.0)
-
-    def _inner_errors(self, targets: Array, u: Array) -> Array:
-        short = np.maximum(2 * RULES.room - self.rooms(u)[0], 0.0)
-        return np.concatenate([self._task_errors(targets, u), np.where(np.isfinite(short), short, np.inf)], axis=1)
-
-    def _inner_jacobians(self, targets: Array, u: Array) -> Array:
-        rooms, slopes = self.rooms(u)
-        slopes = np.where((rooms < 2 * RULES.room)[:, :, None], slopes, 0.0)
-        return np.concatenate([self._task_jacobians(targets, u), np.where(np.isfinite(slopes), slopes, 0.0)], axis=1)
-
-    def _xi_errors_along(self, targets: Array, u: Array) -> Array:
-        return np.concatenate([np.zeros((len(u), self.m)), self.xi_errors(targets, u)], axis=1)
-
-    def _xi_jacobians_along(self, targets: Array, u: Array) -> Array:
-        J = self.phi_map.jacobian(self.points(u)) * self.domain.half_width
-        J[:, : self.m] /= self._scale(targets[:, : self.m])[:, :, None]
-        return J
 
     def _scale(self, x: Array) -> Array:
         scale: Array = self.phi_map.sizes[: self.m] + ROUNDING * np.abs(x)

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.charts.curves import CurveSearch
+from orthocas.charts.inside import Inside
 from orthocas.charts.newton import Attempt, Continuation, LocalSolver
 from orthocas.charts.phi import PhiMap, largest
-from orthocas.charts.search import InDomain, Inside, Starts
+from orthocas.charts.search import InDomain, Starts
 from orthocas.errors import InverseError
 from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.problem import Problem
@@ -217,7 +218,7 @@ class Inverse:
 
     def _searched(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Found:
         """What the search finds from given starts, or from the rough inverse and, where that fails, in the domain."""
-        follows = self.curves is not None and (inside or starts is None)
+        follows = inside or (self.curves is not None and starts is None)
         first = self.local if self.brief is None or not follows else self.brief
         best = self._attempt(targets, self.starts.guess(targets) if starts is None else starts, tolerance, first)
         self._tell_beyond(targets, best)
@@ -255,12 +256,14 @@ class Inverse:
             found = near.distance == 0
             best.improve(rows[found], self._found(targets[rows[found]], near.q[found]))
             return
-        if rows.size and self.in_domain is not None:
-            q, _ = self.in_domain.search(targets[rows], tolerance)
-            attempt = Attempt(q, self.phi_map.residual(targets[rows], q), best.iterations[rows], np.ones(len(q), bool))
-            best.improve(rows, self._judged(attempt, tolerance))
-        if not self.problem.domain.is_box:  # it may be a small part of its box
-            self._restart(targets, best, rows, RULES.restarts, InverseStatus.FOUND, tolerance)
+        if not rows.size or self.in_domain is None or self.inside is None:
+            return
+        if self.problem.domain.is_box:
+            q = self.in_domain.search(targets[rows], tolerance)[0]
+        else:  # it may be a small part of its box, and most cells lie outside
+            q = self.inside.nearest(targets[rows], best.q[rows])[0]
+        attempt = Attempt(q, self.phi_map.residual(targets[rows], q), best.iterations[rows], np.ones(len(q), bool))
+        best.improve(rows, self._judged(attempt, tolerance))
 
     def _restart(
         self, targets: Array, best: Found, rows: Indices, count: int, worst: InverseStatus, tolerance: float

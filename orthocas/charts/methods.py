@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from orthocas.charts.coordinates import Coordinates, InvertibleMap
 from orthocas.charts.curves import SelfMotionCurves
 from orthocas.charts.descent import BoxedPhi
+from orthocas.charts.inside import Inside
 from orthocas.charts.inverse import Inverse, Solutions
 from orthocas.charts.newton import (
     NEWTON,
@@ -22,7 +23,7 @@ from orthocas.charts.newton import (
     inverse_function,
 )
 from orthocas.charts.phi import Differences, PhiFunctions, PhiMap, fill_coordinates, leave_over
-from orthocas.charts.search import Cells, InDomain, Inside, Starts
+from orthocas.charts.search import Cells, InDomain, Starts
 from orthocas.charts.trackers import ReachingTracker, Tracker, near_function
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, units_hint
 from orthocas.tasks.problem import measure_task_sizes
@@ -118,8 +119,8 @@ class InverseMethods(PhiFunctions):
         from phi(q_start) to phi, so that every xi within `xi_range(q_start)` is found. Without a start, Newton's method
         starts at a rough inverse of phi, a polynomial fitted to points of the domain, then at stored points of the
         domain whose phi is nearest. Rows that still have no solution inside are searched for along the self-motion
-        curves of x (r = 1), or in all cells of the domain that may hold one. q is the first solution inside that is
-        found; `solutions` looks for all.
+        curves of x (r = 1, or some of them in wide charts), or in all cells of the domain that may hold one. q is the
+        first solution inside that is found; `solutions` looks for all.
 
         Args:
             phi: target values, (n,) or (N, n). Rows that are not finite get the status BAD_INPUT.
@@ -426,12 +427,12 @@ class ChartParts:
         starts = Starts(phi_map, domain)
         if isinstance(chart.coordinates, InvertibleMap):
             return Inverse(chart.problem, phi_map, OwnInverse(chart.coordinates, phi_map), starts)
-        boxed = BoxedPhi(chart.problem.task, domain, phi_map)
+        boxed = BoxedPhi(chart.problem.task, domain, phi_map, chart.xi)
         local, brief = (
             FewRows(phi_map, self.point_functions, Newton(phi_map, k)) for k in (NEWTON.halvings, NEWTON.brief)
         )
         in_domain, inside = InDomain(boxed, Cells(boxed)), Inside(boxed, starts)
-        curves = SelfMotionCurves(boxed, starts, chart.xi) if chart.r == 1 else None
+        curves = SelfMotionCurves(boxed, starts) if chart.r == 1 else None
         return Inverse(chart.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves, brief)
 
     @cached_property

@@ -284,7 +284,7 @@ class BasisObjective:
         chosen: Array = self.X[block, :, :, column]  # (active, g, S)
         G = self._gradients.expand(chosen.transpose(1, 2, 0)[None], len(chosen))
         rows = (D @ G.astype(np.float32))[:, self.kept]
-        product: Array = (rows.T @ rows).astype(float) * (stride / self.N)
+        product: Array = (rows.T @ rows).astype(float) / (self.N / stride)
         return product
 
 

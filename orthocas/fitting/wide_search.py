@@ -205,19 +205,20 @@ class Search:
 
     def go_on(self) -> None:
         """Descend with the worst of fresh samples, as long as coordinates are not regular enough and get better."""
-        if not self.linear:
-            if not self._done:
-                assert self.best is not None
-                self._last = self.best
-                self._add_worst(RULES.fresh_of_networks, RULES.worst_of_networks, RULES.fresh_tag)
-                self._descend("worst samples", "volume with the worst", _SLOWER)
-            return
-        for turn in range(1, 1 + RULES.rounds):
-            if self._done or self._last is not self.best:
+        # networks in all joints take long, and have one round
+        for turn in range(1, 1 + (RULES.rounds if self.linear or self.left_out else 1)):
+            few = turn > 1 and not self.linear and self.is_enough(RULES.enough)
+            if self._done or few or self._last is not self.best:
                 break
-            self._add_worst(RULES.fresh, RULES.worst, RULES.fresh_tag + turn)
-            name = f"worst samples, round {turn} of {RULES.rounds}"
-            self._descend(name, "volume with the worst", LBFGS(RULES.further, RULES.tolerance))
+            if self.linear:
+                self._add_worst(RULES.fresh, RULES.worst, RULES.fresh_tag + turn)
+                solver: Solver = LBFGS(RULES.further, RULES.tolerance)
+            else:
+                self._add_worst(RULES.fresh_of_networks, RULES.worst_of_networks, RULES.fresh_tag + turn)
+                solver = _SLOWER
+            self._descend(f"worst samples, round {turn}", "volume with the worst", solver)
+        if not self.linear:
+            return
         # The gradient comes nearer to self-motions, if it stays regular enough. A user's balance of terms is kept.
         balanced = self.settings.weights or self.settings.quantities
         if self._done and self._last is self.best and self.problem.r == 1 and not balanced:

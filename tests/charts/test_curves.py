@@ -19,7 +19,8 @@ def test_no_random_start_leads_to_a_nearer_xi(name: str) -> None:
     domain = chart.problem.domain
     wishes, x = sample_uniform(domain, 24, 1), chart.x(sample_uniform(domain, 24, 2))
     near, pool = chart.nearest_xi(wishes, x), sample_uniform(domain, STARTS, 3)
-    assert {FOUND, NEAREST} == set(near.statuses)
+    assert FOUND in near.statuses
+    assert set(near.statuses) <= {FOUND, NEAREST}
     assert domain.contains(near.q).all()
     np.testing.assert_allclose(chart.parts.relative.difference(x, chart.x(near.q)), 0, atol=1e-8)
     xi = chart.xi(wishes)[:, 0]
@@ -30,6 +31,34 @@ def test_no_random_start_leads_to_a_nearer_xi(name: str) -> None:
         known += len(others)
         assert near.distance[k] <= np.abs(chart.xi(others)[:, 0] - xi[k]).min() + 1e-6
     assert known > 20 * len(x)
+
+
+@pytest.mark.slow
+def test_few_random_starts_lead_to_a_nearer_xi_where_curves_fill_surfaces() -> None:
+    """With r = 2, slices show most of the self-motions: of 800 wishes, 4,000 starts led nearer in one of a hundred."""
+    chart = oc.charts.load("pr2-left-wide")
+    domain = chart.problem.domain
+    wishes, x = sample_uniform(domain, 16, 1), chart.task(sample_uniform(domain, 16, 2))
+    near, pool = chart.nearest_xi(wishes, x), sample_uniform(domain, STARTS, 3)
+    assert {FOUND, NEAREST} == set(near.statuses)
+    assert domain.contains(near.q).all()
+    np.testing.assert_allclose(chart.parts.relative.difference(x, chart.task(near.q)), 0, atol=1e-8)
+    xi, nearer = chart.xi(wishes), 0
+    for k in range(len(x)):
+        others = positions_at(chart, x[k], pool)
+        nearer += len(others) > 0 and near.distance[k] > np.linalg.norm(chart.xi(others) - xi[k], axis=1).min() + 1e-6
+    assert nearer <= 1
+
+
+@pytest.mark.parametrize("inside", [False, True])
+@pytest.mark.parametrize("name", ["pr2-left-wide", "panda-position"])
+def test_where_nothing_leads_to_x_nothing_is_claimed(name: str, inside: bool) -> None:
+    chart = oc.charts.load(name)
+    phi = chart.phi(chart.problem.domain.centre)
+    phi[0] += 9.0
+    found = chart.solve(phi, inside=inside)
+    assert found.statuses == (oc.InverseStatus.OUT_OF_REACH,)
+    assert np.isfinite(found.q).all()
 
 
 @pytest.mark.parametrize("inside", [False, True])

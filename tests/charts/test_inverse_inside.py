@@ -1,6 +1,6 @@
 """Rows that are kept inside the domain: the nearest coordinates at the same task values."""
 
-from itertools import product
+from itertools import combinations, product
 
 import casadi as ca
 import numpy as np
@@ -9,6 +9,7 @@ from public_objects import clear
 
 import orthocas as oc
 from orthocas.charts.descent import Programs, solve_programs
+from orthocas.charts.slide import project
 from orthocas.fitting.fit import Fit
 from orthocas.tasks.samples import sample_uniform
 
@@ -97,23 +98,47 @@ def test_bounded_programs_have_the_least_of_all_active_sets() -> None:
     """With 4 variables there are 81 guesses which bounds hold; the least allowed value is the minimum."""
     rng, n = np.random.default_rng(3), 4
     root = rng.standard_normal((50, n, n))
-    A = rng.standard_normal((50, 1, n))
     H, g, high = root @ root.transpose(0, 2, 1), 3 * rng.standard_normal((50, n)), rng.uniform(0, 1, (50, n))
-    programs = Programs(H, g, A, -rng.uniform(0, 1, (50, n)), high, np.zeros((50, 0, n)))
+    programs = Programs(H, g, -rng.uniform(0, 1, (50, n)), high)
     d, _, solved = solve_programs(programs, np.zeros((50, n), dtype=np.int8))
     assert solved.mean() >= 0.98
     for k in np.flatnonzero(solved):
         values = [value(programs, k, np.array(held)) for held in product((-1, 0, 1), repeat=n)]
-        assert abs(A[k] @ d[k]) < 1e-9
         assert np.isclose(d[k] @ programs.H[k] @ d[k] / 2 + programs.g[k] @ d[k], min(values), atol=1e-9)
 
 
 def value(programs: Programs, k: int, held: np.ndarray) -> float:
     """The least value of a program with some variables at their low (-1) or high (1) bounds, or infinity."""
-    H, g, A, low, high = (getattr(programs, name)[k] for name in ("H", "g", "A", "low", "high"))
-    rows = [*A, *np.eye(len(g))[held != 0]]
-    bounds = np.concatenate([np.zeros(len(A)), np.where(held < 0, low, high)[held != 0]])
-    K = np.block([[H, np.transpose(rows)], [np.array(rows), np.zeros((len(rows), len(rows)))]])
-    d = np.linalg.lstsq(K, np.concatenate([-g, bounds]), rcond=None)[0][: len(g)]
-    allowed = np.abs(np.array(rows) @ d - bounds).max() < 1e-9 and (d >= low - 1e-9).all() and (d <= high + 1e-9).all()
+    H, g, low, high = (getattr(programs, name)[k] for name in ("H", "g", "low", "high"))
+    d, free = np.where(held < 0, low, high), held == 0
+    if free.any():
+        d[free] = np.linalg.solve(H[np.ix_(free, free)], -g[free] - H[np.ix_(free, ~free)] @ d[~free])
+    allowed = (d >= low - 1e-9).all() and (d <= high + 1e-9).all()
     return float(d @ H @ d / 2 + g @ d) if allowed else np.inf
+
+
+def test_projections_are_the_nearest_points_of_polygons() -> None:
+    """In a plane, the nearest point is the wish, or its foot on one bound, or a corner: the nearest allowed of all.
+
+    Guesses which bounds hold, right or wrong, change nothing.
+    """
+    rng, k = np.random.default_rng(5), 5
+    B, wanted = rng.standard_normal((80, k, 2)), 3 * rng.standard_normal((80, 2))
+    low, high = -rng.uniform(0, 1, (80, k)), rng.uniform(0, 1, (80, k))
+    z, held = project(B, low, high, wanted, np.zeros((80, k), dtype=np.int8))
+    for guess in (held, rng.integers(-1, 2, (80, k), dtype=np.int8)):
+        np.testing.assert_allclose(project(B, low, high, wanted, guess)[0], z, atol=1e-8)
+    values = (B @ z[:, :, None])[:, :, 0]
+    assert (values >= low - 1e-9).all()
+    assert (values <= high + 1e-9).all()
+    for i in range(80):
+        lines = [(B[i, j], bound) for j in range(k) for bound in (low[i, j], high[i, j])]
+        points = [wanted[i], *(wanted[i] + (bound - b @ wanted[i]) / (b @ b) * b for b, bound in lines)]
+        points += [
+            np.linalg.solve([b, other], [bound, at])
+            for (b, bound), (other, at) in combinations(lines, 2)
+            if abs(np.linalg.det([b, other])) > 1e-12
+        ]
+        allowed = [p for p in points if (B[i] @ p >= low[i] - 1e-9).all() and (B[i] @ p <= high[i] + 1e-9).all()]
+        least = min(np.linalg.norm(p - wanted[i]) for p in allowed)
+        assert abs(np.linalg.norm(z[i] - wanted[i]) - least) < 1e-8

@@ -19,12 +19,13 @@ from fuzz.commands import _COMMANDS
 from fuzz.good_calls import good_calls
 
 import orthocas as oc
-from orthocas import certificates, charts, control, learn, paths, problems, simulation, solvers, viewer
+from orthocas import arms, certificates, charts, control, learn, paths, problems, simulation, solvers, viewer
 from orthocas.cli.commands import build_app
 
 _READS = re.compile(r"(read|load)_?\w*|from_(file|urdf|mjcf)|urdf_look")
 
-_MODULES = (oc, certificates, charts, control, learn, paths, problems, simulation, solvers, viewer)  # of public names
+#: of public names
+_MODULES = (oc, arms, certificates, charts, control, learn, paths, problems, simulation, solvers, viewer)
 _REFERENCE = Path(__file__).parents[2] / "docs" / "reference"  # it describes these, and others in modules
 _LATER = {"Memory", "convergence_figure", "front_figure", "trajectory_figure"}  # their arguments are not checked yet
 _MUTANTS = {"calls": 2000}  # until each function has its turn

@@ -4,6 +4,7 @@ import inspect
 from collections.abc import Callable
 
 from fuzz import signals
+from fuzz.arms import arms
 from fuzz.calls import calls
 from fuzz.certificates import certificates
 from fuzz.charts import charts
@@ -22,6 +23,7 @@ from fuzz.ticks import ticks
 from fuzz.views import views
 
 CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
+    "arms": arms,
     "calls": calls,
     "certificates": certificates,
     "charts": charts,
@@ -44,6 +46,8 @@ CAMPAIGNS: dict[str, Callable[[int], list[Finding]]] = {
 
 READERS = {  #: functions that read files, by module and name, with the campaign that gives them mutants
     "charts.chart.load_file": "charts",
+    "arms.arm.load": "arms",
+    "arms.arm_file.read_charts": "arms",
     "charts.chart_file.read_chart": "charts",
     "charts.ready.load": "charts",
     "codegen.compiled.load_library": "libraries",
@@ -75,6 +79,7 @@ RESULTS = {  #: public classes whose objects only the library makes, with the ca
     **dict.fromkeys(("Breakdown", "Coupling", "DampingCheck", "JointMotion", "Margins", "Modes", "Setting"), "calls"),
     **dict.fromkeys(("Contact", "LeastDistance"), "calls"),
     **dict.fromkeys(("Card", "Model", "Trajectory", "View"), "calls"),
+    **dict.fromkeys(("Arc", "ArmTracker", "Place", "Postures", "SelfMotions"), "calls"),
     "Certificate": "certificates",
     "Domain": "calls",
 }

@@ -10,7 +10,9 @@ import casadi as ca
 import numpy as np
 from mujoco_arm import Arm
 from public_objects import (
+    BENT_POSTURE,
     HAS_COMPILER,
+    arm,
     circle,
     clear,
     collisions,
@@ -49,7 +51,41 @@ Call = tuple[Callable[..., Any], dict[str, Any]]  # a function, and arguments th
 def good_calls() -> dict[str, Call]:
     """What can be called, with arguments that work and take little time."""
     physics = {**_physics(), **_supervised()}
-    return {**_makers(), **_functions(), **_methods(), **_searches(), **_control(), **physics, **_views()}
+    found = {**_makers(), **_functions(), **_methods(), **_searches(), **_arms()}
+    return {**found, **_control(), **physics, **_views()}
+
+
+def _arms() -> dict[str, Call]:
+    """Whole arms."""
+    whole, q = arm(), BENT_POSTURE
+    x, motions = whole.x(q), whole.self_motion(whole.x(q))
+    tracker = whole.tracker(q)
+    return {
+        "Arm": (oc.Arm, {"task": whole.task, "charts": whole.charts}),
+        "Arm.fit": (
+            lambda **given: oc.Arm.fit(**{"robot": "none", **given}),
+            {"robot": planar().robot, "task": planar().task, "metric": "euclidean", "seed": 0, "monitor": print},
+        ),
+        "Arm.load": (oc.Arm.load, {"path": "no.arm"}),
+        "arm.save": (whole.save, {"path": "new.arm", "force": False}),
+        "arm.x": (whole.x, {"q": q}),
+        "arm.self_motion": (whole.self_motion, {"x": x}),
+        "arm.solutions": (whole.solutions, {"x": x, "xi": 0.1}),
+        "arm.solve": (whole.solve, {"x": x, "xi": 0.1, "start": q, "branch": "any"}),
+        "arm.nearest": (whole.nearest, {"x": x, "q_wish": q}),
+        "arm.tracker": (whole.tracker, {"q": q, "period": 0.01, "velocity_limits": 1.0, "detours": True}),
+        "arm.follow": (
+            whole.follow,
+            {"path": np.array([x, x + 0.01]), "xi": 0.1, "q": q, "period": 0.01, "velocity_limits": 1.0},
+        ),
+        "arm.tracker.step": (tracker.step, {"x": x, "xi": 0.1}),
+        "arm.tracker.reset": (tracker.reset, {"q": q}),
+        "motions.sample": (motions.sample, {"n": 5, "metric": "inertia"}),
+        "motions.nearest": (motions.nearest, {"q": q}),
+        "motions.best": (motions.best, {"f": lambda q: q[:, 0]}),
+        "arc.at": (motions.components[0].at, {"place": [0.0, 0.5]}),
+        "arc.sample": (motions.components[0].sample, {"n": 5, "metric": "euclidean"}),
+    }
 
 
 def _searches() -> dict[str, Call]:

@@ -86,6 +86,14 @@ def test_python_blocks_of_the_page_on_the_inverse_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_python_blocks_of_the_page_on_arms_run(tmp_path: Path) -> None:
+    printed = printed_here("\n".join(blocks("python", "how-to/arm.md")), tmp_path)
+    assert "arcs of length" in printed
+    assert "100 FOUND" in printed
+    assert "its limit" in printed
+
+
+@pytest.mark.slow
 def test_python_block_of_the_page_on_circles_runs(tmp_path: Path) -> None:
     (code,) = blocks("python", "explanation/circle.md")
     assert printed_here(code, tmp_path).splitlines() == ["[6.28] True", "True"]

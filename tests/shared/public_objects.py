@@ -16,6 +16,7 @@ import numpy as np
 
 import orthocas as oc
 from orthocas import control, paths, problems, solvers
+from orthocas.arms import Arc, ArmTracker, SelfMotions
 from orthocas.charts.certificate import Certificate
 from orthocas.charts.chart import GrownChart
 from orthocas.charts.singularities import jumps, singular_points
@@ -119,6 +120,14 @@ BENT = oc.Box([0.0, 1.3, 1.3], [3.0, 1.2, 1.2])
 def wide() -> WideFit:
     known = problems.get("planar_3r_xy")
     return oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.Polynomial(3, ["q1"]))
+
+
+BENT_POSTURE = np.array([0.3, 0.9, 0.8])
+
+
+@cache
+def arm() -> oc.Arm:
+    return oc.Arm(wide().chart.problem.task, (wide().chart,))
 
 
 def hand_direction(q: ca.SX) -> ca.SX:
@@ -345,6 +354,12 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "self-motion curve": lambda: cyclic().self_motion(cyclic().problem.domain.centre),
     "solutions": lambda: fitted().chart.solve([[1.6, 0.1, 0.1], [9.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]),
     "tracker": lambda: fitted().chart.tracker(planar().domain.centre),
+    "arm": arm,
+    "arm without charts": lambda: oc.Arm(problems.get("planar_3r_xy").task),
+    "postures of an arm": lambda: arm().solve(arm().x(BENT_POSTURE), start=BENT_POSTURE),
+    "self-motions of an arm": lambda: arm().self_motion(arm().x(BENT_POSTURE)),
+    "arc of an arm": lambda: arm().self_motion(arm().x(BENT_POSTURE)).components[0],
+    "tracker of an arm": lambda: arm().tracker(BENT_POSTURE),
     "nearest tracker": lambda: fitted().chart.tracker(planar().domain.centre, nearest=True),
     "involutivity": lambda: oc.involutivity(planar(), 100),
     "singular point": lambda: singular_points(problems.get("planar_2r"))[0],
@@ -428,6 +443,32 @@ def _of_tracker(tracker: Tracker) -> Iterator[Any]:
     q = tracker.q
     yield from (q, tracker.step(fitted().chart.phi(q) + 1e-3), tracker.status, tracker.largest_step)
     tracker.reset(q)
+
+
+@_numbers.register
+def _of_arm(arm: oc.Arm) -> Iterator[Any]:
+    x = arm.x(BENT_POSTURE)
+    yield from (x, arm.branch_names, arm.robot.joint_names, arm.solve([x, x + 0.1], start=BENT_POSTURE).q)
+    if arm.charts:
+        yield arm.solve(x, 0.1).q
+
+
+@_numbers.register
+def _of_motions(motions: SelfMotions) -> Iterator[Any]:
+    yield from (motions.x, motions.length, motions.curves)
+    for arc in motions:
+        yield from _numbers(arc)
+
+
+@_numbers.register
+def _of_arc(arc: Arc) -> Iterator[Any]:
+    yield from (arc.target, arc.q, arc.at(0.3), arc.length, arc.closed, *map(str, arc.ends))
+
+
+@_numbers.register
+def _of_arm_tracker(tracker: ArmTracker) -> Iterator[Any]:
+    mine, x = copy.deepcopy(tracker), arm().x(BENT_POSTURE)
+    yield from (mine.q, mine.step(x + 1e-3), mine.step(x + 9.0), mine.status, mine.xi, mine.branch)
 
 
 @_numbers.register

@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 from public_objects import (
+    BENT_POSTURE,
     HAS_COMPILER,
+    arm,
     circle,
     collisions,
     compiled,
@@ -67,6 +69,17 @@ def calls_of_law(law: Controller) -> list[Call]:
     return [command]
 
 
+def calls_of_arm() -> list[Call]:
+    """Searches for postures of task values that change from call to call."""
+    whole = copy.deepcopy(arm())
+    x = whole.x(BENT_POSTURE) + np.linspace(0.0, 0.1, 4)[:, None]
+    return [
+        lambda k: whole.solve(x[k % 4], start=BENT_POSTURE).q,
+        lambda k: whole.solve(x[k % 4], 0.1).q,
+        lambda k: np.atleast_1d(whole.self_motion(x[k % 4]).length),
+    ]
+
+
 def calls_of_ticks() -> list[Call]:
     """A law without a memory in ticks, copied for each call."""
     ticks = Remembering(Kinematic(copy.deepcopy(fitted().chart), 1.0))
@@ -89,5 +102,6 @@ SERIES: dict[str, tuple[Callable[[], list[Call]], int]] = {  #: of 5,000 calls
     **({"compiled inverse": (calls_of_compiled, 200)} if HAS_COMPILER else {}),
     "law in ticks": (calls_of_ticks, 200),
     "collisions": (calls_of_collisions, 300),
+    "arm": (calls_of_arm, 120),
     "law": (lambda: calls_of_law(copy.deepcopy(impedance())), 1300),
 }

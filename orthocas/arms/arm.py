@@ -1,0 +1,553 @@
+"""`orthocas.Arm`: an arm with charts of all its branches, and its postures for any task value."""
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocas.arms.arm_file import read_charts, write_charts
+from orthocas.arms.maps import ArmMaps
+from orthocas.arms.self_motion import Arc, SelfMotions, find_motions
+from orthocas.arms.tracker import ArmTracker, TrackStatus
+from orthocas.charts.chart import Chart
+from orthocas.charts.inverse import InverseStatus
+from orthocas.errors import BranchWarning, DomainError, InvalidValueError, NotRedundantError, ShapeError
+from orthocas.fitting.wide import fit_wide
+from orthocas.robots.robot import Robot
+from orthocas.tasks.branches import branches
+from orthocas.tasks.metric import Metric, MetricSpec
+from orthocas.tasks.regular_box import find_joint_range
+from orthocas.tasks.task import Task
+from orthocas.tools.batch import run_in_threads
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import (
+    Array,
+    Indices,
+    as_float_array,
+    as_number,
+    as_path,
+    as_point_set,
+    require_kind,
+    require_known,
+)
+from orthocas.tools.display import Shown, listed, percent
+from orthocas.tools.progress import Monitor, Progress, silent
+
+ANY = "any"  #: branch
+
+
+@dataclass(frozen=True, slots=True)
+class ArmRules:
+    """Numbers of an arm's answers."""
+
+    spacing: float = 0.05  #: [rad] or [m] between postures of an arc among which those with an xi are sought
+    steps: int = 40  #: of a search for an xi between two postures
+    met: float = 1e-11  #: error of xi that ends it
+    narrow: float = 1e-14  #: [rad] or [m] between the postures that ends it
+    tolerance: float = 1e-9  #: error of xi of a posture that has it
+    same: float = 1e-6  #: [rad] or [m] between postures that are the same
+    rows: int = 8  #: that a thread takes at once
+
+
+RULES = ArmRules()
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Postures(Shown):
+    """Joint positions with given task values; of `Arm.solve` for one value, or of several in rows."""
+
+    q: Array  #: (n,) or (N, n), within the joint limits; NaN where none was found
+    status: Any  #: `InverseStatus`, or (N,) of its numbers; with NEAREST and OUTSIDE_DOMAIN, x alone is met
+    branch: Any  #: name of the branch, or a tuple of names; "" on none
+    xi: Array  #: of the branch's chart, () or (N,); NaN outside its domain
+
+    def __len__(self) -> int:
+        return len(np.atleast_2d(self.q))
+
+    @property
+    def found(self) -> Any:
+        """Whether x, and xi where it was given, are met, bool or (N,)."""
+        return self.status == InverseStatus.FOUND
+
+    def facts(self) -> dict[str, str]:
+        """How many rows ended how."""
+        values = np.atleast_1d(self.status)
+        counts = {status.name: int((values == status).sum()) for status in InverseStatus}
+        names = [self.branch] if isinstance(self.branch, str) else sorted(set(self.branch))
+        return {
+            "postures": listed(f"{count} {name}" for name, count in counts.items() if count) or "none",
+            "branches": listed(name or "none" for name in names) or "none",
+        }
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Arm(Shown):
+    """An arm with one joint more than its task needs, and charts of the branches of its joint range.
+
+    Where a chart ends at a boundary of its domain, an arm goes on: it knows the postures of a task value x within the
+    joint limits. Without limits they are a few closed curves, which are traced from stored postures and then cut at
+    the limits: `self_motion`, `nearest`, `solve` and `solutions`. Charts give postures a number xi on each branch.
+    `tracker` follows a stream of x and xi through borders of charts, singular positions and out of reach.
+
+    The curves are traced in C that is compiled on first use and kept; without a compiler, NumPy does the same, a
+    hundred times slower. `Arm(task)` has no charts: it is ready at once, and knows no xi.
+
+    A task value x is the task's vector (m,). For tasks of a whole orientation it is also a 4 x 4 matrix, a pair of
+    position and rotation (3, 3) or quaternion (w, x, y, z), or a `pinocchio.SE3`. Methods that take several, take rows
+    of these.
+
+    Args:
+        task: a task with m = n - 1.
+        charts: of branches, with equal tasks.
+
+    Raises:
+        NotRedundantError, InvalidValueError: if n - m is not 1, or charts have another task.
+
+    Example:
+        >>> import orthocas as oc
+        >>> chart = oc.load("panda-wide")
+        >>> arm = oc.Arm(chart.task, (chart,))
+        >>> q = [0.3, 0.4, 0.1, -1.9, 0.2, 2.2, 0.5]
+        >>> motions = arm.self_motion(arm.robot.pose(q))
+        >>> len(motions), str(motions.components[0].ends[0])
+        (3, "joint 'panda_joint2' at 1.763, its limit")
+        >>> bool(motions.nearest(q).value < 1e-9)
+        True
+    """
+
+    task: Task
+    charts: tuple[Chart, ...] = ()
+
+    def __post_init__(self) -> None:
+        require_kind("task", self.task, Task)
+        robot = self.task.robot
+        free = robot.n - len(robot.tree.floating)
+        if self.task.m >= free:
+            raise NotRedundantError(self.task.m, free)
+        if self.task.m + 1 != robot.n:
+            raise InvalidValueError("task", f"n - m = {robot.n - self.task.m}", "one with n - m = 1, or use charts")
+        one = np.flatnonzero(np.isfinite(robot.lower) != np.isfinite(robot.upper))
+        if any(not robot.tree.prismatic[k] for k in one):
+            raise InvalidValueError("joint", f"'{robot.joint_names[one[0]]}' with one limit", "two limits, or none")
+        object.__setattr__(self, "task", self.task.with_reference_at(find_joint_range(robot, 0).centre))
+        if not isinstance(self.charts, tuple | list):
+            raise InvalidValueError("charts", repr(self.charts)[:80], "a tuple of charts")
+        for chart in self.charts:
+            require_kind("charts", chart, Chart)
+            same = chart.problem.task.recipe == self.task.recipe or _agree(chart, self.task)
+            if not same:
+                raise InvalidValueError("charts", f"one of the task {chart.problem.task.name}", self.task.name)
+        object.__setattr__(self, "charts", tuple(self.charts))
+
+    @classmethod
+    def fit(
+        cls,
+        robot: Robot,
+        task: Task | None = None,
+        metric: Metric | MetricSpec = "euclidean",
+        *,
+        seed: int = 0,
+        monitor: Monitor = silent,
+    ) -> Self:
+        """Fit a wide chart to every branch of the joint range; it takes some seconds for each.
+
+        Args:
+            robot: the robot.
+            task: its task, with m = n - 1. Default: the pose of the tip.
+            metric: as in `Problem`.
+            seed: of samples.
+            monitor: called with progress.
+
+        Raises:
+            NotRedundantError, InvalidValueError: if n - m is not 1.
+            DomainError: if no branch can be fitted. Of single branches that cannot, a BranchWarning says so.
+        """
+        require_kind("robot", robot, Robot)
+        bare = cls(Task.pose(robot) if task is None else task)
+        parts, found, reasons = branches(robot, bare.task), [], []
+        for k, branch in enumerate(parts):
+            own = f"branch {k + 1} of {len(parts)}, "
+
+            def report(progress: Progress, own: str = own) -> None:
+                monitor(replace(progress, stage=own + progress.stage))
+
+            try:
+                found.append(fit_wide(robot, bare.task, branch, metric, seed=seed, monitor=report).chart)
+            except DomainError as error:
+                reasons.append(str(error))
+        for reason in reasons if found else ():
+            warnings.warn(reason, BranchWarning, stacklevel=2)
+        if not found:
+            raise DomainError(f"no branch can be fitted: {listed(reasons)}")
+        return cls(bare.task, tuple(found))
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read an arm file. Loading never runs code from the file.
+
+        Raises:
+            ChartFileError: if the file is missing, truncated, foreign, edited, or from a newer version.
+        """
+        charts = read_charts(as_path("path", path))
+        return cls(charts[0].problem.task, charts)
+
+    def save(self, path: str | Path, force: bool = False) -> None:
+        """Write all charts to one file. It replaces an arm file of that name, and with `force` any other file.
+
+        Raises:
+            InvalidValueError: if the arm has no charts.
+            ChartFileError: as `Chart.save`.
+        """
+        if not self.charts:
+            raise InvalidValueError("arm", "one without charts", "an arm with charts, as `Arm.fit` makes it")
+        write_charts(as_path("path", path), self.charts, force)
+
+    @property
+    def robot(self) -> Robot:
+        """The robot."""
+        return self.task.robot
+
+    @property
+    def branch_names(self) -> tuple[str, ...]:
+        """Names of the branches that have charts."""
+        return tuple(str(chart.notes.get("branch", chart.problem.name)) for chart in self.charts)
+
+    def x(self, q: ArrayLike) -> Array:
+        """The task's vector, (m,) or (N, m), at joint positions (n,) or (N, n)."""
+        points, single = as_point_set("q", q, self.robot.n)
+        values = np.asarray(self.task.batched(points)[0])
+        return values[0] if single else values
+
+    def self_motion(self, x: Any) -> SelfMotions:
+        """All postures within the joint limits with a task value: arcs, with their ends and what stops them there.
+
+        Curves that pass near one another are told apart by the direction in which det [J; t] > 0. That all curves are
+        found is no theorem: docs/how-to/arm.md has how often they are.
+
+        Args:
+            x: one task value.
+
+        Raises:
+            InvalidValueError: if x is no task value, or not finite.
+        """
+        return find_motions(self.maps, self._read_one(x))
+
+    def solutions(self, x: Any, xi: float | None = None) -> tuple[Arc, ...] | Postures:
+        """All postures with a task value, on all branches.
+
+        Args:
+            x: one task value.
+            xi: that postures are to have in the chart of their branch; None for any.
+
+        Returns:
+            Without xi the arcs, the components of `self_motion`; with xi the postures where a chart has it.
+
+        Raises:
+            InvalidValueError: if x is no task value, or xi is given to an arm without charts.
+        """
+        motions = self.self_motion(x)
+        if xi is None:
+            return motions.components
+        self._require_charts()
+        value = as_number("xi", xi)
+        found = [(q, name) for k, name in enumerate(self.branch_names) for q in self._find_xi(motions, k, value)[0]]
+        q = np.array([q for q, _ in found]).reshape(-1, self.robot.n)
+        names = tuple(name for _, name in found)
+        status = np.full(len(q), int(InverseStatus.FOUND))
+        return Postures(q, status, names, np.full(len(q), value))
+
+    def nearest(self, x: Any, q_wish: ArrayLike) -> Postures:
+        """The posture within the joint limits with a task value that is nearest to another one, |q - q_wish| least.
+
+        Args:
+            x: one task value, or N of them.
+            q_wish: (n,), or one for each (N, n).
+        """
+        return self.solve(x, start=q_wish)
+
+    def solve(self, x: Any, xi: ArrayLike | None = None, start: ArrayLike | None = None, branch: str = ANY) -> Postures:
+        """A posture within the joint limits for each task value.
+
+        With xi, charts are asked in turn: that of the start's branch first, or else the largest; the first that has
+        (x, xi) gives the posture, by `Chart.solve`. Where none has, the posture with that x whose xi is nearest is
+        NEAREST; where charts hold none, one with that x within the limits is OUTSIDE_DOMAIN. Without xi, it is the
+        posture nearest to the start, or without one, far from limits.
+
+        Args:
+            x: one task value, or N of them. Rows that are not finite are BAD_INPUT.
+            xi: a number, or one for each row (N,).
+            start: a posture (n,), or one for each row (N, n).
+            branch: name of a branch, to accept no other; "any" for all.
+
+        Raises:
+            InvalidValueError, ShapeError: for arguments that do not fit, or an xi or branch without charts.
+        """
+        targets, single = self.maps.targets.read(x)
+        N, n = len(targets), self.robot.n
+        starts = None if start is None else _repeat_rows("start", as_point_set("start", start, n)[0], N)
+        require_kind("branch", branch, str)
+        if branch != ANY:
+            require_known("branch", branch, self.branch_names)
+        chosen = [k for k, name in enumerate(self.branch_names) if branch in (ANY, name)]
+        q, status = np.full((N, n), np.nan), np.full(N, int(InverseStatus.NOT_FOUND))
+        good = np.isfinite(targets).all(axis=1)
+        values = None
+        if xi is not None:
+            self._require_charts()
+            values = _repeat_rows("xi", as_float_array("xi", xi).reshape(-1, 1), N)[:, 0]
+            good &= np.isfinite(values)
+            self._solve_by_charts(targets, values, starts, chosen, q, status, good)
+        status[~good] = InverseStatus.BAD_INPUT
+        left = np.flatnonzero(good & (status != InverseStatus.FOUND))
+
+        def solve_row(row: int) -> None:
+            wish = None if starts is None else starts[row]
+            value = None if values is None else float(values[row])
+            q[row], status[row] = self._solve_on_arcs(targets[row], value, wish, chosen, branch == ANY)
+
+        run_in_threads(solve_row, left.tolist())
+        owners = self.find_branches(np.where(np.isfinite(q), q, 0.0))
+        owners = [k if good else -1 for k, good in zip(owners, np.isfinite(q).all(axis=1), strict=True)]
+        names = tuple(self.branch_names[k] if k >= 0 else "" for k in owners)
+        own = self._evaluate_xi(q, owners)
+        if single:
+            return Postures(q[0], InverseStatus(int(status[0])), names[0], own[0])
+        return Postures(q, status, names, own)
+
+    def tracker(
+        self, q: ArrayLike, *, period: float = 0.01, velocity_limits: ArrayLike | None = None, detours: bool = True
+    ) -> ArmTracker:
+        """A tracker of a stream of x and xi that is never lost; see `ArmTracker`.
+
+        Args:
+            q: posture within the joint limits, (n,).
+            period: time from one call to the next [s].
+            velocity_limits: (n,) or one number [rad/s] or [m/s]. Default: those of the robot's file.
+            detours: whether the arm may leave x for a while where it is stuck, to get to a posture that has it.
+        """
+        return ArmTracker(self.maps, self.charts, q, period, velocity_limits, detours)
+
+    def follow(
+        self,
+        path: Any,
+        xi: ArrayLike | None = None,
+        *,
+        q: ArrayLike,
+        period: float = 0.01,
+        velocity_limits: ArrayLike | None = None,
+    ) -> tuple[Array, tuple[TrackStatus, ...]]:
+        """Postures along task values, by a tracker that makes one call for each.
+
+        Args:
+            path: N task values.
+            xi: of each, (N,), or one number; None holds that of the first posture as far as it can be had.
+            q: where the arm is before, (n,).
+            period: as in `tracker`.
+            velocity_limits: as in `tracker`.
+
+        Returns:
+            q (N, n), and how each call ended.
+        """
+        targets, _ = self.maps.targets.read(path)
+        tracker = self.tracker(q, period=period, velocity_limits=velocity_limits)
+        values = [None] * len(targets)
+        if xi is not None:
+            values = _repeat_rows("xi", as_float_array("xi", xi).reshape(-1, 1), len(targets))[:, 0].tolist()
+        found, statuses = np.empty((len(targets), self.robot.n)), []
+        for k, (target, value) in enumerate(zip(targets, values, strict=True)):
+            found[k] = tracker.step_to(target, value)
+            statuses.append(tracker.status)
+        return found, tuple(statuses)
+
+    def find_branches(self, q: Array) -> list[int]:
+        """Numbers of the charts whose domains hold postures (N, n); -1 for none."""
+        owners = np.full(len(q), -1)
+        for k, chart in enumerate(self.charts):
+            left = np.flatnonzero(owners < 0)
+            owners[left[np.asarray(chart.problem.domain.contains(q[left]))]] = k
+        return [int(k) for k in owners]
+
+    def facts(self) -> dict[str, str]:
+        """Task, charts, and how much of their branches they cover."""
+        names = [
+            f"{name} {percent(float(chart.notes['share of the branch']), 2)}"
+            if "share of the branch" in chart.notes
+            else name
+            for name, chart in zip(self.branch_names, self.charts, strict=True)
+        ]
+        return {
+            "arm": self.robot.heading,
+            "task": self.task.heading,
+            "charts": f"{len(names)} (share of the branch): {listed(names)}" if names else "none",
+        }
+
+    @cached_property
+    def maps(self) -> ArmMaps:
+        """What other files of this package use of an arm; it may change without notice."""
+        return ArmMaps(self.task)
+
+    def _require_charts(self) -> None:
+        if not self.charts:
+            raise InvalidValueError("xi", "for an arm without charts", "None, or an arm of `Arm.fit`")
+
+    def _read_one(self, x: Any) -> Array:
+        targets, single = self.maps.targets.read(x)
+        if not single or not np.isfinite(targets).all():
+            raise InvalidValueError(
+                "x", f"{len(targets)} values" if not single else "NaN or infinity", "one task value"
+            )
+        return np.asarray(targets[0])
+
+    def _solve_by_charts(
+        self,
+        targets: Array,
+        values: Array,
+        starts: Array | None,
+        chosen: Sequence[int],
+        q: Array,
+        status: Indices,
+        good: NDArray[np.bool_],
+    ) -> None:
+        """Ask charts in turn for (x, xi) of good rows; q and status of those that are found are filled in."""
+        vectors = self.maps.targets.vector(targets)
+        first = np.full(len(targets), -1) if starts is None else np.array(self.find_branches(starts))
+        for own in (True, False):
+            for k in chosen:
+                rows = np.flatnonzero(good & (status != InverseStatus.FOUND) & ((first == k) == own))
+                if not rows.size or (own and starts is None):
+                    continue
+                near = starts[rows] if own and starts is not None else None
+                found = self.charts[k].solve(np.column_stack([vectors[rows], values[rows]]), near)
+                done = found.found
+                q[rows[done]], status[rows[done]] = found.q[done], int(InverseStatus.FOUND)
+
+    def _solve_on_arcs(
+        self, target: Array, xi: float | None, start: Array | None, chosen: Sequence[int], anywhere: bool
+    ) -> tuple[Array, int]:
+        """The posture of one target, by its arcs."""
+        motions = find_motions(self.maps, target, *(() if start is None else (start[None],)))
+        found: tuple[Array, InverseStatus] | None = None
+        if motions.components and xi is not None:
+            found = self._choose_xi(motions, xi, start, chosen)
+        elif motions.components and not anywhere:
+            found = self._choose_inside(motions, [self.charts[k].problem.domain for k in chosen], start)
+        if found is None and motions.components and anywhere:
+            place = motions.best(self._measure_room) if start is None else motions.nearest(start)
+            found = place.q, InverseStatus.FOUND if xi is None else InverseStatus.OUTSIDE_DOMAIN
+        q, status = found or (np.full(self.robot.n, np.nan), InverseStatus.NOT_FOUND)
+        return q, int(status)
+
+    def _choose_xi(
+        self, motions: SelfMotions, xi: float, start: Array | None, chosen: Sequence[int]
+    ) -> tuple[Array, InverseStatus] | None:
+        """The posture with an xi that is nearest to the start; without any, that with the nearest xi."""
+        parts = [self._find_xi(motions, k, xi) for k in chosen]
+        exact = [q for postures, _ in parts for q in postures]
+        if exact:
+            wish = exact[0] if start is None else start
+            return min(exact, key=lambda q: float(np.linalg.norm(q - wish))), InverseStatus.FOUND
+        nearest = min((near for _, near in parts if near is not None), key=lambda item: item[1], default=None)
+        return None if nearest is None else (nearest[0], InverseStatus.NEAREST)
+
+    def _choose_inside(
+        self, motions: SelfMotions, domains: Sequence[Any], start: Array | None
+    ) -> tuple[Array, InverseStatus] | None:
+        """The posture in one of the domains that is nearest to the start, of those 0.05 rad apart on the arcs."""
+        q = np.vstack([arc.at(self._list_places(arc)) for arc in motions])
+        inside = np.any([np.asarray(domain.contains(q)) for domain in domains], axis=0)
+        if not inside.any():
+            return None
+        q = q[inside]
+        k = np.argmax(self._measure_room(q)) if start is None else np.argmin(np.linalg.norm(q - start, axis=1))
+        return q[k], InverseStatus.FOUND
+
+    def _measure_room(self, q: Array) -> Array:
+        """Distances from the limits (N,), in half-widths of the joints' ranges."""
+        low, high = self.robot.lower, self.robot.upper
+        bounded = np.isfinite(low)
+        room = np.minimum(q - low, high - q)[:, bounded] / (high - low)[bounded]
+        return np.asarray(2 * room.min(axis=1, initial=1.0))
+
+    def _find_xi(self, motions: SelfMotions, k: int, xi: float) -> tuple[list[Array], tuple[Array, float] | None]:
+        """Postures on the arcs where chart k has an xi, and the one whose xi is nearest, with its distance."""
+        chart = self.charts[k]
+        domain, (low, high) = chart.problem.domain, chart.problem.domain.bounds
+        period = float(chart.parts.turns[chart.m])
+        found: list[Array] = []
+        best: tuple[Array, float] | None = None
+
+        def miss(q: Array) -> Array:
+            left = chart.xi(q)[:, 0] - xi
+            return np.asarray(left - period * np.round(left / period) if period else left)
+
+        for arc in motions:
+            places = self._list_places(arc)
+            q = arc.at(places)
+            near = np.flatnonzero(((q >= low - RULES.spacing) & (q <= high + RULES.spacing)).all(axis=1))
+            inside, left = np.zeros(len(q), dtype=bool), np.full(len(q), np.nan)
+            if near.size:
+                inside[near], left[near] = np.asarray(domain.contains(q[near])), miss(q[near])
+            if inside.any():
+                row = np.flatnonzero(inside)[np.argmin(np.abs(left[inside]))]
+                if best is None or abs(left[row]) < best[1]:
+                    best = q[row], float(abs(left[row]))
+            crosses = (left[:-1] * left[1:] <= 0) & (inside[:-1] | inside[1:])
+            if period:
+                crosses &= np.abs(left[1:] - left[:-1]) < period / 2
+            for row in np.flatnonzero(crosses):
+                posture, error = _find_root(arc, miss, *places[row : row + 2].tolist())
+                known = any(np.abs(posture - other).max() < RULES.same for other in found)
+                if abs(error) < RULES.tolerance and not known and bool(domain.contains(posture)):
+                    found.append(posture)
+        return found, best
+
+    def _list_places(self, arc: Arc) -> Array:
+        """Places on an arc, at most `RULES.spacing` apart, (P,)."""
+        return np.linspace(0.0, arc.length, max(2, int(arc.length / RULES.spacing) + 2))
+
+    def _evaluate_xi(self, q: Array, owners: Sequence[int]) -> Array:
+        """xi (N,) of postures in the charts that hold them; NaN elsewhere."""
+        values = np.full(len(q), np.nan)
+        for k, chart in enumerate(self.charts):
+            rows = np.flatnonzero(np.array(owners) == k)
+            if rows.size:
+                values[rows] = chart.xi(q[rows])[:, 0]
+        return values
+
+
+def _repeat_rows(name: str, rows: Array, count: int) -> Array:
+    """Rows (count, k), of so many or of one for all."""
+    if len(rows) not in (1, count):
+        raise ShapeError(name, rows.shape, (count, rows.shape[1]))
+    return np.broadcast_to(rows, (count, rows.shape[1]))
+
+
+def _agree(chart: Chart, task: Task) -> bool:
+    """Whether a chart's task has the values of another one."""
+    q = chart.problem.domain.centre[None]
+    same = chart.m == task.m and chart.n == task.robot.n
+    return same and bool(np.allclose(chart.problem.task.batched(q)[0], task.batched(q)[0], rtol=0, atol=1e-9))
+
+
+def _find_root(arc: Arc, f: Callable[[Array], Array], low: float, high: float) -> tuple[Array, float]:
+    """The posture on an arc, between places where f has different signs, at which f is 0; and f there.
+
+    By regula falsi, with every third step a bisection.
+    """
+    values = [float(f(arc.at(place)[None])[0]) for place in (low, high)]
+    q, value = arc.at(low if abs(values[0]) <= abs(values[1]) else high), min(values, key=abs)
+    for k in range(RULES.steps):
+        if abs(value) < RULES.met or high - low < RULES.narrow:
+            break
+        place = low + (high - low) * (values[0] / (values[0] - values[1]) if k % 3 < 2 else 0.5)
+        q = arc.at(place)
+        value = float(f(q[None])[0])
+        if (value > 0) == (values[0] > 0):
+            low, values[0] = place, value
+        else:
+            high, values[1] = place, value
+    return q, value

@@ -1,0 +1,249 @@
+"""All self-motion curves of a task value, r = 1, whatever the limits, and where limits cut them."""
+
+import ctypes
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.arms.stored import StoredPostures
+from orthocas.codegen.compiled import keep_library, load_library
+from orthocas.codegen.kernels import generate_kernels
+from orthocas.codegen.rendering import render
+from orthocas.tasks.task import Frames, Task
+from orthocas.tools.batch import dense_function
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array
+
+_FLAGS = ("-O3",)
+
+
+@dataclass(frozen=True, slots=True)
+class CurveRules:
+    """Numbers of the search for curves, in C and NumPy. Chosen on panda and xarm7, held on others (benchmarks/arm.py).
+
+    Errors of x are in radians, or as long as a radian moves the tip. Joint positions are in [rad] or [m].
+    """
+
+    starts: int = 128  #: stored postures from which curves are sought
+    patience: int = 96  #: starts in turn that find no new curve, after which the search ends
+    reach: int = 25  #: steps from a start to x
+    reached: float = 1e-5  #: error that one more step reduces to its square
+    arrived: float = 1e-4  #: length of the last step, after which another one is rounding, also near singular positions
+    far_damping: float = 1e-3  #: of steps with an error above 0.1, relative to the trace of J J^T
+    near_damping: float = 1e-5  #: of steps with an error above 1e-3
+    largest: float = 0.7  #: norm of a step to x
+    bridges: int = 6  #: places on a curve from which another one is sought beyond singular positions beside it
+    narrow: float = 0.2  #: least singular value of J, scaled, below which it is
+    across: float = 5.0  #: how far, times that value
+    known: float = 0.02  #: distance from the cubic of a step up to which a point may lie on the curve
+    resolved: float = 0.2  #: the same, in lengths of the step
+    sure: float = 0.05  #: the part of that distance up to which it does, without another look
+    step: float = 0.4  #: longest step along a curve
+    shortest: float = 1e-6  #: a curve that needs shorter ones ends, at a singular position
+    aim: float = 0.02  #: first correction of a step that its length is chosen for
+    tight: float = 0.1  #: the same, in lengths of the step
+    missed: float = 0.08  #: largest correction of a step
+    loose: float = 0.25  #: the same, in lengths of the step
+    corrected: float = 3e-4  #: correction after which the next one is rounding for most purposes, 1e-7
+    exact: float = 2.5e-3  #: the same, in lengths of the step
+    corrections: int = 6  #: of a step, at most
+    turned: float = 0.94  #: least cosine between the tangents at both ends of a step
+    straight: float = 0.985  #: cosine from which the next step may be longer
+    prismatic: float = 1.0  #: widths of its range that a sliding joint may leave it by
+    curves: int = 64  #: of a task value, at most
+    graze: float = 2e-3  #: distance from a limit within which the turn of a joint is looked at closely
+    halvings: int = 4  #: of a step, to look closely
+    nodes: int = 8000  #: points on all curves of a task value, at most
+    crossings: int = 4000  #: of limits, at most
+
+
+RULES = CurveRules()
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A self-motion curve: points in order, between which it is a cubic, and what limits do to it."""
+
+    q: Array  #: (P, n), unwrapped; of a closed curve the last is the first, up to full turns
+    tangent: Array  #: unit tangents (P, n), with det [J; t] > 0
+    length: Array  #: of the curve from each point to the next, (P,); 0 at the last
+    closed: bool
+    crossings: NDArray[Any]  #: records `crossing_type` in order along the curve
+
+    @cached_property
+    def places(self) -> Array:
+        """Length of the curve up to each point, (P,)."""
+        return np.concatenate([[0.0], np.cumsum(self.length[:-1])])
+
+    def point(self, place: float) -> tuple[Array, Array]:
+        """The point at a place, exact at crossings, and the direction there, (n,) each."""
+        k = int(np.clip(np.searchsorted(self.places, place, side="right") - 1, 0, len(self.places) - 2))
+        h = float(self.length[k])
+        q, t = evaluate_cubic(
+            self.q[k], self.q[k + 1], self.tangent[k], self.tangent[k + 1], h, (place - self.places[k]) / h
+        )
+        at = np.flatnonzero(self.crossings["place"] == place)
+        return (self.crossings["q"][at[0]] if at.size else q), t
+
+
+def evaluate_cubic(
+    a: Array, b: Array, start: Array, end: Array, h: Array | float, u: Array | float
+) -> tuple[Array, Array]:
+    """Points at shares u of cubic curves of length h from a to b with unit tangents, and unit directions there."""
+    d = b - a
+    q = a + (3 * u * u - 2 * u**3) * d + h * ((u - 2 * u * u + u**3) * start + (u**3 - u * u) * end)
+    slope = 6 * (u - u * u) * d + h * ((1 - 4 * u + 3 * u * u) * start + (3 * u * u - 2 * u) * end)
+    return q, slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-300)
+
+
+class Kernel(Protocol):
+    """What finds curves and corrects points on them."""
+
+    def find_curves(self, target: Array, starts: Array, patience: int = RULES.patience) -> list[Curve]:
+        """All curves of a target that starts (S, n) lead to, with their crossings of limits.
+
+        The search ends after `patience` starts in turn that find no new curve.
+        """
+        ...
+
+    def choose_starts(self, stored: StoredPostures, place: Array) -> Array:
+        """Stored postures near a place of x, in turn from each branch, (S, n)."""
+        ...
+
+    def correct(self, target: Array, q: Array, tangent: Array) -> NDArray[np.bool_]:
+        """Bring points q (K, n) to their curve across tangents (K, n), both in place; where that succeeds, (K,)."""
+        ...
+
+
+def crossing_type(n: int) -> np.dtype[Any]:
+    """A record of a crossing: a joint, less full turns, is at its lowest (side 0) or highest (1) position."""
+    fields: list[Any] = [("place", "f8"), ("q", "f8", (n,))]
+    return np.dtype([*fields, *((name, "i4") for name in ("curve", "joint", "side", "turns", "rises"))], align=True)
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledKernel:
+    """`Kernel` in compiled C: templates/self_motion.c.jinja. Threads may share it.
+
+    Raises:
+        CompileError: if there is no C compiler.
+    """
+
+    equations: ca.Function
+    lower: Array
+    upper: Array
+    turning: NDArray[np.bool_]
+
+    def find_curves(self, target: Array, starts: Array, patience: int = RULES.patience) -> list[Curve]:
+        """As `Kernel.find_curves`."""
+        n = len(self.lower)
+        nodes = np.empty((RULES.nodes, 2 * n + 1))
+        ends, closed = np.zeros(RULES.curves, dtype=np.intc), np.zeros(RULES.curves, dtype=np.intc)
+        used = ctypes.c_int()
+        count = self._c.find_curves(
+            *(_pointer(target), _pointer(starts), len(starts), patience, _pointer(nodes), RULES.nodes),
+            *(_pointer(ends), _pointer(closed), ctypes.byref(used)),
+        )
+        if not count:
+            return []
+        found = np.empty(RULES.crossings, crossing_type(n))
+        size = self._c.find_crossings(
+            _pointer(target), _pointer(nodes), _pointer(ends), count, _pointer(found), RULES.crossings
+        )
+        return split_curves(nodes[: ends[count - 1]].copy(), ends[:count], closed, found[:size].copy())
+
+    def choose_starts(self, stored: StoredPostures, place: Array) -> Array:
+        """As `Kernel.choose_starts`."""
+        count, branches = len(stored.q), len(stored.begins) - 1
+        distance, single = np.empty(count, dtype=np.float32), place.astype(np.float32)
+        chosen = np.empty(RULES.starts + branches, dtype=np.intc)
+        total = self._c.choose_starts(
+            *(_pointer(stored.places), _pointer(stored.weights), _pointer(stored.begins), branches),
+            *(len(stored.places), count, _pointer(single), RULES.starts),
+            *(_pointer(distance), _pointer(chosen)),
+        )
+        return stored.q[chosen[:total]]
+
+    def correct(self, target: Array, q: Array, tangent: Array) -> NDArray[np.bool_]:
+        """As `Kernel.correct`."""
+        good = np.empty(len(q), dtype=np.bool_)
+        self._c.correct_rows(_pointer(target), len(q), _pointer(q), _pointer(tangent), _pointer(good))
+        return good
+
+    def load(self) -> None:
+        """Compile now, or find what was compiled earlier."""
+        assert self._c is not None
+
+    @cached_property
+    def _c(self) -> Any:
+        kernels = generate_kernels([self.equations], "kernel")
+        values = {
+            "kernels": kernels.code,
+            "arrays": kernels.declare_arrays,
+            "call": kernels.write_call,
+            "n": len(self.lower),
+            "rules": asdict(RULES),
+            "low": self.lower,
+            "high": self.upper,
+            "turning": self.turning,
+        }
+        source = render("self_motion.c", values)
+        return load_library(keep_library("self-motion", {"self_motion.c": source}, _FLAGS))
+
+
+def _pointer(array: NDArray[Any]) -> ctypes.c_void_p:
+    """The place of an array that somebody else keeps until the call ends, contiguous."""
+    assert array.flags.c_contiguous
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+def split_curves(
+    nodes: Array, ends: NDArray[np.intc], closed: NDArray[np.intc], crossings: NDArray[Any]
+) -> list[Curve]:
+    """Curves from the points of all of them, (P, 2n + 1), and from all crossings, which come curve by curve."""
+    n, curves, begin = (nodes.shape[1] - 1) // 2, [], 0
+    parts = np.searchsorted(crossings["curve"], np.arange(len(ends) + 1)).tolist()
+    for k, end in enumerate(ends.tolist()):
+        own = crossings[parts[k] : parts[k + 1]]
+        own = own[np.argsort(own["place"], kind="stable")]
+        part = nodes[begin:end]
+        curves.append(Curve(part[:, :n], part[:, n : 2 * n], part[:, 2 * n], bool(closed[k]), own))
+        begin = end
+    return curves
+
+
+def build_equations(task: Task, scale: Array) -> ca.Function:
+    """q (n, 1), target -> e (m, 1) and J (m, n), both divided by the scale; d(e)/dt = -J dq at e = 0.
+
+    For tasks of a whole orientation, the target is the position, if the task has one, and the rotation (3, 3) by
+    columns; e is the rotation vector to it in the axes of the task's frame, and J the geometric Jacobian. Others
+    compare values of x.
+    """
+    robot, turn = task.robot, task.turn
+    q = ca.SX.sym("q", robot.n)
+    if turn is None or not turn.whole:
+        target = ca.SX.sym("target", task.m)
+        e, J = target - task.function(q), task.jacobian_function(q)
+    else:
+        frames = Frames.from_recipe(task.recipe)
+        p, R, J = (frames.build_function(robot, name)(q) for name in ("position", "rotation", "jacobian"))
+        first = 3 if turn.with_position else 0
+        target = ca.SX.sym("target", first + 9)
+        across = ca.reshape(target[first:], 3, 3) @ R.T
+        axis = ca.vertcat(across[2, 1] - across[1, 2], across[0, 2] - across[2, 0], across[1, 0] - across[0, 1]) / 2
+        sine = ca.sqrt(ca.sumsqr(axis) + 1e-32)  # never zero, so that derivatives are finite
+        e = ca.atan2(sine, (ca.trace(across) - 1) / 2) / sine * axis
+        e, J = (ca.vertcat(target[:3] - p, e), J) if first else (e, J[3:, :])
+    parts = [ca.cse(part / ca.repmat(ca.DM(scale), 1, part.shape[1])) for part in (e, J)]
+    return dense_function("task", [q, target], parts, ["q", "target"])
+
+
+def build_curvature(equations: ca.Function) -> ca.Function:
+    """q (n, 1), target -> the second derivative of |e|^2 / 2, (n, n): that of J and e of `build_equations`."""
+    q, target = (ca.SX.sym(name, equations.size1_in(i)) for i, name in enumerate(("q", "target")))
+    e, J = equations(q, target)
+    H = ca.jacobian(-J.T @ e, q)
+    return dense_function("curvature", [q, target], [ca.cse((H + H.T) / 2)], ["q", "target"])

@@ -1,0 +1,374 @@
+"""The self-motions of a task value within the joint limits: arcs, their ends, and questions about them."""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.arms.kernel import Curve, evaluate_cubic
+from orthocas.arms.maps import ArmMaps
+from orthocas.charts.self_motion import Stop
+from orthocas.errors import InvalidValueError
+from orthocas.tasks.domains import StopKind
+from orthocas.tasks.metric import Metric, MetricSpec
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, as_float_array, as_point, require_count
+from orthocas.tools.display import Shown
+from orthocas.tools.expressions import call_user, wrap_shortest
+
+_TURN = 2 * np.pi
+
+
+@dataclass(frozen=True, slots=True)
+class ArcRules:
+    """Numbers of questions about arcs. Lengths are in [rad] or [m]."""
+
+    parts: int = 4  #: points on each step, among which the nearest is sought
+    candidates: int = 3  #: of them that are refined
+    refinements: int = 12  #: of a place, at most
+    refined: float = 1e-10  #: change of a place that ends its refinement
+    largest: float = 0.2  #: of its changes, and distance between candidates that are different
+    least_slope: float = 0.1  #: of half the squared distance, along an arc, by a secant
+    most: int = 1_000_000  #: postures of a sample
+    spacing: float = 0.05  #: of postures at which a function is evaluated
+    golden: int = 40  #: steps of golden-section search for a maximum
+    metric_spacing: float = 0.02  #: of postures between which the length in a metric is summed
+
+
+RULES = ArcRules()
+
+
+class Piece(NamedTuple):
+    """A part of a curve, after some full turns of its joints."""
+
+    begin: float  #: place on the curve, from its first point on
+    end: float
+    turns: tuple[int, ...]  #: (n,)
+
+
+class Place(NamedTuple):
+    """A posture on an arc."""
+
+    q: Array  #: (n,)
+    value: float  #: what was asked for there: the distance, or the value of a function
+    component: int  #: number of the arc in `SelfMotions.components`
+    place: float  #: length of the arc up to there [rad] or [m]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Arc(Shown):
+    """A connected set of postures within the joint limits with one task value: a curve with two ends, or a closed one.
+
+    Joints that can turn farther than a full turn have an arc for each number of full turns. A closed arc returns to its
+    first posture, up to full turns of joints without limits.
+    """
+
+    maps: ArmMaps
+    target: Array  #: of the task, as the kernel takes it
+    curve: Curve  #: of which the arc is a part
+    pieces: tuple[Piece, ...]  #: one after the other
+    ends: tuple[Stop, Stop]  #: what stops it at its begin and its end
+    closed: bool
+
+    @property
+    def length(self) -> float:
+        """Length in joint space [rad] or [m]."""
+        return sum(piece.end - piece.begin for piece in self.pieces)
+
+    @cached_property
+    def q(self) -> Array:
+        """Postures along the arc, (P, n), at most 0.4 rad or m apart, from end to end."""
+        return self.at(self._nodes[2])
+
+    def at(self, place: ArrayLike) -> Array:
+        """Postures at lengths from the begin, one (n,) or several (P, n); beyond the ends, those of the ends.
+
+        Args:
+            place: lengths [rad] or [m].
+        """
+        s = as_float_array("place", place)
+        places = np.clip(np.nan_to_num(s.reshape(-1)), 0.0, self.length)
+        q, tangent = self._guess(places)
+        ends = np.concatenate([self._nodes[0][:1], self._nodes[0][-1:]])
+        self.maps.kernel.correct(self.target, q, tangent)
+        if not self.closed:
+            q[places <= 0.0], q[places >= self.length] = ends[0], ends[1]
+        q = np.clip(q, self.maps.robot.lower, self.maps.robot.upper)
+        return np.asarray(q.reshape(*s.shape, q.shape[1]))
+
+    def direction(self, place: float) -> Array:
+        """The direction of the arc (n,) at a length from its begin, to about 1e-3."""
+        return np.asarray(self._guess(np.array([min(max(place, 0.0), self.length)]))[1][0])
+
+    def sample(self, n: int, metric: Metric | MetricSpec = "euclidean") -> Array:
+        """Postures at equal distances along the arc, (n, joints), both ends among them; of a closed arc only one.
+
+        Args:
+            n: their number.
+            metric: in which distances count: "euclidean", "inertia", a matrix, or a function, as of a `Problem`.
+        """
+        require_count("n", n, least=2, most=RULES.most)
+        known = metric if isinstance(metric, Metric) else Metric.from_spec(self.maps.robot, metric)
+        places = np.linspace(0.0, self.length, n, endpoint=not self.closed)
+        if not known.is_identity:
+            dense = np.linspace(0.0, self.length, max(8, int(self.length / RULES.metric_spacing)) + 1)
+            steps = np.diff(self._guess(dense)[0], axis=0)
+            A = known.evaluate(self._guess((dense[1:] + dense[:-1]) / 2)[0])
+            sums = np.concatenate([[0.0], np.cumsum(np.sqrt(np.einsum("ki,kij,kj->k", steps, A, steps)))])
+            places = np.interp(np.linspace(0.0, sums[-1], n, endpoint=not self.closed), sums, dense)
+        return self.at(places)
+
+    def facts(self) -> dict[str, str]:
+        """Length, ends, and what stops it there."""
+        if self.closed:
+            return {"arc": f"closed, of length {self.length:.4g}"}
+        begin, end = (str(stop) for stop in self.ends)
+        return {"arc": f"of length {self.length:.4g}", "begin": begin, "end": end}
+
+    def _guess(self, places: Array) -> tuple[Array, Array]:
+        """Postures (P, n) on cubic curves between the points of the arc, and directions there."""
+        q, t, at = self._nodes
+        k = np.clip(np.searchsorted(at, places, side="right") - 1, 0, len(at) - 2)
+        h = (at[k + 1] - at[k])[:, None]
+        return evaluate_cubic(q[k], q[k + 1], t[k], t[k + 1], h, (places - at[k])[:, None] / np.maximum(h, 1e-300))
+
+    @cached_property
+    def _nodes(self) -> tuple[Array, Array, Array]:
+        """Points (P, n), exact at the ends and nearly so between, tangents, and their places (P,)."""
+        curve, parts, before = self.curve, [], 0.0
+        along = curve.places
+        for piece in self.pieces:
+            inner = np.flatnonzero((along > piece.begin + 1e-12) & (along < piece.end - 1e-12))
+            (first, t_first), (last, t_last) = (curve.point(place) for place in (piece.begin, piece.end))
+            shift = _TURN * np.array(piece.turns)
+            q = np.vstack([first, curve.q[inner], last]) + shift
+            t = np.vstack([t_first, curve.tangent[inner], t_last])
+            at = np.concatenate([[piece.begin], along[inner], [piece.end]]) - piece.begin + before
+            parts.append((q, t, at))
+            before = at[-1]
+        # Pieces meet at the first point of the curve.
+        kept = [slice(0, None if k + 1 == len(parts) else -1) for k in range(len(parts))]
+        q, t, at = (np.concatenate([part[i][cut] for part, cut in zip(parts, kept, strict=True)]) for i in range(3))
+        return q, t, at
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SelfMotions(Shown):
+    """All postures within the joint limits with one task value; `Arm.self_motion` finds them."""
+
+    maps: ArmMaps
+    target: Array  #: the task value as the kernel takes it
+    components: tuple[Arc, ...]  #: the longest first
+    curves: int  #: number of curves without limits, of which the components are parts
+
+    @cached_property
+    def x(self) -> Array:
+        """The task value, (m,)."""
+        return np.asarray(self.maps.targets.vector(self.target[None])[0])
+
+    @property
+    def length(self) -> float:
+        """Length of all components in joint space [rad] or [m]."""
+        return sum(arc.length for arc in self.components)
+
+    def __len__(self) -> int:
+        return len(self.components)
+
+    def __iter__(self) -> Iterator[Arc]:
+        return iter(self.components)
+
+    def sample(self, n: int, metric: Metric | MetricSpec = "euclidean") -> Array:
+        """About n postures at equal distances along all components, (about n, joints), at least two on each.
+
+        Args:
+            n: their number.
+            metric: as in `Arc.sample`, where each component by itself has equal distances.
+        """
+        require_count("n", n, least=2, most=RULES.most)
+        counts = [max(2, round(n * arc.length / self.length)) for arc in self.components]
+        parts = [arc.sample(count, metric) for arc, count in zip(self.components, counts, strict=True)]
+        return np.vstack([np.empty((0, self.maps.robot.n)), *parts])
+
+    def nearest(self, q: ArrayLike) -> Place:
+        """The posture nearest to q (n,), by |q - q_wish| with full turns of joints without limits left out.
+
+        Raises:
+            InvalidValueError: if there are no components.
+        """
+        wish = as_point("q", q, self.maps.robot.n)
+        self._require_components()
+        arcs = self.components
+        shares = np.arange(RULES.parts) / RULES.parts
+        nodes = [arc._nodes for arc in arcs]
+        places = [np.concatenate([(at[:-1] + np.diff(at) * u) for u in shares] + [at[-1:]]) for _, _, at in nodes]
+        owners = np.repeat(np.arange(len(arcs)), [len(part) for part in places])
+        guesses = np.vstack([arc._guess(part)[0] for arc, part in zip(arcs, places, strict=True)])
+        distances = (self.measure_away(guesses, wish) ** 2).sum(axis=1)
+        along = np.concatenate(places)
+        order, chosen = np.argsort(distances), list[int]()
+        for row in order[: RULES.parts * RULES.candidates].tolist():
+            apart = [owners[row] != owners[other] or abs(along[row] - along[other]) > RULES.largest for other in chosen]
+            near = np.sqrt(distances[row]) < np.sqrt(distances[order[0]]) + RULES.largest
+            if all(apart) and near and len(chosen) < RULES.candidates:
+                chosen.append(row)
+        found = [self._refine(int(owners[row]), float(along[row]), wish) for row in chosen]
+        return min(found, key=lambda place: place.value)
+
+    def best(self, f: Callable[[Array], ArrayLike]) -> Place:
+        """The posture at which a function is largest, such as the distance from limits.
+
+        It is evaluated at postures 0.05 rad or m apart on all components, and then between the best of them.
+
+        Args:
+            f: joint positions (N, n) -> values (N,).
+
+        Raises:
+            InvalidValueError: if there are no components, or f returns something else.
+        """
+        self._require_components()
+
+        def evaluate(q: Array) -> Array:
+            values = as_float_array("what f returns", call_user("f", "a function of joint positions (N, n)", f, q))
+            if values.shape != (len(q),):
+                raise InvalidValueError("what f returns", f"shape {values.shape}", f"({len(q)},)")
+            return np.where(np.isnan(values), -np.inf, values)
+
+        counts = [max(2, int(arc.length / RULES.spacing) + 2) for arc in self.components]
+        places = [np.linspace(0.0, arc.length, count) for arc, count in zip(self.components, counts, strict=True)]
+        q = np.vstack([arc.at(part) for arc, part in zip(self.components, places, strict=True)])
+        values = evaluate(q)
+        row, owners = int(np.argmax(values)), np.repeat(np.arange(len(counts)), counts)
+        k = int(owners[row])
+        arc, at, step = self.components[k], float(np.concatenate(places)[row]), self.components[k].length / counts[k]
+        low, high = max(0.0, at - 2 * step), min(arc.length, at + 2 * step)
+        best = Place(q[row], float(values[row]), k, at)
+        ratio = (np.sqrt(5) - 1) / 2
+        for _ in range(RULES.golden):
+            pair = np.array([high - ratio * (high - low), low + ratio * (high - low)])
+            tried = arc.at(pair)
+            first, second = evaluate(tried)
+            j = 0 if first >= second else 1
+            if (first, second)[j] > best.value:
+                best = Place(tried[j], float((first, second)[j]), k, float(pair[j]))
+            low, high = (low, pair[1]) if j == 0 else (pair[0], high)
+            if high - low < RULES.refined:
+                break
+        return best
+
+    def facts(self) -> dict[str, str]:
+        """How many components there are, how long, and what stops them."""
+        closed = sum(arc.closed for arc in self.components)
+        stops: dict[str, int] = {}
+        for arc in self.components:
+            for stop in () if arc.closed else arc.ends:
+                stops[str(stop)] = stops.get(str(stop), 0) + 1
+        most = sorted(stops.items(), key=lambda item: -item[1])[:5]
+        return {
+            "self-motions": f"{len(self)} arcs of length {self.length:.4g}, {closed} of them closed",
+            **({"stopped by": "; ".join(f"{name} ({count})" for name, count in most)} if most else {}),
+        }
+
+    def _require_components(self) -> None:
+        if not self.components:
+            raise InvalidValueError("x", self.x.tolist(), "a task value that a posture within the limits has")
+
+    def measure_away(self, q: Array, wish: Array) -> Array:
+        """q - wish (N, n), without full turns of joints without limits."""
+        robot, turning = self.maps.robot, self.maps.turning
+        free = turning & np.isinf(robot.lower) & np.isinf(robot.upper)
+        return np.asarray(wrap_shortest(q - wish, np.where(free, _TURN, 0.0)))
+
+    def _refine(self, k: int, place: float, wish: Array) -> Place:
+        """The nearest posture on an arc next to a place of it: secants for (q - wish) . t = 0 along the arc."""
+        arc = self.components[k]
+        best, before, slope = Place(wish, np.inf, k, place), (0.0, 0.0), 1.0
+        for number in range(RULES.refinements):
+            q, t = arc.at(place), arc.direction(place)
+            away = self.measure_away(q[None], wish)[0]
+            gap, pull = float(np.linalg.norm(away)), float(away @ t)
+            if gap < best.value:
+                best = Place(wish + away, gap, k, place)
+            if number > 0 and place != before[0]:
+                slope = max(RULES.least_slope, (pull - before[1]) / (place - before[0]))
+            new = place - float(np.clip(pull / slope, -RULES.largest, RULES.largest))
+            new = new % arc.length if arc.closed else min(max(new, 0.0), arc.length)
+            before, place, moved = (place, pull), new, abs(new - place)
+            if moved < RULES.refined:
+                break
+        return best
+
+
+def find_motions(maps: ArmMaps, target: Array, *starts: Array) -> SelfMotions:
+    """All self-motions of a target (k,), from starts (S, n) of one's own and from stored postures."""
+    curves = maps.find_curves(target, *starts)
+    arcs = [arc for curve in curves for arc in cut_curve(maps, target, curve)]
+    arcs.sort(key=lambda arc: -arc.length)
+    return SelfMotions(maps, target, tuple(arcs), len(curves))
+
+
+def cut_curve(maps: ArmMaps, target: Array, curve: Curve) -> list[Arc]:
+    """The arcs of a curve within the limits: for each number of full turns of the joints, where all are inside."""
+    # Full turns after which each joint is within its limits at the begin.
+    present: list[set[int]] = []
+    for q, (low, high, turns) in zip(curve.q[0].tolist(), maps.limits, strict=True):
+        if turns and math.isfinite(low):
+            lowest, highest = math.ceil((low - q) / _TURN), math.floor((high - q) / _TURN)
+            present.append(set(range(lowest, highest + 1)))
+        else:
+            present.append({0} if low <= q <= high else set())
+    opened = Stop(StopKind.SINGULAR)
+    seam = Stop(StopKind.ENDLESS) if curve.closed else opened
+    active: dict[tuple[int, ...], tuple[float, Stop]] = dict.fromkeys(product(*present), (0.0, seam))
+    pieces: list[tuple[Piece, Stop, Stop]] = []
+    found, stops = curve.crossings, maps.stops
+    columns = (found[name].tolist() for name in ("place", "joint", "side", "turns", "rises"))
+    for place, i, side, turns, rises in zip(*columns, strict=True):
+        k, enters, stop = -turns, side != rises, stops[i][side]
+        if enters and k not in present[i]:
+            present[i].add(k)
+            others = [part if j != i else {k} for j, part in enumerate(present)]
+            active |= dict.fromkeys(product(*others), (place, stop))
+        elif not enters and k in present[i]:
+            present[i].remove(k)
+            for lift in [lift for lift in active if lift[i] == k]:
+                begin, began = active.pop(lift)
+                pieces.append((Piece(begin, place, lift), began, stop))
+    whole = float(curve.places[-1])
+    pieces += [(Piece(begin, whole, lift), began, seam) for lift, (begin, began) in active.items()]
+    if not curve.closed:
+        return [Arc(maps, target, curve, (piece,), (began, ended), False) for piece, began, ended in pieces]
+    return _join_at_seam(maps, target, curve, pieces, seam)
+
+
+def _join_at_seam(
+    maps: ArmMaps, target: Array, curve: Curve, pieces: list[tuple[Piece, Stop, Stop]], seam: Stop
+) -> list[Arc]:
+    """Arcs of pieces of a closed curve that go on beyond its last point."""
+    winding = np.where(np.isfinite(maps.robot.lower), np.rint((curve.q[-1] - curve.q[0]) / _TURN), 0.0)
+    winding = np.where(maps.turning, winding, 0.0).astype(int)
+    begins = {piece.turns: k for k, (piece, began, _) in enumerate(pieces) if began is seam}
+    follower: dict[int, int] = {}
+    for k, (piece, _, ended) in enumerate(pieces):
+        if ended is seam:
+            after = tuple((np.array(piece.turns) + winding).tolist())
+            if after in begins:
+                follower[k] = begins[after]
+    arcs, used = [], set[int]()
+    heads = [k for k in range(len(pieces)) if k not in follower.values()]
+    for head in [*heads, *range(len(pieces))]:
+        if head in used:
+            continue
+        chain, k = [head], head
+        used.add(head)
+        while k in follower and follower[k] not in used:
+            k = follower[k]
+            chain.append(k)
+            used.add(k)
+        closed = follower.get(k) == head
+        ends = (pieces[head][1], pieces[k][2])
+        arcs.append(Arc(maps, target, curve, tuple(pieces[j][0] for j in chain), ends, closed))
+    return arcs

@@ -1,0 +1,296 @@
+"""Positions inside the domain that keep the task: with any xi, and, r > 1, with the nearest."""
+
+from dataclasses import dataclass
+from functools import reduce
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.charts.curve_tracer import CurveTracer, Traces, without_turns
+from orthocas.charts.descent import RULES as DESCENT
+from orthocas.charts.descent import BoxedPhi, descend
+from orthocas.charts.newton import inverses
+from orthocas.charts.search import Starts
+from orthocas.charts.slide import RULES as SLIDE
+from orthocas.charts.slide import slide
+from orthocas.tasks.samples import sample_uniform
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, Indices
+
+
+@dataclass(frozen=True, slots=True)
+class InsideRules:
+    """Numbers of the search. Chosen on pr2-left-wide, held on other seeds and charts (benchmarks/round_trips.py)."""
+
+    starts: int = 8  #: stored positions near x, where no q with x is known inside
+    near_phi: int = 2  #: stored positions near each phi, from which curves are sought on each slice
+    near_x: int = 4  #: the same near each x
+    places: tuple[float, ...] = (-1.0, -0.5, 0.0, 0.5, 1.0)  #: of the first held joint on slices, in half-widths
+    stride: int = 3  #: of the points inside on curves, those taken, from where a curve enters the domain
+    slack: float = 0.1  #: [rad] or [m]: points of curves so far outside the box are moved to its face
+    probes: int = 64  #: positions at which the speeds of joints are measured
+    near: int = 2  #: stored positions near each phi from which slides start
+    short: int = 10  #: points on curves from which slides start
+    steps: int = 4  #: of these slides
+    long: int = 4  #: longer slides from the best of these
+    more: int = 8  #: steps of these slides
+    settled: float = 1e-5  #: error of x up to which their ends are compared
+    last: int = 1  #: slides to the end
+    again: int = 8  #: stored positions near phi, and as many near x, for rows with nothing inside until then
+    descent: int = 16  #: iterations to x from these
+    most: int = 100  #: points nearest to xi, of which those are chosen
+    apart: float = 0.2  #: their least distance from one another, in half-widths
+    nearly: float = 1e-4  #: distance in xi after a short slide from which a long one most probably ends at a solution
+    rows: int = 1024  #: whose points are held in memory
+
+
+RULES = InsideRules()
+
+
+@dataclass(frozen=True, eq=False)
+class Inside:
+    """Finds points of the domain that keep the task."""
+
+    boxed: BoxedPhi
+    starts: Starts
+
+    def with_task(self, targets: Array, q: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Points of the box with the task values of targets (N, n), or near them, from q (N, n) and other starts.
+
+        Returns:
+            q (N, n), and which of them have the task values, (N,).
+        """
+        end = descend(self.boxed.task_equations, targets, self.boxed.of_points(q))
+        u, error = end.u, end.error
+        left = np.flatnonzero(error > DESCENT.kept)
+        if left.size:
+            points = Points.of(self.starts.nearest(targets[left], RULES.starts, self.boxed.m), self.boxed, left)
+            end = descend(self.boxed.task_equations, targets[points.row], points.u)
+            farthest_first = np.argsort(-end.error, kind="stable")  # what is written last stays
+            better = farthest_first[end.error[farthest_first] < error[points.row[farthest_first]]]
+            u[points.row[better]], error[points.row[better]] = end.u[better], end.error[better]
+        return self.boxed.points(u), np.asarray(error <= DESCENT.kept)
+
+    def nearest(self, targets: Array, q: Array) -> tuple[Array, Array]:
+        """Points of the domain with task values as in targets (N, n), and the nearest xi.
+
+        They are the nearest of those that slides from q (N, n) and from points of slices find.
+
+        Returns:
+            q (N, n), and |xi - xi(q)|, (N,), infinite where none was found.
+        """
+        best, distance = q.copy(), np.full(len(q), np.inf)
+        for first in range(0, len(q), RULES.rows):
+            rows = slice(first, first + RULES.rows)
+            best[rows], distance[rows] = self._nearest(targets[rows], q[rows])
+        return best, distance
+
+    def nearer(self, targets: Array, q: Array) -> Array:
+        """Points of the domain as near to xi as those that steps from q (N, n), inside, lead to, (N, n)."""
+        end = slide(self.boxed, targets, self.boxed.of_points(q))
+        good = np.isfinite(end.distance) & (end.error <= SLIDE.kept)
+        return np.where(good[:, None], self.boxed.points(end.u), q)
+
+    def _nearest(self, targets: Array, q: Array) -> tuple[Array, Array]:
+        """The same for few rows: short slides from many points, long ones from the best of their ends."""
+        N, n = q.shape
+        near = np.concatenate([q[None], self.starts.nearest(targets, RULES.near, n)])
+        ends = self._slid(targets, self._turned(targets, Points.of(near, self.boxed), q), RULES.steps)
+        left, bare = np.flatnonzero(ends.best(N)[1] > RULES.nearly), np.zeros(0, dtype=np.int64)
+        if left.size:
+            on_slices = self._ranked(targets, self._slices.points(targets, q, left), q)
+            bare = np.setdiff1d(left, on_slices.row)
+            starts = on_slices.apart(N, RULES.short).joined(self._again(targets, q, bare))
+            ends = ends.joined(self._slid(targets, starts, RULES.steps))
+        ends = self._to_end(targets, ends, N)
+        lost = np.setdiff1d(np.flatnonzero(np.isinf(ends.best(N)[1])), bare)
+        if lost.size:
+            more = self._slid(targets, self._again(targets, q, lost), RULES.more)
+            ends = ends.joined(self._to_end(targets, more, N))
+        (place, distance), u = ends.best(N), self.boxed.of_points(q)
+        found = np.isfinite(distance)
+        u[found] = ends.u[place[found]]
+        return self.boxed.points(u), distance
+
+    def _to_end(self, targets: Array, ends: "Points", N: int) -> "Points":
+        """Where long slides from the best of some ends, and slides to the end from the best of those, keep x."""
+        ends = self._slid(targets, ends.apart(N, RULES.long), RULES.more)
+        return ends.joined(self._slid(targets, ends.apart(N, RULES.last, RULES.settled), SLIDE.most)).kept()
+
+    def _again(self, targets: Array, q: Array, left: Indices) -> "Points":
+        """Stored positions for some rows, and points inside to which descents from these lead."""
+        if not left.size:
+            return Points.of(q[None, left], self.boxed)
+        components = q.shape[1], self.boxed.m
+        near = [self.starts.nearest(targets[left], RULES.again, count) for count in components]
+        points = Points.of(np.concatenate([q[None, left], *near]), self.boxed, left)
+        end = descend(self.boxed.task_equations, targets[points.row], points.u, RULES.descent)
+        kept = (end.error <= DESCENT.kept) & self.boxed.domain.contains(self.boxed.points(end.u))
+        return points.joined(Points(points.row[kept], end.u[kept], *np.zeros((2, kept.sum()))))
+
+    def _slid(self, targets: Array, points: "Points", most: int) -> "Points":
+        """Where slides from points end."""
+        end = slide(self.boxed, targets[points.row], points.u, most)
+        return Points(points.row, end.u, end.distance, end.error)
+
+    def _ranked(self, targets: Array, points: "Points", q: Array) -> "Points":
+        """Points after full turns, and about how far joints have to move from there to xi."""
+        points = self._turned(targets, points, q)
+        J = self.boxed.phi_map.jacobian(self.boxed.points(points.u)) * self.boxed.domain.half_width
+        with np.errstate(all="ignore"):
+            reach = np.linalg.norm(inverses(J)[0][:, :, self.boxed.m :], axis=(1, 2))
+        return Points(points.row, points.u, points.away * reach, np.zeros(len(points.row)))
+
+    def _turned(self, targets: Array, points: "Points", q: Array) -> "Points":
+        """Points after the full turns near those of q (N, n) that bring xi nearest to targets (N, n)."""
+        (turns, shifts), turn = self._turns, 2 * np.pi / self.boxed.domain.half_width
+        u = points.u - np.where(
+            turns.any(axis=0), turn * np.round((points.u - self.boxed.of_points(q)[points.row]) / turn), 0.0
+        )
+        away = np.linalg.norm(self.boxed.xi_gaps(targets[points.row], self.boxed.points(u))[:, None] - shifts, axis=2)
+        return Points(points.row, u + turn * turns[np.argmin(away, axis=1)], away.min(axis=1), points.error)
+
+    @cached_property
+    def _slices(self) -> "Slices":
+        return Slices(self.boxed, self.starts)
+
+    @cached_property
+    def _turns(self) -> tuple[Array, Array]:
+        """Choices of full turns of joints that add the same to xi everywhere, (T, n), and what they add, (T, r)."""
+        winds = self.boxed.winding & self.boxed.even
+        turns = np.array(list(product(*((-1.0, 0.0, 1.0) if joint else (0.0,) for joint in winds))))
+        return turns, turns @ np.where(winds[:, None], self.boxed.turned[0], 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """P points of the box, of any rows."""
+
+    row: Indices  #: (P,)
+    u: Array  #: (P, n)
+    away: Array  #: |xi - xi(q)|, or what points are chosen by, (P,); infinite outside the domain
+    error: Array  #: largest error of x, (P,)
+
+    @classmethod
+    def of(cls, q: Array, boxed: BoxedPhi, rows: Indices | None = None) -> "Points":
+        """S positions of each of N rows, q (S, N, n), which may be some of more rows."""
+        row = np.tile(np.arange(q.shape[1]) if rows is None else rows, len(q))
+        return cls(row, boxed.of_points(q.reshape(-1, q.shape[2])), *np.full((2, len(row)), np.nan))
+
+    def part(self, which: NDArray[np.bool_] | Indices) -> "Points":
+        """Some of them."""
+        return Points(*(array[which] for array in vars(self).values()))
+
+    def kept(self) -> "Points":
+        """Those inside that have x."""
+        return self.part((self.error <= SLIDE.kept) & np.isfinite(self.away))
+
+    def joined(self, other: "Points") -> "Points":
+        """Both."""
+        return Points(*(np.concatenate(pair) for pair in zip(vars(self).values(), vars(other).values(), strict=True)))
+
+    def best(self, N: int) -> tuple[Indices, Array]:
+        """Which point with nearly x is the nearest of each of N rows, and how near it is, (N,); infinite for none."""
+        away = np.where(self.error <= SLIDE.bent, self.away, np.inf)
+        order, distance = np.argsort(-away, kind="stable"), np.full(N, np.inf)
+        place = np.zeros(N, dtype=np.int64)
+        place[self.row[order]], distance[self.row[order]] = order, away[order]  # what is written last stays
+        return place, distance
+
+    def apart(self, N: int, count: int, settled: float = SLIDE.bent) -> "Points":
+        """Up to so many of the best points of each of N rows that lie apart; one alone of rows nearly solved.
+
+        Points with errors of x up to `settled` come first, then those with the least distance.
+        """
+        order = np.lexsort((self.away, self.error > settled, self.row))
+        order = order[np.isfinite(self.away[order])]
+        if not order.size:
+            return self.part(order)
+        row = self.row[order]
+        rank = np.arange(len(row)) - np.searchsorted(row, np.arange(N))[row]
+        order, row, rank = (array[rank < RULES.most] for array in (order, row, rank))
+        place = np.full((N, RULES.most), -1)
+        place[row, rank] = order
+        u, left, chosen = self.u[place], place >= 0, [np.zeros(0, dtype=np.int64)]
+        for _ in range(count):
+            first = np.argmax(left, axis=1)
+            rows = np.flatnonzero(left.any(axis=1))
+            if not rows.size:
+                break
+            best = place[rows, first[rows]]
+            chosen.append(best)
+            left[rows] &= np.abs(u[rows] - self.u[best][:, None]).max(axis=2) >= RULES.apart
+            left[rows[(self.away[best] <= RULES.nearly) & (self.error[best] <= settled)]] = False
+        return self.part(np.concatenate(chosen))
+
+
+@dataclass(frozen=True, eq=False)
+class Slices:
+    """Finds positions with the task values x, and any xi, r > 1.
+
+    Where r - 1 joints are held, all positions of a regular x form closed curves, as they do for r = 1. The held joints
+    are those that move x least over their ranges: the first of them at its boundaries and between, the others where
+    stored positions near x have them. So the curves pass through most of the regions that positions with x form.
+    """
+
+    boxed: BoxedPhi
+    starts: Starts
+
+    def points(self, targets: Array, own: Array, rows: Indices) -> Points:
+        """Points of the domain with x nearly as in some rows of targets (N, n).
+
+        Joints are turned towards given positions (N, n), where they can turn more than once; those without boundaries
+        whose turns change xi unevenly towards the centre of the domain, and once more to both sides.
+        """
+        domain, (low, high), turning = self.boxed.domain, self.boxed.domain.bounds, self.tracer.turning
+        uneven = turning & ~np.isfinite(low) & ~self.boxed.even
+        several = ~uneven & ((domain.half_width > np.pi) | ~np.isfinite(low))
+        turns = 2 * np.pi * np.array(list(product(*((-1, 0, 1) if more else (0,) for more in uneven))))
+        found = [Points.of(own[:0, None], self.boxed)]
+        with np.errstate(all="ignore"):
+            for traces in self._curves(targets[rows]):
+                curve, place = np.nonzero(np.arange(traces.q.shape[1]) < traces.count[:, None])
+                row, q = rows[traces.row[curve] // len(RULES.places)], traces.q[curve, place]
+                towards = np.where(several, own[row], domain.centre)
+                q = towards + without_turns(q - towards, turning)
+                back = (q < low - RULES.slack) * 1 - (q > high + RULES.slack) * 1
+                q = turns[:, None] + q + np.where(turning, 2 * np.pi * back, 0.0)
+                inside = np.asarray(((q >= low - RULES.slack) & (q <= high + RULES.slack)).all(axis=2))
+                number = np.arange(inside.size).reshape(inside.shape)
+                enters = inside & ~np.roll(inside, 1, axis=1)
+                inside &= (number - np.maximum.accumulate(np.where(enters, number, 0), axis=1)) % RULES.stride == 0
+                inside[inside] = domain.contains(np.clip(q[inside], low, high))
+                found.append(Points.of(q[None, inside], self.boxed, np.broadcast_to(row, inside.shape)[inside]))
+        return reduce(Points.joined, found)
+
+    def _curves(self, targets: Array) -> list[Traces]:
+        """Curves of all slices; number k of K of target j is row K j + k."""
+        m, n, K = self.boxed.m, targets.shape[1], len(RULES.places)
+        near = self.starts.nearest(targets, RULES.near_phi, n), self.starts.nearest(targets, RULES.near_x, m)
+        start = np.repeat(np.concatenate(near).transpose(1, 0, 2), K, axis=0)
+        held, domain = list(self.tracer.held), self.boxed.domain
+        places = domain.centre[held[0]] + domain.half_width[held[0]] * np.array(RULES.places)
+        start[:, :, held[0]] = np.tile(places, len(targets))[:, None]
+        x = np.concatenate(
+            [np.repeat(targets[:, :m], K, axis=0)[:, None].repeat(start.shape[1], axis=1), start[:, :, held]], axis=2
+        )
+        q, arrived = self.tracer.reach(x.reshape(-1, n - 1), start.reshape(-1, n))
+        q, known, found = q.reshape(start.shape), ~arrived.reshape(start.shape[:2]), []
+        away = self.tracer.away(q)
+        while not known.all():
+            left = np.flatnonzero(~known.all(axis=1))
+            first = np.argmin(np.where(known[left], np.inf, away[left]), axis=1)
+            found.append(self.tracer.trace(x[left, first], q[left, first], left))
+            known[left, first] = True
+            on = np.flatnonzero(~known[left].all(axis=1))
+            known[left[on]] |= self.tracer.on_curves(q[left[on]], found[-1].part(on))
+        return found
+
+    @cached_property
+    def tracer(self) -> CurveTracer:
+        """Traces the curves."""
+        q = sample_uniform(self.boxed.domain, RULES.probes, 0)
+        J = self.boxed.phi_map.jacobian(q)[:, : self.boxed.m] / self.boxed.phi_map.sizes[: self.boxed.m, None]
+        reach = np.nanmean(np.linalg.norm(J, axis=1), axis=0) * self.boxed.domain.half_width
+        return CurveTracer(self.boxed, tuple(int(j) for j in np.argsort(reach)[: q.shape[1] - self.boxed.m - 1]))

@@ -1,0 +1,201 @@
+"""`oc.Arm`: task values in all forms, postures with x and xi, and files."""
+
+import pickle
+import zipfile
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import orthocas as oc
+from orthocas.arms import Postures
+from orthocas.charts.inverse import InverseStatus
+from orthocas.errors import ChartFileError, InvalidValueError, NotRedundantError, OrthocasError, UnknownNameError
+from orthocas.tools.checks import Array
+from orthocas.tools.progress import Progress
+
+
+@cache
+def panda() -> oc.Arm:
+    chart = oc.load("panda-wide")
+    return oc.Arm(chart.problem.task, (chart,))
+
+
+@cache
+def planar() -> oc.Arm:
+    """A chart of two turning joints bent one way, made by a fit of one branch."""
+    known = oc.problems.get("planar_3r_xy")
+    bent = oc.Box([0.0, 1.3, 1.3], [3.0, 1.2, 1.2])
+    fit = oc.fit_wide(known.robot, known.task, bent, parametrisation=oc.Polynomial(3, ["q1"]))
+    return oc.Arm(known.task, (fit.chart,))
+
+
+def inside(arm: oc.Arm, count: int, seed: int) -> Array:
+    """Postures of the domain of the arm's chart."""
+    return np.asarray(arm.charts[0].problem.domain.sample(count, seed))
+
+
+def test_forms_of_a_task_value_are_one() -> None:
+    arm, q = panda(), inside(panda(), 1, 0)[0]
+    p, R = arm.robot.tip_position(q), arm.robot.tip_rotation(q)
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = R, p
+    turn = pin.Quaternion(np.asarray(R))
+    wxyz = np.array([turn.w, turn.x, turn.y, turn.z])
+    for x in (matrix, (p, R), (p, wxyz), (p, -wxyz), pin.SE3(np.asarray(R), np.asarray(p))):
+        assert arm.nearest(x, q).q == pytest.approx(q, abs=1e-9)
+    several = arm.solve([pin.SE3(matrix), pin.SE3(matrix)], start=q)
+    assert several.q == pytest.approx(np.array([q, q]), abs=1e-9)
+
+
+def test_batches_of_x_and_xi_are_solved_within_the_limits() -> None:
+    arm, q = panda(), inside(panda(), 30, 1)
+    x, xi = arm.x(q), arm.charts[0].xi(q)[:, 0]
+    found = arm.solve(x, xi)
+    assert found.found.all()
+    assert np.abs(arm.x(found.q) - x).max() < 1e-8
+    assert found.xi == pytest.approx(xi, abs=1e-8)
+    assert set(found.branch) == set(arm.branch_names)
+    assert ((found.q >= arm.robot.lower) & (found.q <= arm.robot.upper)).all()
+
+
+def test_xi_that_no_posture_has_gives_the_nearest() -> None:
+    arm, q = panda(), inside(panda(), 1, 2)[0]
+    found = arm.solve(arm.x(q), 50.0)
+    assert found.status is InverseStatus.NEAREST
+    assert arm.x(found.q) == pytest.approx(arm.x(q), abs=1e-9)
+    dense = np.vstack([arc.at(np.linspace(0, arc.length, 500)) for arc in arm.solutions(arm.x(q))])
+    dense = dense[arm.charts[0].problem.domain.contains(dense)]
+    assert found.xi >= arm.charts[0].xi(dense).max() - 0.05
+
+
+def test_where_charts_hold_no_posture_x_is_met_all_the_same() -> None:
+    arm = panda()
+    x = arm.x(arm.robot.sample(40, seed=0))
+    found = arm.solve(x, 0.2)
+    assert {InverseStatus(k).name for k in found.status} == {"FOUND", "NEAREST", "OUTSIDE_DOMAIN"}
+    assert np.abs(arm.x(found.q) - x).max() < 1e-8
+    assert [name == "" for name in found.branch] == (found.status == InverseStatus.OUTSIDE_DOMAIN).tolist()
+
+
+def test_without_xi_the_posture_is_the_nearest_to_the_start() -> None:
+    arm, q = panda(), inside(panda(), 5, 3)
+    found = arm.solve(arm.x(q), start=q + 0.05)
+    for posture, x, near in zip(found.q, arm.x(q), q + 0.05, strict=True):
+        dense = np.vstack([arc.at(np.linspace(0, arc.length, 500)) for arc in arm.solutions(x)])
+        assert np.linalg.norm(posture - near) <= np.linalg.norm(dense - near, axis=1).min() + 1e-9
+
+
+def test_without_a_start_the_posture_is_far_from_limits() -> None:
+    arm, q = panda(), inside(panda(), 1, 4)[0]
+    found, (low, high) = arm.solve(arm.x(q)), (arm.robot.lower, arm.robot.upper)
+    dense = np.vstack([arc.at(np.linspace(0, arc.length, 500)) for arc in arm.solutions(arm.x(q))])
+    room = (np.minimum(dense - low, high - dense) / (high - low)).min(axis=1)
+    assert (np.minimum(found.q - low, high - found.q) / (high - low)).min() >= room.max() - 1e-6
+
+
+def test_solutions_with_xi_are_those_of_newtons_method() -> None:
+    """Newton's method on x and xi from 300 starts in the domain finds no other."""
+    arm, chart = panda(), panda().charts[0]
+    for q in inside(arm, 2, 5):
+        phi = chart.phi(q)
+        found = arm.solutions(phi[:6], float(phi[6]))
+        assert isinstance(found, Postures)
+        assert np.abs(chart.phi(found.q) - phi).max() < 1e-8
+        again = chart.solve(np.tile(phi, (300, 1)), inside(arm, 300, 6))
+        others = again.q[again.found]
+        assert len(others) > 0
+        gaps = np.linalg.norm(others[:, None] - found.q[None], axis=2).min(axis=1)
+        assert gaps.max() < 1e-6
+
+
+def test_a_branch_can_be_asked_for() -> None:
+    arm, q = panda(), inside(panda(), 1, 7)[0]
+    name = arm.branch_names[0]
+    found = arm.solve(arm.x(q), start=q, branch=name)
+    assert found.branch == name
+    with pytest.raises(UnknownNameError, match="branch"):
+        arm.solve(arm.x(q), branch="elbow?")
+
+
+def test_rows_that_fail_do_not_disturb_others() -> None:
+    arm, q = planar(), np.array([0.3, 0.9, 0.8])
+    found = arm.solve([[np.nan, 0.0], arm.x(q), [9.0, 0.0]], start=q)
+    assert [InverseStatus(k).name for k in found.status] == ["BAD_INPUT", "FOUND", "NOT_FOUND"]
+    assert found.q[1] == pytest.approx(q, abs=1e-9)
+    assert np.isnan(found.q[[0, 2]]).all()
+    assert found.branch[1:] == (arm.branch_names[0], "")
+
+
+def test_an_arm_comes_back_from_its_file(tmp_path: Path) -> None:
+    arm, q = planar(), np.array([0.3, 0.9, 0.8])
+    arm.save(tmp_path / "a.arm")
+    for other in (oc.Arm.load(tmp_path / "a.arm"), pickle.loads(pickle.dumps(arm))):
+        assert other.branch_names == arm.branch_names
+        assert other.x(q) == pytest.approx(arm.x(q), abs=0)
+        assert other.solve(arm.x(q), 0.2).q == pytest.approx(arm.solve(arm.x(q), 0.2).q, abs=1e-9)
+
+
+def test_damaged_arm_files_are_refused(tmp_path: Path) -> None:
+    file, damaged = tmp_path / "a.arm", tmp_path / "b.arm"
+    planar().save(file)
+    content = file.read_bytes()
+    damaged.write_bytes(content[: len(content) // 2])
+    with pytest.raises(ChartFileError, match=r"b\.arm"):
+        oc.Arm.load(damaged)
+    with zipfile.ZipFile(file) as whole, zipfile.ZipFile(damaged, "w") as copy:
+        for name in whole.namelist():
+            data = whole.read(name)
+            copy.writestr(name, data if not name.endswith(".npy") else data[:-1] + bytes([data[-1] ^ 1]))
+    with pytest.raises(ChartFileError, match="edited"):
+        oc.Arm.load(damaged)
+    planar().charts[0].save(damaged, force=True)
+    with pytest.raises(ChartFileError, match="expected 'orthocas-arm'"):
+        oc.Arm.load(damaged)
+    with pytest.raises(ChartFileError, match="did not write"):
+        planar().save(damaged)
+
+
+@pytest.mark.slow
+def test_a_fit_has_a_chart_of_each_branch() -> None:
+    """A planar arm has one branch; the fit reports its progress under the branch's number."""
+    known, stages = oc.problems.get("planar_3r_xy"), set[str]()
+
+    def watch(progress: Progress) -> None:
+        stages.add(progress.stage.partition(",")[0])
+
+    arm = oc.Arm.fit(known.robot, known.task, monitor=watch)
+    assert (len(arm.charts), stages) == (1, {"branch 1 of 1"})
+    q = np.array([0.3, 0.9, 0.8])
+    assert arm.solve(arm.x(q), start=q).branch == arm.branch_names[0]
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: oc.Arm(oc.problems.get("iiwa").task), "n - m = 4"),
+        (lambda: oc.Arm(3), "a Task"),  # type: ignore[arg-type]
+        (lambda: oc.Arm(planar().task, (panda().charts[0],)), "charts"),
+        (lambda: oc.Arm(panda().task).save("a.arm"), "without charts"),
+        (lambda: oc.Arm(panda().task).solve(np.zeros(6), 0.1), "without charts"),
+        (lambda: panda().self_motion([0.0, 1.0]), "shape"),
+        (lambda: panda().self_motion(np.zeros((2, 6))), "one task value"),
+        (lambda: panda().self_motion(np.full(6, np.nan)), "NaN"),
+        (lambda: panda().solve(np.diag([2.0, 2.0, 2.0, 1.0])), "rotation"),
+        (lambda: panda().tracker(np.full(7, 9.0)), "within the joint limits"),
+    ],
+)
+def test_bad_input_is_named(call: object, words: str) -> None:
+    assert callable(call)
+    with pytest.raises(OrthocasError, match=words):
+        call()
+
+
+def test_an_arm_needs_one_joint_more_than_its_task() -> None:
+    robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[1.0, 1.0])
+    with pytest.raises(NotRedundantError):
+        oc.Arm(oc.Task.position(robot, "xy"))
+    with pytest.raises(InvalidValueError, match="n - m = 2"):
+        oc.Arm(oc.Task.position(oc.problems.get("planar_3r_xy").robot, "x"))

@@ -1,0 +1,215 @@
+"""The self-motions of a pose: all postures within the limits are on their arcs, and nothing else is."""
+
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from conftest import arm as read_arm
+from programs import needs_c
+from random_arms import random_arm
+
+import orthocas as oc
+from orthocas.arms.kernel import CompiledKernel, Curve
+from orthocas.arms.maps import ArmMaps
+from orthocas.arms.numpy_kernel import NumpyKernel
+from orthocas.arms.self_motion import SelfMotions, find_motions
+from orthocas.errors import InvalidValueError
+from orthocas.tasks.domains import StopKind
+from orthocas.tools.checks import Array
+
+
+@cache
+def panda() -> oc.Arm:
+    return oc.Arm(oc.load("panda-wide").problem.task)
+
+
+@cache
+def planar() -> oc.Arm:
+    return oc.Arm(oc.problems.get("planar_3r_xy").task)
+
+
+def postures(arm: oc.Arm, count: int, seed: int) -> Array:
+    low, high = np.maximum(arm.robot.lower, -np.pi), np.minimum(arm.robot.upper, np.pi)
+    return np.random.default_rng(seed).uniform(low, high, (count, arm.robot.n))
+
+
+def newton(arm: oc.Arm, target: Array, q: Array) -> Array:
+    """Postures within the limits where damped least squares from q (S, n) end, if x is met there."""
+    lower, upper, targets, q = arm.robot.lower, arm.robot.upper, np.tile(target, (len(q), 1)), q.copy()
+    for _ in range(40):
+        e, J = arm.maps.evaluate(q, targets)
+        error, gram = np.abs(e).max(axis=1), J @ J.transpose(0, 2, 1)
+        damping = np.where(error > 0.1, 1e-2, np.where(error > 1e-3, 1e-6, 1e-14)) * np.trace(gram, axis1=1, axis2=2)
+        y = np.linalg.solve(gram + damping[:, None, None] * np.eye(e.shape[1]), e[:, :, None])
+        step = (J.transpose(0, 2, 1) @ y)[:, :, 0]
+        q += step * np.minimum(1.0, 0.7 / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-300))
+    bounded = np.isfinite(lower) & arm.maps.turning
+    q[:, bounded] = lower[bounded] + (q[:, bounded] - lower[bounded]) % (2 * np.pi)
+    met = np.abs(arm.maps.evaluate(q, targets)[0]).max(axis=1) < 1e-9
+    return np.asarray(q[met & ((q >= lower) & (q <= upper)).all(axis=1)])
+
+
+def require_all_found(arm: oc.Arm, seed: int, poses: int, starts: int) -> None:
+    """Postures that Newton's method finds are on the arcs, and these keep x and the limits."""
+    for target in arm.maps.targets_of(postures(arm, poses, seed)):
+        motions = find_motions(arm.maps, target)
+        ends = newton(arm, target, postures(arm, starts, seed + 1))[:100]
+        assert len(ends) > 0
+        assert max(motions.nearest(q).value for q in ends) < 1e-6
+        q = np.vstack([arc.q for arc in motions])
+        assert np.abs(arm.maps.evaluate(q, np.tile(target, (len(q), 1)))[0]).max() < 1e-10
+        assert ((q >= arm.robot.lower) & (q <= arm.robot.upper)).all()
+
+
+def test_postures_of_newtons_method_are_on_the_arcs_of_panda() -> None:
+    require_all_found(panda(), seed=1, poses=5, starts=100)
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3])
+def test_postures_of_newtons_method_are_on_the_arcs_of_random_positions(seed: int) -> None:
+    """Four joints, some of them sliding, turning up to 6 rad either way."""
+    require_all_found(oc.Arm(oc.Task.position(random_arm(np.random.default_rng(seed), 4, 0.25))), seed, 2, 60)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["iiwa7-wide", "xarm7-wide", "baxter-left-wide"])
+def test_postures_of_newtons_method_are_on_the_arcs_of_other_arms(name: str) -> None:
+    require_all_found(oc.Arm(oc.Task.pose(oc.load(name).robot)), seed=2, poses=2, starts=100)
+
+
+@pytest.mark.slow
+def test_postures_of_newtons_method_are_on_the_arcs_of_other_tasks() -> None:
+    rng = np.random.default_rng(5)
+    require_all_found(oc.Arm(oc.Task.position_and_axis(random_arm(rng, 6, 0.0))), 1, 1, 60)
+    require_all_found(oc.Arm(oc.Task.pose(random_arm(rng, 7, 0.2), axis="z")), 2, 1, 60)
+    require_all_found(oc.Arm(oc.Task.orientation(random_arm(rng, 4, 0.0))), 3, 1, 60)
+
+
+def test_pinocchio_finds_the_pose_at_all_postures() -> None:
+    model, tip = read_arm("panda")
+    data, frame = model.createData(), model.getFrameId(tip)
+
+    def place(q: Array) -> pin.SE3:
+        pin.framesForwardKinematics(model, data, q)
+        return data.oMf[frame].copy()
+
+    for q in postures(panda(), 3, 8):
+        pose = place(q)
+        for posture in panda().self_motion(pose).sample(40):
+            assert np.abs(place(posture).homogeneous - pose.homogeneous).max() < 1e-9
+
+
+def test_ends_are_limits_and_next_to_them_arcs_would_leave() -> None:
+    arm = panda()
+    for q in postures(arm, 5, 3):
+        for arc in arm.self_motion(arm.x(q)):
+            assert not arc.closed
+            for stop, end, inside in zip(arc.ends, (0.0, arc.length), (1e-4, arc.length - 1e-4), strict=True):
+                k = arm.robot.joint_names.index(stop.joint)
+                posture, before = arc.at(end), arc.at(inside)
+                assert stop.is_limit
+                assert stop.value in (arm.robot.lower[k], arm.robot.upper[k])
+                assert posture[k] == pytest.approx(stop.value, abs=1e-12)
+                assert abs(before[k] - stop.value) > 1e-9
+
+
+def test_arcs_of_joints_with_several_turns_differ_by_whole_turns() -> None:
+    arm = oc.Arm(oc.Task.pose(oc.load("xarm7-wide").robot))
+    q = postures(arm, 1, 3)[0]
+    shifted = q.copy()
+    shifted[0] += 2 * np.pi if q[0] < 0 else -2 * np.pi
+    motions = arm.self_motion(arm.x(q))
+    assert motions.nearest(q).value < 1e-9
+    assert motions.nearest(shifted).value < 1e-9
+    assert motions.nearest(q).component != motions.nearest(shifted).component
+
+
+def test_planar_arm_without_limits_has_one_closed_arc() -> None:
+    q = np.array([0.3, 0.9, 0.8])
+    motions = planar().self_motion(planar().x(q))
+    assert [arc.closed for arc in motions] == [True]
+    assert motions.components[0].ends[0].kind is StopKind.ENDLESS
+    ends = motions.components[0].at([0.0, motions.length])
+    turned = (ends[1] - ends[0]) / (2 * np.pi)
+    assert np.abs(turned - np.round(turned)).max() < 1e-9
+    there = motions.nearest(q + np.array([0.0, 0.0, 2 * np.pi]))  # a turn of an endless joint does not count
+    assert there.value < 1e-9
+
+
+def test_points_on_an_arc_are_as_far_apart_as_their_places() -> None:
+    arc = panda().self_motion(panda().x(postures(panda(), 1, 4)[0])).components[0]
+    q = arc.at(np.linspace(0.0, arc.length, 20_001))
+    assert np.linalg.norm(np.diff(q, axis=0), axis=1).sum() == pytest.approx(arc.length, rel=1e-4)
+
+
+def test_samples_have_equal_distances_in_their_metric() -> None:
+    arc = panda().self_motion(panda().x(postures(panda(), 1, 4)[0])).components[0]
+    q = arc.sample(201, "inertia")
+    M, steps = panda().robot.mass_matrix((q[1:] + q[:-1]) / 2), np.diff(q, axis=0)
+    lengths = np.sqrt(np.einsum("ki,kij,kj->k", steps, M, steps))
+    assert lengths.max() / lengths.min() < 1.02
+    assert np.array_equal(q[[0, -1]], arc.at([0.0, arc.length]))
+
+
+def test_nearest_posture_is_nearer_than_dense_samples() -> None:
+    motions = panda().self_motion(panda().x(postures(panda(), 1, 4)[0]))
+    dense = np.vstack([arc.at(np.linspace(0.0, arc.length, 2000)) for arc in motions])
+    for wish in postures(panda(), 10, 6):
+        found = motions.nearest(wish)
+        assert found.value <= np.linalg.norm(dense - wish, axis=1).min() + 1e-9
+        assert found.value == pytest.approx(np.linalg.norm(found.q - wish))
+
+
+def test_best_posture_is_better_than_dense_samples() -> None:
+    motions = panda().self_motion(panda().x(postures(panda(), 1, 4)[0]))
+    found = motions.best(lambda q: -np.abs(q[:, 2] - 0.3))
+    dense = np.vstack([arc.at(np.linspace(0.0, arc.length, 2000)) for arc in motions])
+    assert found.value >= (-np.abs(dense[:, 2] - 0.3)).max() - 1e-9
+    with pytest.raises(InvalidValueError, match="what f returns"):
+        motions.best(lambda q: q)
+
+
+def are_same(kernel: NumpyKernel, target: Array, first: list[Curve], second: list[Curve]) -> bool:
+    """Whether each curve of one list is a curve of the other."""
+
+    def lies(curve: Curve, others: list[Curve]) -> bool:
+        rows = (0, len(curve.q) // 3, len(curve.q) // 2)
+        return any(all(kernel.lies_on(target, other, curve.q[k], curve.tangent[k]) for k in rows) for other in others)
+
+    return all(lies(curve, second) for curve in first) and all(lies(curve, first) for curve in second)
+
+
+@needs_c
+@pytest.mark.parametrize("seed", [1, 2])
+def test_compiled_and_numpy_find_the_same_curves(seed: int) -> None:
+    arm = panda()
+    compiled, plain = arm.maps, ArmMaps(arm.task, compiled=False)
+    assert isinstance(compiled.kernel, CompiledKernel)
+    assert isinstance(plain.kernel, NumpyKernel)
+    for target in compiled.targets_of(postures(arm, 2, seed)):
+        first, second = compiled.find_curves(target), plain.find_curves(target)
+        assert are_same(plain.kernel, target, first, second)
+        assert sum(len(curve.crossings) for curve in first) == sum(len(curve.crossings) for curve in second)
+        lengths = [sum(arc.length for arc in find_motions(maps, target)) for maps in (compiled, plain)]
+        assert lengths[0] == pytest.approx(lengths[1], rel=1e-5)
+
+
+@needs_c
+def test_no_curve_is_found_twice() -> None:
+    arm = panda()
+    kernel = ArmMaps(arm.task, compiled=False).kernel
+    assert isinstance(kernel, NumpyKernel)
+    for target in arm.maps.targets_of(postures(arm, 10, 9)):
+        curves = arm.maps.find_curves(target)
+        for k, curve in enumerate(curves):
+            others = curves[:k] + curves[k + 1 :]
+            assert not any(kernel.lies_on(target, other, curve.q[3], curve.tangent[3]) for other in others)
+
+
+def test_out_of_reach_there_is_no_arc() -> None:
+    motions = planar().self_motion([9.0, 0.0])
+    assert (len(motions), motions.length, motions.sample(5).shape) == (0, 0.0, (0, 3))
+    assert isinstance(motions, SelfMotions)
+    with pytest.raises(InvalidValueError, match="within the limits"):
+        motions.nearest([0.0, 0.0, 0.0])

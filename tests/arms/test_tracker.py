@@ -1,0 +1,183 @@
+"""Trackers of arms: x and xi where they can be had, x first elsewhere, and the nearest x out of reach."""
+
+import pickle
+from functools import cache
+
+import numpy as np
+import pytest
+
+import orthocas as oc
+from orthocas.arms import ArmTracker, TrackStatus
+from orthocas.arms.tracker import _solve_by_steps, solve_in_box
+from orthocas.errors import InvalidValueError
+from orthocas.tools.checks import Array
+
+PERIOD = 0.01
+
+
+@cache
+def panda() -> oc.Arm:
+    chart = oc.load("panda-wide")
+    return oc.Arm(chart.problem.task, (chart,))
+
+
+def centre() -> Array:
+    return np.array(panda().charts[0].problem.domain.centre)
+
+
+def lead(tracker: ArmTracker, targets: Array, xi: float | None = None) -> list[TrackStatus]:
+    """The status of each call; each keeps the limits of position and velocity."""
+    robot, found = panda().robot, []
+    for x in targets:
+        before = tracker.q
+        q = tracker.step(x, xi)
+        assert (np.abs(q - before) <= robot.velocity_limits * PERIOD * (1 + 1e-9)).all()
+        assert ((q >= robot.lower) & (q <= robot.upper)).all()
+        found.append(tracker.status)
+    return found
+
+
+def along(x: Array, way: Array, steps: int) -> Array:
+    """Targets from x to x + way."""
+    shares = (1 - np.cos(np.linspace(0, np.pi, steps))) / 2
+    targets = np.tile(x, (steps, 1))
+    targets[:, : len(way)] += shares[:, None] * way
+    return targets
+
+
+def test_inside_a_chart_x_and_xi_are_met() -> None:
+    arm, chart, q = panda(), panda().charts[0], centre()
+    tracker, phi = arm.tracker(q, period=PERIOD), chart.phi(centre())
+    targets = along(phi[:6], np.array([0.1, 0.1, -0.1]), 200)
+    for x, xi in zip(targets, phi[6] + np.linspace(0.0, 0.2, 200), strict=True):
+        posture = tracker.step(x, xi)
+        assert tracker.status is TrackStatus.OK
+        assert np.abs(chart.phi(posture) - np.append(x, xi)).max() < 1e-8
+    assert tracker.xi == pytest.approx(phi[6] + 0.2, abs=1e-8)
+    assert tracker.branch == arm.branch_names[0]
+
+
+def test_out_of_reach_it_rests_at_a_minimum_and_comes_back_with_its_xi() -> None:
+    arm, q = panda(), centre()
+    tracker, x = arm.tracker(q, period=PERIOD), arm.x(q)
+    far = along(x, np.array([0.9, 0.0, 0.0]), 200)
+    assert TrackStatus.NEAREST not in lead(tracker, far)
+    statuses = lead(tracker, np.tile(far[-1], (100, 1)))
+    rest = tracker.q
+    assert statuses[-1] is TrackStatus.NEAREST
+    assert (tracker.step(far[-1]) == rest).all()
+    # No posture nearby is nearer.
+    target = arm.maps.targets.build(far[-1:])
+    nearby = np.clip(rest + 0.02 * np.random.default_rng(0).normal(size=(2000, 7)), arm.robot.lower, arm.robot.upper)
+    errors = np.linalg.norm(arm.maps.evaluate(np.vstack([rest, nearby]), np.tile(target, (2001, 1)))[0], axis=1)
+    assert errors[0] <= errors[1:].min() + 1e-6
+    statuses = lead(tracker, np.vstack([far[::-1], np.tile(x, (100, 1))]))
+    assert statuses[-1] is TrackStatus.OK
+    assert tracker.q == pytest.approx(q, abs=1e-7)
+
+
+def test_jumps_are_followed_as_fast_as_joints_may() -> None:
+    arm, rng = panda(), np.random.default_rng(1)
+    tracker, x = arm.tracker(centre(), period=PERIOD), arm.x(centre())
+    low, high = arm.robot.lower, arm.robot.upper
+    for q in rng.uniform(low, high, (6, 7)):
+        lead(tracker, np.tile(arm.x(q), (30, 1)), rng.uniform(-1, 1))
+    xi = float(panda().charts[0].xi(centre())[0])
+    statuses = lead(tracker, np.tile(x, (700, 1)), xi)
+    assert statuses[-1] in (TrackStatus.OK, TrackStatus.YIELDING)
+    assert np.abs(arm.x(tracker.q) - x).max() < 1e-8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["iiwa7-wide", "xarm7-wide", "baxter-left-wide"])
+def test_hostile_streams_neither_break_limits_nor_lose_the_arm(name: str) -> None:
+    """Jumps, targets out of reach and behind the base, NaN: afterwards, x of the begin is met again."""
+    chart, rng = oc.load(name), np.random.default_rng(4)
+    arm, home = oc.Arm(chart.task, (chart,)), chart.domain.centre
+    tracker, low, high = arm.tracker(home, period=PERIOD), arm.robot.lower, arm.robot.upper
+    x0, most = arm.x(home), arm.robot.velocity_limits * PERIOD * (1 + 1e-9)
+    for kind in range(4):
+        jumps = arm.x(rng.uniform(np.maximum(low, -np.pi), np.minimum(high, np.pi), (8, arm.robot.n)))
+        far = x0 + np.append(1.5 * rng.normal(size=3), np.zeros(3))
+        behind = x0 * np.array([-1, -1, 1, 1, 1, 1])
+        for x in (jumps, [far] * 8, [behind] * 8, [np.full(6, np.nan), *jumps])[kind]:
+            for _ in range(20):
+                before, q = tracker.q, tracker.step(x)
+                assert (np.abs(q - before) <= most).all()
+                assert ((q >= low) & (q <= high)).all()
+        for _ in range(600):
+            tracker.step(x0)
+        assert np.abs(arm.x(tracker.q) - x0).max() < 1e-8, kind
+
+
+def test_without_detours_the_error_of_a_target_at_rest_never_rises() -> None:
+    arm = panda()
+    for q in np.random.default_rng(2).uniform(arm.robot.lower, arm.robot.upper, (4, 7)):
+        tracker, x = arm.tracker(centre(), period=PERIOD, detours=False), arm.x(q)
+        target, errors = arm.maps.targets.build(x[None]), []
+        for _ in range(150):
+            e = arm.maps.evaluate(tracker.step(x)[None], target)[0]
+            errors.append(float(np.linalg.norm(e)))
+        assert (np.diff(errors) <= 1e-7).all()
+
+
+def test_targets_that_are_not_finite_leave_the_arm_where_it_is() -> None:
+    tracker, x = panda().tracker(centre()), panda().x(centre())
+    broken = np.eye(4)
+    broken[0, 3] = np.nan
+    for bad in (np.full(6, np.nan), np.append(x[:5], np.inf), broken):
+        assert (tracker.step(bad) == centre()).all()
+        assert tracker.status is TrackStatus.BAD_INPUT
+    assert (tracker.step(x, np.nan) == centre()).all()
+    assert tracker.status is TrackStatus.BAD_INPUT
+    tracker.step(x)
+    assert tracker.status is TrackStatus.OK
+
+
+def test_an_arm_without_charts_keeps_x() -> None:
+    arm = oc.Arm(oc.problems.get("planar_3r_xy").task)
+    q = np.array([0.3, 0.9, 0.8])
+    tracker, x = arm.tracker(q, velocity_limits=1.0), arm.x(q)
+    for target in x + np.linspace(0.0, 0.3, 100)[:, None] * [1.0, -1.0]:
+        tracker.step(target)
+        assert tracker.status is TrackStatus.OK
+        assert arm.x(tracker.q) == pytest.approx(target, abs=1e-9)
+    with pytest.raises(InvalidValueError, match="without charts"):
+        tracker.step(x, 0.1)
+
+
+def test_following_a_path_is_a_call_for_each_of_its_values() -> None:
+    arm, x = panda(), panda().x(centre())
+    targets = along(x, np.array([0.0, 0.2, 0.1]), 150)
+    q, statuses = arm.follow(targets, q=centre(), period=PERIOD)
+    tracker = arm.tracker(centre(), period=PERIOD)
+    assert statuses == tuple(lead(tracker, targets))
+    assert q[-1] == pytest.approx(tracker.q, abs=1e-12)
+    assert np.abs(arm.x(q) - targets).max() < 1e-8
+
+
+def test_a_copied_tracker_goes_on_where_the_first_one_is() -> None:
+    arm = panda()
+    tracker, x = arm.tracker(centre()), arm.x(centre())
+    ahead = np.array([0.003, 0.0, 0.0, 0.0, 0.0, 0.0])
+    tracker.step(x + ahead, None)
+    other = pickle.loads(pickle.dumps(tracker))
+    for target in (x + 2 * ahead, x):
+        assert other.step(target) == pytest.approx(tracker.step(target), abs=1e-9)
+
+
+def test_the_program_on_a_box_is_solved_by_both_active_sets() -> None:
+    """Its solution meets the conditions of Karush, Kuhn and Tucker."""
+    rng = np.random.default_rng(3)
+    for _ in range(200):
+        n = int(rng.integers(1, 8))
+        A, g = rng.normal(size=(n, n)), 3 * rng.normal(size=n)
+        H, low, high = A.T @ A + 1e-3 * np.eye(n), -rng.uniform(0, 1, n), rng.uniform(0, 1, n)
+        for solve in (solve_in_box, _solve_by_steps):
+            d = solve(H, g, low, high)
+            slope = g + H @ d
+            assert ((d >= low) & (d <= high)).all()
+            inner = (d > low + 1e-12) & (d < high - 1e-12)
+            assert np.abs(slope[inner]).max(initial=0.0) < 1e-8
+            assert (slope[d <= low + 1e-12] >= -1e-8).all()
+            assert (slope[d >= high - 1e-12] <= 1e-8).all()
