@@ -33,6 +33,7 @@ class ReportRules:
     degenerate: float = 0.1  #: 1 % quantile of the conditioning below which a chart is reported as degenerate
     samples: int = 100_000  #: by default
     seed: int = 1  #: by default
+    most: int = 10**18  #: samples of one call, which floats count
     telling: int = 200  #: samples by which idle joints are found
     alone: float = 1e-10  #: fraction of a gradient that counts as zero
     held: int = 20_000  #: most samples at which joints move with xi held
@@ -418,7 +419,7 @@ def evaluate(
 
 def _count(chart: Chart, samples: int) -> int:
     """The number of samples, if there is memory for them."""
-    count = require_count("samples", samples)
+    count = require_count("samples", samples, most=RULES.most)
     require_memory(f"evaluating {count} samples", 8.0 * count * chart.n * (2 * chart.n + 4))
     return count
 

@@ -19,6 +19,7 @@ from orthocas.robots.spatial import rotate_z_to
 from orthocas.robots.tree import BASE_JOINTS, KinematicTree
 from orthocas.robots.urdf import read_urdf
 from orthocas.tools.checks import Array, Indices
+from orthocas.tools.display import listed
 
 SAME_PLACE = 1e-6  #: between the joints of two files of one robot [m]
 
@@ -50,6 +51,8 @@ def place_links(
     # Joints, not tips: the tip may be that of a tool, which the file does not have.
     tips = [name.removesuffix(TOOL_SUFFIX) for name in (tree.tip_name, *tree.tips)]
     model = lock_joints(read_urdf(path, tips, locked), locked or {})
+    if lost := [name for name in tree.joint_names if name not in (*model.names, *BASE_JOINTS)]:
+        raise RobotError(f"{path} has the joints {listed(list(model.names)[1:])}, expected {listed(lost)} among them")
     model = lock_others(model, [i for i in range(1, model.njoints) if model.names[i] in tree.joint_names])
     base = sum(name in BASE_JOINTS for name in tree.joint_names)
     _require_same(path, model, tree, base)

@@ -15,6 +15,15 @@ from fuzz.words import NAMES, NUMBERS, VECTORS, Rng, pick
 from orthocas.tasks.domains import default_box
 from orthocas.viewer.looks import read_urdf_look
 
+_CORNERS = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))
+_MESH = "solid m\n{}endsolid m\n".format(
+    "".join(
+        "facet normal 0 0 0\nouter loop\n{}endloop\nendfacet\n".format(
+            "".join("vertex {} {} {}\n".format(*_CORNERS[k]) for k in range(4) if k != left)
+        )
+        for left in range(4)
+    )
+)
 _COLLIDED = 10  # joints of robots whose pairs are found
 _EVALUATED = 30  # joints of robots whose dynamics are built: it takes long for many
 _KINDS = (
@@ -93,6 +102,7 @@ def write(rng: Rng, folder: Path) -> Path:
     if mjcf:
         (folder / "part.xml").write_bytes(text_of(rng, mjcf_chain(rng, 1)))
     elif rng.random() < 0.4:
+        (folder / "m.stl").write_text(_MESH[: int(rng.integers(len(_MESH) // 2, 2 * len(_MESH)))])
         path.with_suffix(".srdf").write_bytes(text_of(rng, srdf(rng)))
     return path
 
@@ -130,7 +140,7 @@ def urdf_chain(rng: Rng, joints: int) -> Element:
         SubElement(inertial, "origin", xyz="0 0 0.1", rpy="0 0 0.2")
         SubElement(inertial, "mass", value="1.5")
         SubElement(inertial, "inertia", ixx="0.1", ixy="0", ixz="0", iyy="0.1", iyz="0", izz="0.1")
-        if rng.random() < 0.5:
+        if rng.random() < 0.8:
             collision = SubElement(link, "collision")
             SubElement(collision, "origin", xyz="0 0 0.1", rpy="0 0 0.2")
             kind = pick(rng, ("box", "sphere", "cylinder", "capsule", "mesh"))
