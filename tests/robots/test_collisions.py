@@ -265,6 +265,25 @@ def test_robots_without_solids_say_so(tmp_path: Path) -> None:
         oc.obstacles.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
 
 
+def test_rates_bound_how_fast_distances_change(tmp_path: Path) -> None:
+    """What conservative advancement rests on, for one joint at a time and for all."""
+    link = '<box size="0.3 0.05 0.1"/>'
+    robot = build_arm(tmp_path, [link, link, link, link])
+    pairs = [("link0", "link2"), ("link0", "link3"), ("link1", "link3")]
+    collisions = Collisions(robot.tree, robot.collisions.parts, pairs)
+    rng = np.random.default_rng(11)
+    q = rng.uniform(-3, 3, (400, 3))
+    moves = rng.normal(size=q.shape) * rng.choice([1e-3, 0.05, 0.5], size=(400, 1))
+    moves[:200] *= np.eye(3)[rng.integers(3, size=200)]
+    change = np.abs(collisions.pair_distances(q + moves) - collisions.pair_distances(q))
+    bound = np.abs(moves) @ collisions.rates.T
+    # Overlaps are known to 1e-6 m.
+    assert (change <= bound + 5e-6).all()
+    assert (change > 0.5 * bound).any()
+    # A joint that carries both of a pair moves neither against the other.
+    assert not collisions.rates[pairs.index(("link1", "link3")), 0]
+
+
 def test_ways_between_postures_hide_no_contact(tmp_path: Path) -> None:
     """A post of 2 mm, which no posture of the way touches: dense samples are the second route."""
     robot = build_arm(tmp_path, ["", '<box size="0.3 0.05 0.05"/>', '<box size="0.3 0.02 0.02"/>'])
