@@ -21,10 +21,11 @@ def main(
     seeds: Sequence[int] = (0, 1),
     more: Sequence[Path] = (),
     quick: bool = False,
+    methods: Sequence[str] = (),
 ) -> dict[str, dict[str, object]]:
-    """Run, and keep the results unless it is quick."""
+    """Run, and keep the results unless it is quick; those of other methods, arms and seeds stay."""
     chosen = names or (QUICK if quick else tuple(scenarios()))
-    return measured(chosen, arms[:1] if quick else arms, seeds[:1] if quick else seeds, more, quick)
+    return measured(chosen, arms[:1] if quick else arms, seeds[:1] if quick else seeds, more, quick, only=methods)
 
 
 if __name__ == "__main__":
@@ -35,10 +36,11 @@ if __name__ == "__main__":
     parser.add_argument("--method", type=Path, action="append", default=[], help="a file with METHODS of your own")
     parser.add_argument("--quick", action="store_true", help="one arm, short runs; prints, and keeps nothing")
     parser.add_argument("--tune", action="store_true", help="choose the settings first (8 min)")
+    parser.add_argument("--methods", nargs="+", default=[], help="names of methods; others keep their results")
     options = parser.parse_args()
     if options.tune:
         tuning.main()
-    results = main(options.names, options.arms, options.seeds, options.method, options.quick)
+    results = main(options.names, options.arms, options.seeds, options.method, options.quick, options.methods)
     for name, result in results.items():
         print(f"{name}: {result['number']}")
         for method, row in result["methods"].items():  # type: ignore[attr-defined]

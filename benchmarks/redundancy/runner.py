@@ -57,15 +57,18 @@ def files_of(kind: str) -> list[Path]:
     return sorted(paths, key=lambda path: (ORDER.index(path.stem) if path.stem in ORDER else len(ORDER), path.stem))
 
 
-def methods(more: Iterable[Path] = ()) -> list[Any]:
-    """The classes of all methods, and of files outside."""
+def methods(more: Iterable[Path] = (), only: Sequence[str] = ()) -> list[Any]:
+    """The classes of all methods, or of some by their names, and of files outside."""
     found: list[Any] = []
     for path in (*files_of("methods"), *more):
         try:
             found += loaded(path).METHODS
         except ImportError as error:
             found.append(Missing(path, error))
-    return found
+    unknown = set(only) - {method.name for method in found}
+    if unknown:
+        raise ValueError(f"unknown methods {sorted(unknown)}, known: {', '.join(method.name for method in found)}")
+    return [method for method in found if not only or method.name in only]
 
 
 def scenarios() -> dict[str, Scenario]:
@@ -147,13 +150,19 @@ def built(method: Any, arm: Arm, settings: Mapping[str, Any]) -> Any:
 
 
 def on_arm(
-    name: str, mobile: bool, names: Sequence[str], seeds: Sequence[int], more: Sequence[Path], quick: bool
+    name: str,
+    mobile: bool,
+    names: Sequence[str],
+    seeds: Sequence[int],
+    more: Sequence[Path],
+    quick: bool,
+    only: Sequence[str],
 ) -> list[tuple[str, str, dict[str, Any]]]:
     """All cases of an arm: scenario, method, and what is kept. Methods are built once."""
     warnings.simplefilter("ignore")
     arm, found = Arm(name, mobile), []
     asked = [scenario for scenario in scenarios().values() if scenario.name in names and scenario.mobile == mobile]
-    for method in methods(more) if asked else ():
+    for method in methods(more, only) if asked else ():
         build = built(method, arm, settings_of(method))
         for scenario in asked:
             for seed in seeds:
@@ -168,14 +177,16 @@ def measured(
     more: Sequence[Path] = (),
     quick: bool = False,
     processes: int = 2,
+    only: Sequence[str] = (),
 ) -> dict[str, dict[str, Any]]:
-    """The content of the results' files, by scenario."""
-    tasks = [(name, mobile, names, seeds, more, quick) for mobile in (False, True) for name in arms]
+    """The content of the results' files, by scenario. What other methods, arms and seeds have there is kept."""
+    tasks = [(name, mobile, names, seeds, more, quick, only) for mobile in (False, True) for name in arms]
     known, cases, content = scenarios(), [], {}
     for found in _in_processes(tasks, processes):
         cases += found
         content = {
-            name: _file(known[name], [one for one in cases if one[0] == name], arms, seeds, more) for name in names
+            name: _file(known[name], [one for one in cases if one[0] == name], arms, seeds, methods(more, only))
+            for name in names
         }
         if not quick:
             save(content)  # what is there so far
@@ -192,10 +203,10 @@ def _in_processes(tasks: Sequence[Any], processes: int) -> Iterator[list[Any]]:
 
 
 def _file(
-    scenario: Scenario, cases: Sequence[Any], arms: Sequence[str], seeds: Sequence[int], more: Sequence[Path]
+    scenario: Scenario, cases: Sequence[Any], arms: Sequence[str], seeds: Sequence[int], run: Sequence[Any]
 ) -> dict[str, Any]:
     rows = {}
-    for method in methods(more):
+    for method in run:
         mine = [kept for _, name, kept in cases if name == method.name]
         mine.sort(key=lambda kept: (list(arms).index(kept["arm"]), kept["seed"]))
         rows[method.name] = {"versions": versions(method), "settings": settings_of(method), "cases": mine}
@@ -212,7 +223,24 @@ def _file(
 
 
 def save(found: Mapping[str, Mapping[str, Any]]) -> None:
-    """One file for each scenario."""
+    """One file for each scenario, with what others have measured there before."""
     RESULTS.mkdir(exist_ok=True)
     for name, content in found.items():
-        (RESULTS / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
+        path = RESULTS / f"{name}.json"
+        before = json.loads(path.read_text()) if path.exists() else {}
+        path.write_text(json.dumps(_join(before, content), indent=1) + "\n")
+
+
+def _join(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
+    """Results with those of before: of other methods, and of other arms and seeds of the same settings."""
+    if before.get("schema") != now["schema"]:
+        return dict(now)
+    arms = [name for name in SOURCES if name in {*before["arms"], *now["arms"]}]
+    rows = dict(before["methods"])
+    for name, row in now["methods"].items():
+        done = {(case["arm"], case["seed"]) for case in row["cases"]}
+        old = rows.get(name, row)
+        kept = [case for case in old["cases"] if (case["arm"], case["seed"]) not in done]
+        cases = [*row["cases"], *(kept if old["settings"] == row["settings"] else [])]
+        rows[name] = {**row, "cases": sorted(cases, key=lambda case: (arms.index(case["arm"]), case["seed"]))}
+    return {**now, "arms": arms, "seeds": sorted({*before["seeds"], *now["seeds"]}), "methods": rows}

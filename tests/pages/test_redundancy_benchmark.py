@@ -1,5 +1,6 @@
 """The benchmark of redundancy resolution: its arms, its judges, and a method from a file outside."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -122,3 +123,24 @@ def test_a_quick_run_with_a_method_from_a_file_outside(tmp_path: Path, monkeypat
     lines = redundancy_page.table(runner.scenarios()["drift"], found["drift"])
     assert [line.split("|")[1].strip() for line in lines[1:]] == ["chart, tight", "pseudo-inverse", "hold still"]
     redundancy_page.picture(runner.scenarios()["drift"], found["drift"]).savefig(tmp_path / "drift.png")
+
+
+def test_a_part_of_a_run_keeps_what_others_have_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows of other methods stay, and cases of other arms and seeds if the settings are the same."""
+    monkeypatch.setattr(runner, "RESULTS", tmp_path)
+
+    def content(arm: str, seed: int, value: float, **settings: float) -> dict[str, object]:
+        row = {"settings": settings, "cases": [{"arm": arm, "seed": seed, "value": value}]}
+        return {"schema": runner.SCHEMA, "arms": [arm], "seeds": [seed], "methods": {"one": row}}
+
+    def kept() -> dict[str, list[tuple[str, int, float]]]:
+        rows = json.loads((tmp_path / "drift.json").read_text())["methods"]
+        return {name: [tuple(case.values()) for case in row["cases"]] for name, row in rows.items()}
+
+    other = content("panda", 0, 5.0)
+    other["methods"] = {"other": {"settings": {}, "cases": [{"arm": "panda", "seed": 0, "value": 5.0}]}}
+    for results in (other, content("panda", 0, 1.0), content("iiwa", 1, 2.0), content("panda", 0, 3.0)):
+        runner.save({"drift": results})
+    assert kept() == {"other": [("panda", 0, 5.0)], "one": [("iiwa", 1, 2.0), ("panda", 0, 3.0)]}
+    runner.save({"drift": content("iiwa", 0, 4.0, clearance=0.2)})
+    assert kept()["one"] == [("iiwa", 0, 4.0)]
