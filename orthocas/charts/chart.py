@@ -15,6 +15,7 @@ from orthocas.charts.methods import InverseMethods
 from orthocas.charts.point_quality import PointQuality, point_quality
 from orthocas.charts.self_motion import SelfMotion, XiRange, self_motion, xi_range
 from orthocas.errors import InvalidValueError
+from orthocas.robots.collisions import Collisions
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, as_path, as_point_set, require_kind
 from orthocas.tools.display import Shown, listed
@@ -124,7 +125,7 @@ class Chart(InverseMethods, Shown):
         values = np.linalg.svd(J, compute_uv=False)
         return np.asarray(np.prod(values, axis=-1))
 
-    def xi_range(self, q: ArrayLike) -> XiRange:
+    def xi_range(self, q: ArrayLike, collisions: Collisions | None = None) -> XiRange:
         """How far each extra coordinate reaches alone from q, the task value and the other coordinates held.
 
         For each coordinate, the curve through q along which only that coordinate changes is followed in both directions
@@ -133,6 +134,8 @@ class Chart(InverseMethods, Shown):
 
         Args:
             q: a joint position (n,) inside the domain.
+            collisions: of the chart's robot, such as `robot.collisions`: a range ends where a pair touches, which its
+                stop names. Contacts deeper than 0.1 mm are not passed between steps.
 
         Returns:
             An `Interval` for each coordinate: lowest and highest value, and what stops it there.
@@ -152,9 +155,11 @@ class Chart(InverseMethods, Shown):
               low   joint 'q2' at 0.4073
               high  joint 'q3' at 0.4073
         """
-        return xi_range(self, q)
+        return xi_range(self, q, collisions)
 
-    def self_motion(self, q: ArrayLike, step: float = 0.05, samples: int = 1000) -> SelfMotion:
+    def self_motion(
+        self, q: ArrayLike, step: float = 0.05, samples: int = 1000, collisions: Collisions | None = None
+    ) -> SelfMotion:
         """What can move at the task value of q without leaving the domain.
 
         With r = 1 it is the curve through q, followed along the null space of J_x in both directions until it leaves
@@ -165,6 +170,7 @@ class Chart(InverseMethods, Shown):
             q: a joint position (n,) inside the domain.
             step: for r = 1: the largest distance of points along the curve [rad] or [m].
             samples: for r > 1: about how many points, at most 10,000.
+            collisions: as in `xi_range`; with r > 1, points of the set are free, the ways between them are not checked.
 
         Returns:
             Joint positions, their coordinates, and how far each coordinate reaches: exactly for r = 1, at least so far
@@ -184,7 +190,7 @@ class Chart(InverseMethods, Shown):
             >>> motion.closed, motion.q.shape[1], round(float(abs(chart.x(motion.q) - motion.x).max()), 9)
             (False, 3, 0.0)
         """
-        return self_motion(self, q, step, samples)
+        return self_motion(self, q, step, samples, collisions)
 
     def plot(self) -> "Figure":
         """The arm along each coordinate, as far as it reaches from the centre of the domain, with the task held.

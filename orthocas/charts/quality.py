@@ -1,5 +1,6 @@
 """The quality of a chart on its domain: angles and conditioning ([AS2023] Figs. 20 and 27), leaks and folds."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Self
@@ -12,6 +13,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import Judged, WorstPoints, measure_held_speeds, worst_points
 from orthocas.errors import InvalidValueError, SingularTaskError
+from orthocas.robots.collisions import Collisions
 from orthocas.tasks.samples import evaluate_samples, find_idle_joints, sample_uniform
 from orthocas.tools.batch import run_in_threads
 from orthocas.tools.checks import Array, Indices, as_point_set, require_count, require_kind, require_memory
@@ -31,10 +33,12 @@ class ReportRules:
     degenerate: float = 0.1  #: 1 % quantile of the conditioning below which a chart is reported as degenerate
     samples: int = 100_000  #: by default
     seed: int = 1  #: by default
+    most: int = 10**18  #: samples of one call, which floats count
     telling: int = 200  #: samples by which idle joints are found
     alone: float = 1e-10  #: fraction of a gradient that counts as zero
     held: int = 20_000  #: most samples at which joints move with xi held
     mostly: float = 0.9  #: quantile of their speeds there that is reported
+    postures: int = 10_000  #: most samples that are checked for collisions
 
 
 RULES = ReportRules()
@@ -210,6 +214,41 @@ class Conditioning:
         return cls(float(least), float(np.quantile(values, 0.01)), float(values.mean()))
 
 
+@dataclass(frozen=True, eq=False)
+class ContactShare:
+    """How many postures touch, of some of the samples of an evaluation."""
+
+    samples: int
+    touching: int
+    pair: tuple[str, str]  #: that touches most often, or the nearest one if none touches
+    deepest: float  #: least distance [m], negative if a pair overlaps
+
+    @classmethod
+    def of(cls, collisions: Collisions, points: Array) -> "ContactShare":
+        """Of postures (N, n)."""
+        found = collisions.distance(points)
+        touching = np.flatnonzero(found.distance <= 0)
+        pairs = Counter(found.pair[k] for k in touching)
+        k = int(np.argmin(found.distance))
+        pair = pairs.most_common(1)[0][0] if pairs else found.pair[k]
+        return cls(len(points), len(touching), pair, float(found.distance[k]))
+
+    @property
+    def fraction(self) -> float:
+        """Of the postures that touch."""
+        return self.touching / self.samples
+
+    def __str__(self) -> str:
+        first, second = self.pair
+        if not self.touching:
+            return f"none in {self.samples} samples; nearest '{first}' and '{second}', {self.deepest:.3g} m"
+        return f"{percent(self.fraction, 2, fault=True)} of the samples, most often '{first}' and '{second}'"
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain data."""
+        return collect_attributes(self, "samples", "touching", "fraction", "pair", "deepest")
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Report(Shown):
     """Quality of a chart on uniform samples of its domain, or at given joint positions."""
@@ -233,6 +272,7 @@ class Report(Shown):
     folded_samples: int  #: samples where det J has the opposite sign of most samples: the chart folds over
     idle_joints: tuple[str, ...]  #: names of joints that are exact coordinates themselves
     without_idle: Angles | None  #: angles of the other coordinates; None if no joint, or every coordinate, is idle
+    contacts: ContactShare | None = None  #: postures in which the robot hits itself; None if not asked for
 
     @property
     def degenerate(self) -> bool:
@@ -255,6 +295,7 @@ class Report(Shown):
             "conditioning": f"mean {values.mean:.3f}, 1 % quantile {values.p01:.3f}, min {values.min:.3g}",
             **({} if self.worst is None else {"searched": f"least conditioning {self.worst.explained}"}),
             **self._faults(),
+            **({} if self.contacts is None else {"collisions": str(self.contacts)}),
             "lengths": f"of gradients differ by a factor of {self.length_ratio:.3g} (99 % to 1 % quantile)",
             "samples": f"{self.samples} given" if self.seed is None else f"{self.samples} held out, seed {self.seed}",
         }
@@ -313,12 +354,18 @@ class Report(Shown):
             **collect_attributes(
                 self, "singular_samples", "folded_samples", "held_speed", "length_ratio", "degenerate"
             ),
+            **({} if self.contacts is None else {"contacts": self.contacts.as_dict()}),
         }
         return dict(clean(data))
 
 
 def evaluate(
-    chart: Chart, samples: int | None = None, seed: int | None = None, *, points: ArrayLike | None = None
+    chart: Chart,
+    samples: int | None = None,
+    seed: int | None = None,
+    *,
+    points: ArrayLike | None = None,
+    collisions: Collisions | None = None,
 ) -> Report:
     """Measure the quality of a chart on uniform samples of its domain. Use another seed than that of the fit.
 
@@ -335,6 +382,8 @@ def evaluate(
         samples: number of samples N. Default: 100,000.
         seed: seed of the samples. Default: 1.
         points: joint positions (N, n) or (n,) [rad] or [m] in place of samples, for example those of a path.
+        collisions: of the chart's robot, such as `robot.collisions`: the report says how many of up to 10,000 samples
+            touch.
 
     Raises:
         SingularTaskError: if a gradient vanishes, or a coordinate has no value, everywhere.
@@ -351,28 +400,33 @@ def evaluate(
         2
     """
     require_kind("chart", chart, Chart)
+    if collisions is not None:
+        require_kind("collisions", collisions, Collisions)
+        collisions.require_for(chart.problem.robot.tree)
     if points is None:
         count = _count(chart, RULES.samples if samples is None else samples)
         drawn = require_count("seed", RULES.seed if seed is None else seed, least=0)
         searched = isinstance(chart.coordinates, Coordinates) and not chart.problem.domain.full_turns
         problem, found = chart.problem, chart.coordinates
         worst = worst_points(problem, found, drawn, thorough=True) if searched else None
-        return _report(chart, sample_uniform(chart.problem.domain, count, drawn), drawn, worst)
+        return _report(chart, sample_uniform(chart.problem.domain, count, drawn), drawn, worst, collisions)
     if samples is not None or seed is not None:
         raise InvalidValueError("points", "given with samples or a seed", "points alone")
     given = as_point_set("points", points, chart.n)[0]
     _count(chart, len(given))
-    return _report(chart, given, None, None)
+    return _report(chart, given, None, None, collisions)
 
 
 def _count(chart: Chart, samples: int) -> int:
     """The number of samples, if there is memory for them."""
-    count = require_count("samples", samples)
+    count = require_count("samples", samples, most=RULES.most)
     require_memory(f"evaluating {count} samples", 8.0 * count * chart.n * (2 * chart.n + 4))
     return count
 
 
-def _report(chart: Chart, points: Array, seed: int | None, worst: WorstPoints | None) -> Report:
+def _report(
+    chart: Chart, points: Array, seed: int | None, worst: WorstPoints | None, collisions: Collisions | None
+) -> Report:
     judged = Judged.at(chart.problem, chart.coordinates, points)
     if len(judged.points) == 0:
         where = "given points" if seed is None else "samples of the domain"
@@ -402,6 +456,7 @@ def _report(chart: Chart, points: Array, seed: int | None, worst: WorstPoints | 
         folded_samples=int(min((judged.signs > 0).sum(), (judged.signs <= 0).sum())),
         idle_joints=tuple(name for name in idle.values() if name not in floating),
         without_idle=without_idle if idle and others else None,
+        contacts=None if collisions is None else ContactShare.of(collisions, points[: RULES.postures]),
     )
 
 

@@ -13,10 +13,11 @@ from orthocas.charts.descent import RULES as DESCENT
 from orthocas.charts.newton import Newton
 from orthocas.charts.phi import counted_on, largest, require_no_turns
 from orthocas.errors import InvalidValueError, degrees_hint
-from orthocas.tasks.domains import StopKind
+from orthocas.robots.collisions import Collisions
+from orthocas.tasks.domains import StopKind, Wall
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import sample_uniform
-from orthocas.tools.checks import Array, Indices, as_number, as_point, freeze_array, require_count
+from orthocas.tools.checks import Array, Indices, as_number, as_point, freeze_array, require_count, require_kind
 from orthocas.tools.display import Shown, listed, number_list
 from orthocas.tools.expressions import wrap_shortest
 
@@ -38,6 +39,8 @@ class SelfMotionRules:
     step: float = 0.1  #: [rad] or [m], of the widest step
     phi_tolerance: float = 1e-10  #: of phi, relative to `ChartParts.phi_sizes`
     farthest: float = 3.0  #: distance of a point from its neighbour, in lengths of the predicted step
+    grazing: float = 1e-4  #: [rad] or [m]: shorter steps are not checked for contacts between their ends
+    depth: float = 1e-4  #: [m] of contacts that may be passed between two steps
     most: int = 4  #: times as many points as wanted, at most
 
 
@@ -52,7 +55,7 @@ class Stop:
     joint: str = ""  #: name of the joint, for JOINT
     value: float = np.nan  #: position of that joint [rad] or [m], or what a condition of the domain bounds
     is_limit: bool = False  #: whether the boundary of the domain is the limit of the joint
-    condition: str = ""  #: in one line, for conditions of the domain
+    condition: str = ""  #: in one line, for conditions of the domain; the pair, for contacts
 
     def __str__(self) -> str:
         if self.kind is StopKind.JOINT:
@@ -61,6 +64,8 @@ class Stop:
             return f"the task near singular, with a relative singular value of {self.value:.3g}"
         if self.kind is StopKind.CONDITION:
             return f"the boundary of the domain ({self.condition})"
+        if self.kind is StopKind.CONTACT:
+            return f"a contact of {self.condition}"
         return {
             StopKind.FOLD: "a fold of the chart",
             StopKind.SINGULAR: "a singularity or the end of the chart",
@@ -75,6 +80,7 @@ class Stop:
         return {
             StopKind.NEAR_SINGULAR: "the task near singular",
             StopKind.CONDITION: self.condition,
+            StopKind.CONTACT: f"a contact of {self.condition}",
             StopKind.FOLD: "a fold",
             StopKind.SINGULAR: "a singularity",
             StopKind.ENDLESS: "no end",
@@ -85,14 +91,18 @@ class Walls:
     """The boundaries of a problem's domain as functions that are positive inside.
 
     They are (q_i - low_i) and (high_i - q_i), divided by the half-width of the domain, for every joint; then what the
-    domain itself names as its `walls`.
+    domain itself names as its `walls`; then the distance to a contact, if there are solids to hit.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, collisions: Collisions | None = None) -> None:
         domain = problem.domain
-        self._domain, self._robot = domain, problem.robot
+        self._domain, self._robot, self._collisions = domain, problem.robot, collisions
         self._low, self._high = domain.bounds
         self._curved = domain.walls
+        if collisions is not None:
+            require_kind("collisions", collisions, Collisions)
+            collisions.require_for(problem.robot.tree)
+            self._curved = (*domain.walls, Wall(StopKind.CONTACT, lambda q: float(collisions.distance(q).distance)))
         endless = np.isinf(self._low) & ~np.array(problem.robot.tree.prismatic)
         self.turning = endless  #: unbounded revolute joints, (n,): they are at the same place after a full turn
 
@@ -108,12 +118,26 @@ class Walls:
         n = len(q)
         if k >= 2 * n:
             wall = self._curved[k - 2 * n]
+            if wall.kind is StopKind.CONTACT and self._collisions is not None:
+                first, second = self._collisions.distance(q).pair
+                return Stop(wall.kind, condition=f"'{first}' and '{second}'")
             value = np.nan if wall.value is None else float(wall.value(q))
             return Stop(wall.kind, value=value, condition=wall.heading)
         i = k % n
         boundary, limit = (self._low, self._robot.lower) if k < n else (self._high, self._robot.upper)
         at_limit = bool(abs(boundary[i] - limit[i]) <= RULES.at_limit * self._domain.half_width[i])
         return Stop(StopKind.JOINT, self._robot.joint_names[i], float(boundary[i]), at_limit)
+
+    def may_touch(self, q: Array, t: Array, new: Array, onward: Array) -> bool:
+        """Whether a contact deeper than a tolerance may lie on an arc between joint positions (n,) with end tangents.
+
+        An arc whose tangent turns by an angle a is no farther from its chord c than (c / 2) tan(a / 2).
+        """
+        chord = float(np.linalg.norm(new - q))
+        if self._collisions is None or chord < RULES.grazing:
+            return False
+        bend = chord / 2 * float(np.tan(np.arccos(np.clip(t @ onward, 0.0, 1.0)) / 2))
+        return self._collisions.find_contact(np.array([q, new]), -RULES.depth, bend) is not None
 
     def worst(self, q: Array) -> Stop:
         """The boundary that q (n,) has crossed farthest, or is nearest to."""
@@ -151,10 +175,11 @@ class LevelCurve:
         chart: the chart. If only task components are held, its coordinates are not evaluated.
         held: indices of the held components, (n - 1,).
         step: length of the longest step [rad] or [m].
+        collisions: what the robot may hit; the curve ends at a contact.
     """
 
-    def __init__(self, chart: "Chart", held: Indices, step: float) -> None:
-        self.walls, self._step = Walls(chart.problem), step
+    def __init__(self, chart: "Chart", held: Indices, step: float, collisions: Collisions | None = None) -> None:
+        self.walls, self._step = Walls(chart.problem, collisions), step
         whole = bool((held >= chart.m).any())
         self._value, self._jacobian, self._difference = _of_phi(chart) if whole else _of_task(chart)
         self._held, self._sizes = held, chart.parts.phi_sizes[held]
@@ -177,6 +202,9 @@ class LevelCurve:
             if found is None:
                 h /= 2
                 stop = Stop(StopKind.SINGULAR) if h < RULES.shortest * self._step else None
+                continue
+            if self.walls.may_touch(points[-1], tangents[-1], *found):
+                h /= 2
                 continue
             if self._margin(*found, signs) < 0:
                 found, stop = self._end(points[-1], tangents[-1], h, target, signs)
@@ -352,10 +380,10 @@ class XiRange(Shown):
         }
 
 
-def xi_range(chart: "Chart", q: ArrayLike) -> XiRange:
+def xi_range(chart: "Chart", q: ArrayLike, collisions: Collisions | None = None) -> XiRange:
     """How far each coordinate reaches alone; see `Chart.xi_range`."""
-    start = start_inside(chart, q)
-    return XiRange(tuple(_interval(chart, start, k) for k in range(chart.r)), find_turn_shifts(chart))
+    start = start_inside(chart, q, collisions)
+    return XiRange(tuple(_interval(chart, start, k, collisions) for k in range(chart.r)), find_turn_shifts(chart))
 
 
 def find_turn_shifts(chart: "Chart") -> dict[str, Array]:
@@ -388,8 +416,8 @@ def too_far(chart: "Chart", q: Array, wanted: Array) -> str:
     return f"; {interval.label} = {wanted[k]:.4g} is asked for, {told}"
 
 
-def start_inside(chart: "Chart", q: ArrayLike) -> Array:
-    """One joint position (n,) inside the domain, where phi and J are finite.
+def start_inside(chart: "Chart", q: ArrayLike, collisions: Collisions | None = None) -> Array:
+    """One joint position (n,) inside the domain, where phi and J are finite and nothing touches.
 
     Raises:
         ShapeError, InvalidValueError: for anything else.
@@ -402,13 +430,18 @@ def start_inside(chart: "Chart", q: ArrayLike) -> Array:
         raise InvalidValueError("q", given, f"a point of the domain, which ends at {stop}{hint}")
     if not (np.isfinite(chart.phi(point)).all() and np.isfinite(chart.parts.batched_rates(point[None])).all()):
         raise InvalidValueError("q", given, "a point at which the chart is finite")
+    # Inside the domain only a contact can be beyond its wall.
+    if collisions is not None and (walls := Walls(chart.problem, collisions)).values(point).min() <= 0:
+        stop = walls.worst(point)
+        if stop.kind is StopKind.CONTACT:
+            raise InvalidValueError("q", given, f"a posture without {stop}")
     return point
 
 
-def branch_along(chart: "Chart", q: Array, k: int, sign: float) -> Branch:
+def branch_along(chart: "Chart", q: Array, k: int, sign: float, collisions: Collisions | None = None) -> Branch:
     """The curve from q (n,) on which x and all coordinates but the k-th stay, and that one rises (sign 1) or falls."""
     row = chart.m + k
-    curve = LevelCurve(chart, np.delete(np.arange(chart.n), row), RULES.step)
+    curve = LevelCurve(chart, np.delete(np.arange(chart.n), row), RULES.step, collisions)
 
     def rising(point: Array, t: Array) -> float:
         gradient = chart.coordinates.jacobian(point[None])[0, k]
@@ -422,8 +455,8 @@ def xi_along(chart: "Chart", points: Array) -> Array:
     return counted_on(chart.xi(points), chart.parts.turns[chart.m :])
 
 
-def _interval(chart: "Chart", q: Array, k: int) -> Interval:
-    down, up = branch_along(chart, q, k, -1.0), branch_along(chart, q, k, 1.0)
+def _interval(chart: "Chart", q: Array, k: int, collisions: Collisions | None) -> Interval:
+    down, up = (branch_along(chart, q, k, sign, collisions) for sign in (-1.0, 1.0))
     low, high = (float(xi_along(chart, branch.q)[-1, k]) for branch in (down, up))
     return Interval(
         chart.labels[chart.m + k],
@@ -468,8 +501,8 @@ def fan_along(chart: "Chart", q: Array, k: int) -> Fan:
     return Fan(chart.labels[chart.m + k], points, xi, arc_length, down.stop, up.stop)
 
 
-def filled(chart: "Chart", q: Array, alone: XiRange, samples: int) -> Array:
-    """Joint positions (N, n) with the task value of q (n,), inside the domain, q first.
+def filled(chart: "Chart", q: Array, alone: XiRange, samples: int, collisions: Collisions | None = None) -> Array:
+    """Joint positions (N, n) with the task value of q (n,), inside the domain and free, q first.
 
     Their coordinates lie on a lattice around xi(q). Its spacing divides the range of each coordinate alone so that
     about `samples` points result. The fill goes from point to neighbour, so that all points can be reached from q.
@@ -487,6 +520,7 @@ def filled(chart: "Chart", q: Array, alone: XiRange, samples: int) -> Array:
         targets = np.tile(start, (len(pairs), 1))
         targets[:, chart.m :] += places * spacing
         found, good = _solved(chart, np.array([known[origin] for origin, _ in pairs]), targets, float(sign))
+        good = good if collisions is None else good[collisions.check_free(found[good])]
         front = [pairs[row][1] for row in good]
         known.update(zip(front, found[good], strict=True))
     return np.array(list(known.values()))
@@ -568,19 +602,21 @@ class SelfMotionCurve(SelfMotion):
         }
 
 
-def self_motion(chart: "Chart", q: ArrayLike, step: float = 0.05, samples: int = 1000) -> SelfMotion:
+def self_motion(
+    chart: "Chart", q: ArrayLike, step: float = 0.05, samples: int = 1000, collisions: Collisions | None = None
+) -> SelfMotion:
     """The self-motion through a joint position; see `Chart.self_motion`."""
-    start = start_inside(chart, q)
+    start = start_inside(chart, q, collisions)
     longest = as_number("step", step)
     if not 1e-4 <= longest <= 0.5:
         raise InvalidValueError("step", step, "a length from 1e-4 to 0.5 [rad] or [m]")
     require_count("samples", samples, least=2, most=10_000)
-    return _curve(chart, start, longest) if chart.r == 1 else _set(chart, start, samples)
+    return _curve(chart, start, longest, collisions) if chart.r == 1 else _set(chart, start, samples, collisions)
 
 
-def _curve(chart: "Chart", q: Array, step: float) -> SelfMotionCurve:
+def _curve(chart: "Chart", q: Array, step: float, collisions: Collisions | None) -> SelfMotionCurve:
     """Both directions of the curve; the coordinate rises at q."""
-    curve = LevelCurve(chart, np.arange(chart.m), step)
+    curve = LevelCurve(chart, np.arange(chart.m), step, collisions)
     gradient = chart.parts.batched_rates(q[None])[0, chart.m]
     up = curve.follow(q, gradient)
     down = Branch(q[None], np.zeros(1), up.stop) if up.endless else curve.follow(q, -gradient)
@@ -602,22 +638,24 @@ def _curve(chart: "Chart", q: Array, step: float) -> SelfMotionCurve:
     )
 
 
-def _set(chart: "Chart", q: Array, samples: int) -> SelfMotion:
+def _set(chart: "Chart", q: Array, samples: int, collisions: Collisions | None) -> SelfMotion:
     """Points on a lattice in xi, and the extent from its outermost points on."""
     require_no_turns(chart.labels, chart.parts.turns, "a set of self-motions")
-    alone = xi_range(chart, q)
-    points = filled(chart, q, alone, samples)
+    alone = xi_range(chart, q, collisions)
+    points = filled(chart, q, alone, samples, collisions)
     xi = chart.xi(points)
-    widest = tuple(_widest(chart, points, xi, alone[k], k) for k in range(chart.r))
+    widest = tuple(_widest(chart, points, xi, alone[k], k, collisions) for k in range(chart.r))
     return SelfMotion(chart.x(q), points, xi, 0, XiRange(widest))
 
 
-def _widest(chart: "Chart", points: Array, xi: Array, alone: Interval, k: int) -> Interval:
+def _widest(
+    chart: "Chart", points: Array, xi: Array, alone: Interval, k: int, collisions: Collisions | None
+) -> Interval:
     """The extent of one coordinate: from the outermost points of a set along the coordinate to what stops it."""
     if not np.isfinite([alone.low, alone.high]).all():
         return alone
-    down = branch_along(chart, points[np.argmin(xi[:, k])], k, -1.0)
-    up = branch_along(chart, points[np.argmax(xi[:, k])], k, 1.0)
+    down = branch_along(chart, points[np.argmin(xi[:, k])], k, -1.0, collisions)
+    up = branch_along(chart, points[np.argmax(xi[:, k])], k, 1.0, collisions)
     low, high = (float(chart.xi(branch.q[-1])[k]) for branch in (down, up))
     return Interval(alone.label, alone.here, low, high, down.stop, up.stop)
 

@@ -16,6 +16,7 @@ from orthocas.errors import InvalidValueError, PathError, SolveError
 from orthocas.paths.joint_curve import JointCurve, LostCurve, PhiSolver, TimeLaw, compute_fastest_law, list_places
 from orthocas.paths.joint_motion import JointMotion, Margins
 from orthocas.paths.tool_path import RULES, ToolPath
+from orthocas.robots.collisions import Collisions
 from orthocas.robots.obstacles import LinkDistances, Obstacle
 from orthocas.robots.tree import require_driven
 from orthocas.tasks.samples import compute_row_scale, sample_uniform
@@ -40,6 +41,7 @@ def follow(
     obstacles: Sequence[Obstacle] = (),
     link_radius: ArrayLike = 0.0,
     clearance: float = 0.0,
+    collisions: Collisions | None = None,
 ) -> JointMotion:
     """Move the tool along a path: joint positions, velocities and accelerations on time stamps, from rest to rest.
 
@@ -62,10 +64,13 @@ def follow(
         acceleration_limits: (n,) or one number [rad/s^2] or [m/s^2]. Default: full speed within 0.5 s.
         obstacles: spheres, capsules and planes of `orthocas.robots.obstacles`, which the links must not touch.
         link_radius: radius of the links, see `orthocas.robots.obstacles.LinkDistances` [m].
-        clearance: smallest distance from obstacles [m].
+        clearance: smallest distance from obstacles, and of pairs of `collisions` [m].
+        collisions: of the chart's robot, such as `robot.collisions.with_scene(scene)`: no pair may come nearer than
+            the clearance, at the time stamps and between them.
 
     Raises:
-        PathError: if the path leaves the reach or the domain, or touches an obstacle. The message names the waypoint,
+        PathError: if the path leaves the reach or the domain, touches an obstacle, or a pair of `collisions` may come
+            nearer than the clearance; then the message names the pair and the time. The message names the waypoint,
             what stops the motion there, and how far the coordinates reach before it.
         InvalidValueError, ShapeError: for arguments of the wrong value or shape.
         NoExpressionError: for grown charts.
@@ -89,6 +94,9 @@ def follow(
     require_driven("following a path", chart.problem.robot.tree)
     # Raises for grown charts.
     chart.function("second_derivative")
+    if collisions is not None:
+        require_kind("collisions", collisions, Collisions)
+        collisions.require_for(chart.problem.robot.tree)
     start = chart.problem.domain.centre if q_start is None else as_point("q_start", q_start, chart.n)
     distances = LinkDistances(chart.problem.robot, obstacles, link_radius)
     limits = _read_limits(chart, velocity_limits, acceleration_limits, distances, clearance)
@@ -122,7 +130,10 @@ def follow(
     # The fastest s(t), then time stamps, slower until they keep the limits.
     _, first, second = curve.evaluate(list_places())
     law = compute_fastest_law(first, second, limits.velocity, limits.acceleration)
-    return _sample_on_stamps(path, curve, law, limits, stamp)
+    motion = _sample_on_stamps(path, curve, law, limits, stamp)
+    if collisions is not None:
+        limits.check_contacts(path, motion, collisions)
+    return motion
 
 
 def _read_limits(
@@ -240,6 +251,24 @@ class MotionLimits:
         kept = finite[self.chart.problem.domain.contains(q[finite]) & free]
         if len(kept) < len(q):
             raise self._build_error(path, s, q, int(np.setdiff1d(np.arange(len(q)), kept)[0]))
+
+    def check_contacts(self, path: ToolPath, motion: JointMotion, collisions: Collisions) -> None:
+        """Raise PathError where a pair may come nearer than the clearance, at time stamps or between them.
+
+        Between two stamps a motion is at most a h^2 / 8 from the straight way, with the limits a of acceleration.
+        """
+        bend = self.acceleration * (motion.times[1] - motion.times[0]) ** 2 / 8
+        contact = collisions.find_contact(motion.q, self.clearance, bend)
+        if contact is None:
+            return
+        k, (first, second) = contact.segment, contact.pair
+        instant = motion.times[k] + contact.fraction * (motion.times[1] - motion.times[0])
+        where = path.describe_place(float(motion.s[k]), self.chart.labels)
+        near = "touch" if contact.distance <= 0 else f"come to {contact.distance:.3g} m"
+        raise PathError(
+            f"the path cannot be followed {where}: at {instant:.3f} s '{first}' and '{second}' {near}, "
+            f"expected a distance above clearance = {self.clearance:g} m at and between all time stamps"
+        )
 
     def _build_error(self, path: ToolPath, s: Array, q: Array, k: int) -> PathError:
         """What is wrong with the k-th joint position."""

@@ -37,6 +37,9 @@ _KINDS = {
 Pose = tuple[ca.SX, ca.SX]  #: rotation (3, 3) and position (3, 1) [m] in the world
 
 
+TOOL_SUFFIX = " + tool"  #: of the name of a tip at the end of a tool
+
+
 def build_body_poses(tree: KinematicTree, q: ca.SX) -> list[Pose]:
     """Rotation and position of every body frame in the world, for q (n, 1)."""
     poses: list[Pose] = []
@@ -302,7 +305,7 @@ def add_tool(tree: KinematicTree, tool: ArrayLike) -> KinematicTree:
     R, p = _read_tool(tool)
     return replace(
         tree,
-        tip_name=f"{tree.tip_name} + tool",
+        tip_name=f"{tree.tip_name}{TOOL_SUFFIX}",
         tip_rotation=snap(tree.tip_rotation @ R),
         tip_translation=tree.tip_translation + tree.tip_rotation @ p,
     )

@@ -1,23 +1,36 @@
-"""Obstacles: spheres, capsules and half-spaces, and their distances to the links of a robot."""
+"""Obstacles: solids of scenes, and distances of spheres, capsules and half-spaces to a robot's links as expressions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from os import PathLike
 from typing import Protocol, runtime_checkable
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.errors import InvalidValueError
+from orthocas.errors import InvalidValueError, RobotError, one_line
 from orthocas.robots.kinematics import build_body_poses, build_frame_pose
+from orthocas.robots.link_shapes import read_mesh
 from orthocas.robots.robot import Robot
+from orthocas.robots.scene import Solid
+from orthocas.robots.shapes import (
+    BallGeometry,
+    BoxGeometry,
+    CapsuleGeometry,
+    CloudGeometry,
+    HalfSpaceGeometry,
+    HullGeometry,
+    Shape,
+)
+from orthocas.robots.spatial import rotate_z_to, rotation_matrix
 from orthocas.robots.tree import BASE_JOINTS
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, as_number, as_point_set, freeze_array, require_kind
+from orthocas.tools.checks import Array, as_float_array, as_number, as_path, as_point_set, freeze_array, require_kind
 
-__all__ = ["Capsule", "LinkDistances", "Obstacle", "Plane", "Sphere"]
+__all__ = ["Box", "Capsule", "LinkDistances", "Mesh", "Obstacle", "Plane", "PointCloud", "Sphere"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,19 +41,15 @@ class ObstacleRules:
     farthest: float = 1e6  #: [m] largest length
     postures: int = 20  #: by which moving links are found
     move: float = 1e-9  #: [m] of a link that moves
+    cells: int = 30_000  #: of a point cloud along an axis, which an octree can have
 
 
 RULES = ObstacleRules()
 
 
 @runtime_checkable
-class Obstacle(Protocol):
-    """A solid in the world."""
-
-    @property
-    def heading(self) -> str:
-        """The obstacle in a few words."""
-        ...
+class Obstacle(Solid, Protocol):
+    """A solid in the world whose distance is an expression."""
 
     def distance(self, start: ca.SX, end: ca.SX) -> ca.SX:
         """Distance of the segment between two points (3, 1) from the solid [m], a scalar; negative inside it."""
@@ -73,6 +82,11 @@ class Sphere:
         """One line: radius [m] and centre [m] in the base frame."""
         return f"sphere of radius {self.radius:.4g} at {_print_point(self.centre)}"
 
+    @property
+    def shape(self) -> Shape:
+        """The ball for collision checks."""
+        return Shape(BallGeometry(self.radius), np.eye(3), self.centre)
+
     def distance(self, start: ca.SX, end: ca.SX) -> ca.SX:
         """Distance of a segment from the ball."""
         return ca.sqrt(_measure_point(ca.SX(ca.DM(self.centre)), start, end) + RULES.least_square) - self.radius
@@ -101,6 +115,13 @@ class Capsule:
     def heading(self) -> str:
         """One line: radius [m] and the ends of the axis [m] in the base frame."""
         return f"capsule of radius {self.radius:.4g} from {_print_point(self.start)} to {_print_point(self.end)}"
+
+    @property
+    def shape(self) -> Shape:
+        """The capsule for collision checks."""
+        length = float(np.linalg.norm(self.end - self.start))
+        rotation = rotate_z_to((self.end - self.start) / length) if length > 0 else np.eye(3)
+        return Shape(CapsuleGeometry(self.radius, length), rotation, (self.start + self.end) / 2)
 
     def distance(self, start: ca.SX, end: ca.SX) -> ca.SX:
         """Distance of a segment from the capsule."""
@@ -133,10 +154,138 @@ class Plane:
         """One line: a point [m] and the unit normal in the base frame."""
         return f"plane through {_print_point(self.point)} with normal {_print_point(self.normal)}"
 
+    @property
+    def shape(self) -> Shape:
+        """The half-space for collision checks."""
+        return Shape(HalfSpaceGeometry(), rotate_z_to(self.normal), self.point)
+
     def distance(self, start: ca.SX, end: ca.SX) -> ca.SX:
         """Distance of a segment from the half-space: that of its nearer end."""
         normal, offset = ca.SX(ca.DM(self.normal)), float(self.normal @ self.point)
         return ca.fmin(ca.dot(normal, start), ca.dot(normal, end)) - offset
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """A box.
+
+    Args:
+        size: edge lengths (3,) [m], > 0.
+        centre: (3,) in the world [m].
+        rotation: (3, 3), from the axes of its edges to those of the world.
+    """
+
+    size: Array
+    centre: Array
+    rotation: Array
+
+    def __init__(self, size: ArrayLike, centre: ArrayLike, rotation: ArrayLike | None = None) -> None:
+        edges = freeze_array("size", size, (3,))
+        for edge in edges.tolist():
+            _check_size("size", edge)
+        object.__setattr__(self, "size", edges)
+        object.__setattr__(self, "centre", freeze_array("centre", centre, (3,)))
+        turn = np.eye(3) if rotation is None else rotation
+        object.__setattr__(self, "rotation", rotation_matrix("rotation", turn))
+
+    @property
+    def heading(self) -> str:
+        """One line: size and centre [m]."""
+        return f"box of {' x '.join(f'{edge:.4g}' for edge in self.size)} at {_print_point(self.centre)}"
+
+    @property
+    def shape(self) -> Shape:
+        """The box for collision checks."""
+        return Shape(BoxGeometry(self.size), self.rotation, self.centre)
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """The convex hull of points, or of a mesh file.
+
+    Args:
+        points: (N, 3) in the frame of the mesh [m], or the path of a mesh file (STL, OBJ, DAE).
+        position: of the mesh in the world, (3,) [m].
+        rotation: (3, 3), from the axes of the mesh to those of the world.
+        scale: by which the points are multiplied.
+
+    Raises:
+        RobotError: if the file cannot be read.
+        InvalidValueError: if the points span no volume.
+    """
+
+    points: Array
+    position: Array
+    rotation: Array
+
+    def __init__(
+        self,
+        points: ArrayLike | str | PathLike[str],
+        position: ArrayLike = (0.0, 0.0, 0.0),
+        rotation: ArrayLike | None = None,
+        scale: float = 1.0,
+    ) -> None:
+        factor = _check_size("scale", scale)
+        if isinstance(points, str | PathLike):
+            path = as_path("points", points)
+            if not path.is_file():
+                raise RobotError(f"cannot read mesh file {path}: there is none")
+            try:
+                corners = read_mesh(path, np.full(3, factor))[0]
+            except ValueError as error:
+                raise RobotError(f"cannot read mesh file {path}: {one_line(str(error))}") from None
+        else:
+            corners = factor * freeze_array("points", points, (None, 3))
+        try:
+            hull = HullGeometry.around(corners)
+        except ValueError as error:
+            raise InvalidValueError("points", str(error), "corners of a solid") from None
+        object.__setattr__(self, "points", freeze_array("points", hull.points, (None, 3)))
+        object.__setattr__(self, "position", freeze_array("position", position, (3,)))
+        turn = np.eye(3) if rotation is None else rotation
+        object.__setattr__(self, "rotation", rotation_matrix("rotation", turn))
+
+    @property
+    def heading(self) -> str:
+        """One line: number of corners and position [m]."""
+        return f"hull of {len(self.points)} corners at {_print_point(self.position)}"
+
+    @property
+    def shape(self) -> Shape:
+        """The hull for collision checks."""
+        return Shape(HullGeometry.around(self.points), self.rotation, self.position)
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points of a camera or a scanner: the cubes of a lattice that hold one.
+
+    Args:
+        points: (N, 3) in the world [m].
+        cell: edge length of the cubes [m].
+    """
+
+    points: Array
+    cell: float
+
+    def __init__(self, points: ArrayLike, cell: float = 0.02) -> None:
+        object.__setattr__(self, "points", freeze_array("points", points, (None, 3)))
+        if not len(self.points):
+            raise InvalidValueError("points", "no points", "at least one")
+        object.__setattr__(self, "cell", _check_size("cell", cell))
+        spread = float(np.ptp(self.points, axis=0).max() / self.cell)
+        if spread > RULES.cells:
+            raise InvalidValueError("cell", cell, f"at least 1/{RULES.cells} of the extent of the points")
+
+    @property
+    def heading(self) -> str:
+        """One line: number of points, and cell [m]."""
+        return f"cloud of {len(self.points)} points, in cubes of {self.cell:.4g}"
+
+    @property
+    def shape(self) -> Shape:
+        """The cubes for collision checks."""
+        return Shape(CloudGeometry(self.points, self.cell), np.eye(3), np.zeros(3))
 
 
 def _measure_point(point: ca.SX, start: ca.SX, end: ca.SX) -> ca.SX:

@@ -176,10 +176,18 @@ def lock_off_chain(model: pin.Model, *tips: str) -> pin.Model:
 
     Raises:
         UnknownNameError: if there is no frame with the name of a tip.
-        RobotError: if a joint that moves a tip is not revolute, continuous or prismatic. The message names it.
+        RobotError: as in `lock_others`.
     """
     chains = [model.supports[model.frames[find_frame(model, tip)].parentJoint] for tip in tips]
-    chain = sorted({i for supports in chains for i in supports if i > 0})
+    return lock_others(model, sorted({i for supports in chains for i in supports if i > 0}))
+
+
+def lock_others(model: pin.Model, chain: list[int]) -> pin.Model:
+    """Lock every joint that is not in a chain, of any type, at neutral or at the limit closest to zero.
+
+    Raises:
+        RobotError: if a joint of the chain is not revolute, continuous or prismatic. The message names it.
+    """
     for i in chain:
         find_axis(model, i)
     ids = [i for i in range(1, model.njoints) if i not in chain]

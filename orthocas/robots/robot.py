@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, RobotError, ShapeError
 from orthocas.robots import dynamics, kinematics
+from orthocas.robots.collision_files import CollisionSource, read_collisions
+from orthocas.robots.collisions import Collisions
 from orthocas.robots.dynamics import PAYLOAD, add_payload
 from orthocas.robots.kinematics import add_tool
 from orthocas.robots.mjcf import read_mjcf
@@ -69,13 +71,20 @@ class Robot(Shown):
         (2, 1)
     """
 
-    def __init__(self, tree: KinematicTree, homes: Mapping[str, ArrayLike] | None = None) -> None:
+    def __init__(
+        self,
+        tree: KinematicTree,
+        homes: Mapping[str, ArrayLike] | None = None,
+        solids: CollisionSource | None = None,
+    ) -> None:
         require_kind("tree", tree, KinematicTree)
         homes = {} if homes is None else homes
         require_kind("homes", homes, Mapping)
         self.tree = tree
         #: named postures (n,) of the robot's files: SRDF group states, MJCF keyframes. Chart files do not store them.
         self.homes = {name: freeze_array(f"home '{name}'", q, (tree.n,)) for name, q in homes.items()}
+        #: the files that `collisions` reads; None if there are none. Chart files do not store them.
+        self.solids = solids
 
     @classmethod
     def from_file(
@@ -155,7 +164,8 @@ class Robot(Shown):
         file, names = as_path("path", path), _check_tips(tip, tips)
         model = read_urdf(file, names, locked)
         robot = cls._from_chain(model, names, locked, tool, base, gravity)
-        return cls(robot.tree, read_srdf_postures(file, robot.joint_names))
+        source = CollisionSource(file.absolute(), None, dict(locked or {}))
+        return cls(robot.tree, read_srdf_postures(file, robot.joint_names), source)
 
     @classmethod
     def from_mjcf(
@@ -240,7 +250,7 @@ class Robot(Shown):
         if factors.min() <= 0:
             raise InvalidValueError("factor", factors.min(), "numbers > 0")
         masses, inertias = self.tree.masses * factors, self.tree.inertias * factors[:, None, None]
-        return type(self)(replace(self.tree, masses=masses, inertias=inertias), self.homes)
+        return type(self)(replace(self.tree, masses=masses, inertias=inertias), self.homes, self.solids)
 
     def with_tool(self, tool: ArrayLike) -> Self:
         """The same robot with its tip at the end of a massless tool: tip pose = old tip pose times tool pose.
@@ -252,7 +262,7 @@ class Robot(Shown):
         Raises:
             InvalidValueError: if the tool has another form.
         """
-        return type(self)(add_tool(self.tree, tool), self.homes)
+        return type(self)(add_tool(self.tree, tool), self.homes, self.solids)
 
     def with_payload(self, payload: ArrayLike) -> Self:
         """The same robot carrying a load that is fixed to the tip.
@@ -264,7 +274,7 @@ class Robot(Shown):
         Raises:
             InvalidValueError: if the payload has another form, a negative mass, or an indefinite inertia.
         """
-        return type(self)(add_payload(self.tree, payload), self.homes)
+        return type(self)(add_payload(self.tree, payload), self.homes, self.solids)
 
     def with_gravity(self, gravity: ArrayLike) -> Self:
         """The same robot under another gravity, such as on a wall, a ceiling or the moon.
@@ -285,7 +295,31 @@ class Robot(Shown):
         vector = freeze_array("gravity", gravity, (3,))
         if self.tree.floating and vector.any():
             raise RobotError(f"gravity is {vector.tolist()}, expected none: a base that nothing holds has no gravity")
-        return type(self)(replace(self.tree, gravity=vector), self.homes)
+        return type(self)(replace(self.tree, gravity=vector), self.homes, self.solids)
+
+    def with_solids(self, urdf: str | PathLike[str], srdf: str | PathLike[str] | None = None) -> Self:
+        """The same robot with the solids of another file, such as a robot of a chart file, for `collisions`.
+
+        Args:
+            urdf: the robot's URDF file.
+            srdf: an SRDF file whose disabled pairs are not checked. Default: the one with the same stem, beside the
+                URDF file or in ../srdf.
+        """
+        locked = {} if self.solids is None else self.solids.locked
+        pairs = None if srdf is None else as_path("srdf", srdf)
+        return type(self)(self.tree, self.homes, CollisionSource(as_path("urdf", urdf), pairs, locked))
+
+    @cached_property
+    def collisions(self) -> Collisions:
+        """Distances between the links, from the <collision> elements of the robot's URDF file.
+
+        Raises:
+            RobotError: if the robot comes from no URDF file, the file or all its solids are missing.
+        """
+        if self.solids is None:
+            hint = "robot.with_solids(urdf) names the URDF file"
+            raise RobotError(f"nothing is known of the links' solids, expected a robot of a URDF file: {hint}")
+        return read_collisions(self.tree, self.solids)
 
     def home(self, name: str) -> Array:
         """A named posture (n,) of the robot's files.

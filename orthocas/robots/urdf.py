@@ -372,8 +372,7 @@ def read_srdf_postures(urdf: Path, joint_names: Sequence[str]) -> dict[str, Arra
     Raises:
         RobotError: if the SRDF file cannot be read.
     """
-    name = f"{urdf.stem}.srdf"
-    path = next((p for p in (urdf.parent / name, urdf.parent.parent / "srdf" / name) if p.is_file()), None)
+    path = find_srdf(urdf)
     if path is None:
         return {}
     states: dict[str, dict[str, float]] = {}
@@ -384,3 +383,9 @@ def read_srdf_postures(urdf: Path, joint_names: Sequence[str]) -> dict[str, Arra
                 if np.isfinite(value := float(joint.get("value", ""))):
                     joints[joint.get("name", "")] = value
     return collect_postures(states, joint_names)
+
+
+def find_srdf(urdf: Path) -> Path | None:
+    """The SRDF file with the same stem as a URDF file, beside it or in ../srdf; None if there is none."""
+    name = f"{urdf.stem}.srdf"
+    return next((p for p in (urdf.parent / name, urdf.parent.parent / "srdf" / name) if p.is_file()), None)

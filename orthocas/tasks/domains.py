@@ -53,6 +53,7 @@ class StopKind(Enum):
     JOINT = "joint"  #: a joint is at the boundary of the domain, or at its limit
     NEAR_SINGULAR = "near singular"  #: the relative singular value of the task is at the bound of a `ClearBox`
     FOLD = "fold"  #: the coordinate turns back, or would: J = dphi/dq is singular, or at the bound of a `RegularPart`
+    CONTACT = "contact"  #: two links touch, or a link and an object of the scene
     CONDITION = "condition"  #: another condition of the domain holds no more, such as the distance to a path
     SINGULAR = "singular"  #: no way on: the task is singular there, or grown coordinates end
     ENDLESS = "endless"  #: nothing: the motion returns to its start up to full turns of unbounded joints

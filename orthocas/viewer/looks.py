@@ -1,27 +1,23 @@
 """How robots look: meshes of a URDF file, or drums and rods made from the kinematic tree."""
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import casadi as ca
-import coal
 import numpy as np
-import pinocchio as pin
 import scipy
 
 from orthocas.errors import RobotError
 from orthocas.robots.kinematics import build_body_poses, build_tip_pose
-from orthocas.robots.pinocchio_model import find_axis, find_frame, lock_joints, lock_off_chain
+from orthocas.robots.link_shapes import load_mesh, place_links, read_numbers, read_pose
 from orthocas.robots.robot import Robot
 from orthocas.robots.spatial import rotate_z_to
 from orthocas.robots.tree import KinematicTree
-from orthocas.robots.urdf import read_urdf, read_xml
+from orthocas.robots.urdf import read_xml
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array, Indices
 
@@ -40,7 +36,6 @@ class ViewRules:
     rod: float = 0.042  #: radius of the first rod
     taper: float = 0.45  #: fraction of the radius that is lost on the way to the tip
     shortest_rod: float = 0.35  #: in radii; shorter ones are left out
-    same_place: float = 1e-6  #: between the joints of two files of one robot [m]
     triangles: int = 20_000  #: of an arm for a picture
     mesh_triangles: int = 500  #: of a mesh at least
     most_triangles: int = 3_000_000  #: of all meshes, more is slow to send and to draw
@@ -270,11 +265,8 @@ def read_urdf_look(path: Path, tree: KinematicTree, locked: Mapping[str, float] 
         RobotError: if the file cannot be read, or its joints are not those of the robot.
     """
     root = read_xml(path, "URDF", "robot")
-    tips = (tree.tip_name, *tree.tips)
-    model = lock_off_chain(lock_joints(read_urdf(path, tips, locked), locked or {}), *tips)
-    _check_same(path, model, tree)
-    # Frames of our tree have the joint's axis as z; Pinocchio's have those of the file.
-    turns = [np.eye(3), *(rotate_z_to(find_axis(model, i)[1]) for i in range(1, model.njoints))]
+    links = root.findall("link")
+    places = place_links(path, tree, [link.get("name", "") for link in links], locked)
     colours = {
         material.get("name", ""): colour
         for material in root.iter("material")
@@ -282,30 +274,16 @@ def read_urdf_look(path: Path, tree: KinematicTree, locked: Mapping[str, float] 
     }
     look: Look = [[] for _ in range(tree.n + 2)]
     missing: list[str] = []
-    for link in root.findall("link"):
-        frame = model.frames[find_frame(model, link.get("name", ""))]
-        body = frame.parentJoint
+    for link, carrier in zip(links, places, strict=True):
         for visual in link.findall("visual"):
             solid = _build_solid(path, visual, colours, missing)
             if solid is not None:
-                place = frame.placement * _read_pose(visual)
-                look[body].append(solid.move(turns[body].T @ place.rotation, turns[body].T @ place.translation))
+                place = carrier.pose * read_pose(visual)
+                look[carrier.body + 1].append(solid.move(place.rotation, place.translation))
     triangles = sum(len(solid.faces) for solids in look for solid in solids)
     if triangles > RULES.most_triangles:
         raise RobotError(f"{path} shows {triangles:,} triangles, expected at most {RULES.most_triangles:,}")
     return UrdfLook(look, tuple(missing))
-
-
-def _check_same(path: Path, model: pin.Model, tree: KinematicTree) -> None:
-    """Raise RobotError unless a model has the joints of a tree at the same places."""
-    names = tuple(model.names)[1:]
-    if names != tree.joint_names:
-        raise RobotError(f"{path} has the joints {', '.join(names)}, expected {', '.join(tree.joint_names)}")
-    lengths = np.array([np.linalg.norm(model.jointPlacements[i + 1].translation) for i in range(tree.n)])
-    apart = np.abs(lengths - np.linalg.norm(tree.translations, axis=1))
-    if apart.max() > RULES.same_place:
-        joint = names[int(np.argmax(apart))]
-        raise RobotError(f"{path} places joint '{joint}' elsewhere, expected the robot file that the chart was made of")
 
 
 def _read_colour(material: ElementTree.Element) -> Colour | None:
@@ -314,7 +292,7 @@ def _read_colour(material: ElementTree.Element) -> Colour | None:
     if element is None:
         return None
     red, green, blue, *_ = (
-        round(255 * value) for value in np.clip(_read_numbers(element, "rgba", 4, (1, 1, 1, 1)), 0, 1)
+        round(255 * value) for value in np.clip(read_numbers(element, "rgba", 4, (1, 1, 1, 1)), 0, 1)
     )
     return red, green, blue
 
@@ -333,11 +311,11 @@ def _build_solid(
     if shape is None:
         return None
     if shape.tag == "box":
-        return build_block(_read_numbers(shape, "size", 3, (0.1, 0.1, 0.1)), colour)
+        return build_block(read_numbers(shape, "size", 3, (0.1, 0.1, 0.1)), colour)
     if shape.tag == "sphere":
-        return build_ball(float(_read_numbers(shape, "radius", 1, (0.1,))[0]), colour)
+        return build_ball(float(read_numbers(shape, "radius", 1, (0.1,))[0]), colour)
     if shape.tag == "cylinder":
-        radius, length = (float(_read_numbers(shape, name, 1, (0.1,))[0]) for name in ("radius", "length"))
+        radius, length = (float(read_numbers(shape, name, 1, (0.1,))[0]) for name in ("radius", "length"))
         return build_drum(radius, length / 2, colour)
     if shape.tag == "mesh":
         return _load_mesh(path, shape, colour, missing)
@@ -346,55 +324,12 @@ def _build_solid(
 
 def _load_mesh(path: Path, shape: ElementTree.Element, colour: Colour, missing: list[str]) -> Solid | None:
     """The triangles of a mesh file; None if it cannot be found or read."""
-    name = shape.get("filename", "")
-    file = _locate(path, name)
     try:
-        if file is None:
-            raise ValueError("not found")
-        mesh: Any = coal.MeshLoader().load(str(file), _read_numbers(shape, "scale", 3, (1, 1, 1)))
-        vertices = np.array(mesh.vertices(), dtype=float).reshape(-1, 3)
-        faces = np.array([[t[0], t[1], t[2]] for t in map(mesh.tri_indices, range(mesh.num_tris))], dtype=np.intp)
-        if not (len(faces) and np.isfinite(vertices).all()):
-            raise ValueError("empty")
-    except (ValueError, RuntimeError):
-        missing.append(name)
+        vertices, faces = load_mesh(path, shape)
+    except ValueError:
+        missing.append(shape.get("filename", ""))
         return None
     return Solid(vertices, faces, colour)
-
-
-def _locate(path: Path, name: str) -> Path | None:
-    """The mesh file that a URDF file names: beside it, absolute, or in a package above it or on ROS_PACKAGE_PATH."""
-    name = unquote(name)
-    scheme, _, rest = name.rpartition("://")
-    folder = path.resolve().parent
-    # Packages lie above the file, or where ROS looks for them.
-    if scheme in ("package", "model"):
-        package, _, inside = rest.partition("/")
-        roots = [*folder.parents, folder, *map(Path, filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(":")))]
-        places = [root / package / inside for root in roots]
-        places += [root / inside for root in roots if root.name == package]
-    else:
-        places = [folder / (rest if scheme == "file" else name)]
-    return next((place for place in places if place.is_file()), None)
-
-
-def _read_pose(visual: ElementTree.Element) -> Any:
-    """The pose of a visual element in the frame of its link."""
-    origin = visual.find("origin")
-    if origin is None:
-        return pin.SE3.Identity()
-    roll, pitch, yaw = _read_numbers(origin, "rpy", 3, (0, 0, 0))
-    return pin.SE3(pin.rpy.rpyToMatrix(roll, pitch, yaw), _read_numbers(origin, "xyz", 3, (0, 0, 0)))
-
-
-def _read_numbers(element: ElementTree.Element, name: str, count: int, default: tuple[float, ...]) -> Array:
-    """Numbers of an attribute; the default if it is missing or is not that many finite numbers."""
-    try:
-        values = np.array([float(word) for word in element.get(name, "").split()])
-    except ValueError:
-        values = np.empty(0)
-    good = values.shape == (count,) and np.isfinite(values).all() and np.abs(values).max() < 1e6
-    return values if good else np.array(default, dtype=float)
 
 
 class BodyPoses:

@@ -54,6 +54,9 @@ READERS = {  #: functions that read files, by module and name, with the campaign
     "paths.tool_path.read_path": "paths",
     "tasks.corridor.read_postures": "postures",
     "robots.urdf.read_srdf_postures": "robots",
+    "robots.collision_files.read_disabled_pairs": "robots",
+    "robots.link_shapes.load_mesh": "robots",
+    "robots.link_shapes.read_mesh": "robots",
     "robots.robot.from_file": "robots",
     "robots.robot.from_mjcf": "robots",
     "robots.robot.from_urdf": "robots",
@@ -75,6 +78,7 @@ RESULTS = {  #: public classes whose objects only the library makes, with the ca
         ("Solutions", "Tracker", "ReachingTracker", "InverseStatus", "TrackerStatus", "MeaningError"), "calls"
     ),
     **dict.fromkeys(("Breakdown", "Coupling", "DampingCheck", "JointMotion", "Margins", "Modes", "Setting"), "calls"),
+    **dict.fromkeys(("Contact", "LeastDistance"), "calls"),
     **dict.fromkeys(("Card", "Model", "Trajectory", "View"), "calls"),
     **dict.fromkeys(("Arc", "ArmTracker", "Place", "Postures", "SelfMotions"), "calls"),
     "Certificate": "certificates",

@@ -15,6 +15,7 @@ from public_objects import (
     arm,
     circle,
     clear,
+    collisions,
     compiled,
     fitted,
     impedance,
@@ -38,6 +39,7 @@ from orthocas.errors import CompileError
 from orthocas.exact.involutivity import lie_bracket
 from orthocas.fitting.loss import loss
 from orthocas.paths import corridor_problem
+from orthocas.robots.collisions import Collisions
 from orthocas.tasks.domains import default_box
 from orthocas.tasks.metric import Metric
 from orthocas.viewer.session import Session
@@ -459,6 +461,27 @@ def _methods() -> dict[str, Call]:
         "Plane": (oc.obstacles.Plane, {"normal": q, "point": q}),
         "LinkDistances": (oc.obstacles.LinkDistances, {"robot": robot, "obstacles": [], "radius": 0.1}),
         "distances": (link_distances(), {"q": q}),
+        "obstacles.Box": (oc.obstacles.Box, {"size": q, "centre": q, "rotation": np.eye(3)}),
+        "Mesh": (oc.obstacles.Mesh, {"points": np.eye(4, 3), "position": q, "rotation": np.eye(3), "scale": 0.5}),
+        "PointCloud": (oc.obstacles.PointCloud, {"points": [q, -q], "cell": 0.1}),
+        "Scene": (oc.Scene, {"solids": {"ball": oc.obstacles.Sphere(q, 0.1)}}),
+        "Collisions": (
+            Collisions,
+            {"tree": robot.tree, "parts": collisions().parts, "pairs": collisions().pairs, "missing": ("hand",)},
+        ),
+        "collisions.distance": (collisions().distance, {"q": q}),
+        "collisions.pair_distances": (collisions().pair_distances, {"q": q}),
+        "collisions.check_free": (collisions().check_free, {"q": q}),
+        "collisions.find_contact": (collisions().find_contact, {"q": [q, -q], "clearance": 0.01, "bend": 0.001}),
+        "collisions.with_scene": (
+            collisions().with_scene,
+            {"scene": oc.Scene({"ball": oc.obstacles.Sphere(q, 0.1)}), "allowed": [("link2", "ball")]},
+        ),
+        "collisions.with_attached": (
+            collisions().with_attached,
+            {"frame": robot.tips[0], "solids": {"ball": oc.obstacles.Sphere(q, 0.1)}, "allowed": [("link1", "ball")]},
+        ),
+        "evaluate with collisions": (oc.evaluate, {"chart": chart, "samples": 50, "collisions": collisions()}),
         "chart.manipulability": (chart.manipulability, {"q": q}),
         "chart.solve x": (chart.solve, {"x": chart.x(q), "xi": chart.xi(q), "q_start": q}),
         "chart.xi_range": (chart.xi_range, {"q": q}),

@@ -15,6 +15,16 @@ from fuzz.words import NAMES, NUMBERS, VECTORS, Rng, pick
 from orthocas.tasks.domains import default_box
 from orthocas.viewer.looks import read_urdf_look
 
+_CORNERS = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))
+_MESH = "solid m\n{}endsolid m\n".format(
+    "".join(
+        "facet normal 0 0 0\nouter loop\n{}endloop\nendfacet\n".format(
+            "".join("vertex {} {} {}\n".format(*_CORNERS[k]) for k in range(4) if k != left)
+        )
+        for left in range(4)
+    )
+)
+_COLLIDED = 10  # joints of robots whose pairs are found
 _EVALUATED = 30  # joints of robots whose dynamics are built: it takes long for many
 _KINDS = (
     "revolute",
@@ -69,6 +79,10 @@ def use(path: Path, tip: str | None, locked: dict[str, float]) -> None:
     if path.suffix == ".urdf":
         read_urdf_look(path, robot.tree, locked)
     middle = default_box(robot).centre
+    if path.suffix == ".urdf" and robot.n <= _COLLIDED:
+        found = robot.collisions.distance(middle)
+        if np.isnan(found.distance) or not np.isfinite(found.gradient).all():
+            raise AssertionError("a least distance that is no number")
     for q in (middle, middle + 0.1):
         values = (robot.tip_position(q), robot.mass_matrix(q), robot.gravity(q), robot.bias(q, q))
         if not all(np.isfinite(value).all() for value in values):
@@ -88,6 +102,7 @@ def write(rng: Rng, folder: Path) -> Path:
     if mjcf:
         (folder / "part.xml").write_bytes(text_of(rng, mjcf_chain(rng, 1)))
     elif rng.random() < 0.4:
+        (folder / "m.stl").write_text(_MESH[: int(rng.integers(len(_MESH) // 2, 2 * len(_MESH)))])
         path.with_suffix(".srdf").write_bytes(text_of(rng, srdf(rng)))
     return path
 
@@ -125,6 +140,14 @@ def urdf_chain(rng: Rng, joints: int) -> Element:
         SubElement(inertial, "origin", xyz="0 0 0.1", rpy="0 0 0.2")
         SubElement(inertial, "mass", value="1.5")
         SubElement(inertial, "inertia", ixx="0.1", ixy="0", ixz="0", iyy="0.1", iyz="0", izz="0.1")
+        if rng.random() < 0.8:
+            collision = SubElement(link, "collision")
+            SubElement(collision, "origin", xyz="0 0 0.1", rpy="0 0 0.2")
+            kind = pick(rng, ("box", "sphere", "cylinder", "capsule", "mesh"))
+            sizes = (
+                {"size": "0.1 0.1 0.3"} if kind == "box" else {"radius": "0.1", "length": "0.2", "filename": "m.stl"}
+            )
+            SubElement(SubElement(collision, "geometry"), kind, sizes)
         joint = SubElement(root, "joint", name=f"j{i}", type=pick(rng, _KINDS[:3]))
         SubElement(joint, "parent", link=f"l{i - 1}")
         SubElement(joint, "child", link=f"l{i}")
@@ -156,11 +179,13 @@ def mjcf_chain(rng: Rng, joints: int) -> Element:
 
 
 def srdf(rng: Rng) -> Element:
-    """Group states, some of them of joints that are not there."""
+    """Group states and disabled pairs, some of them of joints and links that are not there."""
     root = Element(pick(rng, ("robot", "robot", "sdf")), name="r")
     state = SubElement(root, "group_state", name=pick(rng, NAMES), group="arm")
     for i in range(int(rng.integers(5))):
         SubElement(state, "joint", name=pick(rng, (f"j{i + 1}", *NAMES[:4])), value=pick(rng, ("0.1", *NUMBERS)))
+    if rng.random() < 0.5:
+        SubElement(root, "disable_collisions", link1="l1", link2=pick(rng, ("l2", *NAMES[:3])))
     if rng.random() < 0.3:
         _drop_attribute(rng, root)
     return root

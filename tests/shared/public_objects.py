@@ -26,6 +26,8 @@ from orthocas.control import Controller, Reference
 from orthocas.fitting.compare import Comparison
 from orthocas.fitting.fit import ClearPart, Fit
 from orthocas.fitting.wide import WideFit
+from orthocas.robots.collisions import Collisions, Part
+from orthocas.robots.shapes import BallGeometry, Shape
 from orthocas.robots.tree import place_on_base
 from orthocas.simulation import (
     Elasticity,
@@ -228,6 +230,22 @@ def link_distances() -> oc.obstacles.LinkDistances:
     return oc.obstacles.LinkDistances(planar().robot, [oc.obstacles.Sphere([0.5, 0.0, 0.5], 0.1)], 0.05)
 
 
+def collisions() -> Collisions:
+    """Balls on the base and on two links, and a scene."""
+    ball = Shape(BallGeometry(0.1), np.eye(3), np.zeros(3))
+    parts = [Part(f"link{body}", body, ball) for body in (-1, 1, 2)]
+    return Collisions(planar().robot.tree, parts, [("link-1", "link2")]).with_scene(scene())
+
+
+def scene() -> oc.Scene:
+    cloud = oc.obstacles.PointCloud([[1.5, 0.0, 0.0], [1.5, 0.5, 0.0]], 0.1)
+    return oc.Scene({"box": oc.obstacles.Box([0.2, 0.2, 0.2], [0.0, 2.0, 0.0]), "mesh": mesh(), "cloud": cloud})
+
+
+def mesh() -> oc.obstacles.Mesh:
+    return oc.obstacles.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [3.0, 0.0, 0.0], scale=0.3)
+
+
 def run_time_model() -> control.RunTimeModel:
     return control.RunTimeModel(payload=1.0, wrench=np.zeros(6), extra_torque=0.1)
 
@@ -326,6 +344,12 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "capsule": lambda: oc.obstacles.Capsule([0.5, 0.0, 0.0], [0.5, 0.0, 1.0], 0.1),
     "plane": lambda: oc.obstacles.Plane([0.0, 0.0, 1.0], [0.0, 0.0, -0.1]),
     "distances of links": link_distances,
+    "solid box": lambda: oc.obstacles.Box([0.2, 0.2, 0.2], [0.0, 2.0, 0.0]),
+    "mesh": mesh,
+    "point cloud": lambda: oc.obstacles.PointCloud([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], 0.1),
+    "scene": scene,
+    "collisions": collisions,
+    "least distance": lambda: collisions().distance(np.linspace(-1, 1, 6).reshape(2, 3)),
     "self-motion": lambda: fitted().chart.self_motion(planar().domain.centre, samples=30),
     "self-motion curve": lambda: cyclic().self_motion(cyclic().problem.domain.centre),
     "solutions": lambda: fitted().chart.solve([[1.6, 0.1, 0.1], [9.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]),
@@ -473,6 +497,16 @@ def _of_domain(domain: oc.Box | oc.Torus) -> Iterator[Any]:
 @_numbers.register
 def _of_distances(distances: oc.obstacles.LinkDistances) -> Iterator[Any]:
     yield from (distances.pairs, distances(np.linspace(-1, 1, 6).reshape(2, 3)))
+
+
+@_numbers.register
+def _of_collisions(found: Collisions) -> Iterator[Any]:
+    yield from (found.pairs, found.distance(np.linspace(-1, 1, 6).reshape(2, 3)).distance)
+
+
+@_numbers.register
+def _of_scene(found: oc.Scene) -> Iterator[Any]:
+    yield from found.facts().items()
 
 
 @_numbers.register

@@ -10,6 +10,7 @@ from public_objects import (
     HAS_COMPILER,
     arm,
     circle,
+    collisions,
     compiled,
     disk,
     fitted,
@@ -45,6 +46,15 @@ def calls_of_chart(chart: oc.Chart) -> list[Call]:
         lambda k: chart.solve(phi[k % 6 :]).q,
         lambda k: chart.problem.robot.mass_matrix(q[k % 6]),
         *([] if isinstance(chart, GrownChart) else fitted_calls),
+    ]
+
+
+def calls_of_collisions() -> list[Call]:
+    """Distances, which every thread measures with memory of its own."""
+    found, q = collisions(), points_of(fitted().chart)
+    return [
+        lambda k: np.hstack([found.distance(q[k % 6 :]).distance, found.pair_distances(q[k % 6])]),
+        lambda k: found.check_free(q[: 1 + k % 6]),
     ]
 
 
@@ -91,6 +101,7 @@ SERIES: dict[str, tuple[Callable[[], list[Call]], int]] = {  #: of 5,000 calls
     "disk": (lambda: calls_of_chart(copy.deepcopy(disk())), 40),
     **({"compiled inverse": (calls_of_compiled, 200)} if HAS_COMPILER else {}),
     "law in ticks": (calls_of_ticks, 200),
+    "collisions": (calls_of_collisions, 300),
     "arm": (calls_of_arm, 120),
     "law": (lambda: calls_of_law(copy.deepcopy(impedance())), 1300),
 }

@@ -1,0 +1,194 @@
+"""Collisions from robot files: the <collision> elements of a URDF file, and pairs from an SRDF file or found."""
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from itertools import combinations
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from orthocas.errors import RobotError
+from orthocas.robots.collisions import Collisions, Pair, Part
+from orthocas.robots.link_shapes import load_mesh, place_links, read_numbers, read_pose
+from orthocas.robots.shapes import (
+    BallGeometry,
+    BoxGeometry,
+    CapsuleGeometry,
+    CylinderGeometry,
+    Geometry,
+    HullGeometry,
+    Shape,
+)
+from orthocas.robots.tree import PRISMATIC_ROOM, KinematicTree
+from orthocas.robots.urdf import find_srdf, read_xml
+from orthocas.tools.checks import Array
+
+
+@dataclass(frozen=True, slots=True)
+class PairRules:
+    """Numbers by which pairs of links are found."""
+
+    seed: int = 0  #: of the postures
+    first: int = 1000  #: postures by which pairs are found that always touch
+    postures: int = 10_000  #: postures by which pairs are found that never come near
+    always: float = 0.95  #: fraction of postures from which on a pair touches by its make
+    near: float = 0.02  #: [m]; pairs that never come nearer are left out
+    smallest: float = 1e-9  #: size of a shape [m]
+
+
+RULES = PairRules()
+
+
+@dataclass(frozen=True)
+class CollisionSource:
+    """Where the solids of a robot are described."""
+
+    urdf: Path
+    srdf: Path | None = None  #: None: one beside the URDF file or in ../srdf, with its stem or the robot's name
+    locked: Mapping[str, float] = field(default_factory=dict)  #: joints that were locked, with their positions
+
+
+def read_collisions(tree: KinematicTree, source: CollisionSource) -> Collisions:
+    """The solids of a robot's links and the pairs to check.
+
+    Boxes, cylinders, spheres and capsules stay what they are; a mesh becomes its convex hull. With an SRDF file that
+    disables pairs, all other pairs of links on different bodies are checked. Without one, pairs are found: all but
+    neighbours, links that touch in the middle of the limits or in 95 % of 1,000 seeded postures, and links that never
+    come nearer than 0.02 m in 10,000 postures.
+
+    Args:
+        tree: the robot.
+        source: the files.
+
+    Raises:
+        RobotError: if a file cannot be read, no link has a shape, or the joints are not those of the robot.
+    """
+    root = read_xml(source.urdf, "URDF", "robot")
+    links = [link for link in root.findall("link") if link.find("collision") is not None]
+    places = place_links(source.urdf, tree, [link.get("name", "") for link in links], source.locked)
+    parts: list[Part] = []
+    missing: dict[str, None] = {}
+    for link, place in zip(links, places, strict=True):
+        name = link.get("name", "")
+        for element in link.findall("collision"):
+            shape = _read_shape(source.urdf, element)
+            if shape is None:
+                missing[name] = None
+            else:
+                parts.append(Part(name, place.body, shape.move(place.pose.rotation, place.pose.translation)))
+    if not parts:
+        lost = f" that can be read: no mesh of {', '.join(missing)}" if missing else ""
+        raise RobotError(f"{source.urdf} has no <collision> element{lost}, expected solids of the links")
+
+    # All pairs of links on different bodies, less those that an SRDF file disables.
+    bodies = {part.name: part.body for part in parts}
+    pairs = [(a, b) for a, b in combinations(bodies, 2) if bodies[a] != bodies[b]]
+    srdf = _find_pairs_file(source.urdf, root.get("name", "")) if source.srdf is None else source.srdf
+    disabled = set() if srdf is None else read_disabled_pairs(srdf)
+    if srdf is not None and (disabled or source.srdf is not None):
+        kept = [pair for pair in pairs if frozenset(pair) not in disabled]
+        return Collisions(tree, parts, kept, tuple(missing), f"from {srdf.name}")
+    apart = [pair for pair in pairs if frozenset(pair) not in _find_neighbours(root, set(bodies))]
+    found = find_pairs(Collisions(tree, parts, apart))
+    return Collisions(tree, parts, found, tuple(missing), f"found in {RULES.postures:,} postures")
+
+
+def read_disabled_pairs(path: Path) -> set[frozenset[str]]:
+    """The pairs of links that an SRDF file disables.
+
+    Raises:
+        RobotError: if the file cannot be read.
+    """
+    elements = read_xml(path, "SRDF", "robot").iter("disable_collisions")
+    return {frozenset((element.get("link1", ""), element.get("link2", ""))) for element in elements}
+
+
+def _find_pairs_file(urdf: Path, name: str) -> Path | None:
+    """The SRDF file with the stem of a URDF file, or the only one for a robot of its name; None if there is none."""
+    if (same := find_srdf(urdf)) is not None:
+        return same
+    named = []
+    for path in sorted([*urdf.parent.glob("*.srdf"), *(urdf.parent.parent / "srdf").glob("*.srdf")]):
+        with suppress(RobotError):
+            if name and read_xml(path, "SRDF", "robot").get("name") == name:
+                named.append(path)
+    return named[0] if len(named) == 1 else None
+
+
+def find_pairs(collisions: Collisions) -> list[Pair]:
+    """The pairs of `collisions` that neither touch by their make nor stay apart, in seeded postures between limits."""
+    postures = _draw_postures(collisions.tree, RULES.postures)
+    count = len(collisions.pairs)
+    touching, near = np.zeros(count), np.zeros(count, dtype=bool)
+    # How often pairs touch, of the first postures.
+    for owner, distance in collisions.scan_near(postures[: RULES.first], RULES.near, np.ones(count, dtype=bool)):
+        near[owner] = True
+        touching[owner] += distance <= 0
+    always = touching >= RULES.always * RULES.first
+    always |= collisions.pair_distances(collisions.tree.centre_posture) <= 0
+    # Whether the others ever come near, in further ones.
+    for start in range(RULES.first, len(postures), RULES.first):
+        for owner, _ in collisions.scan_near(postures[start : start + RULES.first], RULES.near, ~near):
+            near[owner] = True
+    return [pair for pair, ever, made in zip(collisions.pairs, near, always, strict=True) if ever and not made]
+
+
+def _draw_postures(tree: KinematicTree, count: int) -> Array:
+    """Uniform postures between the limits, (count, n); a full turn, or a part of a rail, where there are none."""
+    room = np.where(tree.prismatic, PRISMATIC_ROOM, np.pi)
+    low = np.where(np.isfinite(tree.lower), tree.lower, -room)
+    high = np.where(np.isfinite(tree.upper), tree.upper, np.maximum(room, low + room))
+    low = np.minimum(low, high - 1e-9)
+    return np.random.default_rng(RULES.seed).uniform(low, high, (count, tree.n))
+
+
+def _find_neighbours(root: ElementTree.Element, solid: set[str]) -> set[frozenset[str]]:
+    """Pairs of links with solids that a joint connects, or joints with nothing but links without solids between."""
+    parents: dict[str, str] = {}
+    for joint in root.findall("joint"):
+        parent, child = joint.find("parent"), joint.find("child")
+        if parent is not None and child is not None:
+            parents[child.get("link", "")] = parent.get("link", "")
+    neighbours = set()
+    for link in solid:
+        above = parents.get(link)
+        while above is not None and above not in solid:
+            above = parents.get(above)
+        if above is not None:
+            neighbours.add(frozenset((link, above)))
+    return neighbours
+
+
+def _read_shape(path: Path, element: ElementTree.Element) -> Shape | None:
+    """The solid of a collision element in the frame of its link; None if its mesh cannot be found or has no volume."""
+    geometry = element.find("geometry")
+    shape = next(iter(geometry if geometry is not None else ()), None)
+    if shape is None:
+        return None
+    pose = read_pose(element)
+
+    def sizes(*names: str, count: int = 1) -> list[Array]:
+        values = [read_numbers(shape, name, count, (0.0,) * count) for name in names]
+        if min(float(value.min()) for value in values) < RULES.smallest:
+            raise RobotError(f"{path}: <{shape.tag}> of a collision element has no size, expected numbers above 0")
+        return values
+
+    solid: Geometry
+    match shape.tag:
+        case "box":
+            solid = BoxGeometry(sizes("size", count=3)[0])
+        case "sphere":
+            solid = BallGeometry(float(sizes("radius")[0][0]))
+        case "cylinder" | "capsule":
+            radius, length = (float(value[0]) for value in sizes("radius", "length"))
+            solid = (CylinderGeometry if shape.tag == "cylinder" else CapsuleGeometry)(radius, length)
+        case "mesh":
+            try:
+                solid = HullGeometry.around(load_mesh(path, shape)[0])
+            except ValueError:
+                return None
+        case _:
+            return None
+    return Shape(solid, pose.rotation, pose.translation)

@@ -1,0 +1,578 @@
+"""Distances between the links of a robot, and from a scene, by coal: least distance, its gradient, and checked ways."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from threading import local
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+from orthocas.errors import InvalidValueError
+from orthocas.robots.kinematics import build_body_poses
+from orthocas.robots.scene import Scene, Solid
+from orthocas.robots.shapes import Shape
+from orthocas.robots.spatial import constant
+from orthocas.robots.tree import KinematicTree
+from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import (
+    Array,
+    Indices,
+    as_float_array,
+    as_number,
+    as_point_set,
+    require_count,
+    require_kind,
+    require_known,
+    require_text,
+)
+from orthocas.tools.display import Shown, listed
+
+__all__ = ["Collisions", "Contact", "LeastDistance"]
+
+Pair = tuple[str, str]  #: names of two links, or of a link and an object of the scene
+
+
+@dataclass(frozen=True, slots=True)
+class CollisionRules:
+    """Numbers of collision checks."""
+
+    tolerance: float = 1e-10  #: of distances of separate solids, relative to them; overlaps keep coal's 1e-6
+    iterations: int = 1000  #: of the search for them
+    piece: int = 1024  #: postures whose bounds are computed at once
+    slack: float = 2e-6  #: of lower bounds [m]
+    same_place: float = 1e-6  #: between the joints of two robots [m]
+    parallel: float = 1e-12  #: of the squared sine between two axes
+    longest: float = 100.0  #: [rad] or [m], of a joint on the way between two postures
+    resolution: float = 1e-6  #: [m]: closer pairs count as touching while a way between postures is checked
+
+
+RULES = CollisionRules()
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A solid that a body carries; a link or an object has one or several."""
+
+    name: str  #: of the link, or of the object
+    body: int  #: index of the body, -1 for the base and the world
+    shape: Shape  #: in the frame of the body
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LeastDistance(Shown):
+    """The least distance over all pairs at one posture, or at N postures; see `Collisions.distance`."""
+
+    distance: Any  #: [m], a number or (N,); negative: how deep the pair overlaps
+    pair: Any  #: names of the nearest pair, or a list of N
+    points: Array  #: the nearest points of the two in the world, (2, 3) or (N, 2, 3) [m]
+    gradient: Array  #: d distance / dq, (n,) or (N, n) [m/rad] or [m/m]
+
+    def facts(self) -> dict[str, str]:
+        """The least distance and its pair."""
+        if np.ndim(self.distance) == 0:
+            return {"least distance": f"{self.distance:.4g} m, between {_name_pair(self.pair)}"}
+        if not len(self.distance):
+            return {"least distance": "of no postures"}
+        k = int(np.argmin(self.distance))
+        return {
+            "least distance": f"{self.distance[k]:.4g} m in {len(self.distance)} postures",
+            "pair": _name_pair(self.pair[k]),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """Where a way between postures cannot be shown to be free."""
+
+    segment: int  #: it lies between this posture and the next one
+    fraction: float  #: of the way between them
+    pair: Pair
+    distance: float  #: of the pair there [m]
+
+
+class Collisions(Shown):
+    """What links of a robot, and objects around them, may hit.
+
+    `robot.collisions` reads it from the <collision> elements of the robot's URDF file: boxes, cylinders and spheres as
+    they are, meshes as their convex hulls. Distances are those of coal, for all pairs of `pairs`.
+
+    Args:
+        tree: the robot's kinematics.
+        parts: the solids.
+        pairs: names of the two links or objects of each pair that is checked.
+        missing: names of links whose mesh cannot be found or read: nothing is known of them.
+        origin: where the pairs come from, in a few words.
+
+    Example:
+        >>> import orthocas as oc
+        >>> robot = oc.Robot.from_name("panda", tip="panda_hand")  # doctest: +SKIP
+        >>> robot.collisions.distance(robot.sample(1)[0]).pair  # doctest: +SKIP
+        ('panda_link2', 'panda_hand')
+    """
+
+    def __init__(
+        self,
+        tree: KinematicTree,
+        parts: Sequence[Part],
+        pairs: Sequence[Pair],
+        missing: Sequence[str] = (),
+        origin: str = "given",
+    ) -> None:
+        require_kind("tree", tree, KinematicTree)
+        require_kind("parts", parts, Sequence)
+        for part in parts:
+            require_kind("entry of parts", part, Part)
+            require_count("body of a part", part.body + 1, least=0, most=tree.n)
+        require_kind("missing", missing, Sequence)
+        self.tree = tree
+        self.parts = tuple(parts)
+        self.missing = tuple(missing)  #: names of links with a mesh that cannot be found or read
+        self.origin = require_text("origin", origin)
+        self.pairs = _check_pairs("pairs", pairs, [part.name for part in parts])  #: checked pairs, by names
+
+    def facts(self) -> dict[str, str]:
+        """Links, pairs, and what is unchecked."""
+        names = list(dict.fromkeys(part.name for part in self.parts))
+        return {
+            "collisions": f"{len(self.pairs)} pairs of {len(names)} links and objects, {self.origin}",
+            "solids": listed(names),
+            **({"unchecked": f"{listed(self.missing)}: no mesh"} if self.missing else {}),
+        }
+
+    def distance(self, q: ArrayLike) -> LeastDistance:
+        """The least distance over all pairs, with its pair, nearest points and gradient.
+
+        With nearest points p1, p2 on the two bodies and the unit normal u from the first to the second,
+        d = u . (p2 - p1) and grad d = u^T (J_p2 - J_p1). Where nearest points are not unique, it is the gradient of one
+        choice. Without pairs, the distance is infinite.
+
+        Args:
+            q: (n,) or (N, n) [rad] or [m].
+
+        Raises:
+            ShapeError, InvalidValueError: if q has another number of joints, or is not finite.
+        """
+        points, single = as_point_set("q", q, self.tree.n)
+        values, index, ends, normals = self._find_least(points)
+        gradients = self._build_gradients(points, index, ends, normals)
+        names = [self.pairs[self._owners[k]] if k >= 0 else ("", "") for k in index]
+        if single:
+            return LeastDistance(float(values[0]), names[0], ends[0], gradients[0])
+        return LeastDistance(values, names, ends, gradients)
+
+    def pair_distances(self, q: ArrayLike) -> Array:
+        """The distances of all pairs [m], (K,) or (N, K) in the order of `pairs`, at q (n,) or (N, n)."""
+        points, single = as_point_set("q", q, self.tree.n)
+        values = np.full((len(points), len(self.pairs)), np.inf)
+        scratch = self._scratch
+        for row, position in zip(values, points, strict=True):
+            pin.updateGeometryPlacements(scratch.model, scratch.data, scratch.geometry, scratch.placed, position)
+            for k, owner in enumerate(self._owners.tolist()):
+                found = pin.computeDistance(scratch.geometry, scratch.placed, k).min_distance
+                row[owner] = min(row[owner], found)
+        return values[0] if single else values
+
+    def check_free(self, q: ArrayLike) -> Any:
+        """Whether no pair touches at q (n,) or (N, n): a bool, or (N,)."""
+        points, single = as_point_set("q", q, self.tree.n)
+        free = np.ones(len(points), dtype=bool)
+        scratch = self._scratch
+        for start in range(0, len(points), RULES.piece):
+            some = points[start : start + RULES.piece]
+            bounds = self._bound_distances(some)
+            for i in np.flatnonzero((bounds <= 0).any(axis=1)).tolist():
+                pin.updateGeometryPlacements(scratch.model, scratch.data, scratch.geometry, scratch.placed, some[i])
+                near = np.flatnonzero(bounds[i] <= 0)
+                for k in near[np.argsort(bounds[i][near])].tolist():
+                    if pin.computeDistance(scratch.geometry, scratch.placed, k).min_distance <= 0:
+                        free[start + i] = False
+                        break
+        return bool(free[0]) if single else free
+
+    def find_contact(self, q: ArrayLike, clearance: float = 0.0, bend: ArrayLike = 0.0) -> Contact | None:
+        """The first place on straight ways between postures where a pair may be nearer than a clearance.
+
+        Between two postures, no pair can get nearer than (d1 + d2 - L . |dq|) / 2, where L bounds how fast a turn or
+        move of each joint moves the two against each other. Ways where this does not suffice are halved (conservative
+        advancement), until a pair is nearer at a posture, or the bound is below the clearance by less than 1e-6 m.
+        So a way without a contact is free everywhere, not only at its postures.
+
+        Args:
+            q: postures (N, n), with straight ways in joint space between them.
+            clearance: smallest distance to allow [m].
+            bend: how far the true way may be from the straight one, (n,) or one number [rad] or [m].
+
+        Returns:
+            The contact, or None if the way is free.
+
+        Raises:
+            ShapeError, InvalidValueError: if an argument is invalid, or a joint moves by over 100 rad or m at once.
+        """
+        points, _ = as_point_set("q", q, self.tree.n)
+        gap = as_number("clearance", clearance)
+        away = as_float_array("bend", bend)
+        if away.shape not in ((), (self.tree.n,)) or not (away >= 0).all():
+            raise InvalidValueError("bend", away.tolist(), f"one length >= 0, or {self.tree.n}")
+        extra = self.rates @ np.broadcast_to(away, (self.tree.n,))
+        if not self._owners.size or not len(points):
+            return None
+        if np.abs(np.diff(points, axis=0)).max(initial=0.0) > RULES.longest:
+            raise InvalidValueError("q", "two postures farther apart", f"ways of at most {RULES.longest:g} rad or m")
+        for start in range(0, max(len(points) - 1, 1), RULES.piece):
+            some = points[start : start + RULES.piece + 1]
+            bounds = self._bound_distances(some)
+            first, second = (bounds[:-1], bounds[1:]) if len(some) > 1 else (bounds, bounds)
+            moves = np.abs(np.diff(some, axis=0)) if len(some) > 1 else np.zeros_like(some)
+            room = (first + second - moves @ self.rates.T) / 2 - extra
+            for i in np.flatnonzero((room <= gap).any(axis=1)).tolist():
+                suspects = np.flatnonzero(room[i] <= gap)
+                contact = self._halve(some[i], some[min(i + 1, len(some) - 1)], suspects, gap, extra)
+                if contact is not None:
+                    return replace(contact, segment=start + i)
+        return None
+
+    def with_scene(self, scene: Scene, allowed: Sequence[Pair] = ()) -> "Collisions":
+        """The same with objects around the robot: every link that moves is checked against every object.
+
+        Args:
+            scene: the objects, in the frame of the world.
+            allowed: pairs that may touch, by names of a link and an object.
+
+        Raises:
+            InvalidValueError: if a name is taken.
+        """
+        require_kind("scene", scene, Scene)
+        return self._add([Part(name, -1, solid.shape) for name, solid in scene.solids.items()], allowed)
+
+    def with_attached(self, frame: str, solids: Mapping[str, Solid], allowed: Sequence[Pair] = ()) -> "Collisions":
+        """The same with solids that a link carries, such as a tool or a box in the hand.
+
+        They are checked against all links and objects but those of the same body.
+
+        Args:
+            frame: name of the link, or of another frame that the robot knows.
+            solids: by name, in that frame.
+            allowed: further pairs that may touch, by names.
+
+        Raises:
+            UnknownNameError: if the robot has no such frame.
+            InvalidValueError: if a name is taken.
+        """
+        carrier = self.tree.frame(frame)
+        # Half-spaces have no end that a joint could move.
+        for name, solid in Scene(solids).solids.items():
+            if not solid.shape.bounded:
+                raise InvalidValueError(f"solid '{name}'", solid.heading, "one with an end, which a link can carry")
+        shapes = {name: solid.shape for name, solid in Scene(solids).solids.items()}
+        return self._add(
+            [
+                Part(name, carrier.parent, shape.move(carrier.rotation, carrier.translation))
+                for name, shape in shapes.items()
+            ],
+            allowed,
+        )
+
+    def _add(self, parts: Sequence[Part], allowed: Sequence[Pair]) -> "Collisions":
+        """The same with further parts, checked against all that are there and of another body."""
+        bodies = {part.name: part.body for part in self.parts}
+        both = [*bodies, *(part.name for part in parts)]
+        touching = {frozenset(pair) for pair in _check_pairs("allowed", allowed, both)}
+        pairs = list(self.pairs)
+        for part in parts:
+            if part.name in bodies:
+                raise InvalidValueError("name", part.name, "one that no link or object has")
+            pairs += [
+                (name, part.name)
+                for name, body in bodies.items()
+                if body != part.body and frozenset((name, part.name)) not in touching
+            ]
+        return Collisions(self.tree, (*self.parts, *parts), pairs, self.missing, self.origin)
+
+    def scan_near(self, points: Array, least: float, asked: Array) -> Iterator[tuple[int, float]]:
+        """Pairs that are nearer than some distance, with their distances, at postures (N, n).
+
+        Args:
+            points: the postures.
+            least: the distance [m].
+            asked: whether a pair is asked for, (pairs,).
+        """
+        scratch = self._scratch
+        bounds = self._bound_distances(points)
+        bounds[:, np.flatnonzero(asked[self._owners] == 0)] = np.inf
+        for i in np.flatnonzero((bounds < least).any(axis=1)).tolist():
+            pin.updateGeometryPlacements(scratch.model, scratch.data, scratch.geometry, scratch.placed, points[i])
+            distances: dict[int, float] = {}
+            for k in np.flatnonzero(bounds[i] < least).tolist():
+                found = pin.computeDistance(scratch.geometry, scratch.placed, k).min_distance
+                owner = int(self._owners[k])
+                distances[owner] = min(found, distances.get(owner, np.inf))
+            yield from ((owner, found) for owner, found in distances.items() if found < least)
+
+    def require_for(self, tree: KinematicTree) -> None:
+        """Raise InvalidValueError unless the robot is the one of another tree."""
+        mine = self.tree
+        same = mine.joint_names == tree.joint_names and np.allclose(
+            mine.translations, tree.translations, rtol=0.0, atol=RULES.same_place
+        )
+        if not same:
+            raise InvalidValueError(
+                "collisions", f"those of a robot with joints {listed(mine.joint_names)}", "those of the chart's robot"
+            )
+
+    @cached_property
+    def rates(self) -> Array:
+        """How fast joints move the two of each pair of parts against each other, (K, n) [m/rad] or [m/m].
+
+        A joint that carries one of the two turns it about its axis, so no point of it moves faster than its largest
+        distance from that axis, over all postures between the limits.
+        """
+        tree, parts = self.tree, self.parts
+        reach = np.zeros((len(parts), tree.n))
+        for k, part in enumerate(parts):
+            start, end, radius = part.shape.bound()
+            # From the farthest point of the part inwards, along the joints that carry it.
+            length = max(float(np.linalg.norm(start)), float(np.linalg.norm(end))) + radius
+            across = max(float(np.hypot(*start[:2])), float(np.hypot(*end[:2]))) + radius
+            body = part.body
+            while body >= 0:
+                slides = tree.prismatic[body]
+                reach[k, body] = 1.0 if slides else across
+                ends = np.abs([tree.lower[body], tree.upper[body]]).max() if slides else 0.0
+                length += float(np.linalg.norm(tree.translations[body])) + ends
+                across, body = length, tree.parents[body]
+        first, second = self._pair_parts.T
+        # A joint that carries both moves neither against the other.
+        moves = (reach[first] > 0) != (reach[second] > 0)
+        return np.where(moves, reach[first] + reach[second], 0.0)
+
+    def _halve(self, a: Array, b: Array, suspects: Indices, gap: float, extra: Array) -> Contact | None:
+        """The first contact on the straight way from a to b (n,), of some pairs; None if it is free."""
+        waiting = [(0.0, 1.0, suspects)]
+        known: dict[float, Array] = {}
+        whole = self.rates @ np.abs(b - a)
+
+        def measure(s: float, pairs: Indices) -> Array:
+            """Distances at a fraction of the way, NaN for pairs that are not asked for."""
+            values = known.setdefault(s, np.full(len(self._owners), np.nan))
+            scratch = self._scratch
+            pin.updateGeometryPlacements(scratch.model, scratch.data, scratch.geometry, scratch.placed, a + s * (b - a))
+            for k in pairs[np.isnan(values[pairs])].tolist():
+                values[k] = pin.computeDistance(scratch.geometry, scratch.placed, k).min_distance
+            return values[pairs]
+
+        while waiting:
+            low, high, pairs = waiting.pop()
+            first, second = measure(low, pairs), measure(high, pairs)
+            room = (first + second - (high - low) * whole[pairs]) / 2 - extra[pairs]
+            near = np.flatnonzero(room < gap)
+            if not near.size:
+                continue
+            if (high - low) * whole[pairs[near]].max() < RULES.resolution:
+                k = near[np.argmin(room[near])]
+                return Contact(0, low, self.pairs[self._owners[pairs[k]]], float(min(first[k], second[k])))
+            # The earlier half comes first.
+            middle = (low + high) / 2
+            waiting += [(middle, high, pairs[near]), (low, middle, pairs[near])]
+        return None
+
+    def _find_least(self, points: Array) -> tuple[Array, Indices, Array, Array]:
+        """Least distances (N,), pairs of parts (N,), nearest points (N, 2, 3) and normals (N, 3).
+
+        Pairs of parts are evaluated in the order of their lower bounds, until the next bound is above the least one.
+        """
+        N = len(points)
+        values, index = np.full(N, np.inf), np.full(N, -1)
+        ends, normals = np.full((N, 2, 3), np.nan), np.zeros((N, 3))
+        if not self._owners.size:
+            return values, index, ends, normals
+        scratch = self._scratch
+        model, data, geometry, placed = scratch.model, scratch.data, scratch.geometry, scratch.placed
+        for start in range(0, N, RULES.piece):
+            bounds = self._bound_distances(points[start : start + RULES.piece])
+            orders = np.argsort(bounds, axis=1)
+            sorted_bounds = np.take_along_axis(bounds, orders, axis=1).tolist()
+            for i, order in enumerate(orders.tolist(), start):
+                pin.updateGeometryPlacements(model, data, geometry, placed, points[i])
+                least, nearest = np.inf, -1
+                for bound, k in zip(sorted_bounds[i - start], order, strict=True):
+                    if bound >= least:
+                        break
+                    found = pin.computeDistance(geometry, placed, k).min_distance
+                    if found < least:
+                        least, nearest = found, k
+                result = placed.distanceResults[nearest]
+                values[i], index[i], normals[i] = least, nearest, result.normal
+                ends[i, 0], ends[i, 1] = result.getNearestPoint1(), result.getNearestPoint2()
+        # Of point clouds, coal has the cloud first.
+        swapped = np.flatnonzero(self._swapped[index])
+        ends[swapped], normals[swapped] = ends[swapped, ::-1], -normals[swapped]
+        return values, index, ends, normals
+
+    def _build_gradients(self, points: Array, index: Indices, ends: Array, normals: Array) -> Array:
+        """u^T (J_p2 - J_p1), (N, n), for nearest points (N, 2, 3) and unit normals u (N, 3)."""
+        tree, N = self.tree, len(points)
+        frames = self._joint_axes(points)[0].reshape(N, tree.n, 6)
+        gradients = np.zeros((N, tree.n))
+        if not self._owners.size:
+            return gradients
+        for side, sign in ((0, -1.0), (1, 1.0)):
+            carried = self._carried[self._pair_parts[index, side]]
+            arms = np.cross(frames[..., :3], ends[:, side, None, :] - frames[..., 3:])
+            speeds = np.where(np.array(tree.prismatic)[:, None], frames[..., :3], arms)
+            gradients += sign * carried * np.einsum("nij,nj->ni", speeds, normals)
+        return gradients
+
+    def _bound_distances(self, points: Array) -> Array:
+        """Lower bounds of the distances of pairs of parts, (N, K): those of capsules around them."""
+        N = len(points)
+        ends = self._capsule_ends(points)[0].reshape(N, len(self.parts), 2, 3)
+        first, second = self._pair_parts.T
+        a, b = ends[:, first], ends[:, second]
+        squares = _measure_segments(a[:, :, 0], a[:, :, 1], b[:, :, 0], b[:, :, 1])
+        bounds = np.sqrt(squares) - self._radii[first] - self._radii[second]
+        for k in np.flatnonzero(~self._bounded[second]):
+            # A half-space: the nearer end of the capsule.
+            shape = self.parts[second[k]].shape
+            heights = (a[:, k] - shape.translation) @ shape.rotation[:, 2]
+            bounds[:, k] = heights.min(axis=1) - self._radii[first[k]]
+        return np.asarray(bounds - RULES.slack)
+
+    @cached_property
+    def _pair_parts(self) -> Indices:
+        """The two parts of each pair of parts, (K, 2); a half-space comes second."""
+        return self._combinations[:, :2]
+
+    @cached_property
+    def _owners(self) -> Indices:
+        """The pair of names that each pair of parts belongs to, (K,)."""
+        return self._combinations[:, 2]
+
+    @cached_property
+    def _combinations(self) -> Indices:
+        carriers: dict[str, list[int]] = {}
+        for k, part in enumerate(self.parts):
+            carriers.setdefault(part.name, []).append(k)
+        rows = [
+            (i, k, owner)
+            for owner, (first, second) in enumerate(self.pairs)
+            for i in carriers[first]
+            for k in carriers[second]
+            if self.parts[i].body != self.parts[k].body
+        ]
+        return np.array(rows, dtype=np.int64).reshape(-1, 3)
+
+    @cached_property
+    def _swapped(self) -> Array:
+        """Whether coal reports the second part of a pair of parts as the first one, (K,)."""
+        return np.array([self.parts[k].shape.geometry.reported_first for k in self._pair_parts[:, 1]], dtype=bool)
+
+    @cached_property
+    def _bounded(self) -> Array:
+        return np.array([part.shape.bounded for part in self.parts], dtype=bool)
+
+    @cached_property
+    def _radii(self) -> Array:
+        return np.array([part.shape.bound()[2] for part in self.parts])
+
+    @cached_property
+    def _carried(self) -> Array:
+        """Whether a joint carries a part, (parts, n)."""
+        carried = np.zeros((len(self.parts), self.tree.n))
+        for row, part in zip(carried, self.parts, strict=True):
+            row[self.tree.carriers(part.body)] = 1.0
+        return carried
+
+    @cached_property
+    def _capsule_ends(self) -> Batched:
+        """q -> both ends of the capsules around all parts in the world, (6 parts, 1)."""
+        q = ca.SX.sym("q", self.tree.n)
+        poses = [*build_body_poses(self.tree, q), (ca.SX.eye(3), ca.SX.zeros(3))]
+        ends = []
+        for part in self.parts:
+            rotation, translation = poses[part.body]
+            ends += [translation + rotation @ constant(end) for end in part.shape.bound()[:2]]
+        return Batched(dense_function("capsules", [q], [ca.vertcat(*ends)]))
+
+    @cached_property
+    def _joint_axes(self) -> Batched:
+        """q -> axis and origin of every joint in the world, (6 n, 1)."""
+        q = ca.SX.sym("q", self.tree.n)
+        poses = build_body_poses(self.tree, q)
+        axes = [ca.vertcat(rotation[:, 2], translation) for rotation, translation in poses]
+        return Batched(dense_function("axes", [q], [ca.vertcat(*axes)]))
+
+    @cached_property
+    def _models(self) -> tuple[pin.Model, pin.GeometryModel]:
+        """The robot and its solids for Pinocchio."""
+        tree, model, geometry = self.tree, pin.Model(), pin.GeometryModel()
+        for i, name in enumerate(tree.joint_names):
+            joint = pin.JointModelPZ() if tree.prismatic[i] else pin.JointModelRZ()
+            model.addJoint(tree.parents[i] + 1, joint, pin.SE3(tree.rotations[i], tree.translations[i]), name)
+        for k, part in enumerate(self.parts):
+            pose = pin.SE3(part.shape.rotation, part.shape.translation)
+            solid = part.shape.geometry.build()
+            geometry.addGeometryObject(pin.GeometryObject(f"{k} {part.name}", part.body + 1, pose, solid))
+        for first, second in self._pair_parts.tolist():
+            geometry.addCollisionPair(pin.CollisionPair(first, second))
+        return model, geometry
+
+    @cached_property
+    def _threads(self) -> local:
+        return local()
+
+    @property
+    def _scratch(self) -> "_Scratch":
+        """The models, with the memory of one thread."""
+        mine = self._threads
+        if not hasattr(mine, "scratch"):
+            mine.scratch = _Scratch(*self._models)
+        scratch: _Scratch = mine.scratch
+        return scratch
+
+
+class _Scratch:
+    """Models of Pinocchio, and the data of one thread."""
+
+    def __init__(self, model: pin.Model, geometry: pin.GeometryModel) -> None:
+        self.model, self.geometry = model, geometry
+        self.data, self.placed = model.createData(), geometry.createData()
+        for request in self.placed.distanceRequests:
+            request.gjk_tolerance, request.gjk_max_iterations = RULES.tolerance, RULES.iterations
+
+
+def _measure_segments(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
+    """Squared distances of segments (..., 3), which may have no length."""
+    a, b, between = a1 - a0, b1 - b0, a0 - b0
+    aa, ab, bb = (np.einsum("...i,...i->...", u, v) for u, v in ((a, a), (a, b), (b, b)))
+    ac, bc = (np.einsum("...i,...i->...", u, between) for u in (a, b))
+    # The nearest points of the lines, then each in turn on its segment; any point of the first if they are parallel.
+    volume = aa * bb - ab * ab
+    s = np.where(volume > RULES.parallel * aa * bb, ab * bc - ac * bb, 0.0) / np.where(volume > 0, volume, 1.0)
+    t = (ab * np.clip(s, 0.0, 1.0) + bc) / np.where(bb > 0, bb, 1.0)
+    t = np.clip(t, 0.0, 1.0)
+    s = np.clip((ab * t - ac) / np.where(aa > 0, aa, 1.0), 0.0, 1.0)
+    gap = between + s[..., None] * a - t[..., None] * b
+    return np.asarray(np.einsum("...i,...i->...", gap, gap))
+
+
+def _check_pairs(name: str, pairs: Sequence[Pair], known: Sequence[str]) -> tuple[Pair, ...]:
+    """Pairs of known names.
+
+    Raises:
+        InvalidValueError, UnknownNameError: for anything else.
+    """
+    require_kind(name, pairs, Sequence)
+    for pair in pairs:
+        if not isinstance(pair, tuple | list) or len(pair) != 2:
+            raise InvalidValueError(f"entry of {name}", repr(pair)[:80], "two names")
+        for part in pair:
+            require_known("link or object", part, known)
+    return tuple((first, second) for first, second in pairs)
+
+
+def _name_pair(pair: Pair) -> str:
+    return f"'{pair[0]}' and '{pair[1]}'"

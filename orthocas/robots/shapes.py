@@ -1,0 +1,214 @@
+"""Solids in the frame of a body or of the world: boxes, cylinders, rounded hulls, half-spaces and point clouds."""
+
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, Self
+
+import coal
+import numpy as np
+import scipy
+
+from orthocas.tools.checks import Array
+
+
+@dataclass(frozen=True, slots=True)
+class ShapeRules:
+    """Numbers of solids."""
+
+    facets: int = 12  #: of the prism around a cylinder that its bound is made of
+    flat: float = 1e-9  #: [m], of point sets without a volume
+
+
+RULES = ShapeRules()
+
+
+class Geometry(Protocol):
+    """What a solid is made of, in its own frame."""
+
+    reported_first: bool = False  #: whether coal has it first in its answers, whatever is asked
+
+    def build(self) -> Any:
+        """The geometry of coal."""
+        ...
+
+    def list_corners(self) -> tuple[Array, float]:
+        """Points (K, 3) and a radius: the solid lies within the convex hull of the points, rounded by the radius."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class BoxGeometry(Geometry):
+    """A box with its middle at the origin."""
+
+    size: Array  #: (3,) edge lengths [m]
+
+    def build(self) -> Any:
+        """The box."""
+        return coal.Box(*self.size)
+
+    def list_corners(self) -> tuple[Array, float]:
+        """Its corners."""
+        signs = np.array(np.meshgrid(*3 * [[-0.5, 0.5]])).reshape(3, -1).T
+        return signs * self.size, 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class CylinderGeometry(Geometry):
+    """A cylinder along z with its middle at the origin."""
+
+    radius: float
+    length: float
+
+    def build(self) -> Any:
+        """The cylinder."""
+        return coal.Cylinder(self.radius, self.length)
+
+    def list_corners(self) -> tuple[Array, float]:
+        """The corners of a prism around it."""
+        angles = 2 * np.pi * np.arange(RULES.facets) / RULES.facets
+        ring = self.radius / np.cos(np.pi / RULES.facets) * np.column_stack([np.cos(angles), np.sin(angles)])
+        ends = [np.column_stack([ring, np.full(len(ring), z)]) for z in (-self.length / 2, self.length / 2)]
+        return np.concatenate(ends), 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class BallGeometry(Geometry):
+    """A ball about the origin."""
+
+    radius: float
+
+    def build(self) -> Any:
+        """The ball."""
+        return coal.Sphere(self.radius)
+
+    def list_corners(self) -> tuple[Array, float]:
+        """Its centre."""
+        return np.zeros((1, 3)), self.radius
+
+
+@dataclass(frozen=True, eq=False)
+class CapsuleGeometry(Geometry):
+    """All points within a radius of a segment along z with its middle at the origin."""
+
+    radius: float
+    length: float  #: of the segment [m]
+
+    def build(self) -> Any:
+        """The capsule."""
+        return coal.Capsule(self.radius, self.length)
+
+    def list_corners(self) -> tuple[Array, float]:
+        """The ends of the segment."""
+        return np.array([[0.0, 0.0, -self.length / 2], [0.0, 0.0, self.length / 2]]), self.radius
+
+
+@dataclass(frozen=True, eq=False)
+class HullGeometry(Geometry):
+    """The convex hull of points."""
+
+    points: Array  #: (K, 3), all of them corners [m]
+    faces: Array  #: (F, 3) triangles
+
+    @classmethod
+    def around(cls, points: Array) -> Self:
+        """The hull of points (N, 3).
+
+        Raises:
+            ValueError: if they span no volume.
+        """
+        centred = points - points.mean(axis=0)
+        if len(points) < 4 or np.linalg.svd(centred, compute_uv=False)[-1] < RULES.flat:
+            raise ValueError("the points span no volume")
+        hull = scipy.spatial.ConvexHull(points)
+        places = np.zeros(len(points), dtype=np.intp)
+        places[hull.vertices] = np.arange(len(hull.vertices))
+        return cls(points[hull.vertices], places[hull.simplices])
+
+    def build(self) -> Any:
+        """The hull."""
+        points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+        for point in self.points:
+            points.append(point)
+        for face in self.faces.tolist():
+            triangles.append(coal.Triangle(*face))
+        return coal.Convex(points, triangles)
+
+    def list_corners(self) -> tuple[Array, float]:
+        """Its corners."""
+        return self.points, 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class HalfSpaceGeometry(Geometry):
+    """All points below the plane z = 0."""
+
+    def build(self) -> Any:
+        """The half-space."""
+        return coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
+
+    def list_corners(self) -> tuple[Array, float]:
+        """None: it has no end."""
+        return np.zeros((0, 3)), 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class CloudGeometry(Geometry):
+    """Cubes of one size on a lattice: those that hold a point of a cloud."""
+
+    points: Array  #: (N, 3) [m]
+    cell: float  #: edge length of the cubes [m]
+    reported_first = True
+
+    def build(self) -> Any:
+        """The octree."""
+        return coal.makeOctree(self.points, self.cell)
+
+    def list_corners(self) -> tuple[Array, float]:
+        """The points, with the diagonal of a cube around them."""
+        return self.points, float(np.sqrt(3) * self.cell)
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A solid somewhere in the frame of a body or of the world."""
+
+    geometry: Geometry
+    rotation: Array  #: (3, 3)
+    translation: Array  #: (3,) [m]
+
+    def move(self, rotation: Array, translation: Array) -> "Shape":
+        """The solid turned by a rotation (3, 3), then shifted by a translation (3,)."""
+        return replace(self, rotation=rotation @ self.rotation, translation=rotation @ self.translation + translation)
+
+    @property
+    def bounded(self) -> bool:
+        """Whether it has ends."""
+        return len(self.geometry.list_corners()[0]) > 0
+
+    def bound(self) -> tuple[Array, Array, float]:
+        """Both ends (3,) and the radius of a capsule that contains it; a point of its surface and 0 for half-spaces.
+
+        Its axis is the one of least volume of those along the principal axes of the corners.
+        """
+        corners, rounding = self.geometry.list_corners()
+        if not len(corners):
+            return self.translation, self.translation, 0.0
+        corners = corners @ self.rotation.T + self.translation
+        centre = corners.mean(axis=0)
+        best: tuple[float, Array, Array, float] | None = None
+        for axis in np.linalg.svd(corners - centre)[2] if len(corners) > 1 else np.eye(3)[:1]:
+            # The middle of the corners across the axis, and their distances from a line through it.
+            across = corners - np.outer(corners @ axis, axis)
+            middle = (across.min(axis=0) + across.max(axis=0)) / 2
+            middle = middle - (middle @ axis) * axis
+            away = np.linalg.norm(across - middle, axis=1)
+            radius = float(away.max())
+            # Every corner lies within the radius of the segment from low to high.
+            depth, along = np.sqrt(np.maximum(radius**2 - away**2, 0.0)), corners @ axis
+            low, high = float((along + depth).min()), float((along - depth).max())
+            low, high = (low, high) if low < high else ((low + high) / 2, (low + high) / 2)
+            reach = radius + rounding
+            volume = np.pi * reach**2 * (high - low + 4 / 3 * reach)
+            if best is None or volume < best[0]:
+                best = volume, middle + low * axis, middle + high * axis, reach
+        assert best is not None
+        return best[1], best[2], best[3] * (1 + 1e-12)
