@@ -1,5 +1,7 @@
 """`orthocas.Arm`: an arm with charts of all its branches, and its postures for any task value."""
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

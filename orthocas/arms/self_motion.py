@@ -1,5 +1,7 @@
 """The self-motions of a task value within the joint limits: arcs, their ends, and questions about them."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

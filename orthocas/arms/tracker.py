@@ -1,5 +1,7 @@
 """A tracker of task values and coordinates that is never lost: exact in charts, and x first everywhere else."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum

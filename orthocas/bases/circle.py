@@ -1,5 +1,7 @@
 """Circle-valued coordinates, angles of pairs of functions: xi on SO(2) ([AS2023] Sec. 5.1.1; fitting them is ours)."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -51,11 +53,11 @@ class Circle:
         """'circle:' and the label of the pairs."""
         return f"circle:{self.pairs.label}"
 
-    def for_problem(self, problem: "Problem") -> "Circle":
+    def for_problem(self, problem: Problem) -> Circle:
         """The parametrisation with pairs for this problem."""
         return Circle(self.pairs.for_problem(problem))
 
-    def family(self, space: JointSpace, outputs: int) -> "CircleFamily":
+    def family(self, space: JointSpace, outputs: int) -> CircleFamily:
         """The family on the given joints.
 
         Raises:

@@ -1,5 +1,7 @@
 """Joints at all of whose positions a chart holds: those that only turn or shift the task, and mobile bases."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -278,7 +280,7 @@ def parse_suffix(text: str, before: str) -> tuple[Cyclic, tuple[str, ...]]:
     return cyclic, without
 
 
-def resolved(cyclic: Cyclic, problem: "Problem") -> tuple[str, ...]:
+def resolved(cyclic: Cyclic, problem: Problem) -> tuple[str, ...]:
     """The names of the cyclic joints of a problem that are meant.
 
     A joint that is named need not keep the size of task gradients, only their span: as the first and the last joint of
@@ -370,7 +372,7 @@ class Mobile:
         """'mobile:' and the label of the arm's functions."""
         return f"mobile:{self.arm.label}"
 
-    def for_problem(self, problem: Problem) -> "Mobile":
+    def for_problem(self, problem: Problem) -> Mobile:
         """The parametrisation with functions for this problem.
 
         Raises:
@@ -391,7 +393,7 @@ class Mobile:
             parent = k
         return Mobile(self.arm.for_problem(problem), self.base)
 
-    def family(self, space: JointSpace, outputs: int) -> "MobileFamily":
+    def family(self, space: JointSpace, outputs: int) -> MobileFamily:
         """The family on the given joints.
 
         Raises:

@@ -1,5 +1,7 @@
 """Coordinates given in closed form, also the shoulder-elbow-wrist angle. Their charts need no fit."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
@@ -60,7 +62,7 @@ class Given:
         require_tape(self.tape, require_count("n", self.n))
 
     @classmethod
-    def from_function(cls, name: str, n: int, function: Callable[[ca.SX], ca.SX] | ca.Function) -> "Given":
+    def from_function(cls, name: str, n: int, function: Callable[[ca.SX], ca.SX] | ca.Function) -> Given:
         """Build from a function of an SX column q (n, 1) that returns xi (r, 1).
 
         Raises:
@@ -79,15 +81,15 @@ class Given:
         require_shape(f"coordinates '{name}'", xi.shape, (None, 1))
         return cls(name, n, write_tape(dense_function("xi", [q], [xi])))
 
-    def for_problem(self, problem: "Problem") -> "Given":
+    def for_problem(self, problem: Problem) -> Given:
         """The object itself: it does not depend on the problem."""
         return self
 
-    def closed_form(self, problem: "Problem") -> ClosedForm:
+    def closed_form(self, problem: Problem) -> ClosedForm:
         """There are no parameters."""
         return ClosedForm(np.zeros(0))
 
-    def family(self, space: JointSpace, outputs: int) -> "GivenFamily":
+    def family(self, space: JointSpace, outputs: int) -> GivenFamily:
         """The coordinates as a family without parameters.
 
         Raises:

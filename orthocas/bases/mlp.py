@@ -1,5 +1,7 @@
 """Multilayer perceptron of sines and cosines of the joints, or of the joints themselves ([AS2023] Sec. 6, Fig. 16)."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -160,11 +162,11 @@ class MLP:
         widths = "x".join(map(str, self.hidden)) + (":raw" if self.raw else "")
         return f"mlp:{widths}{cyclic_choice.suffix(self.cyclic, self.without)}"
 
-    def for_problem(self, problem: "Problem") -> "MLP":
+    def for_problem(self, problem: Problem) -> MLP:
         """The parametrisation with the names of the problem's cyclic joints, if it reduces any."""
         return replace(self, cyclic=cyclic_choice.resolved(self.cyclic, problem)) if self.cyclic else self
 
-    def family(self, space: JointSpace, outputs: int) -> "MLPFamily":
+    def family(self, space: JointSpace, outputs: int) -> MLPFamily:
         """The network on the given joints.
 
         Raises:

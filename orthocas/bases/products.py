@@ -1,5 +1,7 @@
 """Bases of products of one-joint functions: polynomials, Fourier terms, and linear coordinates."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from math import comb, sqrt
@@ -43,7 +45,7 @@ class ProductFamily(BasisFamily):
         C = np.random.default_rng(seed).normal(size=(self.outputs, len(self.terms))) * 0.3**order
         return C.ravel()
 
-    def embed(self, theta: Array, coarser: "ProductFamily") -> Array:
+    def embed(self, theta: Array, coarser: ProductFamily) -> Array:
         """Convert coefficients of a smaller basis to this one, (size,)."""
         place = {term: k for k, term in enumerate(self.terms)}
         wide = np.zeros((self.outputs, self.width))
@@ -200,7 +202,7 @@ class Products:
         if self.joints is not None:
             object.__setattr__(self, "joints", require_count("joints", self.joints))
 
-    def for_problem(self, problem: "Problem") -> Self:
+    def for_problem(self, problem: Problem) -> Self:
         """The parametrisation with the names of the problem's cyclic joints, if it reduces any."""
         return replace(self, cyclic=cyclic_choice.resolved(self.cyclic, problem)) if self.cyclic else self
 
@@ -371,7 +373,7 @@ class Linear:
         """'linear'."""
         return "linear"
 
-    def for_problem(self, problem: Problem) -> "Linear":
+    def for_problem(self, problem: Problem) -> Linear:
         """The object itself: it does not depend on the problem."""
         return self
 

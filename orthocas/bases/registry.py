@@ -1,5 +1,7 @@
 """The registry of parametrisations: labels for the command line, plain data for chart files. Add your own here."""
 
+from __future__ import annotations
+
 import json
 import warnings
 from collections.abc import Callable, Mapping

@@ -1,5 +1,7 @@
 """Certify charts: prove with rigorous arithmetic that they do not fold, and where they are one-to-one."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import BrokenExecutor, Executor

@@ -1,5 +1,7 @@
 """Charts phi(q) = [h(q); xi(q)]: task and extra coordinates together, with Jacobian and inverse map."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -192,7 +194,7 @@ class Chart(InverseMethods, Shown):
         """
         return self_motion(self, q, step, samples, collisions)
 
-    def plot(self) -> "Figure":
+    def plot(self) -> Figure:
         """The arm along each coordinate, as far as it reaches from the centre of the domain, with the task held.
 
         Returns:
@@ -224,7 +226,7 @@ class GrownChart(Chart):
     `coordinates.leaf` is the base leaf. `coordinates.pull` gives the point of it that each q flows to, with a status.
     """
 
-    coordinates: "GrownCoordinates"
+    coordinates: GrownCoordinates
 
     def __post_init__(self) -> None:
         from orthocas.exact.flow import GrownCoordinates  # flows and meshes, which fitted charts do not need

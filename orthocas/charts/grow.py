@@ -1,5 +1,7 @@
 """Grows a chart: chooses a base leaf, charts it, and carries its coordinates along the task gradients."""
 
+from __future__ import annotations
+
 import numpy as np
 from numpy.typing import ArrayLike
 

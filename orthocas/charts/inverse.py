@@ -1,5 +1,7 @@
 """The inverse map q(x, xi): its searches in order, how each row ended, and their results."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -170,7 +172,7 @@ class Found:
     iterations: Indices  #: (N,)
     status: Indices  #: (N,)
 
-    def improve(self, rows: Indices, other: "Found") -> None:
+    def improve(self, rows: Indices, other: Found) -> None:
         """Take over what another search found in some rows, where it is better."""
         better = other.status < self.status[rows]
         same = other.status == self.status[rows]

@@ -1,5 +1,7 @@
 """Methods of charts around the inverse map q(phi), and the CasADi functions of a chart, the inverse among them."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -242,7 +244,7 @@ class InverseMethods(PhiFunctions):
         return self._inverse_function if name == "inverse" else self._graph(name)
 
     @cached_property
-    def parts(self) -> "ChartParts":
+    def parts(self) -> ChartParts:
         """What other packages of orthocas use of a chart; it may change without notice."""
         return ChartParts(self)
 

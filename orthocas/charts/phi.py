@@ -1,5 +1,7 @@
 """The map phi(q) = [h(q); xi(q)] as functions, its angles, and the scale of its errors."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar, overload

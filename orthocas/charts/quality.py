@@ -1,5 +1,7 @@
 """The quality of a chart on its domain: angles and conditioning ([AS2023] Figs. 20 and 27), leaks and folds."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -75,7 +77,7 @@ class _Sums:
             largest = np.maximum(largest, part[2])
         return cls(N, middle, first, second, largest, counts)
 
-    def __getitem__(self, columns: Sequence[int]) -> "_Sums":
+    def __getitem__(self, columns: Sequence[int]) -> _Sums:
         """Those of some of the angles."""
         chosen = list(columns)
         parts = (self.first[chosen], self.second[chosen], self.largest[chosen], self.counts[chosen])
@@ -172,7 +174,7 @@ class Angles:
     metric_mutual_angle: AngleStatistics  #: between two coordinates, in the metric
 
     @classmethod
-    def of(cls, judged: Judged, chosen: Sequence[Sequence[int]]) -> "list[Angles]":
+    def of(cls, judged: Judged, chosen: Sequence[Sequence[int]]) -> list[Angles]:
         """The angles of each of some sets of coordinates of `judged`."""
         N, m, r = judged.task_cosines.shape
         task = _sums_of_cosines(judged.task_cosines.reshape(N, m * r))
@@ -208,7 +210,7 @@ class Conditioning:
     mean: float
 
     @classmethod
-    def of(cls, values: Array, worst: WorstPoints | None) -> "Conditioning":
+    def of(cls, values: Array, worst: WorstPoints | None) -> Conditioning:
         """Statistics of the values at all samples, (N,), and of the worst points of a search."""
         least = values.min() if worst is None else max(0.0, min(values.min(), worst.least))
         return cls(float(least), float(np.quantile(values, 0.01)), float(values.mean()))
@@ -224,7 +226,7 @@ class ContactShare:
     deepest: float  #: least distance [m], negative if a pair overlaps
 
     @classmethod
-    def of(cls, collisions: Collisions, points: Array) -> "ContactShare":
+    def of(cls, collisions: Collisions, points: Array) -> ContactShare:
         """Of postures (N, n)."""
         found = collisions.distance(points)
         touching = np.flatnonzero(found.distance <= 0)
@@ -279,7 +281,7 @@ class Report(Shown):
         """Whether coordinates are nearly parallel to each other or to the task gradients on over 1 % of the domain."""
         return self.conditioning.p01 < RULES.degenerate
 
-    def plot(self) -> "Figure":
+    def plot(self) -> Figure:
         """Histograms of angles and leaks, as a matplotlib figure; see `figures.quality_figure`."""
         from orthocas.charts.figures import quality_figure  # with matplotlib, which takes long to import
 

@@ -1,5 +1,7 @@
 """Ready charts of known arms: the catalogue, and a card for each."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

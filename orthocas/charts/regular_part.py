@@ -1,5 +1,7 @@
 """The part of a clear box where coordinates do not fold: the domain of wide charts."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
@@ -113,7 +115,7 @@ class RegularPart(ClearBox):
         bound = f"expected one above least_volume = {self.least_volume:g}"
         return f"the coordinates have a volume of {self.volumes(q):.3g}, {bound}"
 
-    def apply_to(self, box: Box) -> "RegularPart":
+    def apply_to(self, box: Box) -> RegularPart:
         """The same conditions on another box."""
         return RegularPart(super().apply_to(box), self.coordinates, self.least_volume)
 

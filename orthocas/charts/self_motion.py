@@ -1,5 +1,7 @@
 """What can move at a task value: ranges of the coordinates, curves, and self-motions."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import product
@@ -178,7 +180,7 @@ class LevelCurve:
         collisions: what the robot may hit; the curve ends at a contact.
     """
 
-    def __init__(self, chart: "Chart", held: Indices, step: float, collisions: Collisions | None = None) -> None:
+    def __init__(self, chart: Chart, held: Indices, step: float, collisions: Collisions | None = None) -> None:
         self.walls, self._step = Walls(chart.problem, collisions), step
         whole = bool((held >= chart.m).any())
         self._value, self._jacobian, self._difference = _of_phi(chart) if whole else _of_task(chart)
@@ -293,12 +295,12 @@ class LevelCurve:
 Functions = tuple[Callable[[Array], Array], Callable[[Array], Array], Callable[[Array, Array], Array]]
 
 
-def _of_phi(chart: "Chart") -> Functions:
+def _of_phi(chart: Chart) -> Functions:
     """phi and its rates at one joint position, and differences of two values."""
     return chart.phi, lambda q: chart.parts.batched_rates(q[None])[0], chart.parts.phi_map.difference
 
 
-def _of_task(chart: "Chart") -> Functions:
+def _of_task(chart: Chart) -> Functions:
     """The same of the task alone."""
     relative = chart.parts.relative
     return chart.task, lambda q: relative.batched_rates(q[None])[0].reshape(chart.m, chart.n), relative.difference
@@ -380,13 +382,13 @@ class XiRange(Shown):
         }
 
 
-def xi_range(chart: "Chart", q: ArrayLike, collisions: Collisions | None = None) -> XiRange:
+def xi_range(chart: Chart, q: ArrayLike, collisions: Collisions | None = None) -> XiRange:
     """How far each coordinate reaches alone; see `Chart.xi_range`."""
     start = start_inside(chart, q, collisions)
     return XiRange(tuple(_interval(chart, start, k, collisions) for k in range(chart.r)), find_turn_shifts(chart))
 
 
-def find_turn_shifts(chart: "Chart") -> dict[str, Array]:
+def find_turn_shifts(chart: Chart) -> dict[str, Array]:
     """What a full turn of a joint that turns without end adds to xi everywhere, (r,) by the joint's name.
 
     One posture then has many values of xi, these apart. Joints whose turns do not change xi are missing, and so are
@@ -401,7 +403,7 @@ def find_turn_shifts(chart: "Chart") -> dict[str, Array]:
     return shifts
 
 
-def too_far(chart: "Chart", q: Array, wanted: Array) -> str:
+def too_far(chart: Chart, q: Array, wanted: Array) -> str:
     """The coordinate that is wanted (r,) farthest outside its range at q (n,), in words; empty if there is none."""
     if chart.parts.turns.any():
         return ""
@@ -416,7 +418,7 @@ def too_far(chart: "Chart", q: Array, wanted: Array) -> str:
     return f"; {interval.label} = {wanted[k]:.4g} is asked for, {told}"
 
 
-def start_inside(chart: "Chart", q: ArrayLike, collisions: Collisions | None = None) -> Array:
+def start_inside(chart: Chart, q: ArrayLike, collisions: Collisions | None = None) -> Array:
     """One joint position (n,) inside the domain, where phi and J are finite and nothing touches.
 
     Raises:
@@ -438,7 +440,7 @@ def start_inside(chart: "Chart", q: ArrayLike, collisions: Collisions | None = N
     return point
 
 
-def branch_along(chart: "Chart", q: Array, k: int, sign: float, collisions: Collisions | None = None) -> Branch:
+def branch_along(chart: Chart, q: Array, k: int, sign: float, collisions: Collisions | None = None) -> Branch:
     """The curve from q (n,) on which x and all coordinates but the k-th stay, and that one rises (sign 1) or falls."""
     row = chart.m + k
     curve = LevelCurve(chart, np.delete(np.arange(chart.n), row), RULES.step, collisions)
@@ -450,12 +452,12 @@ def branch_along(chart: "Chart", q: Array, k: int, sign: float, collisions: Coll
     return curve.follow(q, sign * chart.parts.batched_rates(q[None])[0, row], rising)
 
 
-def xi_along(chart: "Chart", points: Array) -> Array:
+def xi_along(chart: Chart, points: Array) -> Array:
     """Coordinates (N, r) along a curve from its first point on, without the jumps of circle-valued ones."""
     return counted_on(chart.xi(points), chart.parts.turns[chart.m :])
 
 
-def _interval(chart: "Chart", q: Array, k: int, collisions: Collisions | None) -> Interval:
+def _interval(chart: Chart, q: Array, k: int, collisions: Collisions | None) -> Interval:
     down, up = (branch_along(chart, q, k, sign, collisions) for sign in (-1.0, 1.0))
     low, high = (float(xi_along(chart, branch.q)[-1, k]) for branch in (down, up))
     return Interval(
@@ -488,7 +490,7 @@ class Fan:
         return np.column_stack([np.interp(self.places(count), self.arc_length, column) for column in self.q.T])
 
 
-def fan_along(chart: "Chart", q: Array, k: int) -> Fan:
+def fan_along(chart: Chart, q: Array, k: int) -> Fan:
     """The fan of the k-th coordinate at a joint position (n,) inside the domain."""
     down, up = branch_along(chart, q, k, -1.0), branch_along(chart, q, k, 1.0)
     if down.endless:  # then one direction passes everything
@@ -501,7 +503,7 @@ def fan_along(chart: "Chart", q: Array, k: int) -> Fan:
     return Fan(chart.labels[chart.m + k], points, xi, arc_length, down.stop, up.stop)
 
 
-def filled(chart: "Chart", q: Array, alone: XiRange, samples: int, collisions: Collisions | None = None) -> Array:
+def filled(chart: Chart, q: Array, alone: XiRange, samples: int, collisions: Collisions | None = None) -> Array:
     """Joint positions (N, n) with the task value of q (n,), inside the domain and free, q first.
 
     Their coordinates lie on a lattice around xi(q). Its spacing divides the range of each coordinate alone so that
@@ -545,7 +547,7 @@ def _neighbours(
     return pairs
 
 
-def _solved(chart: "Chart", starts: Array, targets: Array, sign: float) -> tuple[Array, Indices]:
+def _solved(chart: Chart, starts: Array, targets: Array, sign: float) -> tuple[Array, Indices]:
     """Newton's method from all starts (N, n), and the rows where it found a point of the domain on the same sheet."""
     phi_map = chart.parts.phi_map
     found = Newton(phi_map)(targets, starts)
@@ -603,7 +605,7 @@ class SelfMotionCurve(SelfMotion):
 
 
 def self_motion(
-    chart: "Chart", q: ArrayLike, step: float = 0.05, samples: int = 1000, collisions: Collisions | None = None
+    chart: Chart, q: ArrayLike, step: float = 0.05, samples: int = 1000, collisions: Collisions | None = None
 ) -> SelfMotion:
     """The self-motion through a joint position; see `Chart.self_motion`."""
     start = start_inside(chart, q, collisions)
@@ -614,7 +616,7 @@ def self_motion(
     return _curve(chart, start, longest, collisions) if chart.r == 1 else _set(chart, start, samples, collisions)
 
 
-def _curve(chart: "Chart", q: Array, step: float, collisions: Collisions | None) -> SelfMotionCurve:
+def _curve(chart: Chart, q: Array, step: float, collisions: Collisions | None) -> SelfMotionCurve:
     """Both directions of the curve; the coordinate rises at q."""
     curve = LevelCurve(chart, np.arange(chart.m), step, collisions)
     gradient = chart.parts.batched_rates(q[None])[0, chart.m]
@@ -638,7 +640,7 @@ def _curve(chart: "Chart", q: Array, step: float, collisions: Collisions | None)
     )
 
 
-def _set(chart: "Chart", q: Array, samples: int, collisions: Collisions | None) -> SelfMotion:
+def _set(chart: Chart, q: Array, samples: int, collisions: Collisions | None) -> SelfMotion:
     """Points on a lattice in xi, and the extent from its outermost points on."""
     require_no_turns(chart.labels, chart.parts.turns, "a set of self-motions")
     alone = xi_range(chart, q, collisions)
@@ -648,9 +650,7 @@ def _set(chart: "Chart", q: Array, samples: int, collisions: Collisions | None) 
     return SelfMotion(chart.x(q), points, xi, 0, XiRange(widest))
 
 
-def _widest(
-    chart: "Chart", points: Array, xi: Array, alone: Interval, k: int, collisions: Collisions | None
-) -> Interval:
+def _widest(chart: Chart, points: Array, xi: Array, alone: Interval, k: int, collisions: Collisions | None) -> Interval:
     """The extent of one coordinate: from the outermost points of a set along the coordinate to what stops it."""
     if not np.isfinite([alone.low, alone.high]).all():
         return alone

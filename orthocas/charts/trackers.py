@@ -1,5 +1,7 @@
 """Trackers of moving targets, which stay or go as near as they can where phi is out of reach."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, NamedTuple
@@ -318,7 +320,7 @@ class ReachingTracker(Tracker):
                 damping *= RULES.grows
         return now.q, False
 
-    def _inside(self, now: "_Look", q: Array, low: Array, high: Array) -> "_Look":
+    def _inside(self, now: _Look, q: Array, low: Array, high: Array) -> _Look:
         """The end q (n,) of a step, brought back inside the conditions of the domain; of infinite cost if it fails."""
         enough = np.minimum(RULES.room / 2, now.rooms)
         new = self._look(np.clip(q, low, high))
@@ -339,7 +341,7 @@ class ReachingTracker(Tracker):
         self._guard.run()
         return bool(self._guarded[1] <= 0)
 
-    def _look(self, q: Array) -> "_Look":
+    def _look(self, q: Array) -> _Look:
         """Errors and rooms at q (n,)."""
         self._left -= 1
         self._at[:] = q

@@ -1,5 +1,7 @@
 """The inverse map of a chart in compiled C, for large batches on machines with a compiler."""
 
+from __future__ import annotations
+
 import ctypes
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace

@@ -1,5 +1,7 @@
 """`export`: charts and torque laws as small modules of NumPy, PyTorch or JAX that do not need orthocas."""
 
+from __future__ import annotations
+
 import re
 import textwrap
 from base64 import b64encode

@@ -1,5 +1,7 @@
 """`generate_c`: writes a chart, the robot's dynamics and a controller as a small C library."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, fields

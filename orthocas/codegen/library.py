@@ -1,5 +1,7 @@
 """Generated C as a compiled library, called from Python: functions, supervised law, and the time of a tick."""
 
+from __future__ import annotations
+
 import ctypes
 import shutil
 from collections.abc import Sequence

@@ -1,5 +1,7 @@
 """Gains: their values and settings, the stiffness by modes of the loop, the modes, and what the motors can hold."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

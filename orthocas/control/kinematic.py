@@ -1,5 +1,7 @@
 """Joint velocities from phi = [x; xi]: a law ([AS2023] Sec. 9), and a task for quadratic programs of others."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType

@@ -1,5 +1,7 @@
 """Laws with a state: what a law remembers from tick to tick, and the two memories that come with orthocas."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -118,7 +120,7 @@ class Remembers(Protocol):
 
     name: ClassVar[str]  #: for commands and displays
 
-    def of(self, law: "_OperationalSpace") -> Memory:
+    def of(self, law: _OperationalSpace) -> Memory:
         """The memory of a law that has the input `extra_torque`."""
 
 
@@ -246,7 +248,7 @@ class MomentumObserver(_Correcting):
 
     name: ClassVar[str] = "momentum"
 
-    def of(self, law: "_OperationalSpace") -> Memory:
+    def of(self, law: _OperationalSpace) -> Memory:
         """The memory of a law: expected momentum, its rate, and the correction.
 
         Raises:
@@ -294,7 +296,7 @@ class Adaptation(_Correcting):
 
     name: ClassVar[str] = "adaptive"
 
-    def of(self, law: "_OperationalSpace") -> Memory:
+    def of(self, law: _OperationalSpace) -> Memory:
         """The memory of a law: errors of first moments [kg m] (masses [kg] for sliding joints), offset, correction.
 
         Raises:
@@ -333,7 +335,7 @@ class Adaptation(_Correcting):
         offset = _replace_invalid(offset)
         return _build_memory(fields, inputs, {"moments": moments, "offset": offset, "correction": correction})
 
-    def _compute_crossing(self, law: "_OperationalSpace") -> float:
+    def _compute_crossing(self, law: _OperationalSpace) -> float:
         """c [1/s]; larger weights, and faster learning, make soft laws swing."""
         # The slowest mode with a spring.
         modes = law.modes(law.problem.domain.centre)
@@ -349,7 +351,7 @@ MEMORIES: Mapping[str, type[MomentumObserver] | type[Adaptation]] = {
 }
 
 
-def _check_bound(bound: ArrayLike | None, law: "_OperationalSpace") -> Array:
+def _check_bound(bound: ArrayLike | None, law: _OperationalSpace) -> Array:
     """Largest corrections (n,)."""
     if law.model.source == "given":
         raise InvalidValueError("model of a law with a memory", "given", "own, because it needs the momentum")
@@ -361,7 +363,7 @@ def _check_bound(bound: ArrayLike | None, law: "_OperationalSpace") -> Array:
     return largest
 
 
-def _name_inputs(law: "_OperationalSpace", fields: Mapping[str, Array]) -> dict[str, ca.MX]:
+def _name_inputs(law: _OperationalSpace, fields: Mapping[str, Array]) -> dict[str, ca.MX]:
     """Symbols for the inputs of a step, in order."""
     further = {"command": law.problem.n, "active": 1, "period": 1} | {name: len(fields[name]) for name in fields}
     symbols = {name: ca.MX.sym(name, size) for name, size in further.items()}

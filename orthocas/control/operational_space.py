@@ -1,5 +1,7 @@
 """Impedance and PD+ control in phi ([AS2023] Sec. 8), and their modes of decoupling."""
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,5 +1,7 @@
 """References over time: steps, splines, low-pass filters, and whether joints can follow them."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache

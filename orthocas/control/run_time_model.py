@@ -1,5 +1,7 @@
 """What a law learns of the robot at run time: payload, contact forces, extra torque, or the model itself."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args

@@ -1,5 +1,7 @@
 """Flows along the task gradients: Dormand-Prince for many points at once, SUNDIALS for the dynamics of one."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
@@ -147,7 +149,7 @@ class GrownCoordinates:
         )
 
     @cached_property
-    def flow(self) -> "TaskFlow":
+    def flow(self) -> TaskFlow:
         """The flow along the task gradients."""
         return TaskFlow(self.problem)
 
@@ -230,11 +232,11 @@ class TaskFlow:
         return J.T if self.problem.metric.is_identity else _solve_spd(self.problem.metric.function(q), J.T)
 
     @cached_property
-    def _positions(self) -> "BatchedFlow":
+    def _positions(self) -> BatchedFlow:
         return BatchedFlow(self.field, np.ones(self.problem.n))
 
     @cached_property
-    def _with_tangents(self) -> "BatchedFlow":
+    def _with_tangents(self) -> BatchedFlow:
         """The flow with r tangent vectors, stored as directions u with |u| = 1 and logarithms of lengths."""
         # The state: q, then r directions, then the logarithms of their lengths.
         n, m, r = self.problem.n, self.problem.m, self.problem.r

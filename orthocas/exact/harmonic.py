@@ -1,5 +1,7 @@
 """Level surfaces of a task as meshes, and harmonic maps of them ([AS2023] App. B)."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 

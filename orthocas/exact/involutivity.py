@@ -1,5 +1,7 @@
 """Involutivity: whether exact orthogonal coordinates exist for a task, and if not, how close one can get."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -215,7 +217,7 @@ class TaskBrackets:
     size: ca.SX  #: root sum of squares of the terms that cancel in the brackets: the scale of rounding in d
 
     @classmethod
-    def build(cls, problem: Problem) -> "TaskBrackets":
+    def build(cls, problem: Problem) -> TaskBrackets:
         """Build the expressions. They are NaN where J_x loses rank.
 
         With A = U^T U and the QR factors U^-T J_x^T = O R, the basis is E = U^-1 O = G R^-1, G = A^-1 J_x^T. Brackets

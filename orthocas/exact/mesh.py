@@ -1,5 +1,7 @@
 """Triangle meshes of leaves: points on them, and meshes that are improved."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -175,7 +177,7 @@ class TriangleLocator:
         # Also at exit, where libigl would call a tree in use a leak.
         finalize(self, self._trees.clear)
 
-    def __reduce__(self) -> tuple[type["TriangleLocator"], tuple[Array, Indices]]:
+    def __reduce__(self) -> tuple[type[TriangleLocator], tuple[Array, Indices]]:
         """Pickle and copy only the mesh; the tree is rebuilt."""
         return TriangleLocator, (self._vertices, self._faces)
 

@@ -1,5 +1,7 @@
 """Comparisons: a grid of parametrisations, solvers, weights and seeds, all evaluated on the same held-out samples."""
 
+from __future__ import annotations
+
 import csv
 import io
 import math
@@ -65,7 +67,7 @@ def compare(
     control_ticks: bool = False,
     monitor: Monitor = silent,
     force: bool = False,
-) -> "Comparison":
+) -> Comparison:
     """Fit every parametrisation with every solver, weights and seed, and evaluate all on the same held-out samples.
 
     If a fit fails, the result says so and the others continue. Coordinates in closed form need no solver and no seed,
@@ -171,13 +173,13 @@ def _list_weights(
 
 
 def _build_cells(
-    first: "Cell",
+    first: Cell,
     parametrisations: Sequence[Parametrisation],
     solvers: Sequence[Solver] | None,
     losses: Sequence[Weights | None],
     seeds: int,
     folder: Path | None,
-) -> list["Cell"]:
+) -> list[Cell]:
     """The cells of a grid, with all else like the first one. Coordinates in closed form need neither solver nor seed.
 
     Raises:
@@ -242,7 +244,7 @@ class Cell:
         assert self.solver is not None
         return self.solver.name if self.parametrisation.closed_form is None else "closed form"
 
-    def fail(self, error: str) -> "CellResult":
+    def fail(self, error: str) -> CellResult:
         """The result if the fit failed."""
         return CellResult(*self.names, Status.FAILED.value, " ".join(error.split()))
 
@@ -519,7 +521,7 @@ class Comparison(Shown):
             },
         }
 
-    def plot(self) -> "Figure":
+    def plot(self) -> Figure:
         """Angles of all fits, or leaks over what they cost, as a figure; see `comparison_figures.front_figure`."""
         from orthocas.fitting.comparison_figures import front_figure  # with matplotlib, which takes long to import
 

@@ -1,5 +1,7 @@
 """Closed expressions for grown coordinates, so that controllers and generated C can use them."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -49,7 +51,7 @@ def distil(
     samples: int | None = None,
     seed: int = 0,
     monitor: Monitor = silent,
-) -> "Distilled":
+) -> Distilled:
     """Fit a closed expression to the values and gradients of a grown chart, for controllers and generated C.
 
     Minimises the mean of |xi - xi_grown|^2 + w^2 |J_xi - J_grown|^2 over samples of the domain, where w is the mean

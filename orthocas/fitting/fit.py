@@ -1,5 +1,7 @@
 """`fit`: fits coordinates to a problem, along stages, and fixes what the loss leaves free."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -54,7 +56,7 @@ def fit(
     split_idle: bool = True,
     precision: Precision = "double",
     like: Likeness | None = None,
-) -> "Fit":
+) -> Fit:
     """Find coordinates xi(q) of a family that are nearly orthogonal to the task.
 
     The parameters theta of the family minimise, over uniform samples q of the domain and its worst points::
@@ -147,7 +149,7 @@ def fit_from(
     weights: Weights,
     seed: int,
     monitor: Monitor,
-) -> "Fit":
+) -> Fit:
     """The fit of `fit`, from known coordinates if there are some."""
     settings = FitSettings.check(problem, parametrisation, None, weights, None, seed, None)
     return _fit(problem, settings, monitor, begin=begin)
@@ -159,7 +161,7 @@ def _fit(
     monitor: Monitor,
     align_to: Chart | None = None,
     begin: Begin | None = None,
-) -> "Fit":
+) -> Fit:
     """Fit with settings that are checked."""
     start = time.perf_counter()
     # the domain that the family asks for, and whether the task can be regular there
@@ -348,7 +350,7 @@ def _write_notes(solution: Solution, settings: FitSettings) -> dict[str, str | f
     }
 
 
-def offer_clear_part(problem: Problem, check: ProblemCheck, worst: WorstPoints | None) -> "ClearPart | None":
+def offer_clear_part(problem: Problem, check: ProblemCheck, worst: WorstPoints | None) -> ClearPart | None:
     """Offer a bound after a fit if the domain touches near-singular positions, or if charts fail near them.
 
     The bound leaves out nine in ten of the points with a conditioning below 0.05 that the fit's search found.
@@ -394,7 +396,7 @@ class Fit(Shown):
     worst: WorstPoints | None  #: result of the last search for folds; None if there was none
     seconds: float
     like: Mapping[str, float] = field(default_factory=dict)  #: root mean square angle to each quantity's gradient [deg]
-    clear_part: "ClearPart | None" = None  #: a smaller domain to fit on, if this one touches near-singular positions
+    clear_part: ClearPart | None = None  #: a smaller domain to fit on, if this one touches near-singular positions
 
     @property
     def cyclic_joints(self) -> tuple[str, ...]:

@@ -1,5 +1,7 @@
 """The loss of a fit: as one CasADi expression of the parameters, and of one sample, as least squares in J_xi."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -143,7 +145,7 @@ class Loss:
     exchanged: Pairs = ()  #: rows i, j of J_xi that stand for components, see `coordinates_of`
 
     @classmethod
-    def of(cls, sizes: Sizes, weights: Mapping[str, float], exchanged: Pairs = ()) -> "Loss":
+    def of(cls, sizes: Sizes, weights: Mapping[str, float], exchanged: Pairs = ()) -> Loss:
         """The terms with a positive weight.
 
         Raises:
@@ -179,7 +181,7 @@ class Loss:
         return tuple((weight, term) for term, weight in self.terms if isinstance(term, RegularityTerm))
 
     @cached_property
-    def written_out(self) -> "Loss":
+    def written_out(self) -> Loss:
         """The loss without its volume terms."""
         names = {term.name for _, term in self.volume_terms}
         kept = tuple(pair for pair in self.weights if pair[0] not in names)
@@ -260,13 +262,13 @@ def build_loss_with_slopes(loss: Loss) -> ColumnFunction:
 
 
 @cache
-def build_loss_columns(loss: Loss) -> "ColumnFunction | LossWithVolumes":
+def build_loss_columns(loss: Loss) -> ColumnFunction | LossWithVolumes:
     """Like `build_loss_with_slopes`, with volumes of many gradients by LAPACK."""
     return LossWithVolumes(loss, build_loss_with_slopes) if loss.volume_terms else build_loss_with_slopes(loss)
 
 
 @cache
-def build_value_columns(loss: Loss) -> "ColumnFunction | LossWithVolumes":
+def build_value_columns(loss: Loss) -> ColumnFunction | LossWithVolumes:
     """Loss of one sample, with the inputs of `build_sample_loss`."""
 
     def written(part: Loss) -> ColumnFunction:

@@ -1,5 +1,7 @@
 """`suggest_domain`: the widest box around a posture on which a chart has the quality that is asked."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -62,7 +64,7 @@ def suggest_domain(
     weights: Weights | WeightNumbers = DEFAULT_WEIGHTS,
     seed: int = 0,
     monitor: Monitor = silent,
-) -> "DomainSuggestion":
+) -> DomainSuggestion:
     """The widest box around a posture, inside the joint limits, on which a chart has the quality that is asked.
 
     Quadratic charts on trial boxes give leak and conditioning in a fraction of a second. A search over the half-widths
@@ -156,7 +158,7 @@ class _Joints:
     cyclic: tuple[str, ...]
 
     @classmethod
-    def of(cls, problem: Problem) -> "_Joints":
+    def of(cls, problem: Problem) -> _Joints:
         idle = find_idle_joints(problem, sample_problem(problem, RULES.checked, 0))[-problem.r :]
         return cls(problem.robot.joint_names, tuple(idle), cyclic_joints(problem))
 
@@ -170,7 +172,7 @@ class _Joints:
         """Joints whose half-widths are searched."""
         return [k for k in self.active if self.names[k] not in self.cyclic]
 
-    def describe(self, problem: Problem, broken: Mapping[int, list[Miss]]) -> "tuple[JointWidth, ...]":
+    def describe(self, problem: Problem, broken: Mapping[int, list[Miss]]) -> tuple[JointWidth, ...]:
         """Half-widths of the problem's domain, with what ends them.
 
         Args:

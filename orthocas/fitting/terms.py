@@ -1,5 +1,7 @@
 """The terms of the loss: cosines between gradients ([AS2023] eq. (24)), angles in the metric, regularity, length."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -447,7 +449,7 @@ class Weights:
             raise InvalidValueError("weights", "all zero", "at least one positive number")
 
     @classmethod
-    def of(cls, weights: "Weights | WeightNumbers") -> "Weights":
+    def of(cls, weights: Weights | WeightNumbers) -> Weights:
         """Convert two to five numbers in the order of the fields; missing ones are 0. Weights stay as they are.
 
         Raises:
@@ -462,7 +464,7 @@ class Weights:
             raise InvalidValueError("lambda1", weights.task, "a positive number")
         return weights
 
-    def for_problem(self, problem: Problem) -> "Weights":
+    def for_problem(self, problem: Problem) -> Weights:
         """The same weights with the default angles of a problem, unless angles are given."""
         if self.angles is not None:
             return self

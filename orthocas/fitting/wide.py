@@ -1,5 +1,7 @@
 """Wide charts: coordinates that are regular on a whole branch of the joint range."""
 
+from __future__ import annotations
+
 import math
 import time
 import warnings
@@ -68,7 +70,7 @@ def fit_wide(
     samples: int | None = None,
     seed: int = 0,
     monitor: Monitor = silent,
-) -> "WideFit":
+) -> WideFit:
     """Find coordinates that are regular on a whole branch of the joint range, and as orthogonal as that permits.
 
     The parameters theta of a family minimise, over samples q of the branch that are clear of singular positions::
@@ -342,7 +344,7 @@ def _finish(
     counted: Array,
     start: float,
     interrupted: bool,
-) -> "WideFit":
+) -> WideFit:
     """The chart of a solution, normalised and evaluated."""
     clear, seed = solution.problem, settings.seed
     status = Status.INTERRUPTED if interrupted else Status.CONVERGED

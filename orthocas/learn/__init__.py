@@ -1,5 +1,7 @@
 """Coordinates (x, xi) in robot learning: actions of Gymnasium environments, and episodes of recorded joints."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -57,7 +59,7 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
 
     def __init__(
         self,
-        env: "gymnasium.Env[Array, Array]",
+        env: gymnasium.Env[Array, Array],
         chart: Chart,
         step: ArrayLike,
         joints: ArrayLike | None = None,

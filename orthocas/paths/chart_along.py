@@ -1,5 +1,7 @@
 """One chart for a whole path of postures: the corridor around the path, and the chart that is fitted there."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

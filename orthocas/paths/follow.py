@@ -1,5 +1,7 @@
 """From a tool path to a motion of the joints."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -142,7 +144,7 @@ def _read_limits(
     acceleration: ArrayLike | None,
     distances: LinkDistances,
     clearance: float,
-) -> "MotionLimits":
+) -> MotionLimits:
     """Limits of all joints, > 0 and finite."""
     most = chart.problem.robot.velocity_limits if velocity is None else velocity
     speeds = _spread_limits(chart, "velocity_limits", most)
@@ -166,7 +168,7 @@ def _spread_limits(chart: Chart, name: str, value: ArrayLike) -> Array:
 
 
 def _sample_on_stamps(
-    path: ToolPath, curve: JointCurve, law: TimeLaw, limits: "MotionLimits", period: float
+    path: ToolPath, curve: JointCurve, law: TimeLaw, limits: MotionLimits, period: float
 ) -> JointMotion:
     """The motion at multiples of the period, slower until these and other instants keep the limits."""
     law = _slow_down(law, limits, *_evaluate_motion(curve, law, np.linspace(0.0, law.duration, RULES.instants))[2:])
@@ -200,7 +202,7 @@ def _evaluate_motion(curve: JointCurve, law: TimeLaw, times: Array) -> tuple[Arr
     return s, q, np.asarray(dq, dtype=float), np.asarray(ddq, dtype=float)
 
 
-def _slow_down(law: TimeLaw, limits: "MotionLimits", dq: Array, ddq: Array) -> TimeLaw:
+def _slow_down(law: TimeLaw, limits: MotionLimits, dq: Array, ddq: Array) -> TimeLaw:
     """The law, or a slower one if velocities or accelerations (N, n) exceed their limits."""
     used = max((np.abs(dq) / limits.velocity).max(), np.sqrt((np.abs(ddq) / limits.acceleration).max()))
     return law if used <= 1 else law.stretch(law.duration * float(used) * RULES.stretch_margin)
@@ -210,7 +212,7 @@ def _slow_down(law: TimeLaw, limits: "MotionLimits", dq: Array, ddq: Array) -> T
 class MotionLimits:
     """What a motion has to keep."""
 
-    chart: "Chart"
+    chart: Chart
     velocity: Array  #: (n,) [rad/s] or [m/s]
     acceleration: Array  #: (n,) [rad/s^2] or [m/s^2]
     distances: LinkDistances
@@ -379,7 +381,7 @@ def _evaluate_inverse(room: Array, scale: float, least: float) -> tuple[Array, A
     return scale / far + (room - far) * slopes, slopes
 
 
-def walk(chart: "Chart", costs: Costs, x: Array, q: Array) -> Array:
+def walk(chart: Chart, costs: Costs, x: Array, q: Array) -> Array:
     """Joint positions (P, n) near task values x (P, m), from q (n,).
 
     At every place, steps of least norm towards x, and Gauss-Newton steps within the null space of J_x that lower the

@@ -1,5 +1,7 @@
 """Plans of tool paths: splines through waypoints, and files of paths."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -122,7 +124,7 @@ class TaskSpline:
         self._rows = rows
         self._curve = build_spline(s, rows, False)
 
-    def close(self) -> "TaskSpline":
+    def close(self) -> TaskSpline:
         """The same, periodic."""
         self._curve = build_spline(self._s, self._rows, True)
         return self
@@ -210,12 +212,12 @@ class ToolPath:
     closed: bool
 
     @classmethod
-    def hold(cls, chart: "Chart", tool_path: Any, xi: Array) -> "ToolPath":
+    def hold(cls, chart: Chart, tool_path: Any, xi: Array) -> ToolPath:
         """A tool path with constant coordinates (r,)."""
         return cls._build(chart, tool_path, np.tile(xi, (2, 1)), np.array([0.0, 1.0]))
 
     @classmethod
-    def schedule(cls, chart: "Chart", tool_path: Any, xi: Any) -> "ToolPath":
+    def schedule(cls, chart: Chart, tool_path: Any, xi: Any) -> ToolPath:
         """A tool path with a schedule: coordinates at the waypoints (N, r), or a function of s."""
         values = counted_on(sample_path("xi", xi, chart.r, chart.labels[chart.m :]), chart.parts.turns[chart.m :])
         if callable(xi) or callable(tool_path):
@@ -223,7 +225,7 @@ class ToolPath:
         return cls._build(chart, tool_path, values, None)
 
     @classmethod
-    def _build(cls, chart: "Chart", tool_path: Any, xi: Array, s_xi: Array | None) -> "ToolPath":
+    def _build(cls, chart: Chart, tool_path: Any, xi: Array, s_xi: Array | None) -> ToolPath:
         """Splines; the coordinates are at parameters of their own, or at those of the waypoints (None)."""
         target = chart.task.target
         x = (lambda s: target(tool_path(s))) if callable(tool_path) else target(tool_path)
@@ -241,7 +243,7 @@ class ToolPath:
         curve = build_spline(s if s_xi is None else s_xi, xi, closed and len(xi) > 2)
         return cls(path.close() if closed else path, curve, s, x, steps, callable(tool_path), closed)
 
-    def replace_xi(self, xi: CubicSpline) -> "ToolPath":
+    def replace_xi(self, xi: CubicSpline) -> ToolPath:
         """The same tool path with other coordinates."""
         return replace(self, xi=xi)
 

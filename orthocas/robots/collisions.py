@@ -1,5 +1,7 @@
 """Distances between the links of a robot, and from a scene, by coal: least distance, its gradient, and checked ways."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from threading import local
@@ -235,7 +237,7 @@ class Collisions(Shown):
                     return replace(contact, segment=start + i)
         return None
 
-    def with_scene(self, scene: Scene, allowed: Sequence[Pair] = ()) -> "Collisions":
+    def with_scene(self, scene: Scene, allowed: Sequence[Pair] = ()) -> Collisions:
         """The same with objects around the robot: every link that moves is checked against every object.
 
         Args:
@@ -248,7 +250,7 @@ class Collisions(Shown):
         require_kind("scene", scene, Scene)
         return self._add([Part(name, -1, solid.shape) for name, solid in scene.solids.items()], allowed)
 
-    def with_attached(self, frame: str, solids: Mapping[str, Solid], allowed: Sequence[Pair] = ()) -> "Collisions":
+    def with_attached(self, frame: str, solids: Mapping[str, Solid], allowed: Sequence[Pair] = ()) -> Collisions:
         """The same with solids that a link carries, such as a tool or a box in the hand.
 
         They are checked against all links and objects but those of the same body.
@@ -276,7 +278,7 @@ class Collisions(Shown):
             allowed,
         )
 
-    def _add(self, parts: Sequence[Part], allowed: Sequence[Pair]) -> "Collisions":
+    def _add(self, parts: Sequence[Part], allowed: Sequence[Pair]) -> Collisions:
         """The same with further parts, checked against all that are there and of another body."""
         bodies = {part.name: part.body for part in self.parts}
         both = [*bodies, *(part.name for part in parts)]
@@ -525,7 +527,7 @@ class Collisions(Shown):
         return local()
 
     @property
-    def _scratch(self) -> "_Scratch":
+    def _scratch(self) -> _Scratch:
         """The models, with the memory of one thread."""
         mine = self._threads
         if not hasattr(mine, "scratch"):

@@ -1,5 +1,7 @@
 """Mass matrix (composite rigid bodies), inverse dynamics (recursive Newton-Euler), and payloads."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Forward kinematics of a tree as CasADi expressions, the tip's turn from a reference, and tools."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from typing import Self
 

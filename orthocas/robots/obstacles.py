@@ -1,5 +1,7 @@
 """Obstacles: solids of scenes, and distances of spheres, capsules and half-spaces to a robot's links as expressions."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,5 +1,7 @@
 """The robot: names, limits, kinematics and dynamics, for SX, MX and NumPy."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike

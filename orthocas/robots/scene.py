@@ -1,5 +1,7 @@
 """Scenes: solids around a robot, by name."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, Protocol, runtime_checkable

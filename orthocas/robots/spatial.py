@@ -1,5 +1,7 @@
 """Rigid-body algebra on CasADi SX columns and on numbers."""
 
+from __future__ import annotations
+
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike

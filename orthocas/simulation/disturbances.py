@@ -1,5 +1,7 @@
 """Steps of disturbances and references of a run, and files that list them."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

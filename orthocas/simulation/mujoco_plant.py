@@ -1,5 +1,7 @@
 """MuJoCo as the plant of a simulation: scenes, and steps."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import ceil, sqrt

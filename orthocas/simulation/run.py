@@ -1,5 +1,7 @@
 """`simulate` and `simulate_many`: a controller, a reference and a robot in closed loop."""
 
+from __future__ import annotations
+
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
@@ -140,7 +142,7 @@ class Settings:
     compiled: bool
 
 
-def prepare(controller: Controller, reference: Reference, q_start: ArrayLike, settings: Settings) -> "Prepared":
+def prepare(controller: Controller, reference: Reference, q_start: ArrayLike, settings: Settings) -> Prepared:
     """Check the arguments of `simulate`, and build what the run needs."""
     friction, noise, rate = settings.friction, settings.noise, settings.control_rate
     _check_kinds(controller, reference, settings)

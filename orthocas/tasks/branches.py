@@ -1,5 +1,7 @@
 """Branches of the joint range: what is left of it if it is cut where self-motions cannot pass."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -130,7 +132,7 @@ class Branches(Shown, Sequence[Branch]):
         image: Array = _reflect(self.robot, self.cuts[cut], q[None])[0]
         return image
 
-    def plot(self) -> "Figure":
+    def plot(self) -> Figure:
         """The posture of each branch, in a panel with its name and its fraction of the clear positions."""
         from matplotlib.layout_engine import ConstrainedLayoutEngine  # takes long, and searches need no pictures
 
@@ -234,7 +236,7 @@ class _Arm:
     scale: Array
 
     @classmethod
-    def build_all(cls, robot: Robot, task: Task | None, whole: Box) -> list["_Arm"]:
+    def build_all(cls, robot: Robot, task: Task | None, whole: Box) -> list[_Arm]:
         """The arm of a robot with one tip; of others, those of all tips whose joints move the task."""
         # One tip: its last seven joints, or the task for shorter arms.
         points = sample_evenly(Box(whole.centre, whole.half_width), 2000, RULES.seed)
@@ -254,7 +256,7 @@ class _Arm:
         return arms
 
     @classmethod
-    def _build(cls, robot: Robot, task: Task, whole: Box, joints: list[int], points: Array) -> "_Arm":
+    def _build(cls, robot: Robot, task: Task, whole: Box, joints: list[int], points: Array) -> _Arm:
         centred = task.with_reference_at(whole.centre)
         J = _evaluate_jacobians(centred, points)
         return cls(robot, centred, whole, joints, compute_row_scale(J[:, :, joints], centred.units))

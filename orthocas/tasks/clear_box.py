@@ -1,5 +1,7 @@
 """The part of a box that stays away from near-singular positions of a task."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self, cast
@@ -178,7 +180,7 @@ class ClearBox(Box):
         bound = f"expected one above least_singular_value = {self.least_singular_value:g}"
         return f"has a relative singular value of {self.singular_values(q):.3g}, {bound}"
 
-    def apply_to(self, box: Box) -> "ClearBox":
+    def apply_to(self, box: Box) -> ClearBox:
         """The same condition on another box."""
         return ClearBox(box, self.task, self.least_singular_value, self.scale, self.rows)
 

@@ -1,5 +1,7 @@
 """The surroundings of a path of postures: the domain of one chart for a long motion."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Domains: the regions of joint space on which charts are fitted and evaluated."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -108,7 +110,7 @@ class Domain(ABC):
         return np.asarray((upper - lower) / 2 + self.slack)
 
     @property
-    def condition(self) -> "Condition | None":
+    def condition(self) -> Condition | None:
         """The condition that holds in a part of the box, as an expression; None for the whole box.
 
         Raises:
@@ -119,7 +121,7 @@ class Domain(ABC):
         raise DomainError(f"a domain of kind '{self.name}' has no condition as an expression, which this needs")
 
     @property
-    def known_condition(self) -> "Condition | None":
+    def known_condition(self) -> Condition | None:
         """`condition`, or None where there is no expression of it and only `contains` answers."""
         try:
             return self.condition
@@ -127,12 +129,12 @@ class Domain(ABC):
             return None
 
     @property
-    def singular_bound(self) -> "SingularBound | None":
+    def singular_bound(self) -> SingularBound | None:
         """The condition, if it is a bound on the singular values of a task."""
         return None
 
     @property
-    def path_bound(self) -> "PathBound | None":
+    def path_bound(self) -> PathBound | None:
         """The condition, if it is a bound on the distance to a path."""
         return None
 
@@ -145,7 +147,7 @@ class Domain(ABC):
         return None
 
     @property
-    def fold_bound(self) -> "FoldBound | None":
+    def fold_bound(self) -> FoldBound | None:
         """What `room_to_fold` is made of, for code that evaluates it in other libraries."""
         return None
 
@@ -189,7 +191,7 @@ class Domain(ABC):
         points: Array = self.centre + self.half_width * (u if power == 1 else np.sign(u) * np.abs(u) ** power)
         return points
 
-    def apply_to(self, box: "Box") -> "Domain":
+    def apply_to(self, box: Box) -> Domain:
         """The same condition on another box."""
         raise DomainError(f"a domain of kind '{self.name}' has no other size, expected a box")
 
@@ -212,7 +214,7 @@ class Domain(ABC):
         )
 
     @classmethod
-    def from_data(cls, task: "Task", data: Mapping[str, Any], arrays: Mapping[str, Any]) -> "Domain":
+    def from_data(cls, task: Task, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
         """The domain from what `to_data` gave; `arrays` also has centre and half_width. They may be anything."""
         raise NotImplementedError
 
@@ -304,7 +306,7 @@ def register_domain(kind: type[Kind]) -> type[Kind]:
     return kind
 
 
-def domain_from_data(name: str, task: "Task", data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
+def domain_from_data(name: str, task: Task, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
     """The domain of a file.
 
     Raises:
@@ -384,7 +386,7 @@ class Box(Domain):
         """Whether points (n,) or (N, n) lie in the box: a bool, or (N,)."""
         return _between_boundaries(self, q)
 
-    def apply_to(self, box: "Box") -> "Box":
+    def apply_to(self, box: Box) -> Box:
         """The other box."""
         return box
 
@@ -393,7 +395,7 @@ class Box(Domain):
         return {"unbounded": list(self.unbounded)}, {}
 
     @classmethod
-    def from_data(cls, task: "Task", data: Mapping[str, Any], arrays: Mapping[str, Any]) -> "Domain":
+    def from_data(cls, task: Task, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
         """The box of a file."""
         # Older files have no unbounded joints.
         unbounded = json.get_part(data, "unbounded", list) if "unbounded" in data else ()
@@ -434,7 +436,7 @@ class Torus(Domain):
         return {}, {}
 
     @classmethod
-    def from_data(cls, task: "Task", data: Mapping[str, Any], arrays: Mapping[str, Any]) -> "Domain":
+    def from_data(cls, task: Task, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
         """The torus of the robot's joints."""
         return cls(task.robot.n)
 

@@ -1,5 +1,7 @@
 """Metrics A(q) on joint space. They define what "orthogonal" means."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field

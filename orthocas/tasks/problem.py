@@ -1,5 +1,7 @@
 """A problem: a robot, a task, a metric and a domain that fit together; and its data in files."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any

@@ -1,5 +1,7 @@
 """The joint range less a margin, the default domain of a task, and the posture in its middle."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -138,7 +140,7 @@ def find_joint_range(robot: Robot, margin_deg: float) -> Box:
     return Box((low + high) / 2, (high - low) / 2, np.flatnonzero(free).tolist())
 
 
-def find_bent_posture(score: "PostureScore", robot: Robot, box: Box) -> Array:
+def find_bent_posture(score: PostureScore, robot: Robot, box: Box) -> Array:
     """The posture with the best score, (n,), found from the centre of the default box."""
     room = np.minimum(box.centre - robot.lower, robot.upper - box.centre) - box.half_width
     way = np.where(robot.tree.prismatic, 0.0, np.clip(room, 0.0, RULES.farthest))
@@ -171,7 +173,7 @@ class PostureScore:
     scale: Array  #: of the rows of J_x, (m,)
 
     @classmethod
-    def build(cls, robot: Robot, task: Task, box: Box) -> "PostureScore":
+    def build(cls, robot: Robot, task: Task, box: Box) -> PostureScore:
         """Scale the rows of J_x by their size on a box."""
         jacobian = Batched(task.centred_jacobian_function)
         points = sample_evenly(box, RULES.centre_samples, 0)

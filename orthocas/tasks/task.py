@@ -1,5 +1,7 @@
 """Tasks x = h(q): m < n numbers that describe what the robot does."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
@@ -101,7 +103,7 @@ class Task(Shown, HoldsFunctions):
     units: tuple[str, ...]  #: units of the components: "m", "rad", or "" if unknown
     function: ca.Function  #: q (n, 1) -> x (m, 1), dense, SX
     recipe: dict[str, Any]  #: plain data that `from_recipe` turns into the same task
-    parts: tuple["Task", ...] = ()  #: of a stack of tasks
+    parts: tuple[Task, ...] = ()  #: of a stack of tasks
 
     @classmethod
     def position(
@@ -297,7 +299,7 @@ class Task(Shown, HoldsFunctions):
         return cls(robot, f"pointing of {camera}", labels, ("rad", "rad"), dense_function("h", [q], [x]), recipe)
 
     @classmethod
-    def stack(cls, *tasks: "Task") -> Self:
+    def stack(cls, *tasks: Task) -> Self:
         """Several tasks of one robot as one, such as the positions of two hands.
 
         Labels that appear twice get a number. The components are compared as numbers: those of an orientation end half
@@ -384,7 +386,7 @@ class Task(Shown, HoldsFunctions):
         return cls(robot, str(name), labels, units, dense_function("h", [q], [x]), recipe)
 
     @classmethod
-    def named(cls, robot: Robot, kind: str, q_reference: ArrayLike | None = None) -> "Task":
+    def named(cls, robot: Robot, kind: str, q_reference: ArrayLike | None = None) -> Task:
         """A task by its short name: position, position:xy, polar, orientation, pose, pose:z, axis:x, position+axis.
 
         Of a robot with two tips also relative_position and relative_pose, of the second tip in the first.
@@ -416,7 +418,7 @@ class Task(Shown, HoldsFunctions):
         return task
 
     @classmethod
-    def from_recipe(cls, robot: Robot, recipe: Mapping[str, Any]) -> "Task":
+    def from_recipe(cls, robot: Robot, recipe: Mapping[str, Any]) -> Task:
         """The task of a robot that `recipe` describes. Custom tasks and stacks have no such recipe."""
         kind, frames = recipe["kind"], Frames.from_recipe(recipe)
         if kind == "pointing":
@@ -445,7 +447,7 @@ class Task(Shown, HoldsFunctions):
         """How the task compares the tip's orientation with a reference; None if it does not."""
         return TipTurn.from_kind(self.recipe["kind"])
 
-    def with_reference_at(self, q: ArrayLike) -> "Task":
+    def with_reference_at(self, q: ArrayLike) -> Task:
         """The task with the tip's orientation at q (n,) as its reference, or the task itself if it has one already."""
         if not self.lacks_reference:
             return self

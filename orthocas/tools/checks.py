@@ -1,5 +1,7 @@
 """Input checks that raise the package's errors."""
 
+from __future__ import annotations
+
 import os
 from collections.abc import Collection
 from importlib import import_module

@@ -1,5 +1,7 @@
 """Progress of long calls: what solvers report, and how it is shown in notebooks and terminals."""
 
+from __future__ import annotations
+
 import html
 import sys
 import time

@@ -1,5 +1,7 @@
 """`orthocas.view`: charts, robots and motions in a browser."""
 
+from __future__ import annotations
+
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
