@@ -166,7 +166,7 @@ def picture(scenario: Scenario, result: Mapping[str, Any]) -> Figure:
             low, high = min(every, default=1), max(every, default=1)
             axes.set_xlim(low / 1.6, (high / low) ** 1.12 * low * 1.6)
         for k, row in enumerate(rows):
-            colour = BLUE if row.method.startswith(("chart", "SEW")) else GREY
+            colour = BLUE if row.method.startswith(("arm", "chart", "SEW")) else GREY
             values = [value if scenario.percent else max(value, floor) for value in row.values]
             axes.plot(values, [k] * len(values), "o", color=colour, markersize=4, alpha=0.6)
             if values:
