@@ -18,7 +18,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any, cast
 
 from orthocas.bases.family import Parametrisation
-from orthocas.bases.registry import require_savable
+from orthocas.bases.registry import parse_parametrisation, require_savable
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.quality import evaluate
 from orthocas.charts.ready import load
@@ -53,7 +53,7 @@ HELD_OUT_SEED = 2**31  #: seed of the held-out samples; no fit of a grid uses it
 
 def compare(
     problem: Problem,
-    parametrisations: Sequence[Parametrisation],
+    parametrisations: Sequence[Parametrisation | str],
     solvers: Sequence[Solver] | None = None,
     *,
     branch: Branch | Box | str | None = None,
@@ -80,7 +80,7 @@ def compare(
 
     Args:
         problem: robot, task, metric and domain. A branch takes the place of the domain.
-        parametrisations: the parametrisations to fit.
+        parametrisations: the parametrisations to fit, or their words of the command line, such as "polynomial:4".
         solvers: the solvers to use. Default: for each parametrisation the default of `fit`. Wide fits have their own.
         branch: fit wide charts of it; a branch of `orthocas.branches`, its name, or a box, as in `fit_wide`.
         seeds: number of seeds 0, 1, ... of samples and random starts.
@@ -123,20 +123,20 @@ def compare(
     seeds, held_out = require_count("seeds", seeds), require_count("held_out", held_out)
     losses = _list_weights(weights, None if branch is not None else DEFAULT_WEIGHTS)
     jobs = None if jobs is None else require_count("jobs", jobs)
-    _check_grid(parametrisations, solvers)
+    families = _check_grid(parametrisations, solvers)
     part = branches(problem.robot, problem.task)[branch] if isinstance(branch, str) else branch
     if part is not None and solvers is not None:
         raise InvalidValueError("solvers", "given with a branch", "no solvers: wide fits have their own")
     folder = None if charts is None else as_path("charts", charts)
     if folder is not None:
         require_writable(folder / "chart", ChartFileError)
-        for parametrisation in parametrisations:
+        for parametrisation in families:
             require_savable(parametrisation.for_problem(problem))
     elif control_ticks:
         raise InvalidValueError("charts", None, "a folder for charts: control_ticks are measured on them")
 
-    first = Cell(problem, parametrisations[0], None, 0, losses[0], samples, held_out, None, force, part)
-    cells = _build_cells(first, parametrisations, solvers, losses, seeds, folder)
+    first = Cell(problem, families[0], None, 0, losses[0], samples, held_out, None, force, part)
+    cells = _build_cells(first, families, solvers, losses, seeds, folder)
 
     # Results arrive in any order, and return in that of the grid.
     order = {cell.names: k for k, cell in enumerate(cells)}
@@ -201,10 +201,15 @@ def _build_cells(
     return cells
 
 
-def _check_grid(parametrisations: Sequence[Parametrisation], solvers: Sequence[Solver] | None) -> None:
-    """Refuse grids that are empty, contain other objects, or have two entries of the same name."""
+def _check_grid(
+    parametrisations: Sequence[Parametrisation | str], solvers: Sequence[Solver] | None
+) -> list[Parametrisation]:
+    """Refuse grids that are empty, contain other objects, or have two entries of the same name; words are read."""
+    families: Any = parametrisations
+    if isinstance(parametrisations, list | tuple):
+        families = [parse_parametrisation(one) if isinstance(one, str) else one for one in parametrisations]
     for name, members, kinds, example in (
-        ("parametrisations", parametrisations, Parametrisation, "Polynomial(degree=4)"),
+        ("parametrisations", families, Parametrisation, "Polynomial(degree=4)"),
         ("solvers", [GaussNewton()] if solvers is None else solvers, Solver, "GaussNewton()"),
     ):
         require_kind(name, members, Sequence)
@@ -219,6 +224,7 @@ def _check_grid(parametrisations: Sequence[Parametrisation], solvers: Sequence[S
             raise InvalidValueError(
                 name, f"a list with two called '{twice[0]}'", "different names; compare these in two grids"
             )
+    return list(families)
 
 
 @dataclass(frozen=True, eq=False)

@@ -374,7 +374,7 @@ def test_ctrl_c_stops_running_processes_too(planar_x: oc.Problem) -> None:
 def test_bad_settings_are_refused(planar_x: oc.Problem) -> None:
     for grid, message in (
         ({"parametrisations": []}, "parametrisations is empty"),
-        ({"parametrisations": ["polynomial:2"]}, "parametrisations is 'polynomial:2', expected objects such as"),
+        ({"parametrisations": [3]}, "parametrisations is 3, expected objects such as"),
         ({"parametrisations": [oc.Linear(), oc.Linear((0.6, 0.8, 0.8))]}, "two called 'linear'"),
         ({"solvers": []}, "solvers is empty"),
         ({"solvers": [solvers.LBFGS(), solvers.LBFGS(memory=5)]}, "two called 'lbfgs'"),
@@ -408,3 +408,13 @@ def test_scripts_without_a_main_guard_get_one_line_from_each_process(tmp_path: P
     assert 1 <= len(lines) <= 2
     wanted = "orthocas: a script that starts processes needs `if __name__ == '__main__':` around its calls"
     assert set(lines) == {wanted}
+
+
+def test_words_of_the_command_line_are_families() -> None:
+    problem = oc.problems.get("planar_3r_xy")
+    with ThreadPoolExecutor(1) as executor:
+        found = oc.compare(problem, ["linear", oc.Polynomial(2)], samples=200, held_out=500, executor=executor)
+    assert [result.parametrisation for result in found.results] == ["linear", "polynomial:2"]
+    for bad, expected in ((["bla"], "unknown parametrisation"), ("linear", "objects such as"), (3, "a Sequence")):
+        with pytest.raises(oc.errors.OrthocasError, match=expected):
+            oc.compare(problem, bad)  # type: ignore[arg-type]
