@@ -51,7 +51,7 @@ class Clearance:
     def __init__(self, collisions: Collisions, tree: KinematicTree, margin: float | None, avoid: float | None) -> None:
         require_kind("collisions", collisions, Collisions)
         collisions.require_for(tree)
-        self.collisions = collisions
+        self.collisions, self._tree = collisions, tree
         self.margin = as_number("margin", RULES.margin if margin is None else margin)
         if not 0 <= self.margin < RULES.largest:
             raise InvalidValueError("margin", margin, f"a distance from 0 to {RULES.largest:g} m")
@@ -61,6 +61,26 @@ class Clearance:
         self._q = np.full(tree.n, np.nan)
         #: of the least distance at that posture: the value, or a lower bound above all that is kept
         self._least, self._exact = -np.inf, False
+
+    @classmethod
+    def build(
+        cls, collisions: Collisions | None, tree: KinematicTree, margin: float | None, avoid: float | None
+    ) -> Clearance | None:
+        """The clearance of a tracker; None without a collision model.
+
+        Raises:
+            InvalidValueError: if a distance is given without one.
+        """
+        if collisions is not None:
+            return cls(collisions, tree, margin, avoid)
+        for name, value in (("margin", margin), ("avoid", avoid)):
+            if value is not None:
+                raise InvalidValueError(name, value, "collisions with it")
+        return None
+
+    def copy(self) -> Clearance:
+        """Another one for another stream."""
+        return Clearance(self.collisions, self._tree, self.margin, self.avoid)
 
     def start(self, q: Array) -> None:
         """Begin at a posture (n,).

@@ -286,11 +286,7 @@ class InverseMethods(PhiFunctions):
         """
         require_expression(self, "a tracker")
         require_kind("nearest", nearest, bool)
-        clearance = None
-        if collisions is not None:
-            clearance = Clearance(collisions, self.problem.robot.tree, margin, avoid)
-        elif margin is not None or avoid is not None:
-            raise InvalidValueError("margin" if avoid is None else "avoid", margin or avoid, "collisions with it")
+        clearance = Clearance.build(collisions, self.problem.robot.tree, margin, avoid)
         parts = self.parts.point_functions, self.problem.domain, q0, largest_step, self.m, clearance
         return ReachingTracker(*parts, self.parts.reaching) if nearest else Tracker(*parts)
 
