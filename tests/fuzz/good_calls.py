@@ -362,6 +362,7 @@ def _functions() -> dict[str, Call]:
         "evaluate points": (oc.evaluate, {"chart": chart, "samples": None, "seed": None, "points": [q, q]}),
         "export": (oc.export, {"chart": chart, "to": "numpy", "path": "module.py", "force": False}),
         "generate_c": (oc.generate_c, {"chart": chart, "out": "c", "controller": impedance(), "name": "arm"}),
+        "fit_capsules": (oc.fit_capsules, {"collisions": Collisions(problem.robot.tree, collisions().parts[:3], ())}),
         "generate_c with settings": (
             oc.generate_c,
             {"chart": chart, "out": "c", "controller": impedance(), "safety": control.Safety.of(impedance())},

@@ -349,6 +349,7 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "point cloud": lambda: oc.obstacles.PointCloud([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], 0.1),
     "scene": scene,
     "collisions": collisions,
+    "capsules": lambda: oc.fit_capsules(Collisions(planar().robot.tree, collisions().parts[:3], ())),
     "near pairs": lambda: collisions().find_near(np.zeros(3), 5.0),
     "least distance": lambda: collisions().distance(np.linspace(-1, 1, 6).reshape(2, 3)),
     "self-motion": lambda: fitted().chart.self_motion(planar().domain.centre, samples=30),
