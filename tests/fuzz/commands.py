@@ -161,6 +161,7 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
         {"--controller": "impedance", "--steps": "steps.json", "--out": "out", "--animation": "none"},
         (*_LAW_OPTIONS, *_RUN_OPTIONS, *_SOLIDS),
     ),
+    "doctor": (("", "chart.orthocas"), {}, ("--out",)),
     "charts": (("ur5-position", "ur5", "chart.orthocas", ""), {}, ("--out",)),
     "export": (_FILES, {"--to": "numpy", "--out": "module.py"}, ()),
     "follow": (

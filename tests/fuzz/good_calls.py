@@ -163,6 +163,15 @@ def _physics() -> dict[str, Call]:
             {"stiffness": [8000.0, 5000.0, 5000.0], "inertia": 0.4, "damping": 5.0},
         ),
         "MuJoCoPlant": (simulation.MuJoCoPlant, {"robot": robot, "friction": simulation.Friction(0.1, 0.1), **options}),
+        "StickingPlant": (
+            simulation.StickingPlant,
+            {"robot": robot, "friction": simulation.Friction(0.1, 0.1), "effort_limits": True, "timestep": 1e-3},
+        ),
+        "sticking.reset": (lambda **given: simulation.StickingPlant(robot).reset(**given), {"q": q, "dq": q}),
+        "sticking.step": (
+            lambda **given: simulation.StickingPlant(robot).step(**given),
+            {"torque": q, "seconds": 0.01, "loads": q},
+        ),
         "plant.reset": (lambda **given: _plant(robot).reset(**given), {"q": q, "dq": q}),
         "plant.push": (lambda **given: _plant(robot).push(**given), {"force": q, "link": 1, "point": q}),
         "plant.step": (lambda **given: _plant(robot).step(**given), {"torque": q, "seconds": 0.01, "loads": q}),
