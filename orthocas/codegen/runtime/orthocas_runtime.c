@@ -95,7 +95,8 @@ static double *take(double **work, int count) {
 /* Solve A x = b for `count` columns b, one after the other, by Gaussian elimination with pivoting. Overwrites A, and b
  * with x. Returns 0 if A is singular. */
 static int solve(const orthocas_arm *arm, double *A, double *b, int size, int count) {
-  double *end = b + count * size, *x;
+  const double *end = b + count * size;
+  double *x;
   int i, j, k;
   for (k = 0; k < size; ++k) {
     int pivot = k;
@@ -220,13 +221,12 @@ static double residual_at(const orthocas_arm *arm, const double *wanted, const d
 static double search(const orthocas_arm *arm, const double *wanted, double *q, int *left, double *work) {
   const int n = arm->n;
   double *next = take(&work, n), *step = take(&work, n), *residual = take(&work, n), *jacobian = take(&work, n * n);
-  double error = residual_at(arm, wanted, q, residual, jacobian, work), reached, share;
+  double error = residual_at(arm, wanted, q, residual, jacobian, work);
   int i, halvings;
   while (error > arm->numbers.exact && *left > 0) {
+    double reached = -1.0, share = 1.0;
     copy(step, residual, n);
     if (!solve(arm, jacobian, step, n, 1)) break;
-    reached = -1.0;
-    share = 1.0;
     for (halvings = error > arm->numbers.solved ? rules.halvings : 1; halvings > 0 && *left > 0;
          --halvings, --*left, share *= 0.5) {
       for (i = 0; i < n; ++i) next[i] = q[i] + share * step[i];
@@ -292,7 +292,8 @@ static void look_at(const orthocas_arm *arm, const double *q, const double *want
   found->cost = sum <= arm->numbers.largest && all_finite(arm, found->slopes, n * n) ? 0.5 * sum : -1.0;
   for (k = 0; k < rooms; ++k) {
     int known = 1;
-    for (i = 0; i < n; ++i) known &= fabs(found->inwards[i * rooms + k]) <= arm->numbers.largest;
+    for (i = 0; i < n; ++i)
+      if (!(fabs(found->inwards[i * rooms + k]) <= arm->numbers.largest)) known = 0;
     for (i = 0; i < n && !known; ++i) found->inwards[i * rooms + k] = 0.0;
   }
 }
@@ -434,8 +435,8 @@ static int descend(const orthocas_arm *arm, const double *wanted, double largest
     if (!(promised > arm->reaching.converged * now->cost)) {
       int by_step = 0;
       for (i = 0; i < n; ++i) {
-        by_step |= held[i] < 0 && low[i] > arm->lower[i];
-        by_step |= held[i] > 0 && high[i] < arm->upper[i];
+        if (held[i] < 0 && low[i] > arm->lower[i]) by_step = 1;
+        if (held[i] > 0 && high[i] < arm->upper[i]) by_step = 1;
       }
       copy(q, now->q, n);
       return !by_step;
