@@ -16,9 +16,11 @@ from orthocas.arms.maps import ArmMaps
 from orthocas.arms.self_motion import Arc, SelfMotions, find_motions
 from orthocas.arms.tracker import ArmTracker, TrackStatus
 from orthocas.charts.chart import Chart
+from orthocas.charts.clearance import Clearance
 from orthocas.charts.inverse import InverseStatus
 from orthocas.errors import BranchWarning, DomainError, InvalidValueError, NotRedundantError, ShapeError
 from orthocas.fitting.wide import fit_wide
+from orthocas.robots.collisions import Collisions
 from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import branches
 from orthocas.tasks.metric import Metric, MetricSpec
@@ -37,6 +39,7 @@ from orthocas.tools.checks import (
     require_known,
 )
 from orthocas.tools.display import Shown, listed, percent
+from orthocas.tools.expressions import wrap_shortest
 from orthocas.tools.progress import Monitor, Progress, silent
 
 ANY = "any"  #: branch
@@ -238,19 +241,26 @@ class Arm(Shown):
         """
         return find_motions(self.maps, self._read_one(x))
 
-    def solutions(self, x: Any, xi: float | None = None) -> tuple[Arc, ...] | Postures:
+    def solutions(
+        self, x: Any, xi: float | None = None, collisions: Collisions | None = None
+    ) -> tuple[Arc, ...] | Postures:
         """All postures with a task value, on all branches.
 
         Args:
             x: one task value.
             xi: that postures are to have in the chart of their branch; None for any.
+            collisions: of the robot, for postures with xi: those without a contact come first, the others are
+                COLLIDING.
 
         Returns:
             Without xi the arcs, the components of `self_motion`; with xi the postures where a chart has it.
 
         Raises:
-            InvalidValueError: if x is no task value, or xi is given to an arm without charts.
+            InvalidValueError: if x is no task value, xi is given to an arm without charts, or collisions without xi.
         """
+        self._check_collisions(collisions)
+        if collisions is not None and xi is None:
+            raise InvalidValueError("collisions", "given without xi", "xi with it; `solve` takes it without xi")
         motions = self.self_motion(x)
         if xi is None:
             return motions.components
@@ -260,7 +270,10 @@ class Arm(Shown):
         q = np.array([q for q, _ in found]).reshape(-1, self.robot.n)
         names = tuple(name for _, name in found)
         status = np.full(len(q), int(InverseStatus.FOUND))
-        return Postures(q, status, names, np.full(len(q), value))
+        if collisions is not None and len(q):
+            status[~collisions.check_free(q)] = InverseStatus.COLLIDING
+        order = np.argsort(status, kind="stable")
+        return Postures(q[order], status[order], tuple(names[k] for k in order), np.full(len(q), value))
 
     def nearest(self, x: Any, q_wish: ArrayLike) -> Postures:
         """The posture within the joint limits with a task value that is nearest to another one, |q - q_wish| least.
@@ -271,7 +284,14 @@ class Arm(Shown):
         """
         return self.solve(x, start=q_wish)
 
-    def solve(self, x: Any, xi: ArrayLike | None = None, start: ArrayLike | None = None, branch: str = ANY) -> Postures:
+    def solve(
+        self,
+        x: Any,
+        xi: ArrayLike | None = None,
+        start: ArrayLike | None = None,
+        branch: str = ANY,
+        collisions: Collisions | None = None,
+    ) -> Postures:
         """A posture within the joint limits for each task value.
 
         With xi, charts are asked in turn: that of the start's branch first, or else the largest; the first that has
@@ -284,10 +304,15 @@ class Arm(Shown):
             xi: a number, or one for each row (N,).
             start: a posture (n,), or one for each row (N, n).
             branch: name of a branch, to accept no other; "any" for all.
+            collisions: of the robot, such as `robot.collisions`. Where the posture touches something, a free one with
+                the same x and xi takes its place; else, of free postures 0.05 rad apart on the arcs, that with the
+                nearest xi (NEAREST), or without xi that nearest to the start, or farthest from limits. Where none is
+                free, the status is COLLIDING.
 
         Raises:
             InvalidValueError, ShapeError: for arguments that do not fit, or an xi or branch without charts.
         """
+        self._check_collisions(collisions)
         targets, single = self.maps.targets.read(x)
         N, n = len(targets), self.robot.n
         starts = None if start is None else _repeat_rows("start", as_point_set("start", start, n)[0], N)
@@ -312,6 +337,13 @@ class Arm(Shown):
             q[row], status[row] = self._solve_on_arcs(targets[row], value, wish, chosen, branch == ANY)
 
         run_in_threads(solve_row, left.tolist())
+        if collisions is not None:
+            known = np.flatnonzero(np.isfinite(q).all(axis=1))
+            for row in known[~collisions.check_free(q[known])].tolist():
+                wish = None if starts is None else starts[row]
+                value = None if values is None else float(values[row])
+                free = self._find_free(targets[row], value, wish, chosen, branch == ANY, collisions)
+                q[row], status[row] = free or (q[row], InverseStatus.COLLIDING)
         owners = self.find_branches(np.where(np.isfinite(q), q, 0.0))
         owners = [k if good else -1 for k, good in zip(owners, np.isfinite(q).all(axis=1), strict=True)]
         names = tuple(self.branch_names[k] if k >= 0 else "" for k in owners)
@@ -321,7 +353,15 @@ class Arm(Shown):
         return Postures(q, status, names, own)
 
     def tracker(
-        self, q: ArrayLike, *, period: float = 0.01, velocity_limits: ArrayLike | None = None, detours: bool = True
+        self,
+        q: ArrayLike,
+        *,
+        period: float = 0.01,
+        velocity_limits: ArrayLike | None = None,
+        detours: bool = True,
+        collisions: Collisions | None = None,
+        margin: float | None = None,
+        avoid: float | None = None,
     ) -> ArmTracker:
         """A tracker of a stream of x and xi that is never lost; see `ArmTracker`.
 
@@ -330,8 +370,12 @@ class Arm(Shown):
             period: time from one call to the next [s].
             velocity_limits: (n,) or one number [rad/s] or [m/s]. Default: those of the robot's file.
             detours: whether the arm may leave x for a while where it is stuck, to get to a posture that has it.
+            collisions: of the robot, such as `robot.collisions`; with margin and avoid as in `Chart.tracker`.
+            margin: [m].
+            avoid: [m].
         """
-        return ArmTracker(self.maps, self.charts, q, period, velocity_limits, detours)
+        clearance = Clearance.build(collisions, self.robot.tree, margin, avoid)
+        return ArmTracker(self.maps, self.charts, q, period, velocity_limits, detours, clearance)
 
     def follow(
         self,
@@ -341,6 +385,9 @@ class Arm(Shown):
         q: ArrayLike,
         period: float = 0.01,
         velocity_limits: ArrayLike | None = None,
+        collisions: Collisions | None = None,
+        margin: float | None = None,
+        avoid: float | None = None,
     ) -> tuple[Array, tuple[TrackStatus, ...]]:
         """Postures along task values, by a tracker that makes one call for each.
 
@@ -350,12 +397,18 @@ class Arm(Shown):
             q: where the arm is before, (n,).
             period: as in `tracker`.
             velocity_limits: as in `tracker`.
+            collisions: as in `tracker`.
+            margin: as in `tracker`.
+            avoid: as in `tracker`.
 
         Returns:
             q (N, n), and how each call ended.
         """
         targets, _ = self.maps.targets.read(path)
-        tracker = self.tracker(q, period=period, velocity_limits=velocity_limits)
+        limits = period, velocity_limits
+        tracker = ArmTracker(
+            self.maps, self.charts, q, *limits, clearance=Clearance.build(collisions, self.robot.tree, margin, avoid)
+        )
         values = [None] * len(targets)
         if xi is not None:
             values = _repeat_rows("xi", as_float_array("xi", xi).reshape(-1, 1), len(targets))[:, 0].tolist()
@@ -466,6 +519,49 @@ class Arm(Shown):
         q = q[inside]
         k = np.argmax(self._measure_room(q)) if start is None else np.argmin(np.linalg.norm(q - start, axis=1))
         return q[k], InverseStatus.FOUND
+
+    def _find_free(
+        self,
+        target: Array,
+        xi: float | None,
+        start: Array | None,
+        chosen: Sequence[int],
+        anywhere: bool,
+        collisions: Collisions,
+    ) -> tuple[Array, InverseStatus] | None:
+        """A posture of one target without a contact, of those with xi or of many on its arcs; None if there is none."""
+        motions = find_motions(self.maps, target, *(() if start is None else (start[None],)))
+        if xi is not None:
+            exact = np.array([q for k in chosen for q in self._find_xi(motions, k, xi)[0]]).reshape(-1, self.robot.n)
+            exact = exact[collisions.check_free(exact)] if len(exact) else exact
+            if len(exact):
+                away = np.linalg.norm(exact - (exact[0] if start is None else start), axis=1)
+                return exact[np.argmin(away)], InverseStatus.FOUND
+        q = np.vstack([np.empty((0, self.robot.n)), *(arc.at(self._list_places(arc)) for arc in motions)])
+        q = q[collisions.check_free(q)] if len(q) else q
+        if xi is None and anywhere:
+            owners = np.zeros(len(q), dtype=np.int64)
+        else:
+            inside = [np.asarray(self.charts[k].problem.domain.contains(q)) for k in chosen] if len(q) else []
+            owners = np.array(
+                [next((k for k, part in zip(chosen, inside, strict=True) if part[row]), -1) for row in range(len(q))],
+                dtype=np.int64,
+            )
+            q, owners = q[owners >= 0], owners[owners >= 0]
+        if not len(q):
+            return None
+        if xi is not None:
+            periods = np.array([self.charts[k].parts.turns[self.charts[k].m] for k in owners])
+            away = np.abs(wrap_shortest(self._evaluate_xi(q, owners.tolist()) - xi, periods))
+            return q[np.argmin(away)], InverseStatus.NEAREST
+        k = np.argmax(self._measure_room(q)) if start is None else np.argmin(np.linalg.norm(q - start, axis=1))
+        return q[k], InverseStatus.FOUND
+
+    def _check_collisions(self, collisions: Collisions | None) -> None:
+        """Raise InvalidValueError for what is no collision model of the robot."""
+        if collisions is not None:
+            require_kind("collisions", collisions, Collisions)
+            collisions.require_for(self.robot.tree)
 
     def _measure_room(self, q: Array) -> Array:
         """Distances from the limits (N,), in half-widths of the joints' ranges."""

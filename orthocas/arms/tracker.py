@@ -15,8 +15,9 @@ from orthocas.arms.kernel import build_curvature, build_equations
 from orthocas.arms.maps import ArmMaps
 from orthocas.arms.self_motion import find_motions
 from orthocas.charts.chart import Chart
+from orthocas.charts.clearance import Clearance
 from orthocas.charts.newton import Bound
-from orthocas.charts.trackers import TrackerStatus
+from orthocas.charts.trackers import Tracker, TrackerStatus
 from orthocas.errors import InvalidValueError, degrees_hint
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import building
@@ -47,6 +48,7 @@ class TrackRules:
     guesses: int = 8  #: of the joints at bounds in a quadratic program, many at a time
     changes: int = 40  #: of these joints, one at a time, at most
     rounding: float = 1e-14  #: slope of the cost at a bound that is none
+    avoid_weight: float = 1e-2  #: of pairs nearer than `avoid`, relative to x
     enough: float = 1e-2  #: relative decrease of the cost below which a far arm leaves the rest to the next call
 
 
@@ -61,6 +63,7 @@ class TrackStatus(IntEnum):
     BEHIND = 2  #: x is not met: the arm moves towards it as fast as its joints may, or its work of a call ended
     NEAREST = 3  #: x is out of reach from here: a local minimum of its error within the limits, at rest
     BAD_INPUT = 4  #: a number of x or xi is not finite; the arm stays
+    BRAKED = 5  #: a part of the way, or none: all of it would come nearer to a contact than `margin` allows
 
 
 class ArmTracker(Shown):
@@ -80,6 +83,8 @@ class ArmTracker(Shown):
     xi is that of the chart in whose domain the tracker began, or came to be first. When the arm comes back to the
     domain, xi goes from the value that it has there to what is asked as fast as the joints may.
 
+    With a collision model it brakes and gives way as `orthocas.charts.trackers.Tracker` does, on detours too.
+
     Source:
         Levenberg and Marquardt's method with an active set on a box; ours.
     """
@@ -92,6 +97,7 @@ class ArmTracker(Shown):
         period: float,
         velocity_limits: ArrayLike | None,
         detours: bool = True,
+        clearance: Clearance | None = None,
     ) -> None:
         robot = maps.robot
         n = robot.n
@@ -107,6 +113,7 @@ class ArmTracker(Shown):
             raise InvalidValueError("velocity_limits", limits.tolist(), "positive numbers")
         limits = np.where(np.isfinite(limits), limits, RULES.speed)
         self._maps, self._charts, self._period = maps, tuple(charts), span
+        self._clearance = clearance
         self._speed = np.array(np.broadcast_to(limits, n))
         require_kind("detours", detours, bool)
         self._detours, self._patience = detours, max(2, int(RULES.window / span))
@@ -127,10 +134,11 @@ class ArmTracker(Shown):
         """Without scratch memory and detours under way."""
         parts = {"maps": self._maps, "charts": self._charts, "q": self.q}
         rules = {"period": self._period, "speed": self._speed, "detours": self._detours}
+        rules["clearance"] = self._clearance
         return {**parts, **rules, "memory": (self._wish, self._last, self.status)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        names = ("maps", "charts", "q", "period", "speed", "detours")
+        names = ("maps", "charts", "q", "period", "speed", "detours", "clearance")
         self.__init__(*(state[name] for name in names))  # type: ignore[misc]
         self._wish, self._last, self.status = state["memory"]
 
@@ -163,13 +171,15 @@ class ArmTracker(Shown):
         """Continue from another posture (n,) within the joint limits.
 
         Raises:
-            InvalidValueError: if it is not within them.
+            InvalidValueError: if it is not within them, or a pair touches there.
         """
         robot = self._maps.robot
         point = as_point("q", q, robot.n)
         if not ((point >= robot.lower) & (point <= robot.upper)).all():
             hint = degrees_hint(*point[np.isfinite(robot.lower)])
             raise InvalidValueError("q", point.tolist(), f"a posture within the joint limits{hint}")
+        if self._clearance is not None:
+            self._clearance.start(point)
         self._q, self._last = np.array(point), np.array(point)
         self._chart: Chart | None = None
         self._inside, self._wish = False, float("nan")
@@ -200,6 +210,18 @@ class ArmTracker(Shown):
         return self._go(None, target, xi)
 
     def _go(self, vector: Array | None, target: Array | None, xi: float | None) -> Array:
+        """The next posture (n,), clear of contacts, for x as the task's vector or as a target."""
+        before = self._q
+        q = self._move(vector, target, xi)
+        if self._clearance is None:
+            return q
+        self._q, fraction = self._clearance.limit(before, self._q)
+        if fraction < 1:
+            self.status = TrackStatus.BRAKED
+            self._look_for_chart()
+        return self._q.copy()
+
+    def _move(self, vector: Array | None, target: Array | None, xi: float | None) -> Array:
         """The next posture for x as the task's vector or as a target, of which the chart takes the one."""
         if xi is not None and not self._charts:
             raise InvalidValueError("xi", xi, "None, for an arm without charts")
@@ -213,7 +235,8 @@ class ArmTracker(Shown):
             x = targets.vector(np.asarray(target)[None])[0] if vector is None else vector
             if self._step_in_chart(x):
                 self._ticks, self._goal = 0, None
-                self.status = TrackStatus.OK
+                yields = self._exact.status == TrackerStatus.YIELDING
+                self.status = TrackStatus.YIELDING if yields else TrackStatus.OK
                 return self._q.copy()
         aim = targets.build(np.asarray(vector)[None])[0] if target is None else target
         rests = self.status == TrackStatus.NEAREST and np.array_equal(aim, self._to)
@@ -274,7 +297,7 @@ class ArmTracker(Shown):
                 return False
         q = exact.step(np.append(vector, self._wish))
         low, high = self._bounds()
-        if exact.status != TrackerStatus.OK or not ((q >= low) & (q <= high)).all():
+        if exact.status not in (TrackerStatus.OK, TrackerStatus.YIELDING) or not ((q >= low) & (q <= high)).all():
             return False
         self._q, self._last = q, q.copy()
         return True
@@ -352,7 +375,20 @@ class ArmTracker(Shown):
         return np.asarray((vectors * np.abs(values)) @ vectors.T)
 
     def _find_wishes(self) -> tuple[Array, Array, float]:
-        """Rows, values and weight of what else the step is to do: xi, or the way back to a posture with a chart."""
+        """Rows, values and weight of what else the step is to do: xi, or the way back to a posture with a chart.
+
+        Pairs nearer than `avoid` come on top: each is to be that far.
+        """
+        rows, wishes, weight = self._find_own_wishes()
+        if self._clearance is not None and self._clearance.avoid is not None:
+            near = self._clearance.collisions.find_near(self._q, self._clearance.avoid)
+            scale = RULES.avoid_weight / weight
+            rows = np.vstack([rows, scale * near.gradient])
+            wishes = np.append(wishes, scale * (self._clearance.avoid - near.distance))
+        return rows, wishes, weight
+
+    def _find_own_wishes(self) -> tuple[Array, Array, float]:
+        """Without a collision model."""
         n = len(self._q)
         if self._inside and np.isfinite(self._wish):
             value, gradient = self._measure_xi()
@@ -368,7 +404,9 @@ class ArmTracker(Shown):
             if bool(chart.problem.domain.contains(self._q)):
                 if self._chart is None:
                     self._chart = chart
-                    self._exact = chart.tracker(self._q, self._speed * self._period)
+                    parts = chart.parts.point_functions, chart.problem.domain, self._q, self._speed * self._period
+                    clearance = None if self._clearance is None else self._clearance.copy()
+                    self._exact = Tracker(*parts, chart.m, clearance)
                     self._values = chart.coordinates.functions
                     q = ca.MX.sym("q", len(self._q))
                     rows = [chart.parts.runnable(self._values[name])(q) for name in ("xi", "jacobian")]
