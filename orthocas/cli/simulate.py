@@ -122,7 +122,7 @@ def simulate(
     if json:
         print_json(report)
     else:
-        print_rows(format_report(report, loaded.problem) | {"files": str(out)})
+        print_rows(format_report(report, loaded.problem) | {"files": str(out)}, f"orthocas view {out} --chart {chart}")
     _print_notes(law, report, interrupted)
     if code := INTERRUPTED if interrupted else int(run.outcome in _FAILED):
         raise typer.Exit(code)
