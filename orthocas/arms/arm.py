@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocas.arms.arm_file import read_charts, write_charts
+from orthocas.arms.chart_kernel import ChartKernel
 from orthocas.arms.maps import ArmMaps
 from orthocas.arms.self_motion import Arc, SelfMotions, find_motions
 from orthocas.arms.tracker import ArmTracker, TrackStatus
 from orthocas.charts.chart import Chart
 from orthocas.charts.inverse import InverseStatus
-from orthocas.errors import BranchWarning, DomainError, InvalidValueError, NotRedundantError, ShapeError
+from orthocas.errors import BranchWarning, CompileError, DomainError, InvalidValueError, NotRedundantError, ShapeError
 from orthocas.fitting.wide import fit_wide
 from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import branches
@@ -274,10 +275,13 @@ class Arm(Shown):
     def solve(self, x: Any, xi: ArrayLike | None = None, start: ArrayLike | None = None, branch: str = ANY) -> Postures:
         """A posture within the joint limits for each task value.
 
-        With xi, charts are asked in turn: that of the start's branch first, or else the largest; the first that has
-        (x, xi) gives the posture, by `Chart.solve`. Where none has, the posture with that x whose xi is nearest is
-        NEAREST; where charts hold none, one with that x within the limits is OUTSIDE_DOMAIN. Without xi, it is the
-        posture nearest to the start, or without one, far from limits.
+        With xi, charts are asked in turn: that of the start's branch first, or else the largest. Newton's method goes
+        to (x, xi) from the start, or from the nearest of stored postures; the first chart in which it arrives gives the
+        posture. Otherwise the self-motion curves of x are searched for postures with xi. Where there is none, the
+        posture whose xi is nearest is NEAREST; where charts hold none, one with that x within the limits is
+        OUTSIDE_DOMAIN. Without xi, it is the posture nearest to the start, or without one, far from limits.
+
+        Rows are spread over the cores, in C that is compiled on first use.
 
         Args:
             x: one task value, or N of them. Rows that are not finite are BAD_INPUT.
@@ -288,34 +292,49 @@ class Arm(Shown):
         Raises:
             InvalidValueError, ShapeError: for arguments that do not fit, or an xi or branch without charts.
         """
-        targets, single = self.maps.targets.read(x)
+        targets, single = self._read(x)
         N, n = len(targets), self.robot.n
         starts = None if start is None else _repeat_rows("start", as_point_set("start", start, n)[0], N)
         require_kind("branch", branch, str)
         if branch != ANY:
             require_known("branch", branch, self.branch_names)
         chosen = [k for k, name in enumerate(self.branch_names) if branch in (ANY, name)]
-        q, status = np.full((N, n), np.nan), np.full(N, int(InverseStatus.NOT_FOUND))
-        good = np.isfinite(targets).all(axis=1)
         values = None
+        good = np.asarray(np.isfinite(targets).all(axis=1))
         if xi is not None:
             self._require_charts()
             values = _repeat_rows("xi", as_float_array("xi", xi).reshape(-1, 1), N)[:, 0]
-            good &= np.isfinite(values)
-            self._solve_by_charts(targets, values, starts, chosen, q, status, good)
+            good = good & np.isfinite(values)
+        q, status = np.full((N, n), np.nan), np.full(N, int(InverseStatus.NOT_FOUND))
+        owners = np.full(N, -1)
         status[~good] = InverseStatus.BAD_INPUT
-        left = np.flatnonzero(good & (status != InverseStatus.FOUND))
+        rows = np.flatnonzero(good)
+        if values is not None and self.chart_kernel is not None:
+            near = None if starts is None else starts[rows]
+            q[rows], status[rows], owners[rows] = self.chart_kernel.solve_rows(
+                targets[rows], values[rows], near, chosen
+            )
+            if branch != ANY:
+                q[status == InverseStatus.OUTSIDE_DOMAIN] = np.nan
+                status[status == InverseStatus.OUTSIDE_DOMAIN] = InverseStatus.NOT_FOUND
+        else:
+            if values is not None:
+                self._solve_by_charts(targets, values, starts, chosen, q, status, good)
+            left = rows[status[rows] != InverseStatus.FOUND]
 
-        def solve_row(row: int) -> None:
-            wish = None if starts is None else starts[row]
-            value = None if values is None else float(values[row])
-            q[row], status[row] = self._solve_on_arcs(targets[row], value, wish, chosen, branch == ANY)
+            def solve_row(row: int) -> None:
+                wish = None if starts is None else starts[row]
+                value = None if values is None else float(values[row])
+                q[row], status[row] = self._solve_on_arcs(targets[row], value, wish, chosen, branch == ANY)
 
-        run_in_threads(solve_row, left.tolist())
-        owners = self.find_branches(np.where(np.isfinite(q), q, 0.0))
-        owners = [k if good else -1 for k, good in zip(owners, np.isfinite(q).all(axis=1), strict=True)]
-        names = tuple(self.branch_names[k] if k >= 0 else "" for k in owners)
-        own = self._evaluate_xi(q, owners)
+            run_in_threads(solve_row, left.tolist())
+            there = np.flatnonzero(np.isfinite(q).all(axis=1))
+            owners[there] = self.find_branches(q[there])
+        names = tuple(self.branch_names[k] if k >= 0 else "" for k in owners.tolist())
+        own = np.full(N, np.nan) if values is None else np.where(status == InverseStatus.FOUND, values, np.nan)
+        unknown = np.flatnonzero(np.isnan(own) & (owners >= 0))
+        if unknown.size:
+            own[unknown] = self._evaluate_xi(q[unknown], owners[unknown])
         if single:
             return Postures(q[0], InverseStatus(int(status[0])), names[0], own[0])
         return Postures(q, status, names, own)
@@ -365,13 +384,13 @@ class Arm(Shown):
             statuses.append(tracker.status)
         return found, tuple(statuses)
 
-    def find_branches(self, q: Array) -> list[int]:
+    def find_branches(self, q: Array) -> Indices:
         """Numbers of the charts whose domains hold postures (N, n); -1 for none."""
         owners = np.full(len(q), -1)
         for k, chart in enumerate(self.charts):
             left = np.flatnonzero(owners < 0)
             owners[left[np.asarray(chart.problem.domain.contains(q[left]))]] = k
-        return [int(k) for k in owners]
+        return owners
 
     def facts(self) -> dict[str, str]:
         """Task, charts, and how much of their branches they cover."""
@@ -392,9 +411,29 @@ class Arm(Shown):
         """What other files of this package use of an arm; it may change without notice."""
         return ArmMaps(self.task)
 
+    @cached_property
+    def chart_kernel(self) -> ChartKernel | None:
+        """Searches in compiled C, with the charts; None without a compiler. For other files of this package."""
+        if not self.maps.compiled:
+            return None
+        kernel = ChartKernel(self.maps, self.charts)
+        try:
+            kernel.load()
+        except (CompileError, DomainError, InvalidValueError):  # no compiler, no folder, or no expression of a domain
+            return None
+        return kernel
+
     def _require_charts(self) -> None:
         if not self.charts:
             raise InvalidValueError("xi", "for an arm without charts", "None, or an arm of `Arm.fit`")
+
+    def _read(self, x: Any) -> tuple[Array, bool]:
+        """As `TargetReader.read`, in C where x is an array of vectors."""
+        m = self.task.m
+        plain = type(x) is np.ndarray and x.dtype == np.float64 and (x.shape == (m,) or x.shape[1:] == (m,) != (4,))
+        if not (plain and self.charts) or self.chart_kernel is None:
+            return self.maps.targets.read(x)
+        return self.chart_kernel.build_targets(np.ascontiguousarray(x).reshape(-1, m)), x.ndim == 1
 
     def _read_one(self, x: Any) -> Array:
         targets, single = self.maps.targets.read(x)
@@ -416,7 +455,7 @@ class Arm(Shown):
     ) -> None:
         """Ask charts in turn for (x, xi) of good rows; q and status of those that are found are filled in."""
         vectors = self.maps.targets.vector(targets)
-        first = np.full(len(targets), -1) if starts is None else np.array(self.find_branches(starts))
+        first = np.full(len(targets), -1) if starts is None else self.find_branches(starts)
         for own in (True, False):
             for k in chosen:
                 rows = np.flatnonzero(good & (status != InverseStatus.FOUND) & ((first == k) == own))
@@ -511,11 +550,11 @@ class Arm(Shown):
         """Places on an arc, at most `RULES.spacing` apart, (P,)."""
         return np.linspace(0.0, arc.length, max(2, int(arc.length / RULES.spacing) + 2))
 
-    def _evaluate_xi(self, q: Array, owners: Sequence[int]) -> Array:
+    def _evaluate_xi(self, q: Array, owners: Indices) -> Array:
         """xi (N,) of postures in the charts that hold them; NaN elsewhere."""
         values = np.full(len(q), np.nan)
         for k, chart in enumerate(self.charts):
-            rows = np.flatnonzero(np.array(owners) == k)
+            rows = np.flatnonzero(owners == k)
             if rows.size:
                 values[rows] = chart.xi(q[rows])[:, 0]
         return values
