@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from orthocas.arms.arm_file import read_charts, write_charts
 from orthocas.arms.chart_kernel import ChartKernel
 from orthocas.arms.maps import ArmMaps
+from orthocas.arms.numpy_tracker import TrackStatus
 from orthocas.arms.self_motion import Arc, SelfMotions, find_motions
-from orthocas.arms.tracker import ArmTracker, TrackStatus
+from orthocas.arms.tracker import ArmTracker
 from orthocas.charts.chart import Chart
 from orthocas.charts.inverse import InverseStatus
 from orthocas.errors import BranchWarning, CompileError, DomainError, InvalidValueError, NotRedundantError, ShapeError
@@ -89,12 +90,13 @@ class Postures(Shown):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Arm(Shown):
-    """An arm with one joint more than its task needs, and charts of the branches of its joint range.
+    """An arm with more joints than its task needs, and charts of the branches of its joint range.
 
     Where a chart ends at a boundary of its domain, an arm goes on: it knows the postures of a task value x within the
     joint limits. Without limits they are a few closed curves, which are traced from stored postures and then cut at
     the limits: `self_motion`, `nearest`, `solve` and `solutions`. Charts give postures a number xi on each branch.
-    `tracker` follows a stream of x and xi through borders of charts, singular positions and out of reach.
+    `tracker` follows a stream of x and xi through borders of charts, singular positions and out of reach. Arms with
+    several joints more than the task needs, such as those on mobile bases, have trackers only.
 
     The curves are traced in C that is compiled on first use and kept; without a compiler, NumPy does the same, a
     hundred times slower. `Arm(task)` has no charts: it is ready at once, and knows no xi.
@@ -104,11 +106,11 @@ class Arm(Shown):
     of these.
 
     Args:
-        task: a task with m = n - 1.
+        task: a task with m < n; with m = n - 1 for all but trackers.
         charts: of branches, with equal tasks.
 
     Raises:
-        NotRedundantError, InvalidValueError: if n - m is not 1, or charts have another task.
+        NotRedundantError, InvalidValueError: if the task leaves no joint free, or charts have another task.
 
     Example:
         >>> import orthocas as oc
@@ -131,8 +133,6 @@ class Arm(Shown):
         free = robot.n - len(robot.tree.floating)
         if self.task.m >= free:
             raise NotRedundantError(self.task.m, free)
-        if self.task.m + 1 != robot.n:
-            raise InvalidValueError("task", f"n - m = {robot.n - self.task.m}", "one with n - m = 1, or use charts")
         one = np.flatnonzero(np.isfinite(robot.lower) != np.isfinite(robot.upper))
         if any(not robot.tree.prismatic[k] for k in one):
             raise InvalidValueError("joint", f"'{robot.joint_names[one[0]]}' with one limit", "two limits, or none")
@@ -171,6 +171,7 @@ class Arm(Shown):
         """
         require_kind("robot", robot, Robot)
         bare = cls(Task.pose(robot) if task is None else task)
+        bare.require_one_free()
         parts, found, reasons = branches(robot, bare.task), [], []
         for k, branch in enumerate(parts):
             own = f"branch {k + 1} of {len(parts)}, "
@@ -235,8 +236,9 @@ class Arm(Shown):
             x: one task value.
 
         Raises:
-            InvalidValueError: if x is no task value, or not finite.
+            InvalidValueError: if x is no task value, or not finite, or n - m is not 1.
         """
+        self.require_one_free()
         return find_motions(self.maps, self._read_one(x))
 
     def solutions(self, x: Any, xi: float | None = None) -> tuple[Arc, ...] | Postures:
@@ -292,6 +294,7 @@ class Arm(Shown):
         Raises:
             InvalidValueError, ShapeError: for arguments that do not fit, or an xi or branch without charts.
         """
+        self.require_one_free()
         targets, single = self._read(x)
         N, n = len(targets), self.robot.n
         starts = None if start is None else _repeat_rows("start", as_point_set("start", start, n)[0], N)
@@ -340,7 +343,14 @@ class Arm(Shown):
         return Postures(q, status, names, own)
 
     def tracker(
-        self, q: ArrayLike, *, period: float = 0.01, velocity_limits: ArrayLike | None = None, detours: bool = True
+        self,
+        q: ArrayLike,
+        *,
+        period: float = 0.01,
+        velocity_limits: ArrayLike | None = None,
+        acceleration_limits: ArrayLike | None = None,
+        weights: ArrayLike | None = None,
+        detours: bool = True,
     ) -> ArmTracker:
         """A tracker of a stream of x and xi that is never lost; see `ArmTracker`.
 
@@ -348,9 +358,14 @@ class Arm(Shown):
             q: posture within the joint limits, (n,).
             period: time from one call to the next [s].
             velocity_limits: (n,) or one number [rad/s] or [m/s]. Default: those of the robot's file.
-            detours: whether the arm may leave x for a while where it is stuck, to get to a posture that has it.
+            acceleration_limits: (n,) or one number [rad/s^2] or [m/s^2]. Default: none.
+            weights: of the joints' steps, and ways back to the last posture with a chart, or where there are no charts,
+                to q: (n,), of which the ratios count. A large one keeps a base nearer to its place than the arm.
+            detours: whether the arm may leave x for a while where it is stuck, to get to a posture that has it, or to
+                one that has xi as well.
         """
-        return ArmTracker(self.maps, self.charts, q, period, velocity_limits, detours)
+        rules = velocity_limits, acceleration_limits, weights, detours
+        return ArmTracker(self.maps, self.charts, self.chart_kernel, q, period, *rules)
 
     def follow(
         self,
@@ -375,9 +390,11 @@ class Arm(Shown):
         """
         targets, _ = self.maps.targets.read(path)
         tracker = self.tracker(q, period=period, velocity_limits=velocity_limits)
-        values = [None] * len(targets)
+        values: list[Any] = [None] * len(targets)
         if xi is not None:
-            values = _repeat_rows("xi", as_float_array("xi", xi).reshape(-1, 1), len(targets))[:, 0].tolist()
+            r = self.robot.n - self.task.m
+            values = list(_repeat_rows("xi", as_float_array("xi", xi).reshape(-1, r), len(targets)))
+            values = [row.item() for row in values] if r == 1 else values
         found, statuses = np.empty((len(targets), self.robot.n)), []
         for k, (target, value) in enumerate(zip(targets, values, strict=True)):
             found[k] = tracker.step_to(target, value)
@@ -426,6 +443,16 @@ class Arm(Shown):
     def _require_charts(self) -> None:
         if not self.charts:
             raise InvalidValueError("xi", "for an arm without charts", "None, or an arm of `Arm.fit`")
+
+    def require_one_free(self) -> None:
+        """Refuse arms with several joints more than the task needs.
+
+        Raises:
+            InvalidValueError: if n - m is not 1.
+        """
+        free = self.robot.n - self.task.m
+        if free != 1:
+            raise InvalidValueError("task", f"n - m = {free}", "one with n - m = 1; here, use charts, or a tracker")
 
     def _read(self, x: Any) -> tuple[Array, bool]:
         """As `TargetReader.read`, in C where x is an array of vectors."""

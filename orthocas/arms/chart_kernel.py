@@ -53,6 +53,10 @@ class ChartKernelRules:
     changes: int = 40  #: of these joints, one at a time, at most
     rounding: float = 1e-14  #: slope of the cost at a bound that is none
     sweeps: int = 8  #: of Jacobi's method for eigenvalues, at most
+    flattest: float = 2.0  #: least curvature that counts, in errors: less would amplify the tremor of a hand
+    calms: float = 0.8  #: factor of it for each call since the target moved
+    saddle: float = 0.02  #: slope of the error, relative to its curvature, below which a posture is next to a saddle
+    astride: float = 0.05  #: step to a side of a saddle
     largest: float = 0.7  #: norm of a step of Newton's method
     in_chart: int = 10  #: rounds of it at a tick in the chart
     seek_rounds: int = 24  #: of it, from a stored posture
@@ -182,7 +186,7 @@ class ChartKernel:
 
     def build_targets(self, vectors: Array) -> Array:
         """As `TargetReader.build`, of contiguous vectors (N, m)."""
-        targets = np.empty((len(vectors), self._target_size))
+        targets = np.empty((len(vectors), self.target_size))
         self._c.build_targets(len(vectors), pointer(vectors), pointer(targets))
         return targets
 
@@ -195,6 +199,11 @@ class ChartKernel:
     def track(self) -> Any:
         """`arm_track` of the library."""
         return self._c.arm_track
+
+    @property
+    def track_value(self) -> Any:
+        """The same for x as the task's vector."""
+        return self._c.track_value
 
     @property
     def reset(self) -> Any:
@@ -212,7 +221,7 @@ class ChartKernel:
             sources["self_motion.c"] = write_curves(self.maps.equations, *self._limits)
         library = load_library(keep_library("arm", sources, _FLAGS))
         library.arm_track_reset.restype = library.build_targets.restype = None
-        if self.charts:
+        if self.charts and self.maps.robot.n - self.maps.task.m == 1:
             library.solve_rows.restype = None
         return library
 
@@ -227,7 +236,8 @@ class ChartKernel:
         return RangeInC(len(stored.q), len(stored.begins) - 1, *parts)
 
     @cached_property
-    def _target_size(self) -> int:
+    def target_size(self) -> int:
+        """Numbers of a target."""
         return int(self.maps.equations.size1_in(1))
 
     @cached_property
@@ -291,6 +301,6 @@ def write_tracker(maps: ArmMaps, charts: Sequence[Chart], name: str, template: s
     }
     values["rows"] = template != "arm_track.c"
     if values["rows"]:
-        values["branches"] = len(maps.stored.begins)
+        values["branches"] = len(maps.stored.begins) if charts and n - task.m == 1 else 0
     source = f"{name}_track.c" if template == "arm_track.c" else f"{name}.c"
     return {f"{name}_track.h": render("arm_track.h", values), source: render(template, values)}

@@ -202,7 +202,7 @@ def test_a_fit_has_a_chart_of_each_branch() -> None:
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: oc.Arm(oc.problems.get("iiwa").task), "n - m = 4"),
+        (lambda: oc.Arm(oc.problems.get("iiwa").task).nearest([0.1, 0.2, 0.3], np.zeros(7)), "n - m = 4"),
         (lambda: oc.Arm(3), "a Task"),  # type: ignore[arg-type]
         (lambda: oc.Arm(planar().task, (panda().charts[0],)), "charts"),
         (lambda: oc.Arm(panda().task).save("a.arm"), "without charts"),
@@ -225,4 +225,4 @@ def test_an_arm_needs_one_joint_more_than_its_task() -> None:
     with pytest.raises(NotRedundantError):
         oc.Arm(oc.Task.position(robot, "xy"))
     with pytest.raises(InvalidValueError, match="n - m = 2"):
-        oc.Arm(oc.Task.position(oc.problems.get("planar_3r_xy").robot, "x"))
+        oc.Arm.fit(oc.problems.get("planar_3r_xy").robot, oc.Task.position(oc.problems.get("planar_3r_xy").robot, "x"))
