@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from orthocas.arms.arm_file import read_charts, write_charts
 from orthocas.arms.chart_kernel import ChartKernel
@@ -18,9 +18,11 @@ from orthocas.arms.numpy_tracker import TrackStatus
 from orthocas.arms.self_motion import Arc, SelfMotions, find_motions
 from orthocas.arms.tracker import ArmTracker
 from orthocas.charts.chart import Chart
+from orthocas.charts.clearance import Clearance
 from orthocas.charts.inverse import InverseStatus
 from orthocas.errors import BranchWarning, CompileError, DomainError, InvalidValueError, NotRedundantError, ShapeError
 from orthocas.fitting.wide import fit_wide
+from orthocas.robots.collisions import Collisions
 from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import branches
 from orthocas.tasks.metric import Metric, MetricSpec
@@ -39,6 +41,7 @@ from orthocas.tools.checks import (
     require_known,
 )
 from orthocas.tools.display import Shown, listed, percent
+from orthocas.tools.expressions import wrap_shortest
 from orthocas.tools.progress import Monitor, Progress, silent
 
 ANY = "any"  #: branch
@@ -241,19 +244,26 @@ class Arm(Shown):
         self.require_one_free()
         return find_motions(self.maps, self._read_one(x))
 
-    def solutions(self, x: Any, xi: float | None = None) -> tuple[Arc, ...] | Postures:
+    def solutions(
+        self, x: Any, xi: float | None = None, collisions: Collisions | None = None
+    ) -> tuple[Arc, ...] | Postures:
         """All postures with a task value, on all branches.
 
         Args:
             x: one task value.
             xi: that postures are to have in the chart of their branch; None for any.
+            collisions: of the robot, for postures with xi: those without a contact come first, the others are
+                COLLIDING.
 
         Returns:
             Without xi the arcs, the components of `self_motion`; with xi the postures where a chart has it.
 
         Raises:
-            InvalidValueError: if x is no task value, or xi is given to an arm without charts.
+            InvalidValueError: if x is no task value, xi is given to an arm without charts, or collisions without xi.
         """
+        self._check_collisions(collisions)
+        if collisions is not None and xi is None:
+            raise InvalidValueError("collisions", "given without xi", "xi with it; `solve` takes it without xi")
         motions = self.self_motion(x)
         if xi is None:
             return motions.components
@@ -263,7 +273,10 @@ class Arm(Shown):
         q = np.array([q for q, _ in found]).reshape(-1, self.robot.n)
         names = tuple(name for _, name in found)
         status = np.full(len(q), int(InverseStatus.FOUND))
-        return Postures(q, status, names, np.full(len(q), value))
+        if collisions is not None and len(q):
+            status[~collisions.check_free(q)] = InverseStatus.COLLIDING
+        order = np.argsort(status, kind="stable")
+        return Postures(q[order], status[order], tuple(names[k] for k in order), np.full(len(q), value))
 
     def nearest(self, x: Any, q_wish: ArrayLike) -> Postures:
         """The posture within the joint limits with a task value that is nearest to another one, |q - q_wish| least.
@@ -274,7 +287,14 @@ class Arm(Shown):
         """
         return self.solve(x, start=q_wish)
 
-    def solve(self, x: Any, xi: ArrayLike | None = None, start: ArrayLike | None = None, branch: str = ANY) -> Postures:
+    def solve(
+        self,
+        x: Any,
+        xi: ArrayLike | None = None,
+        start: ArrayLike | None = None,
+        branch: str = ANY,
+        collisions: Collisions | None = None,
+    ) -> Postures:
         """A posture within the joint limits for each task value.
 
         With xi, charts are asked in turn: that of the start's branch first, or else the largest. Newton's method goes
@@ -290,11 +310,16 @@ class Arm(Shown):
             xi: a number, or one for each row (N,).
             start: a posture (n,), or one for each row (N, n).
             branch: name of a branch, to accept no other; "any" for all.
+            collisions: of the robot, such as `robot.collisions`. Where the posture touches something, a free one with
+                the same x and xi takes its place; else, of free postures 0.05 rad apart on the arcs, that with the
+                nearest xi (NEAREST), or without xi that nearest to the start, or farthest from limits. Where none is
+                free, the status is COLLIDING.
 
         Raises:
             InvalidValueError, ShapeError: for arguments that do not fit, or an xi or branch without charts.
         """
         self.require_one_free()
+        self._check_collisions(collisions)
         targets, single = self._read(x)
         N, n = len(targets), self.robot.n
         starts = None if start is None else _repeat_rows("start", as_point_set("start", start, n)[0], N)
@@ -311,28 +336,18 @@ class Arm(Shown):
         q, status = np.full((N, n), np.nan), np.full(N, int(InverseStatus.NOT_FOUND))
         owners = np.full(N, -1)
         status[~good] = InverseStatus.BAD_INPUT
-        rows = np.flatnonzero(good)
-        if values is not None and self.chart_kernel is not None:
-            near = None if starts is None else starts[rows]
-            q[rows], status[rows], owners[rows] = self.chart_kernel.solve_rows(
-                targets[rows], values[rows], near, chosen
-            )
-            if branch != ANY:
-                q[status == InverseStatus.OUTSIDE_DOMAIN] = np.nan
-                status[status == InverseStatus.OUTSIDE_DOMAIN] = InverseStatus.NOT_FOUND
-        else:
-            if values is not None:
-                self._solve_by_charts(targets, values, starts, chosen, q, status, good)
-            left = rows[status[rows] != InverseStatus.FOUND]
-
-            def solve_row(row: int) -> None:
+        rows, near = np.flatnonzero(good), None if starts is None else starts[good]
+        solve_rows = self._solve_rows if xi is None or self.chart_kernel is None else self._solve_rows_in_c
+        wishes = None if values is None else values[rows]
+        q[rows], status[rows], owners[rows] = solve_rows(targets[rows], wishes, near, chosen, branch == ANY)
+        if collisions is not None:
+            known = np.flatnonzero(np.isfinite(q).all(axis=1))
+            for row in known[~collisions.check_free(q[known])].tolist():
                 wish = None if starts is None else starts[row]
                 value = None if values is None else float(values[row])
-                q[row], status[row] = self._solve_on_arcs(targets[row], value, wish, chosen, branch == ANY)
-
-            run_in_threads(solve_row, left.tolist())
-            there = np.flatnonzero(np.isfinite(q).all(axis=1))
-            owners[there] = self.find_branches(q[there])
+                free = self._find_free(targets[row], value, wish, chosen, branch == ANY, collisions)
+                q[row], status[row] = free or (q[row], InverseStatus.COLLIDING)
+                owners[row] = self.find_branches(q[row : row + 1])[0]
         names = tuple(self.branch_names[k] if k >= 0 else "" for k in owners.tolist())
         own = np.full(N, np.nan) if values is None else np.where(status == InverseStatus.FOUND, values, np.nan)
         unknown = np.flatnonzero(np.isnan(own) & (owners >= 0))
@@ -351,6 +366,9 @@ class Arm(Shown):
         acceleration_limits: ArrayLike | None = None,
         weights: ArrayLike | None = None,
         detours: bool = True,
+        collisions: Collisions | None = None,
+        margin: float | None = None,
+        avoid: float | None = None,
     ) -> ArmTracker:
         """A tracker of a stream of x and xi that is never lost; see `ArmTracker`.
 
@@ -363,8 +381,12 @@ class Arm(Shown):
                 to q: (n,), of which the ratios count. A large one keeps a base nearer to its place than the arm.
             detours: whether the arm may leave x for a while where it is stuck, to get to a posture that has it, or to
                 one that has xi as well.
+            collisions: of the robot, such as `robot.collisions`; with margin and avoid as in `Chart.tracker`.
+            margin: [m].
+            avoid: [m].
         """
-        rules = velocity_limits, acceleration_limits, weights, detours
+        clearance = Clearance.build(collisions, self.robot.tree, margin, avoid)
+        rules = velocity_limits, acceleration_limits, weights, detours, clearance
         return ArmTracker(self.maps, self.charts, self.chart_kernel, q, period, *rules)
 
     def follow(
@@ -375,6 +397,9 @@ class Arm(Shown):
         q: ArrayLike,
         period: float = 0.01,
         velocity_limits: ArrayLike | None = None,
+        collisions: Collisions | None = None,
+        margin: float | None = None,
+        avoid: float | None = None,
     ) -> tuple[Array, tuple[TrackStatus, ...]]:
         """Postures along task values, by a tracker that makes one call for each.
 
@@ -384,12 +409,17 @@ class Arm(Shown):
             q: where the arm is before, (n,).
             period: as in `tracker`.
             velocity_limits: as in `tracker`.
+            collisions: as in `tracker`.
+            margin: as in `tracker`.
+            avoid: as in `tracker`.
 
         Returns:
             q (N, n), and how each call ended.
         """
         targets, _ = self.maps.targets.read(path)
-        tracker = self.tracker(q, period=period, velocity_limits=velocity_limits)
+        tracker = self.tracker(
+            q, period=period, velocity_limits=velocity_limits, collisions=collisions, margin=margin, avoid=avoid
+        )
         values: list[Any] = [None] * len(targets)
         if xi is not None:
             r = self.robot.n - self.task.m
@@ -470,6 +500,36 @@ class Arm(Shown):
             )
         return np.asarray(targets[0])
 
+    def _solve_rows_in_c(
+        self, targets: Array, values: Any, starts: Array | None, chosen: Sequence[int], anywhere: bool
+    ) -> tuple[Array, Indices, Indices]:
+        """Postures of targets and xi, numbers of their status and charts."""
+        assert self.chart_kernel is not None
+        q, status, owners = self.chart_kernel.solve_rows(targets, values, starts, chosen)
+        if not anywhere:
+            beyond = status == InverseStatus.OUTSIDE_DOMAIN
+            q[beyond], status[beyond] = np.nan, InverseStatus.NOT_FOUND
+        return q, status, owners
+
+    def _solve_rows(
+        self, targets: Array, values: Array | None, starts: Array | None, chosen: Sequence[int], anywhere: bool
+    ) -> tuple[Array, Indices, Indices]:
+        """The same by charts, and arcs where they have none; without xi by arcs alone."""
+        N = len(targets)
+        q, status = np.full((N, self.robot.n), np.nan), np.full(N, int(InverseStatus.NOT_FOUND))
+        if values is not None:
+            self._solve_by_charts(targets, values, starts, chosen, q, status)
+
+        def solve_row(row: int) -> None:
+            wish = None if starts is None else starts[row]
+            value = None if values is None else float(values[row])
+            q[row], status[row] = self._solve_on_arcs(targets[row], value, wish, chosen, anywhere)
+
+        run_in_threads(solve_row, np.flatnonzero(status != InverseStatus.FOUND).tolist())
+        owners, there = np.full(N, -1), np.flatnonzero(np.isfinite(q).all(axis=1))
+        owners[there] = self.find_branches(q[there])
+        return q, status, owners
+
     def _solve_by_charts(
         self,
         targets: Array,
@@ -478,14 +538,13 @@ class Arm(Shown):
         chosen: Sequence[int],
         q: Array,
         status: Indices,
-        good: NDArray[np.bool_],
     ) -> None:
-        """Ask charts in turn for (x, xi) of good rows; q and status of those that are found are filled in."""
+        """Ask charts in turn for (x, xi); q and status of those that are found are filled in."""
         vectors = self.maps.targets.vector(targets)
         first = np.full(len(targets), -1) if starts is None else self.find_branches(starts)
         for own in (True, False):
             for k in chosen:
-                rows = np.flatnonzero(good & (status != InverseStatus.FOUND) & ((first == k) == own))
+                rows = np.flatnonzero((status != InverseStatus.FOUND) & ((first == k) == own))
                 if not rows.size or (own and starts is None):
                     continue
                 near = starts[rows] if own and starts is not None else None
@@ -532,6 +591,49 @@ class Arm(Shown):
         q = q[inside]
         k = np.argmax(self._measure_room(q)) if start is None else np.argmin(np.linalg.norm(q - start, axis=1))
         return q[k], InverseStatus.FOUND
+
+    def _find_free(
+        self,
+        target: Array,
+        xi: float | None,
+        start: Array | None,
+        chosen: Sequence[int],
+        anywhere: bool,
+        collisions: Collisions,
+    ) -> tuple[Array, InverseStatus] | None:
+        """A posture of one target without a contact, of those with xi or of many on its arcs; None if there is none."""
+        motions = find_motions(self.maps, target, *(() if start is None else (start[None],)))
+        if xi is not None:
+            exact = np.array([q for k in chosen for q in self._find_xi(motions, k, xi)[0]]).reshape(-1, self.robot.n)
+            exact = exact[collisions.check_free(exact)] if len(exact) else exact
+            if len(exact):
+                away = np.linalg.norm(exact - (exact[0] if start is None else start), axis=1)
+                return exact[np.argmin(away)], InverseStatus.FOUND
+        q = np.vstack([np.empty((0, self.robot.n)), *(arc.at(self._list_places(arc)) for arc in motions)])
+        q = q[collisions.check_free(q)] if len(q) else q
+        if xi is None and anywhere:
+            owners = np.zeros(len(q), dtype=np.int64)
+        else:
+            inside = [np.asarray(self.charts[k].problem.domain.contains(q)) for k in chosen] if len(q) else []
+            owners = np.array(
+                [next((k for k, part in zip(chosen, inside, strict=True) if part[row]), -1) for row in range(len(q))],
+                dtype=np.int64,
+            )
+            q, owners = q[owners >= 0], owners[owners >= 0]
+        if not len(q):
+            return None
+        if xi is not None:
+            periods = np.array([self.charts[k].parts.turns[self.charts[k].m] for k in owners])
+            away = np.abs(wrap_shortest(self._evaluate_xi(q, owners) - xi, periods))
+            return q[np.argmin(away)], InverseStatus.NEAREST
+        k = np.argmax(self._measure_room(q)) if start is None else np.argmin(np.linalg.norm(q - start, axis=1))
+        return q[k], InverseStatus.FOUND
+
+    def _check_collisions(self, collisions: Collisions | None) -> None:
+        """Raise InvalidValueError for what is no collision model of the robot."""
+        if collisions is not None:
+            require_kind("collisions", collisions, Collisions)
+            collisions.require_for(self.robot.tree)
 
     def _measure_room(self, q: Array) -> Array:
         """Distances from the limits (N,), in half-widths of the joints' ranges."""

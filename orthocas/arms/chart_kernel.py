@@ -210,6 +210,11 @@ class ChartKernel:
         """`arm_track_reset` of the library."""
         return self._c.arm_track_reset
 
+    @property
+    def hold(self) -> Any:
+        """`arm_track_hold` of the library."""
+        return self._c.arm_track_hold
+
     def load(self) -> None:
         """Compile now, or find what was compiled earlier."""
         assert self._c is not None
@@ -220,7 +225,7 @@ class ChartKernel:
         if self.charts and self.maps.robot.n - self.maps.task.m == 1:
             sources["self_motion.c"] = write_curves(self.maps.equations, *self._limits)
         library = load_library(keep_library("arm", sources, _FLAGS))
-        library.arm_track_reset.restype = library.build_targets.restype = None
+        library.arm_track_reset.restype = library.arm_track_hold.restype = library.build_targets.restype = None
         if self.charts and self.maps.robot.n - self.maps.task.m == 1:
             library.solve_rows.restype = None
         return library

@@ -14,8 +14,9 @@ from orthocas.arms.kernel import build_curvature, build_equations
 from orthocas.arms.maps import ArmMaps
 from orthocas.arms.self_motion import find_motions
 from orthocas.charts.chart import Chart
+from orthocas.charts.clearance import Clearance
 from orthocas.charts.newton import Bound
-from orthocas.charts.trackers import TrackerStatus
+from orthocas.charts.trackers import Tracker, TrackerStatus
 from orthocas.errors import InvalidValueError
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import building
@@ -44,6 +45,7 @@ class TrackRules:
     guesses: int = 8  #: of the joints at bounds in a quadratic program, many at a time
     changes: int = 40  #: of these joints, one at a time, at most
     rounding: float = 1e-14  #: slope of the cost at a bound that is none
+    avoid_weight: float = 1e-2  #: of pairs nearer than `avoid`, relative to x
     enough: float = 1e-2  #: relative decrease of the cost below which a far arm leaves the rest to the next call
 
 
@@ -58,6 +60,7 @@ class TrackStatus(IntEnum):
     BEHIND = 2  #: x is not met: the arm moves towards it as fast as its joints may, or goes another way to it
     NEAREST = 3  #: x is out of reach from here: a local minimum of its error within the limits, at rest
     BAD_INPUT = 4  #: a number of x or xi is not finite; the arm stays
+    BRAKED = 5  #: a part of the way, or none: all of it would come nearer to a contact than `margin` allows
 
 
 class NumpyTracker:
@@ -68,10 +71,18 @@ class NumpyTracker:
     """
 
     def __init__(
-        self, maps: ArmMaps, charts: Sequence[Chart], q: Array, period: float, speed: Array, detours: bool
+        self,
+        maps: ArmMaps,
+        charts: Sequence[Chart],
+        q: Array,
+        period: float,
+        speed: Array,
+        detours: bool,
+        clearance: Clearance | None,
     ) -> None:
         n = maps.robot.n
         self._maps, self._charts, self._period, self._speed = maps, tuple(charts), period, speed
+        self._clearance = clearance
         self._detours, self._patience = detours, max(2, int(RULES.window / period))
         self._at, self._to = np.empty(n), np.empty(len(maps.targets_of(np.zeros((1, n)))[0]))
         self._e, self._J = np.empty(maps.task.m), np.empty((n, maps.task.m))
@@ -113,6 +124,8 @@ class NumpyTracker:
 
     def reset(self, q: Array) -> None:
         """Continue from another posture (n,)."""
+        if self._clearance is not None:
+            self._clearance.start(q)
         self._q, self._last = np.array(q, dtype=float), np.array(q, dtype=float)
         self._chart: Chart | None = None
         self._inside, self._wish = False, float("nan")
@@ -122,6 +135,18 @@ class NumpyTracker:
         self._look_for_chart()
 
     def step(self, vector: Array | None, target: Array | None, xi: float | None) -> Array:
+        """The next posture (n,), clear of contacts, for x as the task's vector or as a target."""
+        before = self._q
+        q = self._move(vector, target, xi)
+        if self._clearance is None:
+            return q
+        self._q, fraction = self._clearance.limit(before, self._q)
+        if fraction < 1:
+            self.status = TrackStatus.BRAKED
+            self._look_for_chart()
+        return self._q.copy()
+
+    def _move(self, vector: Array | None, target: Array | None, xi: float | None) -> Array:
         """The next posture for x as the task's vector or as a target, of which the chart takes the one."""
         parts = [np.atleast_1d(part) for part in (vector, target, xi) if part is not None]
         if not np.isfinite(np.concatenate(parts)).all():
@@ -133,7 +158,8 @@ class NumpyTracker:
             x = targets.vector(np.asarray(target)[None])[0] if vector is None else vector
             if self._step_in_chart(x):
                 self._ticks, self._goal = 0, None
-                self.status = TrackStatus.OK
+                yields = self._exact.status == TrackerStatus.YIELDING
+                self.status = TrackStatus.YIELDING if yields else TrackStatus.OK
                 return self._q.copy()
         aim = targets.build(np.asarray(vector)[None])[0] if target is None else target
         rests = self.status == TrackStatus.NEAREST and np.array_equal(aim, self._to)
@@ -194,7 +220,7 @@ class NumpyTracker:
                 return False
         q = exact.step(np.append(vector, self._wish))
         low, high = self._bounds()
-        if exact.status != TrackerStatus.OK or not ((q >= low) & (q <= high)).all():
+        if exact.status not in (TrackerStatus.OK, TrackerStatus.YIELDING) or not ((q >= low) & (q <= high)).all():
             return False
         self._q, self._last = q, q.copy()
         return True
@@ -272,7 +298,20 @@ class NumpyTracker:
         return np.asarray((vectors * np.abs(values)) @ vectors.T)
 
     def _find_wishes(self) -> tuple[Array, Array, float]:
-        """Rows, values and weight of what else the step is to do: xi, or the way back to a posture with a chart."""
+        """Rows, values and weight of what else the step is to do: xi, or the way back to a posture with a chart.
+
+        Pairs nearer than `avoid` come on top: each is to be that far.
+        """
+        rows, wishes, weight = self._find_own_wishes()
+        if self._clearance is not None and self._clearance.avoid is not None:
+            near = self._clearance.collisions.find_near(self._q, self._clearance.avoid)
+            scale = RULES.avoid_weight / weight
+            rows = np.vstack([rows, scale * near.gradient])
+            wishes = np.append(wishes, scale * (self._clearance.avoid - near.distance))
+        return rows, wishes, weight
+
+    def _find_own_wishes(self) -> tuple[Array, Array, float]:
+        """Without a collision model."""
         n = len(self._q)
         if self._inside and np.isfinite(self._wish):
             value, gradient = self._measure_xi()
@@ -288,7 +327,9 @@ class NumpyTracker:
             if bool(chart.problem.domain.contains(self._q)):
                 if self._chart is None:
                     self._chart = chart
-                    self._exact = chart.tracker(self._q, self._speed * self._period)
+                    parts = chart.parts.point_functions, chart.problem.domain, self._q, self._speed * self._period
+                    clearance = None if self._clearance is None else self._clearance.copy()
+                    self._exact = Tracker(*parts, chart.m, clearance)
                     self._values = chart.coordinates.functions
                     q = ca.MX.sym("q", len(self._q))
                     rows = [chart.parts.runnable(self._values[name])(q) for name in ("xi", "jacobian")]

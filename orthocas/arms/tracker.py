@@ -15,6 +15,7 @@ from orthocas.arms.kernel import pointer
 from orthocas.arms.maps import ArmMaps
 from orthocas.arms.numpy_tracker import NumpyTracker, TrackStatus
 from orthocas.charts.chart import Chart
+from orthocas.charts.clearance import Clearance
 from orthocas.errors import CompileError, InvalidValueError, degrees_hint
 from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind, require_shape
 from orthocas.tools.display import Shown, number_list
@@ -51,6 +52,9 @@ class ArmTracker(Shown):
     there, with x kept as long as that leads nearer. From a target at rest it then goes straight, and leaves x for a
     while; so it does where it is stuck without x. `detours=False` forbids both.
 
+    With a collision model it brakes as `orthocas.charts.trackers.Tracker` does, on detours too, whatever the limits of
+    acceleration; with `avoid` it gives way, in NumPy.
+
     With a C compiler, a call is one call of C that takes a bounded time. Without one, NumPy does the same, slower,
     without limits of acceleration, with one joint more than the task needs, and does not look for xi elsewhere.
 
@@ -69,6 +73,7 @@ class ArmTracker(Shown):
         acceleration_limits: ArrayLike | None = None,
         weights: ArrayLike | None = None,
         detours: bool = True,
+        clearance: Clearance | None = None,
     ) -> None:
         robot, span = maps.robot, as_number("period", period)
         if not 1e-5 <= span <= 10:
@@ -83,22 +88,24 @@ class ArmTracker(Shown):
             "weights": _read_limits("weights", weights, np.ones(robot.n)),  # only their ratios count
             "detours": detours,
         }
-        self._maps, self._charts, self._kernel = maps, tuple(charts), kernel
+        self._maps, self._charts, self._kernel, self._clearance = maps, tuple(charts), kernel, clearance
         self._r = robot.n - maps.task.m
         point = self._read_posture(q)
         self._engine: NumpyTracker | _Compiled
-        if kernel is not None:
-            self._engine = _Compiled(kernel, self._rules)
+        gives_way = clearance is not None and clearance.avoid is not None
+        if kernel is not None and not gives_way:
+            self._engine = _Compiled(kernel, self._rules, clearance)
             self._engine.reset(point)
-        elif self._r == 1 and acceleration_limits is None:
-            self._engine = NumpyTracker(maps, self._charts, point, span, speed, detours)
+        elif self._r > 1 or acceleration_limits is not None:
+            what = "limits of acceleration, and more than one joint too many,"
+            raise CompileError(f"{what} need a C compiler, and a tracker without `avoid`")
         else:
-            raise CompileError("limits of acceleration, and more than one joint too many, need a C compiler")
+            self._engine = NumpyTracker(maps, self._charts, point, span, speed, detours, clearance)
 
     def __getstate__(self) -> dict[str, Any]:
         """Without scratch memory."""
         parts = {"maps": self._maps, "charts": self._charts, "kernel": self._kernel, "q": self.q}
-        return {**parts, "rules": self._rules, "memory": self._engine.memory}
+        return {**parts, "rules": {**self._rules, "clearance": self._clearance}, "memory": self._engine.memory}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         rules = dict(state["rules"])
@@ -142,7 +149,7 @@ class ArmTracker(Shown):
         """Continue from another posture (n,) within the joint limits, at rest.
 
         Raises:
-            InvalidValueError: if it is not within them.
+            InvalidValueError: if it is not within them, or a pair touches there.
         """
         self._engine.reset(self._read_posture(q))
 
@@ -190,10 +197,10 @@ class ArmTracker(Shown):
 class _Compiled:
     """The tracker in C: templates/arm_track.c.jinja, and its state."""
 
-    def __init__(self, kernel: ChartKernel, rules: dict[str, Any]) -> None:
+    def __init__(self, kernel: ChartKernel, rules: dict[str, Any], clearance: Clearance | None) -> None:
         robot, m = kernel.maps.robot, kernel.maps.task.m
         period, self._r = rules["period"], robot.n - m
-        self._kernel = kernel
+        self._kernel, self._clearance = kernel, clearance
         self._state = np.zeros(1, tracker_type(robot.n, self._r, kernel.target_size))
         self._state["most"], self._state["weight"] = (
             rules["velocity_limits"] * period,
@@ -211,6 +218,7 @@ class _Compiled:
 
     def step(self, vector: Array | None, target: Array | None, xi: Any) -> Array:
         """The next posture for x as the task's vector or as a target."""
+        before = None if self._clearance is None else self.q
         wish = None
         if xi is not None:
             self._wish[:] = xi
@@ -221,11 +229,17 @@ class _Compiled:
         else:
             self._target[:] = target
             self._track(self._at, self._postures_at, self._target_at, wish)
+        if self._clearance is not None and before is not None:
+            q, fraction = self._clearance.limit(before, self.q)
+            if fraction < 1:
+                self._kernel.hold(self._at, pointer(np.ascontiguousarray(q)), int(TrackStatus.BRAKED))
         return self._q.copy()
 
     def reset(self, q: Array) -> None:
         """Continue from another posture (n,)."""
         point = np.array(q, dtype=float)
+        if self._clearance is not None:
+            self._clearance.start(point)
         self._kernel.reset(self._at, pointer(point))
 
     @property
@@ -254,6 +268,8 @@ class _Compiled:
     @memory.setter
     def memory(self, memory: bytes) -> None:
         self._state[:] = np.frombuffer(memory, self._state.dtype)
+        if self._clearance is not None:
+            self._clearance.start(self.q)
 
 
 def _read_limits(name: str, limits: ArrayLike | None, default: Array) -> Array:

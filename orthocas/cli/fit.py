@@ -358,7 +358,7 @@ def _format_fit(result: Fit, report: Report, target: Path) -> dict[str, str]:
     rows = report.facts() if isinstance(result, WideFit) else format_report_rows(report)
     rows["robot"] = f"{robot.n} joints, {'tip' if len(robot.tips) == 1 else 'tips'} {listed(robot.tips)}"
     rows["fit"] = f"{coordinates.label}, {result.seconds:.2f} s, {result.status.value}"
-    if isinstance(result, WideFit) and result.branch is not None:
+    if isinstance(result, WideFit):
         rows["branch"] = (
             f"{result.branch.name}, {percent(result.branch.share)} of the clear positions of the joint range"
         )
@@ -390,7 +390,7 @@ def _format_fit(result: Fit, report: Report, target: Path) -> dict[str, str]:
 
 
 def _describe_wide(result: Fit) -> dict[str, Any]:
-    if not isinstance(result, WideFit) or result.branch is None:
+    if not isinstance(result, WideFit):
         return {}
     named = result.chart.parts.named_coordinates[0].partition(": ")[2]
     meaning = None if result.meaning is None else {"like": named, **asdict(result.meaning)}

@@ -13,6 +13,7 @@ import numpy as np
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
+from orthocas.codegen.distance import render_distance
 from orthocas.codegen.kernels import Kernels, generate_kernels, share_calls, share_sines
 from orthocas.codegen.rendering import (
     DOUBLE,
@@ -29,6 +30,7 @@ from orthocas.codegen.supervision import build_supervision_kernels, describe_law
 from orthocas.control.controller import Controller, require_controller
 from orthocas.control.safety import Safety
 from orthocas.errors import ArchiveError, InvalidValueError
+from orthocas.robots.capsules import FittedCapsules
 from orthocas.robots.kinematics import TipTurn
 from orthocas.tools.checks import Array, as_path, require_kind, require_shape
 from orthocas.tools.expressions import choose_form, expand_scalars
@@ -74,6 +76,7 @@ def generate_c(
     safety: Safety | None = None,
     single_precision: bool = False,
     rows: bool = False,
+    capsules: FittedCapsules | None = None,
 ) -> GeneratedC:
     """Write C99 for a chart, the robot's dynamics, the inverse map, and a controller.
 
@@ -92,6 +95,8 @@ def generate_c(
             precision only.
         rows: also write NAME_rows.c and NAME_rows.h with NAME_phi_rows, phi of many joint positions, for vector
             instructions. Not for large networks.
+        capsules: of `oc.fit_capsules(robot.collisions)`: also write NAME_distance.c and NAME_distance.h with
+            NAME_distance, the least distance of the links and its gradient.
 
     Raises:
         NoExpressionError: if the chart is grown; `orthocas.distil` turns it into a chart with a closed expression.
@@ -111,6 +116,9 @@ def generate_c(
         ['CMakeLists.txt', 'README.md', 'arm.c', 'arm.h', 'arm.pc.in']
     """
     require_kind("chart", chart, Chart)
+    if capsules is not None:
+        require_kind("capsules", capsules, FittedCapsules)
+        capsules.collisions.require_for(chart.problem.robot.tree)
     if controller is not None:
         safety = _check_law(chart, controller, safety)
     if name is None:
@@ -129,6 +137,7 @@ def generate_c(
     kernels = generate_kernels(_build_functions(chart, controller, precision), f"{name}_kernel")
     stack_bytes = _bound_stack(kernels, chart, controller, precision.size)
     values = _describe_library(chart, controller, name, rows, precision, kernels) | {"stack_bytes": stack_bytes}
+    values["distances"] = capsules is not None
     values |= _describe_chart(chart, precision) | {"check": _compute_check(chart, controller, precision)}
     if controller is not None and safety is not None:
         values |= describe_law(controller) | describe_supervision(controller, safety)
@@ -141,6 +150,8 @@ def generate_c(
     }
     if rows:
         contents |= render_rows(chart, values, precision)
+    if capsules is not None:
+        contents |= render_distance(capsules, values, precision)
 
     # All files are written or, if one fails, none.
     folder = as_path("out", out)

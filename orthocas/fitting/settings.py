@@ -35,6 +35,7 @@ class FitRules:
 
     least_samples: int = 1000  #: of bases
     residuals: int = 140  #: per coefficient, for which samples are drawn beyond these
+    residuals_of_many: int = 100  #: the same for coordinates of many joints, and nothing beyond them
     network_samples: int = 2000  #: of families that are not linear in their parameters
     first: int = 200  #: samples that scale coordinates
     first_tag: int = 1000  #: their seed tag; stages use other tags

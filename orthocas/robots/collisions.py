@@ -25,6 +25,7 @@ from orthocas.tools.checks import (
     Indices,
     as_float_array,
     as_number,
+    as_point,
     as_point_set,
     require_count,
     require_kind,
@@ -33,7 +34,7 @@ from orthocas.tools.checks import (
 )
 from orthocas.tools.display import Shown, listed
 
-__all__ = ["Collisions", "Contact", "LeastDistance"]
+__all__ = ["Collisions", "Contact", "LeastDistance", "NearPairs"]
 
 Pair = tuple[str, str]  #: names of two links, or of a link and an object of the scene
 
@@ -84,6 +85,21 @@ class LeastDistance(Shown):
             "least distance": f"{self.distance[k]:.4g} m in {len(self.distance)} postures",
             "pair": _name_pair(self.pair[k]),
         }
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class NearPairs(Shown):
+    """Pairs that are near at one posture, the nearest first; see `Collisions.find_near`."""
+
+    pairs: tuple[Pair, ...]  #: names
+    distance: Array  #: (P,) [m], negative: how deep they overlap
+    gradient: Array  #: d distance / dq, (P, n) [m/rad] or [m/m]
+    points: Array  #: nearest points in the world, (P, 2, 3) [m]
+
+    def facts(self) -> dict[str, str]:
+        """The nearest ones."""
+        near = [f"{_name_pair(pair)} {value:.4g} m" for pair, value in zip(self.pairs, self.distance, strict=True)]
+        return {"near": listed(near) or "no pair"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +210,28 @@ class Collisions(Shown):
                         free[start + i] = False
                         break
         return bool(free[0]) if single else free
+
+    def find_near(self, q: ArrayLike, within: float) -> NearPairs:
+        """The pairs nearer than a distance at one posture, each with its gradient: rows of a program or a barrier.
+
+        Args:
+            q: (n,) [rad] or [m].
+            within: [m].
+
+        Raises:
+            ShapeError, InvalidValueError: if q is no posture of the robot, or `within` no number.
+        """
+        point, limit = as_point("q", q, self.tree.n), as_number("within", within)
+        index = self.list_near_parts(point, limit)
+        values, gradients, ends = self.measure_parts(point, index)
+        # Of several parts of a pair, the nearest one.
+        order = [int(k) for k in np.argsort(values, kind="stable") if values[k] < limit]
+        names = [self.pairs[self._owners[index[k]]] for k in order]
+        kept: dict[Pair, int] = {}
+        for name, k in zip(names, order, strict=True):
+            kept.setdefault(name, k)
+        rows = list(kept.values())
+        return NearPairs(tuple(kept), values[rows], gradients[rows], ends[rows])
 
     def find_contact(self, q: ArrayLike, clearance: float = 0.0, bend: ArrayLike = 0.0) -> Contact | None:
         """The first place on straight ways between postures where a pair may be nearer than a clearance.
@@ -314,6 +352,25 @@ class Collisions(Shown):
                 distances[owner] = min(found, distances.get(owner, np.inf))
             yield from ((owner, found) for owner, found in distances.items() if found < least)
 
+    def list_near_parts(self, q: Array, within: float) -> Indices:
+        """Numbers of the pairs of parts whose bounds at q (n,) are nearer than a distance."""
+        return np.flatnonzero(self._bound_distances(q[None])[0] < within)
+
+    def measure_parts(self, q: Array, index: Indices) -> tuple[Array, Array, Array]:
+        """Distances (P,), gradients (P, n) and nearest points (P, 2, 3) of numbered pairs of parts (P,) at q (n,)."""
+        scratch = self._scratch
+        pin.updateGeometryPlacements(scratch.model, scratch.data, scratch.geometry, scratch.placed, q)
+        values, ends, normals = np.empty(len(index)), np.empty((len(index), 2, 3)), np.empty((len(index), 3))
+        for row, k in enumerate(index.tolist()):
+            result = pin.computeDistance(scratch.geometry, scratch.placed, k)
+            values[row], normals[row] = result.min_distance, result.normal
+            ends[row, 0], ends[row, 1] = result.getNearestPoint1(), result.getNearestPoint2()
+        # Of point clouds, coal has the cloud first.
+        swapped = self._swapped[index]
+        ends[swapped], normals[swapped] = ends[swapped, ::-1], -normals[swapped]
+        gradients = self._build_gradients(np.broadcast_to(q, (len(index), len(q))), index, ends, normals)
+        return values, gradients, ends
+
     def require_for(self, tree: KinematicTree) -> None:
         """Raise InvalidValueError unless the robot is the one of another tree."""
         mine = self.tree
@@ -417,7 +474,7 @@ class Collisions(Shown):
     def _build_gradients(self, points: Array, index: Indices, ends: Array, normals: Array) -> Array:
         """u^T (J_p2 - J_p1), (N, n), for nearest points (N, 2, 3) and unit normals u (N, 3)."""
         tree, N = self.tree, len(points)
-        frames = self._joint_axes(points)[0].reshape(N, tree.n, 6)
+        frames = self._joint_axes(points)[0].reshape(N, tree.n, 6) if N else np.empty((0, tree.n, 6))
         gradients = np.zeros((N, tree.n))
         if not self._owners.size:
             return gradients

@@ -47,7 +47,7 @@ SEARCHED = {
     "torque": "explanation/control",
     "gripper": "tutorials/own_arm",
     "collision avoidance": "how-to/paths",
-    "install": "index",
+    "install": "how-to/install",
 }
 
 
