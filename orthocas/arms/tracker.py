@@ -209,7 +209,8 @@ class _Compiled:
         self._state["change"] = rules["acceleration_limits"] * period**2
         self._state["detours"], self._state["patience"] = rules["detours"], max(2, int(RULES.window / period))
         self._x, self._target, self._wish = np.empty(m), np.empty(kernel.target_size), np.empty(self._r)
-        self._q, self._status = self._state["q"][0], self._state["status"]
+        self._q: Array = self._state["q"][0]
+        self._status = self._state["status"]
         places = (pointer(part) for part in (self._state, self._x, self._target, self._wish))
         self._at, self._x_at, self._target_at, self._wish_at = places
         self._postures = kernel.postures
@@ -233,7 +234,7 @@ class _Compiled:
             q, fraction = self._clearance.limit(before, self.q)
             if fraction < 1:
                 self._kernel.hold(self._at, pointer(np.ascontiguousarray(q)), int(TrackStatus.BRAKED))
-        return self._q.copy()
+        return np.array(self._q)
 
     def reset(self, q: Array) -> None:
         """Continue from another posture (n,)."""
@@ -244,7 +245,7 @@ class _Compiled:
 
     @property
     def q(self) -> Array:
-        return self._q.copy()
+        return np.array(self._q)
 
     @property
     def status(self) -> TrackStatus:
