@@ -45,7 +45,8 @@ class CollisionRules:
 
     tolerance: float = 1e-10  #: of distances of separate solids, relative to them; overlaps keep coal's 1e-6
     iterations: int = 1000  #: of the search for them
-    piece: int = 1024  #: postures whose bounds are computed at once
+    piece: int = 256  #: postures whose bounds are computed at once
+    first: int = 24  #: pairs with the nearest balls, of which bounds by capsules are computed first
     slack: float = 2e-6  #: of lower bounds [m]
     same_place: float = 1e-6  #: between the joints of two robots [m]
     parallel: float = 1e-12  #: of the squared sine between two axes
@@ -201,7 +202,7 @@ class Collisions(Shown):
         scratch = self._scratch
         for start in range(0, len(points), RULES.piece):
             some = points[start : start + RULES.piece]
-            bounds = self._bound_distances(some)
+            bounds = self._bound_distances(some, 0.0)
             for i in np.flatnonzero((bounds <= 0).any(axis=1)).tolist():
                 pin.updateGeometryPlacements(scratch.model, scratch.data, scratch.geometry, scratch.placed, some[i])
                 near = np.flatnonzero(bounds[i] <= 0)
@@ -264,10 +265,19 @@ class Collisions(Shown):
             raise InvalidValueError("q", "two postures farther apart", f"ways of at most {RULES.longest:g} rad or m")
         for start in range(0, max(len(points) - 1, 1), RULES.piece):
             some = points[start : start + RULES.piece + 1]
-            bounds = self._bound_distances(some)
-            first, second = (bounds[:-1], bounds[1:]) if len(some) > 1 else (bounds, bounds)
-            moves = np.abs(np.diff(some, axis=0)) if len(some) > 1 else np.zeros_like(some)
-            room = (first + second - moves @ self.rates.T) / 2 - extra
+            later = slice(1, None) if len(some) > 1 else slice(None)
+            moves = np.abs(some[later] - some[:-1]) if len(some) > 1 else np.zeros_like(some)
+            bounds, ends = self._bound_by_balls(some)
+            loss = moves @ self.rates.T / 2 + extra
+
+            def find_room(bounds: Array = bounds, loss: Array = loss, later: slice = later) -> Array:
+                return np.asarray((bounds[: len(loss)] + bounds[later]) / 2 - loss)
+
+            rows, pairs = np.nonzero(find_room() <= gap)
+            near = np.zeros(bounds.shape, dtype=bool)
+            near[rows, pairs] = near[np.minimum(rows + 1, len(some) - 1), pairs] = True
+            self._refine_bounds(bounds, ends, *np.nonzero(near))
+            room = find_room()
             for i in np.flatnonzero((room <= gap).any(axis=1)).tolist():
                 suspects = np.flatnonzero(room[i] <= gap)
                 contact = self._halve(some[i], some[min(i + 1, len(some) - 1)], suspects, gap, extra)
@@ -341,7 +351,7 @@ class Collisions(Shown):
             asked: whether a pair is asked for, (pairs,).
         """
         scratch = self._scratch
-        bounds = self._bound_distances(points)
+        bounds = self._bound_distances(points, least)
         bounds[:, np.flatnonzero(asked[self._owners] == 0)] = np.inf
         for i in np.flatnonzero((bounds < least).any(axis=1)).tolist():
             pin.updateGeometryPlacements(scratch.model, scratch.data, scratch.geometry, scratch.placed, points[i])
@@ -354,7 +364,7 @@ class Collisions(Shown):
 
     def list_near_parts(self, q: Array, within: float) -> Indices:
         """Numbers of the pairs of parts whose bounds at q (n,) are nearer than a distance."""
-        return np.flatnonzero(self._bound_distances(q[None])[0] < within)
+        return np.flatnonzero(self._bound_distances(q[None], within)[0] < within)
 
     def measure_parts(self, q: Array, index: Indices) -> tuple[Array, Array, Array]:
         """Distances (P,), gradients (P, n) and nearest points (P, 2, 3) of numbered pairs of parts (P,) at q (n,)."""
@@ -442,34 +452,53 @@ class Collisions(Shown):
         """Least distances (N,), pairs of parts (N,), nearest points (N, 2, 3) and normals (N, 3).
 
         Pairs of parts are evaluated in the order of their lower bounds, until the next bound is above the least one.
+        The bounds are those of capsules for the pairs whose balls are nearest, and for others where these may matter.
         """
         N = len(points)
-        values, index = np.full(N, np.inf), np.full(N, -1)
-        ends, normals = np.full((N, 2, 3), np.nan), np.zeros((N, 3))
+        found = np.full(N, np.inf), np.full(N, -1), np.full((N, 2, 3), np.nan), np.zeros((N, 3))
         if not self._owners.size:
-            return values, index, ends, normals
-        scratch = self._scratch
-        model, data, geometry, placed = scratch.model, scratch.data, scratch.geometry, scratch.placed
+            return found
         for start in range(0, N, RULES.piece):
-            bounds = self._bound_distances(points[start : start + RULES.piece])
-            orders = np.argsort(bounds, axis=1)
-            sorted_bounds = np.take_along_axis(bounds, orders, axis=1).tolist()
-            for i, order in enumerate(orders.tolist(), start):
-                pin.updateGeometryPlacements(model, data, geometry, placed, points[i])
-                least, nearest = np.inf, -1
-                for bound, k in zip(sorted_bounds[i - start], order, strict=True):
-                    if bound >= least:
-                        break
-                    found = pin.computeDistance(geometry, placed, k).min_distance
-                    if found < least:
-                        least, nearest = found, k
-                result = placed.distanceResults[nearest]
-                values[i], index[i], normals[i] = least, nearest, result.normal
-                ends[i, 0], ends[i, 1] = result.getNearestPoint1(), result.getNearestPoint2()
+            rows = np.arange(start, min(start + RULES.piece, N))
+            bounds, capsules = self._bound_by_balls(points[rows])
+            count = min(RULES.first, bounds.shape[1])
+            chosen = np.argpartition(bounds, count - 1, axis=1)[:, :count]
+            own = np.repeat(np.arange(len(rows)), count)
+            self._refine_bounds(bounds, capsules, own, chosen.ravel())
+            orders = np.take_along_axis(chosen, np.argsort(np.take_along_axis(bounds, chosen, axis=1), axis=1), axis=1)
+            self._evaluate_rows(points, rows, orders, bounds, found)
+            # The other pairs, where balls are nearer than what was found.
+            bounds[own, chosen.ravel()] = np.inf
+            self._refine_bounds(bounds, capsules, *np.nonzero(bounds < found[0][rows, None]))
+            left = np.flatnonzero((bounds < found[0][rows, None]).any(axis=1))
+            self._evaluate_rows(points, rows[left], np.argsort(bounds[left], axis=1), bounds[left], found)
+        values, index, ends, normals = found
         # Of point clouds, coal has the cloud first.
         swapped = np.flatnonzero(self._swapped[index])
         ends[swapped], normals[swapped] = ends[swapped, ::-1], -normals[swapped]
         return values, index, ends, normals
+
+    def _evaluate_rows(
+        self, points: Array, rows: Indices, orders: Indices, bounds: Array, found: tuple[Array, Indices, Array, Array]
+    ) -> None:
+        """Evaluate pairs at R of the points (N, n), in orders (R, k), until bounds (R, K) are above what is found."""
+        values, index, ends, normals = found
+        scratch = self._scratch
+        model, data, geometry, placed = scratch.model, scratch.data, scratch.geometry, scratch.placed
+        sorted_bounds = np.take_along_axis(bounds, orders, axis=1).tolist()
+        for row, order, own in zip(rows.tolist(), orders.tolist(), sorted_bounds, strict=True):
+            pin.updateGeometryPlacements(model, data, geometry, placed, points[row])
+            least, nearest = values[row], -1
+            for bound, k in zip(own, order, strict=True):
+                if bound >= least:
+                    break
+                distance = pin.computeDistance(geometry, placed, k).min_distance
+                if distance < least:
+                    least, nearest = distance, k
+            if nearest >= 0:
+                result = placed.distanceResults[nearest]
+                values[row], index[row], normals[row] = least, nearest, result.normal
+                ends[row, 0], ends[row, 1] = result.getNearestPoint1(), result.getNearestPoint2()
 
     def _build_gradients(self, points: Array, index: Indices, ends: Array, normals: Array) -> Array:
         """u^T (J_p2 - J_p1), (N, n), for nearest points (N, 2, 3) and unit normals u (N, 3)."""
@@ -485,20 +514,39 @@ class Collisions(Shown):
             gradients += sign * carried * np.einsum("nij,nj->ni", speeds, normals)
         return gradients
 
-    def _bound_distances(self, points: Array) -> Array:
-        """Lower bounds of the distances of pairs of parts, (N, K): those of capsules around them."""
+    def _bound_distances(self, points: Array, within: float = np.inf) -> Array:
+        """Lower bounds of the distances of pairs of parts, (N, K): where they may be within a distance, by capsules."""
+        bounds, ends = self._bound_by_balls(points)
+        self._refine_bounds(bounds, ends, *np.nonzero(bounds <= within))
+        return bounds
+
+    def _bound_by_balls(self, points: Array) -> tuple[Array, Array]:
+        """Lower bounds (N, K), those of balls around the parts, and the ends of their capsules (N, parts, 2, 3)."""
         N = len(points)
-        ends = self._capsule_ends(points)[0].reshape(N, len(self.parts), 2, 3)
+        places = self._places(points)[0].reshape(N, len(self.parts), 3, 3)
+        centres = places[:, :, 2]
         first, second = self._pair_parts.T
-        a, b = ends[:, first], ends[:, second]
-        squares = _measure_segments(a[:, :, 0], a[:, :, 1], b[:, :, 0], b[:, :, 1])
-        bounds = np.sqrt(squares) - self._radii[first] - self._radii[second]
+        # |c_1 - c_2|^2 of all parts at once; rounding is far below the slack.
+        squares = np.einsum("npi,npi->np", centres, centres)
+        products = centres @ centres.transpose(0, 2, 1)
+        apart = squares[:, first] + squares[:, second] - 2 * products[:, first, second]
+        bounds = np.sqrt(np.maximum(apart, 0.0)) - (self._ball_radii[first] + self._ball_radii[second] + RULES.slack)
         for k in np.flatnonzero(~self._bounded[second]):
             # A half-space: the nearer end of the capsule.
             shape = self.parts[second[k]].shape
-            heights = (a[:, k] - shape.translation) @ shape.rotation[:, 2]
-            bounds[:, k] = heights.min(axis=1) - self._radii[first[k]]
-        return np.asarray(bounds - RULES.slack)
+            heights = (places[:, first[k], :2] - shape.translation) @ shape.rotation[:, 2]
+            bounds[:, k] = heights.min(axis=1) - self._radii[first[k]] - RULES.slack
+        return bounds, places[:, :, :2]
+
+    def _refine_bounds(self, bounds: Array, ends: Array, rows: Indices, pairs: Indices) -> None:
+        """Put the bounds of capsules in the place of those of balls, at numbers of postures and pairs, (M,) each."""
+        kept = self._bounded[self._pair_parts[pairs, 1]]
+        rows, pairs = rows[kept], pairs[kept]
+        first, second = self._pair_parts[pairs].T
+        a, b = ends[rows, first], ends[rows, second]
+        squares = _measure_segments(a[:, 0], a[:, 1], b[:, 0], b[:, 1])
+        own = np.sqrt(squares) - (self._radii[first] + self._radii[second] + RULES.slack)
+        bounds[rows, pairs] = np.maximum(bounds[rows, pairs], own)
 
     @cached_property
     def _pair_parts(self) -> Indices:
@@ -546,15 +594,25 @@ class Collisions(Shown):
         return carried
 
     @cached_property
-    def _capsule_ends(self) -> Batched:
-        """q -> both ends of the capsules around all parts in the world, (6 parts, 1)."""
+    def _places(self) -> Batched:
+        """q -> ends of the capsules around all parts, and centres of the balls, in the world, (9 parts, 1)."""
         q = ca.SX.sym("q", self.tree.n)
         poses = [*build_body_poses(self.tree, q), (ca.SX.eye(3), ca.SX.zeros(3))]
-        ends = []
-        for part in self.parts:
+        places = []
+        for part, (centre, _) in zip(self.parts, self._balls, strict=True):
             rotation, translation = poses[part.body]
-            ends += [translation + rotation @ constant(end) for end in part.shape.bound()[:2]]
-        return Batched(dense_function("capsules", [q], [ca.vertcat(*ends)]))
+            points = (*part.shape.bound()[:2], centre)
+            places += [translation + rotation @ constant(point) for point in points]
+        return Batched(dense_function("places", [q], [ca.vertcat(*places)]))
+
+    @cached_property
+    def _balls(self) -> list[tuple[Array, float]]:
+        """Centres in the frames of the bodies, and radii, of balls around all parts."""
+        return [part.shape.bound_by_ball() for part in self.parts]
+
+    @cached_property
+    def _ball_radii(self) -> Array:
+        return np.array([radius for _, radius in self._balls])
 
     @cached_property
     def _joint_axes(self) -> Batched:

@@ -240,6 +240,14 @@ class Shape:
         """Whether it has ends."""
         return len(self.geometry.list_corners()[0]) > 0
 
+    def bound_by_ball(self) -> tuple[Array, float]:
+        """Centre (3,) and radius of a ball that contains it; a point of its surface and 0 for half-spaces."""
+        corners, rounding = self.list_corners()
+        if not len(corners):
+            return self.translation, 0.0
+        centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
+        return centre, float(np.linalg.norm(corners - centre, axis=1).max()) + rounding
+
     def bound(self) -> tuple[Array, Array, float]:
         """Both ends (3,) and the radius of a capsule that contains it; a point of its surface and 0 for half-spaces.
 

@@ -257,6 +257,21 @@ def test_rates_bound_how_fast_distances_change(tmp_path: Path) -> None:
     assert not collisions.rates[pairs.index(("link1", "link3")), 0]
 
 
+@pytest.mark.slow
+def test_bounds_leave_out_no_pair_of_many() -> None:
+    """Of 277 pairs few are evaluated; evaluating all gives the same."""
+    collisions = oc.Robot.from_urdf(robot_data("baxter_description/urdf/baxter.urdf"), "left_gripper").collisions
+    q = oc.Robot(collisions.tree).sample(300, seed=5)
+    every = collisions.pair_distances(q)
+    assert every.shape[1] > 200
+    np.testing.assert_allclose(collisions.distance(q).distance, every.min(axis=1), atol=2e-6)
+    np.testing.assert_array_equal(collisions.check_free(q), every.min(axis=1) > 0)
+    for position, row in zip(q[:20], every, strict=False):
+        assert set(collisions.find_near(position, 0.2).pairs) == {
+            collisions.pairs[k] for k in np.flatnonzero(row < 0.2)
+        }
+
+
 def test_ways_between_postures_hide_no_contact(tmp_path: Path) -> None:
     """A post of 2 mm, which no posture of the way touches: dense samples are the second route."""
     robot = build_arm(tmp_path, ["", '<box size="0.3 0.05 0.05"/>', '<box size="0.3 0.02 0.02"/>'])
