@@ -40,6 +40,7 @@ CHARTS = {
     "ur5": "ur5-position",
 }
 DIRECT, TIMED, CAPSULES, TICKS = 2000, 4096, 3000, 20_000  # postures; postures; postures; ticks of an arm
+TOLERANCE = 1e-10  # of coal's distances, relative
 MARGIN, AVOID, STEP = 0.01, 0.03, 0.1  # [m]; [m]; largest step of a joint in a tick [rad]
 NOISE, JUMPS, LEG = 0.003, 0.02, 60  # of phi relative to its sizes; share of ticks with a far target; ticks
 PROGRAM = """
@@ -97,11 +98,22 @@ class Direct:
                     geometry.addCollisionPair(pin.CollisionPair(i, j))
         return cls(model, geometry)
 
+    @property
+    def joints(self) -> list[Any]:
+        """Without the universe."""
+        return list(self.model.joints)[1:]
+
     def measure(self, q: Array) -> Array:
         """Least distances of all pairs at postures (N, n)."""
         data, placed, least = self.model.createData(), self.geometry.createData(), np.empty(len(q))
+        for request in placed.distanceRequests:
+            request.gjk_tolerance, request.gjk_max_iterations = TOLERANCE, 1000
         for k, posture in enumerate(q):
-            pin.computeDistances(self.model, data, self.geometry, placed, posture)
+            # Joints without limits have a cosine and a sine in Pinocchio.
+            parts = [
+                [np.cos(p), np.sin(p)] if joint.nq == 2 else [p] for p, joint in zip(posture, self.joints, strict=True)
+            ]
+            pin.computeDistances(self.model, data, self.geometry, placed, np.concatenate(parts))
             least[k] = min(result.min_distance for result in placed.distanceResults)
         return least
 
