@@ -2,8 +2,8 @@
 
 Arms of random shape, position, degree 2, in boxes of 0.3 rad; then the 7-DoF arm by degree with both metrics. Seconds
 are of a core. Each fit has a process of its own, whose largest memory is reported, and so each time includes what the
-first fit of a process builds. C of x, xi and their gradients is compiled with gcc -O3 -march=native. `--quick` takes two
-small cases; the picture `growth.png` is drawn into `--out`.
+first fit of a process builds. C of x, xi and their gradients is compiled with gcc -O3 -march=native. `--quick` takes
+two small cases; the picture `growth.png` is drawn into `--out`.
 """
 
 import argparse
