@@ -223,7 +223,7 @@ class ChartKernel:
     def _c(self) -> Any:
         sources = write_tracker(self.maps, self.charts, "arm", "arm_rows.c")
         if self.charts and self.maps.robot.n - self.maps.task.m == 1:
-            sources["self_motion.c"] = write_curves(self.maps.equations, *self._limits)
+            sources |= write_curves(self.maps.equations, *self._limits)
         library = load_library(keep_library("arm", sources, _FLAGS))
         library.arm_track_reset.restype = library.arm_track_hold.restype = library.build_targets.restype = None
         if self.charts and self.maps.robot.n - self.maps.task.m == 1:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from orthocas.arms.stored import StoredPostures
 from orthocas.codegen.compiled import keep_library, load_library
 from orthocas.codegen.kernels import generate_kernels
-from orthocas.codegen.rendering import render
+from orthocas.codegen.rendering import get_source, render
 from orthocas.tasks.task import Frames, Task
 from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import cached_property
@@ -126,7 +126,7 @@ def crossing_type(n: int) -> np.dtype[Any]:
 
 @dataclass(frozen=True, eq=False)
 class CompiledKernel:
-    """`Kernel` in compiled C: templates/self_motion.c.jinja. Threads may share it.
+    """`Kernel` in compiled C: runtime/self_motion.c. Threads may share it.
 
     Raises:
         CompileError: if there is no C compiler.
@@ -179,12 +179,12 @@ class CompiledKernel:
 
     @cached_property
     def _c(self) -> Any:
-        source = write_curves(self.equations, self.lower, self.upper, self.turning)
-        return load_library(keep_library("self-motion", {"self_motion.c": source}, _FLAGS))
+        sources = write_curves(self.equations, self.lower, self.upper, self.turning)
+        return load_library(keep_library("self-motion", sources, _FLAGS))
 
 
-def write_curves(equations: ca.Function, lower: Array, upper: Array, turning: NDArray[np.bool_]) -> str:
-    """C of the search for curves: templates/self_motion.c.jinja for a task."""
+def write_curves(equations: ca.Function, lower: Array, upper: Array, turning: NDArray[np.bool_]) -> dict[str, str]:
+    """C of the search for curves: kernels and tables of a task, and runtime/self_motion.c, which they include."""
     kernels = generate_kernels([equations], "kernel")
     values = {
         "kernels": kernels.code,
@@ -196,7 +196,7 @@ def write_curves(equations: ca.Function, lower: Array, upper: Array, turning: ND
         "high": upper,
         "turning": turning,
     }
-    return render("self_motion.c", values)
+    return {"task_curves.c": render("task_curves.c", values), "self_motion.c": get_source("self_motion.c")}
 
 
 def pointer(array: NDArray[Any]) -> ctypes.c_void_p:

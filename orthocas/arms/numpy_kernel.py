@@ -1,4 +1,4 @@
-"""The search for self-motion curves in NumPy, for machines without a C compiler: as templates/self_motion.c.jinja."""
+"""The search for self-motion curves in NumPy, for machines without a C compiler: as runtime/self_motion.c."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

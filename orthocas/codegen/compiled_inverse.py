@@ -22,7 +22,7 @@ from orthocas.charts.newton import NEWTON, Attempt, Newton
 from orthocas.codegen.compiled import keep_library, load_library
 from orthocas.codegen.generate import generate_c
 from orthocas.codegen.kernels import generate_kernels
-from orthocas.codegen.rendering import get_template, render
+from orthocas.codegen.rendering import get_source, render
 from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_kind
@@ -137,10 +137,10 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
     with open_draft_folder() as drafts:
         generate_c(chart, drafts, name="arm")
         sources = {path.name: path.read_text(encoding="utf-8") for path in sorted(drafts.glob("*.[hc]"))}
-    sources[_ROWS] = get_template(_ROWS)
+    sources[_ROWS] = get_source(_ROWS)
     curves = chart.parts.inverse.curves
     if isinstance(curves, SelfMotionCurves):
-        sources["curves.c"] = write_curve_source(chart, curves)
+        sources |= {"curves.c": write_curve_source(chart, curves), "curve_rows.c": get_source("curve_rows.c")}
     return CompiledInverse(chart, keep_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder))
 
 
@@ -175,7 +175,7 @@ class CompiledCurves:
 
 
 def write_curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
-    """C of the search along self-motion curves: templates/curve_rows.c.jinja for a chart.
+    """C of the search along self-motion curves: kernels and tables of a chart, then runtime/curve_rows.c.
 
     Raises:
         DomainError: if the domain has a condition, but no expression of it.
@@ -209,4 +209,4 @@ def write_curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
         "winding": curves.boxed.winding,
         "pivots": kernels.numbers.get("curve_pivots", 0),
     }
-    return render("curve_rows.c", values)
+    return render("curves.c", values)

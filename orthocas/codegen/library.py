@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
 from orthocas.codegen.generate import GeneratedC, generate_c
-from orthocas.codegen.rendering import DOUBLE, SINGLE, Precision, get_template
+from orthocas.codegen.rendering import DOUBLE, SINGLE, Precision, get_source
 from orthocas.control.controller import Controller, ControlStatus, require_controller
 from orthocas.control.memory import find_memory
 from orthocas.control.operational_space import PDPlus
@@ -29,7 +29,7 @@ from orthocas.tools.processes import run_program
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 NO_DOUBLE = ("-Wdouble-promotion", "-Wfloat-conversion")  #: for code in single precision
 _POINTER = ctypes.c_void_p
-# As in templates/ticks.c.
+# As in runtime/ticks.c.
 _STATES = 64
 # To spend on one measurement.
 _MICROSECONDS = 3e5
@@ -377,7 +377,7 @@ def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int =
         # For each law its states, then its gains.
         parts = [part.ravel() for law, _ in cases for part in (_sample_states(law), gain_numbers(law))]
         first.numbers(np.concatenate(parts)).tofile(data)
-        (folder / "ticks.c").write_text(get_template("ticks.c"))
+        (folder / "ticks.c").write_text(get_source("ticks.c"))
         number = f"-DNUMBER={first.precision.c_name}"
         run_program([find_compilers()[0], "-O2", number, str(folder / "ticks.c"), "-o", str(program), "-ldl"])
         arguments = [str(program), str(data), str(calls), str(cases[0][0].problem.n)]

@@ -1,27 +1,10 @@
-{# The search of `CompiledCurves`; compiled_inverse.py fills it in. #}
 /* The nearest xi along self-motion curves, one row after the other: the search of orthocas/charts/curves.py, which says
- * what is done and why. */
-#include <math.h>
-#include <string.h>
-
-{{ kernels }}
-
-#define M {{ m }}
-#define STARTS {{ starts }}
-{% for name, value in rules.items() %}
-#define {{ name | upper }} {{ value }}
-{% endfor %}
-#define XI_SIZE {{ xi_size }}
-#define PERIOD {{ period if period > 0 else "INFINITY" }}
+ * what is done and why. curves.c includes it behind the kernels, tables and rules of a chart. */
 #define POINTS (2 * MOST + 3)
 #define CURVES STARTS
 #define SHEETS 256
 #define ENDS 64
 #define TURN 6.283185307179586
-
-static const double low[N] = {{ low | array }}, high[N] = {{ high | array }};
-static const double centre[N] = {{ centre | array }}, half_width[N] = {{ half_width | array }};
-static const int turning[N] = {{ turning | array }}, bounded[N] = {{ bounded | array }}, winding[N] = {{ winding | array }};
 
 typedef struct {
   double q[POINTS][N], t[POINTS][N];
@@ -40,10 +23,11 @@ typedef struct {
 } row_search;
 
 static double task_at(const double *q, const double *x, double *e, double *J) {
-  {{ arrays("curve_task", ", size = 0.0", ", i") }}
+  double size = 0.0;
+  int i;
   memset(e, 0, M * sizeof *e); /* compilers do not see that the kernel sets them */
   memset(J, 0, M * N * sizeof *J);
-  {{ call("curve_task", ["q", "x"], ["e", "J"]) }}
+  errors_at(q, x, e, J);
   for (i = 0; i < M; ++i) {
     if (!isfinite(e[i])) return INFINITY;
     size = fmax(size, fabs(e[i]));
@@ -53,15 +37,8 @@ static double task_at(const double *q, const double *x, double *e, double *J) {
 
 /* xi - xi(q), by the shorter way around. */
 static double xi_left(const double *target, const double *q) {
-  {{ arrays("curve_xi", ", left = 0.0") }}
-  {{ call("curve_xi", ["q"], ["&left"]) }}
-  left = target[M] - left;
+  const double left = target[M] - xi_at(q);
   return isfinite(PERIOD) ? left - PERIOD * round(left / PERIOD) : left;
-}
-
-static void gradient_at(const double *q, double *gradient) {
-  {{ arrays("curve_gradient") }}
-  {{ call("curve_gradient", ["q"], ["gradient"]) }}
 }
 
 static int in_box(const double *q, double slack) {
@@ -71,18 +48,7 @@ static int in_box(const double *q, double slack) {
   return 1;
 }
 
-static int contains(const double *q) {
-{% if pivots %}
-  {{ arrays("curve_pivots", ", pivots[" ~ pivots ~ "] = {0}", ", i") }}
-  if (!in_box(q, 0.0)) return 0;
-  {{ call("curve_pivots", ["q"], ["pivots"]) }}
-  for (i = 0; i < {{ pivots }}; ++i)
-    if (!(pivots[i] > 0.0)) return 0;
-  return 1;
-{% else %}
-  return in_box(q, 0.0);
-{% endif %}
-}
+static int contains(const double *q) { return in_box(q, 0.0) && is_clear(q); }
 
 /* Solve A X = B (n, n + k) in place, with partial pivoting; X comes back in the columns from n on. */
 static void eliminate(double A[N][N + 2], int n, int k) {

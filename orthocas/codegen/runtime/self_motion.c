@@ -1,20 +1,8 @@
-{# The search of `orthocas.arms.kernel`; it fills this in, and says what is done and why. #}
 /* The self-motion curves of a task value, r = 1: ways to x, the curves there whatever the limits, and where limits cut
- * them. */
-#include <math.h>
-#include <string.h>
-
-{{ kernels }}
-
-#define N {{ n }}
+ * them. task_curves.c includes it behind the kernels, tables and rules of a task; orthocas.arms.kernel says what is done
+ * and why. */
 #define M (N - 1)
-{% for name, value in rules.items() %}
-#define {{ name | upper }} {{ value }}
-{% endfor %}
 #define TURN 6.283185307179586
-
-static const double low[N] = {{ low | array }}, high[N] = {{ high | array }};
-static const int turning[N] = {{ turning | array }};
 
 /* A point of a curve, the unit tangent, and the length of the curve to the next point. */
 typedef struct {
@@ -40,10 +28,11 @@ static double turned_back(double difference, int joint) {
 
 /* The errors e (M) and rates J (M, N), by columns; the largest error, infinite where it is undefined. */
 static double task_at(const double *q, const double *target, double *e, double *J) {
-  {{ arrays("task", ", size = 0.0", ", i") }}
+  double size = 0.0;
+  int i;
   memset(e, 0, M * sizeof *e); /* compilers do not see that the kernel sets them */
   memset(J, 0, M * N * sizeof *J);
-  {{ call("task", ["q", "target"], ["e", "J"]) }}
+  errors_at(q, target, e, J);
   for (i = 0; i < M; ++i) {
     if (!isfinite(e[i])) return INFINITY;
     size = fmax(size, fabs(e[i]));
