@@ -884,13 +884,13 @@ static void test_boundary(void) {
   for (k = 0; k < 3; ++k) {
     fault.coupling = couplings[k];
     set(q, k == 1 ? 0.0 : 0.2, 0.3, 0);
-    CHECK(distance(arm, q, dq, 0.0, work) <= 1.0);
-    CHECK(distance(arm, q, anything, 0.0, work) <= 1.0);
+    CHECK(distance(arm, q, dq, 0.0, clearance(arm, q, work), work) <= 1.0);
+    CHECK(distance(arm, q, anything, 0.0, clearance(arm, q, work), work) <= 1.0);
     set(inner, 1.0, -1.0, 0.0);
-    CHECK(distance(arm, q, inner, 0.5, work) <= distance(arm, q, inner, 0.0, work));
+    CHECK(distance(arm, q, inner, 0.5, 1.0, work) <= distance(arm, q, inner, 0.0, 1.0, work));
   }
   fault.gram = -5.0; /* no norm has such a square */
-  CHECK(distance(arm, q, dq, 0.0, work) <= 1.0);
+  CHECK(distance(arm, q, dq, 0.0, clearance(arm, q, work), work) <= 1.0);
   good();
   set(q, 1.45, 1.45, 0);
   well_inside(arm, q, 0.8, inner, work);

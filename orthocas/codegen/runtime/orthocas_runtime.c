@@ -645,27 +645,25 @@ static double smallest_eigenvalue(double *A, int m) {
   return least;
 }
 
-/* How far q is inside the condition of the domain, 0 at its boundary. In a corridor: 1 on the path. Of a singular value:
- * 1 as at the centre; or the room to a fold, if that is less. */
+/* How far q is inside the condition of the domain beside its box, 0 at its boundary; 1 without one. In a corridor: 1 on the
+ * path. Of a singular value: 1 as at the centre; or the room to a fold, if that is less. */
 static double clearance(const orthocas_arm *arm, const double *q, double *work) {
   const orthocas_boundary *boundary = &arm->boundary;
   double *way = take(&work, boundary->lines > 0 ? boundary->counted : arm->m * arm->m), room;
   if (boundary->lines > 0) return 1.0 - way_from_path(boundary, q, way, work);
+  if (arm->kernels.gram == 0) return 1.0;
   arm->kernels.gram(q, way);
   room = (sqrt(fmax(smallest_eigenvalue(way, arm->m), 0.0)) - boundary->bound) / boundary->span;
   return arm->kernels.room_to_fold != 0 ? fmin(arm->kernels.room_to_fold(q), room) : room;
 }
 
 /* Distance to the boundary of the domain in half-widths, or the clearance, after a time at the present speed; negative
- * outside. */
-static double distance(const orthocas_arm *arm, const double *q, const double *dq, double time, double *work) {
-  double *ahead = take(&work, arm->n), nearest = 1.0;
+ * outside. clear: the clearance at q. */
+static double distance(const orthocas_arm *arm, const double *q, const double *dq, double time, double clear, double *work) {
+  double *ahead = take(&work, arm->n), nearest = clear;
   int i;
-  if (arm->boundary.lines > 0 || arm->kernels.gram != 0) {
-    nearest = clearance(arm, q, work);
-    for (i = 0; i < arm->n; ++i) ahead[i] = q[i] + time * dq[i];
-    if (time > 0.0) nearest = fmin(nearest, clearance(arm, ahead, work));
-  }
+  for (i = 0; i < arm->n; ++i) ahead[i] = q[i] + time * dq[i];
+  if (time > 0.0) nearest = fmin(nearest, clearance(arm, ahead, work));
   for (i = 0; i < arm->n; ++i) {
     const double place = q[i] - arm->centre[i], speed = place < 0.0 ? -dq[i] : dq[i];
     if (arm->bounded[i])
@@ -823,14 +821,14 @@ static int works(int law) { return law == ORTHOCAS_OK || law == ORTHOCAS_SATURAT
 
 /* R12: decide who commands, as the table of modes says. law: its status. */
 static void choose_mode(const orthocas_arm *arm, orthocas_state *state, int law, const double *q, const double *dq,
-                        double room, const double *error, double period, int late, double *work) {
+                        double clear, double room, const double *error, double period, int late, double *work) {
   const orthocas_safety *safety = state->safety;
   const int fast = faster_than(arm, dq, safety->speed_limit, 1.0);
   const int ready = works(law) && room >= safety->return_margin;
   switch (state->mode) {
   case ORTHOCAS_LAW:
     if (!works(law)) catch_arm(arm, state, law, q);
-    else if (distance(arm, q, dq, safety->fade_out, work) < safety->catch_margin)
+    else if (distance(arm, q, dq, safety->fade_out, clear, work) < safety->catch_margin)
       catch_arm(arm, state, ORTHOCAS_OUTSIDE_DOMAIN, q);
     else if (fast) catch_arm(arm, state, ORTHOCAS_TOO_FAST, q);
     else if (late) catch_arm(arm, state, ORTHOCAS_LATE, q);
@@ -972,8 +970,8 @@ static void govern(const orthocas_arm *arm, orthocas_state *state, const double 
 
 /* R16: fade the offset on a straight line, with no component faster than its rate, nor all together. It waits where that
  * would lead the arm on towards a boundary that is near. */
-static void fade_offset(const orthocas_arm *arm, orthocas_state *state, const double *shared, double room, double period,
-                        double *work) {
+static void fade_offset(const orthocas_arm *arm, orthocas_state *state, const double *shared, double clear, double room,
+                        double period, double *work) {
   double *motion = take(&work, arm->n), *back = take(&work, arm->k), needed = rules.settling;
   int i;
   for (i = 0; i < arm->k; ++i) {
@@ -983,14 +981,14 @@ static void fade_offset(const orthocas_arm *arm, orthocas_state *state, const do
   if (!(needed > rules.settling)) return;
   if (room < state->safety->return_margin &&
       joints_of(arm, state->q, state->dq, shared, &state->reference, back, motion, work) &&
-      distance(arm, state->q, motion, period / needed, work) < room)
+      distance(arm, state->q, motion, period / needed, clear, work) < room)
     return;
   for (i = 0; i < arm->k; ++i) state->offset[i] *= fmax(0.0, 1.0 - period / needed);
 }
 
 /* Fade weights and offset. R17: integrate the error, unless the command is cut or the law does not command. */
 static void advance(const orthocas_arm *arm, orthocas_state *state, const double *shared, const double *error, int cut,
-                    double room, double period, double *work) {
+                    double clear, double room, double period, double *work) {
   const orthocas_safety *safety = state->safety;
   int i;
   if (state->mode == ORTHOCAS_LAW) {
@@ -1004,7 +1002,7 @@ static void advance(const orthocas_arm *arm, orthocas_state *state, const double
     state->integral[i] = clipped(state->integral[i] + safety->integral_rate[i] * e * period * state->weight,
                                  safety->integral_limit[i]);
   }
-  fade_offset(arm, state, shared, room, period, work);
+  fade_offset(arm, state, shared, clear, room, period, work);
 }
 
 /* ---- the catcher, and the command of law and catcher together ---- */
@@ -1138,12 +1136,14 @@ static void foresee(const orthocas_arm *arm, orthocas_state *state, double perio
 static void observe(const orthocas_arm *arm, orthocas_state *state, double *q, double *dq, double period) {
   int i;
   for (i = 0; i < arm->n; ++i) {
-    const double rate = state->safety->observer_rate[i], left = exp(-rate * period), taken = 1.0 - left;
-    const double error = between(arm, i, q[i] - state->q[i]);
+    const double rate = state->safety->observer_rate[i], error = between(arm, i, q[i] - state->q[i]);
+    double left, taken;
     if (!observes(state) || !(rate > 0.0) || !(fabs(error) <= rules.far_off)) {
       state->unexplained[i] = 0.0;
       continue;
     }
+    left = exp(-rate * period);
+    taken = 1.0 - left;
     q[i] -= left * left * left * error;
     dq[i] = state->dq[i] + 1.5 * taken * taken * (1.0 + left) / period * error;
     state->unexplained[i] += taken * taken * taken / (period * period) * error;
@@ -1296,7 +1296,7 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   const double since = timed ? fmin(period, safety->longest_period) : 0.0;
   double *shared = take(&work, arm->shared), *measured = take(&work, k), *change = take(&work, k);
   double *error = take(&work, k), *law = take(&work, n), *fallback = take(&work, n), *here = take(&work, n);
-  double *speed = take(&work, n), *M = take(&work, n * n), *bias = take(&work, n), *gravity = take(&work, n), room;
+  double *speed = take(&work, n), *M = take(&work, n * n), *bias = take(&work, n), *gravity = take(&work, n), clear, room;
   const orthocas_reference shifted = take_places(arm, &work);
   int i, good, cut, known, status, limited = 1;
 
@@ -1325,7 +1325,8 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   state->bad_ticks = 0;
   copy(state->q, here, n);
   copy(state->dq, speed, n);
-  room = distance(arm, here, speed, 0.0, work);
+  clear = clearance(arm, here, work);
+  room = distance(arm, here, speed, 0.0, clear, work);
   arm->kernels.shared(here, speed, shared);
 
   /* The reference, and with it the law. */
@@ -1339,7 +1340,7 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   for (i = 0; i < n && works(status); ++i) state->law[i] = law[i] - fallback[i];
 
   /* Who commands, and the command. */
-  choose_mode(arm, state, status, here, speed, room, error, since, late, work);
+  choose_mode(arm, state, status, here, speed, clear, room, error, since, late, work);
   if (works(status) && state->mode == ORTHOCAS_LAW && room >= safety->return_margin + rules.room)
     copy(state->safe, here, n); /* the law works here */
   if (arm->torque)
@@ -1351,7 +1352,7 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   /* What the next tick has to know. */
   watch_sensors(arm, state, fallback, command, since);
   if (arm->torque) expect(arm, state, command, fallback, M, bias, gravity);
-  advance(arm, state, shared, error, cut, room, since, work);
+  advance(arm, state, shared, error, cut, clear, room, since, work);
   if (arm->memory > 0) remember(arm, state, &shifted, gains, cut ? 0.0 : state->weight, known ? since : 0.0, work);
 
   /* R28: the status says what the program should do. */
@@ -1380,13 +1381,14 @@ ORTHOCAS_API void orthocas_reference_at(const orthocas_arm *arm, const double *q
 /* The largest share of a motion from q whose end is inside by the return margin, or no farther out than q. */
 static double share_inside(const orthocas_arm *arm, const orthocas_safety *safety, const double *q, const double *motion,
                            double *work) {
-  const double margin = fmin(safety->return_margin, distance(arm, q, motion, 0.0, work));
+  const double clear = clearance(arm, q, work);
+  const double margin = fmin(safety->return_margin, distance(arm, q, motion, 0.0, clear, work));
   double inner = 0.0, outer = 1.0;
   int k;
-  if (distance(arm, q, motion, outer, work) >= margin) return outer;
+  if (distance(arm, q, motion, outer, clear, work) >= margin) return outer;
   for (k = 0; k < rules.bisections; ++k) {
     const double half_way = 0.5 * (inner + outer);
-    if (distance(arm, q, motion, half_way, work) >= margin) inner = half_way;
+    if (distance(arm, q, motion, half_way, clear, work) >= margin) inner = half_way;
     else outer = half_way;
   }
   return inner;
