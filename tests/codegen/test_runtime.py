@@ -1,8 +1,10 @@
 """The runtime in C: one text, alone under a made-up arm, its branches, and what other programs say of it."""
 
 import json
+import os
 import re
 import shutil
+import sys
 from importlib.resources import files
 from pathlib import Path
 
@@ -78,7 +80,14 @@ def test_branches_are_tested(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "words",
     [
-        ("cppcheck", "--enable=warning,performance,portability", "--std=c99", "--error-exitcode=1", "--quiet"),
+        (
+            "cppcheck",
+            "--enable=warning,performance,portability,style",
+            "--check-level=exhaustive",
+            "--std=c99",
+            "--error-exitcode=1",
+            "--quiet",
+        ),
         (
             *("clang-tidy", "--quiet", "--warnings-as-errors=*"),
             "--checks=-*,clang-analyzer-*,bugprone-*,cert-*,-bugprone-easily-swappable-parameters,"
@@ -89,9 +98,10 @@ def test_branches_are_tested(tmp_path: Path) -> None:
     ids=["cppcheck", "clang-tidy"],
 )
 def test_static_analysis_finds_nothing(words: tuple[str, ...]) -> None:
-    if shutil.which(words[0]) is None:
+    program = shutil.which(words[0], path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    if program is None:
         pytest.skip(f"no {words[0]}")
-    output_of(*words, SOURCE, *(("--", "-std=c99") if words[0] == "clang-tidy" else ()))
+    output_of(program, *words[1:], SOURCE, *(("--", "-std=c99") if words[0] == "clang-tidy" else ()))
 
 
 def test_every_requirement_is_in_the_code_and_on_the_page_with_its_tests() -> None:

@@ -1234,10 +1234,9 @@ ORTHOCAS_API void orthocas_resume(orthocas_state *state) {
 /* R26: brakes hold the arm at q (HOLD), or do so no more (CATCHER). Nothing that was felt or remembered holds on. */
 ORTHOCAS_API void orthocas_stand(const orthocas_arm *arm, orthocas_state *state, int mode, const double *q,
                                  const double *command) {
-  const int n = arm->n;
+  const int n = arm->n, is_position = all_within(q, n, arm->numbers.farthest);
   int i;
-  if (all_within(q, n, arm->numbers.farthest))
-    for (i = 0; i < n; ++i) state->q[i] = unturned(arm, state, i, q[i]);
+  for (i = 0; i < n && is_position; ++i) state->q[i] = unturned(arm, state, i, q[i]);
   set_zero(state->dq, n);
   set_zero(state->impulse, n);
   if (arm->torque) {
