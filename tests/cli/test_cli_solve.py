@@ -36,6 +36,12 @@ def test_charts_and_arms_are_solved(run: Run, arm_file: Path) -> None:
     assert (code, "NOT_FOUND" in text) == (1, True)
 
 
+def test_codegen_writes_the_tracker_of_an_arm(run: Run, arm_file: Path, tmp_path: Path) -> None:
+    made = json.loads(run("codegen", str(arm_file), "--controller", "track", "--out", str(tmp_path / "c"), "--json")[1])
+    assert Path(made["source"]).name == "arm_track.c"
+    assert Path(made["header"]).exists()
+
+
 def test_bad_input_is_one_sentence(run: Run, arm_file: Path) -> None:
     for words, part in (
         (["solve", str(arm_file), "--x", "1"], "2 numbers"),
