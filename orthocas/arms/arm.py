@@ -20,6 +20,7 @@ from orthocas.arms.tracker import ArmTracker
 from orthocas.charts.chart import Chart
 from orthocas.charts.clearance import Clearance
 from orthocas.charts.inverse import InverseStatus
+from orthocas.charts.ready import load, names
 from orthocas.codegen.generate import require_free_folder, require_name
 from orthocas.errors import BranchWarning, CompileError, DomainError, InvalidValueError, NotRedundantError, ShapeError
 from orthocas.fitting.wide import fit_wide
@@ -49,6 +50,14 @@ from orthocas.tools.progress import Monitor, Progress, silent
 from orthocas.version import VERSION
 
 ANY = "any"  #: branch
+
+
+_WIDE = "-wide"  # ends the names of ready charts that an arm can have
+
+
+def list_arms() -> tuple[str, ...]:
+    """Names of the arms that `Arm.load` knows: those of the ready wide charts."""
+    return tuple(name.removesuffix(_WIDE) for name in names() if name.endswith(_WIDE))
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,12 +208,20 @@ class Arm(Shown):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read an arm file. Loading never runs code from the file.
+        """Read an arm file, or take a known arm by its name, such as "panda". Loading never runs code from a file.
+
+        A known arm has the ready wide chart of one branch: `oc.load(f"{name}-wide")`; `Arm.fit` makes those of all.
 
         Raises:
+            UnknownNameError: for a word that is neither a file nor the name of a known arm.
             ChartFileError: if the file is missing, truncated, foreign, edited, or from a newer version.
         """
-        charts = read_charts(as_path("path", path))
+        file = as_path("path", path)
+        if not (file.exists() or file.suffix or len(file.parts) > 1):
+            require_known("arm file or known arm", file.name, list_arms())
+            chart = load(f"{file.name}{_WIDE}")
+            return cls(chart.task, (chart,))
+        charts = read_charts(file)
         return cls(charts[0].problem.task, charts)
 
     def save(self, path: str | Path, force: bool = False) -> None:

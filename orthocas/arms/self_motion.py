@@ -361,7 +361,9 @@ class SelfMotions(Shown):
             along = np.gradient(q, axis=0)
             along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
             step -= (step * along).sum(axis=1, keepdims=True) * along
-            step *= np.minimum(MERGE.step, MERGE.longest / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-300))
+            step *= np.minimum(
+                MERGE.step, MERGE.longest / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-300)
+            )
             q[1:-1] = np.clip(q + step, low, high)[1:-1]
             lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(q, axis=0), axis=1))])
             even = np.linspace(0.0, lengths[-1], MERGE.images)

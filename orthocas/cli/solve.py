@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from orthocas.arms.arm import Arm
+from orthocas.arms.arm import Arm, list_arms
 from orthocas.arms.arm_file import is_arm
 from orthocas.charts.inverse import InverseStatus
 from orthocas.charts.ready import load
@@ -21,7 +21,12 @@ _QUATERNION, _MATRIX = 7, 16  # numbers of a position and a quaternion, and of a
 
 
 def solve(
-    file: Annotated[Path, typer.Argument(metavar="CHART|ARM", help="A chart file, a ready chart, or an arm file.")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="CHART|ARM", help="A chart or an arm: a file, or a ready one, such as panda-wide or panda."
+        ),
+    ],
     x: Annotated[
         str,
         typer.Option(
@@ -39,7 +44,7 @@ def solve(
 ) -> None:
     """Find joint positions with a task value, and xi if it is given. Exit code 1 if there are none."""
     near = None if start is None else parse_numbers("--start", start)
-    if is_arm(file):
+    if is_arm(file) or (str(file) in list_arms() and not file.exists()):
         arm = Arm.load(file)
         value = None if xi is None else parse_number(xi)
         target = _read_target(arm.task, x)

@@ -165,6 +165,14 @@ def test_an_arm_comes_back_from_its_file(tmp_path: Path) -> None:
         assert other.solve(arm.x(q), 0.2).q == pytest.approx(arm.solve(arm.x(q), 0.2).q, abs=1e-9)
 
 
+def test_known_arms_load_by_name() -> None:
+    arm, chart = oc.Arm.load("iiwa7"), oc.load("iiwa7-wide")
+    assert arm.branch_names == (chart.notes["branch"],)
+    assert arm.x(chart.domain.centre) == pytest.approx(chart.x(chart.domain.centre))
+    with pytest.raises(UnknownNameError, match="iiwa7"):
+        oc.Arm.load("iwa")
+
+
 def test_damaged_arm_files_are_refused(tmp_path: Path) -> None:
     file, damaged = tmp_path / "a.arm", tmp_path / "b.arm"
     planar().save(file)
