@@ -128,8 +128,11 @@ class Clearance:
 
     def list_rows(self, q: Array, limit: Array) -> tuple[Indices, Array]:
         """Pairs of parts that steps from q (n,) of at most `limit` (n,) may bring too near, and their floors."""
-        index = self.collisions.list_near_parts(q, self.margin + self._reach(limit))
-        return index, self.floor(self.collisions.measure_parts(q, index)[0])
+        reach = self.collisions.rates @ limit
+        index = self.collisions.list_near_parts(q, self.margin + reach)
+        distance = self.collisions.measure_parts(q, index)[0]
+        near = distance - reach[index] < self.margin
+        return index[near], self.floor(distance[near])
 
     def yield_to(self, q: Array, slopes: Array, wish: Array) -> Array:
         """The change of xi (r,) nearest to a wished one that keeps pairs at `avoid`, to first order.

@@ -362,8 +362,8 @@ class Collisions(Shown):
                 distances[owner] = min(found, distances.get(owner, np.inf))
             yield from ((owner, found) for owner, found in distances.items() if found < least)
 
-    def list_near_parts(self, q: Array, within: float) -> Indices:
-        """Numbers of the pairs of parts whose bounds at q (n,) are nearer than a distance."""
+    def list_near_parts(self, q: Array, within: float | Array) -> Indices:
+        """Numbers of pairs of parts whose bounds at q (n,) are nearer than a distance, or each than its own (K,)."""
         return np.flatnonzero(self._bound_distances(q[None], within)[0] < within)
 
     def measure_parts(self, q: Array, index: Indices) -> tuple[Array, Array, Array]:
@@ -502,19 +502,21 @@ class Collisions(Shown):
 
     def _build_gradients(self, points: Array, index: Indices, ends: Array, normals: Array) -> Array:
         """u^T (J_p2 - J_p1), (N, n), for nearest points (N, 2, 3) and unit normals u (N, 3)."""
-        tree, N = self.tree, len(points)
-        frames = self._joint_axes(points)[0].reshape(N, tree.n, 6) if N else np.empty((0, tree.n, 6))
-        gradients = np.zeros((N, tree.n))
-        if not self._owners.size:
+        N, n = len(points), self.tree.n
+        gradients = np.zeros((N, n))
+        if not self._owners.size or not N:
             return gradients
+        # u . (a x (p - o)) = a . (p x u) - (a x o) . u for turns about an axis a through o, and u . a for slides.
+        same = points.strides[0] == 0
+        twists = self._twists(points[:1] if same else points)[0].reshape(-1, n, 6)
         for side, sign in ((0, -1.0), (1, 1.0)):
-            carried = self._carried[self._pair_parts[index, side]]
-            arms = np.cross(frames[..., :3], ends[:, side, None, :] - frames[..., 3:])
-            speeds = np.where(np.array(tree.prismatic)[:, None], frames[..., :3], arms)
-            gradients += sign * carried * np.einsum("nij,nj->ni", speeds, normals)
+            carried = sign * self._carried[self._pair_parts[index, side]]
+            wrenches = np.concatenate([_cross(ends[:, side], normals), -normals], axis=1)
+            rates = wrenches @ twists[0].T if same else np.einsum("nij,nj->ni", twists, wrenches)
+            gradients += carried * rates
         return gradients
 
-    def _bound_distances(self, points: Array, within: float = np.inf) -> Array:
+    def _bound_distances(self, points: Array, within: float | Array = np.inf) -> Array:
         """Lower bounds of the distances of pairs of parts, (N, K): where they may be within a distance, by capsules."""
         bounds, ends = self._bound_by_balls(points)
         self._refine_bounds(bounds, ends, *np.nonzero(bounds <= within))
@@ -615,12 +617,14 @@ class Collisions(Shown):
         return np.array([radius for _, radius in self._balls])
 
     @cached_property
-    def _joint_axes(self) -> Batched:
-        """q -> axis and origin of every joint in the world, (6 n, 1)."""
+    def _twists(self) -> Batched:
+        """q -> of every joint a and a x o, with its axis a through o in the world; 0 and -a of slides, (6 n, 1)."""
         q = ca.SX.sym("q", self.tree.n)
-        poses = build_body_poses(self.tree, q)
-        axes = [ca.vertcat(rotation[:, 2], translation) for rotation, translation in poses]
-        return Batched(dense_function("axes", [q], [ca.vertcat(*axes)]))
+        rows = []
+        for slides, (rotation, translation) in zip(self.tree.prismatic, build_body_poses(self.tree, q), strict=True):
+            axis = rotation[:, 2]
+            rows += [ca.SX.zeros(3), -axis] if slides else [axis, ca.cross(axis, translation)]
+        return Batched(dense_function("twists", [q], [ca.vertcat(*rows)]))
 
     @cached_property
     def _models(self) -> tuple[pin.Model, pin.GeometryModel]:
@@ -659,6 +663,12 @@ class _Scratch:
         self.data, self.placed = model.createData(), geometry.createData()
         for request in self.placed.distanceRequests:
             request.gjk_tolerance, request.gjk_max_iterations = RULES.tolerance, RULES.iterations
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Cross products of rows (N, 3); NumPy's own takes ten times as long for a few."""
+    (x, y, z), (u, v, w) = a.T, b.T
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
 
 
 def _measure_segments(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:

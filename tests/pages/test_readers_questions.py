@@ -52,6 +52,7 @@ SEARCHED = {
     "gravity compensation": "how-to/robots",
     "torque": "explanation/control",
     "gripper": "tutorials/own_arm",
+    "collision": "how-to/collisions",
     "collision avoidance": "how-to/paths",
     "install": "how-to/install",
 }
