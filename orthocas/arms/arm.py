@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any, Self
 
@@ -52,6 +53,7 @@ from orthocas.version import VERSION
 ANY = "any"  #: branch
 
 
+_DATA = files(__package__) / "data"
 _WIDE = "-wide"  # ends the names of ready charts that an arm can have
 
 
@@ -210,7 +212,8 @@ class Arm(Shown):
     def load(cls, path: str | Path) -> Self:
         """Read an arm file, or take a known arm by its name, such as "panda". Loading never runs code from a file.
 
-        A known arm has the ready wide chart of one branch: `oc.load(f"{name}-wide")`; `Arm.fit` makes those of all.
+        "panda" and "iiwa7" have charts of all their branches, which `Arm.fit` made; the others have that of one branch,
+        `oc.load(f"{name}-wide")`.
 
         Raises:
             UnknownNameError: for a word that is neither a file nor the name of a known arm.
@@ -219,6 +222,9 @@ class Arm(Shown):
         file = as_path("path", path)
         if not (file.exists() or file.suffix or len(file.parts) > 1):
             require_known("arm file or known arm", file.name, list_arms())
+            if (_DATA / f"{file.name}.arm").is_file():
+                with as_file(_DATA / f"{file.name}.arm") as stored:
+                    return cls.load(stored)
             chart = load(f"{file.name}{_WIDE}")
             return cls(chart.task, (chart,))
         charts = read_charts(file)

@@ -7,7 +7,7 @@ import orthocas as oc
 from orthocas.problems import urdf_path
 from orthocas.tools.checks import Array
 
-POSES, SAMPLES, SAME = 20, 60, 1e-5  # poses; postures on an arc of ssik; [rad], as exact as its folds are
+POSES, SAMPLES, SAME = 6, 12, 1e-5  # poses; postures on an arc of ssik; [rad], as exact as its folds are
 
 
 @pytest.mark.nightly
