@@ -424,10 +424,8 @@ def _format_fit(result: Fit, report: Report, target: Path) -> dict[str, str]:
         share = percent(check.half_turn_share, 2, fault=True)
         rows["half a turn"] = f"x of the task jumps on {share} of the domain: half a turn from its reference"
     if offer is not None:
-        bound, share = offer.least_singular_value, offer.share
-        rows["clear part"] = (
-            f"--least-singular-value {bound:g} leaves out singular positions and keeps {percent(share)}"
-        )
+        bound, kept = offer.least_singular_value, percent(offer.share)
+        rows["clear part"] = f"--least-singular-value {bound:g} leaves out singular positions and keeps {kept}"
     return {**rows, **format_reach_rows(result.chart), "chart": str(target)}
 
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from orthocas.arms.arm import Arm, list_arms
+from orthocas.arms.arm import ANY, Arm, list_arms
 from orthocas.arms.arm_file import is_arm
 from orthocas.charts.inverse import InverseStatus
 from orthocas.charts.ready import load
@@ -53,7 +53,7 @@ def solve(
                 raise OptionError("--all requires --xi")
             postures: Any = arm.solutions(target, value)
         else:
-            postures = arm.solve(target, value, near, **({} if branch is None else {"branch": branch}))
+            postures = arm.solve(target, value, near, ANY if branch is None else branch)
         single = postures.q.ndim == 1
         statuses = [postures.status] if single else postures.status
         branches = [postures.branch] if single else postures.branch
