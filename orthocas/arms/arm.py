@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.arms.arm_file import read_charts, write_charts
-from orthocas.arms.chart_kernel import ChartKernel
+from orthocas.arms.chart_kernel import ChartKernel, write_tracker
 from orthocas.arms.maps import ArmMaps
 from orthocas.arms.numpy_tracker import TrackStatus
 from orthocas.arms.self_motion import Arc, SelfMotions, find_motions
@@ -20,6 +21,8 @@ from orthocas.arms.tracker import ArmTracker
 from orthocas.charts.chart import Chart
 from orthocas.charts.clearance import Clearance
 from orthocas.charts.inverse import InverseStatus
+from orthocas.charts.ready import load, names
+from orthocas.codegen.generate import require_free_folder, require_name
 from orthocas.errors import BranchWarning, CompileError, DomainError, InvalidValueError, NotRedundantError, ShapeError
 from orthocas.fitting.wide import fit_wide
 from orthocas.robots.collisions import Collisions
@@ -37,14 +40,26 @@ from orthocas.tools.checks import (
     as_number,
     as_path,
     as_point_set,
+    require_count,
     require_kind,
     require_known,
 )
 from orthocas.tools.display import Shown, listed, percent
 from orthocas.tools.expressions import wrap_shortest
+from orthocas.tools.files import make_folder, publish
 from orthocas.tools.progress import Monitor, Progress, silent
+from orthocas.version import VERSION
 
 ANY = "any"  #: branch
+
+
+_DATA = files(__package__) / "data"
+_WIDE = "-wide"  # ends the names of ready charts that an arm can have
+
+
+def list_arms() -> tuple[str, ...]:
+    """Names of the arms that `Arm.load` knows: those of the ready wide charts."""
+    return tuple(name.removesuffix(_WIDE) for name in names() if name.endswith(_WIDE))
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +73,7 @@ class ArmRules:
     tolerance: float = 1e-9  #: error of xi of a posture that has it
     same: float = 1e-6  #: [rad] or [m] between postures that are the same
     rows: int = 8  #: that a thread takes at once
+    postures: int = 100_000  #: of a chart, in generated C
 
 
 RULES = ArmRules()
@@ -194,12 +210,24 @@ class Arm(Shown):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read an arm file. Loading never runs code from the file.
+        """Read an arm file, or take a known arm by its name, such as "panda". Loading never runs code from a file.
+
+        "panda" and "iiwa7" have charts of all their branches, which `Arm.fit` made; the others have that of one branch,
+        `oc.load(f"{name}-wide")`.
 
         Raises:
+            UnknownNameError: for a word that is neither a file nor the name of a known arm.
             ChartFileError: if the file is missing, truncated, foreign, edited, or from a newer version.
         """
-        charts = read_charts(as_path("path", path))
+        file = as_path("path", path)
+        if not (file.exists() or file.suffix or len(file.parts) > 1):
+            require_known("arm file or known arm", file.name, list_arms())
+            if (_DATA / f"{file.name}.arm").is_file():
+                with as_file(_DATA / f"{file.name}.arm") as stored:
+                    return cls.load(stored)
+            chart = load(f"{file.name}{_WIDE}")
+            return cls(chart.task, (chart,))
+        charts = read_charts(file)
         return cls(charts[0].problem.task, charts)
 
     def save(self, path: str | Path, force: bool = False) -> None:
@@ -430,6 +458,39 @@ class Arm(Shown):
             found[k] = tracker.step_to(target, value)
             statuses.append(tracker.status)
         return found, tuple(statuses)
+
+    def generate_c(
+        self, folder: str | Path, name: str = "arm", postures: int = 200, force: bool = False
+    ) -> tuple[Path, Path]:
+        """Write the tracker as C99: NAME_track.h and NAME_track.c, without memory of its own or other libraries.
+
+        A call does what `ArmTracker.step` does without a collision model, in a bounded time.
+
+        Args:
+            folder: created if its parent exists.
+            name: prefix of all C names.
+            postures: stored for each chart, and once more for all of the joint range; searches for another way try
+                24 of them, one a call.
+            force: also replace files of these names that were not generated.
+
+        Returns:
+            The header and the source.
+
+        Raises:
+            InvalidValueError, ArchiveError: as `orthocas.generate_c`.
+            DomainError: if a domain has a condition, but no expression of it.
+        """
+        out = as_path("folder", folder)
+        require_name(name)
+        require_count("postures", postures, least=1, most=RULES.postures)
+        names = f"{name}_track.h", f"{name}_track.c"
+        require_free_folder(out, name, names, force)
+        header = f"/* Generated by orthocas {VERSION}. Do not edit; generate it again instead. */"
+        sources = write_tracker(self.maps, self.charts, name, "arm_track.c", header, postures)
+        with publish(make_folder("folder", out)) as drafts:
+            for file, text in sources.items():
+                (drafts / file).write_text(text, encoding="utf-8")
+        return out / names[0], out / names[1]
 
     def find_branches(self, q: Array) -> Indices:
         """Numbers of the charts whose domains hold postures (N, n); -1 for none."""

@@ -8,10 +8,15 @@ import numpy as np
 from orthocas.charts.chart import Chart, load_file
 from orthocas.errors import ChartFileError
 from orthocas.tools.archive import Kind, read_archive, require_free, write_archive
-from orthocas.tools.files import open_draft_folder, write_temporary
+from orthocas.tools.files import is_archive, open_draft_folder, write_temporary
 
 ARM = Kind("arm", 1, ChartFileError)
 _MOST = 256  # charts of an arm
+
+
+def is_arm(path: Path) -> bool:
+    """Whether a file says that it is an arm file."""
+    return is_archive(path, ARM.format)
 
 
 def write_charts(path: Path, charts: Sequence[Chart], force: bool) -> None:

@@ -72,6 +72,8 @@ class ChartKernelRules:
     patience: int = 32  #: of them in turn that find no new curve, after which the search ends
     postures: int = 2000  #: stored in the domain of each chart, and in all of the joint range
     seed: int = 0  #: of them
+    speed: float = 2.0  #: [rad/s] or [m/s] of joints whose file gives no velocity limit
+    window: float = 0.25  #: [s] without progress after which a tracker looks for another way
     piece: int = 32  #: rows that a thread takes at once
 
 
@@ -250,7 +252,9 @@ class ChartKernel:
         return CURVES.nodes * (2 * self.maps.robot.n + 1) + (len(self.maps.stored.q) + 1) // 2
 
 
-def write_tracker(maps: ArmMaps, charts: Sequence[Chart], name: str, template: str, header: str = "") -> dict[str, str]:
+def write_tracker(
+    maps: ArmMaps, charts: Sequence[Chart], name: str, template: str, header: str = "", postures: int = 0
+) -> dict[str, str]:
     """Sources of an arm's tracker, by the names of their files: NAME_track.h and .c.
 
     Args:
@@ -259,6 +263,7 @@ def write_tracker(maps: ArmMaps, charts: Sequence[Chart], name: str, template: s
         name: prefix of names in C.
         template: "arm_track.c", or "arm_rows.c" for the searches of many rows as well.
         header: first lines of both files.
+        postures: stored for each chart, in the code; 0 for none there.
     """
     robot, task, n = maps.robot, maps.task, maps.robot.n
     equations = maps.equations
@@ -304,6 +309,9 @@ def write_tracker(maps: ArmMaps, charts: Sequence[Chart], name: str, template: s
         "slides": ~maps.turning,
         "include": f'#include "{name}_track.h"',
     }
+    speed = np.where(np.isfinite(robot.velocity_limits), robot.velocity_limits, RULES.speed)
+    values |= {"stored": ChartPostures.build(maps, charts, postures) if postures else None, "speed": speed}
+    values |= {"window": RULES.window}
     values["rows"] = template != "arm_track.c"
     if values["rows"]:
         values["branches"] = len(maps.stored.begins) if charts and n - task.m == 1 else 0

@@ -6,21 +6,24 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import product
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.arms.kernel import Curve, evaluate_cubic
+from orthocas.arms.kernel import Curve, build_curvature, evaluate_cubic
 from orthocas.arms.maps import ArmMaps
 from orthocas.charts.self_motion import Stop
 from orthocas.errors import InvalidValueError
 from orthocas.tasks.domains import StopKind
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, as_point, require_count
+from orthocas.tools.checks import Array, as_float_array, as_point, require_count, require_kind
 from orthocas.tools.display import Shown
 from orthocas.tools.expressions import call_user, wrap_shortest
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _TURN = 2 * np.pi
 
@@ -44,6 +47,25 @@ class ArcRules:
 RULES = ArcRules()
 
 
+@dataclass(frozen=True, slots=True)
+class MergeRules:
+    """Numbers of the search for the way on which two components join."""
+
+    images: int = 31  #: postures of the way
+    rounds: int = 400  #: of the search, at most
+    step: float = 0.3  #: of a Gauss-Newton step towards x that a posture goes, across the way
+    longest: float = 0.05  #: of the steps
+    damping: float = 1e-2  #: of these steps, relative to the trace of J J^T
+    pairs: int = 40  #: rounds of the search for a gap, at most
+    near: float = 0.2  #: relative difference of errors of a pass and of the highest posture of the way
+    away: float = 1.0  #: between these two
+    flat: float = 1e-4  #: curvature, relative to the largest, that counts as none
+    settled: float = 1e-7  #: relative change of the largest error that ends it
+
+
+MERGE = MergeRules()
+
+
 class Piece(NamedTuple):
     """A part of a curve, after some full turns of its joints."""
 
@@ -59,6 +81,23 @@ class Place(NamedTuple):
     value: float  #: what was asked for there: the distance, or the value of a function
     component: int  #: number of the arc in `SelfMotions.components`
     place: float  #: length of the arc up to there [rad] or [m]
+
+
+class Gap(NamedTuple):
+    """The least distance of two components, and where they are so near."""
+
+    value: float  #: |q_a - q_b| [rad] or [m]
+    first: Place
+    second: Place
+
+
+class Merge(NamedTuple):
+    """A way from one component to another, which leaves x as little as was found."""
+
+    value: float  #: largest error of x on the way [rad], or as long as a radian moves the tip
+    q: Array  #: the posture there (n,); with its value of x, the two components meet, or a limit is in the way
+    x: Array  #: that value of x (m,)
+    way: Array  #: postures (P, n) from one component to the other
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -260,6 +299,130 @@ class SelfMotions(Shown):
             if high - low < RULES.refined:
                 break
         return best
+
+    def gap(self, a: int, b: int) -> Gap:
+        """The least distance in joint space between two components.
+
+        Args:
+            a: number of a component.
+            b: number of another one.
+
+        Raises:
+            InvalidValueError: if there are no such components, or they are the same.
+        """
+        first, second = self._require_pair(a, b)
+        spaced = [np.linspace(0.0, arc.length, max(2, int(arc.length / RULES.spacing) + 2)) for arc in (first, second)]
+        rows = [arc.at(places) for arc, places in zip((first, second), spaced, strict=True)]
+        apart = [np.linalg.norm(self.measure_away(rows[1], q), axis=1) for q in rows[0]]
+        i, j = np.unravel_index(int(np.argmin(apart)), (len(rows[0]), len(rows[1])))
+        near, at = rows[0][i], (float(spaced[0][i]), float(spaced[1][j]))
+        best, value = None, np.inf
+        for _ in range(MERGE.pairs):
+            other = self._refine(b, at[1], near)
+            own = self._refine(a, at[0], other.q)
+            near, at = own.q, (own.place, other.place)
+            if best is not None and own.value > value * (1 - MERGE.settled):
+                break
+            best, value = (own, other), own.value
+        assert best is not None
+        return Gap(value, *best)
+
+    def merge(self, a: int, b: int) -> Merge:
+        """A way from one component to another that leaves x little.
+
+        From the straight way across their gap, postures go down to smaller errors of x, across the way, which is kept
+        at equal distances. It is one way, not the best of all: its error is an upper bound of the least.
+
+        Args:
+            a: number of a component.
+            b: number of another one.
+
+        Raises:
+            InvalidValueError: if there are no such components, or they are the same.
+
+        Source:
+            The string method: E, Ren and Vanden-Eijnden, J. Chem. Phys. 126 (2007) 164103, with Gauss-Newton steps.
+        """
+        gap = self.gap(a, b)
+        end = gap.first.q + self.measure_away(gap.second.q[None], gap.first.q)[0]
+        shares = np.linspace(0.0, 1.0, MERGE.images)[:, None]
+        q, before = gap.first.q + shares * (end - gap.first.q), np.inf
+        targets = np.tile(self.target, (MERGE.images, 1))
+        low, high = self.maps.robot.lower, self.maps.robot.upper
+        for _ in range(MERGE.rounds):
+            e, J = self.maps.evaluate(q, targets)
+            most = float(np.linalg.norm(e, axis=1).max())
+            if abs(before - most) < MERGE.settled * most:
+                break
+            before = most
+            gram = J @ J.transpose(0, 2, 1)
+            floor = MERGE.damping * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(e.shape[1])
+            step = (J.transpose(0, 2, 1) @ np.linalg.solve(gram + floor, e[:, :, None]))[:, :, 0]
+            along = np.gradient(q, axis=0)
+            along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
+            step -= (step * along).sum(axis=1, keepdims=True) * along
+            step *= np.minimum(
+                MERGE.step, MERGE.longest / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-300)
+            )
+            q[1:-1] = np.clip(q + step, low, high)[1:-1]
+            lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(q, axis=0), axis=1))])
+            even = np.linspace(0.0, lengths[-1], MERGE.images)
+            q = np.column_stack([np.interp(even, lengths, column) for column in q.T])
+        errors = np.linalg.norm(self.maps.evaluate(q, targets)[0], axis=1)
+        k = int(np.argmax(errors))
+        q[k] = self._find_pass(q[k], float(errors[k]))
+        errors[k] = np.linalg.norm(self.maps.evaluate(q[k : k + 1], targets[:1])[0])
+        vector = self.maps.targets.vector(self.maps.targets_of(q[k : k + 1]))[0]
+        return Merge(float(errors[k]), q[k], np.asarray(vector), q)
+
+    def _find_pass(self, q: Array, error: float) -> Array:
+        """The posture near q (n,) within the limits at which |e|^2 neither rises nor falls; q where there is none."""
+        at, target = q.copy(), self.target[None]
+        bend = build_curvature(self.maps.equations)
+        for _ in range(MERGE.pairs):
+            e, J = (part[0] for part in self.maps.evaluate(at[None], target))
+            step = np.linalg.lstsq(np.asarray(bend(at, self.target)), J.T @ e, rcond=MERGE.flat)[0]
+            size = float(np.linalg.norm(step))
+            at = at + min(1.0, RULES.largest / (size + 1e-300)) * step
+            if size < MERGE.settled:
+                break
+        inside = ((at >= self.maps.robot.lower) & (at <= self.maps.robot.upper)).all()
+        found = float(np.linalg.norm(self.maps.evaluate(at[None], target)[0]))
+        good = inside and size < MERGE.settled and abs(found - error) < MERGE.near * error
+        return at if good and np.linalg.norm(at - q) < MERGE.away else q
+
+    def plot(self) -> Figure:
+        """A picture: the joints along each component, in shares of their ranges, with the joints that stop it named."""
+        from matplotlib.figure import Figure  # heavy, and few calls need it
+
+        robot, figure = self.maps.robot, Figure(figsize=(8.0, 2.2 * max(1, len(self))), layout="constrained")
+        for k, arc in enumerate(self.components):
+            axes = figure.add_subplot(len(self), 1, k + 1)
+            places = np.linspace(0.0, arc.length, max(2, int(arc.length / RULES.spacing)))
+            q = arc.at(places)
+            for i, name in enumerate(robot.joint_names):
+                low, high = float(robot.lower[i]), float(robot.upper[i])
+                bounded = math.isfinite(low) and math.isfinite(high)
+                centre, half = ((low + high) / 2, (high - low) / 2) if bounded else (0.0, np.pi)
+                axes.plot(places, (q[:, i] - centre) / half, label=name, linewidth=1.2)
+            axes.axhspan(0.9, 1.0, color="0.9")
+            axes.axhspan(-1.0, -0.9, color="0.9")
+            axes.set(ylim=(-1.02, 1.02), xlim=(0.0, arc.length), ylabel=f"component {k}")
+            ends = "closed" if arc.closed else " -> ".join(str(stop) for stop in arc.ends)
+            axes.set_title(ends, fontsize="small", loc="left")
+        if self.components:
+            figure.axes[-1].set_xlabel("length along the component [rad]")
+            figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right upper", fontsize="small")
+        return figure
+
+    def _require_pair(self, a: int, b: int) -> tuple[Arc, Arc]:
+        for name, k in (("a", a), ("b", b)):
+            require_kind(name, k, int)
+            if not 0 <= k < len(self):
+                raise InvalidValueError(name, k, f"the number of one of {len(self)} components, from 0 on")
+        if a == b:
+            raise InvalidValueError("b", b, "another component than a")
+        return self.components[a], self.components[b]
 
     def facts(self) -> dict[str, str]:
         """How many components there are, how long, and what stops them."""

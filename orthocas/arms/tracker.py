@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.arms.chart_kernel import ChartKernel, tracker_type
+from orthocas.arms.chart_kernel import RULES, ChartKernel, tracker_type
 from orthocas.arms.kernel import pointer
 from orthocas.arms.maps import ArmMaps
 from orthocas.arms.numpy_tracker import NumpyTracker, TrackStatus
@@ -19,17 +18,6 @@ from orthocas.charts.clearance import Clearance
 from orthocas.errors import CompileError, InvalidValueError, degrees_hint
 from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind, require_shape
 from orthocas.tools.display import Shown, number_list
-
-
-@dataclass(frozen=True, slots=True)
-class SpeedRules:
-    """Numbers of what a tracker is given."""
-
-    speed: float = 2.0  #: [rad/s] or [m/s] of joints whose file gives no velocity limit
-    window: float = 0.25  #: [s] without progress after which another way is looked for
-
-
-RULES = SpeedRules()
 
 
 class ArmTracker(Shown):

@@ -31,7 +31,7 @@ from orthocas.robots.capsules import fit_capsules
 from orthocas.tools.interrupts import deferred
 
 CONTROLLERS = law_names()
-_NONE = "none"
+_NONE, _TRACK = "none", "track"
 
 
 def add_law_options(for_codegen: bool) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -66,7 +66,10 @@ def _find_laws_with(setting: str) -> list[str]:
 @add_law_options(for_codegen=True)
 def codegen(
     chart: ChartPath,
-    controller: Annotated[str, typer.Option("--controller", help=f"Control law: {', '.join(CONTROLLERS)} or {_NONE}.")],
+    controller: Annotated[
+        str,
+        typer.Option("--controller", help=f"Control law: {', '.join(CONTROLLERS)}, {_NONE}, or {_TRACK} for an arm."),
+    ],
     out: Annotated[Path, typer.Option("--out", help="Folder for the generated library.")],
     settings: dict[str, str],
     name: Annotated[str | None, typer.Option("--name", help="Prefix of all C names; default: from the chart.")] = None,
@@ -83,6 +86,11 @@ def codegen(
     json: AsJson = False,
 ) -> None:
     """Write a chart, the robot's dynamics, the inverse map and a controller as C99."""
+    if controller == _TRACK:
+        if settings or limit is not None or check or single_precision or collisions is not None:
+            raise OptionError(f"--controller {_TRACK} takes --out, --name and --force")
+        _write_tracker(chart, out, name, force, json)
+        return
     if controller != _NONE:
         require_settings(controller, settings)
     elif settings or limit is not None:
@@ -105,6 +113,25 @@ def codegen(
         print_rows(_format_rows(report))
     for remark in remarks:
         note(remark)
+
+
+def _write_tracker(file: Path, out: Path, name: str | None, force: bool, json: bool) -> None:
+    """The tracker of an arm file, or of an arm with one chart."""
+    from orthocas.arms.arm import Arm  # with all that arms need, which charts do not
+    from orthocas.arms.arm_file import is_arm
+
+    with deferred():
+        if is_arm(file):
+            arm = Arm.load(file)
+        else:
+            chart = load(file)
+            arm = Arm(chart.task, (chart,))
+        header, source = arm.generate_c(out, "arm" if name is None else name, force=force)
+    data = {"header": str(header), "source": str(source), "lines": len(source.read_text().splitlines())}
+    if json:
+        print_json(data)
+    else:
+        print_rows({"tracker": f"{data['lines']} lines of C99, {source}", "header": str(header)})
 
 
 def _build_report(generated: GeneratedC, agreement: AgreementCheck | None) -> dict[str, Any]:

@@ -20,6 +20,7 @@ COMMANDS = {
     "info": "Show a chart, a named problem, or a robot.",
     "compare": "Fit a grid of parametrisations, solvers and seeds; write tables, pictures and charts.",
     "simulate": "Run a controller in a chart's coordinates; write the run, pictures, an animation and a report.",
+    "solve": "Find joint positions with a task value, and xi if it is given. Exit code 1 if there are none.",
     "follow": "Follow a tool path; write joint positions, velocities and accelerations on time stamps.",
     "codegen": "Write a chart, the robot's dynamics, the inverse map and a controller as C99.",
     "export": "Write task, xi, phi, Jacobian and inverse of a chart as one Python module that needs the library only.",

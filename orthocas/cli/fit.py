@@ -1,5 +1,6 @@
 """`orthocas fit`: from a robot to a chart file."""
 
+import time
 import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -56,10 +57,10 @@ from orthocas.tasks.task import Task
 from orthocas.tools.archive import require_free
 from orthocas.tools.display import listed, number_list, percent
 from orthocas.tools.interrupts import INTERRUPTED
-from orthocas.tools.json import collect_attributes
+from orthocas.tools.json import clean, collect_attributes
 from orthocas.tools.progress import Monitor
 
-_AUTO, _BRANCH = "auto", "branch"  # words of --domain
+_AUTO, _BRANCH, _ALL = "auto", "branch", "all"  # words of --domain
 _IN_CORRIDOR = "polynomial:3:cyclic"  # more terms gain little there
 _WIDE_ROWS = ("regular", "left out", "meaning")  # facts of wide fits
 
@@ -91,7 +92,7 @@ def fit(
             "--domain",
             help="auto: the widest box around the home on which the fit keeps --leak-deg and --conditioning; "
             "branch: all of the home's branch of the joint range (a wide chart); branch:NAME: of another one, "
-            "see orthocas info --branches.",
+            "see orthocas info --branches; all: a chart of every branch, in an arm file for orthocas solve and oc.Arm.",
         ),
     ] = None,
     like: Annotated[
@@ -160,6 +161,12 @@ def fit(
 ) -> None:
     """Fit extra coordinates to a problem and save the chart."""
     bounds = {"leak_deg": leak_deg, "conditioning": conditioning}
+    if domain == _ALL:
+        own = {"param": param, "solver": solver, "like": like, "exact": exact or None, "corridor": corridor, **bounds}
+        own |= {"samples": samples, "angles": angles, "max-mutual-deg": max_mutual_deg}
+        own |= {"weights": None if weights == WEIGHTS_TEXT else weights}
+        _fit_arm(problem, words, own, seed, out, force, json)
+        return
     kind, branch = _check_domain(domain, corridor, bounds)
     if exact and (kind != _BRANCH or like is None):
         raise OptionError("--exact requires --domain branch and --like")
@@ -220,6 +227,43 @@ def fit(
     _save_and_report(result, suggestion, target, seed, force, json)
 
 
+def _fit_arm(
+    name: str,
+    words: ProblemOptions,
+    others: Mapping[str, Any],
+    seed: int,
+    out: Path | None,
+    force: bool,
+    json: bool,
+) -> None:
+    """Fit a chart to every branch, and write and print the arm; `others` are options that must not be given."""
+    from orthocas.arms.arm import Arm  # with all that arms need, which other fits do not
+    from orthocas.arms.arm_file import ARM
+
+    if given := [option for option, value in others.items() if value is not None]:
+        raise OptionError(f"--domain all chooses by itself: leave out --{given[0].replace('_', '-')}")
+    words.require_none(("centre", "half_width", "home", "least_singular_value"), "--domain all is all there is")
+    target = out or Path(f"{Path(name).stem}.arm")
+    require_free(target, ARM, force)
+    base = None if is_robot_file(name) else words.build_problem(name)
+    robot, task, metric = _build_parts(name, replace(words, task=words.task or "pose"), base)
+    begin = time.perf_counter()
+    with terminal_monitor() as monitor:
+        arm = Arm.fit(robot, task, metric, seed=seed, monitor=monitor)
+    seconds = time.perf_counter() - begin
+    arm.save(target, force)
+    shares = [chart.notes.get("share of the branch") for chart in arm.charts]
+    if json:
+        branches = [
+            {"branch": branch, "share": clean(share)} for branch, share in zip(arm.branch_names, shares, strict=True)
+        ]
+        print_json({"arm": str(target), "task": task.name, "branches": branches, "seconds": seconds})
+        return
+    print_rows(
+        {**arm.facts(), "fit": f"{seconds:.1f} s", "file": str(target)}, f"orthocas solve {target} --x ... --xi 0"
+    )
+
+
 def _check_domain(domain: str | None, corridor: Path | None, bounds: Mapping[str, float | None]) -> tuple[str, str]:
     """The kind of a domain, and the name of its branch; raises OptionError for options of another kind."""
     kind, _, branch = (domain or "").partition(":")
@@ -233,7 +277,7 @@ def _check_domain(domain: str | None, corridor: Path | None, bounds: Mapping[str
         raise InvalidValueError(
             "--domain",
             repr(domain),
-            "auto, branch, branch:NAME, or --centre and --half-width for a box of your own",
+            "auto, branch, branch:NAME, all, or --centre and --half-width for a box of your own",
         )
     return kind, branch.strip()
 
@@ -380,10 +424,8 @@ def _format_fit(result: Fit, report: Report, target: Path) -> dict[str, str]:
         share = percent(check.half_turn_share, 2, fault=True)
         rows["half a turn"] = f"x of the task jumps on {share} of the domain: half a turn from its reference"
     if offer is not None:
-        bound, share = offer.least_singular_value, offer.share
-        rows["clear part"] = (
-            f"--least-singular-value {bound:g} leaves out singular positions and keeps {percent(share)}"
-        )
+        bound, kept = offer.least_singular_value, percent(offer.share)
+        rows["clear part"] = f"--least-singular-value {bound:g} leaves out singular positions and keeps {kept}"
     return {**rows, **format_reach_rows(result.chart), "chart": str(target)}
 
 

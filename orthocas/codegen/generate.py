@@ -128,12 +128,7 @@ def generate_c(
         words = f"{chart.problem.name}_{'chart' if controller is None else controller.name}"
         words = re.sub(r"\W", "_", words, flags=re.ASCII)[-90:]
         name = words if words[0].isalpha() else f"robot_{words}"
-    # C must allow the name, and no header or library of C may have it.
-    is_identifier = isinstance(name, str) and re.fullmatch(r"[A-Za-z]\w{0,99}", name, flags=re.ASCII)
-    if not is_identifier or name.lower() in _TAKEN:
-        raise InvalidValueError(
-            "name", repr(name), "a C identifier that is not a C header or library, such as arm_controller"
-        )
+    require_name(name)
 
     # CasADi writes the functions as kernels; templates put an interface around them.
     precision = SINGLE if single_precision else DOUBLE
@@ -160,7 +155,7 @@ def generate_c(
     # All files are written or, if one fails, none.
     folder = as_path("out", out)
     try:
-        _require_free(folder, name, contents, force)
+        require_free_folder(folder, name, contents, force)
         with open_output_folder("out", folder) as place, publish(place) as drafts:
             for file, text in contents.items():
                 (drafts / file).write_text(text, encoding="utf-8")
@@ -363,7 +358,16 @@ def _compute_check(chart: Chart, controller: Controller | None, precision: Preci
     return check
 
 
-def _require_free(out: Path, name: str, files: Iterable[str], force: bool) -> None:
+def require_name(name: str) -> None:
+    """Raise InvalidValueError unless C allows a name, and no header or library of C has it."""
+    is_identifier = isinstance(name, str) and re.fullmatch(r"[A-Za-z]\w{0,99}", name, flags=re.ASCII)
+    if not is_identifier or name.lower() in _TAKEN:
+        raise InvalidValueError(
+            "name", repr(name), "a C identifier that is not a C header or library, such as arm_controller"
+        )
+
+
+def require_free_folder(out: Path, name: str, files: Iterable[str], force: bool) -> None:
     """Raise InvalidValueError if the folder holds files of the user that would be overwritten."""
     if out.exists() and not out.is_dir():
         raise InvalidValueError("out", str(out), "a folder")

@@ -159,7 +159,8 @@ def _check_header(source: Path, kind: Kind, text: bytes) -> dict[str, Any]:
     # One of our files: of which kind, and not from a later version.
     name, version = header["format"], header["version"]
     if name != kind.format:
-        raise kind.error(f"{source} has format '{name}', expected '{kind.format}'")
+        hint = "; arms open with oc.Arm.load and orthocas solve" if name == "orthocas-arm" else ""
+        raise kind.error(f"{source} has format '{name}', expected '{kind.format}'{hint}")
     if not isinstance(version, int) or isinstance(version, bool) or version < 1:
         raise kind.error(f"{source} has format version {version}, expected 1 to {kind.version}")
     if version > kind.version:

@@ -165,6 +165,31 @@ def test_an_arm_comes_back_from_its_file(tmp_path: Path) -> None:
         assert other.solve(arm.x(q), 0.2).q == pytest.approx(arm.solve(arm.x(q), 0.2).q, abs=1e-9)
 
 
+def test_known_arms_load_by_name() -> None:
+    arm, chart = oc.Arm.load("xarm7"), oc.load("xarm7-wide")
+    assert arm.branch_names == (chart.notes["branch"],)
+    assert arm.x(chart.domain.centre) == pytest.approx(chart.x(chart.domain.centre))
+    with pytest.raises(UnknownNameError, match="iiwa7"):
+        oc.Arm.load("iwa")
+
+
+@pytest.mark.parametrize(("name", "branches"), [("panda", 4), ("iiwa7", 8)])
+def test_ready_arms_have_charts_of_all_branches(name: str, branches: int) -> None:
+    """Held-out postures of each domain: xi rises along the self-motion, and x and xi lead back to the branch."""
+    arm = oc.Arm.load(name)
+    assert len(set(arm.branch_names)) == branches == len(arm.charts)
+    for own, chart in zip(arm.branch_names, arm.charts, strict=True):
+        q = chart.domain.sample(300, 99)
+        assert (
+            np.linalg.det(chart.jacobian(q)) * np.linalg.det(chart.jacobian(chart.domain.centre)) > 0
+        ).mean() > 0.999
+        found = arm.solve(arm.x(q), chart.xi(q)[:, 0], branch=own)
+        assert found.found.all()
+        assert set(found.branch) == {own}
+    share = np.mean([k >= 0 for k in arm.find_branches(arm.robot.sample(4000, seed=5))])
+    assert share > 0.5
+
+
 def test_damaged_arm_files_are_refused(tmp_path: Path) -> None:
     file, damaged = tmp_path / "a.arm", tmp_path / "b.arm"
     planar().save(file)

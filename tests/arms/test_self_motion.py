@@ -213,3 +213,32 @@ def test_out_of_reach_there_is_no_arc() -> None:
     assert isinstance(motions, SelfMotions)
     with pytest.raises(InvalidValueError, match="within the limits"):
         motions.nearest([0.0, 0.0, 0.0])
+
+
+def test_gap_and_merge_of_a_planar_arm_are_those_of_its_linkage() -> None:
+    """With the tip at a distance r of the base, links of 1 m make a four-bar linkage of sides 1, 1, 1, r.
+
+    Its configurations have two components for r < 1 and one for r in (1, 3) (Grashof), so they join where the tip has
+    gone out by 1 - r.
+    """
+    arm, r = oc.Arm(oc.problems.get("planar_3r_xy").task), 0.7
+    motions = arm.self_motion([r, 0.0])
+    assert len(motions) == 2
+    gap, merge = motions.gap(0, 1), motions.merge(0, 1)
+    dense = [arc.at(np.linspace(0, arc.length, 400)) for arc in motions]
+    apart = [np.linalg.norm(motions.measure_away(dense[1], q), axis=1).min() for q in dense[0]]
+    assert gap.value == pytest.approx(min(apart), abs=1e-3)
+    assert gap.value <= min(apart) + 1e-6
+    assert np.linalg.norm(motions.measure_away(gap.second.q[None], gap.first.q)) == pytest.approx(gap.value, abs=1e-6)
+    out = np.linalg.norm(merge.x - [r, 0.0])
+    assert out == pytest.approx(1 - r, rel=1e-6)
+    assert np.linalg.norm(arm.x(merge.q)) == pytest.approx(1.0, abs=1e-6)
+    errors = np.linalg.norm(arm.x(merge.way) - [r, 0.0], axis=1)
+    assert errors[[0, -1]].max() < 1e-6
+    assert errors.max() < 1.1 * out
+    figure = motions.plot()
+    assert len(figure.axes) == 2
+    with pytest.raises(InvalidValueError, match="another component"):
+        motions.gap(1, 1)
+    with pytest.raises(InvalidValueError, match="one of 2 components"):
+        motions.merge(0, 5)

@@ -80,7 +80,7 @@ RESULTS = {  #: public classes whose objects only the library makes, with the ca
     **dict.fromkeys(("Breakdown", "Coupling", "DampingCheck", "JointMotion", "Margins", "Modes", "Setting"), "calls"),
     **dict.fromkeys(("Contact", "FittedCapsules", "LeastDistance", "NearPairs"), "calls"),
     **dict.fromkeys(("Card", "Model", "Trajectory", "View"), "calls"),
-    **dict.fromkeys(("Arc", "ArmTracker", "Place", "Postures", "SelfMotions"), "calls"),
+    **dict.fromkeys(("Arc", "ArmTracker", "Gap", "Merge", "Place", "Postures", "SelfMotions"), "calls"),
     "Certificate": "certificates",
     "Domain": "calls",
 }

@@ -1,0 +1,112 @@
+"""`orthocas solve`: joint positions with a task value and xi."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from orthocas.arms.arm import ANY, Arm, list_arms
+from orthocas.arms.arm_file import is_arm
+from orthocas.charts.inverse import InverseStatus
+from orthocas.charts.ready import load
+from orthocas.cli.options import AsJson, parse_number, parse_numbers
+from orthocas.cli.output import print_json, print_rows
+from orthocas.errors import InvalidValueError, OptionError
+from orthocas.tasks.task import Task
+from orthocas.tools.checks import Array
+from orthocas.tools.json import clean
+
+_QUATERNION, _MATRIX = 7, 16  # numbers of a position and a quaternion, and of a 4 x 4 matrix
+
+
+def solve(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="CHART|ARM", help="A chart or an arm: a file, or a ready one, such as panda-wide or panda."
+        ),
+    ],
+    x: Annotated[
+        str,
+        typer.Option(
+            "--x",
+            help='Task value "0.5,0,0.4,..."; of a pose also x,y,z,qw,qx,qy,qz, or a 4 x 4 matrix row by row.',
+        ),
+    ],
+    xi: Annotated[str | None, typer.Option("--xi", help="Extra coordinates; default: near --start.")] = None,
+    start: Annotated[
+        str | None, typer.Option("--start", help='Joint positions to be near to, "0,0.5,..."; default: none.')
+    ] = None,
+    branch: Annotated[str | None, typer.Option("--branch", help="Of an arm: accept no other branch.")] = None,
+    every: Annotated[bool, typer.Option("--all", help="Of an arm: every posture with x and --xi.")] = False,
+    json: AsJson = False,
+) -> None:
+    """Find joint positions with a task value, and xi if it is given. Exit code 1 if there are none."""
+    near = None if start is None else parse_numbers("--start", start)
+    if is_arm(file) or (str(file) in list_arms() and not file.exists()):
+        arm = Arm.load(file)
+        value = None if xi is None else parse_number(xi)
+        target = _read_target(arm.task, x)
+        if every:
+            if value is None:
+                raise OptionError("--all requires --xi")
+            postures: Any = arm.solutions(target, value)
+        else:
+            postures = arm.solve(target, value, near, ANY if branch is None else branch)
+        single = postures.q.ndim == 1
+        statuses = [postures.status] if single else postures.status
+        branches = [postures.branch] if single else postures.branch
+        rows = list(
+            zip(np.atleast_2d(postures.q), np.atleast_1d(postures.xi)[:, None], statuses, branches, strict=True)
+        )
+    else:
+        if branch is not None or every:
+            raise OptionError("--branch and --all require an arm file, such as orthocas fit --domain all writes")
+        chart = load(file)
+        target = _read_target(chart.task, x)
+        q_start = chart.domain.centre if near is None else near
+        if xi is None:
+            found = chart.nearest_xi(q_start, target)
+        else:
+            found = chart.solve(x=target, xi=parse_numbers("--xi", xi, chart.r), q_start=near)
+        name = str(chart.notes.get("branch", ""))
+        rows = [(found.q[0], np.ravel(chart.xi(found.q[0])), found.status[0], name)]
+    _print(rows, json)
+
+
+def _read_target(task: Task, text: str) -> Array:
+    """The task's vector of the numbers of --x."""
+    numbers = parse_numbers("--x", text)
+    if len(numbers) == _MATRIX:
+        return task.target(numbers.reshape(4, 4))
+    if len(numbers) == _QUATERNION != task.m:
+        return task.target((numbers[:3], numbers[3:]))
+    if len(numbers) != task.m:
+        raise InvalidValueError("--x", repr(text)[:80], f"{task.m} numbers: {', '.join(task.labels)}, or a pose")
+    return numbers
+
+
+def _print(rows: list[tuple[Array, Array, Any, str]], json: bool) -> None:
+    """One posture, or several; exit code 1 for none."""
+    found = [
+        {"q": clean(q), "xi": clean(xi), "status": InverseStatus(int(status)).name, "branch": branch}
+        for q, xi, status, branch in rows
+    ]
+    if json:
+        print_json({"postures": found})
+    elif not found:
+        typer.echo("no posture")
+    for k, (q, xi, status, branch) in enumerate(() if json else rows):
+        label = f" {k + 1}" if len(rows) > 1 else ""
+        xi_text = _write(xi) if np.isfinite(xi).all() else "none"
+        named = {f"branch{label}": branch} if branch else {}
+        texts = {f"q{label}": _write(q), f"xi{label}": xi_text, **named}
+        print_rows({f"status{label}": InverseStatus(int(status)).name, **texts})
+    if not any(np.isfinite(q).all() and status <= InverseStatus.OUTSIDE_DOMAIN for q, _, status, _ in rows):
+        raise typer.Exit(1)
+
+
+def _write(values: Array) -> str:
+    """Numbers as options take them."""
+    return ",".join(f"{value:.9g}" for value in values)
