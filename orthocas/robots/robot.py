@@ -185,7 +185,11 @@ class Robot(Shown):
 
         Needs the extra `orthocas[mujoco]`, because MuJoCo's compiler reads the file.
         """
-        return cls._from_chain(read_mjcf(path), _check_tips(tip, tips), locked, tool, base, gravity)
+        robot = cls._from_chain(read_mjcf(path), _check_tips(tip, tips), locked, tool, base, gravity)
+        if not isinstance(path, str | PathLike):
+            return robot
+        source = CollisionSource(as_path("path", path).absolute(), None, dict(locked or {}))
+        return cls(robot.tree, robot.homes, source)
 
     @classmethod
     def _from_chain(
@@ -303,7 +307,7 @@ class Robot(Shown):
         """The same robot with the solids of another file, such as a robot of a chart file, for `collisions`.
 
         Args:
-            urdf: the robot's URDF file.
+            urdf: the robot's URDF file, or its MJCF file, whose name ends in .xml.
             srdf: an SRDF file whose disabled pairs are not checked. Default: the one with the same stem, beside the
                 URDF file or in ../srdf.
         """
@@ -313,14 +317,14 @@ class Robot(Shown):
 
     @cached_property
     def collisions(self) -> Collisions:
-        """Distances between the links, from the <collision> elements of the robot's URDF file.
+        """Distances between the links, from the <collision> elements of the robot's URDF file, or its MJCF geoms.
 
         Raises:
-            RobotError: if the robot comes from no URDF file, the file or all its solids are missing.
+            RobotError: if the robot comes from no file, the file or all its solids are missing.
         """
         if self.solids is None:
-            hint = "robot.with_solids(urdf) names the URDF file"
-            raise RobotError(f"nothing is known of the links' solids, expected a robot of a URDF file: {hint}")
+            hint = "robot.with_solids(urdf) names its file"
+            raise RobotError(f"nothing is known of the links' solids, expected a robot of a URDF or MJCF file: {hint}")
         return read_collisions(self.tree, self.solids)
 
     def home(self, name: str) -> Array:

@@ -85,6 +85,25 @@ class CylinderGeometry(Geometry):
 
 
 @dataclass(frozen=True, eq=False)
+class EllipsoidGeometry(Geometry):
+    """An ellipsoid with its middle at the origin, and its axes along those of the frame."""
+
+    radii: Array  #: (3,) [m]
+
+    def build(self) -> Any:
+        """The ellipsoid."""
+        return coal.Ellipsoid(*self.radii)
+
+    def list_corners(self) -> tuple[Array, float]:
+        """The corners of the box around it."""
+        return BoxGeometry(2 * self.radii).list_corners()
+
+    def contains(self, points: Array) -> Flags:
+        """Within the unit ball, in units of the radii."""
+        return np.asarray(np.linalg.norm(points / self.radii, axis=1) <= 1)
+
+
+@dataclass(frozen=True, eq=False)
 class BallGeometry(Geometry):
     """A ball about the origin."""
 
