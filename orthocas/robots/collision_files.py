@@ -54,6 +54,10 @@ class CollisionSource:
     srdf: Path | None = None  #: None: one beside the URDF file or in ../srdf, with its stem or the robot's name
     locked: Mapping[str, float] = field(default_factory=dict)  #: joints that were locked, with their positions
 
+    def read(self, tree: KinematicTree) -> Collisions:
+        """The solids on the links of a robot; see `read_collisions`."""
+        return read_collisions(tree, self)
+
 
 def read_collisions(tree: KinematicTree, source: CollisionSource) -> Collisions:
     """The solids of a robot's links and the pairs to check.

@@ -25,6 +25,7 @@ class Geometry(Protocol):
     """What a solid is made of, in its own frame."""
 
     reported_first: bool = False  #: whether coal has it first in its answers, whatever is asked
+    knows_clouds: bool = True  #: whether coal has distances of it from point clouds
 
     def build(self) -> Any:
         """The geometry of coal."""
@@ -89,6 +90,7 @@ class EllipsoidGeometry(Geometry):
     """An ellipsoid with its middle at the origin, and its axes along those of the frame."""
 
     radii: Array  #: (3,) [m]
+    knows_clouds = False
 
     def build(self) -> Any:
         """The ellipsoid."""
