@@ -103,7 +103,7 @@ def evaluate(
     if json:
         print_json({**report.as_dict(), **build_reach_data(loaded)})
     else:
-        print_rows({**format_report_rows(report), **format_reach_rows(loaded)})
+        print_rows({**format_report_rows(report, loaded), **format_reach_rows(loaded)}, f"orthocas view {chart}")
 
 
 def certify(
@@ -175,7 +175,9 @@ def certify(
     if json:
         print_json({"chart": str(target), **certificate.as_dict()})
     else:
-        print_rows({**certificate.facts(), "chart": str(target)})
+        print_rows(
+            {**certificate.facts(), "chart": str(target)}, f"orthocas codegen {target} --controller pd_plus --out c"
+        )
     if interrupted:
         note("interrupted: the file holds what is proved so far; the same command goes on from it")
         raise typer.Exit(INTERRUPTED)

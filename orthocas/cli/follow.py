@@ -109,7 +109,10 @@ def follow(
     if json:
         print_json(_build_report(motion, seconds, out))
     else:
-        print_rows({**motion.facts(), "computed in": f"{seconds:.2f} s", "file": str(out)})
+        print_rows(
+            {**motion.facts(), "computed in": f"{seconds:.2f} s", "file": str(out)},
+            f"orthocas view {out} --chart {chart}",
+        )
 
 
 def _read_task(path: Path, chart: Chart, xi: str | None) -> tuple[Array, Any]:

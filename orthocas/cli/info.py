@@ -19,7 +19,7 @@ from orthocas.cli.options import (
     is_robot_file,
     read_solids,
 )
-from orthocas.cli.output import build_reach_data, print_json, print_rows
+from orthocas.cli.output import build_reach_data, print_json, print_rows, print_table
 from orthocas.errors import OptionError, RobotError, SingularTaskError
 from orthocas.exact.involutivity import involutivity
 from orthocas.robots.collisions import Collisions
@@ -84,7 +84,13 @@ def info(
     if json:
         print_json(data)
     else:
-        print_rows({name: _format(value, name) for name, value in data.items()})
+        then = f"orthocas {'view' if 'parametrisation' in data else 'fit'} {target}"
+        # Branches are a table of their own.
+        tables = ("branches", "clearance_at_most", "postures") if branches else ()
+        rows = {name: _format(value, name) for name, value in data.items() if name not in tables}
+        print_rows(rows, "" if branches else then)
+        if branches:
+            print_table(_tabulate_branches(data), f"{then} --task pose --domain branch")
 
 
 def _load_chart(target: str) -> "Chart":
@@ -162,6 +168,22 @@ def _describe_collisions(collisions: Collisions | None, draw: Callable[[int, int
     }
 
 
+def _tabulate_branches(data: dict[str, Any]) -> list[tuple[str, ...]]:
+    """The branches as a table: name, share, the clearance that a wide chart needs if it is lower, and a posture."""
+    lower = data.get("clearance_at_most", {})
+    head = ("branch", "share", *(("clearance at most",) if lower else ()), "a posture")
+    rows = [
+        (
+            name,
+            percent(share),
+            *((_format(lower.get(name, "default")),) if lower else ()),
+            ", ".join(f"{value:.2f}" for value in data["postures"][name]),
+        )
+        for name, share in data["branches"].items()
+    ]
+    return [head, *rows]
+
+
 def _describe_problem(problem: Problem) -> dict[str, Any]:
     checked = check(problem)
     return {
@@ -200,7 +222,7 @@ def _describe_involutivity(problem: Problem) -> dict[str, Any]:
 
 def _format(value: Any, name: str = "") -> str:
     if isinstance(value, list):
-        return ", ".join(_format(item) for item in value) or "none"
+        return ("; " if name == "cuts" else ", ").join(_format(item) for item in value) or "none"
     if isinstance(value, dict):
         return ", ".join(f"{key} {_format(item, name if name in _SHARES else key)}" for key, item in value.items())
     if value is None:

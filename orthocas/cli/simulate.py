@@ -137,7 +137,7 @@ def simulate(
     if json:
         print_json(report)
     else:
-        print_rows(format_report(report, loaded.problem) | {"files": str(out)})
+        print_rows(format_report(report, loaded.problem) | {"files": str(out)}, f"orthocas view {out} --chart {chart}")
     _print_notes(law, report, interrupted)
     if solids is not None:
         note(_find_contact(solids, run))

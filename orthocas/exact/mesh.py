@@ -121,7 +121,7 @@ def require_disk(mesh: TriangleMesh) -> Indices:
         NotADiskError: if the mesh is not a disk; the message says what it is.
 
     Source:
-        Ours: docs/explanation/derivations_exact.md#disk-chart.
+        Ours: docs/explanation/derivations_disk.md.
     """
     kind = (mesh.components, mesh.boundary_loops, mesh.euler_characteristic)
     if kind != (1, 1, 1) or mesh.clashing_edges:
@@ -252,7 +252,7 @@ def flip_to_delaunay(vertices: Array, faces: Indices) -> Indices:
         New faces (F, 3) with the same vertices, boundary and topology.
 
     Source:
-        Ours, after [BS2007]: docs/explanation/derivations_exact.md#disk-chart.
+        Ours, after [BS2007]: docs/explanation/derivations_disk.md.
     """
     faces = faces.copy()
     for _ in range(RULES.rounds):

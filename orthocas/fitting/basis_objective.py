@@ -346,7 +346,7 @@ class BoundedMutual:
         bound: upper bound on the root mean square mutual cosine, > 0.
 
     Source:
-        ours, docs/explanation/derivations_fits.md#constrained-form.
+        ours, docs/explanation/derivations_meaning.md#constrained-form.
     """
 
     def __init__(self, objective: BasisObjective, bound: float) -> None:

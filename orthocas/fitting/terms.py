@@ -144,7 +144,7 @@ class LengthTerm:
     Angles do not fix how fast a coordinate grows along itself: xi^7 is as orthogonal as xi, but flat at 0.
 
     Source:
-        ours, docs/explanation/derivations_fits.md#lengths.
+        ours, docs/explanation/derivations_meaning.md#lengths.
     """
 
     name: str = "length"

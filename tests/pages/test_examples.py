@@ -7,6 +7,7 @@ import batches
 import beyond_reach
 import c_timing
 import casadi as ca
+import casadi_dynamics
 import certificates
 import clear_positions
 import collisions
@@ -283,6 +284,16 @@ def test_benchmarks_of_networks_and_starts_print_rows(capsys: pytest.CaptureFixt
     assert "| q | 300 | 1000, 30 |" in paper_network.row((1000.0, 30.0), raw=True, quick=True)
     starts.main(quick=True)
     assert "| polynomial:2 | gauss_newton |" in capsys.readouterr().out
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+@needs_c
+def test_benchmark_of_casadi_dynamics_times_every_function() -> None:
+    """The fastest of few rounds: a forward dynamics takes longer than the mass matrix in it."""
+    found = casadi_dynamics.main(quick=True)
+    assert len(found) == len(casadi_dynamics.FUNCTIONS)
+    assert 0 < found["iiwa, 7 joints, mass matrix"] < found["iiwa, 7 joints, forward dynamics"]
 
 
 @pytest.mark.nightly
