@@ -207,16 +207,27 @@ class Chart(InverseMethods, Shown):
 
         return self_motion_figure(self, reach=None)
 
-    def save(self, path: str | Path, force: bool = False) -> None:
+    def save(self, path: str | Path, force: bool = False, collisions: Collisions | None = None) -> None:
         """Write a self-contained chart file. It replaces a chart file of that name, and with `force` any other file.
 
+        Args:
+            path: the file.
+            force: replace a file that is no chart.
+            collisions: of the chart's robot, such as `robot.collisions`: the file holds its solids and pairs, which
+                `chart.robot.collisions` of the loaded chart has, with corners of hulls in single precision.
+
         Raises:
+            InvalidValueError: if collisions are another robot's.
             ChartFileError: if the folder is missing or cannot be written, if there is a file that is no chart, or a
                 symbolic link.
         """
         from orthocas.charts.chart_file import write_chart  # all that files may hold, which a fit does not need
 
-        write_chart(as_path("path", path), self.problem, self.coordinates, self.notes, self.certificate, force)
+        if collisions is not None:
+            require_kind("collisions", collisions, Collisions)
+            collisions.require_for(self.problem.robot.tree)
+        target = as_path("path", path)
+        write_chart(target, self.problem, self.coordinates, self.notes, self.certificate, force, collisions)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -19,6 +19,8 @@ from orthocas.charts.regular_part import RegularPart
 from orthocas.errors import CertifyError, ChartFileError, InvalidValueError, OrthocasError
 from orthocas.exact.flow import GrownCoordinates
 from orthocas.exact.leaves import read_leaf
+from orthocas.robots.collision_data import KnownSolids, collisions_from_data, collisions_to_data
+from orthocas.robots.collisions import Collisions
 from orthocas.tasks.problem import FOREIGN, Problem, read_problem, write_problem
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.archive import Kind, Stored, read_archive, write_archive, write_npy
@@ -114,8 +116,11 @@ def write_chart(
     notes: Notes,
     certificate: Certificate | None = None,
     force: bool = False,
+    collisions: Collisions | None = None,
 ) -> None:
-    """Write a chart. `orthocas.tools.archive` describes the container.
+    """Write a chart, with a collision model, or the one that the file had from which its robot came.
+
+    `orthocas.tools.archive` describes the container.
 
     Raises:
         ChartFileError: if the file cannot be written, or would replace something other than a chart without `force`.
@@ -125,6 +130,11 @@ def write_chart(
     if certificate is not None:
         data, proof = certificate_to_data(certificate)
         header["certificate"], arrays = {**data, "notes": _digest_of(header["notes"])}, {**arrays, **proof}
+    if collisions is None and isinstance(problem.robot.solids, KnownSolids):
+        collisions = problem.robot.collisions
+    if collisions is not None:
+        header["collisions"], solids = collisions_to_data(collisions)
+        arrays = {**arrays, **solids}
     write_archive(path, CHART, header, arrays, force)
 
 
@@ -157,6 +167,9 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes, Certifi
         if coordinates.r != problem.r:
             raise ChartFileError(f"{path} has {coordinates.r} coordinates, expected r = {problem.r}")
         _require_finite(problem, coordinates)
+        if "collisions" in header:
+            solids = collisions_from_data(problem.robot.tree, get_part(header, "collisions", dict), arrays)
+            problem.robot.solids = KnownSolids(solids)
         certificate = _certificate(problem, coordinates, header, arrays)
         return problem, coordinates, _checked_notes(get_part(header, "notes", dict)), certificate
     except ChartFileError:

@@ -10,10 +10,21 @@ import typer
 from orthocas import problems
 from orthocas.charts.chart import Chart
 from orthocas.charts.ready import load
-from orthocas.cli.options import AsJson, Force, ProblemOptions, add_problem_options, is_robot_file, parse_whole_number
+from orthocas.cli.options import (
+    AsJson,
+    DisabledPairs,
+    Force,
+    ProblemOptions,
+    Solids,
+    add_problem_options,
+    is_robot_file,
+    parse_whole_number,
+    read_solids,
+)
 from orthocas.cli.output import note, print_json, print_rows
 from orthocas.errors import OptionError
 from orthocas.paths.tool_path import read_path
+from orthocas.robots.collisions import Collisions
 from orthocas.robots.robot import Robot
 from orthocas.tools.interrupts import deferred
 from orthocas.viewer import view as open_view
@@ -59,6 +70,8 @@ def view(
         Path | None,
         typer.Option("--export", metavar="PAGE.html", help="Write a page that moves by itself and works offline."),
     ] = None,
+    collisions: Solids = None,
+    srdf: DisabledPairs = None,
     host: Annotated[str, typer.Option("--host", help="Address to listen at; 0.0.0.0: open to the network.")] = LOCAL,
     port: Annotated[int, typer.Option("--port", parser=parse_whole_number, help="0: any free one.")] = PORT,
     browse: Annotated[bool, typer.Option("--open", help="Open the page in the browser.")] = False,
@@ -82,6 +95,7 @@ def view(
         points = None if path is None else read_path(path, scene.shown)[0]
         scene = _Scene(cyclic_motions(scene.shown, points), scene.shown, scene.meshes, scene.locked)
     arm, meshes, locks = scene.robot, scene.meshes, scene.locked
+    solids = _read_collisions(scene, collisions, srdf, export)
     if export is not None:
         shape = export_page(scene.shown, export, robot=arm, robot_file=meshes, locked=locks, force=force)
         _note_missing(shape.missing)
@@ -91,7 +105,8 @@ def view(
         else:
             print_rows({"page": str(export), "size": f"{size / 2**20:.1f} MiB, with all it needs: it works offline"})
         return
-    with open_view(scene.shown, robot=arm, robot_file=meshes, locked=locks, host=host, port=port) as page:
+    opened = open_view(scene.shown, robot=arm, robot_file=meshes, locked=locks, collisions=solids, host=host, port=port)
+    with opened as page:
         _note_missing(page.missing)
         local = is_local(host)
         who = "this machine only (--host opens it to others)" if local else "all who reach it and know this address"
@@ -125,6 +140,15 @@ def _read_scene(target: str, chart: Path | None, meshes: Path | None, words: Pro
     if chart is not None:
         raise OptionError(f"{target} is a chart: leave out --chart")
     return _Scene(load(place), None, meshes, locked)
+
+
+def _read_collisions(scene: _Scene, urdf: str | None, srdf: Path | None, export: Path | None) -> Collisions | None:
+    """The collision model that the page of a chart shows."""
+    if isinstance(scene.shown, Chart) and export is None:
+        return read_solids(scene.shown.robot, urdf, srdf)
+    if urdf is not None or srdf is not None:
+        raise OptionError("--collisions is for live pages of charts: leave it out")
+    return None
 
 
 def _note_missing(missing: tuple[str, ...]) -> None:

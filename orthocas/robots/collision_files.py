@@ -1,23 +1,28 @@
-"""Collisions from robot files: the <collision> elements of a URDF file, and pairs from an SRDF file or found."""
+"""Collisions from robot files: <collision> elements of URDF files with pairs of SRDF files or found, and MJCF geoms."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+import pinocchio as pin
 
 from orthocas.errors import RobotError
 from orthocas.robots.collisions import Collisions, Pair, Part
-from orthocas.robots.link_shapes import load_mesh, place_links, read_numbers, read_pose
+from orthocas.robots.link_shapes import MJCF, LinkPlace, load_mesh, place_links, read_numbers, read_pose
+from orthocas.robots.mjcf import build_pose, compile_mjcf, name_body
 from orthocas.robots.shapes import (
     BallGeometry,
     BoxGeometry,
     CapsuleGeometry,
     CylinderGeometry,
+    EllipsoidGeometry,
     Geometry,
+    HalfSpaceGeometry,
     HullGeometry,
     Shape,
 )
@@ -45,9 +50,13 @@ RULES = PairRules()
 class CollisionSource:
     """Where the solids of a robot are described."""
 
-    urdf: Path
+    urdf: Path  #: or an MJCF file, whose name ends in .xml
     srdf: Path | None = None  #: None: one beside the URDF file or in ../srdf, with its stem or the robot's name
     locked: Mapping[str, float] = field(default_factory=dict)  #: joints that were locked, with their positions
+
+    def read(self, tree: KinematicTree) -> Collisions:
+        """The solids on the links of a robot; see `read_collisions`."""
+        return read_collisions(tree, self)
 
 
 def read_collisions(tree: KinematicTree, source: CollisionSource) -> Collisions:
@@ -58,6 +67,9 @@ def read_collisions(tree: KinematicTree, source: CollisionSource) -> Collisions:
     neighbours, links that touch in the middle of the limits or in 95 % of 1,000 seeded postures, and links that never
     come nearer than 0.02 m in 10,000 postures.
 
+    Of an MJCF file, geoms that can collide are the solids, named by their bodies, and pairs are those that MuJoCo's own
+    rules let collide: by contype and conaffinity, without parents and their children, and without what is excluded.
+
     Args:
         tree: the robot.
         source: the files.
@@ -65,6 +77,8 @@ def read_collisions(tree: KinematicTree, source: CollisionSource) -> Collisions:
     Raises:
         RobotError: if a file cannot be read, no link has a shape, or the joints are not those of the robot.
     """
+    if source.urdf.suffix.lower() == MJCF:
+        return _read_geoms(tree, source)
     root = read_xml(source.urdf, "URDF", "robot")
     links = [link for link in root.findall("link") if link.find("collision") is not None]
     places = place_links(source.urdf, tree, [link.get("name", "") for link in links], source.locked)
@@ -93,6 +107,84 @@ def read_collisions(tree: KinematicTree, source: CollisionSource) -> Collisions:
     apart = [pair for pair in pairs if frozenset(pair) not in _find_neighbours(root, set(bodies))]
     found = find_pairs(Collisions(tree, parts, apart))
     return Collisions(tree, parts, found, tuple(missing), f"found in {RULES.postures:,} postures")
+
+
+def _read_geoms(tree: KinematicTree, source: CollisionSource) -> Collisions:
+    """The same for an MJCF file."""
+    if source.srdf is not None:
+        raise RobotError(f"{source.srdf} is given with {source.urdf}, expected a URDF file with it: MJCF has own pairs")
+    compiled = compile_mjcf(source.urdf)
+    solid = [i for i in range(compiled.ngeom) if compiled.geom_contype[i] or compiled.geom_conaffinity[i]]
+    bodies = sorted({int(compiled.geom_bodyid[i]) for i in solid})
+    moved = [name_body(compiled, i) for i in bodies if i]
+    places = dict(zip(moved, place_links(source.urdf, tree, moved, source.locked), strict=True))
+    parts: list[Part] = []
+    names: dict[int, str] = {}
+    missing: dict[str, None] = {}
+    for i in solid:
+        body = int(compiled.geom_bodyid[i])
+        name = name_body(compiled, body)
+        # Solids of the world have names of their own.
+        names[i] = name if body else str(compiled.geom(i).name or name)
+        place = places[name] if body else LinkPlace(-1, pin.SE3.Identity())
+        geometry = _build_geom(compiled, i)
+        if geometry is None or (place.body >= 0 and isinstance(geometry, HalfSpaceGeometry)):
+            missing[names[i]] = None
+            continue
+        pose = place.pose * build_pose(compiled.geom_pos[i], compiled.geom_quat[i])
+        parts.append(Part(names[i], place.body, Shape(geometry, pose.rotation, pose.translation)))
+    if not parts:
+        raise RobotError(f"{source.urdf} has no geom that can collide, expected solids of the links")
+    known = {part.name: part.body for part in parts}
+    pairs: dict[tuple[str, str], None] = {}
+    for i, k in combinations(solid, 2):
+        first, second = names[i], names[k]
+        both = first in known and second in known and known.get(first) != known.get(second)
+        if both and (second, first) not in pairs and _can_collide(compiled, i, k):
+            pairs[first, second] = None
+    # A half-space comes second.
+    planes = {part.name for part in parts if not part.shape.bounded}
+    ordered = [(b, a) if a in planes else (a, b) for a, b in pairs if not {a, b} <= planes]
+    return Collisions(tree, parts, ordered, tuple(missing), f"from {source.urdf.name}")
+
+
+def _can_collide(compiled: Any, i: int, k: int) -> bool:
+    """Whether MuJoCo looks for contacts of two geoms."""
+    first, second = (int(compiled.geom_bodyid[j]) for j in (i, k))
+    low, high = sorted((first, second))
+    if (low << 16) + high in compiled.exclude_signature.tolist():
+        return False
+    # Bodies without joints between them count as one.
+    a, b = (int(compiled.body_weldid[j]) for j in (first, second))
+    parents = [int(compiled.body_weldid[compiled.body_parentid[j]]) for j in (a, b)]
+    if a == b or (a and b and (parents[0] == b or parents[1] == a)):
+        return False
+    contype, conaffinity = compiled.geom_contype, compiled.geom_conaffinity
+    return bool(contype[i] & conaffinity[k] or contype[k] & conaffinity[i])
+
+
+def _build_geom(compiled: Any, i: int) -> Geometry | None:
+    """The solid of a geom; None for height fields and meshes without a volume."""
+    size, kind = np.array(compiled.geom_size[i], dtype=float), int(compiled.geom_type[i])
+    if kind == _MESH:
+        mesh = int(compiled.geom_dataid[i])
+        first, count = int(compiled.mesh_vertadr[mesh]), int(compiled.mesh_vertnum[mesh])
+        with suppress(ValueError):
+            return HullGeometry.around(np.array(compiled.mesh_vert[first : first + count], dtype=float))
+        return None
+    return _GEOMS[kind](size) if kind in _GEOMS else None
+
+
+_MESH = 7  #: of MuJoCo's mjtGeom
+#: by mjtGeom, from their sizes (3,)
+_GEOMS: Mapping[int, Callable[[Array], Geometry]] = {
+    0: lambda _: HalfSpaceGeometry(),
+    2: lambda size: BallGeometry(float(size[0])),
+    3: lambda size: CapsuleGeometry(float(size[0]), float(2 * size[1])),
+    4: EllipsoidGeometry,
+    5: lambda size: CylinderGeometry(float(size[0]), float(2 * size[1])),
+    6: lambda size: BoxGeometry(2 * size),
+}
 
 
 def read_disabled_pairs(path: Path) -> set[frozenset[str]]:

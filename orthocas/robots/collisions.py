@@ -152,6 +152,11 @@ class Collisions(Shown):
         self.missing = tuple(missing)  #: names of links with a mesh that cannot be found or read
         self.origin = require_text("origin", origin)
         self.pairs = _check_pairs("pairs", pairs, [part.name for part in parts])  #: checked pairs, by names
+        shut = {part.name for part in parts if not part.shape.geometry.knows_clouds}
+        clouds = {part.name for part in parts if part.shape.geometry.reported_first}
+        for pair in self.pairs if shut and clouds else ():
+            if set(pair) & shut and set(pair) & clouds:
+                raise InvalidValueError("pairs", _name_pair(pair), "no ellipsoid with a point cloud: see `allowed`")
 
     def facts(self) -> dict[str, str]:
         """Links, pairs, and what is unchecked."""

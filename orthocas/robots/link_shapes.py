@@ -14,6 +14,7 @@ import pinocchio as pin
 
 from orthocas.errors import RobotError
 from orthocas.robots.kinematics import TOOL_SUFFIX
+from orthocas.robots.mjcf import read_mjcf
 from orthocas.robots.pinocchio_model import find_axis, find_frame, lock_joints, lock_others
 from orthocas.robots.spatial import rotate_z_to
 from orthocas.robots.tree import BASE_JOINTS, KinematicTree
@@ -21,6 +22,7 @@ from orthocas.robots.urdf import read_urdf
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.display import listed
 
+MJCF = ".xml"  #: how names of MJCF files end
 SAME_PLACE = 1e-6  #: between the joints of two files of one robot [m]
 
 
@@ -35,14 +37,14 @@ class LinkPlace:
 def place_links(
     path: Path, tree: KinematicTree, names: list[str], locked: Mapping[str, float] | None = None
 ) -> list[LinkPlace]:
-    """The places of links of a URDF file on a robot that was built from it.
+    """The places of links of a URDF file, or of bodies of an MJCF file, on a robot that was built from it.
 
     Joints that the robot does not have are locked as in `Robot.from_urdf`.
 
     Args:
-        path: the URDF file.
+        path: the file, of MJCF if its name ends in .xml.
         tree: the robot.
-        names: of the links.
+        names: of the links or bodies.
         locked: joints that were locked when the robot was built, with their positions [rad] or [m].
 
     Raises:
@@ -50,7 +52,8 @@ def place_links(
     """
     # Joints, not tips: the tip may be that of a tool, which the file does not have.
     tips = [name.removesuffix(TOOL_SUFFIX) for name in (tree.tip_name, *tree.tips)]
-    model = lock_joints(read_urdf(path, tips, locked), locked or {})
+    whole = read_mjcf(path) if path.suffix.lower() == MJCF else read_urdf(path, tips, locked)
+    model = lock_joints(whole, locked or {})
     if lost := [name for name in tree.joint_names if name not in (*model.names, *BASE_JOINTS)]:
         raise RobotError(f"{path} has the joints {listed(list(model.names)[1:])}, expected {listed(lost)} among them")
     model = lock_others(model, [i for i in range(1, model.njoints) if model.names[i] in tree.joint_names])

@@ -41,17 +41,22 @@ def read_mjcf(source: Any) -> pin.Model:
     mujoco = import_extra("mujoco", "reading MJCF files", "mujoco")
     if isinstance(source, mujoco.MjModel):
         return _convert(mujoco, source, "the model")
-    source = as_path("path", source)
+    return _convert(mujoco, compile_mjcf(source), str(as_path("path", source)))
+
+
+def compile_mjcf(path: Any) -> Any:
+    """The `mujoco.MjModel` of a file; errors as in `read_mjcf`."""
+    mujoco = import_extra("mujoco", "reading MJCF files", "mujoco")
+    source = as_path("path", path)
     # The bounds of size and depth, and no document types, protect MuJoCo's parser.
     root = read_xml(source, "MJCF", "mujoco")
     if sum(1 for _ in root.iter("body")) > RULES.links:
         raise RobotError(f"{source} has more than {RULES.links} bodies")
     _check_numbers(root, source)
     try:
-        compiled = mujoco.MjModel.from_xml_path(str(source))
+        return mujoco.MjModel.from_xml_path(str(source))
     except ValueError as error:
         raise RobotError(f"MuJoCo refuses {source}: {one_line(str(error))}") from None
-    return _convert(mujoco, compiled, str(source))
 
 
 def _check_numbers(root: Element, source: str | Path) -> None:
@@ -74,7 +79,7 @@ def _convert(mujoco: Any, compiled: Any, name: str) -> pin.Model:
     for i in range(compiled.nsite):
         if compiled.site(i).name:
             joint, placement = carriers[compiled.site_bodyid[i]]
-            there = placement * _build_pose(compiled.site_pos[i], compiled.site_quat[i])
+            there = placement * build_pose(compiled.site_pos[i], compiled.site_quat[i])
             model.addFrame(pin.Frame(compiled.site(i).name, joint, there, pin.FrameType.OP_FRAME))
     for i in range(compiled.nkey):
         if compiled.key(i).name:
@@ -118,10 +123,10 @@ def _refuse_unread(compiled: Any, name: str) -> None:
 
 def _add_body(mujoco: Any, model: pin.Model, compiled: Any, i: int, joint: int, placement: pin.SE3) -> Any:
     """Add a body to the joint that moves its parent. Returns the joint that moves it, and its pose in that frame."""
-    placement = placement * _build_pose(compiled.body_pos[i], compiled.body_quat[i])
+    placement = placement * build_pose(compiled.body_pos[i], compiled.body_quat[i])
     for k in range(compiled.body_jntadr[i], compiled.body_jntadr[i] + compiled.body_jntnum[i]):
         joint, placement = _add_joint(mujoco, model, compiled, k, joint, placement)
-    model.addFrame(pin.Frame(compiled.body(i).name or f"body{i}", joint, placement, pin.FrameType.BODY))
+    model.addFrame(pin.Frame(name_body(compiled, i), joint, placement, pin.FrameType.BODY))
     # Bodies fixed to the world load no joint.
     if joint:
         turn = pin.Quaternion(*compiled.body_iquat[i]).matrix()
@@ -130,6 +135,11 @@ def _add_body(mujoco: Any, model: pin.Model, compiled: Any, i: int, joint: int, 
             joint, pin.Inertia(compiled.body_mass[i], compiled.body_ipos[i].copy(), inertia), placement
         )
     return joint, placement
+
+
+def name_body(compiled: Any, i: int) -> str:
+    """The name of body i."""
+    return str(compiled.body(i).name or f"body{i}")
 
 
 def _add_joint(mujoco: Any, model: pin.Model, compiled: Any, k: int, parent: int, placement: pin.SE3) -> Any:
@@ -191,6 +201,6 @@ def _reach(ends: Array) -> float:
     return float(min(-lower, upper)) if lower < 0 < upper else np.inf
 
 
-def _build_pose(position: Array, quaternion: Array) -> pin.SE3:
+def build_pose(position: Array, quaternion: Array) -> pin.SE3:
     """A pose; MuJoCo's quaternions begin with their real part, as the arguments of Pinocchio's do."""
     return pin.SE3(pin.Quaternion(*quaternion).normalized().matrix(), position.copy())

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, RobotError, ShapeError
 from orthocas.robots import dynamics, kinematics
-from orthocas.robots.collision_files import CollisionSource, read_collisions
+from orthocas.robots.collision_data import KnownSolids
+from orthocas.robots.collision_files import CollisionSource
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.dynamics import PAYLOAD, add_payload
 from orthocas.robots.kinematics import add_tool
@@ -77,7 +78,7 @@ class Robot(Shown):
         self,
         tree: KinematicTree,
         homes: Mapping[str, ArrayLike] | None = None,
-        solids: CollisionSource | None = None,
+        solids: CollisionSource | KnownSolids | None = None,
     ) -> None:
         require_kind("tree", tree, KinematicTree)
         homes = {} if homes is None else homes
@@ -85,7 +86,7 @@ class Robot(Shown):
         self.tree = tree
         #: named postures (n,) of the robot's files: SRDF group states, MJCF keyframes. Chart files do not store them.
         self.homes = {name: freeze_array(f"home '{name}'", q, (tree.n,)) for name, q in homes.items()}
-        #: the files that `collisions` reads; None if there are none. Chart files do not store them.
+        #: the files that `collisions` reads, or solids of a chart file; None if there are none
         self.solids = solids
 
     @classmethod
@@ -185,7 +186,11 @@ class Robot(Shown):
 
         Needs the extra `orthocas[mujoco]`, because MuJoCo's compiler reads the file.
         """
-        return cls._from_chain(read_mjcf(path), _check_tips(tip, tips), locked, tool, base, gravity)
+        robot = cls._from_chain(read_mjcf(path), _check_tips(tip, tips), locked, tool, base, gravity)
+        if not isinstance(path, str | PathLike):
+            return robot
+        source = CollisionSource(as_path("path", path).absolute(), None, dict(locked or {}))
+        return cls(robot.tree, robot.homes, source)
 
     @classmethod
     def _from_chain(
@@ -303,7 +308,7 @@ class Robot(Shown):
         """The same robot with the solids of another file, such as a robot of a chart file, for `collisions`.
 
         Args:
-            urdf: the robot's URDF file.
+            urdf: the robot's URDF file, or its MJCF file, whose name ends in .xml.
             srdf: an SRDF file whose disabled pairs are not checked. Default: the one with the same stem, beside the
                 URDF file or in ../srdf.
         """
@@ -313,15 +318,15 @@ class Robot(Shown):
 
     @cached_property
     def collisions(self) -> Collisions:
-        """Distances between the links, from the <collision> elements of the robot's URDF file.
+        """Distances between the links, from <collision> elements of a URDF file, MJCF geoms, or a chart file.
 
         Raises:
-            RobotError: if the robot comes from no URDF file, the file or all its solids are missing.
+            RobotError: if the robot comes from no file, the file or all its solids are missing.
         """
         if self.solids is None:
-            hint = "robot.with_solids(urdf) names the URDF file"
-            raise RobotError(f"nothing is known of the links' solids, expected a robot of a URDF file: {hint}")
-        return read_collisions(self.tree, self.solids)
+            hint = "robot.with_solids(urdf) names its file"
+            raise RobotError(f"nothing is known of the links' solids, expected a robot of a URDF or MJCF file: {hint}")
+        return self.solids.read(self.tree)
 
     def home(self, name: str) -> Array:
         """A named posture (n,) of the robot's files.

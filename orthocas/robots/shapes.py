@@ -25,6 +25,7 @@ class Geometry(Protocol):
     """What a solid is made of, in its own frame."""
 
     reported_first: bool = False  #: whether coal has it first in its answers, whatever is asked
+    knows_clouds: bool = True  #: whether coal has distances of it from point clouds
 
     def build(self) -> Any:
         """The geometry of coal."""
@@ -82,6 +83,26 @@ class CylinderGeometry(Geometry):
         return np.asarray(
             (np.hypot(points[:, 0], points[:, 1]) <= self.radius) & (np.abs(points[:, 2]) <= self.length / 2)
         )
+
+
+@dataclass(frozen=True, eq=False)
+class EllipsoidGeometry(Geometry):
+    """An ellipsoid with its middle at the origin, and its axes along those of the frame."""
+
+    radii: Array  #: (3,) [m]
+    knows_clouds = False
+
+    def build(self) -> Any:
+        """The ellipsoid."""
+        return coal.Ellipsoid(*self.radii)
+
+    def list_corners(self) -> tuple[Array, float]:
+        """The corners of the box around it."""
+        return BoxGeometry(2 * self.radii).list_corners()
+
+    def contains(self, points: Array) -> Flags:
+        """Within the unit ball, in units of the radii."""
+        return np.asarray(np.linalg.norm(points / self.radii, axis=1) <= 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,10 @@ import numpy as np
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.self_motion import Fan, fan_along
+from orthocas.robots.collisions import Collisions
 from orthocas.tasks.branches import branches
 from orthocas.tools.checks import Array
+from orthocas.viewer.contacts import Contacts
 from orthocas.viewer.looks import RULES, Arm, Ghosts, Look, compute_chain_length
 from orthocas.viewer.panel import ChartPanel
 from orthocas.viewer.session import Session
@@ -22,7 +24,7 @@ _NONE = "none"
 class ChartPage:
     """The page of a chart on a viser server."""
 
-    def __init__(self, server: Any, session: Session, look: Look) -> None:
+    def __init__(self, server: Any, session: Session, look: Look, collisions: Collisions | None = None) -> None:
         # State of the page, and the thread that works for it.
         self.session = session
         self._server = server
@@ -34,6 +36,7 @@ class ChartPage:
         robot = session.chart.problem.robot
         self._arm, self._ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
         place_scene(server, robot, self.session.home[None])
+        self._contacts = None if collisions is None else Contacts(server.scene, collisions)
         self._handle = self._add_handle()
         self._readings = place_panels(server)
         self._sliders = self._add_sliders()
@@ -210,7 +213,8 @@ class ChartPage:
         with self._server.atomic():
             self._show_arm(readings.q)
             shown = replace(readings, q=self.session.mirror(readings.q[None])[0])
-            self._readings.content = self._panel.format_html(shown)
+            nearest = "" if self._contacts is None else self._contacts.show(shown.q)
+            self._readings.content = self._panel.format_html(shown, nearest)
             values = np.concatenate([readings.x, readings.xi]).tolist()
             for label, value in zip(self._chart.labels, values, strict=True):
                 slider = self._sliders[label]

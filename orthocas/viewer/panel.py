@@ -107,8 +107,8 @@ class ChartPanel:
         lines += [f"task {task}; {chart.r} coordinate{'s' if chart.r > 1 else ''}"]
         self._head = f'<div class="name">{escape(name_robot(robot))}</div><div class="about">{"<br>".join(lines)}</div>'
 
-    def format_html(self, readings: Readings) -> str:
-        """The page."""
+    def format_html(self, readings: Readings, nearest: str = "") -> str:
+        """The page; `nearest` is a part about collisions."""
         m = len(readings.x)
         # What stopped the last motion, and the leak of each coordinate.
         stop = f'<div class="stop">stopped by {escape(readings.stop)}</div>' if readings.stop else ""
@@ -136,7 +136,7 @@ class ChartPanel:
         parts = [
             STYLE, '<div class="oc">', self._head, f'<div class="held"><span>task moved by</span>{drift}</div>',
             stop, "<h4>leak of the coordinates</h4>", *leaks,
-            "<h4>chart</h4>", conditioning, boundary,
+            "<h4>chart</h4>", conditioning, boundary, nearest,
             "<h4>joints</h4>", self._joints.format_html(readings.q), self._joints.format_copy(readings.q), "</div>",
         ]  # fmt: skip
         return "".join(parts)

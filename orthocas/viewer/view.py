@@ -12,9 +12,10 @@ from typing import Any, Self
 from orthocas.charts.chart import Chart, GrownChart
 from orthocas.errors import ArchiveError, InvalidValueError, NoExpressionError
 from orthocas.paths.joint_motion import JointMotion
+from orthocas.robots.collisions import Collisions
 from orthocas.robots.robot import Robot
 from orthocas.simulation.trajectory import Trajectory
-from orthocas.tools.checks import as_path, suggest_attribute
+from orthocas.tools.checks import as_path, require_kind, suggest_attribute
 from orthocas.tools.files import publish, require_replaceable, require_writable
 from orthocas.viewer.chart_page import ChartPage
 from orthocas.viewer.looks import Look, build_stick_arm, decimate, read_urdf_look
@@ -77,6 +78,7 @@ def view(
     robot: Robot | Chart | None = None,
     robot_file: str | Path | None = None,
     locked: Mapping[str, float] | None = None,
+    collisions: Collisions | None = None,
     host: str = LOCAL,
     port: int = PORT,
 ) -> View:
@@ -88,6 +90,8 @@ def view(
         robot: for motions: whose they are, or a chart of that robot.
         robot_file: URDF file of the robot with its meshes. Default: drums and rods, made from the kinematic tree.
         locked: joints that were locked when the robot was built from that file, with their positions [rad] or [m].
+        collisions: for charts, such as `robot.collisions`: the page shows the nearest pair, in red where it is close,
+            and the objects of its scene.
         host: address to listen at. By default only this machine can open the page. The page's address holds a random
             token, which stands for a password.
         port: of the page; 0 takes any free one.
@@ -100,9 +104,15 @@ def view(
         ViewError: if the port is taken, or the host is no address of this machine.
         NoExpressionError: for grown charts.
         RobotError: if the robot file is another robot's.
+        InvalidValueError: if collisions are another robot's, or given without a chart.
     """
     # What is shown decides which page it gets.
     arm, motions = read_subject(shown, robot)
+    if collisions is not None:
+        require_kind("collisions", collisions, Collisions)
+        collisions.require_for(arm.tree)
+        if not isinstance(shown, Chart):
+            raise InvalidValueError("collisions", f"given with a {type(shown).__name__}", "a chart with it")
     shape = build_shape(arm, robot_file, locked)
     server, url = open_window(host, port, name_robot(arm))
     try:
@@ -110,7 +120,7 @@ def view(
         if motions:
             page = PlayerPage(server, arm, shape.look, motions)
         elif isinstance(shown, Chart):
-            page = ChartPage(server, Session(shown), shape.look)
+            page = ChartPage(server, Session(shown), shape.look, collisions)
         else:
             page = RobotPage(server, arm, shape.look)
     except BaseException:

@@ -175,12 +175,12 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
     "view": (
         (*_FILES, "q.csv"),
         {"--export": "page.html"},
-        ("--chart", "--path", "--robot", "--host", "--port", "--tip", "--lock"),
+        ("--chart", "--path", "--robot", "--host", "--port", "--tip", "--lock", *_SOLIDS),
     ),
     "codegen": (
         _FILES,
         {"--controller": "pd_plus", "--out": "out"},
-        (*_LAW_OPTIONS, "--name", "--model", "--gravity-compensation", "--inputs"),
+        (*_LAW_OPTIONS, "--name", "--model", "--gravity-compensation", "--inputs", *_SOLIDS),
     ),
 }
 

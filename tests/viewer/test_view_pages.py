@@ -12,9 +12,10 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from public_objects import clear, cyclic, fitted, joint_motion, trajectory
+from solid_arms import build_arm
 
 import orthocas as oc
-from orthocas.errors import ArchiveError, ViewError
+from orthocas.errors import ArchiveError, InvalidValueError, ViewError
 from orthocas.viewer import cyclic_motions, export_page
 
 pytestmark = [
@@ -99,3 +100,24 @@ def test_pages_are_written_whole_and_replace_only_their_own(tmp_path: Path) -> N
     with pytest.raises(ArchiveError, match="orthocas did not write the file"):
         export_page(chart, path)
     assert path.read_text() == "mine"
+
+
+def test_a_page_shows_the_nearest_pair_and_red_ones_where_they_are_close(tmp_path: Path) -> None:
+    link = '<box size="0.3 0.04 0.04"/>'
+    robot = build_arm(tmp_path, ["", link, link, link]).with_tool([1.0, 0.0, 0.0])
+    home = np.array([0.6, 0.8, 0.8])
+    chart = oc.fit(oc.Problem(robot, oc.Task.position(robot, "xy"), "euclidean", oc.Box(home, 0.5)), oc.Linear()).chart
+    place = robot.frame_position(home, "link2") + 0.8 * robot.frame_rotation(home, "link2")[:, 0]
+    for gap, shown, close in ((0.2, "mm", 0), (0.03, "mm", 2), (0.0, "touch", 2)):
+        aside = place + (0.02 + 0.05 + gap - 0.02) * robot.frame_rotation(home, "link2")[:, 1]
+        scene = oc.Scene({"ball": oc.obstacles.Sphere(aside, 0.05), "floor": oc.obstacles.Plane([0, 0, 1], [0, 0, -5])})
+        around = robot.collisions.with_scene(scene)
+        with oc.view(chart, collisions=around, port=0) as view:
+            page = view._page
+            content = page._readings.content
+            assert "nearest pair" in content
+            assert "link2 and ball" in content
+            assert shown in content
+            assert len(page._contacts._nodes) == 1 + close
+    with pytest.raises(InvalidValueError, match="a chart with it"):
+        oc.view(robot, collisions=robot.collisions, port=0)
