@@ -455,6 +455,7 @@ def _methods() -> dict[str, Call]:
             oc.follow,
             {"chart": chart, "tool_path": chart.x([q, q + 0.05]), "xi": "objective", "velocity_limits": 1.0},
         ),
+        "read_joints": (oc.read_joints, {"path": "no.csv", "robot": robot, "topic": "/arm"}),
         "motion.save_csv": (joint_motion().save_csv, {"path": "motion.csv"}),
         "Sphere": (oc.obstacles.Sphere, {"centre": q, "radius": 0.1}),
         "Capsule": (oc.obstacles.Capsule, {"start": q, "end": -q, "radius": 0.1}),
