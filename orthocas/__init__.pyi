@@ -40,6 +40,7 @@ from orthocas.paths.chart_along import chart_along as chart_along
 from orthocas.paths.follow import follow as follow
 from orthocas.paths.recordings import read_joints as read_joints
 from orthocas.robots import obstacles as obstacles
+from orthocas.robots.capsules import fit_capsules as fit_capsules
 from orthocas.robots.robot import Robot as Robot
 from orthocas.robots.scene import Scene as Scene
 from orthocas.simulation.run import simulate as simulate

@@ -16,7 +16,16 @@ from orthocas.charts.certificate import METHODS, Certificate
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.ready import Card, card, load, names
-from orthocas.cli.options import AsJson, ChartPath, Force, parse_number, parse_whole_number
+from orthocas.cli.options import (
+    AsJson,
+    ChartPath,
+    DisabledPairs,
+    Force,
+    Solids,
+    parse_number,
+    parse_whole_number,
+    read_solids,
+)
 from orthocas.cli.output import (
     build_reach_data,
     format_reach_rows,
@@ -83,11 +92,14 @@ def evaluate(
             "--seed", parser=parse_whole_number, help="Seed of the samples; use another one than for the fit."
         ),
     ] = 1,
+    collisions: Solids = None,
+    srdf: DisabledPairs = None,
     json: AsJson = False,
 ) -> None:
     """Measure the quality of a chart on held-out samples of its domain."""
     loaded = load(chart)
-    report = quality.evaluate(loaded, samples, seed)
+    solids = read_solids(loaded.problem.robot, collisions, srdf)
+    report = quality.evaluate(loaded, samples, seed, collisions=solids)
     if json:
         print_json({**report.as_dict(), **build_reach_data(loaded)})
     else:

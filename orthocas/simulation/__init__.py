@@ -3,6 +3,7 @@
 from orthocas.simulation.disturbances import Friction, Noise, Push, Stops
 from orthocas.simulation.mujoco_plant import Elasticity, MuJoCo, MuJoCoPlant, Payload, Wall
 from orthocas.simulation.run import simulate, simulate_many
+from orthocas.simulation.sticking import StickingPlant
 from orthocas.simulation.trajectory import (
     Breakdown,
     Coupling,
@@ -23,6 +24,7 @@ __all__ = [
     "Outcome",
     "Payload",
     "Push",
+    "StickingPlant",
     "Stops",
     "Trajectory",
     "Wall",

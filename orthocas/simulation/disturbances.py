@@ -37,6 +37,7 @@ class SimulationRules:
     most_ticks: float = 1e7  #: of a sampled run
     most_instants: float = 1e6  #: of a run that is read from a file
     shortest: float = 1e-3  #: time between points, and length of a run or a push [s]
+    stribeck_speed: float = 0.05  #: at which a joint that breaks away rubs less [rad/s] or [m/s]
     stiction_speed: float = 0.01  #: above twice this, Coulomb friction is nearly at its full value [rad/s] or [m/s]
     beyond: float = 1e-3  #: a joint limit: stops give way a little [rad] or [m]
     lasting: float = 0.1  #: at the limit, from which on the storage must not rise [s]
@@ -142,25 +143,39 @@ class Push:
 
 @dataclass(frozen=True, eq=False)
 class Friction:
-    """Joint friction tau_f = viscous dq + coulomb tanh(dq / 0.01), which opposes the motion.
+    """Joint friction tau_f = viscous dq + F(dq) sign(dq), which opposes the motion, after Stribeck.
+
+    F(v) = coulomb + (breakaway - coulomb) exp(-(v / stribeck_speed)^2) is the size of the dry friction: a joint breaks
+    away at more than it rubs with. At rest, any torque up to the breakaway torque is held exactly by `StickingPlant`;
+    with CVODES, sign(v) is tanh(v / 0.01), so that joints creep. MuJoCo has no Stribeck friction.
 
     Args:
         viscous: >= 0, (n,) or one number [N m s/rad].
         coulomb: >= 0, (n,) or one number [N m].
+        breakaway: >= coulomb, (n,) or one number [N m]; default coulomb.
+        stribeck_speed: > 0, at which friction falls from the one to the other, (n,) or one number [rad/s] or [m/s].
     """
 
     viscous: ArrayLike = 0.0
     coulomb: ArrayLike = 0.0
+    breakaway: ArrayLike | None = None
+    stribeck_speed: ArrayLike = RULES.stribeck_speed
 
     def numbers(self, n: int) -> Array:
-        """Viscous and Coulomb friction of n joints in one row, (2 n,)."""
-        return np.concatenate([non_negative_gains(name, getattr(self, name), n) for name in ("viscous", "coulomb")])
+        """Viscous and Coulomb friction of n joints, what breaking away takes beyond it, and its speed, (4 n,)."""
+        viscous, coulomb = (non_negative_gains(name, getattr(self, name), n) for name in ("viscous", "coulomb"))
+        breakaway = coulomb if self.breakaway is None else non_negative_gains("breakaway", self.breakaway, n)
+        if (breakaway < coulomb).any():
+            raise InvalidValueError("breakaway", breakaway.tolist(), f"at least coulomb, {coulomb.tolist()}")
+        speed = positive_gains("stribeck_speed", self.stribeck_speed, n)
+        return np.concatenate([viscous, coulomb, breakaway - coulomb, speed])
 
     @staticmethod
     def torque(dq: ca.SX, numbers: ca.SX) -> ca.SX:
-        """Friction torque, to be subtracted from the joint torque, (n, 1), for `numbers` as a column (2 n, 1)."""
-        n = dq.shape[0]
-        friction: ca.SX = numbers[:n] * dq + numbers[n:] * ca.tanh(dq / RULES.stiction_speed)
+        """Friction torque, to be subtracted from the joint torque, (n, 1), for `numbers` as a column (4 n, 1)."""
+        viscous, coulomb, extra, speed = ca.vertsplit(numbers, dq.shape[0])
+        size = coulomb + extra * ca.exp(-((dq / speed) ** 2))
+        friction: ca.SX = viscous * dq + size * ca.tanh(dq / RULES.stiction_speed)
         return friction
 
 

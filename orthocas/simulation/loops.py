@@ -55,7 +55,7 @@ class ClosedLoop:
     @property
     def stiff(self) -> bool:
         """Whether friction or stops make an implicit method necessary."""
-        return self.stops is not None or bool(np.any(np.asarray(self.friction.coulomb)))
+        return self.stops is not None or bool(self.friction.numbers(self.n)[self.n : 3 * self.n].any())
 
     @cached_property
     def plant_rate(self) -> ca.Function:
@@ -80,8 +80,8 @@ class ClosedLoop:
         if self.stops is not None:
             torque += self.stops.torque(self.plant.tree, q, dq)
         if self.rubs:
-            torque -= self.friction.torque(dq, numbers[: 2 * n])
-        inertials = numbers[2 * n :] if self.rubs else numbers
+            torque -= self.friction.torque(dq, numbers[: 4 * n])
+        inertials = numbers[4 * n :] if self.rubs else numbers
         tree = self.plant.tree
         ddq = dynamics.build_forward_dynamics(tree, q, dq, torque, tree.gravity, inertials)
         return ca.Function("plant", [ca.vertcat(q, dq), command, load, numbers], [ca.vertcat(dq, ddq)])
@@ -109,7 +109,7 @@ class ClosedLoop:
     @property
     def rubs(self) -> bool:
         """Whether there is friction."""
-        return bool(self.friction.numbers(self.n).any())
+        return bool(self.friction.numbers(self.n)[: 3 * self.n].any())
 
     def commanded(self, state: ca.MX, reference: Sequence[ca.MX]) -> tuple[ca.MX, ca.MX]:
         """Command and status for a (measured) state and a reference with two derivatives."""

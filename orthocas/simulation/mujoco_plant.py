@@ -372,9 +372,9 @@ class MuJoCoPlant(Shown):
         scene = MuJoCo(robot, stops, effort_limits, payload, wall, timestep, elasticity)
         friction = Friction() if friction is None else friction
         require_kind("friction", friction, Friction)
-        viscous, coulomb = (
-            non_negative_gains(name, getattr(friction, name), robot.n) for name in ("viscous", "coulomb")
-        )
+        viscous, coulomb, extra, _ = np.split(friction.numbers(robot.n), 4)
+        if extra.any():
+            raise InvalidValueError("breakaway", friction.breakaway, "none in MuJoCo; StickingPlant has it")
         self.robot, self.elasticity = robot, elasticity
         #: MuJoCo's model and data, for renderers and for looking; `step` owns them.
         self.model: Any = mujoco_model(robot.tree, scene, viscous, coulomb)

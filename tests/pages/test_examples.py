@@ -10,6 +10,7 @@ import casadi as ca
 import casadi_dynamics
 import certificates
 import clear_positions
+import collisions
 import compare_parametrisations
 import distillation
 import domain_size
@@ -324,6 +325,17 @@ def test_benchmark_beyond_reach_finds_nothing_nearer() -> None:
     assert found["panda-wide, settled"] == 1
     assert found["panda-wide, left"] == 0
     assert found["panda-wide, way [m]"] > 0.05
+
+
+@pytest.mark.slow
+def test_benchmark_of_collisions_agrees_with_coal_and_touches_nothing() -> None:
+    found = collisions.main(quick=True)
+    assert found["panda, differ"] == 0
+    assert found["panda, apart [m]"] < 1e-9
+    assert found["panda, lost"] == 0
+    assert found["panda, ratio"] < 1.6
+    assert found["panda, contacts"] == 0
+    assert found["panda, nearest [m]"] > 0.01 - 1e-6
 
 
 @pytest.mark.slow

@@ -1,0 +1,163 @@
+"""A plant whose joints stick: dry friction with an exact standstill, by time stepping."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import ceil
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.errors import InvalidValueError, SimulationError
+from orthocas.robots.robot import Robot
+from orthocas.simulation.disturbances import Friction
+from orthocas.tools.batch import Batched, dense_function
+from orthocas.tools.checks import Array, as_number, as_point, require_kind
+from orthocas.tools.display import Shown
+
+
+@dataclass(frozen=True, slots=True)
+class StickingRules:
+    """Numbers of the plant that sticks."""
+
+    timestep: float = 2.5e-4  #: longest step of the physics [s]
+    most_steps: int = 100_000  #: in a tick
+    runaway: float = 1e6  #: velocity [rad/s] or [m/s]
+    blocks: int = 10  #: rounds of the pivoting in which all joints change at once; then one by one, which always ends
+    rounds: int = 1000  #: of the pivoting, in all
+
+
+RULES = StickingRules()
+
+
+class StickingPlant(Shown):
+    """A robot that holds a torque for a tick, with joints that stick: exactly at rest until the torque breaks them off.
+
+    M ddq + C dq + g = clip(torque) + loads - viscous dq - f, with the dry friction f of `Friction`: |f_i| is at most
+    the breakaway torque where dq_i = 0, and f_i has the size F_i(dq_i) and the direction of dq_i where it is not. A
+    step of length h finds the velocities after it as the minimum of a convex function,
+
+        dq+ = argmin_v 1/2 v^T (M + h B) v - (M dq + h (torque - C dq - g))^T v + h sum_i F_i |v_i|,
+
+    at the position in the middle of the step, whose kinks at v_i = 0 are joints that stick. Steps are of first order,
+    and there is no smoothed sign, no stiffness of contacts and no creep. Joints do not stop at their limits.
+
+    Args:
+        robot: the true robot.
+        friction: of the joints; default none.
+        effort_limits: whether the motors saturate at the robot's limits of effort.
+        timestep: longest step of the physics [s].
+
+    Raises:
+        ShapeError, InvalidValueError: for arguments of the wrong shape, value or type.
+
+    Source:
+        [M1988] for the time stepping, [JP1994] for the minimum.
+
+    Example:
+        >>> import orthocas as oc
+        >>> robot = oc.Robot.planar(lengths=[1.0], masses=[3.0])
+        >>> plant = oc.simulation.StickingPlant(robot, friction=oc.simulation.Friction(coulomb=1.0, breakaway=1.2))
+        >>> weight = robot.gravity(plant.q)
+        >>> plant.step(weight + 1.1, 0.5)
+        >>> float(plant.q[0])
+        0.0
+        >>> plant.step(weight + 1.3, 0.5)
+        >>> float(plant.q[0].round(3))
+        0.017
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        friction: Friction | None = None,
+        effort_limits: bool = True,
+        timestep: float = RULES.timestep,
+    ) -> None:
+        require_kind("robot", robot, Robot)
+        friction = Friction() if friction is None else friction
+        require_kind("friction", friction, Friction)
+        if not 0 < as_number("timestep", timestep) < np.inf:
+            raise InvalidValueError("timestep", timestep, "a finite number > 0")
+        self.robot, self.friction, self._timestep = robot, friction, float(timestep)
+        self._viscous, self._coulomb, self._extra, self._speed = np.split(friction.numbers(robot.n), 4)
+        self._limit = robot.effort_limits if effort_limits else np.full(robot.n, np.inf)
+        q, dq = ca.SX.sym("q", robot.n), ca.SX.sym("dq", robot.n)
+        outputs = [robot.function("mass_matrix")(q), robot.function("bias")(q, dq)]
+        self._dynamics = Batched(dense_function("dynamics", [q, dq], outputs))
+        self.reset(np.zeros(robot.n))
+
+    def facts(self) -> dict[str, str]:
+        """The robot, the time and the state."""
+        q, dq = (np.array2string(values, precision=3, max_line_width=1000) for values in (self.q, self.dq))
+        return {"plant": f"{self.robot.heading}, with joints that stick", "time": f"{self.time:g} s", "q": q, "dq": dq}
+
+    def reset(self, q: ArrayLike, dq: ArrayLike | None = None) -> None:
+        """Begin anew at joint positions (n,) and velocities (n,), default at rest, at time 0.
+
+        Raises:
+            ShapeError, InvalidValueError: for other states.
+        """
+        n = self.robot.n
+        self.q: Array = np.array(as_point("q", q, n))  #: joint positions (n,) [rad] or [m]
+        #: joint velocities (n,) [rad/s] or [m/s]; exactly 0 where a joint sticks
+        self.dq: Array = np.zeros(n) if dq is None else np.array(as_point("dq", dq, n))
+        self.time = 0.0  #: since `reset` [s]
+
+    def step(self, torque: ArrayLike, seconds: float, loads: ArrayLike | None = None) -> None:
+        """Hold a torque for some time.
+
+        Args:
+            torque: of the motors, (n,) [N m] or [N].
+            seconds: > 0 [s]; divided into equal steps of the physics, none longer than `timestep`.
+            loads: further joint torques, which do not saturate, (n,) [N m] or [N].
+
+        Raises:
+            ShapeError, InvalidValueError: for torques that are not (n,) or not finite, and ticks that are too long.
+            SimulationError: if the state has diverged.
+        """
+        applied = np.clip(as_point("torque", torque, self.robot.n), -self._limit, self._limit)
+        if loads is not None:
+            applied = applied + as_point("loads", loads, self.robot.n)
+        count = as_number("seconds", seconds) / self._timestep - 1e-9
+        if not -1e-9 < count <= RULES.most_steps:
+            raise InvalidValueError("seconds", seconds, f"a number > 0, at most {RULES.most_steps * self._timestep:g}")
+        steps = max(1, ceil(count))
+        h, q, dq = seconds / steps, self.q, self.dq
+        for _ in range(steps):
+            # Mass matrix and bias at the position in the middle, and the friction that goes with the last velocity.
+            middle = q + h / 2 * dq
+            M, bias = (out[0] for out in self._dynamics(middle[None], dq[None]))
+            size = self._coulomb + self._extra * np.exp(-((dq / self._speed) ** 2))
+            A = M.reshape(len(q), -1) + h * np.diag(self._viscous)
+            dq = minimise_with_kinks(A, M.reshape(len(q), -1) @ dq + h * (applied - bias), h * size, dq)
+            q = middle + h / 2 * dq
+        if not dq @ dq < RULES.runaway**2:
+            raise SimulationError(f"the arm ran away at {self.time:g} s: joint velocities beyond {RULES.runaway:g}")
+        self.q, self.dq = q, dq
+        self.time += seconds
+
+
+def minimise_with_kinks(A: Array, b: Array, size: Array, start: Array) -> Array:
+    """The v with the least 1/2 v^T A v - b^T v + sum_i size_i |v_i|, for A symmetric positive definite, size >= 0.
+
+    At the minimum each v_i is 0 with |b_i - (A v)_i| <= size_i, or has the sign s_i and b_i - (A v)_i = s_i size_i.
+    Signs are guessed, here those of a start, and corrected where one of these conditions is violated: all at once, and
+    if that does not end, the last violated one only, which always ends, since every principal minor of A is positive.
+    """
+    signs = np.where(size > 0, np.sign(start), 1.0)
+    for k in range(RULES.rounds):
+        v = np.zeros_like(b)
+        moves = np.flatnonzero(signs)
+        v[moves] = np.linalg.solve(A[np.ix_(moves, moves)], (b - signs * size)[moves])
+        # What sticks and must not, and what moves against its sign.
+        rest = b - A @ v
+        breaks, turns = (signs == 0) & (np.abs(rest) > size), signs * v * (size > 0) < 0
+        wrong = np.flatnonzero(breaks | turns)
+        if not wrong.size:
+            return v
+        changed = wrong if k < RULES.blocks else wrong[-1:]
+        signs[changed] = np.where(signs[changed] == 0, np.sign(rest[changed]), 0.0)
+    raise SimulationError("the joints that stick were not found")
