@@ -113,9 +113,15 @@ class ChartPanel:
         # What stopped the last motion, and the leak of each coordinate.
         stop = f'<div class="stop">stopped by {escape(readings.stop)}</div>' if readings.stop else ""
         # On a whole branch, leaks of tens of degrees are no fault.
-        whole, colour_of = (90, lambda degrees: PLAIN) if self._wide else (15, lambda d: choose_colour(-d, -2, -6))
+        whole = 90 if self._wide else 15
         leaks = [
-            format_bar(label, degrees / whole, f"{degrees:.2f}°", colour_of(degrees), value=degrees)
+            format_bar(
+                label,
+                degrees / whole,
+                f"{degrees:.2f}°",
+                PLAIN if self._wide else choose_colour(-degrees, -2, -6),
+                degrees,
+            )
             for label, degrees in zip(self._labels[m:], readings.leak_deg.tolist(), strict=True)
         ]
         if self._wide:

@@ -20,6 +20,7 @@ try, arm_mex('chart', [1 2]); catch problem, printf('%s\\n', problem.message); e
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("mkoctfile") is None, reason="no Octave with mkoctfile")
 def test_octave_calls_the_library(tmp_path: Path) -> None:

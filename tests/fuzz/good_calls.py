@@ -581,6 +581,17 @@ def _control() -> dict[str, Call]:
             control.Reference.steps,
             {"labels": ("x", "y"), "start": [0.0, 0.0], "changes": changes, "duration": 0.5, "natural_frequency": 6.0},
         ),
+        "Reference.jerk_limited": (
+            control.Reference.jerk_limited,
+            {
+                "labels": ("x", "xi1"),
+                "points": [[0.0, 0.0], [0.1, 0.2]],
+                "velocity": 1.0,
+                "acceleration": [2.0, 2.0],
+                "jerk": 10.0,
+                "pause": 0.1,
+            },
+        ),
         "Reference.through": (
             control.Reference.through,
             {"labels": ("x", "y"), "times": [0.0, 1.0, 2.0], "points": [[0.0, 1.0], [1.0, 1.0], [2.0, 0.0]]},
