@@ -124,11 +124,11 @@ class ChartPanel:
             )
             for label, degrees in zip(self._labels[m:], readings.leak_deg.tolist(), strict=True)
         ]
-        if self._wide:
-            leaks.append('<div class="about">tens of degrees are normal on a whole branch</div>')
         if len(leaks) == 1:
             most = 1 / float(np.cos(np.radians(readings.leak_deg[0])))
             leaks.append(format_row("speed to hold it", most, "of the least, at most"))
+        if self._wide:
+            leaks.append('<div class="about">tens of degrees are normal on a whole branch</div>')
         # How near the boundary and folds are, and how far the task has moved.
         joint, fraction = readings.nearest, readings.boundary / self._half_width
         label = f"boundary {self._joints.shown[joint]}" if np.isfinite(readings.boundary) else "boundary"
