@@ -38,6 +38,7 @@ from orthocas.fitting.terms import register_loss_term as register_loss_term
 from orthocas.fitting.wide import fit_wide as fit_wide
 from orthocas.paths.chart_along import chart_along as chart_along
 from orthocas.paths.follow import follow as follow
+from orthocas.paths.recordings import read_joints as read_joints
 from orthocas.robots import obstacles as obstacles
 from orthocas.robots.capsules import fit_capsules as fit_capsules
 from orthocas.robots.robot import Robot as Robot

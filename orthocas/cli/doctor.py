@@ -26,6 +26,8 @@ EXTRAS = {
     "view": "charts and motions in the browser",
     "mesh": "charts grown on closed surfaces of three joints",
     "mujoco": "MJCF files, and MuJoCo as plant of simulations",
+    "jerk": "references within limits of jerk",
+    "recordings": "joints in MCAP files of rosbag2",
     "learn": "environments of Gymnasium",
     "dask": "proofs and comparisons on many machines",
 }  #: what is lost without each of the extras

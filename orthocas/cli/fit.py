@@ -421,8 +421,8 @@ def _format_fit(result: Fit, report: Report, target: Path) -> dict[str, str]:
         if offer is None:
             rows["singular"] += "; --domain auto, or another --centre or --home, stays clear"
     if check.half_turn_samples:
-        share = percent(check.half_turn_share, 2, fault=True)
-        rows["half a turn"] = f"x of the task jumps on {share} of the domain: half a turn from its reference"
+        jumps = percent(check.half_turn_share, 2, fault=True)
+        rows["half a turn"] = f"x of the task jumps on {jumps} of the domain: half a turn from its reference"
     if offer is not None:
         bound, kept = offer.least_singular_value, percent(offer.share)
         rows["clear part"] = f"--least-singular-value {bound:g} leaves out singular positions and keeps {kept}"

@@ -74,7 +74,7 @@ DisabledPairs = Annotated[
 
 # Options that describe a robot and a problem: the fields of `ProblemOptions`. Commands say which of them they take.
 
-ROBOT = ("tip", "lock", "tool", "base", "gravity")
+ROBOT = ("tip", "lock", "tool", "base", "gravity", "payload")
 CHAIN = (*ROBOT, "task", "metric")
 DOMAIN = ("centre", "home", "half_width", "least_singular_value")
 _PROBLEM_OPTIONS: dict[str, Any] = {
@@ -101,6 +101,13 @@ _PROBLEM_OPTIONS: dict[str, Any] = {
             "--gravity",
             help='Gravity in the axes of the base of a robot file, "x,y,z" [m/s^2]; default: that of an MJCF file, '
             "or 0,0,-9.81.",
+        ),
+    ],
+    "payload": Annotated[
+        str | None,
+        typer.Option(
+            "--payload",
+            help='What the tip of a robot file carries: "kg", or "kg,x,y,z" with its centre in the tip frame [m].',
         ),
     ],
     "task": Annotated[
@@ -156,6 +163,7 @@ class ProblemOptions:
     tool: str | None = None
     base: str | None = None
     gravity: str | None = None
+    payload: str | None = None
     task: str | None = None
     metric: str | None = None
     centre: str | None = None
@@ -183,7 +191,11 @@ class ProblemOptions:
         gravity = None if self.gravity is None else parse_numbers("--gravity", self.gravity)
         tips = [name.strip() for name in (self.tip or "").split(",") if name.strip()]
         build = Robot.from_name if is_robot_name(path) else Robot.from_file
-        return build(path, None, self.parse_locks(), tool, tips=tips, base=self.base, gravity=gravity)
+        robot = build(path, None, self.parse_locks(), tool, tips=tips, base=self.base, gravity=gravity)
+        if self.payload is None:
+            return robot
+        carried = parse_numbers("--payload", self.payload)
+        return robot.with_payload(carried[0] if len(carried) == 1 else carried)
 
     def build_problem(self, name: str) -> Problem:
         """Build the problem of a name, or of a robot file.

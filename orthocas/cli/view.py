@@ -51,7 +51,7 @@ def view(
         str,
         typer.Argument(
             metavar="CHART|RUN|FILE.urdf",
-            help="A chart file; trajectory.npz or folder of simulate; CSV file of follow; robot or problem.",
+            help="A chart file; trajectory.npz or folder of simulate; CSV file of follow; MCAP file; robot or problem.",
         ),
     ],
     words: ProblemOptions,
@@ -129,13 +129,13 @@ def _read_scene(target: str, chart: Path | None, meshes: Path | None, words: Pro
     if target in problems.names() and not place.exists():
         words.require_no_robot(f"the named problem '{target}'")
         return _Scene(problems.get(target).robot, None, meshes, locked)
-    if place.is_dir() or place.suffix.lower() in (".npz", ".csv"):
+    if place.is_dir() or place.suffix.lower() in (".npz", ".csv", ".mcap"):
         if chart is None and meshes is None:
             raise OptionError("files of motions hold no robot: give --chart or --robot")
         owner = words.build_robot(str(meshes)) if chart is None else load(chart)
         arm = owner.problem.robot if isinstance(owner, Chart) else owner
         file = place / _RUN if place.is_dir() else place
-        motion = read_joint_motion(file, arm) if file.suffix.lower() == ".csv" else read_run(file, arm)
+        motion = read_joint_motion(file, arm) if file.suffix.lower() in (".csv", ".mcap") else read_run(file, arm)
         return _Scene(motion, owner, meshes, locked)
     if chart is not None:
         raise OptionError(f"{target} is a chart: leave out --chart")

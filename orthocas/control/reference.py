@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from math import factorial
-from typing import Self
+from typing import Any, Self
 
 import casadi as ca
 import numpy as np
@@ -16,7 +17,14 @@ from numpy.typing import ArrayLike
 from orthocas.charts.chart import Chart
 from orthocas.charts.self_motion import too_far
 from orthocas.charts.trackers import Tracker, TrackerStatus
-from orthocas.errors import InvalidValueError, InverseError, OrthocasError, UnreachableReferenceError, degrees_hint
+from orthocas.errors import (
+    InvalidValueError,
+    InverseError,
+    OrthocasError,
+    ShapeError,
+    UnreachableReferenceError,
+    degrees_hint,
+)
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
@@ -24,6 +32,7 @@ from orthocas.tools.checks import (
     as_float_array,
     as_point,
     freeze_array,
+    import_extra,
     require_kind,
     require_known,
     require_shape,
@@ -50,7 +59,7 @@ _VALUES = "; targets of a Reference are values of phi, not changes of it ('move'
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Reference(Shown):
-    """phi_d(t) and two derivatives, smooth on each of S segments. Use `steps` or `through` to build one."""
+    """phi_d(t) and two derivatives, smooth on each of S segments; `steps`, `through` and `jerk_limited` build one."""
 
     labels: tuple[str, ...]  #: names of the k quantities
     times: Array  #: (S + 1,) starts of the segments, then the end [s]
@@ -133,6 +142,62 @@ class Reference(Shown):
         coefficients = np.stack(taylor, axis=2).reshape(len(t) - 1, -1)
         spacing = min(RULES.grid, float(np.diff(t).min()) / 4)
         return cls(names, t, values[1:], values[0], coefficients, _build_polynomial(len(names)), spacing)
+
+    @classmethod
+    def jerk_limited(
+        cls,
+        labels: Sequence[str],
+        points: ArrayLike,
+        velocity: ArrayLike,
+        acceleration: ArrayLike,
+        jerk: ArrayLike,
+        pause: float = 0.0,
+    ) -> Self:
+        """The fastest way from point to point within limits of velocity, acceleration and jerk, at rest at each point.
+
+        All quantities of a way end together. Accelerations are continuous, so torques do not jump.
+
+        Args:
+            labels: names of the quantities.
+            points: (N, k), N >= 2; the first is where the reference starts.
+            velocity: limit of each quantity or of all, (k,), > 0 [1/s].
+            acceleration: the same [1/s^2].
+            jerk: the same [1/s^3].
+            pause: rest at each point but the first [s], >= 0.
+
+        Raises:
+            InvalidValueError, ShapeError: for arguments of the wrong value or shape.
+            MissingExtraError: without the package ruckig.
+
+        Source:
+            [BK2021]
+        """
+        names = _check_names(labels)
+        values = freeze_array("points", points, (None, len(names)))
+        if len(values) < 2:
+            raise InvalidValueError("number of points", len(values), "at least 2")
+        limits = {"velocity": velocity, "acceleration": acceleration, "jerk": jerk}
+        sizes = {name: _read_limit(name, limit, len(names)) for name, limit in limits.items()}
+        _require_number("pause", pause, above=-np.finfo(float).tiny)
+        times, targets, coefficients = [0.0], [], []
+        for start, end in pairwise(values):
+            # Between its corners, the way is cubic; a pause is a way that stays.
+            corners, states = _plan_way(start, end, sizes)
+            for (begin, finish), state in zip(pairwise(corners), states, strict=True):
+                times.append(times[-1] + finish - begin)
+                coefficients.append(state)
+                targets.append(end)
+            if pause > 0:
+                times.append(times[-1] + pause)
+                coefficients.append(np.column_stack([np.zeros((len(names), RULES.degree)), end]))
+                targets.append(end)
+        if len(times) == 1:
+            raise InvalidValueError("points", values.tolist(), "points that differ, or a pause")
+        parameters = np.array(coefficients).reshape(len(targets), -1)
+        spacing = min(RULES.grid, times[-1] / 100)
+        return cls(
+            names, np.array(times), np.array(targets), values[0], parameters, _build_polynomial(len(names)), spacing
+        )
 
     def facts(self) -> dict[str, str]:
         """Quantities, time, start and targets."""
@@ -219,6 +284,44 @@ def _build_polynomial(k: int) -> ca.Function:
     value = ca.SX(table @ ca.vertcat(*(t ** (RULES.degree - i) for i in range(RULES.degree + 1))))
     velocity = ca.jacobian(value, t)
     return dense_function("spline", [t, coefficients], [value, velocity, ca.jacobian(velocity, t)])
+
+
+def _read_limit(name: str, limit: ArrayLike, k: int) -> Array:
+    """One limit for each of k quantities."""
+    numbers = as_float_array(name, limit)
+    if numbers.shape not in ((), (k,)):
+        raise ShapeError(name, numbers.shape, (k,))
+    if not (np.isfinite(numbers) & (numbers > 0)).all():
+        raise InvalidValueError(name, numbers.tolist(), "finite numbers > 0")
+    return np.broadcast_to(numbers, (k,))
+
+
+def _plan_way(start: Array, end: Array, limits: Mapping[str, Array]) -> tuple[list[float], list[Array]]:
+    """Corners in time of the way from rest to rest, and before each the coefficients (k, 6), highest power first."""
+    ruckig: Any = import_extra("ruckig", "a jerk-limited reference", "jerk")
+    wish, planned = ruckig.InputParameter(len(start)), ruckig.Trajectory(len(start))
+    wish.current_position, wish.target_position = start.tolist(), end.tolist()
+    for name, limit in limits.items():
+        setattr(wish, f"max_{name}", limit.tolist())
+    try:
+        result = ruckig.Ruckig(len(start)).calculate(wish, planned)
+    except ruckig.RuckigError:
+        result = ruckig.Result.Error
+    if result not in (ruckig.Result.Working, ruckig.Result.Finished) or not np.isfinite(planned.duration):
+        raise InvalidValueError("points", [start.tolist(), end.tolist()], "a way and limits of similar sizes")
+    phases = [np.cumsum(profile.t) for profile in planned.profiles[0]]
+    corners = np.unique(np.clip(np.concatenate([[0.0, planned.duration], *phases]), 0, planned.duration))
+    corners = np.append(corners[:-1][np.diff(corners) > 1e-9], corners[-1]) if planned.duration > 0 else corners[:1]
+    states = []
+    for begin, finish in pairwise(corners.tolist()):
+        position, velocity, acceleration = (np.array(part) for part in planned.at_time(begin)[:3])
+        # The jerk is constant; taken in the middle, it does not feel rounding at the corners.
+        quarter, three = (np.array(planned.at_time(begin + share * (finish - begin))[2]) for share in (0.25, 0.75))
+        jerk = (three - quarter) / (0.5 * (finish - begin))
+        acceleration = quarter - 0.25 * (finish - begin) * jerk
+        zeros = np.zeros_like(position)
+        states.append(np.column_stack([zeros, zeros, jerk / 6, acceleration / 2, velocity, position]))
+    return corners.tolist(), states
 
 
 def _check_names(labels: Sequence[str]) -> tuple[str, ...]:

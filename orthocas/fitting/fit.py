@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
@@ -18,6 +18,7 @@ from orthocas.bases.registry import warn_unless_savable
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import WorstPoints
+from orthocas.charts.quality import evaluate
 from orthocas.errors import DomainError, Interrupted, InvalidValueError, OrthocasError
 from orthocas.fitting.like import Likeness
 from orthocas.fitting.settings import RULES, FitSettings, Precision
@@ -36,6 +37,9 @@ from orthocas.tools.checks import Array, require_count
 from orthocas.tools.display import Shown, listed, percent
 from orthocas.tools.interrupts import remembered
 from orthocas.tools.progress import Monitor, silent
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def fit(
@@ -397,6 +401,10 @@ class Fit(Shown):
     seconds: float
     like: Mapping[str, float] = field(default_factory=dict)  #: root mean square angle to each quantity's gradient [deg]
     clear_part: ClearPart | None = None  #: a smaller domain to fit on, if this one touches near-singular positions
+
+    def plot(self, samples: int = 20_000) -> Figure:
+        """Histograms of angles and leaks on held-out samples, as a matplotlib figure: `evaluate(fit.chart).plot()`."""
+        return evaluate(self.chart, samples, seed=1).plot()
 
     @property
     def cyclic_joints(self) -> tuple[str, ...]:

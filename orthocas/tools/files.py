@@ -295,7 +295,13 @@ def open_output_folder(name: str, out: str | Path) -> Iterator[Path]:
 
 
 def read_table(
-    path: str | Path, what: str, rows: str, most: int, columns: Callable[[Sequence[str]], Sequence[int]], least: int = 2
+    path: str | Path,
+    what: str,
+    rows: str,
+    most: int,
+    columns: Callable[[Sequence[str]], Sequence[int]],
+    least: int = 2,
+    largest: float = RULES.largest,
 ) -> Array:
     """The chosen columns of a table, in their order, (N, k). Cells of others may hold anything.
 
@@ -306,6 +312,7 @@ def read_table(
         most: largest number of rows.
         columns: takes the names of the header, and returns the indices of the columns; raises ValueError for others.
         least: smallest number of rows.
+        largest: of the numbers; larger ones are mistakes.
 
     Raises:
         PathFileError: names the file, the line, and what is wrong there.
@@ -317,7 +324,7 @@ def read_table(
     header = [cell.strip() for cell in lines[0][1]]
     try:
         chosen = list(columns(header))
-        return np.array([_parse_row(line, cells, header, chosen) for line, cells in lines[1:]])
+        return np.array([_parse_row(line, cells, header, chosen, largest) for line, cells in lines[1:]])
     except ValueError as error:
         raise PathFileError(f"{what} {path}: {error}") from None
 
@@ -348,7 +355,9 @@ def _read_lines(path: Path, what: str) -> list[tuple[int, list[str]]]:
         raise PathFileError(f"{what} {path}: no CSV text, {str(error)[: RULES.cell]}") from None
 
 
-def _parse_row(line: int, cells: Sequence[str], header: Sequence[str], chosen: Sequence[int]) -> list[float]:
+def _parse_row(
+    line: int, cells: Sequence[str], header: Sequence[str], chosen: Sequence[int], largest: float
+) -> list[float]:
     """The numbers of the chosen columns of a line."""
     # Columns that nobody reads may hold anything, but none may be missing.
     if len(cells) != len(header):
@@ -359,8 +368,8 @@ def _parse_row(line: int, cells: Sequence[str], header: Sequence[str], chosen: S
             value = float("nan" if "_" in cell else cell)
         except ValueError:
             value = np.nan
-        if not abs(value) <= RULES.largest:
-            want = f"a number from {-RULES.largest:g} to {RULES.largest:g}"
+        if not abs(value) <= largest:
+            want = f"a number from {-largest:g} to {largest:g}"
             raise ValueError(f"line {line}: {name} is {cell[: RULES.cell]!r}, expected {want}")
         values.append(value)
     return values

@@ -11,6 +11,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.trackers import TrackerStatus
 from orthocas.errors import InvalidValueError, PathError, PathFileError
 from orthocas.paths.joint_motion import JointMotion
+from orthocas.paths.recordings import read_joints
 from orthocas.robots.robot import Robot
 from orthocas.simulation.trajectory import Trajectory
 from orthocas.tools.checks import Array, as_float_array, as_point_set, freeze_array, require_count, require_kind
@@ -88,11 +89,17 @@ def read_run(path: Path, robot: Robot) -> Motion:
 def read_joint_motion(path: Path, robot: Robot) -> Motion:
     """Read a file of `orthocas follow`: a header with time_s and the names of all joints, then one row an instant.
 
-    Columns for velocities and accelerations are left out; others are quantities to show.
+    Columns for velocities and accelerations are left out; others are quantities to show. An MCAP file of rosbag2 gives
+    its JointState messages.
 
     Raises:
         PathFileError: names the file, and what is wrong there.
     """
+    if path.suffix.lower() == ".mcap":
+        times, q = read_joints(path, robot)
+        # Several messages of one time count once.
+        kept = np.append(True, np.diff(times) > 0)
+        return Motion(path.stem, times[kept], q[kept], (), np.zeros((int(kept.sum()), 0)))
     header: list[str] = []
 
     def choose_columns(names: Sequence[str]) -> list[int]:

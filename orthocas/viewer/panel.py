@@ -113,16 +113,22 @@ class ChartPanel:
         # What stopped the last motion, and the leak of each coordinate.
         stop = f'<div class="stop">stopped by {escape(readings.stop)}</div>' if readings.stop else ""
         # On a whole branch, leaks of tens of degrees are no fault.
-        whole, colour_of = (90, lambda degrees: PLAIN) if self._wide else (15, lambda d: choose_colour(-d, -2, -6))
+        whole = 90 if self._wide else 15
         leaks = [
-            format_bar(label, degrees / whole, f"{degrees:.2f}°", colour_of(degrees), value=degrees)
+            format_bar(
+                label,
+                degrees / whole,
+                f"{degrees:.2f}°",
+                PLAIN if self._wide else choose_colour(-degrees, -2, -6),
+                degrees,
+            )
             for label, degrees in zip(self._labels[m:], readings.leak_deg.tolist(), strict=True)
         ]
-        if self._wide:
-            leaks.append('<div class="about">tens of degrees are normal on a whole branch</div>')
         if len(leaks) == 1:
             most = 1 / float(np.cos(np.radians(readings.leak_deg[0])))
             leaks.append(format_row("speed to hold it", most, "of the least, at most"))
+        if self._wide:
+            leaks.append('<div class="about">tens of degrees are normal on a whole branch</div>')
         # How near the boundary and folds are, and how far the task has moved.
         joint, fraction = readings.nearest, readings.boundary / self._half_width
         label = f"boundary {self._joints.shown[joint]}" if np.isfinite(readings.boundary) else "boundary"

@@ -9,9 +9,10 @@ from conftest import Run, arm, robot_data
 from programs import needs_c
 
 import orthocas as oc
+from orthocas.cli.options import ProblemOptions
 from orthocas.codegen import CompiledLibrary, compile_shared
 from orthocas.control import PDPlus, Reference
-from orthocas.errors import InvalidValueError, RobotError, ShapeError
+from orthocas.errors import InvalidValueError, OptionError, RobotError, ShapeError
 from orthocas.tools.checks import Array
 
 PANDA = "panda_description/urdf/panda.urdf"
@@ -140,3 +141,15 @@ def test_the_gravity_of_a_law_has_its_own_option(run: Run) -> None:
     assert code == 2
     assert err.startswith("orthocas: no such option: --gravity; ")
     assert "codegen --gravity-compensation law or robot" in err
+
+
+@pytest.mark.parametrize("words", ["1.5", "1.5,0,0,0.1"])
+def test_the_payload_of_the_command_line_is_that_of_the_robot(words: str) -> None:
+    file = robot_data(PANDA)
+    options = ProblemOptions(tip="panda_hand", payload=words)
+    carried = [float(word) for word in words.split(",")]
+    expected = oc.Robot.from_urdf(file, tip="panda_hand").with_payload(carried if len(carried) > 1 else carried[0])
+    q = np.full(7, 0.3)
+    np.testing.assert_array_equal(options.build_robot(str(file)).gravity(q), expected.gravity(q))
+    with pytest.raises(OptionError):
+        options.require_no_robot("the named problem 'iiwa'")

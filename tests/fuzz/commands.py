@@ -55,7 +55,7 @@ _COUNTS = ("0", "1", "2", "-1", "20", "99999999999999999999", "1.5", "")
 _VALUES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("--tip", "--home"), ("l1", "tip", "nowhere", *NAMES)),
     **dict.fromkeys(("--lock",), ("j1=0", "j1", "=", "j1=nan", "j1=x", "nowhere=1", "l1=0=1", "j1=1e300")),
-    **dict.fromkeys(("--tool", "--centre", "--half-width", "--weights", "--friction", "--noise"), _LISTS),
+    **dict.fromkeys(("--tool", "--payload", "--centre", "--half-width", "--weights", "--friction", "--noise"), _LISTS),
     **dict.fromkeys(("--stiffness", "--damping-ratio", "--feedback", "--limit"), _LISTS),
     "--damping-stiffness": _LISTS,
     "--model": ("own", "given", "", "x"),
@@ -103,7 +103,7 @@ _VALUES: dict[str, tuple[str, ...]] = {
     "--name": ("arm", "int", "1arm", "a b", "math", "é", "x" * 200, "main"),
 }
 _KEPT = ("--export",)  # without it, the command serves until Ctrl-C
-_PROBLEM_OPTIONS = ("--tip", "--lock", "--tool")
+_PROBLEM_OPTIONS = ("--tip", "--lock", "--tool", "--payload")
 _DOMAIN_OPTIONS = ("--task", "--metric", "--centre", "--home", "--half-width")
 _AUTO_OPTIONS = ("--domain", "--leak-deg", "--conditioning")
 _LAW_OPTIONS = (

@@ -476,6 +476,7 @@ def _methods() -> dict[str, Call]:
             oc.follow,
             {"chart": chart, "tool_path": chart.x([q, q + 0.05]), "xi": "objective", "velocity_limits": 1.0},
         ),
+        "read_joints": (oc.read_joints, {"path": "no.csv", "robot": robot, "topic": "/arm"}),
         "motion.save_csv": (joint_motion().save_csv, {"path": "motion.csv"}),
         "Sphere": (oc.obstacles.Sphere, {"centre": q, "radius": 0.1}),
         "Capsule": (oc.obstacles.Capsule, {"start": q, "end": -q, "radius": 0.1}),
@@ -579,6 +580,17 @@ def _control() -> dict[str, Call]:
         "Reference.steps": (
             control.Reference.steps,
             {"labels": ("x", "y"), "start": [0.0, 0.0], "changes": changes, "duration": 0.5, "natural_frequency": 6.0},
+        ),
+        "Reference.jerk_limited": (
+            control.Reference.jerk_limited,
+            {
+                "labels": ("x", "xi1"),
+                "points": [[0.0, 0.0], [0.1, 0.2]],
+                "velocity": 1.0,
+                "acceleration": [2.0, 2.0],
+                "jerk": 10.0,
+                "pause": 0.1,
+            },
         ),
         "Reference.through": (
             control.Reference.through,

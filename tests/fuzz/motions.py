@@ -1,5 +1,6 @@
 """Campaign of files of joint motions: what is read moves the robot, or the error names the file and what is wrong."""
 
+import struct
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -10,6 +11,7 @@ from public_objects import joint_motion, planar
 from fuzz.child import Finding, run
 from fuzz.mutants import TEXTS, Rng, flipped, pick
 from fuzz.sealed_files import judged
+from orthocas.paths.recordings import read_joints
 from orthocas.viewer.motion import read_joint_motion
 
 _CELLS = ("0", "nan", "-1e999", "1e300", "", " ", "a", '"1"', '"1', "1_0", "0x10", "time_s", "q1", "d_q1", *TEXTS)
@@ -21,8 +23,16 @@ def motions(count: int) -> list[Finding]:
 
 
 def judge(seed: int) -> str | None:
-    """What is wrong with the treatment of a mutant."""
-    return judged(_mutant, use, seed)
+    """What is wrong with the treatment of a mutant, as a motion to show or as a recording."""
+    return judged(_mutant, use, seed) if seed % 2 else judged(_recording if seed % 4 else _mutant, use_recording, seed)
+
+
+def use_recording(path: Path) -> None:
+    """Read recorded joints; they have to be finite, at times that do not decrease."""
+    times, q = read_joints(path, planar().robot)
+    assert len(times) == len(q)
+    assert np.isfinite(q).all()
+    assert (np.diff(times) >= 0).all()
 
 
 def use(path: Path) -> None:
@@ -39,6 +49,13 @@ def _text() -> str:
     with TemporaryDirectory() as folder:
         joint_motion().save_csv(Path(folder, "q.csv"))
         return Path(folder, "q.csv").read_text()
+
+
+def _recording(rng: Rng) -> bytes:
+    """What begins as an MCAP file, with damaged bytes."""
+    length = struct.pack("<Q", int(rng.integers(0, 2**40)))
+    content = bytes(rng.integers(256, size=200, dtype=np.uint8))
+    return b"\x89MCAP0\r\n" + pick(rng, (content, b"\x01" + length + content, b"\x06" + length, b""))
 
 
 def _mutant(rng: Rng) -> bytes:

@@ -18,7 +18,8 @@ EVIL = "<img src=x>"
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "build", [lambda: oc.evaluate(fitted().chart, 200), trajectory, joint_motion, comparison, lambda: fitted().chart]
+    "build",
+    [lambda: oc.evaluate(fitted().chart, 200), fitted, trajectory, joint_motion, comparison, lambda: fitted().chart],
 )
 def test_plots_show_themselves_inline(build: Any) -> None:
     figure = build().plot()

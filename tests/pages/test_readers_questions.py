@@ -53,7 +53,7 @@ SEARCHED = {
     "torque": "explanation/control",
     "gripper": "tutorials/own_arm",
     "collision": "how-to/collisions",
-    "collision avoidance": "how-to/paths",
+    "collision avoidance": "how-to/collisions_in_motion",
     "install": "how-to/install",
 }
 
