@@ -271,9 +271,9 @@ class BasisObjective:
             gradients = self._thin(stride)
             H = build_normal_matrix(smooth, gradients, shared) / len(gradients[0])
         # a hinge couples all coordinates, but acts at few samples
-        for D, G, share in hinges:
+        for D, G, count in hinges:
             active = (D @ G)[:, self.kept]
-            H += share * (active.T @ active).astype(float)
+            H += (active.T @ active).astype(float) / count
         return H
 
     def _build_blocks(self, theta: Array, stride: int) -> list[Array]:
@@ -285,9 +285,9 @@ class BasisObjective:
             if smooth:
                 gradients = self._thin(stride)[j : j + 1]
                 H = build_normal_matrix(smooth[j : j + 1], gradients, ()) / len(gradients[0])
-            for D, G, share in hinges:
+            for D, G, count in hinges:
                 active = (D[:, j : j + 1] @ G)[:, 0, self.kept[j]]
-                H += share * (active.T @ active).astype(float)
+                H += (active.T @ active).astype(float) / count
             return H
 
         return [build(j) for j in range(self.r)]
@@ -298,7 +298,7 @@ class BasisObjective:
         Returns:
             Those of the smooth residuals of each coordinate at every `stride`-th sample, (N / stride, rows, n); none
             if there are none. And for each hinge (N', r, n) at some of the samples where it acts, with gradients of the
-            basis there (N', n, K), and by what their products count.
+            basis there (N', n, K), and by what their products are divided.
         """
         derivatives = build_residual_columns(self._loss)(self._evaluate_jacobians(theta), *self._data)
         smooth, hinges = list[Array](), list[tuple[Any, Any, float]]()
@@ -315,7 +315,7 @@ class BasisObjective:
             D = derivative[block, :, column].reshape(-1, self.n, self.r).transpose(0, 2, 1).astype(np.float32)
             chosen: Array = self.X[block, :, :, column]  # (active, g, S)
             G = self._gradients.expand(chosen.transpose(1, 2, 0)[None], len(chosen)).astype(np.float32)
-            hinges.append((D, G, every / self.N))
+            hinges.append((D, G, self.N / every))
         return smooth, hinges
 
 
