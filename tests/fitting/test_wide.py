@@ -795,7 +795,8 @@ def test_command_notes_what_a_chart_leaves_out_of_its_branch(run: Run) -> None:
 
 def test_command_gives_no_advice_that_wide_fits_refuse() -> None:
     uneven = replace(oc.evaluate(wide_plane().chart, 500), length_ratio=50.0)
-    assert "--weights" in format_report_rows(uneven)["lengths"]
+    tight = replace(wide_plane().chart, notes={})
+    assert "--weights" in format_report_rows(uneven, tight)["lengths"]
     assert "--weights" not in _format_fit(wide_plane(), uneven, Path("a.orthocas"))["lengths"]
 
 

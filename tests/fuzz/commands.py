@@ -99,6 +99,8 @@ _VALUES: dict[str, tuple[str, ...]] = {
     "--port": ("0", "-1", "99999", "1.5", ""),
     "--path": _FILES,
     "--robot": ("arm.urdf", "nothing.urdf", "chart.orthocas"),
+    "--x": ("0.9", "0.9,0.1", "", "a", "nan", "1e400", "0.9,"),
+    "--branch": ("any", "shoulder+", ""),
     "--to": ("numpy", "torch", "jax", "", "tensorflow"),
     "--name": ("arm", "int", "1arm", "a b", "math", "é", "x" * 200, "main"),
 }
@@ -163,6 +165,7 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
     ),
     "doctor": (("", "chart.orthocas"), {}, ("--out",)),
     "charts": (("ur5-position", "ur5", "chart.orthocas", ""), {}, ("--out",)),
+    "solve": (_FILES, {"--x": "0.9"}, ("--xi", "--start", "--branch")),
     "export": (_FILES, {"--to": "numpy", "--out": "module.py"}, ()),
     "follow": (
         _FILES,

@@ -62,6 +62,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {  #: words after `orthocas`; the loop is
     "follow": ("follow", "chart.orthocas", "path.csv", *_CHOSEN, "--out", "out/q.csv", "--json"),
     "codegen": ("codegen", "chart.orthocas", *_CONTROLLED, "--check"),
     "export": ("export", "chart.orthocas", "--to", "numpy", "--out", "out/arm.py"),
+    "solve": ("solve", "chart.orthocas", "--x", "0.9", "--json"),
     "charts": ("charts", "ur5-position", "--out", "out/ur5.orthocas"),
     "doctor": ("doctor", "--json"),
     "demo": ("demo", "--out", "out"),

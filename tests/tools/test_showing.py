@@ -119,7 +119,7 @@ def test_numbers_shown_are_those_of_the_object() -> None:
 def test_the_command_line_shows_the_facts_of_a_report() -> None:
     report = oc.evaluate(fitted().chart, 500)
     assert report.length_ratio > 30
-    advised = format_report_rows(report)
+    advised = format_report_rows(report, fitted().chart)
     assert advised.pop("lengths").startswith(report.facts()["lengths"])
     assert advised == {name: text for name, text in report.facts().items() if name != "lengths"}
 
