@@ -226,6 +226,9 @@ class Prober:
         if self._start is None:
             return None
         quadratic = Polynomial(RULES.degree, self.cyclic).family(family.space, self.outputs)
+        # linear coordinates cannot hold quadratic ones
+        if not set(quadratic.terms) <= set(family.terms):
+            return None
         return family.embed(self._start.on(quadratic), quadratic)
 
     def least(self, problem: Problem, seed: int) -> float:

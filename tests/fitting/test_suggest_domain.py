@@ -37,6 +37,15 @@ def suggested(**asked: object) -> object:
     return oc.suggest_domain(*planar(), HOME, **{"parametrisation": oc.Polynomial(2, cyclic="auto"), **asked})
 
 
+def test_domains_are_suggested_for_linear_coordinates() -> None:
+    """Trials are quadratic, which linear coordinates cannot begin from."""
+    known = problems.get("planar_3r_x")
+    found = oc.suggest_domain(known.robot, known.task, parametrisation=oc.Polynomial(1))
+    worst = oc.fit(found.problem, oc.Polynomial(1)).worst
+    assert worst is not None
+    assert worst.least > 0
+
+
 def test_leak_and_conditioning_are_those_of_their_definitions() -> None:
     """Against principal angles and singular values in coordinates where A is the identity."""
     known = problems.get("planar_3r_xy")
