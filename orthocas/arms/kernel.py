@@ -196,7 +196,8 @@ def write_curves(equations: ca.Function, lower: Array, upper: Array, turning: ND
         "high": upper,
         "turning": turning,
     }
-    return {"task_curves.c": render("task_curves.c", values), "self_motion.c": get_source("self_motion.c")}
+    included = {name: get_source(name) for name in ("self_motion.c", "curve_math.c")}
+    return {"task_curves.c": render("task_curves.c", values), **included}
 
 
 def pointer(array: NDArray[Any]) -> ctypes.c_void_p:

@@ -140,7 +140,8 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
     sources[_ROWS] = get_source(_ROWS)
     curves = chart.parts.inverse.curves
     if isinstance(curves, SelfMotionCurves):
-        sources |= {"curves.c": write_curve_source(chart, curves), "curve_rows.c": get_source("curve_rows.c")}
+        sources |= {name: get_source(name) for name in ("curve_rows.c", "curve_math.c")}
+        sources["curves.c"] = write_curve_source(chart, curves)
     return CompiledInverse(chart, keep_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder))
 
 

@@ -4,7 +4,8 @@
 #define CURVES STARTS
 #define SHEETS 256
 #define ENDS 64
-#define TURN 6.283185307179586
+
+#include "curve_math.c"
 
 typedef struct {
   double q[POINTS][N], t[POINTS][N];
@@ -22,19 +23,6 @@ typedef struct {
   arc_end end[ENDS];
 } row_search;
 
-static double task_at(const double *q, const double *x, double *e, double *J) {
-  double size = 0.0;
-  int i;
-  memset(e, 0, M * sizeof *e); /* compilers do not see that the kernel sets them */
-  memset(J, 0, M * N * sizeof *J);
-  errors_at(q, x, e, J);
-  for (i = 0; i < M; ++i) {
-    if (!isfinite(e[i])) return INFINITY;
-    size = fmax(size, fabs(e[i]));
-  }
-  return size;
-}
-
 /* xi - xi(q), by the shorter way around. */
 static double xi_left(const double *target, const double *q) {
   const double left = target[M] - xi_at(q);
@@ -50,31 +38,6 @@ static int in_box(const double *q, double slack) {
 
 static int contains(const double *q) { return in_box(q, 0.0) && is_clear(q); }
 
-/* Solve A X = B (n, n + k) in place, with partial pivoting; X comes back in the columns from n on. */
-static void eliminate(double A[N][N + 2], int n, int k) {
-  int i, j, c;
-  for (c = 0; c < n; ++c) {
-    int best = c;
-    for (i = c + 1; i < n; ++i)
-      if (fabs(A[i][c]) > fabs(A[best][c])) best = i;
-    if (best != c)
-      for (j = c; j < n + k; ++j) {
-        const double swapped = A[c][j];
-        A[c][j] = A[best][j];
-        A[best][j] = swapped;
-      }
-    for (i = c + 1; i < n; ++i) {
-      const double factor = A[i][c] / A[c][c];
-      for (j = c + 1; j < n + k; ++j) A[i][j] -= factor * A[c][j];
-    }
-  }
-  for (c = n - 1; c >= 0; --c)
-    for (j = n; j < n + k; ++j) {
-      for (i = c + 1; i < n; ++i) A[c][j] -= A[c][i] * A[i][j];
-      A[c][j] /= A[c][c];
-    }
-}
-
 /* dq with J dq = e, t . dq = 0, and the one with J dq = 0, t . dq = 1. */
 static void bordered(const double *J, const double *e, const double *t, double *change, double *onward) {
   double A[N][N + 2];
@@ -87,22 +50,12 @@ static void bordered(const double *J, const double *e, const double *t, double *
   for (j = 0; j < N; ++j) A[M][j] = t[j];
   A[M][N] = 0.0;
   A[M][N + 1] = 1.0;
-  eliminate(A, N, 2);
+  if (eliminate(A, N, 2) == 0)
+    for (i = 0; i < N; ++i) A[i][N] = A[i][N + 1] = NAN; /* singular: the step is not finite */
   for (i = 0; i < N; ++i) {
     change[i] = A[i][N];
     onward[i] = A[i][N + 1];
   }
-}
-
-static double dot(const double *a, const double *b) {
-  double sum = 0.0;
-  int i;
-  for (i = 0; i < N; ++i) sum += a[i] * b[i];
-  return sum;
-}
-
-static double turned_back(double difference, int joint) {
-  return turning[joint] ? difference - TURN * rint(difference / TURN) : difference;
 }
 
 /* Damped least squares to x, whatever the limits; whether it arrives near x. */
@@ -122,7 +75,7 @@ static int reach_x(double *q, const double *x) {
     }
     damping = (error > 0.1 ? 1e-2 : error > 1e-3 ? 1e-5 : 1e-14) * trace;
     for (i = 0; i < M; ++i) A[i][i] += damping;
-    eliminate(A, M, 1);
+    if (eliminate(A, M, 1) == 0) return 0;
     for (k = 0; k < N; ++k) {
       step[k] = 0.0;
       for (i = 0; i < M; ++i) step[k] += J[i + M * k] * A[i][M];
@@ -240,7 +193,7 @@ static void take_solution(row_search *row, const double *start) {
     }
     for (j = 0; j < N; ++j) A[M][j] = gradient[j] / XI_SIZE;
     A[M][N] = left / XI_SIZE;
-    eliminate(A, N, 1);
+    if (eliminate(A, N, 1) == 0) return;
     for (i = 0; i < N; ++i) q[i] += A[i][N];
   }
   for (i = 0; i < N; ++i) near = near && fabs(q[i] - fmin(fmax(q[i], low[i]), high[i])) <= 1e-9 * half_width[i];

@@ -2,7 +2,8 @@
  * them. task_curves.c includes it behind the kernels, tables and rules of a task; orthocas.arms.kernel says what is done
  * and why. */
 #define M (N - 1)
-#define TURN 6.283185307179586
+
+#include "curve_math.c"
 
 /* A point of a curve, the unit tangent, and the length of the curve to the next point. */
 typedef struct {
@@ -14,61 +15,6 @@ typedef struct {
   double place, q[N];
   int curve, joint, side, turns, rises;
 } crossing;
-
-static double dot(const double *a, const double *b) {
-  double sum = 0.0;
-  int i;
-  for (i = 0; i < N; ++i) sum += a[i] * b[i];
-  return sum;
-}
-
-static double turned_back(double difference, int joint) {
-  return turning[joint] ? difference - TURN * rint(difference / TURN) : difference;
-}
-
-/* The errors e (M) and rates J (M, N), by columns; the largest error, infinite where it is undefined. */
-static double task_at(const double *q, const double *target, double *e, double *J) {
-  double size = 0.0;
-  int i;
-  memset(e, 0, M * sizeof *e); /* compilers do not see that the kernel sets them */
-  memset(J, 0, M * N * sizeof *J);
-  errors_at(q, target, e, J);
-  for (i = 0; i < M; ++i) {
-    if (!isfinite(e[i])) return INFINITY;
-    size = fmax(size, fabs(e[i]));
-  }
-  return size;
-}
-
-/* Solve A X = B in place, X in the last two columns; the sign of det A, 0 where it is singular. */
-static int eliminate(double A[N][N + 2]) {
-  int i, j, c, sign = 1;
-  for (c = 0; c < N; ++c) {
-    int best = c;
-    for (i = c + 1; i < N; ++i)
-      if (fabs(A[i][c]) > fabs(A[best][c])) best = i;
-    if (!(fabs(A[best][c]) > 0.0)) return 0;
-    if (best != c) {
-      for (j = c; j < N + 2; ++j) {
-        const double swapped = A[c][j];
-        A[c][j] = A[best][j];
-        A[best][j] = swapped;
-      }
-      sign = -sign;
-    }
-    if (A[c][c] < 0.0) sign = -sign;
-    for (i = c + 1; i < N; ++i) {
-      const double factor = A[i][c] / A[c][c];
-      for (j = c + 1; j < N + 2; ++j) A[i][j] -= factor * A[c][j];
-    }
-  }
-  for (c = N - 1; c >= 0; --c)
-    for (j = N; j < N + 2; ++j) {
-      for (i = c + 1; i < N; ++i) A[c][j] -= A[c][i] * A[i][j];
-      A[c][j] /= A[c][c];
-    }
-  return sign;
-}
 
 /* dq with J dq = e, row . dq = rest, and the unit tangent with det [J; t] > 0; 0 where there is none. */
 static int bordered(const double *J, const double *e, const double *row, double rest, double *change, double *t) {
@@ -82,7 +28,7 @@ static int bordered(const double *J, const double *e, const double *row, double 
   for (j = 0; j < N; ++j) A[M][j] = row[j];
   A[M][N] = rest;
   A[M][N + 1] = 1.0;
-  sign = eliminate(A);
+  sign = eliminate(A, N, 2);
   if (sign == 0) return 0;
   for (i = 0; i < N; ++i) {
     change[i] = A[i][N];
