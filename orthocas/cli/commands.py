@@ -1,5 +1,6 @@
 """Collects the commands, and turns errors into one line and exit code 2."""
 
+import logging
 import sys
 import warnings
 from collections.abc import Sequence
@@ -28,6 +29,7 @@ COMMANDS = {
     "doctor": "Show what is installed, what is missing for what, and whether a first chart works. Exit code 1 if not.",
     "charts": "List the ready charts of known arms, show the card of one, or write it to a file.",
 }  #: names of the commands and the first lines of their help
+_PACKAGE = __package__.partition(".")[0]  #: whose log is shown
 _MODULES = {"demo": "compare", "evaluate": "charts", "certify": "charts", "export": "codegen"}
 
 
@@ -69,6 +71,7 @@ def run(app: typer.Typer) -> int:
     """Run a command line. Bad input gives one line on standard error and exit code 2, a signal its own code."""
     with ended_in_order() as ended, remembered() as pressed, warnings.catch_warnings():
         warnings.showwarning = _show_warning
+        logging.getLogger(_PACKAGE).addHandler(notes := _Notes())
         try:
             code = app(prog_name="orthocas", standalone_mode=False) or 0
         except KeyboardInterrupt:
@@ -82,12 +85,22 @@ def run(app: typer.Typer) -> int:
                 line = one_line(_format_error(error))
                 typer.echo(f"orthocas: {line[:1000]}{'...' if len(line) > 1000 else ''}", err=True)
             code = 2
+        finally:
+            logging.getLogger(_PACKAGE).removeHandler(notes)
         return ended() or (report_interrupt() if pressed() or code == INTERRUPTED else code)
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     """Print a warning as a note in one line, those of other libraries too."""
     typer.echo(f"note: {one_line(str(message))}", err=True)
+
+
+class _Notes(logging.Handler):
+    """Prints what the library logs, as warnings."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """One line."""
+        _show_warning(record.getMessage())
 
 
 def _format_error(error: Exception) -> str:
