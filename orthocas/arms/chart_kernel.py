@@ -26,7 +26,7 @@ _FLAGS = ("-O3",)
 
 @dataclass(frozen=True, slots=True)
 class ChartKernelRules:
-    """Numbers of the search for postures with x and xi, and of the tracker, in C.
+    """Numbers of the search for postures with x and xi in C, and of the tracker in C and NumPy.
 
     Errors of x are in radians, or as long as a radian moves the tip; joint positions in [rad] or [m].
     """
@@ -37,6 +37,7 @@ class ChartKernelRules:
     xi_found: float = 1e-9  #: error of xi of a posture that has it
     xi_weight: float = 1e-3  #: of errors of xi, relative to those of x
     posture_weight: float = 1e-4  #: of the way back to the last posture with a chart, where there is none
+    avoid_weight: float = 1e-2  #: of pairs nearer than `avoid`, relative to x
     way_weight: float = 1e-2  #: of the way to a posture with x and xi that was found
     step_damping: float = 1e-8  #: of squared joint steps
     error_damping: float = 0.3  #: of squared joint steps, times the squared error of x

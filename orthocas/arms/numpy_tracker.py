@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from orthocas.arms.chart_kernel import RULES
 from orthocas.arms.kernel import build_curvature, build_equations
 from orthocas.arms.maps import ArmMaps
 from orthocas.arms.self_motion import find_motions
@@ -22,34 +22,6 @@ from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import building
 from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import deferred
-
-
-@dataclass(frozen=True, slots=True)
-class TrackRules:
-    """Numbers of the arm's tracker. Errors of x are in radians, or as long as a radian moves the tip."""
-
-    met: float = 1e-10  #: error of x that is met
-    xi_met: float = 1e-8  #: error of xi that is met
-    xi_weight: float = 1e-3  #: of errors of xi, relative to those of x
-    posture_weight: float = 1e-4  #: of the way back to the last posture with a chart, where there is none
-    step_damping: float = 1e-8  #: of squared joint steps
-    error_damping: float = 0.3  #: of squared joint steps, times the squared error of x
-    damping: float = 1e-3  #: of squared joint steps after one that does not lower the error, at least
-    grows: float = 10.0  #: damping after another one; it shrinks as much after one that does
-    rounds: int = 12  #: of a call, at most
-    gain: float = 1e-9  #: relative decrease of the squared error below which it is a minimum
-    near: float = 1e-3  #: error of x below which the last posture with a chart does not count
-    decrease: float = 1e-4  #: of the cost, relative to what a step promises
-    window: float = 0.25  #: [s] in which the error of x must fall, or a detour is looked for
-    falls: float = 0.9  #: the error at its end, relative to that at its begin
-    guesses: int = 8  #: of the joints at bounds in a quadratic program, many at a time
-    changes: int = 40  #: of these joints, one at a time, at most
-    rounding: float = 1e-14  #: slope of the cost at a bound that is none
-    avoid_weight: float = 1e-2  #: of pairs nearer than `avoid`, relative to x
-    enough: float = 1e-2  #: relative decrease of the cost below which a far arm leaves the rest to the next call
-
-
-RULES = TrackRules()
 
 
 class TrackStatus(IntEnum):

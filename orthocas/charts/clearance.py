@@ -135,7 +135,9 @@ class Clearance:
         return index[near], self.floor(distance[near])
 
     def yield_to(self, q: Array, slopes: Array, wish: Array) -> Array:
-        """The change of xi (r,) nearest to a wished one that keeps pairs at `avoid`, to first order.
+        """A change of xi (r,) near a wished one that keeps pairs at `avoid`, to first order.
+
+        With one pair it is the nearest.
 
         Args:
             q: posture (n,).

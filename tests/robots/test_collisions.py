@@ -8,8 +8,8 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
+from collisions import hull_of
 from conftest import robot_data
-from scipy.spatial import ConvexHull
 from solid_arms import BALL, build_arm, place_balls
 
 import orthocas as oc
@@ -129,14 +129,7 @@ def build_directly(path: Path, pairs: tuple[tuple[str, str], ...]) -> tuple[pin.
     for solid in geometry.geometryObjects:
         if isinstance(solid.geometry, coal.BVHModelBase):
             vertices = np.array(solid.geometry.vertices())
-            hull = ConvexHull(vertices)
-            places = {int(corner): k for k, corner in enumerate(hull.vertices)}
-            points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
-            for corner in hull.vertices:
-                points.append(vertices[corner])
-            for face in hull.simplices:
-                triangles.append(coal.Triangle(*(places[int(corner)] for corner in face)))
-            solid.geometry = coal.Convex(points, triangles)
+            solid.geometry = hull_of(vertices)
     names = [model.frames[solid.parentFrame].name for solid in geometry.geometryObjects]
     for first, second in pairs:
         for i in [k for k, name in enumerate(names) if name == first]:
