@@ -56,6 +56,7 @@ def test_bad_input_is_one_sentence(run: Run, arm_file: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_a_fit_of_all_branches_makes_an_arm(run: Run, tmp_path: Path) -> None:
     target = tmp_path / "planar.arm"
     made = json.loads(run("fit", "planar_3r_xy", "--domain", "all", "--out", str(target), "--json")[1])

@@ -97,6 +97,7 @@ def test_branches_are_tested(tmp_path: Path) -> None:
     ],
     ids=["cppcheck", "clang-tidy"],
 )
+@pytest.mark.nightly
 def test_static_analysis_finds_nothing(words: tuple[str, ...]) -> None:
     program = shutil.which(words[0], path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     if program is None:

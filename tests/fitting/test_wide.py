@@ -1044,6 +1044,7 @@ def test_regular_part_refuses_coordinates_that_fold_at_its_centre() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_nearly_all_of_a_branch_is_proved_and_holds() -> None:
     robot, chart = iiwa(), wide_pose().chart
 

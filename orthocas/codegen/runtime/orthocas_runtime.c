@@ -2,7 +2,7 @@
  *
  * Read it from top to bottom: constants; numbers; chart and dynamics; inverse map; then the supervised law: its modes as
  * a table, its boundary, its sensors, its references, its modes in code, the catcher, memory, one tick; and references
- * of programs. R1 to R30 are requirements; docs/reference/runtime.md says which test proves which.
+ * of programs. R1 to R30 are requirements; docs/reference/runtime.md says which tests check which.
  *
  * C99, no global variables, no heap, no input, no output. Every array has the size that orthocas_runtime.h says; local
  * arrays are places in `work`, which a caller owns.
