@@ -30,6 +30,7 @@ from orthocas.tools.json import get_part
 _TREES = ("regular", "injective")
 _CORNERS = ("low", "high", "codes")
 _GUARDED = ("least_volume", "clear_share")  # in certificates of domains that keep folds out
+FREE = "free postures only"  #: note of charts that were fitted without postures in collision: where pairs are from
 CHART = Kind("chart", 1, ChartFileError)
 KINDS = (RegularPart,)  #: of domains that files may have beside those of `orthocas.tasks`; the import registers them
 _PROBES = 8  # points of the domain where a chart that is read is evaluated
@@ -130,7 +131,7 @@ def write_chart(
     if certificate is not None:
         data, proof = certificate_to_data(certificate)
         header["certificate"], arrays = {**data, "notes": _digest_of(header["notes"])}, {**arrays, **proof}
-    if collisions is None and isinstance(problem.robot.solids, KnownSolids):
+    if collisions is None and (isinstance(problem.robot.solids, KnownSolids) or FREE in notes):
         collisions = problem.robot.collisions
     if collisions is not None:
         header["collisions"], solids = collisions_to_data(collisions)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocas.charts.angles import pairs
 from orthocas.charts.chart import Chart
+from orthocas.charts.chart_file import FREE
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import Judged, WorstPoints, measure_held_speeds, worst_points
 from orthocas.errors import InvalidValueError, SingularTaskError
@@ -385,7 +386,7 @@ def evaluate(
         seed: seed of the samples. Default: 1.
         points: joint positions (N, n) or (n,) [rad] or [m] in place of samples, for example those of a path.
         collisions: of the chart's robot, such as `robot.collisions`: the report says how many of up to 10,000 samples
-            touch.
+            touch. Charts of `fit_wide(collisions=True)` are evaluated so by default, and at free samples only.
 
     Raises:
         SingularTaskError: if a gradient vanishes, or a coordinate has no value, everywhere.
@@ -405,13 +406,16 @@ def evaluate(
     if collisions is not None:
         require_kind("collisions", collisions, Collisions)
         collisions.require_for(chart.problem.robot.tree)
+    free = FREE in chart.notes
+    if free and collisions is None:
+        collisions = chart.problem.robot.collisions
     if points is None:
         count = _count(chart, RULES.samples if samples is None else samples)
         drawn = require_count("seed", RULES.seed if seed is None else seed, least=0)
         searched = isinstance(chart.coordinates, Coordinates) and not chart.problem.domain.full_turns
         problem, found = chart.problem, chart.coordinates
         worst = worst_points(problem, found, drawn, thorough=True) if searched else None
-        return _report(chart, sample_uniform(chart.problem.domain, count, drawn), drawn, worst, collisions)
+        return _report(chart, sample_uniform(chart.problem.domain, count, drawn), drawn, worst, collisions, free)
     if samples is not None or seed is not None:
         raise InvalidValueError("points", "given with samples or a seed", "points alone")
     given = as_point_set("points", points, chart.n)[0]
@@ -427,8 +431,18 @@ def _count(chart: Chart, samples: int) -> int:
 
 
 def _report(
-    chart: Chart, points: Array, seed: int | None, worst: WorstPoints | None, collisions: Collisions | None
+    chart: Chart,
+    points: Array,
+    seed: int | None,
+    worst: WorstPoints | None,
+    collisions: Collisions | None,
+    free: bool = False,
 ) -> Report:
+    contacts = None if collisions is None else ContactShare.of(collisions, points[: RULES.postures])
+    if collisions is not None and free:
+        points = points[collisions.check_free(points)]
+        if not len(points):
+            raise InvalidValueError("collisions", "a contact at all samples of the domain", "free postures")
     judged = Judged.at(chart.problem, chart.coordinates, points)
     if len(judged.points) == 0:
         where = "given points" if seed is None else "samples of the domain"
@@ -458,7 +472,7 @@ def _report(
         folded_samples=int(min((judged.signs > 0).sum(), (judged.signs <= 0).sum())),
         idle_joints=tuple(name for name in idle.values() if name not in floating),
         without_idle=without_idle if idle and others else None,
-        contacts=None if collisions is None else ContactShare.of(collisions, points[: RULES.postures]),
+        contacts=contacts,
     )
 
 
