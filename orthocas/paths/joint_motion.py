@@ -30,8 +30,8 @@ class Margins:
     velocity: float  #: largest share of a velocity limit that is used, at most 1
     acceleration: float  #: largest share of an acceleration limit that is used, at most 1
     singular_value: float  #: smallest relative singular value of the task, see `orthocas.ClearBox`
-    distance: float  #: smallest distance of a link to an obstacle [m]; inf without obstacles
-    distance_pair: str  #: which link and obstacle, or ""
+    distance: float  #: smallest distance of a pair [m]; inf without a collision model
+    distance_pair: str  #: the names of the two, or ""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -95,7 +95,7 @@ class JointMotion(Shown):
             "boundary": f"{kept.boundary:.3g} half-widths away{near}",
             "speed": f"{100 * kept.velocity:.3g} % of the limits, acceleration {100 * kept.acceleration:.3g} %",
             "task": f"relative singular value at least {kept.singular_value:.3g}",
-            **({"obstacles": f"{kept.distance:.3g} m away: {kept.distance_pair}"} if kept.distance_pair else {}),
+            **({"collisions": f"{kept.distance:.3g} m between {kept.distance_pair}"} if kept.distance_pair else {}),
         }
 
     def plot(self) -> "Figure":

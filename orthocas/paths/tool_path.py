@@ -55,7 +55,8 @@ class PathRules:
     inside: float = 0.97  #: fraction of the half-width beyond which the residual of a joint is a straight line
     regular: float = 0.1  #: relative singular value: scale of its residual
     nearly_singular: float = 0.02  #: where the line of that residual begins
-    away: float = 0.02  #: distance from obstacles: scale of its residual [m]
+    away: float = 0.02  #: distance of a pair: scale of its residual [m]
+    nearest: int = 6  #: pairs of parts with such residuals, the nearest ones by the bounds of their capsules
     too_near: float = 0.004  #: where the line of that residual begins [m]
 
     walk_steps: int = 3  #: at each place
