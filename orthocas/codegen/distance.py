@@ -1,4 +1,4 @@
-"""The least distance between a robot's links in C, with its gradient: of capsules that contain them."""
+"""The least distance between a robot's links in C and in exported modules: of capsules that contain them."""
 
 from __future__ import annotations
 
@@ -6,13 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
+from orthocas.codegen.export_forms import Form, write_function
 from orthocas.codegen.rendering import Precision, clean_word, clean_words, render
 from orthocas.robots.capsules import FittedCapsules
 from orthocas.robots.collisions import Collisions
+from orthocas.robots.kinematics import build_body_poses
 from orthocas.robots.robot import Robot
 from orthocas.robots.shapes import HalfSpaceGeometry
+from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
 from orthocas.tools.display import listed
 
@@ -25,6 +29,8 @@ class DistanceRules:
     seed: int = 0  #: of them
     grown: float = 1e-9  #: of the balls around links, relative: more than rounding
     locals_bytes: int = 1024  #: of stack for other variables
+    parallel: float = 1e-6  #: of the squared sine between two axes in modules, which may have single precision
+    least_square: float = 1e-18  #: [m^2], keeps square roots in modules differentiable
 
 
 RULES = DistanceRules()
@@ -91,6 +97,66 @@ def render_distance(fitted: FittedCapsules, values: Mapping[str, Any], precision
     }
     files = {f"{values['name']}_distance.{kind}": render(f"distance.{kind}", values) for kind in ("h", "c")}
     return {file: precision.translate(text) for file, text in files.items()}
+
+
+def build_distance_form(fitted: FittedCapsules) -> Form:
+    """The functions `distance` and `pair_distances` of an exported module."""
+    model = fitted.collisions
+    tree, parts = model.tree, [part for part in model.parts if part.shape.bounded]
+    # Poses of the bodies, and of the world, which comes last.
+    q = ca.SX.sym("q", tree.n)
+    poses = [*build_body_poses(tree, q), (ca.SX.eye(3), ca.SX.zeros(3))]
+    rows = ca.vertcat(*(ca.vec(ca.horzcat(rotation, translation).T) for rotation, translation in poses))
+    code = write_function(
+        "_body_poses", "Rotations and places of the bodies, row by row, (12 B, N).", dense_function("f", [q], [rows])
+    )
+    corners = [part.shape.list_corners() for part in parts]
+    radii = np.array([radius for _, radius in corners])
+    own: dict[str, list[int]] = {}
+    for k, part in enumerate(parts):
+        own.setdefault(part.name, []).append(k)
+    # Pairs of capsules, as many for each pair of names: the last one counts several times.
+    pairs = [(k, pair) for k, pair in enumerate(model.pairs) if pair[1] in own]
+    rows_of = [[(i, j) for i in own[a] for j in own[b]] for _, (a, b) in pairs]
+    most = max(map(len, rows_of), default=1)
+    numbers = np.array([[*row, *(most - len(row)) * [row[-1]]] for row in rows_of], dtype=int).reshape(-1, 2)
+    # Half-spaces: normals and offsets.
+    solids = {part.name: part.shape for part in model.parts}
+    planes = [(k, pair) for k, pair in enumerate(model.pairs) if pair[1] not in own]
+    most_planes = max((len(own[first]) for _, (first, _) in planes), default=1)
+    below = [[*own[a], *(most_planes - len(own[a])) * own[a][-1:]] for _, (a, _) in planes]
+    normals = [
+        np.append(shape.rotation[:, 2], shape.rotation[:, 2] @ shape.translation)
+        for shape in (solids[b] for _, (_, b) in planes)
+    ]
+    order = np.argsort([k for k, _ in (*pairs, *planes)])
+    flat = np.array(below, dtype=int).ravel()
+    tables = {
+        "capsule_ends": np.array([*(points[0] for points, _ in corners), *(points[-1] for points, _ in corners)]),
+        "radii": (radii[numbers[:, 0]] + radii[numbers[:, 1]])[:, None],
+        "plane_normals": np.repeat(np.reshape(normals, (-1, 4)), most_planes, axis=0)[:, :, None],
+        "plane_radii": radii[flat][:, None],
+    }
+    bodies = [part.body if part.body >= 0 else tree.n for part in parts]
+    indices = {
+        "capsule_bodies": [*bodies, *bodies],
+        "first": numbers[:, 0].tolist(),
+        "second": numbers[:, 1].tolist(),
+        "plane_first": flat.tolist(),
+        "pair_order": order.tolist(),
+    }
+    values = {
+        "pairs": ascii(model.pairs),
+        "bodies": tree.n + 1,
+        "capsules": len(parts),
+        "count": len(pairs),
+        "most": most,
+        "planes": len(planes),
+        "most_planes": most_planes,
+        "parallel": RULES.parallel,
+        "least_square": RULES.least_square,
+    }
+    return Form("distance", values, code, tables, indices)
 
 
 _BOX = ((np.min, -1.0), (np.max, 1.0))  #: how a box around balls begins and ends

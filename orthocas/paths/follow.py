@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -16,7 +17,8 @@ from orthocas.charts.self_motion import Walls, xi_range
 from orthocas.errors import InvalidValueError, PathError, SolveError
 from orthocas.paths.joint_curve import JointCurve, LostCurve, PhiSolver, TimeLaw, compute_fastest_law, list_places
 from orthocas.paths.joint_motion import JointMotion, Margins
-from orthocas.paths.tool_path import RULES, ToolPath
+from orthocas.paths.tool_path import RULES, ToolPath, build_spline
+from orthocas.paths.xi_search import search_xi
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.tree import require_driven
 from orthocas.tasks.samples import compute_row_scale, sample_uniform
@@ -54,7 +56,8 @@ def follow(
             `Task.target` takes them.
         xi: "hold" keeps the coordinates of `q_start`. An array (N, r) gives them at the waypoints, a function of s in
             [0, 1] along the path. "objective" chooses them: away from the boundary of the domain, from positions where
-            the task is near-singular, and from contacts, and with little motion. Circle-valued coordinates go from
+            the task is near-singular, and from contacts, and with little motion; where a contact stops what a descent
+            finds, and r = 1, all xi along the path are searched. Circle-valued coordinates go from
             each waypoint to the next by the shorter way, and count on beyond pi.
         q_start: a joint position (n,) near the start of the path. Default: the centre of the domain.
         period: distance of the time stamps [s].
@@ -107,14 +110,48 @@ def follow(
     else:
         raise InvalidValueError("xi", repr(xi)[:80], f"'{HOLD}', '{OBJECTIVE}', an array or a function")
     solver = PhiSolver(chart)
+    if not (isinstance(xi, str) and xi == OBJECTIVE):
+        return _move(path, JointCurve.trace(solver, path.phi, start), limits, stamp)
+    # The first choice of xi that can be followed, or why the first one cannot.
+    first: PathError | None = None
+    for chosen, q in _choose_xi(path, solver, limits, start):
+        try:
+            return _move(chosen, JointCurve.trace(solver, chosen.phi, q), limits, stamp)
+        except PathError as error:
+            first = first or error
+    assert first is not None
+    raise first
+
+
+def _choose_xi(
+    path: ToolPath, solver: PhiSolver, limits: MotionLimits, start: Array
+) -> Iterator[tuple[ToolPath, Array]]:
+    """Tool paths with chosen coordinates, each with a start (n,): by descent, then from a search of all xi."""
+    chart, costs = solver.chart, Costs(limits)
+    choice = XiChoice(path, costs, solver)
+    # From coordinates that are held, or from a walk where that is not possible.
     curve = JointCurve.trace(solver, path.phi, start)
-    if isinstance(xi, str) and xi == OBJECTIVE:
-        # From coordinates that are held, or from a walk where that is not possible.
-        costs = Costs(limits)
-        choice = XiChoice(path, costs, solver)
-        q = walk(chart, costs, path.x(choice.s), start) if isinstance(curve, LostCurve) else curve.q(choice.s)
-        path = choice.optimise(q)
-        curve = JointCurve.trace(solver, path.phi, q[0])
+    q = walk(chart, costs, path.x(choice.s), start) if isinstance(curve, LostCurve) else curve.q(choice.s)
+    yield choice.optimise(q), q[0]
+    if limits.collisions is None or chart.r > 1:
+        return
+    for clearance in (limits.clearance + RULES.away, limits.clearance):
+        found = search_xi(
+            chart, path, limits.collisions, clearance, Costs(replace(limits, collisions=None)).sum_squares
+        )
+        if found is None:
+            continue
+        s, q = found
+        near = np.column_stack([np.interp(choice.s, s, column) for column in q.T])
+        yield choice.optimise(near), q[0]
+        xi = counted_on(chart.xi(q), chart.parts.turns[chart.m :])
+        if path.closed:
+            xi[-1] = xi[0]
+        yield path.replace_xi(build_spline(s, xi, path.closed)), q[0]
+
+
+def _move(path: ToolPath, curve: JointCurve | LostCurve, limits: MotionLimits, period: float) -> JointMotion:
+    """The motion along a curve, from rest to rest, if it can be followed."""
     # Where it ends early or leaves the domain, an error says why.
     if isinstance(curve, LostCurve):
         limits.check_kept(path, curve.s, curve.q)
@@ -125,7 +162,7 @@ def follow(
     # The fastest s(t), then time stamps, slower until they keep the limits.
     _, first, second = curve.evaluate(list_places())
     law = compute_fastest_law(first, second, limits.velocity, limits.acceleration)
-    motion = _sample_on_stamps(path, curve, law, limits, stamp)
+    motion = _sample_on_stamps(path, curve, law, limits, period)
     limits.check_contacts(path, motion)
     return motion
 
@@ -327,6 +364,10 @@ class Costs:
             residuals, slopes = _evaluate_inverse(values - self.limits.clearance, RULES.away, RULES.too_near)
             parts.append((residuals, slopes[..., None] * gradients))
         return np.concatenate([part[0] for part in parts], axis=1), np.concatenate([part[1] for part in parts], axis=1)
+
+    def sum_squares(self, q: Array) -> Array:
+        """Of the residuals at joint positions (P, n), (P,)."""
+        return np.asarray((self(q)[0] ** 2).sum(axis=1))
 
     def _evaluate_boundaries(self, q: Array) -> tuple[Array, Array]:
         domain = self.limits.chart.problem.domain
