@@ -90,11 +90,16 @@ class Search:
         good[good] = self.line.around.check_free(q[good])
         return good
 
+    def differentiate(self, q: Array) -> Array:
+        """How velocities of joints move the tip, (N, m, n), at postures (N, n)."""
+        rates: Array = self.chart.parts.relative.batched_rates(q)[0]
+        return rates.reshape(len(q), self.chart.m, self.chart.n)
+
     def correct(self, q: Array, x: Array) -> Array:
         """Postures (N, n) with a task value near others, by Newton's method of least norm; NaN where it fails."""
         relative = self.chart.parts.relative
         for _ in range(NEWTON):
-            J = self.chart.jacobian(q)[:, : self.chart.m]
+            J = self.differentiate(q)
             errors = relative.difference(np.tile(x, (len(q), 1)), self.chart.x(q))
             q = q + np.einsum("nij,nj->ni", np.linalg.pinv(J), errors)
         good = np.abs(relative.difference(np.tile(x, (len(q), 1)), self.chart.x(q))).max(axis=1, initial=0.0) < 1e-6
@@ -109,7 +114,7 @@ class Search:
                 if not len(known) or np.linalg.norm(known - q, axis=1).min() > STEP * 2 / 3:
                     known = np.vstack([known, q])
             fresh = known[-len(front) :] if len(known) else known
-            along = np.linalg.svd(self.chart.jacobian(fresh)[:, : self.chart.m])[2][:, -1]
+            along = np.linalg.svd(self.differentiate(fresh))[2][:, -1]
             new = self.correct(np.vstack([fresh + STEP * along, fresh - STEP * along]), x)
             new = new[self.allow(new)]
             if not len(new):

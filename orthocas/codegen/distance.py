@@ -66,7 +66,9 @@ def render_distance(fitted: FittedCapsules, values: Mapping[str, Any], precision
         carried[tree.carriers(parts[0].body)] = 1
         ball = {"centre": centre, "radius": float(max(far)) * (1 + RULES.grown)}
         links.append({"body": parts[0].body, "first": len(capsules), "count": len(parts), "carried": carried, **ball})
-        capsules += [{"start": p[0], "end": p[1], "radius": float(r)} for p, r in zip(rows, radii, strict=True)]
+        for (start, end), r in zip(rows, radii, strict=True):
+            reach = float(np.linalg.norm(end - start) / 2 + r) * (1 + RULES.grown)
+            capsules.append({"start": start, "end": end, "radius": float(r), "reach": reach})
     pairs, plane_pairs = list[tuple[int, int, int]](), list[tuple[int, int, int]]()
     for number in _order_pairs(model):
         first, second = model.pairs[number]
@@ -76,7 +78,9 @@ def render_distance(fitted: FittedCapsules, values: Mapping[str, Any], precision
     up = (lambda value: value) if precision.scalar is np.float64 else lambda value: _round_up(value, precision)
     for item in (*capsules, *links):
         item["radius"] = up(item["radius"])
-    numbers_held = 12 * tree.n + 3 * len(links) + 6 * len(capsules)
+    for capsule in capsules:
+        capsule["reach"] = up(capsule["reach"])
+    numbers_held = 12 * tree.n + 3 * len(links) + 9 * len(capsules)
     values = {
         **values,
         "n": tree.n,
