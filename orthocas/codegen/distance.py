@@ -9,6 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from orthocas.charts.clearance import RULES as CLEARANCE
 from orthocas.codegen.export_forms import Form, write_function
 from orthocas.codegen.rendering import Precision, clean_word, clean_words, render
 from orthocas.robots.capsules import FittedCapsules
@@ -29,6 +30,8 @@ class DistanceRules:
     seed: int = 0  #: of them
     grown: float = 1e-9  #: of the balls around links, relative: more than rounding
     locals_bytes: int = 1024  #: of stack for other variables
+    rounds: int = 16  #: distances by which a way is checked, at most
+    resolution: float = 1e-6  #: [m]: nearer to what is kept counts as too near
     parallel: float = 1e-6  #: of the squared sine between two axes in modules, which may have single precision
     least_square: float = 1e-18  #: [m^2], keeps square roots in modules differentiable
 
@@ -80,7 +83,7 @@ def render_distance(fitted: FittedCapsules, values: Mapping[str, Any], precision
         item["radius"] = up(item["radius"])
     for capsule in capsules:
         capsule["reach"] = up(capsule["reach"])
-    numbers_held = 12 * tree.n + 3 * len(links) + 9 * len(capsules)
+    numbers_held = 18 * tree.n + 3 * len(links) + 9 * len(capsules)
     values = {
         **values,
         "n": tree.n,
@@ -97,6 +100,16 @@ def render_distance(fitted: FittedCapsules, values: Mapping[str, Any], precision
         "pairs": pairs,
         "planes": planes if plane_pairs else [],
         "plane_pairs": plane_pairs,
+        "rates": [up(rate) for rate in model.rates.max(axis=0, initial=0.0).tolist()],
+        "clear": {
+            "zone": CLEARANCE.zone,
+            "left": 1 - CLEARANCE.fall,
+            "between": CLEARANCE.between,
+            "halvings": CLEARANCE.halvings,
+            "rounds": RULES.rounds,
+            "resolution": RULES.resolution,
+            "most": 1 + CLEARANCE.halvings * (1 + RULES.rounds),
+        },
         "stack": precision.size * numbers_held + len(links) + RULES.locals_bytes,
     }
     files = {f"{values['name']}_distance.{kind}": render(f"distance.{kind}", values) for kind in ("h", "c")}
