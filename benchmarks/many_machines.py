@@ -20,7 +20,9 @@ from orthocas.tools.processes import scheduler_executor, starting_workers
 WORKERS = (1, 2, 4, 64)
 JOB, JOBS_OF_A_WORKER = 0.5, 8
 CHART = "iiwa7-position"
-JOBS_HEADER = "| Dask's workers | jobs of half a second | efficiency | client's processor, a job [ms] |\n| --- | --- | --- | --- |"
+JOBS_HEADER = (
+    "| Dask's workers | jobs of half a second | efficiency | client's processor, a job [ms] |\n| --- | --- | --- | --- |"
+)
 PROOF_HEADER = "| proof of a chart by | boxes | time [s] | of two processes |\n| --- | --- | --- | --- |"
 
 
