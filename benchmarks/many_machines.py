@@ -21,7 +21,7 @@ WORKERS = (1, 2, 4, 64)
 JOB, JOBS_OF_A_WORKER = 0.5, 8
 CHART = "iiwa7-position"
 JOBS_HEADER = (
-    "| Dask's workers | jobs of half a second | efficiency | client's processor, a job [ms] |\n| --- | --- | --- | --- |"
+    "| Dask's workers | jobs of half a second | efficiency | client's time, a job [ms] |\n| --- | --- | --- | --- |"
 )
 PROOF_HEADER = "| proof of a chart by | boxes | time [s] | of two processes |\n| --- | --- | --- | --- |"
 
