@@ -34,7 +34,7 @@ from orthocas.cli import simulate
 from orthocas.cli.entry import main
 from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared, compiled, compiled_inverse
 from orthocas.codegen.library import STRICT
-from orthocas.control import PDPlus, Reference
+from orthocas.control import PDPlus, Reference, matched_stiffness
 from orthocas.fitting.fit import Fit
 from orthocas.robots import pinocchio_model, urdf
 from orthocas.tools.checks import Array
@@ -177,8 +177,12 @@ def planar_steps(planar_chart: oc.Chart, planar_q0: Array) -> Reference:
 
 @pytest.fixture(scope="session")
 def supervised_law(planar_for_control: oc.Chart) -> PDPlus:
-    """A law on a box of the planar arm, to be supervised."""
-    return PDPlus.on_chart(planar_for_control, limit=120.0)
+    """A law on a box of the planar arm, to be supervised.
+
+    With 14 kg m^2 at the first joint and torques that change by 1 N m in a millisecond, springs of 8 Hz would be too
+    stiff to take over an arm that moves.
+    """
+    return PDPlus(planar_for_control, matched_stiffness(planar_for_control), limit=120.0)
 
 
 @pytest.fixture(scope="session")

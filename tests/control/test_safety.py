@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 
-import numpy as np
 import pytest
 from charts import with_metric
 from programs import needs_c, nightly
@@ -33,7 +32,7 @@ def test_pushed_arms_slow_down_come_to_rest_and_come_back(iiwa: oc.Problem) -> N
 
 
 def test_a_start_with_a_wrong_mass_is_not_caught_and_integral_action_takes_the_sag_away() -> None:
-    """With A = M the light wrist makes up for the sag of the tip: a law that faded in over 0.2 s made it too fast."""
+    """With A = M the light wrist makes up for the sag of the tip, also while the law fades in over 0.2 s."""
     chart = default_gains.chart_of("iiwa", "position", "inertia")
     law, plant = PDPlus.on_chart(chart), MuJoCoPlant(chart.problem.robot.with_scaled_masses(1.2))
     worst = default_gains.starts_of(chart.problem, 3)[2]
@@ -41,7 +40,7 @@ def test_a_start_with_a_wrong_mass_is_not_caught_and_integral_action_takes_the_s
         default = Supervisor(library, law, Safety.of(law, integral_rate=3.0))
         slow = Supervisor(library, law, Safety.of(law, integral_rate=3.0, fade_in=0.2))
         assert default_gains.held(law, default, plant, worst) < 1e-3  # [m] after 2 s
-        assert np.isinf(default_gains.held(law, slow, plant, worst))  # caught
+        assert default_gains.held(law, slow, plant, worst) < 1e-3
 
 
 @pytest.fixture(scope="module")
@@ -81,9 +80,10 @@ def test_the_observer_keeps_torques_of_coarse_encoders_below_their_rate() -> Non
 
 
 def test_gains_for_a_delay_settle_an_arm_that_default_ones_make_swing() -> None:
-    """Ten milliseconds on an arm that nothing was tuned for, from its fastest posture and others."""
+    """25 ms on an arm that nothing was tuned for, from its fastest posture and others; default gains bear 10."""
     chart = oc.charts.load("ur5-position")
-    default, slower = PDPlus.on_chart(chart), PDPlus.on_chart(chart, delay=10e-3)
+    default, slower = PDPlus.on_chart(chart), PDPlus.on_chart(chart, delay=25e-3)
     with default_gains.compiled(default) as library:
-        assert default_gains.settled(default, library, 10) > 1.0  # [rad/s]
-        assert default_gains.settled(slower, library, 10) < 0.02
+        assert default_gains.settled(default, library, 10) < 0.02  # [rad/s]
+        assert default_gains.settled(default, library, 25) > 1.0
+        assert default_gains.settled(slower, library, 25) < 0.1
