@@ -26,9 +26,9 @@ POSES, NEWTON_POSES, DENSE, STARTS = 100, 20, 20_000, 1000
 SAME = 1e-6  # [rad] from an arc: the posture is on it
 
 
-def random_arm(seed: int) -> oc.Robot:
-    """Seven joints of limits -2.6 and 2.6, axes tilted by right angles and up to 12 degrees, links of 0.2 m."""
-    rng, n = np.random.default_rng(seed), 7
+def random_arm(seed: int, n: int = 7) -> oc.Robot:
+    """n joints of limits -2.6 and 2.6, axes tilted by right angles and up to 12 degrees, links of 0.2 m."""
+    rng = np.random.default_rng(seed)
     offsets = rng.uniform(-0.05, 0.05, (n, 3)) + np.array([0.0, 0.0, 0.2])
     right = np.where(np.arange(n) % 2, -np.pi / 2, np.pi / 2) * (np.arange(n) > 0)
     roll, pitch = right + rng.uniform(-0.2, 0.2, n), rng.uniform(-0.1, 0.1, n)

@@ -53,6 +53,7 @@ SCRIPTS = (
     "exported_inverse",
     "exported_nearest",
     "beyond_reach",
+    "collisions",
     "arm",
     "default_gains",
     "safety",

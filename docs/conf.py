@@ -42,6 +42,7 @@ copybutton_prompt_is_regexp = True
 html_theme = "furo"
 html_title = f"orthocas {release}"
 html_static_path = ["_static"]
+html_favicon = "_static/favicon.svg"
 html_css_files = ["site.css"]
 html_math_renderer = "mathml"
 html_copy_source = False

@@ -27,7 +27,7 @@ STEPS = {  # [m], [rad]: small enough for the boxes of the problems
     "planar_3r_xy": {"x": 0.1, "y": 0.1, "xi1": -0.05},
 }
 PAUSE = 4.0  # [s] between steps, in which even slow springs come to rest
-WEIGHTS = (1000.0, 30.0, 150.0, 0.1)  # the last keeps gradients even (docs/explanation/derivations_fits.md#lengths)
+WEIGHTS = (1000.0, 30.0, 150.0, 0.1)  # the last keeps gradients even (docs/explanation/derivations_meaning.md#lengths)
 
 
 def main(quick: bool = False) -> dict[str, float]:

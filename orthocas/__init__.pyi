@@ -39,6 +39,7 @@ from orthocas.fitting.wide import fit_wide as fit_wide
 from orthocas.paths.chart_along import chart_along as chart_along
 from orthocas.paths.follow import follow as follow
 from orthocas.robots import obstacles as obstacles
+from orthocas.robots.capsules import fit_capsules as fit_capsules
 from orthocas.robots.robot import Robot as Robot
 from orthocas.robots.scene import Scene as Scene
 from orthocas.simulation.run import simulate as simulate

@@ -1,7 +1,8 @@
 """SciPy's L-BFGS-B behind the protocol of solvers, also preconditioned by a Gauss-Newton matrix."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy
@@ -75,7 +76,8 @@ class LBFGS:
 class QuasiNewton(LBFGS):
     """L-BFGS in variables z in which a Gauss-Newton matrix H, estimated from few samples and damped, is the identity.
 
-    theta = theta_k + L^-T z with L L^T = H(theta_k) + 0.003 diag H. A matrix of K coefficients and N samples takes
+    theta = theta_k + L^-T z with L L^T = H(theta_k) + 0.003 diag H; of many coefficients, H has only its diagonal
+    blocks. A matrix of K coefficients and N samples takes
     N K^2 operations, a gradient N K. So one matrix and many gradients cost less than a few Gauss-Newton steps, and
     L-BFGS learns what the matrix misses. It starts again, with a new matrix, where the loss has fallen by a fifth.
 
@@ -127,14 +129,15 @@ class QuasiNewton(LBFGS):
         """Minimise in the variables z of the matrix at the best point; None where that is out of date."""
         assert isinstance(best.objective, EstimatedObjective)
         start, height, loss = best.theta, best.value, _Finite(best, gradient)
-        factor = _factor(best.objective.curvature_estimate(start))
+        factors = [_factor(block) for block in best.objective.curvature_estimate(start)]
         # SciPy's first step has length 1: in these units it is the Gauss-Newton step
-        factor /= np.linalg.norm(_solve(factor, gradient))
+        unit = np.linalg.norm(_solve(factors, gradient))
+        factors = [factor / unit for factor in factors]
         value, gained_little, converged = height, False, False
 
         def value_and_gradient(z: Array) -> tuple[float, Array]:
-            value, gradient = loss.value_and_gradient(start + _solve(factor, z, transposed=True))
-            return value, _solve(factor, gradient)
+            value, gradient = loss.value_and_gradient(start + _solve(factors, z, transposed=True))
+            return value, _solve(factors, gradient)
 
         def count(_: Array) -> None:
             nonlocal value, gained_little, converged
@@ -202,6 +205,10 @@ def _factor(H: Array) -> Array:
             damping *= 10
 
 
-def _solve(factor: Array, vector: Array, transposed: bool = False) -> Array:
-    """L^-1 v, or L^-T v."""
-    return np.asarray(scipy.linalg.solve_triangular(factor, vector, trans=int(transposed), lower=True), dtype=float)
+def _solve(factors: Sequence[Array], vector: Array, transposed: bool = False) -> Array:
+    """L^-1 v, or L^-T v, of a matrix L with these blocks on its diagonal."""
+    ends = np.cumsum([len(factor) for factor in factors])
+    parts = zip(factors, np.split(vector, ends[:-1]), strict=True)
+    # numbers that are not finite are for the loss to report
+    solve = partial(scipy.linalg.solve_triangular, trans=int(transposed), lower=True, check_finite=False)
+    return np.concatenate([solve(factor, part) for factor, part in parts], dtype=float)

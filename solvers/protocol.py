@@ -62,8 +62,8 @@ class LeastSquaresObjective(Objective, Protocol):
 class EstimatedObjective(Objective, Protocol):
     """A mean of squared residuals with a rough Gauss-Newton matrix, which costs less than the one of all samples."""
 
-    def curvature_estimate(self, theta: Array) -> Array:
-        """An estimate of the Gauss-Newton matrix, (size, size)."""
+    def curvature_estimate(self, theta: Array) -> list[Array]:
+        """An estimate of the Gauss-Newton matrix: its diagonal blocks, in the order of theta, or the whole as one."""
         ...
 
 

@@ -8,6 +8,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from shared.pages import HOW_TO, read_page
+
 ROOT = Path(__file__).parent.parent
 USE = """
 import orthocas as oc
@@ -53,6 +55,11 @@ def main() -> None:
             "charts/licences/NOTICE.txt",
         ):
             assert wanted in names, wanted
+        run(python, "-m", "pip", "install", "--quiet", f"{wheel}[view,mujoco,learn,robots]", cwd=folder)
+        for page in HOW_TO:
+            sys.stdout.write(f"{page}\n")
+            (folder / page).mkdir(parents=True)
+            read_page(page, python, folder / page)
     sys.stdout.write("wheel check passed\n")
 
 

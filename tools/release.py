@@ -22,7 +22,7 @@ from typing import Any
 ROOT = Path(__file__).parent.parent
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 VERSION = re.findall(r'VERSION = "(.+)"', (ROOT / "orthocas" / "version.py").read_text())[0]
-CONDA_NAMES = {"pin": "pinocchio", "libigl": "igl", "matplotlib": "matplotlib-base"}
+CONDA_NAMES = {"pin": "pinocchio", "matplotlib": "matplotlib-base"}
 
 IN_WHEEL = (
     "orthocas/py.typed",

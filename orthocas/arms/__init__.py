@@ -7,7 +7,8 @@ hold them, and `maps` holds what all of these need of the robot.
 """
 
 from orthocas.arms.arm import Arm, Postures
+from orthocas.arms.numpy_tracker import TrackStatus
 from orthocas.arms.self_motion import Arc, Place, SelfMotions
-from orthocas.arms.tracker import ArmTracker, TrackStatus
+from orthocas.arms.tracker import ArmTracker
 
 __all__ = ["Arc", "Arm", "ArmTracker", "Place", "Postures", "SelfMotions", "TrackStatus"]

@@ -9,16 +9,20 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from orthocas.arms.arm_file import read_charts, write_charts
+from orthocas.arms.chart_kernel import ChartKernel
 from orthocas.arms.maps import ArmMaps
+from orthocas.arms.numpy_tracker import TrackStatus
 from orthocas.arms.self_motion import Arc, SelfMotions, find_motions
-from orthocas.arms.tracker import ArmTracker, TrackStatus
+from orthocas.arms.tracker import ArmTracker
 from orthocas.charts.chart import Chart
+from orthocas.charts.clearance import Clearance
 from orthocas.charts.inverse import InverseStatus
-from orthocas.errors import BranchWarning, DomainError, InvalidValueError, NotRedundantError, ShapeError
+from orthocas.errors import BranchWarning, CompileError, DomainError, InvalidValueError, NotRedundantError, ShapeError
 from orthocas.fitting.wide import fit_wide
+from orthocas.robots.collisions import Collisions
 from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import branches
 from orthocas.tasks.metric import Metric, MetricSpec
@@ -37,6 +41,7 @@ from orthocas.tools.checks import (
     require_known,
 )
 from orthocas.tools.display import Shown, listed, percent
+from orthocas.tools.expressions import wrap_shortest
 from orthocas.tools.progress import Monitor, Progress, silent
 
 ANY = "any"  #: branch
@@ -88,12 +93,13 @@ class Postures(Shown):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Arm(Shown):
-    """An arm with one joint more than its task needs, and charts of the branches of its joint range.
+    """An arm with more joints than its task needs, and charts of the branches of its joint range.
 
     Where a chart ends at a boundary of its domain, an arm goes on: it knows the postures of a task value x within the
     joint limits. Without limits they are a few closed curves, which are traced from stored postures and then cut at
     the limits: `self_motion`, `nearest`, `solve` and `solutions`. Charts give postures a number xi on each branch.
-    `tracker` follows a stream of x and xi through borders of charts, singular positions and out of reach.
+    `tracker` follows a stream of x and xi through borders of charts, singular positions and out of reach. Arms with
+    several joints more than the task needs, such as those on mobile bases, have trackers only.
 
     The curves are traced in C that is compiled on first use and kept; without a compiler, NumPy does the same, a
     hundred times slower. `Arm(task)` has no charts: it is ready at once, and knows no xi.
@@ -103,11 +109,11 @@ class Arm(Shown):
     of these.
 
     Args:
-        task: a task with m = n - 1.
+        task: a task with m < n; with m = n - 1 for all but trackers.
         charts: of branches, with equal tasks.
 
     Raises:
-        NotRedundantError, InvalidValueError: if n - m is not 1, or charts have another task.
+        NotRedundantError, InvalidValueError: if the task leaves no joint free, or charts have another task.
 
     Example:
         >>> import orthocas as oc
@@ -130,8 +136,6 @@ class Arm(Shown):
         free = robot.n - len(robot.tree.floating)
         if self.task.m >= free:
             raise NotRedundantError(self.task.m, free)
-        if self.task.m + 1 != robot.n:
-            raise InvalidValueError("task", f"n - m = {robot.n - self.task.m}", "one with n - m = 1, or use charts")
         one = np.flatnonzero(np.isfinite(robot.lower) != np.isfinite(robot.upper))
         if any(not robot.tree.prismatic[k] for k in one):
             raise InvalidValueError("joint", f"'{robot.joint_names[one[0]]}' with one limit", "two limits, or none")
@@ -170,6 +174,7 @@ class Arm(Shown):
         """
         require_kind("robot", robot, Robot)
         bare = cls(Task.pose(robot) if task is None else task)
+        bare.require_one_free()
         parts, found, reasons = branches(robot, bare.task), [], []
         for k, branch in enumerate(parts):
             own = f"branch {k + 1} of {len(parts)}, "
@@ -234,23 +239,31 @@ class Arm(Shown):
             x: one task value.
 
         Raises:
-            InvalidValueError: if x is no task value, or not finite.
+            InvalidValueError: if x is no task value, or not finite, or n - m is not 1.
         """
+        self.require_one_free()
         return find_motions(self.maps, self._read_one(x))
 
-    def solutions(self, x: Any, xi: float | None = None) -> tuple[Arc, ...] | Postures:
+    def solutions(
+        self, x: Any, xi: float | None = None, collisions: Collisions | None = None
+    ) -> tuple[Arc, ...] | Postures:
         """All postures with a task value, on all branches.
 
         Args:
             x: one task value.
             xi: that postures are to have in the chart of their branch; None for any.
+            collisions: of the robot, for postures with xi: those without a contact come first, the others are
+                COLLIDING.
 
         Returns:
             Without xi the arcs, the components of `self_motion`; with xi the postures where a chart has it.
 
         Raises:
-            InvalidValueError: if x is no task value, or xi is given to an arm without charts.
+            InvalidValueError: if x is no task value, xi is given to an arm without charts, or collisions without xi.
         """
+        self._check_collisions(collisions)
+        if collisions is not None and xi is None:
+            raise InvalidValueError("collisions", "given without xi", "xi with it; `solve` takes it without xi")
         motions = self.self_motion(x)
         if xi is None:
             return motions.components
@@ -260,7 +273,10 @@ class Arm(Shown):
         q = np.array([q for q, _ in found]).reshape(-1, self.robot.n)
         names = tuple(name for _, name in found)
         status = np.full(len(q), int(InverseStatus.FOUND))
-        return Postures(q, status, names, np.full(len(q), value))
+        if collisions is not None and len(q):
+            status[~collisions.check_free(q)] = InverseStatus.COLLIDING
+        order = np.argsort(status, kind="stable")
+        return Postures(q[order], status[order], tuple(names[k] for k in order), np.full(len(q), value))
 
     def nearest(self, x: Any, q_wish: ArrayLike) -> Postures:
         """The posture within the joint limits with a task value that is nearest to another one, |q - q_wish| least.
@@ -271,57 +287,88 @@ class Arm(Shown):
         """
         return self.solve(x, start=q_wish)
 
-    def solve(self, x: Any, xi: ArrayLike | None = None, start: ArrayLike | None = None, branch: str = ANY) -> Postures:
+    def solve(
+        self,
+        x: Any,
+        xi: ArrayLike | None = None,
+        start: ArrayLike | None = None,
+        branch: str = ANY,
+        collisions: Collisions | None = None,
+    ) -> Postures:
         """A posture within the joint limits for each task value.
 
-        With xi, charts are asked in turn: that of the start's branch first, or else the largest; the first that has
-        (x, xi) gives the posture, by `Chart.solve`. Where none has, the posture with that x whose xi is nearest is
-        NEAREST; where charts hold none, one with that x within the limits is OUTSIDE_DOMAIN. Without xi, it is the
-        posture nearest to the start, or without one, far from limits.
+        With xi, charts are asked in turn: that of the start's branch first, or else the largest. Newton's method goes
+        to (x, xi) from the start, or from the nearest of stored postures; the first chart in which it arrives gives the
+        posture. Otherwise the self-motion curves of x are searched for postures with xi. Where there is none, the
+        posture whose xi is nearest is NEAREST; where charts hold none, one with that x within the limits is
+        OUTSIDE_DOMAIN. Without xi, it is the posture nearest to the start, or without one, far from limits.
+
+        Rows are spread over the cores, in C that is compiled on first use.
 
         Args:
             x: one task value, or N of them. Rows that are not finite are BAD_INPUT.
             xi: a number, or one for each row (N,).
             start: a posture (n,), or one for each row (N, n).
             branch: name of a branch, to accept no other; "any" for all.
+            collisions: of the robot, such as `robot.collisions`. Where the posture touches something, a free one with
+                the same x and xi takes its place; else, of free postures 0.05 rad apart on the arcs, that with the
+                nearest xi (NEAREST), or without xi that nearest to the start, or farthest from limits. Where none is
+                free, the status is COLLIDING.
 
         Raises:
             InvalidValueError, ShapeError: for arguments that do not fit, or an xi or branch without charts.
         """
-        targets, single = self.maps.targets.read(x)
+        self.require_one_free()
+        self._check_collisions(collisions)
+        targets, single = self._read(x)
         N, n = len(targets), self.robot.n
         starts = None if start is None else _repeat_rows("start", as_point_set("start", start, n)[0], N)
         require_kind("branch", branch, str)
         if branch != ANY:
             require_known("branch", branch, self.branch_names)
         chosen = [k for k, name in enumerate(self.branch_names) if branch in (ANY, name)]
-        q, status = np.full((N, n), np.nan), np.full(N, int(InverseStatus.NOT_FOUND))
-        good = np.isfinite(targets).all(axis=1)
         values = None
+        good = np.asarray(np.isfinite(targets).all(axis=1))
         if xi is not None:
             self._require_charts()
             values = _repeat_rows("xi", as_float_array("xi", xi).reshape(-1, 1), N)[:, 0]
-            good &= np.isfinite(values)
-            self._solve_by_charts(targets, values, starts, chosen, q, status, good)
+            good = good & np.isfinite(values)
+        q, status = np.full((N, n), np.nan), np.full(N, int(InverseStatus.NOT_FOUND))
+        owners = np.full(N, -1)
         status[~good] = InverseStatus.BAD_INPUT
-        left = np.flatnonzero(good & (status != InverseStatus.FOUND))
-
-        def solve_row(row: int) -> None:
-            wish = None if starts is None else starts[row]
-            value = None if values is None else float(values[row])
-            q[row], status[row] = self._solve_on_arcs(targets[row], value, wish, chosen, branch == ANY)
-
-        run_in_threads(solve_row, left.tolist())
-        owners = self.find_branches(np.where(np.isfinite(q), q, 0.0))
-        owners = [k if good else -1 for k, good in zip(owners, np.isfinite(q).all(axis=1), strict=True)]
-        names = tuple(self.branch_names[k] if k >= 0 else "" for k in owners)
-        own = self._evaluate_xi(q, owners)
+        rows, near = np.flatnonzero(good), None if starts is None else starts[good]
+        solve_rows = self._solve_rows if xi is None or self.chart_kernel is None else self._solve_rows_in_c
+        wishes = None if values is None else values[rows]
+        q[rows], status[rows], owners[rows] = solve_rows(targets[rows], wishes, near, chosen, branch == ANY)
+        if collisions is not None:
+            known = np.flatnonzero(np.isfinite(q).all(axis=1))
+            for row in known[~collisions.check_free(q[known])].tolist():
+                wish = None if starts is None else starts[row]
+                value = None if values is None else float(values[row])
+                free = self._find_free(targets[row], value, wish, chosen, branch == ANY, collisions)
+                q[row], status[row] = free or (q[row], InverseStatus.COLLIDING)
+                owners[row] = self.find_branches(q[row : row + 1])[0]
+        names = tuple(self.branch_names[k] if k >= 0 else "" for k in owners.tolist())
+        own = np.full(N, np.nan) if values is None else np.where(status == InverseStatus.FOUND, values, np.nan)
+        unknown = np.flatnonzero(np.isnan(own) & (owners >= 0))
+        if unknown.size:
+            own[unknown] = self._evaluate_xi(q[unknown], owners[unknown])
         if single:
             return Postures(q[0], InverseStatus(int(status[0])), names[0], own[0])
         return Postures(q, status, names, own)
 
     def tracker(
-        self, q: ArrayLike, *, period: float = 0.01, velocity_limits: ArrayLike | None = None, detours: bool = True
+        self,
+        q: ArrayLike,
+        *,
+        period: float = 0.01,
+        velocity_limits: ArrayLike | None = None,
+        acceleration_limits: ArrayLike | None = None,
+        weights: ArrayLike | None = None,
+        detours: bool = True,
+        collisions: Collisions | None = None,
+        margin: float | None = None,
+        avoid: float | None = None,
     ) -> ArmTracker:
         """A tracker of a stream of x and xi that is never lost; see `ArmTracker`.
 
@@ -329,9 +376,18 @@ class Arm(Shown):
             q: posture within the joint limits, (n,).
             period: time from one call to the next [s].
             velocity_limits: (n,) or one number [rad/s] or [m/s]. Default: those of the robot's file.
-            detours: whether the arm may leave x for a while where it is stuck, to get to a posture that has it.
+            acceleration_limits: (n,) or one number [rad/s^2] or [m/s^2]. Default: none.
+            weights: of the joints' steps, and ways back to the last posture with a chart, or where there are no charts,
+                to q: (n,), of which the ratios count. A large one keeps a base nearer to its place than the arm.
+            detours: whether the arm may leave x for a while where it is stuck, to get to a posture that has it, or to
+                one that has xi as well.
+            collisions: of the robot, such as `robot.collisions`; with margin and avoid as in `Chart.tracker`.
+            margin: [m].
+            avoid: [m].
         """
-        return ArmTracker(self.maps, self.charts, q, period, velocity_limits, detours)
+        clearance = Clearance.build(collisions, self.robot.tree, margin, avoid)
+        rules = velocity_limits, acceleration_limits, weights, detours, clearance
+        return ArmTracker(self.maps, self.charts, self.chart_kernel, q, period, *rules)
 
     def follow(
         self,
@@ -341,6 +397,9 @@ class Arm(Shown):
         q: ArrayLike,
         period: float = 0.01,
         velocity_limits: ArrayLike | None = None,
+        collisions: Collisions | None = None,
+        margin: float | None = None,
+        avoid: float | None = None,
     ) -> tuple[Array, tuple[TrackStatus, ...]]:
         """Postures along task values, by a tracker that makes one call for each.
 
@@ -350,28 +409,35 @@ class Arm(Shown):
             q: where the arm is before, (n,).
             period: as in `tracker`.
             velocity_limits: as in `tracker`.
+            collisions: as in `tracker`.
+            margin: as in `tracker`.
+            avoid: as in `tracker`.
 
         Returns:
             q (N, n), and how each call ended.
         """
         targets, _ = self.maps.targets.read(path)
-        tracker = self.tracker(q, period=period, velocity_limits=velocity_limits)
-        values = [None] * len(targets)
+        tracker = self.tracker(
+            q, period=period, velocity_limits=velocity_limits, collisions=collisions, margin=margin, avoid=avoid
+        )
+        values: list[Any] = [None] * len(targets)
         if xi is not None:
-            values = _repeat_rows("xi", as_float_array("xi", xi).reshape(-1, 1), len(targets))[:, 0].tolist()
+            r = self.robot.n - self.task.m
+            values = list(_repeat_rows("xi", as_float_array("xi", xi).reshape(-1, r), len(targets)))
+            values = [row.item() for row in values] if r == 1 else values
         found, statuses = np.empty((len(targets), self.robot.n)), []
         for k, (target, value) in enumerate(zip(targets, values, strict=True)):
             found[k] = tracker.step_to(target, value)
             statuses.append(tracker.status)
         return found, tuple(statuses)
 
-    def find_branches(self, q: Array) -> list[int]:
+    def find_branches(self, q: Array) -> Indices:
         """Numbers of the charts whose domains hold postures (N, n); -1 for none."""
         owners = np.full(len(q), -1)
         for k, chart in enumerate(self.charts):
             left = np.flatnonzero(owners < 0)
             owners[left[np.asarray(chart.problem.domain.contains(q[left]))]] = k
-        return [int(k) for k in owners]
+        return owners
 
     def facts(self) -> dict[str, str]:
         """Task, charts, and how much of their branches they cover."""
@@ -392,9 +458,39 @@ class Arm(Shown):
         """What other files of this package use of an arm; it may change without notice."""
         return ArmMaps(self.task)
 
+    @cached_property
+    def chart_kernel(self) -> ChartKernel | None:
+        """Searches in compiled C, with the charts; None without a compiler. For other files of this package."""
+        if not self.maps.compiled:
+            return None
+        kernel = ChartKernel(self.maps, self.charts)
+        try:
+            kernel.load()
+        except (CompileError, DomainError, InvalidValueError):  # no compiler, no folder, or no expression of a domain
+            return None
+        return kernel
+
     def _require_charts(self) -> None:
         if not self.charts:
             raise InvalidValueError("xi", "for an arm without charts", "None, or an arm of `Arm.fit`")
+
+    def require_one_free(self) -> None:
+        """Refuse arms with several joints more than the task needs.
+
+        Raises:
+            InvalidValueError: if n - m is not 1.
+        """
+        free = self.robot.n - self.task.m
+        if free != 1:
+            raise InvalidValueError("task", f"n - m = {free}", "one with n - m = 1; here, use charts, or a tracker")
+
+    def _read(self, x: Any) -> tuple[Array, bool]:
+        """As `TargetReader.read`, in C where x is an array of vectors."""
+        m = self.task.m
+        plain = type(x) is np.ndarray and x.dtype == np.float64 and (x.shape == (m,) or x.shape[1:] == (m,) != (4,))
+        if not (plain and self.charts) or self.chart_kernel is None:
+            return self.maps.targets.read(x)
+        return self.chart_kernel.build_targets(np.ascontiguousarray(x).reshape(-1, m)), x.ndim == 1
 
     def _read_one(self, x: Any) -> Array:
         targets, single = self.maps.targets.read(x)
@@ -404,6 +500,36 @@ class Arm(Shown):
             )
         return np.asarray(targets[0])
 
+    def _solve_rows_in_c(
+        self, targets: Array, values: Any, starts: Array | None, chosen: Sequence[int], anywhere: bool
+    ) -> tuple[Array, Indices, Indices]:
+        """Postures of targets and xi, numbers of their status and charts."""
+        assert self.chart_kernel is not None
+        q, status, owners = self.chart_kernel.solve_rows(targets, values, starts, chosen)
+        if not anywhere:
+            beyond = status == InverseStatus.OUTSIDE_DOMAIN
+            q[beyond], status[beyond] = np.nan, InverseStatus.NOT_FOUND
+        return q, status, owners
+
+    def _solve_rows(
+        self, targets: Array, values: Array | None, starts: Array | None, chosen: Sequence[int], anywhere: bool
+    ) -> tuple[Array, Indices, Indices]:
+        """The same by charts, and arcs where they have none; without xi by arcs alone."""
+        N = len(targets)
+        q, status = np.full((N, self.robot.n), np.nan), np.full(N, int(InverseStatus.NOT_FOUND))
+        if values is not None:
+            self._solve_by_charts(targets, values, starts, chosen, q, status)
+
+        def solve_row(row: int) -> None:
+            wish = None if starts is None else starts[row]
+            value = None if values is None else float(values[row])
+            q[row], status[row] = self._solve_on_arcs(targets[row], value, wish, chosen, anywhere)
+
+        run_in_threads(solve_row, np.flatnonzero(status != InverseStatus.FOUND).tolist())
+        owners, there = np.full(N, -1), np.flatnonzero(np.isfinite(q).all(axis=1))
+        owners[there] = self.find_branches(q[there])
+        return q, status, owners
+
     def _solve_by_charts(
         self,
         targets: Array,
@@ -412,14 +538,13 @@ class Arm(Shown):
         chosen: Sequence[int],
         q: Array,
         status: Indices,
-        good: NDArray[np.bool_],
     ) -> None:
-        """Ask charts in turn for (x, xi) of good rows; q and status of those that are found are filled in."""
+        """Ask charts in turn for (x, xi); q and status of those that are found are filled in."""
         vectors = self.maps.targets.vector(targets)
-        first = np.full(len(targets), -1) if starts is None else np.array(self.find_branches(starts))
+        first = np.full(len(targets), -1) if starts is None else self.find_branches(starts)
         for own in (True, False):
             for k in chosen:
-                rows = np.flatnonzero(good & (status != InverseStatus.FOUND) & ((first == k) == own))
+                rows = np.flatnonzero((status != InverseStatus.FOUND) & ((first == k) == own))
                 if not rows.size or (own and starts is None):
                     continue
                 near = starts[rows] if own and starts is not None else None
@@ -467,6 +592,49 @@ class Arm(Shown):
         k = np.argmax(self._measure_room(q)) if start is None else np.argmin(np.linalg.norm(q - start, axis=1))
         return q[k], InverseStatus.FOUND
 
+    def _find_free(
+        self,
+        target: Array,
+        xi: float | None,
+        start: Array | None,
+        chosen: Sequence[int],
+        anywhere: bool,
+        collisions: Collisions,
+    ) -> tuple[Array, InverseStatus] | None:
+        """A posture of one target without a contact, of those with xi or of many on its arcs; None if there is none."""
+        motions = find_motions(self.maps, target, *(() if start is None else (start[None],)))
+        if xi is not None:
+            exact = np.array([q for k in chosen for q in self._find_xi(motions, k, xi)[0]]).reshape(-1, self.robot.n)
+            exact = exact[collisions.check_free(exact)] if len(exact) else exact
+            if len(exact):
+                away = np.linalg.norm(exact - (exact[0] if start is None else start), axis=1)
+                return exact[np.argmin(away)], InverseStatus.FOUND
+        q = np.vstack([np.empty((0, self.robot.n)), *(arc.at(self._list_places(arc)) for arc in motions)])
+        q = q[collisions.check_free(q)] if len(q) else q
+        if xi is None and anywhere:
+            owners = np.zeros(len(q), dtype=np.int64)
+        else:
+            inside = [np.asarray(self.charts[k].problem.domain.contains(q)) for k in chosen] if len(q) else []
+            owners = np.array(
+                [next((k for k, part in zip(chosen, inside, strict=True) if part[row]), -1) for row in range(len(q))],
+                dtype=np.int64,
+            )
+            q, owners = q[owners >= 0], owners[owners >= 0]
+        if not len(q):
+            return None
+        if xi is not None:
+            periods = np.array([self.charts[k].parts.turns[self.charts[k].m] for k in owners])
+            away = np.abs(wrap_shortest(self._evaluate_xi(q, owners) - xi, periods))
+            return q[np.argmin(away)], InverseStatus.NEAREST
+        k = np.argmax(self._measure_room(q)) if start is None else np.argmin(np.linalg.norm(q - start, axis=1))
+        return q[k], InverseStatus.FOUND
+
+    def _check_collisions(self, collisions: Collisions | None) -> None:
+        """Raise InvalidValueError for what is no collision model of the robot."""
+        if collisions is not None:
+            require_kind("collisions", collisions, Collisions)
+            collisions.require_for(self.robot.tree)
+
     def _measure_room(self, q: Array) -> Array:
         """Distances from the limits (N,), in half-widths of the joints' ranges."""
         low, high = self.robot.lower, self.robot.upper
@@ -511,11 +679,11 @@ class Arm(Shown):
         """Places on an arc, at most `RULES.spacing` apart, (P,)."""
         return np.linspace(0.0, arc.length, max(2, int(arc.length / RULES.spacing) + 2))
 
-    def _evaluate_xi(self, q: Array, owners: Sequence[int]) -> Array:
+    def _evaluate_xi(self, q: Array, owners: Indices) -> Array:
         """xi (N,) of postures in the charts that hold them; NaN elsewhere."""
         values = np.full(len(q), np.nan)
         for k, chart in enumerate(self.charts):
-            rows = np.flatnonzero(np.array(owners) == k)
+            rows = np.flatnonzero(owners == k)
             if rows.size:
                 values[rows] = chart.xi(q[rows])[:, 0]
         return values

@@ -144,14 +144,14 @@ class CompiledKernel:
         ends, closed = np.zeros(RULES.curves, dtype=np.intc), np.zeros(RULES.curves, dtype=np.intc)
         used = ctypes.c_int()
         count = self._c.find_curves(
-            *(_pointer(target), _pointer(starts), len(starts), patience, _pointer(nodes), RULES.nodes),
-            *(_pointer(ends), _pointer(closed), ctypes.byref(used)),
+            *(pointer(target), pointer(starts), len(starts), patience, pointer(nodes), RULES.nodes),
+            *(pointer(ends), pointer(closed), ctypes.byref(used)),
         )
         if not count:
             return []
         found = np.empty(RULES.crossings, crossing_type(n))
         size = self._c.find_crossings(
-            _pointer(target), _pointer(nodes), _pointer(ends), count, _pointer(found), RULES.crossings
+            pointer(target), pointer(nodes), pointer(ends), count, pointer(found), RULES.crossings
         )
         return split_curves(nodes[: ends[count - 1]].copy(), ends[:count], closed, found[:size].copy())
 
@@ -161,16 +161,16 @@ class CompiledKernel:
         distance, single = np.empty(count, dtype=np.float32), place.astype(np.float32)
         chosen = np.empty(RULES.starts + branches, dtype=np.intc)
         total = self._c.choose_starts(
-            *(_pointer(stored.places), _pointer(stored.weights), _pointer(stored.begins), branches),
-            *(len(stored.places), count, _pointer(single), RULES.starts),
-            *(_pointer(distance), _pointer(chosen)),
+            *(pointer(stored.places), pointer(stored.weights), pointer(stored.begins), branches),
+            *(len(stored.places), count, pointer(single), RULES.starts),
+            *(pointer(distance), pointer(chosen)),
         )
         return stored.q[chosen[:total]]
 
     def correct(self, target: Array, q: Array, tangent: Array) -> NDArray[np.bool_]:
         """As `Kernel.correct`."""
         good = np.empty(len(q), dtype=np.bool_)
-        self._c.correct_rows(_pointer(target), len(q), _pointer(q), _pointer(tangent), _pointer(good))
+        self._c.correct_rows(pointer(target), len(q), pointer(q), pointer(tangent), pointer(good))
         return good
 
     def load(self) -> None:
@@ -179,25 +179,30 @@ class CompiledKernel:
 
     @cached_property
     def _c(self) -> Any:
-        kernels = generate_kernels([self.equations], "kernel")
-        values = {
-            "kernels": kernels.code,
-            "arrays": kernels.declare_arrays,
-            "call": kernels.write_call,
-            "n": len(self.lower),
-            "rules": asdict(RULES),
-            "low": self.lower,
-            "high": self.upper,
-            "turning": self.turning,
-        }
-        source = render("self_motion.c", values)
+        source = write_curves(self.equations, self.lower, self.upper, self.turning)
         return load_library(keep_library("self-motion", {"self_motion.c": source}, _FLAGS))
 
 
-def _pointer(array: NDArray[Any]) -> ctypes.c_void_p:
+def write_curves(equations: ca.Function, lower: Array, upper: Array, turning: NDArray[np.bool_]) -> str:
+    """C of the search for curves: templates/self_motion.c.jinja for a task."""
+    kernels = generate_kernels([equations], "kernel")
+    values = {
+        "kernels": kernels.code,
+        "arrays": kernels.declare_arrays,
+        "call": kernels.write_call,
+        "n": len(lower),
+        "rules": asdict(RULES),
+        "low": lower,
+        "high": upper,
+        "turning": turning,
+    }
+    return render("self_motion.c", values)
+
+
+def pointer(array: NDArray[Any]) -> ctypes.c_void_p:
     """The place of an array that somebody else keeps until the call ends, contiguous."""
     assert array.flags.c_contiguous
-    return ctypes.c_void_p(array.ctypes.data)
+    return ctypes.c_void_p(array.__array_interface__["data"][0])
 
 
 def split_curves(

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +18,7 @@ from orthocas.tasks.domains import Box, StopKind
 from orthocas.tasks.regular_box import find_joint_range
 from orthocas.tasks.samples import sample_evenly
 from orthocas.tasks.task import Task
-from orthocas.tools.batch import Batched, use_threads
+from orthocas.tools.batch import Batched, dense_function, use_threads
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 
@@ -52,10 +53,32 @@ class ArmMaps:
         return sizes
 
     @cached_property
+    def equations(self) -> ca.Function:
+        """q, target -> e and J: `orthocas.arms.kernel.build_equations`."""
+        return build_equations(self.task, self.scale)
+
+    @cached_property
+    def target_function(self) -> ca.Function:
+        """x (m, 1) -> target (k, 1), as `TargetReader.build`."""
+        task, x = self.task, ca.SX.sym("x", self.task.m)
+        if not self.places.turned:
+            return dense_function("target", [x], [x], ["x"])
+        w, *axis = ca.vertsplit(task.quaternion_function(x))
+        cross = ca.skew(ca.vertcat(*axis))
+        R = ca.SX(ca.DM(task.reference)) @ (ca.SX.eye(3) + 2 * (w * cross + cross @ cross))
+        position = [x[:3]] if self.task.turn is not None and self.task.turn.with_position else []
+        return dense_function("target", [x], [ca.vertcat(*position, ca.vec(R))], ["x"])
+
+    @cached_property
+    def place_scale(self) -> Array:
+        """A place is a target times this, (k,)."""
+        probe = np.ones(len(self._some_target))
+        return np.asarray(self.places.of_targets(probe.copy()) / probe)
+
+    @cached_property
     def kernel(self) -> Kernel:
         """The search for curves: compiled, or in NumPy without a compiler."""
-        equations = build_equations(self.task, self.scale)
-        parts = equations, self.robot.lower, self.robot.upper, self.turning
+        parts = self.equations, self.robot.lower, self.robot.upper, self.turning
         if self.compiled:
             kernel = CompiledKernel(*parts)
             try:
@@ -128,7 +151,7 @@ class ArmMaps:
 
     @cached_property
     def _batched_equations(self) -> Batched:
-        return Batched(build_equations(self.task, self.scale))
+        return Batched(self.equations)
 
     @property
     def _some_target(self) -> Array:

@@ -2,73 +2,42 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.arms.kernel import build_curvature, build_equations
+from orthocas.arms.chart_kernel import ChartKernel, tracker_type
+from orthocas.arms.kernel import pointer
 from orthocas.arms.maps import ArmMaps
-from orthocas.arms.self_motion import find_motions
+from orthocas.arms.numpy_tracker import NumpyTracker, TrackStatus
 from orthocas.charts.chart import Chart
-from orthocas.charts.newton import Bound
-from orthocas.charts.trackers import TrackerStatus
-from orthocas.errors import InvalidValueError, degrees_hint
-from orthocas.tools.batch import dense_function
-from orthocas.tools.cached import building
+from orthocas.charts.clearance import Clearance
+from orthocas.errors import CompileError, InvalidValueError, degrees_hint
 from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind, require_shape
 from orthocas.tools.display import Shown, number_list
-from orthocas.tools.interrupts import deferred
 
 
 @dataclass(frozen=True, slots=True)
-class TrackRules:
-    """Numbers of the arm's tracker. Errors of x are in radians, or as long as a radian moves the tip."""
+class SpeedRules:
+    """Numbers of what a tracker is given."""
 
     speed: float = 2.0  #: [rad/s] or [m/s] of joints whose file gives no velocity limit
-    met: float = 1e-10  #: error of x that is met
-    xi_met: float = 1e-8  #: error of xi that is met
-    xi_weight: float = 1e-3  #: of errors of xi, relative to those of x
-    posture_weight: float = 1e-4  #: of the way back to the last posture with a chart, where there is none
-    step_damping: float = 1e-8  #: of squared joint steps
-    error_damping: float = 0.3  #: of squared joint steps, times the squared error of x
-    damping: float = 1e-3  #: of squared joint steps after one that does not lower the error, at least
-    grows: float = 10.0  #: damping after another one; it shrinks as much after one that does
-    rounds: int = 12  #: of a call, at most
-    gain: float = 1e-9  #: relative decrease of the squared error below which it is a minimum
-    near: float = 1e-3  #: error of x below which the last posture with a chart does not count
-    decrease: float = 1e-4  #: of the cost, relative to what a step promises
-    window: float = 0.25  #: [s] in which the error of x must fall, or a detour is looked for
-    falls: float = 0.9  #: the error at its end, relative to that at its begin
-    guesses: int = 8  #: of the joints at bounds in a quadratic program, many at a time
-    changes: int = 40  #: of these joints, one at a time, at most
-    rounding: float = 1e-14  #: slope of the cost at a bound that is none
-    enough: float = 1e-2  #: relative decrease of the cost below which a far arm leaves the rest to the next call
+    window: float = 0.25  #: [s] without progress after which another way is looked for
 
 
-RULES = TrackRules()
-
-
-class TrackStatus(IntEnum):
-    """How the last call of an arm's tracker ended."""
-
-    OK = 0  #: x is met, and xi if one was given
-    YIELDING = 1  #: x is met; xi is another one: a limit, a border of the chart or the speed of joints is in its way
-    BEHIND = 2  #: x is not met: the arm moves towards it as fast as its joints may, or its work of a call ended
-    NEAREST = 3  #: x is out of reach from here: a local minimum of its error within the limits, at rest
-    BAD_INPUT = 4  #: a number of x or xi is not finite; the arm stays
+RULES = SpeedRules()
 
 
 class ArmTracker(Shown):
     """Follows a stream of x and xi from posture to posture; `Arm.tracker` makes it, and it belongs to one thread.
 
-    A call moves no joint by more than its velocity limit times the period, and none beyond its position limit. In the
-    domain of the chart that it began in, x and xi are met exactly, as by `Chart.tracker`. Where xi cannot be had, x has
-    priority: the joint step d solves
+    A call moves no joint by more than its velocity limit times the period, and none beyond its position limit; with
+    limits of acceleration, the joints can always stop before their limits. In the domain of the chart that it began in,
+    x and xi are met exactly, as by `Chart.tracker`. Where xi cannot be had, x has priority: the joint step d solves
 
         min |J d - e|^2 + w^2 |g d - e_xi|^2 + damping |d|^2,  with bounds of position and velocity,
 
@@ -78,7 +47,16 @@ class ArmTracker(Shown):
     the error of a target at rest never rises.
 
     xi is that of the chart in whose domain the tracker began, or came to be first. When the arm comes back to the
-    domain, xi goes from the value that it has there to what is asked as fast as the joints may.
+    domain, xi goes from the value that it has there to what is asked as fast as the joints may. Where it does not come
+    nearer for a quarter of a second, stored postures are tried, one a call, for one that has x and xi; the arm goes
+    there, with x kept as long as that leads nearer. From a target at rest it then goes straight, and leaves x for a
+    while; so it does where it is stuck without x. `detours=False` forbids both.
+
+    With a collision model it brakes as `orthocas.charts.trackers.Tracker` does, on detours too, whatever the limits of
+    acceleration; with `avoid` it gives way, in NumPy.
+
+    With a C compiler, a call is one call of C that takes a bounded time. Without one, NumPy does the same, slower,
+    without limits of acceleration, with one joint more than the task needs, and does not look for xi elsewhere.
 
     Source:
         Levenberg and Marquardt's method with an active set on a box; ours.
@@ -88,369 +66,218 @@ class ArmTracker(Shown):
         self,
         maps: ArmMaps,
         charts: Sequence[Chart],
+        kernel: ChartKernel | None,
         q: ArrayLike,
         period: float,
-        velocity_limits: ArrayLike | None,
+        velocity_limits: ArrayLike | None = None,
+        acceleration_limits: ArrayLike | None = None,
+        weights: ArrayLike | None = None,
         detours: bool = True,
+        clearance: Clearance | None = None,
     ) -> None:
-        robot = maps.robot
-        n = robot.n
-        span = as_number("period", period)
+        robot, span = maps.robot, as_number("period", period)
         if not 1e-5 <= span <= 10:
             raise InvalidValueError("period", period, "a time from 1e-5 to 10 s")
-        limits = as_float_array(
-            "velocity_limits", robot.velocity_limits if velocity_limits is None else velocity_limits
-        )
-        if limits.ndim:
-            require_shape("velocity_limits", limits.shape, (n,))
-        if not (limits > 0).all():
-            raise InvalidValueError("velocity_limits", limits.tolist(), "positive numbers")
-        limits = np.where(np.isfinite(limits), limits, RULES.speed)
-        self._maps, self._charts, self._period = maps, tuple(charts), span
-        self._speed = np.array(np.broadcast_to(limits, n))
         require_kind("detours", detours, bool)
-        self._detours, self._patience = detours, max(2, int(RULES.window / span))
-        self._at, self._to = np.empty(n), np.empty(len(maps.targets_of(np.zeros((1, n)))[0]))
-        self._e, self._J = np.empty(maps.task.m), np.empty((n, maps.task.m))
-        with deferred(), building:  # CasADi's expressions are not for several threads at a time
-            equations = build_equations(maps.task, maps.scale)
-            curvature = build_curvature(equations)
-        self._equations = Bound(equations, [self._at, self._to], [self._e, self._J])
-        self._H = np.empty((n, n))
-        self._curvature = Bound(curvature, [self._at, self._to], [self._H])
-        if detours:  # compiled now rather than in a call
-            assert maps.kernel is not None
-            assert maps.stored is not None
-        self.reset(q)
+        speed = _read_limits("velocity_limits", velocity_limits, robot.velocity_limits)
+        speed = np.where(np.isfinite(speed), speed, RULES.speed)
+        self._rules: dict[str, Any] = {
+            "period": span,
+            "velocity_limits": speed,
+            "acceleration_limits": _read_limits("acceleration_limits", acceleration_limits, np.full(robot.n, np.inf)),
+            "weights": _read_limits("weights", weights, np.ones(robot.n)),  # only their ratios count
+            "detours": detours,
+        }
+        self._maps, self._charts, self._kernel, self._clearance = maps, tuple(charts), kernel, clearance
+        self._r = robot.n - maps.task.m
+        point = self._read_posture(q)
+        self._engine: NumpyTracker | _Compiled
+        gives_way = clearance is not None and clearance.avoid is not None
+        if kernel is not None and not gives_way:
+            self._engine = _Compiled(kernel, self._rules, clearance)
+            self._engine.reset(point)
+        elif self._r > 1 or acceleration_limits is not None:
+            what = "limits of acceleration, and more than one joint too many,"
+            raise CompileError(f"{what} need a C compiler, and a tracker without `avoid`")
+        else:
+            self._engine = NumpyTracker(maps, self._charts, point, span, speed, detours, clearance)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without scratch memory and detours under way."""
-        parts = {"maps": self._maps, "charts": self._charts, "q": self.q}
-        rules = {"period": self._period, "speed": self._speed, "detours": self._detours}
-        return {**parts, **rules, "memory": (self._wish, self._last, self.status)}
+        """Without scratch memory."""
+        parts = {"maps": self._maps, "charts": self._charts, "kernel": self._kernel, "q": self.q}
+        return {**parts, "rules": {**self._rules, "clearance": self._clearance}, "memory": self._engine.memory}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        names = ("maps", "charts", "q", "period", "speed", "detours")
-        self.__init__(*(state[name] for name in names))  # type: ignore[misc]
-        self._wish, self._last, self.status = state["memory"]
+        rules = dict(state["rules"])
+        if not np.isfinite(rules["acceleration_limits"]).any():
+            rules["acceleration_limits"] = None
+        self.__init__(state["maps"], state["charts"], state["kernel"], state["q"], **rules)  # type: ignore[misc]
+        self._engine.memory = state["memory"]
 
     @property
     def q(self) -> Array:
         """The last posture, (n,)."""
-        return self._q.copy()
+        return self._engine.q
 
     @property
-    def xi(self) -> float:
-        """xi of the last posture; NaN outside the domain of the tracker's chart."""
-        return self._measure_xi()[0] if self._inside else float("nan")
+    def status(self) -> TrackStatus:
+        """How the last call ended."""
+        return self._engine.status
+
+    @property
+    def xi(self) -> Any:
+        """xi of the last posture, a number, or (r,) of several; NaN outside the domain of the tracker's chart."""
+        return self._engine.xi
 
     @property
     def branch(self) -> str:
         """Name of the branch whose chart gives xi; "" before there is one."""
-        if self._chart is None:
+        if self._engine.chart < 0:
             return ""
-        return str(self._chart.notes.get("branch", self._chart.problem.name))
+        chart = self._charts[self._engine.chart]
+        return str(chart.notes.get("branch", chart.problem.name))
 
     def facts(self) -> dict[str, str]:
         """Where it is."""
         return {
             "tracker": f"status {self.status.name}",
-            "q": number_list(self._q),
+            "q": number_list(self.q),
             "branch": self.branch or "none",
         }
 
     def reset(self, q: ArrayLike) -> None:
-        """Continue from another posture (n,) within the joint limits.
+        """Continue from another posture (n,) within the joint limits, at rest.
 
         Raises:
-            InvalidValueError: if it is not within them.
+            InvalidValueError: if it is not within them, or a pair touches there.
         """
+        self._engine.reset(self._read_posture(q))
+
+    def step(self, x: Any, xi: ArrayLike | None = None) -> Array:
+        """The next posture (n,); see `status`.
+
+        Args:
+            x: one task value.
+            xi: wished value in the tracker's chart, a number, or (r,); None holds the last one, at first that of the
+                begin.
+
+        Raises:
+            InvalidValueError: if x is no task value of this task.
+        """
+        wish = None if xi is None else self._read_wish(xi)
+        if type(x) is np.ndarray and x.dtype == np.float64 and x.shape == (self._maps.task.m,):
+            return self._engine.step(x, None, wish)
+        targets, single = self._maps.targets.read(x)
+        if not single:
+            raise InvalidValueError("x", f"{len(targets)} values", "one task value")
+        return self._engine.step(None, targets[0], wish)
+
+    def step_to(self, target: Array, xi: ArrayLike | None) -> Array:
+        """As `step`, for x as `orthocas.arms.kernel.build_equations` takes it."""
+        return self._engine.step(None, target, None if xi is None else self._read_wish(xi))
+
+    def _read_wish(self, xi: ArrayLike) -> Any:
+        if not self._charts:
+            raise InvalidValueError("xi", xi, "None, for an arm without charts")
+        if self._r == 1:
+            return as_number("xi", xi)
+        values = as_float_array("xi", xi)
+        require_shape("xi", values.shape, (self._r,))
+        return values
+
+    def _read_posture(self, q: ArrayLike) -> Array:
         robot = self._maps.robot
         point = as_point("q", q, robot.n)
         if not ((point >= robot.lower) & (point <= robot.upper)).all():
             hint = degrees_hint(*point[np.isfinite(robot.lower)])
             raise InvalidValueError("q", point.tolist(), f"a posture within the joint limits{hint}")
-        self._q, self._last = np.array(point), np.array(point)
-        self._chart: Chart | None = None
-        self._inside, self._wish = False, float("nan")
-        self._goal: Array | None = None  # of a detour
-        self._ticks, self._error = 0, np.inf  # since x was met or the error fell, and the error then
-        self.status = TrackStatus.OK  #: how the last call ended
-        self._look_for_chart()
-
-    def step(self, x: Any, xi: float | None = None) -> Array:
-        """The next posture (n,); see `status`.
-
-        Args:
-            x: one task value.
-            xi: wished value in the tracker's chart; None holds the last one, at first that of the begin.
-
-        Raises:
-            InvalidValueError: if x is no task value of this task.
-        """
-        if type(x) is np.ndarray and x.dtype == np.float64 and x.shape == (self._maps.task.m,):
-            return self._go(x, None, None if xi is None else as_number("xi", xi))
-        targets, single = self._maps.targets.read(x)
-        if not single:
-            raise InvalidValueError("x", f"{len(targets)} values", "one task value")
-        return self.step_to(targets[0], None if xi is None else as_number("xi", xi))
-
-    def step_to(self, target: Array, xi: float | None) -> Array:
-        """As `step`, for x as `orthocas.arms.kernel.build_equations` takes it."""
-        return self._go(None, target, xi)
-
-    def _go(self, vector: Array | None, target: Array | None, xi: float | None) -> Array:
-        """The next posture for x as the task's vector or as a target, of which the chart takes the one."""
-        if xi is not None and not self._charts:
-            raise InvalidValueError("xi", xi, "None, for an arm without charts")
-        parts = [np.atleast_1d(part) for part in (vector, target, xi) if part is not None]
-        if not np.isfinite(np.concatenate(parts)).all():
-            self.status = TrackStatus.BAD_INPUT
-            return self._q.copy()
-        self._wish = self._wish if xi is None else xi
-        targets = self._maps.targets
-        if self._inside and np.isfinite(self._wish):
-            x = targets.vector(np.asarray(target)[None])[0] if vector is None else vector
-            if self._step_in_chart(x):
-                self._ticks, self._goal = 0, None
-                self.status = TrackStatus.OK
-                return self._q.copy()
-        aim = targets.build(np.asarray(vector)[None])[0] if target is None else target
-        rests = self.status == TrackStatus.NEAREST and np.array_equal(aim, self._to)
-        self._to[:] = aim
-        if not rests or self._ticks % self._patience == 0:  # what rests would rest again
-            self.status = self._step_anywhere(asked=xi is not None)
-        if self.status in (TrackStatus.OK, TrackStatus.YIELDING):
-            self._ticks, self._goal = 0, None
-        elif self._detours:
-            self._watch_error()
-        self._look_for_chart()
-        return self._q.copy()
-
-    def _watch_error(self) -> None:
-        """Look for a detour where the error of x has not fallen for a while."""
-        e, _ = self._look(self._q)
-        error = float(np.linalg.norm(e))
-        if self._ticks % self._patience == 0:
-            if self._ticks and self._goal is None and error > RULES.falls * self._error:
-                self._goal = self._find_goal()
-            self._error = error
-        self._ticks += 1
-
-    def _find_goal(self) -> Array | None:
-        """The nearest posture within the limits that has x, in the tracker's chart if that has one; None for none."""
-        motions = find_motions(self._maps, self._to.copy(), self._q[None])
-        if not motions.components:
-            return None
-        if self._chart is not None:
-            q = np.vstack([arc.q for arc in motions])
-            q = self._q + motions.measure_away(q, self._q)
-            q = q[np.asarray(self._chart.problem.domain.contains(q))]
-            if len(q):
-                return np.asarray(q[np.argmin(np.linalg.norm(q - self._q, axis=1))])
-        return motions.nearest(self._q).q
-
-    def _step_to_goal(self) -> TrackStatus | None:
-        """A step of a detour; None if it has no end any more."""
-        robot = self._maps.robot
-        met, goal = self._descend(np.array(self._goal), robot.lower, robot.upper)
-        if not met:
-            self._goal = None
-            return None
-        self._goal = goal
-        way = goal - self._q
-        share = float((self._speed * self._period / np.maximum(np.abs(way), 1e-300)).min())
-        self._q = goal if share >= 1 else self._q + share * way
-        return TrackStatus.YIELDING if share >= 1 else TrackStatus.BEHIND
-
-    def _step_in_chart(self, vector: Array) -> bool:
-        """Whether the chart has x and xi within the bounds of this step; then the arm goes there."""
-        assert self._chart is not None
-        exact = self._exact
-        if not np.array_equal(exact.q, self._q):
-            try:
-                exact.reset(self._q)
-            except InvalidValueError:  # within rounding of its boundary
-                return False
-        q = exact.step(np.append(vector, self._wish))
-        low, high = self._bounds()
-        if exact.status != TrackerStatus.OK or not ((q >= low) & (q <= high)).all():
-            return False
-        self._q, self._last = q, q.copy()
-        return True
-
-    def _step_anywhere(self, asked: bool) -> TrackStatus:
-        """A step with x first."""
-        if self._goal is not None and (status := self._step_to_goal()) is not None:
-            return status
-        low, high = self._bounds()
-        q = self._q
-        e, J = self._look(q)
-        error = float(e @ e)
-        if self.status in (TrackStatus.BEHIND, TrackStatus.NEAREST) and np.abs(e).max() > RULES.near:
-            met, ahead = self._descend(q, low, high)
-        else:  # first with the wishes, then towards x alone
-            rows, wishes, weight = self._find_wishes()
-            damping = RULES.step_damping + RULES.error_damping * error
-            H = J.T @ J + weight**2 * rows.T @ rows + damping * np.eye(len(q))
-            g = -J.T @ e - weight**2 * rows.T @ wishes
-            met, ahead = self._descend(np.clip(q + solve_in_box(H, g, low - q, high - q), low, high), low, high)
-            if not met:  # wishes may be in the way
-                met, other = self._descend(q, low, high)
-                ahead = other if met or self._cost_of(other) < self._cost_of(ahead) else ahead
-        if not met and self._cost_of(ahead) >= self._cost_of(q) * (1 - RULES.gain):
-            ahead = q
-        moved = ahead - q
-        fast = (np.abs(moved) >= (1 - 1e-9) * self._period * self._speed).any()
-        self._q = ahead
-        if not met:
-            return TrackStatus.BEHIND if fast or moved.any() else TrackStatus.NEAREST
-        if not asked and not np.isfinite(self._wish):
-            return TrackStatus.OK
-        return TrackStatus.YIELDING
-
-    def _descend(self, q: Array, low: Array, high: Array) -> tuple[bool, Array]:
-        """Where damped Newton steps in a box lead from q (n,), and whether x is met there.
-
-        They lower |e|^2 + w^2 |q - p|^2 with the last posture p that had a chart, and a tiny w: at a border of reach,
-        where two postures meet, that is the side to go back to.
-        """
-        e, J = self._look(q)
-        weight, damping = RULES.posture_weight**2, RULES.step_damping
-        away = q - self._last
-        cost = float(e @ e) + weight * float(away @ away)
-        for _ in range(RULES.rounds):
-            far = np.abs(e).max() > RULES.near
-            if np.abs(e).max() < RULES.met:
-                return True, q
-            pull = weight if far else 0.0
-            g = pull * away - J.T @ e
-            H = (self._bend(q) if far else J.T @ J) + (damping + pull) * np.eye(len(q))
-            d = solve_in_box(H, g, low - q, high - q)
-            promised = -float(2 * g @ d + d @ H @ d)
-            if promised <= RULES.gain * cost:
-                break
-            new = np.clip(q + d, low, high)
-            e_new, J_new = self._look(new)
-            away_new = new - self._last
-            before, after = (float(a @ a) + pull * float(b @ b) for a, b in ((e, away), (e_new, away_new)))
-            if (before - after) / promised > RULES.decrease:
-                q, e, J, away = new, e_new, J_new, away_new
-                cost = float(e @ e) + weight * float(away @ away)
-                damping = max(RULES.step_damping, damping / RULES.grows)
-                if far and before - after < RULES.enough * before:
-                    break
-            else:
-                damping = max(RULES.grows * damping, RULES.damping)
-        return bool(np.abs(e).max() < RULES.met), q
-
-    def _bend(self, q: Array) -> Array:
-        """The second derivative of |e|^2 / 2 at q (n,), with the signs of its eigenvalues made positive, (n, n)."""
-        self._at[:] = q
-        self._curvature.run()
-        values, vectors = np.linalg.eigh(self._H)
-        return np.asarray((vectors * np.abs(values)) @ vectors.T)
-
-    def _find_wishes(self) -> tuple[Array, Array, float]:
-        """Rows, values and weight of what else the step is to do: xi, or the way back to a posture with a chart."""
-        n = len(self._q)
-        if self._inside and np.isfinite(self._wish):
-            value, gradient = self._measure_xi()
-            left = self._wish - value
-            period = float(self._chart.parts.turns[-1]) if self._chart is not None else 0.0
-            left -= period * np.round(left / period) if period else 0.0
-            return gradient[None], np.array([left]), RULES.xi_weight
-        return np.eye(n), self._last - self._q, RULES.posture_weight
-
-    def _look_for_chart(self) -> None:
-        """Whether the posture is in the domain of the tracker's chart; without one, the first that holds it."""
-        for chart in self._charts if self._chart is None else (self._chart,):
-            if bool(chart.problem.domain.contains(self._q)):
-                if self._chart is None:
-                    self._chart = chart
-                    self._exact = chart.tracker(self._q, self._speed * self._period)
-                    self._values = chart.coordinates.functions
-                    q = ca.MX.sym("q", len(self._q))
-                    rows = [chart.parts.runnable(self._values[name])(q) for name in ("xi", "jacobian")]
-                    self._point, self._value, self._slope = self._q.copy(), np.empty(1), np.empty(len(self._q))
-                    function = dense_function("xi_rows", [q], rows)
-                    self._xi = Bound(function, [self._point], [self._value, self._slope])
-                    self._wish = self._measure_xi()[0]
-                self._inside, self._last = True, self._q.copy()
-                return
-        self._inside = False
-
-    def _measure_xi(self) -> tuple[float, Array]:
-        """xi of the posture, and its gradient (n,)."""
-        self._point[:] = self._q
-        self._xi.run()
-        return float(self._value[0]), self._slope.copy()
-
-    def _bounds(self) -> tuple[Array, Array]:
-        """Lowest and highest posture of the next step, (n,) each."""
-        robot, most = self._maps.robot, self._speed * self._period
-        return np.maximum(robot.lower, self._q - most), np.minimum(robot.upper, self._q + most)
-
-    def _look(self, q: Array) -> tuple[Array, Array]:
-        """Errors (m,) and rates (m, n) at q (n,)."""
-        self._at[:] = q
-        self._equations.run()
-        return self._e.copy(), self._J.T.copy()
-
-    def _cost_of(self, q: Array) -> float:
-        """What `_descend` lowers, at q (n,)."""
-        e, _ = self._look(q)
-        away = q - self._last
-        return float(e @ e) + RULES.posture_weight**2 * float(away @ away)
+        return point
 
 
-def solve_in_box(H: Array, g: Array, low: Array, high: Array) -> Array:
-    """The d (n,) with the least g d + d H d / 2 of those with low <= d <= high.
+class _Compiled:
+    """The tracker in C: templates/arm_track.c.jinja, and its state."""
 
-    By a primal-dual active set, which changes many bounds at a time, and if that does not end soon, by a primal one
-    from d = 0, which changes one.
+    def __init__(self, kernel: ChartKernel, rules: dict[str, Any], clearance: Clearance | None) -> None:
+        robot, m = kernel.maps.robot, kernel.maps.task.m
+        period, self._r = rules["period"], robot.n - m
+        self._kernel, self._clearance = kernel, clearance
+        self._state = np.zeros(1, tracker_type(robot.n, self._r, kernel.target_size))
+        self._state["most"], self._state["weight"] = (
+            rules["velocity_limits"] * period,
+            rules["weights"] / rules["weights"].max(),
+        )
+        self._state["change"] = rules["acceleration_limits"] * period**2
+        self._state["detours"], self._state["patience"] = rules["detours"], max(2, int(RULES.window / period))
+        self._x, self._target, self._wish = np.empty(m), np.empty(kernel.target_size), np.empty(self._r)
+        self._q: Array = self._state["q"][0]
+        self._status = self._state["status"]
+        places = (pointer(part) for part in (self._state, self._x, self._target, self._wish))
+        self._at, self._x_at, self._target_at, self._wish_at = places
+        self._postures = kernel.postures
+        self._postures_at = ctypes.byref(self._postures.in_c)
+        self._track, self._track_value = kernel.track, kernel.track_value
 
-    Args:
-        H: (n, n), positive definite.
-        g: (n,).
-        low: (n,), <= 0.
-        high: (n,), >= 0.
-    """
-    d = np.linalg.solve(H, -g)
-    below, above = d < low, d > high
-    if not (below.any() or above.any()):
-        return np.asarray(d)
-    for _ in range(RULES.guesses):
-        free = ~(below | above)
-        d = np.where(below, low, np.where(above, high, 0.0))
-        d[free] = np.linalg.solve(H[free][:, free], -(g + H @ d)[free])
-        pull = g + H @ d  # at a bound: positive where the cost falls beyond the lowest, negative beyond the highest
-        under, over = np.where(below, pull > 0, d < low), np.where(above, pull < 0, d > high)
-        if (under == below).all() and (over == above).all():
-            return np.asarray(d)
-        below, above = under, over
-    return _solve_by_steps(H, g, low, high)
+    def step(self, vector: Array | None, target: Array | None, xi: Any) -> Array:
+        """The next posture for x as the task's vector or as a target."""
+        before = None if self._clearance is None else self.q
+        wish = None
+        if xi is not None:
+            self._wish[:] = xi
+            wish = self._wish_at
+        if vector is not None:
+            self._x[:] = vector
+            self._track_value(self._at, self._postures_at, self._x_at, wish)
+        else:
+            self._target[:] = target
+            self._track(self._at, self._postures_at, self._target_at, wish)
+        if self._clearance is not None and before is not None:
+            q, fraction = self._clearance.limit(before, self.q)
+            if fraction < 1:
+                self._kernel.hold(self._at, pointer(np.ascontiguousarray(q)), int(TrackStatus.BRAKED))
+        return np.array(self._q)
+
+    def reset(self, q: Array) -> None:
+        """Continue from another posture (n,)."""
+        point = np.array(q, dtype=float)
+        if self._clearance is not None:
+            self._clearance.start(point)
+        self._kernel.reset(self._at, pointer(point))
+
+    @property
+    def q(self) -> Array:
+        return np.array(self._q)
+
+    @property
+    def status(self) -> TrackStatus:
+        return TrackStatus(int(self._status[0]))
+
+    @property
+    def chart(self) -> int:
+        return int(self._state["chart"][0])
+
+    @property
+    def xi(self) -> Any:
+        if not self._state["inside"][0]:
+            return float("nan") if self._r == 1 else np.full(self._r, np.nan)
+        value = np.asarray(self._kernel.charts[self.chart].xi(self.q))
+        return float(value[0]) if self._r == 1 else value
+
+    @property
+    def memory(self) -> bytes:
+        return self._state.tobytes()
+
+    @memory.setter
+    def memory(self, memory: bytes) -> None:
+        self._state[:] = np.frombuffer(memory, self._state.dtype)
+        if self._clearance is not None:
+            self._clearance.start(self.q)
 
 
-def _solve_by_steps(H: Array, g: Array, low: Array, high: Array) -> Array:
-    """As `solve_in_box`, by a primal active set."""
-    d, held = np.zeros(len(g)), np.zeros(len(g))
-    for _ in range(RULES.changes):
-        free, way = held == 0, np.zeros(len(g))
-        way[free] = np.linalg.solve(H[free][:, free], -(g + H @ d)[free])
-        with np.errstate(all="ignore"):
-            shares = np.where(way > 0, (high - d) / way, np.where(way < 0, (low - d) / way, np.inf))
-        k = int(np.argmin(shares))
-        if shares[k] < 1:
-            d = d + max(0.0, float(shares[k])) * way
-            held[k] = np.sign(way[k])
-            d[k] = high[k] if way[k] > 0 else low[k]
-            continue
-        d = d + way
-        # What a bound holds back: the cost would fall on the other side.
-        pull = (g + H @ d) * held
-        worst = int(np.argmax(pull))
-        if pull[worst] <= RULES.rounding:
-            break
-        held[worst] = 0.0
-    return np.asarray(np.clip(d, low, high))
+def _read_limits(name: str, limits: ArrayLike | None, default: Array) -> Array:
+    """Positive numbers (n,), or one for all joints."""
+    values = default if limits is None else as_float_array(name, limits)
+    if values.ndim:
+        require_shape(name, values.shape, default.shape)
+    if not (values > 0).all():
+        raise InvalidValueError(name, values.tolist(), "positive numbers")
+    return np.array(np.broadcast_to(values, default.shape))

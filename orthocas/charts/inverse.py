@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Self
@@ -51,12 +51,14 @@ class InverseStatus(IntEnum):
     NOT_FOUND = 5  #: no solution was found, which does not prove that there is none; q has the smallest error found
     BAD_INPUT = 6  #: a number of phi or of the start is not finite; q is NaN
     OUT_OF_REACH = 7  #: no solution: x is farther from the first joint than the arm is long; q as for NOT_FOUND
+    COLLIDING = 8  #: a solution inside the domain where a pair touches; no free one was found
 
 
 _KEPT = (InverseStatus.NEAREST, InverseStatus.OUTSIDE_DOMAIN)  # x, if q is to lie inside
 _UNSOLVED = (InverseStatus.NOT_FOUND, InverseStatus.OUT_OF_REACH)
 _MOVED = (InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT, *_UNSOLVED)
 _ACCEPTED = (InverseStatus.FOUND, InverseStatus.NEAREST)
+_SOLVED = (*_ACCEPTED, InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT, InverseStatus.COLLIDING)
 _FAILED = (InverseStatus.NOT_FOUND, InverseStatus.BAD_INPUT, InverseStatus.OUT_OF_REACH)
 _BEYOND = (InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT)
 
@@ -103,12 +105,24 @@ class Solutions(Shown):
     def facts(self) -> dict[str, str]:
         """How many rows ended how."""
         counts = {status.name: int((self.status == status).sum()) for status in InverseStatus}
-        solved = self.error[np.isin(self.status, (*_ACCEPTED, *_BEYOND))]
+        solved = self.error[np.isin(self.status, _SOLVED)]
         return {
             "solutions": listed(f"{count} {name}" for name, count in counts.items() if count) or "no rows",
             **({"largest error": f"{solved.max():.3g}"} if solved.size else {}),
             **({"iterations": f"{self.iterations.mean():.3g} on average"} if len(self) else {}),
         }
+
+    def row(self, k: int) -> Solutions:
+        """One row alone."""
+        part = slice(k, k + 1)
+        return Solutions(
+            self.q[part],
+            self.status[part],
+            self.iterations[part],
+            self.error[part],
+            self.distance[part],
+            self.tolerance,
+        )
 
     def require(self, inside: bool = True) -> Self:
         """These solutions, if all rows have one.
@@ -127,6 +141,9 @@ class Solutions(Shown):
                 f"{self.error[missing].max():.3g}, expected <= {self.tolerance:.1g}. "
                 "The target may be out of reach, or the path to it singular"
             )
+        colliding = np.flatnonzero(self.status == InverseStatus.COLLIDING)
+        if colliding.size:
+            raise InverseError(f"all q found touch something for {self.named(colliding)}")
         singular = np.flatnonzero(self.status == InverseStatus.SINGULAR)
         if singular.size:
             raise InverseError(
@@ -140,6 +157,13 @@ class Solutions(Shown):
     def named(self, rows: Indices) -> str:
         """Some rows in words, for messages."""
         return f"rows {rows[: RULES.named].tolist()}" if len(self) > 1 else "phi"
+
+
+def join_solutions(parts: Sequence[Solutions]) -> Solutions:
+    """All rows, in this order."""
+    names = ("q", "status", "iterations", "error", "distance")
+    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return Solutions(**columns, tolerance=parts[0].tolerance)
 
 
 def beyond_reach(task: Task, x: Array) -> NDArray[np.bool_]:

@@ -9,11 +9,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from orthocas.charts.clearance import Clearance
 from orthocas.charts.coordinates import Coordinates, InvertibleMap
 from orthocas.charts.curves import SelfMotionCurves
 from orthocas.charts.descent import BoxedPhi
 from orthocas.charts.inside import Inside
-from orthocas.charts.inverse import Inverse, Solutions
+from orthocas.charts.inverse import Inverse, InverseStatus, Solutions, join_solutions
 from orthocas.charts.newton import (
     NEWTON,
     Continuation,
@@ -24,10 +25,11 @@ from orthocas.charts.newton import (
     PointFunctions,
     inverse_function,
 )
-from orthocas.charts.phi import Differences, PhiFunctions, PhiMap, fill_coordinates, leave_over
+from orthocas.charts.phi import Differences, PhiFunctions, PhiMap, fill_coordinates, largest, leave_over
 from orthocas.charts.search import Cells, InDomain, Starts
 from orthocas.charts.trackers import ReachingTracker, Tracker, near_function
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, units_hint
+from orthocas.robots.collisions import Collisions
 from orthocas.tasks.problem import measure_task_sizes
 from orthocas.tasks.relative import Relative
 from orthocas.tools.cached import cached_property
@@ -112,6 +114,8 @@ class InverseMethods(PhiFunctions):
         xi: ArrayLike | None = None,
         tolerance: float = 1e-9,
         inside: bool = False,
+        all: bool = False,  # noqa: A002
+        collisions: Collisions | None = None,
         local: LocalSolver | None = None,
     ) -> Solutions:
         """Solve phi(q) = phi for q, with a status for each row: a row that fails does not disturb the others.
@@ -136,6 +140,10 @@ class InverseMethods(PhiFunctions):
                 the domain that has it, such as one too near to a singular position, or else NOT_FOUND. With r = 1, the
                 nearest is that on all self-motion curves of x that are found; with more coordinates, a local minimum.
                 Not for grown coordinates.
+            all: for one phi: every solution inside the domain that `solutions` finds, in rows.
+            collisions: of the chart's robot, such as `robot.collisions`. Rows whose solution touches something get the
+                nearest free one of all solutions that are found, or else the status COLLIDING. With `all`, free ones
+                come first. A NEAREST that touches is COLLIDING; `self_motion` knows what is free there.
             local: another solver of phi(q) = phi near given starts; `orthocas.compile_inverse` has one.
 
         Returns:
@@ -143,7 +151,8 @@ class InverseMethods(PhiFunctions):
 
         Raises:
             ShapeError: if a row has another number of entries, or q_start another number of rows.
-            NoExpressionError: if `inside` is asked of grown coordinates.
+            InvalidValueError: if `all` comes with several phi, a start or `inside`, or collisions are another robot's.
+            NoExpressionError: if `inside` or `all` is asked of grown coordinates.
 
         Source:
             ours: docs/how-to/inverse.md.
@@ -151,8 +160,17 @@ class InverseMethods(PhiFunctions):
         if local is not None and not callable(local):
             raise InvalidValueError("local", repr(local)[:80], "a function of targets and starts")
         phi = build_phi(self, phi, x, xi)
+        if collisions is not None:
+            require_kind("collisions", collisions, Collisions)
+            collisions.require_for(self.problem.robot.tree)
+        require_kind("all", all, bool)
+        if all:
+            if q_start is not None or inside:
+                raise InvalidValueError("all", "given with q_start or inside", "all alone")
+            return self._solve_all(as_point("phi", phi, self.n), tolerance, collisions)
         search = self.parts.inverse if local is None else replace(self.parts.inverse, local=local, brief=local)
-        return solve_with(search, self, phi, q_start, tolerance, inside)
+        found = solve_with(search, self, phi, q_start, tolerance, inside)
+        return found if collisions is None else self._prefer_free(rows_of(self, "phi", phi), found, collisions)
 
     def nearest_xi(self, q_wish: ArrayLike, x: Any = None, *, tolerance: float = 1e-9) -> Solutions:
         """Joint positions in the domain with task values x, and of these the xi nearest to that of a wished posture.
@@ -176,7 +194,41 @@ class InverseMethods(PhiFunctions):
         phi, wishes = targets_of_wish(self, q_wish, x)
         return self.solve(phi, wishes, tolerance=tolerance, inside=True)
 
-    def solutions(self, phi: ArrayLike, tolerance: float = 1e-9) -> Array:
+    def _solve_all(self, phi: Array, tolerance: float, collisions: Collisions | None) -> Solutions:
+        """All solutions inside that a search finds, free ones first."""
+        require_at_least("tolerance", tolerance, 0)
+        require_expression(self, "a search for all solutions")
+        in_domain = self.parts.inverse.in_domain
+        assert in_domain is not None
+        q = in_domain.all_solutions(phi, float(tolerance))
+        status = np.full(len(q), int(InverseStatus.FOUND))
+        if collisions is not None and len(q):
+            status[~collisions.check_free(q)] = InverseStatus.COLLIDING
+        order = np.argsort(status, kind="stable")
+        q, rows = q[order], np.broadcast_to(phi, q.shape)
+        error = largest(self.parts.phi_map.residual(rows, q)) if len(q) else np.zeros(0)
+        own = self.parts.phi_map.difference(rows, np.asarray(self.phi(q)))[:, self.m :] if len(q) else q[:, self.m :]
+        steps = np.zeros(len(q), dtype=np.int64)
+        return Solutions(q, status[order], steps, error, np.linalg.norm(own, axis=1), float(tolerance))
+
+    def _prefer_free(self, targets: Array, found: Solutions, collisions: Collisions) -> Solutions:
+        """The same with free solutions in place of those that touch, where there are any."""
+        rows = np.flatnonzero(np.isin(found.status, (InverseStatus.FOUND, InverseStatus.NEAREST)))
+        rows = rows[~collisions.check_free(found.q[rows])] if rows.size else rows
+        if not rows.size:
+            return found
+        status = found.status.copy()
+        status[rows] = InverseStatus.COLLIDING
+        parts = [replace(found, status=status).row(k) for k in range(len(found))]
+        for k in rows[found.status[rows] == InverseStatus.FOUND].tolist():
+            if not isinstance(self.coordinates, InvertibleMap):
+                every = self._solve_all(targets[k], found.tolerance, collisions)
+                free = np.flatnonzero(every.found)
+                if free.size:
+                    parts[k] = every.row(free[np.argmin(np.linalg.norm(every.q[free] - found.q[k], axis=1))])
+        return join_solutions(parts)
+
+    def solutions(self, phi: ArrayLike, tolerance: float = 1e-9, collisions: Collisions | None = None) -> Array:
         """All q inside the domain with phi(q) = phi that a search of the whole domain finds.
 
         A chart without a fold may have several: det J != 0 makes phi one-to-one near each point only. On the box of a
@@ -186,6 +238,7 @@ class InverseMethods(PhiFunctions):
         Args:
             phi: target values, (n,).
             tolerance: as in `solve`.
+            collisions: of the chart's robot: solutions without a contact come first. `solve` with `all` says which.
 
         Returns:
             Different solutions, the one nearest to the centre of the domain first, (k, n).
@@ -202,13 +255,18 @@ class InverseMethods(PhiFunctions):
             >>> len(chart.solutions(chart.phi([0.4, 0.3])))
             2
         """
-        require_at_least("tolerance", tolerance, 0)
-        require_expression(self, "a search for all solutions")
-        in_domain = self.parts.inverse.in_domain
-        assert in_domain is not None
-        return in_domain.all_solutions(as_point("phi", phi, self.n), float(tolerance))
+        return self.solve(phi, tolerance=tolerance, all=True, collisions=collisions).q
 
-    def tracker(self, q0: ArrayLike, largest_step: ArrayLike | None = None, *, nearest: bool = False) -> Tracker:
+    def tracker(
+        self,
+        q0: ArrayLike,
+        largest_step: ArrayLike | None = None,
+        *,
+        nearest: bool = False,
+        collisions: Collisions | None = None,
+        margin: float | None = None,
+        avoid: float | None = None,
+    ) -> Tracker:
         """A tracker that follows a stream of phi from q0; see `Tracker`.
 
         Args:
@@ -217,16 +275,20 @@ class InverseMethods(PhiFunctions):
                 the half-widths of the domain.
             nearest: where phi is out of reach, descend to the nearest x, and with that to the nearest xi, instead of
                 staying where it was; see `ReachingTracker`.
+            collisions: of the chart's robot, such as `robot.collisions`: no call comes nearer to a contact than margin.
+            margin: that distance [m]. Default: 0.01.
+            avoid: distance below which xi gives way [m], above the margin. Default: it does not.
 
         Raises:
             NoExpressionError: if the coordinates are grown.
-            InvalidValueError: if q0 lies outside the domain, or J is singular there.
+            InvalidValueError: if q0 lies outside the domain, J is singular there, or a pair touches.
             DomainError: if the domain has a condition, but no expression of it.
         """
         require_expression(self, "a tracker")
         require_kind("nearest", nearest, bool)
-        parts = self.parts.point_functions, self.problem.domain, q0, largest_step
-        return ReachingTracker(*parts, self.parts.reaching, self.m) if nearest else Tracker(*parts)
+        clearance = Clearance.build(collisions, self.problem.robot.tree, margin, avoid)
+        parts = self.parts.point_functions, self.problem.domain, q0, largest_step, self.m, clearance
+        return ReachingTracker(*parts, self.parts.reaching) if nearest else Tracker(*parts)
 
     def function(self, name: str) -> ca.Function:
         """A CasADi function: xi, phi, jacobian, task, task_jacobian, second_derivative or inverse.

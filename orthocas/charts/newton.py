@@ -287,6 +287,7 @@ class PointFunctions:
     inverted: ca.Function  #: q -> phi, H = J^-1, and |D^-1 J| |H D| with the sizes D of the components
     chord: ca.Function  #: q, phi, H, target -> q and phi after 3 steps, and |residual| at each of the 4 points
     turning: tuple[int, ...] = ()  #: joints that turn without end, as in `Problem.turning`
+    turns: tuple[float, ...] = ()  #: periods of the components, as in `Differences`
 
     @classmethod
     def of(
@@ -306,7 +307,7 @@ class PointFunctions:
             left = difference(target, value)
             errors.append(ca.norm_2(left / scale))
         chord = dense_function("chord", [q, known, H, target], [now, value, ca.vertcat(*errors)])
-        return cls(inverted, chord, turning)
+        return cls(inverted, chord, turning, tuple(np.asarray(difference.turns, dtype=float).tolist()))
 
     def distance(self, phi: Array, target: Array) -> float:
         """|target - phi| relative to the sizes of the components, by the shorter way around."""
@@ -330,6 +331,12 @@ class PointSolver:
         self._refresh = Bound(functions.inverted, [self.q], [self.phi, self._H, self.condition])
         results = [self.reached, self._phi_reached, self.errors]
         self._step = Bound(functions.chord, [self.q, self.phi, self._H, self.target], results)
+
+    @property
+    def inverse(self) -> Array:
+        """dq/dphi at the last refresh, (n, n)."""
+        n = len(self.q)
+        return self._H.reshape(n, n).T.copy()
 
     def refresh(self) -> bool:
         """Evaluate phi and J at q. Returns whether J is regular."""

@@ -322,7 +322,7 @@ class Report(Shown):
             flatters = f"{listed(self.idle_joints)} is exact and" if self.idle_joints else "the floating base"
             found["without idle"] = (
                 f"task std {others.task_angle.std:.2f}{several}, leak rms {others.leak.rms:.2f} deg: "
-                f"{flatters} flatters the mean"
+                f"{flatters} makes the mean look better"
             )
         return found
 

@@ -10,6 +10,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from orthocas.charts.clearance import RULES as CLEARANCE
+from orthocas.charts.clearance import Clearance
 from orthocas.charts.descent import rooms_of
 from orthocas.charts.newton import NEWTON, Bound, PointFunctions, PointSolver
 from orthocas.charts.phi import PhiMap, leave_over
@@ -19,6 +21,7 @@ from orthocas.tools.batch import dense_function
 from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, as_float_array, as_point, require_shape
 from orthocas.tools.display import Shown, number_list
+from orthocas.tools.expressions import wrap_shortest
 from orthocas.tools.interrupts import deferred
 
 
@@ -30,13 +33,14 @@ class TrackerRules:
     returned: float = 1e-8  #: of phi, relative to its sizes: the tracker is back
     refreshes: int = 8  #: of the Jacobian in a call
     step: float = 0.1  #: of the half-widths: default of the largest change of q in a call
+    halvings: int = 4  #: of a change of xi that has no solution
 
 
 TRACKER = TrackerRules()
 
 
 class TrackerStatus(IntEnum):
-    """How the last call of a tracker ended. With all but OK, NEAREST and NEARER, q stays where it was."""
+    """How the last call of a tracker ended. With JUMP to BAD_INPUT, q stays where it was."""
 
     OK = 0  #: phi(q) = phi, inside the domain
     JUMP = 1  #: q would have moved by more than `largest_step`
@@ -46,6 +50,8 @@ class TrackerStatus(IntEnum):
     BAD_INPUT = 5  #: a number of phi is not finite
     NEAREST = 6  #: a local minimum of the distance to phi in the domain; of trackers with `nearest=True`
     NEARER = 7  #: at least as near as before, but no minimum: `largest_step` or the work of a call ended the descent
+    YIELDING = 8  #: x is met, and xi gives way to keep clear of contacts; of trackers with `avoid`
+    BRAKED = 9  #: a part of the way, or none: all of it would come nearer to a contact than `margin` allows
 
 
 class Tracker(Shown):
@@ -54,6 +60,11 @@ class Tracker(Shown):
     A call takes chord steps with the Jacobian of an earlier call, and evaluates a new one only where they do not
     converge. If the new q would be too far from the last one or outside the domain, or if there is none, `step` returns
     the last q again, and `status` says why. `Chart.tracker` makes trackers; each belongs to one thread.
+
+    With a collision model, no call comes nearer to a contact than a margin: it goes a part of the way, with the status
+    BRAKED. With `avoid`, xi gives way before: of the xi whose pairs are at least as far as that, the tracker goes to
+    one near the wished one, with x met and the status YIELDING. With r > 1 or several pairs it is not always the
+    nearest.
 
     Example:
         >>> import numpy as np
@@ -68,10 +79,16 @@ class Tracker(Shown):
     """
 
     def __init__(
-        self, functions: PointFunctions, domain: Domain, q0: ArrayLike, largest_step: ArrayLike | None
+        self,
+        functions: PointFunctions,
+        domain: Domain,
+        q0: ArrayLike,
+        largest_step: ArrayLike | None,
+        m: int,
+        clearance: Clearance | None = None,
     ) -> None:
         n = len(domain.centre)
-        self._functions, self._domain = functions, domain
+        self._functions, self._domain, self._m, self._clearance = functions, domain, m, clearance
         limit = as_float_array(
             "largest_step", TRACKER.step * domain.half_width if largest_step is None else largest_step
         )
@@ -90,10 +107,11 @@ class Tracker(Shown):
     def __getstate__(self) -> dict[str, Any]:
         """Without scratch memory."""
         parts = {"functions": self._functions, "domain": self._domain, "q": self.q, "limit": self._limit}
-        return {**parts, "start": self._start}
+        return {**parts, "m": self._m, "clearance": self._clearance, "start": self._start}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(state["functions"], state["domain"], state["q"], state["limit"])  # type: ignore[misc]
+        names = ("functions", "domain", "q", "limit", "m", "clearance")
+        self.__init__(*(state[name] for name in names))  # type: ignore[misc]
         self._start = state["start"]
 
     @property
@@ -132,7 +150,7 @@ class Tracker(Shown):
             q: a point of the domain, (n,).
 
         Raises:
-            InvalidValueError: if q lies outside the domain, or J is singular there.
+            InvalidValueError: if q lies outside the domain, J is singular there, or a pair touches.
         """
         point = as_point("q", q, len(self._limit))
         if not self._domain.contains(point):
@@ -141,6 +159,8 @@ class Tracker(Shown):
         self._solver.q[:] = point
         if not self._solver.refresh():
             raise InvalidValueError("q", point.tolist(), "a point where J is regular")
+        if self._clearance is not None:
+            self._clearance.start(point)
         self._start = self._solver.q.copy(), self._solver.phi.copy()
         self.status = TrackerStatus.OK  #: how the last call ended
 
@@ -163,10 +183,71 @@ class Tracker(Shown):
         solver.target[:] = phi
         self._before[:] = solver.q
         self.status = self._advance()
-        if self.status != TrackerStatus.OK:
-            solver.q[:] = self._before
-            solver.refresh()
+        if self._clearance is not None and self.status != TrackerStatus.BAD_INPUT:
+            self._keep_clear(self._clearance)
+        if self.status not in _MOVED:
+            self._return()
         return solver.q.copy()
+
+    def _return(self) -> None:
+        """Go back to where the call began."""
+        self._solver.q[:] = self._before
+        self._solver.refresh()
+
+    def _keep_clear(self, clearance: Clearance) -> None:
+        """Let xi give way where the step came near a contact, and stop where it still comes too near."""
+        solver = self._solver
+        if clearance.avoid is not None:
+            met = self.status == TrackerStatus.OK
+            if not met or clearance.measure(solver.q) < clearance.avoid:
+                self._give_way(clearance)
+        if self.status not in _MOVED:
+            return
+        q, fraction = clearance.limit(self._before, solver.q)
+        if fraction < 1:
+            inside = bool(self._domain.contains(q))
+            solver.q[:] = q if inside else self._before
+            if not inside or not solver.refresh():
+                self._return()
+            clearance.hold(solver.q)
+            self.status = TrackerStatus.BRAKED
+
+    def _give_way(self, clearance: Clearance) -> None:
+        """Meet x, with an xi near the wished one that keeps clear."""
+        solver, m = self._solver, self._m
+        target = solver.target.copy()
+        failed = self.status
+        self._return()
+        solver.target[m:] = solver.phi[m:]
+        self.status = self._advance()
+        rounds = CLEARANCE.rounds if self.status == TrackerStatus.OK else 0
+        for _ in range(rounds):
+            if not solver.refresh():
+                break
+            # No joint moves by more than its limit.
+            wish = wrap_shortest(target[m:] - solver.phi[m:], np.array(self._functions.turns[m:]))
+            slopes = solver.inverse[:, m:]
+            change = clearance.yield_to(solver.q, slopes, wish)
+            step = np.abs(slopes @ change) / self._limit
+            change = change / max(1.0, float(step.max()))
+            if float(np.abs(change).max()) <= CLEARANCE.settled * max(1.0, float(np.abs(wish).max())):
+                break
+            q, reached = solver.q.copy(), solver.phi[m:].copy()
+            for _ in range(TRACKER.halvings):
+                solver.target[m:] = reached + change
+                if self._advance() == TrackerStatus.OK:
+                    break
+                solver.q[:] = q
+                solver.refresh()
+                change = change / 2
+            else:
+                break
+        solver.target[:] = target
+        if self.status == TrackerStatus.OK:
+            left = self._functions.distance(solver.phi, target)
+            self.status = TrackerStatus.OK if left <= TRACKER.returned else TrackerStatus.YIELDING
+        elif failed != TrackerStatus.OK:
+            self.status = failed
 
     def _advance(self) -> TrackerStatus:
         """Move to the solution; returns whether that is allowed."""
@@ -193,6 +274,16 @@ class Tracker(Shown):
         if outside > 0:
             return TrackerStatus.OUTSIDE_DOMAIN
         return TrackerStatus.JUMP if jump > 1 else TrackerStatus.OK
+
+
+#: with these, q has moved
+_MOVED = (
+    TrackerStatus.OK,
+    TrackerStatus.NEAREST,
+    TrackerStatus.NEARER,
+    TrackerStatus.YIELDING,
+    TrackerStatus.BRAKED,
+)
 
 
 def _guard(domain: Domain, limit: Array) -> ca.Function:
@@ -241,7 +332,8 @@ class ReachingTracker(Tracker):
 
     A phi that is reached is met to rounding, as by `Tracker`. Otherwise `status` is NEAREST at a local minimum, where
     the model promises less than 1e-8 of the cost. It is NEARER if `largest_step` or the bounded work of a call ended
-    the descent, which goes on in the next call.
+    the descent, which goes on in the next call. With a collision model, distances of near pairs are constraints of
+    each step, too: what a contact is in the way of counts as out of reach.
 
     Source:
         Levenberg and Marquardt's method with an active set; ours: docs/how-to/inverse.md.
@@ -253,11 +345,12 @@ class ReachingTracker(Tracker):
         domain: Domain,
         q0: ArrayLike,
         largest_step: ArrayLike | None,
-        near: ca.Function,
         m: int,
+        clearance: Clearance | None,
+        near: ca.Function,
     ) -> None:
-        self._parts, self._m = near, m
-        super().__init__(functions, domain, q0, largest_step)
+        self._parts = near
+        super().__init__(functions, domain, q0, largest_step, m, clearance)
         n, rooms = len(domain.centre), near.size1_out(2)
         self._at, self._to, self._e, self._rooms = np.empty(n), np.empty(n), np.empty(n), np.empty(rooms)
         self._J, self._slopes = np.empty((n, n)), np.empty((n, rooms))
@@ -267,24 +360,33 @@ class ReachingTracker(Tracker):
 
     def __getstate__(self) -> dict[str, Any]:
         """Without scratch memory."""
-        return {**super().__getstate__(), "near": self._parts, "m": self._m}
+        return {**super().__getstate__(), "near": self._parts}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        names = ("functions", "domain", "q", "limit", "near", "m")
+        names = ("functions", "domain", "q", "limit", "m", "clearance", "near")
         self.__init__(*(state[name] for name in names))  # type: ignore[misc]
         self._start = state["start"]
 
     def step(self, phi: ArrayLike) -> Array:
         """As `Tracker.step`; where that stays, the nearest q (n,) that a descent from the last one finds."""
         q = super().step(phi)
-        if self.status in (TrackerStatus.OK, TrackerStatus.BAD_INPUT):
+        if self.status in (TrackerStatus.OK, TrackerStatus.YIELDING, TrackerStatus.BAD_INPUT):
             return q
-        found, is_minimum = self._descended(q)
+        start = self._before.copy()
+        if self._clearance is not None:
+            self._clearance.hold(start)
+            self._near_parts = self._clearance.list_rows(start, self._limit)
+        found, is_minimum = self._descended(start)
+        if self._clearance is not None:
+            found, fraction = self._clearance.limit(start, found)
+            if fraction < 1 and not self._domain.contains(found):
+                found = start
+                self._clearance.hold(start)
+            is_minimum = is_minimum and fraction == 1
         self._solver.q[:] = found
         if not self._solver.refresh():
-            self._solver.q[:] = q
-            self._solver.refresh()
-            return q
+            self._return()
+            return start
         self.status = TrackerStatus.NEAREST if is_minimum else TrackerStatus.NEARER
         return found
 
@@ -348,9 +450,14 @@ class ReachingTracker(Tracker):
         self._near.run()
         cost = float(self._e @ self._e) / 2
         known = np.asarray(np.isfinite(self._slopes).all(axis=0))
-        slopes = np.where(known[:, None], self._slopes.T, 0.0)
+        slopes, rooms = np.where(known[:, None], self._slopes.T, 0.0), self._rooms.copy()
         cost = cost if np.isfinite(cost) and np.isfinite(self._J).all() else np.inf
-        return _Look(np.array(q), cost, self._e.copy(), self._J.T.copy(), self._rooms.copy(), slopes)
+        # Distances count like conditions of the domain.
+        if self._clearance is not None:
+            index, floor = self._near_parts
+            values, gradients, _ = self._clearance.collisions.measure_parts(np.asarray(q), index)
+            slopes, rooms = np.vstack([slopes, gradients]), np.concatenate([rooms, values - floor])
+        return _Look(np.array(q), cost, self._e.copy(), self._J.T.copy(), rooms, slopes)
 
 
 class _Look(NamedTuple):
@@ -360,7 +467,7 @@ class _Look(NamedTuple):
     cost: float  #: half the sum of squares of e; infinite where phi is undefined
     e: Array  #: weighted errors of phi, (n,)
     J: Array  #: de/dq, (n, n)
-    rooms: Array  #: of the domain's conditions, (k,), positive inside
+    rooms: Array  #: of the domain's conditions and of near pairs, (k,), positive inside
     slopes: Array  #: d rooms/dq, (k, n); 0 where undefined
 
 

@@ -16,7 +16,16 @@ from orthocas.charts.certificate import METHODS, Certificate
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.ready import Card, card, load, names
-from orthocas.cli.options import AsJson, ChartPath, Force, parse_number, parse_whole_number
+from orthocas.cli.options import (
+    AsJson,
+    ChartPath,
+    DisabledPairs,
+    Force,
+    Solids,
+    parse_number,
+    parse_whole_number,
+    read_solids,
+)
 from orthocas.cli.output import (
     build_reach_data,
     format_reach_rows,
@@ -83,15 +92,18 @@ def evaluate(
             "--seed", parser=parse_whole_number, help="Seed of the samples; use another one than for the fit."
         ),
     ] = 1,
+    collisions: Solids = None,
+    srdf: DisabledPairs = None,
     json: AsJson = False,
 ) -> None:
     """Measure the quality of a chart on held-out samples of its domain."""
     loaded = load(chart)
-    report = quality.evaluate(loaded, samples, seed)
+    solids = read_solids(loaded.problem.robot, collisions, srdf)
+    report = quality.evaluate(loaded, samples, seed, collisions=solids)
     if json:
         print_json({**report.as_dict(), **build_reach_data(loaded)})
     else:
-        print_rows({**format_report_rows(report), **format_reach_rows(loaded)})
+        print_rows({**format_report_rows(report, loaded), **format_reach_rows(loaded)}, f"orthocas view {chart}")
 
 
 def certify(
@@ -163,7 +175,9 @@ def certify(
     if json:
         print_json({"chart": str(target), **certificate.as_dict()})
     else:
-        print_rows({**certificate.facts(), "chart": str(target)})
+        print_rows(
+            {**certificate.facts(), "chart": str(target)}, f"orthocas codegen {target} --controller pd_plus --out c"
+        )
     if interrupted:
         note("interrupted: the file holds what is proved so far; the same command goes on from it")
         raise typer.Exit(INTERRUPTED)

@@ -9,7 +9,17 @@ import typer
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.ready import load
-from orthocas.cli.options import AsJson, ChartPath, Force, Limit, parse_one_or_all, spread_options
+from orthocas.cli.options import (
+    AsJson,
+    ChartPath,
+    DisabledPairs,
+    Force,
+    Limit,
+    Solids,
+    parse_one_or_all,
+    read_solids,
+    spread_options,
+)
 from orthocas.cli.output import note, print_json, print_rows
 from orthocas.codegen.check import AgreementCheck, check_c
 from orthocas.codegen.export import LIBRARIES
@@ -17,6 +27,7 @@ from orthocas.codegen.export import export as export_chart
 from orthocas.codegen.generate import GeneratedC, generate_c
 from orthocas.control.controller import Controller, Setting, law_names, law_of
 from orthocas.errors import LawWarning, OptionError
+from orthocas.robots.capsules import fit_capsules
 from orthocas.tools.interrupts import deferred
 
 CONTROLLERS = law_names()
@@ -66,6 +77,8 @@ def codegen(
     single_precision: Annotated[
         bool, typer.Option("--float", help="Numbers are float instead of double, for processors in single precision.")
     ] = False,
+    collisions: Solids = None,
+    srdf: DisabledPairs = None,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
@@ -80,7 +93,9 @@ def codegen(
         # Raises for grown charts.
         loaded.function("xi")
         law = None if controller == _NONE else build_controller(controller, loaded, settings, limit)
-        generated = generate_c(loaded, out, law, name, force, single_precision=single_precision)
+        solids = read_solids(loaded.problem.robot, collisions, srdf)
+        capsules = None if solids is None else fit_capsules(solids)
+        generated = generate_c(loaded, out, law, name, force, single_precision=single_precision, capsules=capsules)
         remarks = [] if law is None else law.remarks()
     agreement = check_c(generated, loaded, law) if check else None
     report = _build_report(generated, agreement)

@@ -24,6 +24,7 @@ COMMANDS = {
     "codegen": "Write a chart, the robot's dynamics, the inverse map and a controller as C99.",
     "export": "Write task, xi, phi, Jacobian and inverse of a chart as one Python module that needs the library only.",
     "view": "Show a chart, a robot or a motion in the browser, until Ctrl-C.",
+    "doctor": "Show what is installed, what is missing for what, and whether a first chart works. Exit code 1 if not.",
     "charts": "List the ready charts of known arms, show the card of one, or write it to a file.",
 }  #: names of the commands and the first lines of their help
 _MODULES = {"demo": "compare", "evaluate": "charts", "certify": "charts", "export": "codegen"}

@@ -345,7 +345,7 @@ def _save_and_report(
             # What ends the domain in each joint.
             rows["home"] = f"{number_list(suggestion.home)} ({suggestion.home_source})"
             rows |= {end.joint: f"half-width {end.half_width:.3g}, {end.explanation}" for end in suggestion.joints}
-        print_rows(rows)
+        print_rows(rows, f"orthocas view {target}")
     if result.status is Status.INTERRUPTED:
         note("interrupted: the chart holds the best coordinates found so far")
         raise typer.Exit(INTERRUPTED)
@@ -354,11 +354,10 @@ def _save_and_report(
 def _format_fit(result: Fit, report: Report, target: Path) -> dict[str, str]:
     """What a fit prints."""
     coordinates, robot = result.chart.coordinates, result.chart.problem.robot
-    # The advice is on weights of tight fits.
-    rows = report.facts() if isinstance(result, WideFit) else format_report_rows(report)
+    rows = format_report_rows(report, result.chart)
     rows["robot"] = f"{robot.n} joints, {'tip' if len(robot.tips) == 1 else 'tips'} {listed(robot.tips)}"
     rows["fit"] = f"{coordinates.label}, {result.seconds:.2f} s, {result.status.value}"
-    if isinstance(result, WideFit) and result.branch is not None:
+    if isinstance(result, WideFit):
         rows["branch"] = (
             f"{result.branch.name}, {percent(result.branch.share)} of the clear positions of the joint range"
         )
@@ -378,9 +377,8 @@ def _format_fit(result: Fit, report: Report, target: Path) -> dict[str, str]:
         if offer is None:
             rows["singular"] += "; --domain auto, or another --centre or --home, stays clear"
     if check.half_turn_samples:
-        rows["half a turn"] = (
-            f"at {percent(check.half_turn_share, 2, fault=True)} of the domain the task's own orientation ends"
-        )
+        share = percent(check.half_turn_share, 2, fault=True)
+        rows["half a turn"] = f"x of the task jumps on {share} of the domain: half a turn from its reference"
     if offer is not None:
         bound, share = offer.least_singular_value, offer.share
         rows["clear part"] = (
@@ -390,7 +388,7 @@ def _format_fit(result: Fit, report: Report, target: Path) -> dict[str, str]:
 
 
 def _describe_wide(result: Fit) -> dict[str, Any]:
-    if not isinstance(result, WideFit) or result.branch is None:
+    if not isinstance(result, WideFit):
         return {}
     named = result.chart.parts.named_coordinates[0].partition(": ")[2]
     meaning = None if result.meaning is None else {"like": named, **asdict(result.meaning)}

@@ -9,7 +9,17 @@ import typer
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.ready import load
-from orthocas.cli.options import AsJson, ChartPath, Force, parse_number, parse_numbers, parse_one_or_all
+from orthocas.cli.options import (
+    AsJson,
+    ChartPath,
+    DisabledPairs,
+    Force,
+    Solids,
+    parse_number,
+    parse_numbers,
+    parse_one_or_all,
+    read_solids,
+)
 from orthocas.cli.output import print_json, print_rows
 from orthocas.errors import InvalidValueError
 from orthocas.paths.follow import HOLD, OBJECTIVE
@@ -17,6 +27,7 @@ from orthocas.paths.follow import follow as follow_path
 from orthocas.paths.joint_motion import JointMotion, require_place
 from orthocas.paths.tool_path import read_path
 from orthocas.robots.obstacles import Capsule, Obstacle, Plane, Sphere
+from orthocas.robots.scene import Scene
 from orthocas.tools.checks import Array, require_known
 from orthocas.tools.interrupts import deferred
 
@@ -57,8 +68,11 @@ def follow(
         float, typer.Option("--link-radius", parser=parse_number, help="Radius of the robot's links [m].")
     ] = 0.0,
     clearance: Annotated[
-        float, typer.Option("--clearance", parser=parse_number, help="Smallest distance from obstacles [m].")
+        float,
+        typer.Option("--clearance", parser=parse_number, help="Smallest distance of obstacles and links [m]."),
     ] = 0.0,
+    collisions: Solids = None,
+    srdf: DisabledPairs = None,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
@@ -70,6 +84,12 @@ def follow(
         # Raises for grown charts.
         loaded.function("xi")
     waypoints, choice = _read_task(path, loaded, xi)
+    solids, obstacles = (
+        read_solids(loaded.problem.robot, collisions, srdf),
+        [_build_obstacle(t) for t in obstacle or ()],
+    )
+    if solids is not None:
+        solids = solids.with_scene(Scene({f"obstacle {k}": solid for k, solid in enumerate(obstacles)}))
     begin = time.perf_counter()
     motion = follow_path(
         loaded,
@@ -79,16 +99,20 @@ def follow(
         period=period,
         velocity_limits=None if velocity is None else parse_one_or_all("--velocity-limit", velocity),
         acceleration_limits=None if acceleration is None else parse_one_or_all("--acceleration-limit", acceleration),
-        obstacles=[_build_obstacle(text) for text in obstacle or ()],
+        obstacles=obstacles,
         link_radius=link_radius,
         clearance=clearance,
+        collisions=solids,
     )
     seconds = time.perf_counter() - begin
     motion.save_csv(out, force)
     if json:
         print_json(_build_report(motion, seconds, out))
     else:
-        print_rows({**motion.facts(), "computed in": f"{seconds:.2f} s", "file": str(out)})
+        print_rows(
+            {**motion.facts(), "computed in": f"{seconds:.2f} s", "file": str(out)},
+            f"orthocas view {out} --chart {chart}",
+        )
 
 
 def _read_task(path: Path, chart: Chart, xi: str | None) -> tuple[Array, Any]:

@@ -1,5 +1,6 @@
 """`orthocas info`: what a chart, a named problem or a robot file holds."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -8,23 +9,34 @@ import typer
 
 from orthocas import problems
 from orthocas.bases.cyclic import cyclic_joints
-from orthocas.cli.options import AsJson, ProblemName, ProblemOptions, add_problem_options, is_robot_file
-from orthocas.cli.output import build_reach_data, print_json, print_rows
+from orthocas.cli.options import (
+    AsJson,
+    DisabledPairs,
+    ProblemName,
+    ProblemOptions,
+    Solids,
+    add_problem_options,
+    is_robot_file,
+    read_solids,
+)
+from orthocas.cli.output import build_reach_data, print_json, print_rows, print_table
 from orthocas.errors import OptionError, RobotError, SingularTaskError
 from orthocas.exact.involutivity import involutivity
+from orthocas.robots.collisions import Collisions
 from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import RULES as BRANCH_RULES
 from orthocas.tasks.branches import branches as find_branches
 from orthocas.tasks.problem import Problem, check
 from orthocas.tasks.samples import NEGLIGIBLE
 from orthocas.tasks.task import Task
+from orthocas.tools.checks import Array
 from orthocas.tools.display import percent
 from orthocas.tools.json import clean
 
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
 
-_FAULTS = ("near_singular_share", "half_turn_share")
+_FAULTS = ("near_singular_share", "half_turn_share", "touching_share")
 _SHARES = ("share", "clear_share", "share of the branch", "branches", *_FAULTS)  #: names of numbers to show in percent
 
 
@@ -35,6 +47,8 @@ def info(
     branches: Annotated[
         bool, typer.Option("--branches", help="Of a robot: also the branches of its joint range, for wide charts.")
     ] = False,
+    collisions: Solids = None,
+    srdf: DisabledPairs = None,
     json: AsJson = False,
 ) -> None:
     """Show a chart, a named problem, or a robot."""
@@ -44,10 +58,15 @@ def info(
             **_describe_robot(robot),
             **_describe_redundancy(robot),
             **(_describe_branches(robot, None) if branches else {}),
+            **_describe_collisions(read_solids(robot, collisions, srdf), robot.sample),
         }
     elif target in problems.names():
         problem = words.build_problem(target)
-        data = {**_describe_problem(problem), **(_describe_branches(problem.robot, problem.task) if branches else {})}
+        data = {
+            **_describe_problem(problem),
+            **(_describe_branches(problem.robot, problem.task) if branches else {}),
+            **_describe_collisions(read_solids(problem.robot, collisions, srdf), problem.domain.sample),
+        }
     elif branches:
         raise OptionError(f"--branches requires a robot file or a named problem, not the chart {target}")
     else:
@@ -58,13 +77,20 @@ def info(
             "parametrisation": chart.coordinates.label,
             "parameters": chart.coordinates.size,
             **build_reach_data(chart),
+            **_describe_collisions(read_solids(chart.problem.robot, collisions, srdf), chart.problem.domain.sample),
             "notes": dict(chart.notes),
             **({"certificate": chart.certificate.as_dict()} if chart.certificate else {}),
         }
     if json:
         print_json(data)
     else:
-        print_rows({name: _format(value, name) for name, value in data.items()})
+        then = f"orthocas {'view' if 'parametrisation' in data else 'fit'} {target}"
+        # Branches are a table of their own.
+        tables = ("branches", "clearance_at_most", "postures") if branches else ()
+        rows = {name: _format(value, name) for name, value in data.items() if name not in tables}
+        print_rows(rows, "" if branches else then)
+        if branches:
+            print_table(_tabulate_branches(data), f"{then} --task pose --domain branch")
 
 
 def _load_chart(target: str) -> "Chart":
@@ -126,6 +152,38 @@ def _describe_branches(robot: Robot, task: Task | None) -> dict[str, Any]:
     }
 
 
+def _describe_collisions(collisions: Collisions | None, draw: Callable[[int, int], Array]) -> dict[str, Any]:
+    """Pairs, what is unchecked, and how many of the postures touch that `draw` makes of a number and a seed."""
+    from orthocas.charts.quality import RULES, ContactShare  # as `_load_chart`
+
+    if collisions is None:
+        return {}
+    found = ContactShare.of(collisions, draw(RULES.postures, RULES.seed))
+    return {
+        "collisions": {"pairs": len(collisions.pairs), "origin": collisions.origin},
+        "unchecked": list(collisions.missing),
+        "touching_share": found.fraction,
+        "touching_pair" if found.touching else "nearest_pair": list(found.pair),
+        "least_distance": found.deepest,
+    }
+
+
+def _tabulate_branches(data: dict[str, Any]) -> list[tuple[str, ...]]:
+    """The branches as a table: name, share, the clearance that a wide chart needs if it is lower, and a posture."""
+    lower = data.get("clearance_at_most", {})
+    head = ("branch", "share", *(("clearance at most",) if lower else ()), "a posture")
+    rows = [
+        (
+            name,
+            percent(share),
+            *((_format(lower.get(name, "default")),) if lower else ()),
+            ", ".join(f"{value:.2f}" for value in data["postures"][name]),
+        )
+        for name, share in data["branches"].items()
+    ]
+    return [head, *rows]
+
+
 def _describe_problem(problem: Problem) -> dict[str, Any]:
     checked = check(problem)
     return {
@@ -164,7 +222,7 @@ def _describe_involutivity(problem: Problem) -> dict[str, Any]:
 
 def _format(value: Any, name: str = "") -> str:
     if isinstance(value, list):
-        return ", ".join(_format(item) for item in value) or "none"
+        return ("; " if name == "cuts" else ", ").join(_format(item) for item in value) or "none"
     if isinstance(value, dict):
         return ", ".join(f"{key} {_format(item, name if name in _SHARES else key)}" for key, item in value.items())
     if value is None:

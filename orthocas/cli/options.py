@@ -10,15 +10,18 @@ from typing import Annotated, Any, cast
 import numpy as np
 import typer
 
+from orthocas.cli.output import note
 from orthocas.errors import InvalidValueError, OptionError, UnknownNameError
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Angles, Weights
-from orthocas.robots.named import list_robot_files
+from orthocas.robots.collisions import Collisions
+from orthocas.robots.named import find_robot_file, list_robot_files
 from orthocas.robots.robot import Robot
 from orthocas.tasks.domains import default_box
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.regular_box import regular_box
 from orthocas.tasks.task import Task, list_task_kinds
 from orthocas.tools.checks import Array
+from orthocas.tools.display import listed
 
 
 def parse_whole_number(text: str) -> int:
@@ -54,6 +57,19 @@ Limit = Annotated[
     typer.Option(
         "--limit", help='Largest torque or speed, "50" or "50,40,..." per joint; default: the limits of the robot.'
     ),
+]
+
+Solids = Annotated[
+    str | None,
+    typer.Option(
+        "--collisions",
+        metavar="FILE.urdf|NAME",
+        help="Check collisions with the solids of this URDF file of the robot, or of a known robot such as panda.",
+    ),
+]
+DisabledPairs = Annotated[
+    Path | None,
+    typer.Option("--srdf", help="SRDF file whose disabled pairs are not checked; default: that of the URDF file."),
 ]
 
 # Options that describe a robot and a problem: the fields of `ProblemOptions`. Commands say which of them they take.
@@ -220,6 +236,24 @@ class ProblemOptions:
     def parse_half_width(self) -> Array | float | None:
         """One number for all joints, or one per joint."""
         return None if self.half_width is None else parse_one_or_all("--half-width", self.half_width)
+
+
+def read_solids(robot: Robot, urdf: str | None, srdf: Path | None) -> Collisions | None:
+    """The collision model that --collisions and --srdf name; None without them.
+
+    Raises:
+        OptionError: for --srdf alone.
+        RobotError: if a file cannot be read, or is that of another robot.
+    """
+    if urdf is None:
+        if srdf is not None:
+            raise OptionError("--srdf requires --collisions FILE.urdf, which has the solids")
+        return None
+    path = find_robot_file(urdf) if is_robot_name(urdf) else Path(urdf)
+    found = robot.with_solids(path, srdf).collisions
+    if found.missing:
+        note(f"nothing is known of {listed(found.missing)}: no mesh in {path}, so contacts with it go unseen")
+    return found
 
 
 def is_robot_file(name: str) -> bool:

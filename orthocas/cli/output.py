@@ -28,16 +28,24 @@ def print_json(data: Mapping[str, Any]) -> None:
     typer.echo(write_json(data))
 
 
-def print_rows(rows: Mapping[str, str]) -> None:
-    """Print names and values in two columns."""
+def print_rows(rows: dict[str, str], then: str = "") -> None:
+    """Print names and values in two columns; to people also what to do next, a command."""
+    if sys.stdout.isatty():
+        _draw(list((rows | {"next": then} if then else rows).items()))
+        return
     width = max(len(name) for name in rows) + 2
     for name, value in rows.items():
         typer.echo(printable(f"{name:<{width}}{value}"))
 
 
-def print_table(rows: Sequence[Sequence[str]]) -> None:
-    """Print rows in aligned columns; the last cell of a short row may be long."""
+def print_table(rows: Sequence[Sequence[str]], then: str = "") -> None:
+    """Print rows in aligned columns, the first one as their head; the last cell of a short row may be long."""
     head = rows[0]
+    if sys.stdout.isatty():
+        _draw(rows[1:], head)
+        if then:
+            print_rows({"next": then})
+        return
     aligned = [row if len(row) == len(head) else row[:-1] for row in rows]
     widths = [max(len(row[k]) for row in aligned if k < len(row)) for k in range(len(head))]
     for row in rows:
@@ -45,15 +53,34 @@ def print_table(rows: Sequence[Sequence[str]]) -> None:
         typer.echo(printable(line.rstrip()))
 
 
+def _draw(rows: Sequence[Sequence[str]], head: Sequence[str] = ()) -> None:
+    """Print rows to a terminal: as wide as it is, and broken between words."""
+    from rich.console import Console  # only terminals need it
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=bool(head), header_style="bold")
+    for k in range(max(map(len, rows))):
+        table.add_column(head[k] if head else "", no_wrap=k == 0, overflow="fold", style="cyan" if k == 0 else "")
+    for row in rows:
+        table.add_row(*(Text(printable(cell)) for cell in row))
+    Console().print(table)
+
+
 def note(text: str) -> None:
     """Print a remark on standard error."""
     typer.echo(f"note: {one_line(text)}", err=True)
 
 
-def format_report_rows(report: "Report") -> dict[str, str]:
-    """The rows of a quality report, with advice on command-line options."""
+def format_report_rows(report: "Report", chart: "Chart") -> dict[str, str]:
+    """The rows of a quality report, with what is normal for a wide chart, or advice on options for a tight one."""
     rows = report.facts()
-    if report.length_ratio > _UNEVEN:
+    if "branch" in chart.notes:
+        rows["wide"] = (
+            f"of the branch {chart.notes['branch']}: leaks of tens of degrees are normal; judge it by conditioning, by "
+            "'xi held', and by the regular share of its fit"
+        )
+    elif report.length_ratio > _UNEVEN:
         rows["lengths"] += "; for use in controllers, fit with --weights 1000,30,150,1,1000"
     return rows
 
@@ -62,7 +89,12 @@ def format_reach_rows(chart: "Chart") -> dict[str, str]:
     """The ranges of xi in one row."""
     if (reach := _find_reach(chart)) is None:
         return {}
-    return {"xi reach": ", ".join(f"{part.label} {part.low:.3g} to {part.high:.3g}" for part in reach)}
+    named = [name.partition(": ")[2] for name in chart.parts.named_coordinates]
+    texts = [
+        f"{part.label} {part.low:.3g} to {part.high:.3g}{f' ({name})' if name else ''}"
+        for part, name in zip(reach, named, strict=True)
+    ]
+    return {"xi reach": ", ".join(texts)}
 
 
 def build_reach_data(chart: "Chart") -> dict[str, Any]:

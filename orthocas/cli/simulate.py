@@ -13,12 +13,24 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.quality import evaluate
 from orthocas.charts.ready import load
 from orthocas.cli.codegen import CONTROLLERS, add_law_options, build_controller, require_settings
-from orthocas.cli.options import AsJson, ChartPath, Force, Limit, parse_number, parse_numbers, parse_whole_number
+from orthocas.cli.options import (
+    AsJson,
+    ChartPath,
+    DisabledPairs,
+    Force,
+    Limit,
+    Solids,
+    parse_number,
+    parse_numbers,
+    parse_whole_number,
+    read_solids,
+)
 from orthocas.cli.output import note, print_json, print_rows, terminal_monitor
 from orthocas.control.controller import Controller, ControlStatus, law_of
 from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
 from orthocas.errors import ArchiveError, Interrupted, InvalidValueError, OptionError, SingularTaskError
+from orthocas.robots.collisions import Collisions
 from orthocas.robots.robot import Robot
 from orthocas.simulation.disturbances import Friction, Noise, Plan, read_steps
 from orthocas.simulation.figure import FORMATS, require_format, save_animation, trajectory_figure, units_of
@@ -83,6 +95,8 @@ def simulate(
     animation: Annotated[
         str, typer.Option("--animation", help="Format of the animation: gif, mp4 (needs ffmpeg) or none.")
     ] = "gif",
+    collisions: Solids = None,
+    srdf: DisabledPairs = None,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
@@ -98,6 +112,7 @@ def simulate(
         loaded.function("xi")
         plan = read_steps(steps, loaded)
         law = build_controller(controller, loaded, settings, limit)
+    solids = read_solids(loaded.problem.robot, collisions, srdf)
     conditions = {
         "control_rate": rate,
         "plant": _build_plant(plant, loaded.problem.robot, mass_factor),
@@ -122,8 +137,10 @@ def simulate(
     if json:
         print_json(report)
     else:
-        print_rows(format_report(report, loaded.problem) | {"files": str(out)})
+        print_rows(format_report(report, loaded.problem) | {"files": str(out)}, f"orthocas view {out} --chart {chart}")
     _print_notes(law, report, interrupted)
+    if solids is not None:
+        note(_find_contact(solids, run))
     if code := INTERRUPTED if interrupted else int(run.outcome in _FAILED):
         raise typer.Exit(code)
 
@@ -213,6 +230,21 @@ def _print_notes(law: Controller, report: dict[str, Any], interrupted: bool) -> 
         note(f"the run diverged: the integrator gave up at t = {report['duration']:.4g} s, the run so far is saved")
     if interrupted:
         note("interrupted: the run so far is saved, without an animation")
+
+
+def _find_contact(collisions: Collisions, run: Trajectory) -> str:
+    """The first contact of a run in a sentence, between its time stamps too; or how near it came to one."""
+    q = run.q[np.isfinite(run.q).all(axis=1)]
+    contact = collisions.find_contact(q)
+    if contact is not None:
+        (first, second), at = contact.pair, run.times[contact.segment]
+        return f"at t = {at:.4g} s '{first}' and '{second}' touch; the simulation knows no contacts"
+    if not collisions.pairs:
+        return "no contact: no pair of links is checked"
+    least = collisions.distance(q)
+    k = int(np.argmin(least.distance))
+    first, second = least.pair[k]
+    return f"no contact: '{first}' and '{second}' come nearest, {least.distance[k]:.3g} m at t = {run.times[k]:.4g} s"
 
 
 _REASONS = {

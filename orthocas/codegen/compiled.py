@@ -3,6 +3,7 @@
 import ctypes
 import hashlib
 import os
+import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -24,6 +25,7 @@ from orthocas.tools.processes import run_program
 
 # -O3 takes twice as long, and gains little.
 _FLAGS = ("-O2",)
+_INCLUDED = re.compile(r'^#include "(\w+\.c)"', re.MULTILINE)
 _PREFIX = "kernel"
 _ENTRY = """int {name}(const double **arg, double **res, int *iw, double *w) {{
   return {prefix}_{name}(arg, res, iw, w, 0);
@@ -56,7 +58,9 @@ def keep_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], fo
         with open_draft_folder() as place, publish(library.parent) as drafts:
             for file, text in sources.items():
                 (place / file).write_text(text, encoding="utf-8")
-            code = [str(place / file) for file in sources if file.endswith(".c")]
+            # Files that others include are a part of those.
+            included = {name for text in sources.values() for name in _INCLUDED.findall(text)}
+            code = [str(place / file) for file in sources if file.endswith(".c") and file not in included]
             run_program([compiler, *options, "-o", str(drafts / name), *code, "-lm"])
             (drafts / f"{name}.sha256").write_text(compute_digest(drafts / name))
     return library

@@ -136,7 +136,7 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
     require_kind("chart", chart, Chart)
     with open_draft_folder() as drafts:
         generate_c(chart, drafts, name="arm")
-        sources = {name: (drafts / name).read_text(encoding="utf-8") for name in ("arm.h", "arm.c")}
+        sources = {path.name: path.read_text(encoding="utf-8") for path in sorted(drafts.glob("*.[hc]"))}
     sources[_ROWS] = get_template(_ROWS)
     curves = chart.parts.inverse.curves
     if isinstance(curves, SelfMotionCurves):

@@ -13,6 +13,7 @@ import numpy as np
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
+from orthocas.codegen.distance import render_distance
 from orthocas.codegen.kernels import Kernels, generate_kernels, share_calls, share_sines
 from orthocas.codegen.rendering import (
     DOUBLE,
@@ -21,14 +22,17 @@ from orthocas.codegen.rendering import (
     clean_word,
     clean_words,
     find_bounds_inside,
+    get_runtime,
     is_generated,
     render,
 )
 from orthocas.codegen.rows import render_rows
 from orthocas.codegen.supervision import build_supervision_kernels, describe_law, describe_supervision, find_condition
 from orthocas.control.controller import Controller, require_controller
+from orthocas.control.memory import find_memory
 from orthocas.control.safety import Safety
 from orthocas.errors import ArchiveError, InvalidValueError
+from orthocas.robots.capsules import FittedCapsules
 from orthocas.robots.kinematics import TipTurn
 from orthocas.tools.checks import Array, as_path, require_kind, require_shape
 from orthocas.tools.expressions import choose_form, expand_scalars
@@ -40,6 +44,7 @@ _TAKEN = (
     *("assert", "complex", "ctype", "errno", "fenv", "float", "inttypes", "iso646", "limits", "locale", "math"),
     *("setjmp", "signal", "stdarg", "stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath", "time"),
     *("wchar", "wctype", "features", "endian", "strings", "unistd", "pthread", "sched", "dlfcn", "alloca", "threads"),
+    *("orthocas", "orthocas_runtime", "orthocas_runtime_float"),
     *("uchar", "stdalign", "stdatomic", "stdnoreturn", "m", "c", "dl", "rt"),
 )
 
@@ -74,6 +79,7 @@ def generate_c(
     safety: Safety | None = None,
     single_precision: bool = False,
     rows: bool = False,
+    capsules: FittedCapsules | None = None,
 ) -> GeneratedC:
     """Write C99 for a chart, the robot's dynamics, the inverse map, and a controller.
 
@@ -92,6 +98,8 @@ def generate_c(
             precision only.
         rows: also write NAME_rows.c and NAME_rows.h with NAME_phi_rows, phi of many joint positions, for vector
             instructions. Not for large networks.
+        capsules: of `oc.fit_capsules(robot.collisions)`: also write NAME_distance.c and NAME_distance.h with
+            NAME_distance, the least distance of the links and its gradient.
 
     Raises:
         NoExpressionError: if the chart is grown; `orthocas.distil` turns it into a chart with a closed expression.
@@ -108,9 +116,12 @@ def generate_c(
         >>> with TemporaryDirectory() as folder:
         ...     generated = oc.generate_c(chart, folder, name="arm")
         ...     sorted(path.name for path in generated.folder.iterdir())
-        ['CMakeLists.txt', 'README.md', 'arm.c', 'arm.h', 'arm.pc.in']
+        ['CMakeLists.txt', 'README.md', 'arm.c', 'arm.h', 'arm.pc.in', 'orthocas_runtime.c', 'orthocas_runtime.h']
     """
     require_kind("chart", chart, Chart)
+    if capsules is not None:
+        require_kind("capsules", capsules, FittedCapsules)
+        capsules.collisions.require_for(chart.problem.robot.tree)
     if controller is not None:
         safety = _check_law(chart, controller, safety)
     if name is None:
@@ -129,6 +140,7 @@ def generate_c(
     kernels = generate_kernels(_build_functions(chart, controller, precision), f"{name}_kernel")
     stack_bytes = _bound_stack(kernels, chart, controller, precision.size)
     values = _describe_library(chart, controller, name, rows, precision, kernels) | {"stack_bytes": stack_bytes}
+    values["distances"] = capsules is not None
     values |= _describe_chart(chart, precision) | {"check": _compute_check(chart, controller, precision)}
     if controller is not None and safety is not None:
         values |= describe_law(controller) | describe_supervision(controller, safety)
@@ -138,9 +150,12 @@ def generate_c(
         "CMakeLists.txt": render("CMakeLists.txt", values),
         f"{name}.pc.in": render("pkgconfig.pc", values),
         "README.md": render("README.md", values),
+        **{f"{precision.runtime}.{end}": get_runtime(precision, end) for end in ("h", "c")},
     }
     if rows:
         contents |= render_rows(chart, values, precision)
+    if capsules is not None:
+        contents |= render_distance(capsules, values, precision)
 
     # All files are written or, if one fails, none.
     folder = as_path("out", out)
@@ -200,24 +215,24 @@ def _build_functions(chart: Chart, controller: Controller | None, precision: Pre
 
 
 def _bound_stack(kernels: Kernels, chart: Chart, controller: Controller | None, size: int) -> int:
-    """Sum of the work arrays, those of the inverse map or a supervised law, and an allowance for other variables."""
-    n, k = chart.n, 0 if controller is None else len(controller.labels)
-    inverse = kernels.array_bytes("chart", size) + size * n * (n + 6)
-    compose = kernels.array_bytes("dynamics", size) + size * n * (n + 5)
-    supervised = size * (9 * n + 8 * k + kernels.numbers["shared"]) if k else 0
-    # Compilers keep matrices in local variables.
+    """Sum of the work arrays of kernels and runtime, and an allowance for other variables."""
+    n, rooms = chart.n, max(1, chart.parts.reaching.size1_out(2))
+    # Numbers of `work` in the runtime, as in orthocas_runtime.h, and copies of reference and gains.
+    system = 2 * n + rooms
+    inverse, law = n * (n + 7), 0
+    nearest = 4 * n * n + 14 * n + 4 * rooms + 3 * n * rooms + system * (system + 1)
+    if controller is not None:
+        k, memory = len(controller.labels), find_memory(controller)
+        remembered = 0 if memory is None else sum(map(len, memory.start.values()))
+        law = 2 * n * n + 10 * n + 9 * k + kernels.numbers["shared"] + remembered
+        law += 3 * k + sum(map(len, controller.gains.values()))
+    # Compilers keep matrices in local variables, and some kernels run inside others.
     locals_ = round(RULES.locals_bytes * max(1.0, n / 7) ** 2)
-    # These kernels run inside others.
     inner = [name for name in ("pivots", "gram", "room") if name in kernels.work]
     nested = sum(kernels.array_bytes(name, size) for name in inner)
     work = max(kernels.array_bytes(name, size) for name in kernels.work)
-
-    # Two positions that the descent to the nearest x looks at, and the equations of its steps.
-    rooms = max(1, chart.parts.reaching.size1_out(2))
-    system = 2 * n + rooms
-    descent = 2 * n * (n + rooms + 3) + 2 * n * n + n * rooms + system**2 + 4 * system
-    nearest = kernels.array_bytes("near", size) + size * descent
-    return max(inverse, nearest, compose, work) + supervised + nested + locals_
+    longest = max(work + size * max(inverse, law), kernels.array_bytes("near", size) + size * nearest)
+    return longest + nested + locals_
 
 
 def _describe_library(
@@ -236,6 +251,7 @@ def _describe_library(
         "casadi_version": ca.CasadiMeta.version(),
         "rows": rows,
         "max_evaluations": RULES.evaluations,
+        "runtime": precision.runtime,
         **precision.describe(),
         "kernels": kernels.code,
         "work": kernels.sizes(),

@@ -10,7 +10,7 @@ from orthocas.charts.chart import Chart
 from orthocas.codegen.rendering import clean_word, clean_words, write_number, write_numbers
 from orthocas.control.controller import Controller
 from orthocas.control.memory import find_memory
-from orthocas.control.safety import SIGNED, UNBOUNDED, Safety
+from orthocas.control.safety import TORQUE_ONLY, Safety
 from orthocas.tasks.domains import Domain
 from orthocas.tasks.relative import Relative
 from orthocas.tasks.samples import sample_uniform
@@ -161,6 +161,7 @@ def describe_supervision(controller: Controller, safety: Safety) -> dict[str, An
     path, relative = domain.path_bound, Relative(problem.task)
     return {
         "settings": [_describe_setting(name, value) for name, value in safety.in_c(controller.command).items()],
+        "unused_settings": () if controller.command == "torque" else TORQUE_ONLY,
         "turning": np.isinf(robot.lower) & np.isinf(robot.upper) & ~np.array(robot.tree.prismatic),
         "bounded": np.isfinite(lower) & np.isfinite(upper) & (controller.chart is not None),
         # A path of a corridor ends one radius before the boundary of its box, which may be many radii wide.
@@ -173,21 +174,15 @@ def describe_supervision(controller: Controller, safety: Safety) -> dict[str, An
 
 
 def _describe_setting(name: str, value: Any) -> dict[str, Any]:
-    """A setting of `Safety` as a field of a struct, its value, and what C requires of it."""
-    place, meaning = f"safety->{name}", Safety.meaning(name)
-    # A single number must be positive; a count must not be negative.
-    if not isinstance(value, np.ndarray):
-        whole = isinstance(value, int)
-        check = f"{place} >= 0" if whole else f"{place} > 0.0 && {place} <= LARGEST"
-        literal = write_number(value if whole else float(value))
-        kind = "int" if whole else "double"
-        return {"name": name, "kind": kind, "size": 0, "meaning": meaning, "check": check, "literal": literal}
-    # Lists are finite and not negative, unless UNBOUNDED or SIGNED names them.
-    check = f"all_from({'-INFINITY' if name in SIGNED else '0.0'}, {place}, {value.size})"
-    if name not in UNBOUNDED:
-        check += f" && all_within({place}, {value.size}, LARGEST)"
-    literal = f"{{{write_numbers(value)}}}"
-    return {"name": name, "kind": "double", "size": value.size, "meaning": meaning, "check": check, "literal": literal}
+    """A setting of `Safety` as a field of a struct, and its value."""
+    meaning = Safety.meaning(name)
+    if isinstance(value, np.ndarray):
+        literal = f"{{{write_numbers(value)}}}"
+        return {"name": name, "kind": "double", "size": value.size, "meaning": meaning, "literal": literal}
+    # A count, or a single number.
+    whole = isinstance(value, int)
+    literal = write_number(value if whole else float(value))
+    return {"name": name, "kind": "int" if whole else "double", "size": 0, "meaning": meaning, "literal": literal}
 
 
 def _describe_boundary(controller: Controller) -> dict[str, Any] | None:
@@ -229,12 +224,18 @@ def _describe_memory(controller: Controller) -> dict[str, Any] | None:
     memory = find_memory(controller)
     if memory is None:
         return None
+    # C keeps the fields one after the other.
+    first = dict(zip(memory.start, np.cumsum([0, *map(len, memory.start.values())]).tolist(), strict=False))
     return {
         "torque": memory.torque,
-        "last": [f"last.{name}" for name in memory.start],
-        "kept": [f"state->memory.{name}" for name in memory.start],
-        "fields": [{"name": name, "size": len(values), "numbers": values} for name, values in memory.start.items()],
+        "first_torque": -1 if memory.torque is None else first[memory.torque],
+        "size": sum(map(len, memory.start.values())),
+        "start": np.concatenate([np.ravel(values) for values in memory.start.values()]),
+        "last": [f"last + {place}" for place in first.values()],
+        "kept": [f"memory + {place}" for place in first.values()],
+        "fields": [{"name": name, "size": len(values)} for name, values in memory.start.items()],
         "adds": [
-            {"name": gain, "size": len(controller.gains[gain]), "field": name} for gain, name in memory.adds.items()
+            {"name": gain, "size": len(controller.gains[gain]), "first": first[name]}
+            for gain, name in memory.adds.items()
         ],
     }

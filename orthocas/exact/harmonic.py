@@ -68,7 +68,7 @@ def build_level_surface(
 
     Source:
         Marching cubes: [AS2023] Sec. 5.2. Exact vertices and the improvement of the triangles are ours:
-        docs/explanation/derivations_exact.md#disk-chart.
+        docs/explanation/derivations_disk.md.
     """
     freeze_array("level", level, ())
     corners = np.stack([freeze_array("low", low, (3,)), freeze_array("high", high, (3,))])
@@ -226,7 +226,7 @@ def map_to_disk(mesh: TriangleMesh) -> Array:
         FoldedMapError: if the map inverts triangles.
 
     Source:
-        [AS2023] eqs. (40)-(43), by libigl. The check is ours: docs/explanation/derivations_exact.md#disk-chart.
+        [AS2023] eqs. (40)-(43), by libigl. The check is ours: docs/explanation/derivations_disk.md.
     """
     loop = require_disk(mesh)
     disk = solve_dirichlet(mesh, loop, igl.map_vertices_to_circle(mesh.vertices, loop))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any, NamedTuple
 from weakref import finalize
 
@@ -12,7 +11,15 @@ from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, NotADiskError
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, Indices, freeze_array, freeze_indices, require_finite, require_shape
+from orthocas.tools.checks import (
+    Array,
+    Indices,
+    freeze_array,
+    freeze_indices,
+    import_extra,
+    require_finite,
+    require_shape,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,10 +35,10 @@ RULES = MeshRules()
 
 
 class _Libigl:
-    """libigl, which is imported on first use: only meshes need it, and it brings half of SciPy."""
+    """libigl, of the extra `mesh`, which is imported on first use."""
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(import_module("igl"), name)
+        return getattr(import_extra("igl", "a chart on a surface", "mesh"), name)
 
 
 igl = _Libigl()
@@ -114,7 +121,7 @@ def require_disk(mesh: TriangleMesh) -> Indices:
         NotADiskError: if the mesh is not a disk; the message says what it is.
 
     Source:
-        Ours: docs/explanation/derivations_exact.md#disk-chart.
+        Ours: docs/explanation/derivations_disk.md.
     """
     kind = (mesh.components, mesh.boundary_loops, mesh.euler_characteristic)
     if kind != (1, 1, 1) or mesh.clashing_edges:
@@ -245,7 +252,7 @@ def flip_to_delaunay(vertices: Array, faces: Indices) -> Indices:
         New faces (F, 3) with the same vertices, boundary and topology.
 
     Source:
-        Ours, after [BS2007]: docs/explanation/derivations_exact.md#disk-chart.
+        Ours, after [BS2007]: docs/explanation/derivations_disk.md.
     """
     faces = faces.copy()
     for _ in range(RULES.rounds):

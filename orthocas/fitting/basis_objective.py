@@ -35,6 +35,7 @@ class ObjectiveRules:
     stride: int = 2  #: every second sample estimates the Gauss-Newton matrix, which is a mean, well enough
     most_stride: int = 16  #: of rough estimates; a divisor of the samples in a block
     hinges: int = 1000  #: samples that estimate the Gauss-Newton matrix of a hinge, about
+    coupled: int = 1500  #: coefficients up to which an estimate holds what couples coordinates
     rough: int = 12  #: residuals per coefficient in a rough estimate
 
     orienting: int = 200  #: samples that determine the orientation of a network's start
@@ -154,14 +155,18 @@ class BasisObjective:
         value, gradient = self.value_and_gradient(theta)
         return value, gradient, self._build_matrix(theta, RULES.stride)
 
-    def curvature_estimate(self, theta: Array) -> Array:
-        """The Gauss-Newton matrix from as few samples as steer a quasi-Newton method."""
+    def curvature_estimate(self, theta: Array) -> list[Array]:
+        """The Gauss-Newton matrix from as few samples as steer a quasi-Newton method: one block, or its diagonal ones.
+
+        With n joints, r coordinates have about r n^2 / 2 coefficients. The whole matrix takes n^6 operations, and n^9
+        to factor. Its blocks, one for each coordinate, take n^5 and n^7.
+        """
         # as few samples as leave enough residuals for each coefficient
         residuals = self.N * (self._loss.hinge_rows.start or 1)
         stride = RULES.stride
         while 2 * stride <= RULES.most_stride and residuals >= 2 * stride * RULES.rough * theta.size:
             stride *= 2
-        return self._build_matrix(theta, stride)
+        return [self._build_matrix(theta, stride)] if theta.size <= RULES.coupled else self._build_blocks(theta, stride)
 
     def hessian(self, theta: Array) -> Array:
         """d^2L/dtheta^2, exact, (size, size)."""
@@ -257,35 +262,61 @@ class BasisObjective:
 
     def _build_matrix(self, theta: Array, stride: int) -> Array:
         """Gauss-Newton matrix; that of the smooth residuals from every `stride`-th sample."""
-        derivatives = build_residual_columns(self._loss)(self._evaluate_jacobians(theta), *self._data)
+        smooth, hinges = self._differentiate(theta, stride)
         free, rows = int(self.kept.sum()), self._loss.smooth_rows
         H = np.zeros((free, free))
-        if any(rows):
+        if smooth:
             # blocks of coordinate pairs, from few rows per sample in single precision
             shared = [(i, j, rows[i].index(row), rows[j].index(row)) for i, j, row in self._loss.shared_rows]
-            gradients, by_coordinate = self._thin(stride), list[Any]()
-            for derivative in derivatives[: self.r]:
-                blocks = derivative.reshape(len(derivative), self.n, -1, derivative.shape[2])
-                by_coordinate.append(split_by_sample(blocks, self.N, stride).astype(np.float32))
-            H = build_normal_matrix(by_coordinate, gradients, shared) / len(gradients[0])
-        hinges = derivatives[self.r :]
-        for residual, derivative in zip(hinges[::2], hinges[1::2], strict=True):
-            H += self._sum_hinges(residual, derivative)
+            gradients = self._thin(stride)
+            H = build_normal_matrix(smooth, gradients, shared) / len(gradients[0])
+        # a hinge couples all coordinates, but acts at few samples
+        for D, G, share in hinges:
+            active = (D @ G)[:, self.kept]
+            H += share * (active.T @ active).astype(float)
         return H
 
-    def _sum_hinges(self, residual: Array, derivative: Array) -> Array:
-        """Gauss-Newton matrix of a hinge residual. It couples all coordinates, but acts at few samples."""
-        # only samples at which the hinge acts, without the padding of the last block
-        block, column = np.nonzero((residual[:, 0] > 0) & (self._share > 0))
-        # where it acts at most samples, some of them estimate the matrix well enough
-        stride = max(1, len(block) // RULES.hinges)
-        block, column = block[::stride], column[::stride]
-        D = derivative[block, :, column].reshape(-1, self.n, self.r).transpose(0, 2, 1).astype(np.float32)
-        chosen: Array = self.X[block, :, :, column]  # (active, g, S)
-        G = self._gradients.expand(chosen.transpose(1, 2, 0)[None], len(chosen))
-        rows = (D @ G.astype(np.float32))[:, self.kept]
-        product: Array = (rows.T @ rows).astype(float) / (self.N / stride)
-        return product
+    def _build_blocks(self, theta: Array, stride: int) -> list[Array]:
+        """The diagonal blocks of the same matrix, one for the coefficients of each coordinate."""
+        smooth, hinges = self._differentiate(theta, stride)
+
+        def build(j: int) -> Array:
+            H = np.zeros((int(self.kept[j].sum()),) * 2)
+            if smooth:
+                gradients = self._thin(stride)[j : j + 1]
+                H = build_normal_matrix(smooth[j : j + 1], gradients, ()) / len(gradients[0])
+            for D, G, share in hinges:
+                active = (D[:, j : j + 1] @ G)[:, 0, self.kept[j]]
+                H += share * (active.T @ active).astype(float)
+            return H
+
+        return [build(j) for j in range(self.r)]
+
+    def _differentiate(self, theta: Array, stride: int) -> tuple[list[Array], list[tuple[Any, Any, float]]]:
+        """Derivatives of residuals with respect to J_xi, in single precision.
+
+        Returns:
+            Those of the smooth residuals of each coordinate at every `stride`-th sample, (N / stride, rows, n); none
+            if there are none. And for each hinge (N', r, n) at some of the samples where it acts, with gradients of the
+            basis there (N', n, K), and by what their products count.
+        """
+        derivatives = build_residual_columns(self._loss)(self._evaluate_jacobians(theta), *self._data)
+        smooth, hinges = list[Array](), list[tuple[Any, Any, float]]()
+        if any(self._loss.smooth_rows):
+            for derivative in derivatives[: self.r]:
+                blocks = derivative.reshape(len(derivative), self.n, -1, derivative.shape[2])
+                smooth.append(split_by_sample(blocks, self.N, stride).astype(np.float32))
+        for residual, derivative in zip(derivatives[self.r :: 2], derivatives[self.r + 1 :: 2], strict=True):
+            # only samples at which the hinge acts, without the padding of the last block
+            block, column = np.nonzero((residual[:, 0] > 0) & (self._share > 0))
+            # where it acts at most samples, some of them estimate the matrix well enough
+            every = max(1, len(block) // RULES.hinges)
+            block, column = block[::every], column[::every]
+            D = derivative[block, :, column].reshape(-1, self.n, self.r).transpose(0, 2, 1).astype(np.float32)
+            chosen: Array = self.X[block, :, :, column]  # (active, g, S)
+            G = self._gradients.expand(chosen.transpose(1, 2, 0)[None], len(chosen)).astype(np.float32)
+            hinges.append((D, G, every / self.N))
+        return smooth, hinges
 
 
 def _to_double(products: Array) -> Array:
@@ -315,7 +346,7 @@ class BoundedMutual:
         bound: upper bound on the root mean square mutual cosine, > 0.
 
     Source:
-        ours, docs/explanation/derivations_fits.md#constrained-form.
+        ours, docs/explanation/derivations_meaning.md#constrained-form.
     """
 
     def __init__(self, objective: BasisObjective, bound: float) -> None:

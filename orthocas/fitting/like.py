@@ -89,7 +89,7 @@ class Like:
     no gradient in general, so a term of the loss holds the one against the other.
 
     Source:
-        ours, docs/explanation/derivations_fits.md#meaning.
+        ours, docs/explanation/derivations_meaning.md#meaning.
     """
 
     names: tuple[str, ...]  #: of the quantities, with their units

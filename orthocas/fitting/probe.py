@@ -135,7 +135,7 @@ class _Steered:
 
     loss: BasisObjective
     half_width: Array  #: of the box of the matrix, (n,)
-    matrix: Array
+    matrix: list[Array]  #: its blocks
 
     def value(self, theta: Array) -> float:
         """L(theta)."""
@@ -145,7 +145,7 @@ class _Steered:
         """L(theta) and dL/dtheta."""
         return self.loss.value_and_gradient(theta)
 
-    def curvature_estimate(self, theta: Array) -> Array:
+    def curvature_estimate(self, theta: Array) -> list[Array]:
         """The matrix."""
         return self.matrix
 

@@ -241,9 +241,13 @@ class LinearSum(WeightedSum):
         slopes = _add([weight * slope for weight, _, slope, _ in results])
         return value, slopes, _add([weight * H for weight, *_, H in results])
 
-    def curvature_estimate(self, theta: Array) -> Array:
-        """A rough Gauss-Newton matrix of the sum."""
-        return _add([weight * part.curvature_estimate(theta) for weight, part in self._solve_least_squares])
+    def curvature_estimate(self, theta: Array) -> list[Array]:
+        """A rough Gauss-Newton matrix of the sum, in blocks."""
+        parts = [(weight, part.curvature_estimate(theta)) for weight, part in self._solve_least_squares]
+        return [
+            _add([weight * block for (weight, _), block in zip(parts, blocks, strict=True)])
+            for blocks in zip(*(blocks for _, blocks in parts), strict=True)
+        ]
 
     def hessian(self, theta: Array) -> Array:
         """The Hessian of the sum."""
@@ -468,9 +472,11 @@ class StageRunner:
         return count if kept is None or self.settings.samples else ceil(count / 2)
 
     def _count_for_basis(self, terms: int, r: int) -> int:
-        """Number of samples for a linear family, so that there are about 140 residuals per coefficient."""
-        residuals = RULES.residuals * terms
-        return self.settings.samples or RULES.least_samples + ceil(residuals / (self.problem.m + r - 1))
+        """Number of samples for a linear family, so that there are about 100 to 140 residuals per coefficient."""
+        rows = self.problem.m + r - 1
+        if self.problem.n > RULES.many_joints:
+            return self.settings.samples or ceil(RULES.residuals_of_many * terms / rows)
+        return self.settings.samples or RULES.least_samples + ceil(RULES.residuals * terms / rows)
 
     def _sample(self, count: int, tag: int) -> Samples:
         points = sample_evenly(self.problem.domain, count, (self.settings.seed, tag))

@@ -144,7 +144,7 @@ class LengthTerm:
     Angles do not fix how fast a coordinate grows along itself: xi^7 is as orthogonal as xi, but flat at 0.
 
     Source:
-        ours, docs/explanation/derivations_fits.md#lengths.
+        ours, docs/explanation/derivations_meaning.md#lengths.
     """
 
     name: str = "length"
@@ -271,20 +271,28 @@ def volume_hinges(J: Array, null_basis: Array, metric_inverse: Array | None, bou
         bound: of the volume.
     """
     raised = J if metric_inverse is None else J @ metric_inverse
-    lengths = np.sqrt((raised * J).sum(axis=2, keepdims=True))
-    D = J @ null_basis / lengths
+    squares = np.einsum("srn,srn->sr", raised, J)[:, :, None]
+    D = J @ null_basis
+    D /= np.sqrt(squares)
     volume = np.linalg.det(D)
     hinges, slopes = np.maximum(bound - volume, 0.0), np.zeros(J.shape)
     active = np.flatnonzero(hinges > 0)
-    across = _cofactors(D[active], volume[active]) @ null_basis[active].transpose(0, 2, 1) / lengths[active]
-    slopes[active] = volume[active, None, None] * raised[active] / lengths[active] ** 2 - across
+    across = _cofactors(D[active], volume[active])
+    across /= np.sqrt(squares[active])
+    slopes[active] = volume[active, None, None] / squares[active] * raised[active]
+    slopes[active] -= across @ null_basis[active].transpose(0, 2, 1)
     return hinges, slopes
 
 
 def _cofactors(D: Array, volume: Array) -> Array:
     """Cofactors of matrices (N, r, r) with these determinants: det D D^-T, or by singular values next to folds."""
-    cofactors, folded = np.empty(D.shape), np.abs(volume) < RULES.nearly_folded
-    cofactors[~folded] = volume[~folded, None, None] * np.linalg.inv(D[~folded]).transpose(0, 2, 1)
+    folded = np.abs(volume) < RULES.nearly_folded
+    if not folded.any():
+        inverse = np.linalg.inv(D)
+        inverse *= volume[:, None, None]
+        return np.asarray(inverse.transpose(0, 2, 1), dtype=float)
+    cofactors = np.empty(D.shape)
+    cofactors[~folded] = _cofactors(D[~folded], volume[~folded])
     U, s, Vt = np.linalg.svd(D[folded])
     sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
     others = np.stack([np.delete(s, k, axis=1).prod(axis=1) for k in range(D.shape[1])], axis=1)

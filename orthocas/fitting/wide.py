@@ -426,11 +426,11 @@ def _describe_left_out(problem: Problem, branch: Branch, counted: Array) -> str:
     return f"all but {kept} of the clear positions: {'; '.join(reasons)}" if reasons else ""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class WideFit(Fit):
     """A chart of a branch, and how it was found."""
 
-    branch: Branch | None = None  #: the branch of the chart
+    branch: Branch
     regular_share: float = float("nan")  #: of the clear positions of the branch, the share in the domain, from samples
     left_out: str = ""  #: what the fit left out of the branch from the start, and why
     meaning: MeaningError | None = None  #: how far xi is from what it is like, for r = 1
@@ -438,7 +438,6 @@ class WideFit(Fit):
     def facts(self) -> dict[str, str]:
         """The facts of a fit, with branch and regular share."""
         facts = super().facts()
-        branch = "" if self.branch is None else self.branch.name
         share = percent(self.regular_share, 2)
         named, meaning = self.chart.parts.named_coordinates, ""
         if "exact" in self.chart.notes:
@@ -446,7 +445,7 @@ class WideFit(Fit):
         elif self.meaning is not None:
             meaning = f"{self.meaning.explained}: {named[0]}"
         own = {
-            "branch": branch,
+            "branch": self.branch.name,
             "regular": f"{share} of the branch's clear positions (samples); the domain is this part",
             **({"left out": self.left_out} if self.left_out else {}),
             **({"meaning": meaning} if meaning else {}),

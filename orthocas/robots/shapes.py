@@ -7,7 +7,7 @@ import coal
 import numpy as np
 import scipy
 
-from orthocas.tools.checks import Array
+from orthocas.tools.checks import Array, Flags
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +34,10 @@ class Geometry(Protocol):
         """Points (K, 3) and a radius: the solid lies within the convex hull of the points, rounded by the radius."""
         ...
 
+    def contains(self, points: Array) -> Flags:
+        """Whether points (N, 3) in its own frame belong to it, (N,)."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class BoxGeometry(Geometry):
@@ -49,6 +53,10 @@ class BoxGeometry(Geometry):
         """Its corners."""
         signs = np.array(np.meshgrid(*3 * [[-0.5, 0.5]])).reshape(3, -1).T
         return signs * self.size, 0.0
+
+    def contains(self, points: Array) -> Flags:
+        """Between all faces."""
+        return np.asarray((np.abs(points) <= self.size / 2).all(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +77,12 @@ class CylinderGeometry(Geometry):
         ends = [np.column_stack([ring, np.full(len(ring), z)]) for z in (-self.length / 2, self.length / 2)]
         return np.concatenate(ends), 0.0
 
+    def contains(self, points: Array) -> Flags:
+        """Within radius and length."""
+        return np.asarray(
+            (np.hypot(points[:, 0], points[:, 1]) <= self.radius) & (np.abs(points[:, 2]) <= self.length / 2)
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class BallGeometry(Geometry):
@@ -83,6 +97,10 @@ class BallGeometry(Geometry):
     def list_corners(self) -> tuple[Array, float]:
         """Its centre."""
         return np.zeros((1, 3)), self.radius
+
+    def contains(self, points: Array) -> Flags:
+        """Within the radius."""
+        return np.asarray(np.linalg.norm(points, axis=1) <= self.radius)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +117,11 @@ class CapsuleGeometry(Geometry):
     def list_corners(self) -> tuple[Array, float]:
         """The ends of the segment."""
         return np.array([[0.0, 0.0, -self.length / 2], [0.0, 0.0, self.length / 2]]), self.radius
+
+    def contains(self, points: Array) -> Flags:
+        """Within the radius of the segment."""
+        beyond = points[:, 2] - np.clip(points[:, 2], -self.length / 2, self.length / 2)
+        return np.asarray(np.linalg.norm(np.column_stack([points[:, :2], beyond]), axis=1) <= self.radius)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +159,14 @@ class HullGeometry(Geometry):
         """Its corners."""
         return self.points, 0.0
 
+    def contains(self, points: Array) -> Flags:
+        """On the inner side of all faces."""
+        corners = self.points[self.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        offsets = np.einsum("fi,fi->f", normals, corners[:, 0])
+        outwards = np.sign(offsets - normals @ self.points.mean(axis=0))
+        return np.asarray((outwards * (points @ normals.T - offsets) <= 0).all(axis=1))
+
 
 @dataclass(frozen=True, eq=False)
 class HalfSpaceGeometry(Geometry):
@@ -148,6 +179,10 @@ class HalfSpaceGeometry(Geometry):
     def list_corners(self) -> tuple[Array, float]:
         """None: it has no end."""
         return np.zeros((0, 3)), 0.0
+
+    def contains(self, points: Array) -> Flags:
+        """Below."""
+        return np.asarray(points[:, 2] <= 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +201,13 @@ class CloudGeometry(Geometry):
         """The points, with the diagonal of a cube around them."""
         return self.points, float(np.sqrt(3) * self.cell)
 
+    def contains(self, points: Array) -> Flags:
+        """In a cube that holds a point of the cloud."""
+        cells = {tuple(cell) for cell in np.floor(self.points / self.cell).astype(int).tolist()}
+        return np.array(
+            [tuple(cell) in cells for cell in np.floor(points / self.cell).astype(int).tolist()], dtype=bool
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Shape:
@@ -179,10 +221,32 @@ class Shape:
         """The solid turned by a rotation (3, 3), then shifted by a translation (3,)."""
         return replace(self, rotation=rotation @ self.rotation, translation=rotation @ self.translation + translation)
 
+    def contains(self, points: Array) -> Flags:
+        """Whether points (N, 3) belong to it, (N,)."""
+        return self.geometry.contains((points - self.translation) @ self.rotation)
+
+    def list_box(self) -> tuple[Array, Array]:
+        """Lowest and highest coordinates of a box around it in the frame of the body, (3,) each."""
+        corners, rounding = self.list_corners()
+        return corners.min(axis=0) - rounding, corners.max(axis=0) + rounding
+
+    def list_corners(self) -> tuple[Array, float]:
+        """As `Geometry.list_corners`, in the frame of the body."""
+        corners, rounding = self.geometry.list_corners()
+        return corners @ self.rotation.T + self.translation, rounding
+
     @property
     def bounded(self) -> bool:
         """Whether it has ends."""
         return len(self.geometry.list_corners()[0]) > 0
+
+    def bound_by_ball(self) -> tuple[Array, float]:
+        """Centre (3,) and radius of a ball that contains it; a point of its surface and 0 for half-spaces."""
+        corners, rounding = self.list_corners()
+        if not len(corners):
+            return self.translation, 0.0
+        centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
+        return centre, float(np.linalg.norm(corners - centre, axis=1).max()) + rounding
 
     def bound(self) -> tuple[Array, Array, float]:
         """Both ends (3,) and the radius of a capsule that contains it; a point of its surface and 0 for half-spaces.

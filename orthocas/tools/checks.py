@@ -18,6 +18,7 @@ from orthocas.errors import InvalidValueError, MemoryNeedError, MissingExtraErro
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 _LONGEST_TEXT = 500  #: characters of a name
 _REAL = "biuf"  #: NumPy's kinds of numbers: bool, int, unsigned, float

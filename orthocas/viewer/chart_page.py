@@ -153,6 +153,10 @@ class ChartPage:
         """Move towards what the user wishes, as the first or a later part of a gesture."""
         self._rest()
         self._begin()
+        # Ghosts are those of the coordinate that moves.
+        for label in values:
+            if label in self._chart.labels[self._chart.m :] and self._chosen.value not in (_NONE, label):
+                self._chosen.value = label
         self.session.wish(values)
         self.session.follow()
         self._show(moved=values)
@@ -225,11 +229,13 @@ class ChartPage:
         """After a gesture: ranges of the sliders, the fan, and values that were not reached."""
         self._gesture = self._dragging = False
         self._fans = [fan_along(self._chart, self.session.q, k) for k in range(self._chart.r)]
+        ranges = {fan.label: (float(fan.xi[0]), float(fan.xi[-1])) for fan in self._fans}
+        ranges |= {label: self.session.find_reach(k) for k, label in enumerate(self._chart.labels[: self._chart.m])}
         # Whole steps of the sliders inside the range.
-        for fan in self._fans:
-            slider = self._sliders[fan.label]
-            low = np.ceil(fan.xi[0] / RULES.slider_step) * RULES.slider_step
-            high = np.floor(fan.xi[-1] / RULES.slider_step) * RULES.slider_step
+        for label, ends in ranges.items():
+            slider = self._sliders[label]
+            low = np.ceil(min(ends) / RULES.slider_step) * RULES.slider_step
+            high = np.floor(max(ends) / RULES.slider_step) * RULES.slider_step
             if np.isfinite([low, high]).all():
                 slider.min, slider.max = round(float(min(low, high)), 3), round(float(max(low, high)), 3)
         self._show()

@@ -62,6 +62,9 @@ class ViewRules:
 
     small_angle: float = 0.001  #: [deg]
     slider_step: float = 1e-3
+    reach_steps: int = 8  #: of a component of the task over its size, to find how far it goes
+    missed: float = 1e-6  #: of the sizes of the components: a target that is not reached
+    reach_sizes: float = 2.0  #: of a component, beyond which nobody slides
     endless: float = float(np.pi)  #: half of a slider without limits [rad] or [m]
     handle: float = 0.17
     sweep: float = 6.0  #: there and back [s]

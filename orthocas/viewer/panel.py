@@ -13,11 +13,11 @@ from orthocas.tools.checks import Array
 from orthocas.viewer.looks import RULES
 from orthocas.viewer.motion import Motion
 
-GOOD, FAIR, POOR = "#2f9e62", "#e0a100", "#d64545"
+GOOD, FAIR, POOR, PLAIN = "#2f9e62", "#e0a100", "#d64545", "#5b83b5"
 STYLE = """<style>
 .oc{font:13px/1.45 system-ui,sans-serif;color:#22262b;padding:2px 14px 6px 4px}
 .oc h4{font-size:11px;letter-spacing:.06em;text-transform:uppercase;color:#7a828c;margin:14px 0 5px;font-weight:600}
-.oc .name{font-size:16px;font-weight:650}.oc .about{color:#6a727c;font-size:12px}
+.oc .name{font-size:16px;font-weight:650}.oc .about{color:#6a727c;font-size:12px;overflow-wrap:anywhere}
 .oc .row{display:grid;grid-template-columns:8em 1fr 4.6em;gap:8px;align-items:center;margin:3px 0}
 .oc .row>span:first-child{overflow-wrap:anywhere}
 .oc .row>b{font-weight:500;text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap}
@@ -27,6 +27,7 @@ STYLE = """<style>
 .oc .held{display:flex;justify-content:space-between;align-items:baseline;background:#f1f5fa;border-radius:8px;
 padding:8px 10px;margin-top:10px}
 .oc .held b{font-size:17px;font-weight:650;color:#1f5fa8;font-variant-numeric:tabular-nums}
+.oc .copy{user-select:all;font:12px/1.4 ui-monospace,monospace;background:#f6f7f9;border-radius:6px;padding:5px 8px}
 .oc .stop{margin-top:10px;padding:7px 10px;border-radius:8px;background:#fff3e6;color:#8a4b08;font-size:12px}
 </style>"""
 
@@ -96,21 +97,29 @@ class ChartPanel:
         self._half_width = float(domain.half_width.min())
         # Whose chart it is, which does not change.
         task = ", ".join(map(escape, chart.labels[: chart.m]))
+        self._wide = "branch" in chart.notes
+        self._levels = (0.15, 0.04) if self._wide else (0.4, 0.15)
         branch = chart.notes.get("branch")
         lines = [escape(place)] if place else [f"branch {escape(branch)}"] if isinstance(branch, str) else []
+        if not lines and problem.name:
+            lines = [f"problem {escape(problem.name)}"]
         lines += [f"{escape(chart.coordinates.label)}, {chart.n} joints"]
         lines += [f"task {task}; {chart.r} coordinate{'s' if chart.r > 1 else ''}"]
-        self._head = f'<div class="name">{escape(problem.name)}</div><div class="about">{"<br>".join(lines)}</div>'
+        self._head = f'<div class="name">{escape(name_robot(robot))}</div><div class="about">{"<br>".join(lines)}</div>'
 
     def format_html(self, readings: Readings) -> str:
         """The page."""
         m = len(readings.x)
         # What stopped the last motion, and the leak of each coordinate.
         stop = f'<div class="stop">stopped by {escape(readings.stop)}</div>' if readings.stop else ""
+        # On a whole branch, leaks of tens of degrees are no fault.
+        whole, colour_of = (90, lambda degrees: PLAIN) if self._wide else (15, lambda d: choose_colour(-d, -2, -6))
         leaks = [
-            format_bar(label, degrees / 15, f"{degrees:.2f}°", choose_colour(-degrees, -2, -6), value=degrees)
+            format_bar(label, degrees / whole, f"{degrees:.2f}°", colour_of(degrees), value=degrees)
             for label, degrees in zip(self._labels[m:], readings.leak_deg.tolist(), strict=True)
         ]
+        if self._wide:
+            leaks.append('<div class="about">tens of degrees are normal on a whole branch</div>')
         if len(leaks) == 1:
             most = 1 / float(np.cos(np.radians(readings.leak_deg[0])))
             leaks.append(format_row("speed to hold it", most, "of the least, at most"))
@@ -120,13 +129,15 @@ class ChartPanel:
         text, colour = self._joints.format_value(joint, readings.boundary), choose_colour(fraction, 0.15, 0.04)
         boundary = format_bar(label, fraction, text, colour, readings.boundary, "boundary")
         level = readings.conditioning
-        conditioning = format_bar("conditioning", level, f"{level:.3f}", choose_colour(level, 0.4, 0.15), value=level)
+        conditioning = format_bar(
+            "conditioning", level, f"{level:.3f}", choose_colour(level, *self._levels), value=level
+        )
         drift = format_number("drift", float(readings.drift.max()), format_drift(readings.drift, self._units))
         parts = [
             STYLE, '<div class="oc">', self._head, f'<div class="held"><span>task moved by</span>{drift}</div>',
             stop, "<h4>leak of the coordinates</h4>", *leaks,
             "<h4>chart</h4>", conditioning, boundary,
-            "<h4>joints</h4>", self._joints.format_html(readings.q), "</div>",
+            "<h4>joints</h4>", self._joints.format_html(readings.q), self._joints.format_copy(readings.q), "</div>",
         ]  # fmt: skip
         return "".join(parts)
 
@@ -152,6 +163,11 @@ class JointBars:
         """The bars at a joint position (n,)."""
         return "".join(self._format_bar(*joint, value) for joint, value in zip(self._joints, q.tolist(), strict=True))
 
+    def format_copy(self, q: Array) -> str:
+        """All joints as text that one click selects, to copy them [rad], [m]."""
+        numbers = ", ".join(f"{value:.6g}" for value in q.tolist())
+        return f'<div class="about">to copy, rad and m:</div><div class="copy">{numbers}</div>'
+
     def format_value(self, i: int, value: float) -> str:
         """A position of the i-th joint, or a way of it, with its unit."""
         return f"{value:.3f} m" if self._slides[i] else f"{round(np.degrees(value), 1) + 0.0:.1f}°"
@@ -170,6 +186,13 @@ class JointBars:
             f'<u style="left:{100 * shown:.2f}%;background:{choose_colour(near, 0.03, 0.005)}"></u></div>'
             f"{format_number(name, value, self.format_value(i, value))}</div>"
         )
+
+
+def name_robot(robot: Robot) -> str:
+    """A robot's name for people: the words that its joints' names share, as panda_joint1 has panda, or its tip's."""
+    first = robot.joint_names[0]
+    shared = first.removesuffix(strip_shared_words(robot.joint_names)[0]).strip("_")
+    return shared or robot.tree.tip_name
 
 
 def strip_shared_words(names: Sequence[str]) -> list[str]:
@@ -230,8 +253,9 @@ class RobotPanel:
             robot.joint_names, robot.tree.prismatic, robot.lower, robot.upper, -endless, endless
         )  # fmt: skip
         self._head = (
-            f'<div class="name">{escape(robot.tree.tip_name)}</div>'
-            f'<div class="about">{robot.n} joints, {robot.tree.masses.sum():.4g} kg</div>'
+            f'<div class="name">{escape(name_robot(robot))}</div>'
+            f'<div class="about">{robot.n} joints, {robot.tree.masses.sum():.4g} kg<br>'
+            f"tip {escape(robot.tree.tip_name)}</div>"
         )
 
     def format_html(self, q: Array) -> str:

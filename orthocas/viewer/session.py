@@ -148,6 +148,28 @@ class Session:
             moved, self.stop = True, ""
         return moved
 
+    def find_reach(self, k: int) -> tuple[float, float]:
+        """The lowest and highest value of the k-th component of phi along a line from here, with the others held."""
+        here, size, ends = self.chart.phi(self.q), float(self.chart.parts.phi_sizes[k]), []
+        for sense in (-1.0, 1.0):
+            tracker, far, step = self.chart.tracker(self.q), 0.0, size / RULES.reach_steps
+            while step > RULES.slider_step / 4 and far < RULES.reach_sizes * size:
+                target, before = here.copy(), tracker.q
+                target[k] += sense * (far + step)
+                tracker.step(target)
+                missed = np.abs(self.chart.phi(tracker.q) - target) / self.chart.parts.phi_sizes
+                if (
+                    tracker.status is TrackerStatus.OK
+                    and missed.max() < RULES.missed
+                    and self.find_allowed(tracker.q[None])[0]
+                ):
+                    far += step
+                else:
+                    tracker.reset(before)
+                    step /= 2
+            ends.append(float(here[k] + sense * far))
+        return ends[0], ends[1]
+
     def remember(self) -> None:
         """Keep the joint position, for `undo`."""
         if not self._past or not self._is_here(*self._past[-1]):

@@ -19,6 +19,7 @@ from orthocas.tools.files import publish, require_replaceable, require_writable
 from orthocas.viewer.chart_page import ChartPage
 from orthocas.viewer.looks import Look, build_stick_arm, decimate, read_urdf_look
 from orthocas.viewer.motion import Motion, require_joints
+from orthocas.viewer.panel import name_robot
 from orthocas.viewer.player import PlayerPage, RobotPage, Scene, record_scene, show_chart, show_motions, show_robot
 from orthocas.viewer.session import Session
 from orthocas.viewer.window import LOCAL, close_window, open_window
@@ -103,7 +104,7 @@ def view(
     # What is shown decides which page it gets.
     arm, motions = read_subject(shown, robot)
     shape = build_shape(arm, robot_file, locked)
-    server, url = open_window(host, port, "orthocas")
+    server, url = open_window(host, port, name_robot(arm))
     try:
         page: ChartPage | RobotPage | PlayerPage
         if motions:

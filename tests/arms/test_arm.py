@@ -61,6 +61,33 @@ def test_batches_of_x_and_xi_are_solved_within_the_limits() -> None:
     assert ((found.q >= arm.robot.lower) & (found.q <= arm.robot.upper)).all()
 
 
+def test_compiled_rows_end_as_those_without_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At random poses, with and without starts: the same statuses, x and xi met, and no xi that is farther."""
+    arm, postures = panda(), panda().robot.sample(60, seed=3)
+    x = arm.x(postures)
+    assert arm.chart_kernel is not None
+    compiled = [arm.solve(x, 0.2, start) for start in (None, postures)]
+    monkeypatch.setattr(oc.Arm, "chart_kernel", None)
+    for found, other in zip(compiled, [arm.solve(x, 0.2, start) for start in (None, postures)], strict=True):
+        assert (found.status == other.status).all()
+        assert found.branch == other.branch
+        assert np.abs(arm.x(found.q) - x).max() < 1e-8
+        nearest = found.status == InverseStatus.NEAREST
+        assert nearest.any()
+        assert (np.abs(found.xi - 0.2) <= np.abs(other.xi - 0.2) + 5e-3)[nearest].all()  # xi may turn between points
+        assert found.xi[found.found] == pytest.approx(arm.charts[0].xi(found.q[found.found])[:, 0], abs=1e-8)
+
+
+def test_arrays_and_lists_of_task_values_are_one() -> None:
+    arm, q = panda(), inside(panda(), 3, 8)
+    x, xi = arm.x(q), arm.charts[0].xi(q)[:, 0]
+    assert arm.solve(x.tolist(), xi, q).q == pytest.approx(arm.solve(x, xi, q).q, abs=1e-12)
+    assert arm.solve(x[:, None][:, 0], xi, q).q == pytest.approx(q, abs=1e-8)
+    one = arm.solve(x[0], xi[0], q[0])
+    assert one.q == pytest.approx(q[0], abs=1e-8)
+    assert isinstance(one.status, InverseStatus)
+
+
 def test_xi_that_no_posture_has_gives_the_nearest() -> None:
     arm, q = panda(), inside(panda(), 1, 2)[0]
     found = arm.solve(arm.x(q), 50.0)
@@ -175,7 +202,7 @@ def test_a_fit_has_a_chart_of_each_branch() -> None:
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: oc.Arm(oc.problems.get("iiwa").task), "n - m = 4"),
+        (lambda: oc.Arm(oc.problems.get("iiwa").task).nearest([0.1, 0.2, 0.3], np.zeros(7)), "n - m = 4"),
         (lambda: oc.Arm(3), "a Task"),  # type: ignore[arg-type]
         (lambda: oc.Arm(planar().task, (panda().charts[0],)), "charts"),
         (lambda: oc.Arm(panda().task).save("a.arm"), "without charts"),
@@ -198,4 +225,4 @@ def test_an_arm_needs_one_joint_more_than_its_task() -> None:
     with pytest.raises(NotRedundantError):
         oc.Arm(oc.Task.position(robot, "xy"))
     with pytest.raises(InvalidValueError, match="n - m = 2"):
-        oc.Arm(oc.Task.position(oc.problems.get("planar_3r_xy").robot, "x"))
+        oc.Arm.fit(oc.problems.get("planar_3r_xy").robot, oc.Task.position(oc.problems.get("planar_3r_xy").robot, "x"))

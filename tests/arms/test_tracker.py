@@ -8,8 +8,8 @@ import pytest
 
 import orthocas as oc
 from orthocas.arms import ArmTracker, TrackStatus
-from orthocas.arms.tracker import _solve_by_steps, solve_in_box
-from orthocas.errors import InvalidValueError
+from orthocas.arms.numpy_tracker import _solve_by_steps, solve_in_box
+from orthocas.errors import CompileError, InvalidValueError
 from orthocas.tools.checks import Array
 
 PERIOD = 0.01
@@ -91,7 +91,7 @@ def test_jumps_are_followed_as_fast_as_joints_may() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["iiwa7-wide", "xarm7-wide", "baxter-left-wide"])
 def test_hostile_streams_neither_break_limits_nor_lose_the_arm(name: str) -> None:
-    """Jumps, targets out of reach and behind the base, NaN: afterwards, x of the begin is met again."""
+    """Jumps, targets out of reach and behind the base, NaN: afterwards, x and xi of the begin are met again."""
     chart, rng = oc.load(name), np.random.default_rng(4)
     arm, home = oc.Arm(chart.task, (chart,)), chart.domain.centre
     tracker, low, high = arm.tracker(home, period=PERIOD), arm.robot.lower, arm.robot.upper
@@ -105,9 +105,94 @@ def test_hostile_streams_neither_break_limits_nor_lose_the_arm(name: str) -> Non
                 before, q = tracker.q, tracker.step(x)
                 assert (np.abs(q - before) <= most).all()
                 assert ((q >= low) & (q <= high)).all()
-        for _ in range(600):
+        for _ in range(900):
             tracker.step(x0)
         assert np.abs(arm.x(tracker.q) - x0).max() < 1e-8, kind
+        assert tracker.status is TrackStatus.OK, kind
+        assert tracker.xi == pytest.approx(float(chart.xi(home)[0]), abs=1e-8)
+
+
+def test_xi_on_another_arc_is_reached_again() -> None:
+    """From a posture of the same pose on another arc, the arm leaves x for a while; without detours, it may not."""
+    arm, chart = panda(), panda().charts[0]
+    q = np.array([0.3, -0.9, 1.2, -1.9, 0.6, 2.0, 0.2])
+    x, xi = arm.x(q), float(chart.xi(q)[0])
+    arcs, own = arm.solutions(x), arm.self_motion(x).nearest(q).component
+    others = [arc.at(arc.length / 2) for k, arc in enumerate(arcs) if k != own]
+    other = min(others, key=lambda posture: float(np.abs(posture - q).max()))
+    for detours, end in ((True, TrackStatus.OK), (False, TrackStatus.YIELDING)):
+        tracker = arm.tracker(q, period=PERIOD, detours=detours)
+        lead(tracker, arm.x(np.linspace(q, other, 300)))  # so that the chart is the one of the begin
+        statuses = lead(tracker, np.tile(x, (900, 1)), xi)
+        assert np.abs(arm.x(tracker.q) - x).max() < 1e-8
+        if statuses[0] is not TrackStatus.OK:
+            assert statuses[-1] is end
+        assert detours or TrackStatus.BEHIND not in statuses
+
+
+def test_joints_keep_limits_of_acceleration_and_stop_before_their_ends() -> None:
+    """Random jumps, out of reach as well, and NaN; a slow motion is followed exactly, and a jump without overshoot."""
+    arm, rng, most = panda(), np.random.default_rng(5), 10.0 * PERIOD**2
+    tracker, low, high = (
+        arm.tracker(centre(), period=PERIOD, acceleration_limits=10.0),
+        arm.robot.lower,
+        arm.robot.upper,
+    )
+    before, step = tracker.q, np.zeros(7)
+    jumps = arm.x(rng.uniform(low, high, (12, 7)))
+    jumps[3, :3] += 2.0
+    jumps[6] = np.nan
+    for x in jumps:
+        for _ in range(30):
+            q = tracker.step(x, rng.uniform(-1, 1))
+            assert (np.abs((q - before) - step) <= most * (1 + 1e-6)).all()
+            assert (np.abs(q - before) <= arm.robot.velocity_limits * PERIOD * (1 + 1e-9)).all()
+            assert ((q >= low) & (q <= high)).all()
+            before, step = q, q - before
+    tracker.reset(centre())
+    phi = panda().charts[0].phi(centre())
+    for x in along(phi[:6], np.array([0.2, 0.1, 0.0]), 200):
+        tracker.step(x)
+        assert tracker.status is TrackStatus.OK
+    far, errors = along(phi[:6], np.array([0.1, -0.2, 0.1]), 2)[-1], []
+    for _ in range(300):
+        errors.append(float(np.linalg.norm((arm.x(tracker.step(far)) - far)[:3])))
+    assert tracker.status in (TrackStatus.OK, TrackStatus.YIELDING)
+    assert np.diff(errors)[100:].max() < 1e-3
+
+
+def test_on_a_moving_base_x_is_followed_and_the_posture_comes_back() -> None:
+    """Of the planar arm with three joints too many; a heavy first joint moves least."""
+    robot = oc.Robot.planar(lengths=[1.0, 1.0, 0.5, 0.5, 0.3], masses=[1.0] * 5)
+    arm, q = oc.Arm(oc.Task.position(robot, "xy")), np.array([0.2, 0.5, 0.4, -0.6, 0.8])
+    moved = []
+    for weights in (None, [100.0, 1.0, 1.0, 1.0, 1.0]):
+        tracker, x = arm.tracker(q, velocity_limits=1.5, weights=weights), arm.x(q)
+        for share in np.linspace(0.0, 1.0, 200):
+            tracker.step(x - 0.4 * share)
+            assert tracker.status is TrackStatus.OK
+            assert np.abs(arm.x(tracker.q) - x + 0.4 * share).max() < 1e-8
+        moved.append(abs(tracker.q[0] - q[0]))
+        lead_back = [tracker.step(x) for _ in range(300)]
+        assert lead_back[-1] == pytest.approx(q, abs=1e-6)
+    assert moved[1] < moved[0] / 2
+    with pytest.raises(InvalidValueError, match="n - m = 3"):
+        arm.self_motion(arm.x(q))
+
+
+def test_without_a_compiler_numpy_tracks(monkeypatch: pytest.MonkeyPatch) -> None:
+    arm, x, q = panda(), panda().x(centre()), centre()
+    path = along(x, np.array([0.5, 0.1, -0.1]), 120)
+    compiled = [arm.follow(path, q=q)]
+    monkeypatch.setattr(oc.Arm, "chart_kernel", None)
+    other, statuses = arm.follow(path, q=q)
+    inside = np.flatnonzero([status is TrackStatus.OK for status in statuses])
+    assert len(inside) > 50
+    assert compiled[0][0][inside[:50]] == pytest.approx(other[inside[:50]], abs=1e-7)
+    tracker = arm.tracker(q)
+    assert pickle.loads(pickle.dumps(tracker)).step(path[3]) == pytest.approx(tracker.step(path[3]), abs=1e-9)
+    with pytest.raises(CompileError, match="acceleration"):
+        arm.tracker(q, acceleration_limits=1.0)
 
 
 def test_without_detours_the_error_of_a_target_at_rest_never_rises() -> None:

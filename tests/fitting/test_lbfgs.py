@@ -23,8 +23,8 @@ class Well:
             return self.outside, np.full_like(theta, np.nan)
         return float(np.sum(theta - 1e-3 * np.log(theta))), 1 - 1e-3 / theta
 
-    def curvature_estimate(self, theta: np.ndarray) -> np.ndarray:
-        return np.eye(theta.size)
+    def curvature_estimate(self, theta: np.ndarray) -> list[np.ndarray]:
+        return [np.eye(theta.size)]
 
 
 @pytest.mark.parametrize("outside", [np.nan, np.inf])

@@ -1,6 +1,7 @@
 """What single solvers promise, and every pair of a solver and a parametrisation that makes sense."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from orthocas import problems, solvers
 from orthocas.bases import JointSpace
 from orthocas.charts.quality import Report
 from orthocas.errors import InvalidValueError, SolveError
+from orthocas.fitting import basis_objective
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.starts import find_spectral_start
 from orthocas.solvers.protocol import ConstrainedObjective, Objective, Solver, Status
@@ -132,13 +134,36 @@ def test_solvers_with_a_matrix_refuse_objectives_without_one(planar_xy: oc.Probl
         oc.fit(planar_xy, oc.MLP((4,)), solver, samples=50)
 
 
+def test_blocks_of_the_estimate_are_those_of_the_whole_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of many coefficients the estimate is the diagonal of the matrix of few, and leads to the same minimum."""
+    iiwa = problems.get("iiwa")
+    problem = oc.Problem(iiwa.robot, iiwa.task, "inertia", iiwa.domain)
+    family = oc.Polynomial(2).family(JointSpace.of(problem), problem.r)
+    samples = sample_problem(problem, 500, (3,))
+    start = find_spectral_start(family, samples)
+    objective = BasisObjective(family, samples, oc.Weights(folds=0), start, lambda *_: samples)
+    (whole,) = objective.curvature_estimate(start)
+    together = solvers.QuasiNewton(tolerance=1e-10, max_iterations=2000).minimise(objective, start)
+    monkeypatch.setattr(basis_objective, "RULES", replace(basis_objective.RULES, coupled=0))
+    blocks = objective.curvature_estimate(start)
+    # from beside it, as the loss has several minima
+    beside = together.theta * np.random.default_rng(0).uniform(0.95, 1.05, together.theta.size)
+    apart = solvers.QuasiNewton(tolerance=1e-10, max_iterations=2000).minimise(objective, beside)
+    assert objective.value(beside) > 1.02 * together.value
+    assert len(blocks) == problem.r
+    for j, block in enumerate(blocks):
+        place = slice(j * family.width, (j + 1) * family.width)
+        np.testing.assert_allclose(block, whole[place, place], rtol=1e-4, atol=1e-4 * np.abs(whole).max())
+    assert apart.value == pytest.approx(together.value, rel=1e-3)
+
+
 @pytest.mark.slow
 def test_quasi_newton_meets_gauss_newton_with_few_matrices() -> None:
     """The same minimum of a real fit, from one matrix for many steps."""
     problem, counts = problems.get("iiwa"), []
 
     class Counted(BasisObjective):
-        def curvature_estimate(self, theta: np.ndarray) -> np.ndarray:
+        def curvature_estimate(self, theta: np.ndarray) -> list[np.ndarray]:
             counts.append(theta)
             return super().curvature_estimate(theta)
 

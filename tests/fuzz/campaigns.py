@@ -78,7 +78,7 @@ RESULTS = {  #: public classes whose objects only the library makes, with the ca
         ("Solutions", "Tracker", "ReachingTracker", "InverseStatus", "TrackerStatus", "MeaningError"), "calls"
     ),
     **dict.fromkeys(("Breakdown", "Coupling", "DampingCheck", "JointMotion", "Margins", "Modes", "Setting"), "calls"),
-    **dict.fromkeys(("Contact", "LeastDistance"), "calls"),
+    **dict.fromkeys(("Contact", "FittedCapsules", "LeastDistance", "NearPairs"), "calls"),
     **dict.fromkeys(("Card", "Model", "Trajectory", "View"), "calls"),
     **dict.fromkeys(("Arc", "ArmTracker", "Place", "Postures", "SelfMotions"), "calls"),
     "Certificate": "certificates",

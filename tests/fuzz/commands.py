@@ -66,6 +66,8 @@ _VALUES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("--seed", "--seeds", "--samples", "--held-out", "--jobs"), _COUNTS),
     **dict.fromkeys(("--rate", "--mass-factor", "--max-mutual-deg"), (*NUMBERS, "50", "10")),
     **dict.fromkeys(("--period", "--link-radius", "--clearance"), (*NUMBERS, "0.01")),
+    "--collisions": ("arm.urdf", "nothing.urdf", "", "panda", "chart.orthocas"),
+    "--srdf": ("arm.srdf", "", "arm.urdf"),
     **dict.fromkeys(("--start", "--velocity-limit", "--acceleration-limit"), _LISTS),
     "--obstacle": (
         "",
@@ -114,6 +116,7 @@ _LAW_OPTIONS = (
     "--damping-stiffness",
 )
 _RUN_OPTIONS = ("--rate", "--mass-factor", "--friction", "--noise", "--seed", "--plant")
+_SOLIDS = ("--collisions", "--srdf")
 _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = {  # targets, options, other options
     "fit": (
         _PROBLEMS,
@@ -146,8 +149,8 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
     "info --branches": ((*_PROBLEMS, *_FILES), {}, (*_PROBLEM_OPTIONS, "--task")),
     "certify": (_FILES, {"--seconds": "0.5", "--out": "new.orthocas"}, ("--bound", "--workers")),
     "demo": (("", *_PROBLEMS), {"--out": "out"}, ()),  # takes no word, so this is refused before it fits
-    "evaluate": (_FILES, {"--samples": "50"}, ("--seed",)),
-    "info": ((*_PROBLEMS, *_FILES), {}, _PROBLEM_OPTIONS),
+    "evaluate": (_FILES, {"--samples": "50"}, ("--seed", *_SOLIDS)),
+    "info": ((*_PROBLEMS, *_FILES), {}, (*_PROBLEM_OPTIONS, *_SOLIDS)),
     "compare": (
         _PROBLEMS,
         {"--param": "polynomial:1", "--samples": "30", "--held-out": "50", "--jobs": "0"},
@@ -156,8 +159,9 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
     "simulate": (
         _FILES,
         {"--controller": "impedance", "--steps": "steps.json", "--out": "out", "--animation": "none"},
-        (*_LAW_OPTIONS, *_RUN_OPTIONS),
+        (*_LAW_OPTIONS, *_RUN_OPTIONS, *_SOLIDS),
     ),
+    "doctor": (("", "chart.orthocas"), {}, ("--out",)),
     "charts": (("ur5-position", "ur5", "chart.orthocas", ""), {}, ("--out",)),
     "export": (_FILES, {"--to": "numpy", "--out": "module.py"}, ()),
     "follow": (
@@ -165,7 +169,7 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
         {"--out": "q.csv", "--velocity-limit": "1", "--period": "0.05"},
         (
             *("--xi", "--start", "--acceleration-limit", "--obstacle"),
-            *("--link-radius", "--clearance"),
+            *("--link-radius", "--clearance", *_SOLIDS),
         ),
     ),
     "view": (

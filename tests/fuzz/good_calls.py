@@ -371,6 +371,7 @@ def _functions() -> dict[str, Call]:
         "evaluate points": (oc.evaluate, {"chart": chart, "samples": None, "seed": None, "points": [q, q]}),
         "export": (oc.export, {"chart": chart, "to": "numpy", "path": "module.py", "force": False}),
         "generate_c": (oc.generate_c, {"chart": chart, "out": "c", "controller": impedance(), "name": "arm"}),
+        "fit_capsules": (oc.fit_capsules, {"collisions": Collisions(problem.robot.tree, collisions().parts[:3], ())}),
         "generate_c with settings": (
             oc.generate_c,
             {"chart": chart, "out": "c", "controller": impedance(), "safety": control.Safety.of(impedance())},
@@ -442,6 +443,17 @@ def _methods() -> dict[str, Call]:
         "chart.solve": (chart.solve, {"phi": phi, "q_start": q, "tolerance": 1e-9, "inside": True}),
         "chart.solutions": (chart.solutions, {"phi": phi, "tolerance": 1e-9}),
         "chart.tracker": (chart.tracker, {"q0": planar().domain.centre, "largest_step": 0.1}),
+        "chart.tracker with collisions": (
+            chart.tracker,
+            {
+                "q0": planar().domain.centre,
+                "nearest": True,
+                "collisions": collisions(),
+                "margin": 0.001,
+                "avoid": 0.002,
+            },
+        ),
+        "chart.solve with collisions": (chart.solve, {"phi": phi, "all": True, "collisions": collisions()}),
         "tracker.step": (chart.tracker(planar().domain.centre).step, {"phi": phi}),
         "tracker.reset": (chart.tracker(planar().domain.centre).reset, {"q": q}),
         "grown.inverse": (grown.inverse, {"phi": grown.phi([1.0, 0.0]), "q_start": [1.0, 0.0], "tolerance": 1e-6}),
@@ -481,6 +493,7 @@ def _methods() -> dict[str, Call]:
         "collisions.distance": (collisions().distance, {"q": q}),
         "collisions.pair_distances": (collisions().pair_distances, {"q": q}),
         "collisions.check_free": (collisions().check_free, {"q": q}),
+        "collisions.find_near": (collisions().find_near, {"q": q, "within": 2.0}),
         "collisions.find_contact": (collisions().find_contact, {"q": [q, -q], "clearance": 0.01, "bend": 0.001}),
         "collisions.with_scene": (
             collisions().with_scene,

@@ -63,6 +63,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {  #: words after `orthocas`; the loop is
     "codegen": ("codegen", "chart.orthocas", *_CONTROLLED, "--check"),
     "export": ("export", "chart.orthocas", "--to", "numpy", "--out", "out/arm.py"),
     "charts": ("charts", "ur5-position", "--out", "out/ur5.orthocas"),
+    "doctor": ("doctor", "--json"),
     "demo": ("demo", "--out", "out"),
     "view": ("view", "chart.orthocas", "--export", "out/page.html"),
     "loop": ("-c", _LOOP),

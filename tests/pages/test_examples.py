@@ -7,8 +7,10 @@ import batches
 import beyond_reach
 import c_timing
 import casadi as ca
+import casadi_dynamics
 import certificates
 import clear_positions
+import collisions
 import compare_parametrisations
 import distillation
 import domain_size
@@ -287,6 +289,16 @@ def test_benchmarks_of_networks_and_starts_print_rows(capsys: pytest.CaptureFixt
 @pytest.mark.nightly
 @pytest.mark.slow
 @needs_c
+def test_benchmark_of_casadi_dynamics_times_every_function() -> None:
+    """The fastest of few rounds: a forward dynamics takes longer than the mass matrix in it."""
+    found = casadi_dynamics.main(quick=True)
+    assert len(found) == len(casadi_dynamics.FUNCTIONS)
+    assert 0 < found["iiwa, 7 joints, mass matrix"] < found["iiwa, 7 joints, forward dynamics"]
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+@needs_c
 def test_benchmark_of_batches_prints_rows() -> None:
     rows = batches.main(quick=True)
     assert [row.split("|")[1].strip() for row in rows[:3]] == ["orthocas", "NumPy, float64", "NumPy, float32"]
@@ -313,6 +325,17 @@ def test_benchmark_beyond_reach_finds_nothing_nearer() -> None:
     assert found["panda-wide, settled"] == 1
     assert found["panda-wide, left"] == 0
     assert found["panda-wide, way [m]"] > 0.05
+
+
+@pytest.mark.slow
+def test_benchmark_of_collisions_agrees_with_coal_and_touches_nothing() -> None:
+    found = collisions.main(quick=True)
+    assert found["panda, differ"] == 0
+    assert found["panda, apart [m]"] < 1e-9
+    assert found["panda, lost"] == 0
+    assert found["panda, ratio"] < 1.6
+    assert found["panda, contacts"] == 0
+    assert found["panda, nearest [m]"] > 0.01 - 1e-6
 
 
 @pytest.mark.slow

@@ -37,6 +37,12 @@ SEARCHED = {
     "joint limits": "how-to/limits",
     "ROS": "how-to/robots",
     "ROS 2": "how-to/robots",
+    "ROS2": "how-to/robots",
+    "redundancy": "explanation/ideas",
+    "Windows": "how-to/install",
+    "mass matrix": "how-to/casadi_dynamics",
+    "inverse dynamics": "how-to/casadi_dynamics",
+    "pinocchio.casadi": "how-to/casadi_dynamics",
     "velocity limit": "how-to/limits",
     "elbow": "how-to/elbow",
     "null space": "how-to/coming_from",
@@ -46,8 +52,9 @@ SEARCHED = {
     "gravity compensation": "how-to/robots",
     "torque": "explanation/control",
     "gripper": "tutorials/own_arm",
+    "collision": "how-to/collisions",
     "collision avoidance": "how-to/paths",
-    "install": "index",
+    "install": "how-to/install",
 }
 
 

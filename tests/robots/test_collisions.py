@@ -10,40 +10,13 @@ import pinocchio as pin
 import pytest
 from conftest import robot_data
 from scipy.spatial import ConvexHull
+from solid_arms import BALL, build_arm, place_balls
 
 import orthocas as oc
 from orthocas.errors import InvalidValueError, PathError, RobotError, UnknownNameError
 from orthocas.robots.collisions import Collisions
 from orthocas.tasks.domains import StopKind
 from orthocas.tools.checks import Array
-
-BALL = '<sphere radius="0.1"/>'
-
-
-def build_arm(folder: Path, solids: list[str], limit: float = 3.1) -> oc.Robot:
-    """A planar arm of links of length 1 along x, each with a solid 0.8 along it; the base has one at the origin."""
-    links, joints = [], []
-    for k, solid in enumerate(solids):
-        place = f'<origin xyz="{0.8 if k else 0} 0 0"/>'
-        shape = f"<collision>{place}<geometry>{solid}</geometry></collision>" if solid else ""
-        inertia = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
-        links.append(f'<link name="link{k}"><inertial><mass value="1"/>{inertia}</inertial>{shape}</link>')
-        if k:
-            ends = f'<parent link="link{k - 1}"/><child link="link{k}"/><axis xyz="0 0 1"/>'
-            bounds = f'<limit lower="-{limit}" upper="{limit}" effort="1" velocity="1"/>'
-            joints.append(
-                f'<joint name="q{k}" type="revolute"><origin xyz="{1 if k > 1 else 0} 0 0"/>{ends}{bounds}</joint>'
-            )
-    path = folder / "arm.urdf"
-    path.write_text(f'<robot name="arm">{"".join(links)}{"".join(joints)}</robot>')
-    return oc.Robot.from_urdf(path, f"link{len(solids) - 1}")
-
-
-def place_balls(q: Array) -> Array:
-    """Centres of the balls of `build_arm` in the plane, (3, 2) for q (2,)."""
-    first, second = q[0], q[0] + q[1]
-    elbow = np.array([np.cos(first), np.sin(first)])
-    return np.array([np.zeros(2), 0.8 * elbow, elbow + 0.8 * np.array([np.cos(second), np.sin(second)])])
 
 
 def differentiate(collisions: Collisions, q: Array, step: float = 1e-6) -> Array:
@@ -282,6 +255,21 @@ def test_rates_bound_how_fast_distances_change(tmp_path: Path) -> None:
     assert (change > 0.5 * bound).any()
     # A joint that carries both of a pair moves neither against the other.
     assert not collisions.rates[pairs.index(("link1", "link3")), 0]
+
+
+@pytest.mark.slow
+def test_bounds_leave_out_no_pair_of_many() -> None:
+    """Of 277 pairs few are evaluated; evaluating all gives the same."""
+    collisions = oc.Robot.from_urdf(robot_data("baxter_description/urdf/baxter.urdf"), "left_gripper").collisions
+    q = oc.Robot(collisions.tree).sample(300, seed=5)
+    every = collisions.pair_distances(q)
+    assert every.shape[1] > 200
+    np.testing.assert_allclose(collisions.distance(q).distance, every.min(axis=1), atol=2e-6)
+    np.testing.assert_array_equal(collisions.check_free(q), every.min(axis=1) > 0)
+    for position, row in zip(q[:20], every, strict=False):
+        assert set(collisions.find_near(position, 0.2).pairs) == {
+            collisions.pairs[k] for k in np.flatnonzero(row < 0.2)
+        }
 
 
 def test_ways_between_postures_hide_no_contact(tmp_path: Path) -> None:

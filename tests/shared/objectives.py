@@ -42,9 +42,9 @@ class Valley:
         rho, D = self.residuals(theta)
         return float(rho @ rho / 2), D.T @ rho, D.T @ D
 
-    def curvature_estimate(self, theta: np.ndarray) -> np.ndarray:
+    def curvature_estimate(self, theta: np.ndarray) -> list[np.ndarray]:
         D = self.residuals(theta)[1]
-        return D.T @ D
+        return [D.T @ D]
 
 
 class SmoothValley(Valley):

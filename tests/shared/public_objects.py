@@ -349,11 +349,16 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "point cloud": lambda: oc.obstacles.PointCloud([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], 0.1),
     "scene": scene,
     "collisions": collisions,
+    "capsules": lambda: oc.fit_capsules(Collisions(planar().robot.tree, collisions().parts[:3], ())),
+    "near pairs": lambda: collisions().find_near(np.zeros(3), 5.0),
     "least distance": lambda: collisions().distance(np.linspace(-1, 1, 6).reshape(2, 3)),
     "self-motion": lambda: fitted().chart.self_motion(planar().domain.centre, samples=30),
     "self-motion curve": lambda: cyclic().self_motion(cyclic().problem.domain.centre),
     "solutions": lambda: fitted().chart.solve([[1.6, 0.1, 0.1], [9.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]),
     "tracker": lambda: fitted().chart.tracker(planar().domain.centre),
+    "tracker with collisions": lambda: fitted().chart.tracker(
+        planar().domain.centre, collisions=collisions(), margin=0.001, avoid=0.002
+    ),
     "arm": arm,
     "arm without charts": lambda: oc.Arm(problems.get("planar_3r_xy").task),
     "postures of an arm": lambda: arm().solve(arm().x(BENT_POSTURE), start=BENT_POSTURE),

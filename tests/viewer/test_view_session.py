@@ -35,6 +35,18 @@ def test_a_task_component_moves_alone(iiwa_fit: Fit) -> None:
     assert (session.readings.drift < 1e-9).all()  # from where the task was wished to be
 
 
+@pytest.mark.parametrize("end", [0, 1])
+def test_a_slider_of_the_task_ends_where_its_component_ends(iiwa_fit: Fit, end: int) -> None:
+    """What the range has is reached, and what is a centimetre beyond is not."""
+    reach = Session(iiwa_fit.chart).find_reach(2)[end]
+    for beyond, reached in ((0.0, True), (0.01, False)):
+        session = Session(iiwa_fit.chart)
+        session.wish({"z": reach + (2 * end - 1) * beyond})
+        session.follow()
+        missed = abs(session.readings.x[2] - reach - (2 * end - 1) * beyond)
+        assert (missed < 1e-6) == reached
+
+
 def test_a_wish_out_of_reach_ends_at_the_boundary_and_tells_the_joint() -> None:
     chart = fitted().chart
     session = Session(chart)

@@ -7,21 +7,25 @@ import numpy as np
 import orthocas as oc
 from orthocas.tools.checks import Array
 from redundancy.arms import TICK, Arm
-from redundancy.protocol import Target, Unsuited
+from redundancy.protocol import Target
 from redundancy.search import secant
 
 
 class Whole:
-    """The tracker of `oc.Arm` on the chart of the home's branch. The elbow's angle of a posture is what it holds."""
+    """The tracker of `oc.Arm` on the chart of the home's branch. The elbow's angle of a posture is what it holds.
+
+    On a mobile base there is no chart: the tracker holds the posture of the beginning as far as x leaves it free.
+    """
 
     name = "arm"
     packages = ("orthocas", "casadi")
     grid = ({"clearance": 0.1}, {"clearance": 0.05}, {"clearance": 0.2})
 
     def __init__(self, arm: Arm, clearance: float) -> None:
+        self.arm, self.chart = arm, None
         if arm.mobile:
-            raise Unsuited("it is of a fixed arm")
-        self.arm = arm
+            self.whole = oc.Arm(arm.task)
+            return
         fit = oc.fit_wide(arm.robot, arm.task, clearance=clearance, home=arm.home, like=arm.elbow_expression)
         self.chart, self.whole = fit.chart, oc.Arm(fit.chart.task, (fit.chart,))
 
@@ -33,9 +37,11 @@ class Whole:
 
     def step(self, target: Target) -> Array:
         """Follow x, and the xi at which the elbow has the wished angle."""
-        if target.posture is not self.posture:
+        if self.chart is not None and target.posture is not self.posture:
             self.posture, self.bend = target.posture, self.arm.elbow(target.posture)
-        x = self.chart.task.value(target.placement.translation, target.placement.rotation)
+        x = self.whole.task.value(target.placement.translation, target.placement.rotation)
+        if self.chart is None:
+            return np.array(self.tracker.step(x))
         self.q = self.tracker.step(x, self._xi_of(x, self.bend if target.elbow is None else target.elbow))
         return np.array(self.q)
 

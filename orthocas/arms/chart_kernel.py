@@ -1,0 +1,311 @@
+"""Postures with x and xi, and the tracker, in C that is compiled for an arm with its charts."""
+
+import ctypes
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocas.arms.kernel import RULES as CURVES
+from orthocas.arms.kernel import build_curvature, pointer, write_curves
+from orthocas.arms.maps import ArmMaps
+from orthocas.charts.chart import Chart
+from orthocas.codegen.compiled import keep_library, load_library
+from orthocas.codegen.kernels import generate_kernels
+from orthocas.codegen.rendering import render
+from orthocas.tasks.regular_box import find_joint_range
+from orthocas.tools.batch import dense_function, run_in_threads
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import Array, Indices
+
+_FLAGS = ("-O3",)
+
+
+@dataclass(frozen=True, slots=True)
+class ChartKernelRules:
+    """Numbers of the search for postures with x and xi, and of the tracker, in C.
+
+    Errors of x are in radians, or as long as a radian moves the tip; joint positions in [rad] or [m].
+    """
+
+    met: float = 1e-10  #: error of x that is met
+    xi_met: float = 1e-10  #: error of xi that is met
+    squared: float = 3e-6  #: errors of x and xi that one more step of Newton's method reduces to their squares
+    xi_found: float = 1e-9  #: error of xi of a posture that has it
+    xi_weight: float = 1e-3  #: of errors of xi, relative to those of x
+    posture_weight: float = 1e-4  #: of the way back to the last posture with a chart, where there is none
+    way_weight: float = 1e-2  #: of the way to a posture with x and xi that was found
+    step_damping: float = 1e-8  #: of squared joint steps
+    error_damping: float = 0.3  #: of squared joint steps, times the squared error of x
+    damping: float = 1e-3  #: of squared joint steps after one that does not lower the error, at least
+    grows: float = 10.0  #: damping after another one; it shrinks as much after one that does
+    rounds: int = 12  #: of a descent, at most
+    far_rounds: int = 4  #: of them, those with an error above `near`
+    gain: float = 1e-9  #: relative decrease of the squared error below which it is a minimum
+    near: float = 1e-3  #: error of x below which the last posture with a chart does not count
+    decrease: float = 1e-4  #: of the cost, relative to what a step promises
+    enough: float = 1e-2  #: relative decrease of the cost below which a far arm leaves the rest to the next call
+    falls: float = 0.9  #: of an error at the end of a window, relative to that at its begin, where the arm is not stuck
+    guesses: int = 8  #: of the joints at bounds in a quadratic program, many at a time
+    changes: int = 40  #: of these joints, one at a time, at most
+    rounding: float = 1e-14  #: slope of the cost at a bound that is none
+    sweeps: int = 8  #: of Jacobi's method for eigenvalues, at most
+    flattest: float = 2.0  #: least curvature that counts, in errors: less would amplify the tremor of a hand
+    calms: float = 0.8  #: factor of it for each call since the target moved
+    saddle: float = 0.02  #: slope of the error, relative to its curvature, below which a posture is next to a saddle
+    astride: float = 0.05  #: step to a side of a saddle
+    largest: float = 0.7  #: norm of a step of Newton's method
+    in_chart: int = 10  #: rounds of it at a tick in the chart
+    seek_rounds: int = 24  #: of it, from a stored posture
+    solve_rounds: int = 14  #: of it, from one of many near ones
+    searched: int = 24  #: stored postures that a tracker tries, one a tick
+    longest: int = 16  #: windows that it waits after a search that found nothing, at most
+    near_starts: int = 6  #: stored postures of a chart that a row tries before all curves of x are searched
+    spacing: float = 0.05  #: between points of curves at which xi is looked at
+    room: float = 0.05  #: beyond limits, within which a point between nodes may be inside
+    lifts: int = 32  #: combinations of full turns of joints that are looked at
+    bisections: int = 30  #: between two of these points
+    curve_starts: int = CURVES.starts  #: of the search of all curves
+    patience: int = 32  #: of them in turn that find no new curve, after which the search ends
+    postures: int = 2000  #: stored in the domain of each chart, and in all of the joint range
+    seed: int = 0  #: of them
+    piece: int = 32  #: rows that a thread takes at once
+
+
+RULES = ChartKernelRules()
+
+
+class PosturesInC(ctypes.Structure):
+    """`NAME_postures` of templates/arm_track.h.jinja."""
+
+    _fields_ = (
+        ("count", ctypes.c_int),
+        *((name, ctypes.c_void_p) for name in ("q", "places", "xi", "begins")),
+    )
+
+
+class RangeInC(ctypes.Structure):
+    """`range_postures` of templates/arm_rows.c.jinja."""
+
+    _fields_ = (
+        ("count", ctypes.c_int),
+        ("branches", ctypes.c_int),
+        *((name, ctypes.c_void_p) for name in ("q", "places", "weights", "begins")),
+    )
+
+
+def tracker_type(n: int, r: int, target: int) -> np.dtype[Any]:
+    """`NAME_tracker` of templates/arm_track.h.jinja."""
+    rows = ("q", "most", "change", "weight", "moved", "last", "goal")
+    fields: list[Any] = [(name, "f8", (n,)) for name in rows]
+    fields += [("wish", "f8", (r,)), ("target", "f8", (target,)), ("far", "f8"), ("best", "f8")]
+    numbers = ("detours", "patience", "chart", "inside", "status", "mode", "ticks", "pause", "rested", "next", "listed")
+    fields += [(name, "i4") for name in numbers]
+    return np.dtype([*fields, ("list", "i4", (RULES.searched,))], align=True)
+
+
+@dataclass(frozen=True, eq=False)
+class ChartPostures:
+    """Postures of the domains of charts, one chart after the other, then of all of the joint range."""
+
+    q: Array  #: (S, n)
+    places: NDArray[np.float32]  #: (S, k), as of `StoredPostures`, by rows
+    xi: NDArray[np.float32]  #: of the own chart, (S, r)
+    begins: NDArray[np.intc]  #: (charts + 1,)
+
+    @classmethod
+    def build(cls, maps: ArmMaps, charts: Sequence[Chart], count: int) -> "ChartPostures":
+        """So many for each chart."""
+        robot, r = maps.robot, maps.robot.n - maps.task.m
+        whole = find_joint_range(robot, 0)
+        own = [np.asarray(chart.problem.domain.sample(count, RULES.seed)) for chart in charts]
+        rng = np.random.default_rng(RULES.seed)
+        free = rng.uniform(whole.centre - whole.half_width, whole.centre + whole.half_width, (count, robot.n))
+        xi = [np.asarray(chart.xi(q)).reshape(-1, r) for chart, q in zip(charts, own, strict=True)]
+        q = np.vstack([*own, free])
+        begins = np.cumsum([0, *(len(part) for part in own)])
+        return cls(
+            np.ascontiguousarray(q),
+            np.ascontiguousarray(maps.places.of_postures(q), dtype=np.float32),
+            np.ascontiguousarray(np.vstack([*xi, np.zeros((len(free), r))]), dtype=np.float32),
+            begins.astype(np.intc),
+        )
+
+    @cached_property
+    def in_c(self) -> PosturesInC:
+        """For C, as long as this object lives."""
+        return PosturesInC(len(self.q), *(pointer(part) for part in (self.q, self.places, self.xi, self.begins)))
+
+
+@dataclass(frozen=True, eq=False)
+class ChartKernel:
+    """Searches and trackers of an arm and its charts, which may be none, in compiled C. Threads may share it.
+
+    `solve_rows` asks charts in turn, that of the start first: Newton's method on x and xi from the start, or from the
+    stored postures that are nearest in x and xi. Where none arrives, all curves of x are traced and xi is looked at
+    along them, as `Arm` does it without a compiler.
+
+    Raises:
+        CompileError, InvalidValueError: if there is no C compiler, or no folder to keep the library.
+        DomainError: if a domain has a condition, but no expression of it.
+    """
+
+    maps: ArmMaps
+    charts: tuple[Chart, ...]
+
+    def solve_rows(
+        self, targets: Array, xi: Array, starts: Array | None, allowed: Sequence[int]
+    ) -> tuple[Array, Indices, Indices]:
+        """Postures (N, n) of targets (N, k) and xi (N,), numbers of `InverseStatus`, and of charts; -1 for none."""
+        count, n = len(targets), self.maps.robot.n
+        q = np.empty((count, n))
+        status, owner = (np.empty(count, dtype=np.intc) for _ in range(2))
+        flags = np.zeros(len(self.charts), dtype=np.int8)
+        flags[list(allowed)] = 1
+        solve, stored, whole, room_size = self._c.solve_rows, self.postures.in_c, self._range, self._room_size
+        inputs = [np.ascontiguousarray(part) for part in (targets, xi)]
+        first = None if starts is None else np.ascontiguousarray(starts)
+
+        def solve_piece(begin: int) -> None:
+            rows, room = slice(begin, begin + RULES.piece), np.empty(room_size)
+            start = None if first is None else pointer(first[rows])
+            solve(
+                *(len(q[rows]), *(pointer(part[rows]) for part in inputs), start, pointer(flags)),
+                *(ctypes.byref(stored), ctypes.byref(whole), RULES.patience, pointer(room), CURVES.nodes),
+                *(pointer(part[rows]) for part in (q, status, owner)),
+            )
+
+        if count <= RULES.piece:
+            solve_piece(0)
+        else:
+            run_in_threads(solve_piece, range(0, count, RULES.piece))
+        return q, status.astype(np.int64), owner.astype(np.int64)
+
+    def build_targets(self, vectors: Array) -> Array:
+        """As `TargetReader.build`, of contiguous vectors (N, m)."""
+        targets = np.empty((len(vectors), self.target_size))
+        self._c.build_targets(len(vectors), pointer(vectors), pointer(targets))
+        return targets
+
+    @cached_property
+    def postures(self) -> ChartPostures:
+        """From which searches start."""
+        return ChartPostures.build(self.maps, self.charts, RULES.postures)
+
+    @property
+    def track(self) -> Any:
+        """`arm_track` of the library."""
+        return self._c.arm_track
+
+    @property
+    def track_value(self) -> Any:
+        """The same for x as the task's vector."""
+        return self._c.track_value
+
+    @property
+    def reset(self) -> Any:
+        """`arm_track_reset` of the library."""
+        return self._c.arm_track_reset
+
+    @property
+    def hold(self) -> Any:
+        """`arm_track_hold` of the library."""
+        return self._c.arm_track_hold
+
+    def load(self) -> None:
+        """Compile now, or find what was compiled earlier."""
+        assert self._c is not None
+
+    @cached_property
+    def _c(self) -> Any:
+        sources = write_tracker(self.maps, self.charts, "arm", "arm_rows.c")
+        if self.charts and self.maps.robot.n - self.maps.task.m == 1:
+            sources["self_motion.c"] = write_curves(self.maps.equations, *self._limits)
+        library = load_library(keep_library("arm", sources, _FLAGS))
+        library.arm_track_reset.restype = library.arm_track_hold.restype = library.build_targets.restype = None
+        if self.charts and self.maps.robot.n - self.maps.task.m == 1:
+            library.solve_rows.restype = None
+        return library
+
+    @property
+    def _limits(self) -> tuple[Array, Array, NDArray[np.bool_]]:
+        return self.maps.robot.lower, self.maps.robot.upper, self.maps.turning
+
+    @cached_property
+    def _range(self) -> RangeInC:
+        stored = self.maps.stored
+        parts = (pointer(part) for part in (stored.q, stored.places, stored.weights, stored.begins))
+        return RangeInC(len(stored.q), len(stored.begins) - 1, *parts)
+
+    @cached_property
+    def target_size(self) -> int:
+        """Numbers of a target."""
+        return int(self.maps.equations.size1_in(1))
+
+    @cached_property
+    def _room_size(self) -> int:
+        return CURVES.nodes * (2 * self.maps.robot.n + 1) + (len(self.maps.stored.q) + 1) // 2
+
+
+def write_tracker(maps: ArmMaps, charts: Sequence[Chart], name: str, template: str, header: str = "") -> dict[str, str]:
+    """Sources of an arm's tracker, by the names of their files: NAME_track.h and .c.
+
+    Args:
+        maps: of the arm.
+        charts: of the arm; they may be none.
+        name: prefix of names in C.
+        template: "arm_track.c", or "arm_rows.c" for the searches of many rows as well.
+        header: first lines of both files.
+    """
+    robot, task, n = maps.robot, maps.task, maps.robot.n
+    equations = maps.equations
+    functions = [equations, build_curvature(equations), maps.target_function]
+    parts = []
+    for k, chart in enumerate(charts):
+        q, own, domain = ca.MX.sym("q", n), chart.coordinates.functions, chart.problem.domain
+        rows = [chart.parts.runnable(own[word])(q) for word in ("xi", "jacobian")]
+        functions.append(dense_function(f"xi_{k}", [q], rows))
+        pivots = 0
+        if domain.condition is not None:
+            functions.append(dense_function(f"pivots_{k}", [q], [domain.condition.pivots(q)]))
+            pivots = functions[-1].numel_out(0)
+        low, high = domain.bounds
+        periods, sizes = chart.parts.turns[chart.m :], chart.parts.phi_sizes[chart.m :]
+        parts.append(
+            {"low": low, "high": high, "slack": domain.slack, "pivots": pivots, "period": periods, "size": sizes}
+        )
+    kernels = generate_kernels(functions, f"{name}_kernel")
+    size = equations.size1_in(1)
+    words = f"its vector ({size})"
+    if maps.places.turned:
+        words = "the rotation (3, 3) of the frame by columns"
+        words = f"the position (3), then {words}" if size > 9 else words
+    values = {
+        "header": header,
+        "name": name,
+        "robot": robot.heading,
+        "target_words": words,
+        "kernels": kernels.code,
+        "arrays": kernels.declare_arrays,
+        "call": kernels.write_call,
+        "n": n,
+        "m": task.m,
+        "target": size,
+        "places": len(maps.place_scale),
+        "place_scale": maps.place_scale,
+        "charts": parts,
+        "rules": asdict(RULES),
+        "curve_rules": asdict(CURVES),
+        "low": robot.lower,
+        "high": robot.upper,
+        "slides": ~maps.turning,
+        "include": f'#include "{name}_track.h"',
+    }
+    values["rows"] = template != "arm_track.c"
+    if values["rows"]:
+        values["branches"] = len(maps.stored.begins) if charts and n - task.m == 1 else 0
+    source = f"{name}_track.c" if template == "arm_track.c" else f"{name}.c"
+    return {f"{name}_track.h": render("arm_track.h", values), source: render(template, values)}

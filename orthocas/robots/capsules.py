@@ -1,0 +1,290 @@
+"""Capsules around the links of a robot: few for each, of little volume, that contain them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from orthocas.errors import InvalidValueError
+from orthocas.robots.collisions import Collisions, Part
+from orthocas.robots.shapes import CapsuleGeometry, CloudGeometry, Shape
+from orthocas.robots.spatial import rotate_z_to
+from orthocas.tools.checks import Array, Flags, require_kind
+from orthocas.tools.display import Shown, listed
+
+__all__ = ["FittedCapsules", "fit_capsules"]
+
+
+@dataclass(frozen=True, slots=True)
+class CapsuleRules:
+    """Numbers of fitted capsules."""
+
+    ratio: float = 1.55  #: volume of a link's capsules over that of its solids: with less, it is divided no more
+    most: int = 6  #: capsules of a link
+    places: tuple[float, ...] = (0.3, 0.5, 0.7)  #: of cuts, as fractions of the extent along a principal axis
+    steps: int = 300  #: of a search for the smallest capsule
+    converged: float = 1e-6  #: of its volume, relative
+    turned: float = 1e-5  #: [rad] and radii: smaller steps end it
+    first: float = 0.2  #: its first steps
+    room: float = 1e-9  #: [m] between a corner and the surface; rounding takes a thousandth of it
+    points: int = 20_000  #: by which volumes are measured
+    few: int = 2000  #: of them, to choose a cut
+    chunk: int = 1000  #: of these points, at once
+    seed: int = 0  #: of these points
+
+
+RULES = CapsuleRules()
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FittedCapsules(Shown):
+    """Capsules that contain the links of a robot; see `fit_capsules`."""
+
+    collisions: Collisions  #: the same pairs, with capsules as solids
+    ratios: Mapping[str, float]  #: volume of the capsules over that of the solids, by link
+    ratio: float  #: the same of all links together
+    pieces: tuple[tuple[str, Array, Part], ...]  #: links, corners (K, 3) of their pieces, and the capsules of these
+
+    def facts(self) -> dict[str, str]:
+        """How many there are, and how much larger than the links."""
+        worst = max(self.ratios, key=lambda name: self.ratios[name], default="")
+        return {
+            "capsules": f"{len(self.pieces)} around {len(self.ratios)} links",
+            "volume": f"{self.ratio:.3g} of that of the links, at most {self.ratios[worst]:.3g} ({worst})",
+            "links": listed(self.ratios),
+        }
+
+
+def fit_capsules(collisions: Collisions) -> FittedCapsules:
+    """Capsules around the solids of each link and object, for distances in C and for quick ones.
+
+    The convex hull of a link is cut by planes across its principal axes until the union of the capsules around all
+    pieces has at most 1.55 times the volume of the link, or there are six; each cut is the best of nine, of the piece
+    with the most to lose. A link of several solids that is not convex is cut into these first, if that is smaller.
+
+    Every corner of a piece lies within its capsule, by 1e-9 m or more. A capsule is convex, so it contains the piece;
+    the pieces of a hull are all of it. So distances of capsules are never larger than those of the hulls.
+
+    Args:
+        collisions: such as `robot.collisions`. Half-spaces of a scene stay what they are.
+
+    Raises:
+        InvalidValueError: for a point cloud.
+
+    Source:
+        ours: docs/how-to/collisions.md.
+    """
+    require_kind("collisions", collisions, Collisions)
+    solids: dict[str, list[Part]] = {}
+    for part in collisions.parts:
+        if isinstance(part.shape.geometry, CloudGeometry):
+            raise InvalidValueError(
+                "collisions", f"with the point cloud '{part.name}'", "solids that capsules can hold"
+            )
+        solids.setdefault(part.name, []).append(part)
+    kept, pieces, ratios, volumes = list[Part](), list[tuple[str, Array, Part]](), dict[str, float](), np.zeros(2)
+    for name, parts in solids.items():
+        if not parts[0].shape.bounded:
+            kept += parts
+            continue
+        volume = _measure_union([part.shape for part in parts])
+        # All of the link as one hull, or each of its solids for itself.
+        corners = [part.shape.list_corners() for part in parts]
+        rounding = max(radius for _, radius in corners)
+        found = _cover([np.concatenate([points for points, _ in corners])], rounding, volume)
+        if len(parts) > 1 and found[1] > RULES.ratio * volume:
+            found = min(found, _cover([points for points, _ in corners], rounding, volume), key=lambda cover: cover[1])
+        for hull, capsule in found[0]:
+            pieces.append((name, hull, Part(name, parts[0].body, capsule.shape)))
+        ratios[name] = found[1] / volume
+        volumes += [found[1], volume]
+    model = Collisions(
+        collisions.tree,
+        [*kept, *(part for _, _, part in pieces)],
+        collisions.pairs,
+        collisions.missing,
+        f"capsules around those {collisions.origin}",
+    )
+    return FittedCapsules(model, ratios, float(volumes[0] / volumes[1]) if volumes[1] else 1.0, tuple(pieces))
+
+
+@dataclass(frozen=True, eq=False)
+class Capsule:
+    """All points within a radius of a segment."""
+
+    start: Array  #: (3,) [m]
+    end: Array  #: (3,) [m]
+    radius: float  #: [m]
+
+    @property
+    def volume(self) -> float:
+        """[m^3]."""
+        return _measure_volume(self.radius, float(np.linalg.norm(self.end - self.start)))
+
+    @property
+    def shape(self) -> Shape:
+        """The capsule as a solid."""
+        length = float(np.linalg.norm(self.end - self.start))
+        rotation = rotate_z_to((self.end - self.start) / length) if length > 0 else np.eye(3)
+        return Shape(CapsuleGeometry(self.radius, length), rotation, (self.start + self.end) / 2)
+
+    def list_box(self) -> tuple[Array, Array]:
+        """Lowest and highest coordinates, (3,) each."""
+        return np.minimum(self.start, self.end) - self.radius, np.maximum(self.start, self.end) + self.radius
+
+    def contains(self, points: Array) -> Flags:
+        """Whether points (N, 3) belong to it, (N,)."""
+        return np.asarray(self.measure_rooms(points) >= 0)
+
+    def measure_rooms(self, points: Array) -> Array:
+        """Distances of points (N, 3) from the surface, (N,), positive inside."""
+        along = self.end - self.start
+        squared = float(along @ along)
+        s = np.clip((points - self.start) @ along / squared, 0.0, 1.0) if squared > 0 else np.zeros(len(points))
+        return np.asarray(self.radius - np.linalg.norm(points - self.start - s[:, None] * along, axis=1))
+
+
+def _cover(hulls: Sequence[Array], rounding: float, volume: float) -> tuple[list[tuple[Array, Capsule]], float]:
+    """Pieces of hulls with a capsule around each, and the volume of their union.
+
+    Args:
+        hulls: corners of each, (K, 3).
+        rounding: radius by which all of them are rounded.
+        volume: of what they hold [m^3].
+    """
+    found = []
+    for overlaps in (True, False):
+        pieces = [(hull, _fit_capsule(hull, rounding)) for hull in hulls]
+        whole = _measure_union([capsule for _, capsule in pieces])
+        while whole > RULES.ratio * volume and len(pieces) < RULES.most:
+            # The piece whose capsule has most to lose, and its best cut.
+            order = np.argsort([_measure_hull(hull) - capsule.volume for hull, capsule in pieces])
+            k, cuts = next(((int(k), cuts) for k in order if (cuts := _list_cuts(pieces[k][0]))), (0, []))
+            if not cuts:
+                break
+            others = [capsule for row, (_, capsule) in enumerate(pieces) if row != k]
+            parts = [[(side, _fit_capsule(side, rounding, quick=True)) for side in cut] for cut in cuts]
+            values = [
+                _measure_union([*others, *(capsule for _, capsule in cut)], RULES.few)
+                if overlaps
+                else sum(capsule.volume for _, capsule in cut)
+                for cut in parts
+            ]
+            pieces[k : k + 1] = parts[int(np.argmin(values))]
+            whole = _measure_union([capsule for _, capsule in pieces], RULES.few)
+        if len(pieces) > len(hulls):
+            pieces = [(hull, _fit_capsule(hull, rounding)) for hull, _ in pieces]
+            whole = _measure_union([capsule for _, capsule in pieces])
+        found.append((pieces, whole))
+        if whole <= RULES.ratio * volume:
+            break
+    return min(found, key=lambda cover: cover[1])
+
+
+def _fit_capsule(corners: Array, rounding: float, quick: bool = False) -> Capsule:
+    """A capsule of little volume around points (K, 3), each at least 1e-9 m within its surface."""
+    centre = corners.mean(axis=0)
+    axes = np.linalg.svd(corners - centre, full_matrices=False)[2] if len(corners) > 2 else np.eye(3)
+    if len(corners) == 2:
+        axes = (corners[1:] - corners[:1]) / max(float(np.linalg.norm(corners[1] - corners[0])), 1e-300)
+    best = min((_enclose(corners, axis) for axis in axes), key=lambda capsule: capsule.volume)
+    if not quick and len(corners) > 2:
+        found = _refine(corners, best)
+        best = found if found.volume < best.volume else best
+    wide = Capsule(best.start, best.end, best.radius + rounding + RULES.room)
+    short = float(wide.measure_rooms(corners).min()) - rounding - RULES.room / 2
+    return wide if short >= 0 else Capsule(wide.start, wide.end, wide.radius - short)
+
+
+def _enclose(corners: Array, axis: Array) -> Capsule:
+    """A capsule along an axis (3,): the line through the middle of the points, and the shortest segment on it."""
+    across = corners - np.outer(corners @ axis, axis)
+    middle = (across.min(axis=0) + across.max(axis=0)) / 2
+    return _shorten(corners, middle, axis, 0.0)
+
+
+def _shorten(corners: Array, place: Array, axis: Array, more: float) -> Capsule:
+    """The capsule about a line with the radius that its points need, and more, and the shortest segment on it."""
+    offsets = corners - place
+    along = offsets @ axis
+    away = np.linalg.norm(offsets - np.outer(along, axis), axis=1)
+    radius = float(away.max()) + more
+    depth = np.sqrt(np.maximum(radius**2 - away**2, 0.0))
+    low, high = float((along + depth).min()), float((along - depth).max())
+    low, high = (low, high) if low < high else ((low + high) / 2, (low + high) / 2)
+    return Capsule(place + low * axis, place + high * axis, radius)
+
+
+def _refine(corners: Array, start: Capsule) -> Capsule:
+    """The smallest capsule that a search from another one finds, over line and radius."""
+    middle, along = (start.start + start.end) / 2, start.end - start.start
+    length = float(np.linalg.norm(along))
+    axis = along / length if length > 0 else np.array([0.0, 0.0, 1.0])
+    side = np.linalg.svd(axis[None])[2][1:]
+    size = float(start.radius)
+
+    def build(x: Array) -> Capsule:
+        turned = axis + x[0] * side[0] + x[1] * side[1]
+        place = middle + size * (x[2] * side[0] + x[3] * side[1])
+        return _shorten(corners, place, turned / np.linalg.norm(turned), size * x[4] ** 2)
+
+    simplex = np.vstack([np.zeros(5), 0.2 * np.eye(5)])
+    options = {
+        "maxiter": RULES.steps,
+        "fatol": RULES.converged * start.volume,
+        "xatol": 1e-5,
+        "initial_simplex": simplex,
+    }
+    found = scipy.optimize.minimize(lambda x: build(x).volume, np.zeros(5), method="Nelder-Mead", options=options)
+    return build(found.x)
+
+
+def _list_cuts(corners: Array) -> list[list[Array]]:
+    """Pairs of corners of the two pieces into which planes across the principal axes cut a hull."""
+    if len(corners) < 4:
+        return []
+    try:
+        hull = scipy.spatial.ConvexHull(corners)
+    except scipy.spatial.QhullError:
+        return []
+    edges = np.concatenate([hull.simplices[:, pair] for pair in ([0, 1], [1, 2], [0, 2])])
+    edges = np.unique(np.sort(edges, axis=1), axis=0)
+    cuts = []
+    for axis in np.linalg.svd(corners[hull.vertices] - corners[hull.vertices].mean(axis=0), full_matrices=False)[2]:
+        along = corners @ axis
+        low, high = float(along.min()), float(along.max())
+        for fraction in RULES.places:
+            level = low + fraction * (high - low)
+            a, b = edges.T
+            crossed = (along[a] - level) * (along[b] - level) < 0
+            a, b = a[crossed], b[crossed]
+            s = ((level - along[a]) / (along[b] - along[a]))[:, None]
+            seam = corners[a] + s * (corners[b] - corners[a])
+            sides = [corners[along <= level], corners[along >= level]]
+            if min(map(len, sides)) and len(seam) > 2:
+                cuts.append([np.concatenate([side, seam]) for side in sides])
+    return cuts
+
+
+def _measure_volume(radius: float, length: float) -> float:
+    return float(np.pi * radius**2 * (length + 4 / 3 * radius))
+
+
+def _measure_hull(corners: Array) -> float:
+    return float(scipy.spatial.ConvexHull(corners, qhull_options="QJ").volume) if len(corners) > 3 else 0.0
+
+
+def _measure_union(solids: Sequence[Shape | Capsule], count: int = RULES.points) -> float:
+    """The volume of a union, by seeded points in a box around each solid, weighed by how many solids hold them."""
+    rng, total = np.random.default_rng(RULES.seed), 0.0
+    for solid in solids:
+        low, high = solid.list_box()
+        points = rng.uniform(low, high, (count, 3))
+        pieces = [points[first : first + RULES.chunk] for first in range(0, len(points), RULES.chunk)]
+        held = [np.concatenate([other.contains(piece) for piece in pieces]) for other in (solid, *solids)]
+        share = float((held[0] / np.maximum(np.sum(held[1:], axis=0), 1)).mean())
+        total += share * float(np.prod(high - low))
+    return total
