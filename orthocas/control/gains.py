@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,8 +27,9 @@ from orthocas.tools.checks import (
 )
 from orthocas.tools.display import Shown, number_list, percent
 
-STIFFNESS, DAMPING_RATIO, FEEDBACK, LIMIT = (  #: units of gains, in words
+STIFFNESS, FASTEST, DAMPING_RATIO, FEEDBACK, LIMIT = (  #: units of gains, in words
     "J per squared unit of the quantity, > 0",
+    "frequency that no mode of the loop exceeds [rad/s], > 0",
     ">= 0, 1 is critical damping",
     "1/s, >= 0",
     "largest command per joint, > 0; INFINITY for no limit",
@@ -39,6 +41,8 @@ class GainRules:
     """Numbers of gains. What the default stiffness holds: docs/measurements/control.md."""
 
     frequency: float = 12 * np.pi  #: of the springs, 6 Hz [rad/s]
+    tracking: float = 16 * np.pi  #: fastest mode of tracking laws, 8 Hz: stable with a delay of 14 ms [rad/s]
+    stiff: float = 6.0  #: their springs, in that frequency: modes of heavy directions come near it
     fastest: float = 36 * np.pi  #: mode, 18 Hz: stable with a delay of 6.5 ms at a damping ratio of 0.7 [rad/s]
     feedback: float = 10.0  #: of velocity laws: 0.23 s to a tenth; no overshoot with up to 36 ms to the motion [1/s]
     margin: float = np.pi / 6  #: 30 degrees of phase that are left to the fastest mode at a stated delay [rad]
@@ -50,6 +54,48 @@ class GainRules:
 
 
 RULES = GainRules()
+
+
+def tracking_gains(chart: Chart, delay: float = 0.0, damping_ratio: ArrayLike = 0.7) -> tuple[Array, float]:
+    """Stiffness of [x; xi], (n,), and the fastest mode omega [rad/s], with which every mode settles in the domain.
+
+    No constant K does this on a wide chart: wrists turn from light to heavy directions, so if no mode may be fast, some
+    are slow. Each spring K is therefore in series with one of omega^2 M_phi (`limit_stiffness`), and its squared
+    frequency s becomes lambda = omega^2 s / (omega^2 + s) <= omega^2. K is then large: `matched_stiffness` at 6 omega.
+    Light directions have the frequency omega, heavy ones nearly so, and where coordinates fold (M_phi grows) the
+    stiffness stays below K. With a delay T, omega <= omega_T leaves 30 deg of phase, see `matched_stiffness`.
+    """
+    omega = min(RULES.tracking, find_fastest_frequency(delay, damping_ratio, chart))
+    return matched_stiffness(chart, RULES.stiff * omega, np.inf), omega
+
+
+def limit_stiffness(mobility: Array, stiffness: Array, fastest: float, blocks: Sequence[int]) -> Array:
+    """K(q) = (K^-1 + M_phi^-1 / omega^2)^-1 of each block of coordinates, (N, n, n), for M_phi^-1 (N, n, n), K (n,)."""
+    result = np.zeros_like(mobility)
+    for part in np.split(np.arange(len(stiffness)), np.cumsum(blocks)[:-1]):
+        place = np.ix_(np.arange(len(mobility)), part, part)
+        result[place] = np.linalg.inv(np.diag(1 / stiffness[part]) + mobility[place] / fastest**2)
+    return result
+
+
+def find_fastest_frequency(delay: float, damping_ratio: ArrayLike, chart: Chart) -> float:
+    """omega_T [rad/s]: the fastest mode that keeps 30 deg of phase with a delay T >= 0 [s]; infinite without one.
+
+    Raises:
+        InvalidValueError: for other delays, and a damping ratio that leaves less than 30 deg without any delay.
+    """
+    if not 0 <= as_number("delay", delay) < np.inf:
+        raise InvalidValueError("delay", delay, "a finite number >= 0")
+    if not delay:
+        return float(np.inf)
+    # At the crossing a omega, the phase of (2 zeta omega s + omega^2) exp(-s T) / s^2 is atan(2 zeta a) - a omega T.
+    ratio = float(positive_gains("damping_ratio", damping_ratio, chart.n).min())
+    crossing = np.sqrt(2 * ratio**2 + np.sqrt(4 * ratio**4 + 1))
+    phase = np.arctan(2 * ratio * crossing) - RULES.margin
+    if phase <= 0:
+        need = "a larger one: this leaves less than 30 deg without a delay"
+        raise InvalidValueError("damping_ratio", ratio, need)
+    return float(phase / (crossing * delay))
 
 
 def matched_stiffness(
@@ -92,18 +138,7 @@ def matched_stiffness(
     # Grown charts raise here.
     chart.function("xi")
     require_mass(chart.problem.robot, "gains by modes")
-    if not 0 <= as_number("delay", delay) < np.inf:
-        raise InvalidValueError("delay", delay, "a finite number >= 0")
-    bound = as_number("fastest", fastest)
-    if delay:
-        # The fastest mode that has the phase margin at this delay.
-        ratio = float(positive_gains("damping_ratio", damping_ratio, chart.n).min())
-        crossing = np.sqrt(2 * ratio**2 + np.sqrt(4 * ratio**4 + 1))
-        phase = np.arctan(2 * ratio * crossing) - RULES.margin
-        if phase <= 0:
-            need = "a larger one: this leaves less than 30 deg without a delay"
-            raise InvalidValueError("damping_ratio", ratio, need)
-        bound = min(bound, float(phase / (crossing * delay)))
+    bound = min(as_number("fastest", fastest), find_fastest_frequency(delay, damping_ratio, chart))
     points = sample_uniform(chart.problem.domain, RULES.samples, RULES.seed)
     mobilities = compute_mobility(chart, points, chart.problem.robot)
     return _match(mobilities, frequency, bound) if not delay else _match_everywhere(chart, mobilities, frequency, bound)
@@ -199,14 +234,14 @@ class Modes(Shown):
 
 
 def compute_modes(mobility: Array, stiffness: Array, damping: Array) -> Modes:
-    """Modes for M_phi^-1 (N, n, n), the diagonal of K (n,), and D (N, n, n).
+    """Modes for M_phi^-1 (N, n, n), K (N, n, n), and D (N, n, n).
 
     With S = M_phi^-1/2 and the unit eigenvectors u_i of S K S, v_i = S u_i.
     """
     # The root S of M_phi^-1.
     values, vectors = np.linalg.eigh(mobility)
     half = (vectors * np.sqrt(values.clip(0))[:, None, :]) @ vectors.transpose(0, 2, 1)
-    squares, shapes = np.linalg.eigh((half * stiffness) @ half)
+    squares, shapes = np.linalg.eigh(half @ stiffness @ half)
     omega = np.sqrt(squares.clip(0))
     # 2 zeta omega of each mode [1/s].
     rates = np.einsum("kij,kij->kj", shapes, half @ damping @ half @ shapes)

@@ -167,3 +167,31 @@ def apply_damping(
     root_K = ca.sqrt(stiff)
     scale = ca.repmat(root_K * ca.sqrt(damping_ratio), 1, c)
     return 2 * scale * multiply_by_root(inertia / (root_K @ root_K.T), scale * velocities)
+
+
+def apply_limited_springs(
+    inertia: Expression,
+    stiffness: Expression,
+    damping_ratio: Expression,
+    fastest: Expression,
+    errors: Expression,
+    velocities: Expression,
+) -> tuple[Expression, Expression]:
+    """K(q) E and D V, for an inertia (k, k), the diagonals of K and Z, (k, 1), omega (1, 1), E (k, c) and V (k, d).
+
+    K(q) = (K^-1 + M^-1 / omega^2)^-1 is the spring K in series with omega^2 M, so its modes are not faster than omega.
+    With A = K^-1/2 M K^-1/2 and N = (I + omega^2 A)^-1, K(q) = K^1/2 (I - N) K^1/2, and the geometric mean of both
+    is omega K^1/2 A N^1/2 K^1/2: A and N commute. So D = 2 omega Z^1/2 K^1/2 A N^1/2 K^1/2 Z^1/2 gives every mode the
+    damping ratio z if all have the same, and is always positive semi-definite.
+
+    Source:
+        ours, docs/explanation/derivations_control.md#springs-that-no-mode-is-too-fast-for
+    """
+    k, c, d = inertia.shape[0], errors.shape[1], velocities.shape[1]
+    root = ca.sqrt(stiffness)
+    A = inertia / (root @ root.T)
+    N = invert_spd(ca.DM.eye(k) + fastest**2 * A)[0]
+    stretched = ca.repmat(root, 1, c) * errors
+    scale = ca.repmat(root * ca.sqrt(damping_ratio), 1, d)
+    rooted = multiply_by_root(N, ca.repmat(root, 1, d) * (ca.repmat(ca.sqrt(damping_ratio), 1, d) * velocities))
+    return ca.repmat(root, 1, c) * (stretched - N @ stretched), 2 * fastest * scale * (A @ rooted)

@@ -1,4 +1,4 @@
-"""Laws with a state: what a law remembers from tick to tick, and the two memories that come with orthocas."""
+"""Laws with a state: what a law remembers from tick to tick, and the memories that come with orthocas."""
 
 from __future__ import annotations
 
@@ -49,6 +49,13 @@ class MemoryRules:
     fraction: float = 0.5  #: of the law's limit that a correction may use, by default
     gravity: float = 9.81  #: to compare moments with torques [m/s^2]
     crossed: float = 0.5  #: weight of the error in J^-1 (de + weight e), in the decay rate of the slowest mode
+    #: error at which a friction observer stops: half of what it may leave, 0.5 mm, 0.01 rad and 0.02 of xi
+    metres: float = 2.5e-4
+    others: float = 5e-3
+    extra: float = 1e-2
+    breaking: float = 60.0  #: torque that joints which stick get, per torque of the law and time [1/s]
+    sticking: float = 5e-3  #: speed below which a joint may stick [rad/s] or [m/s]
+    travel: float = 0.01  #: way on which a joint that broke away forgets that torque [rad] or [m]
 
 
 RULES = MemoryRules()
@@ -346,8 +353,83 @@ class Adaptation(_Correcting):
         return RULES.crossed * float(decays[decays > 0].min())
 
 
-MEMORIES: Mapping[str, type[MomentumObserver] | type[Adaptation]] = {
-    kind.name: kind for kind in (MomentumObserver, Adaptation)
+@dataclass(frozen=True)
+class FrictionObserver(_Correcting):
+    """Finds what the model does not explain, also in joints that stick, and stops where the error is small enough.
+
+    A momentum observer r alone hunts: friction changes its sign with the motion, and what was found while a joint moved
+    pushes it on where it stands. Here the law gets the `extra_torque` b - r, and both stand still inside a tolerance:
+
+        s = min(1, max(0, max_k |e_k| / tolerance_k - 1)),
+        dr/dt = s rate (the torque that momentum shows beyond command, C^T dq - g, r and -b),
+        db/dt = s 60/s exp(-(dq / 5 mrad/s)^2) (the law's own torque) - b |dq| / 10 mrad, joint by joint.
+
+    b is what breaks a joint away: it grows where the law pulls and nothing moves, whatever the joint's inertia, and is
+    forgotten as soon as it moves, so that its own friction stops it. Slow r bears wrong masses: with rate = alpha
+    omega, a joint whose true inertia is kappa times that of the model is stable up to kappa = (2 zeta + alpha)
+    (1 + 2 zeta alpha) / alpha (docs/explanation/derivations_control.md#observers).
+
+    Args:
+        rate: > 0 [1/s].
+        bound: largest r and b of each joint, > 0, (n,) or one number [N m] or [N]; default half of the law's limit.
+        tolerance: errors of phi at which it stops, > 0, (n,) or one number; up to twice that may be left. Default
+            0.25 mm, 5 mrad, and 0.01 of each xi.
+
+    Example:
+        >>> import orthocas as oc
+        >>> chart = oc.charts.load("panda-wide")
+        >>> law = oc.control.PDPlus(chart, remembers=oc.control.FrictionObserver())
+        >>> list(law.memory.start)
+        ['expected', 'drive', 'breakaway', 'correction']
+    """
+
+    tolerance: ArrayLike | None = None
+
+    name: ClassVar[str] = "friction"
+
+    def of(self, law: _OperationalSpace) -> Memory:
+        """The memory of a law: expected momentum, its rate, b, and the correction b - r.
+
+        Raises:
+            ShapeError, InvalidValueError: for a bound or tolerance of another shape or value, none for a law without a
+                limit, and laws whose model is given.
+        """
+        n, model = law.problem.n, law.model
+        bound, tolerance = _check_bound(self.bound, law), self._compute_tolerance(law)
+        fields = {name: np.zeros(n) for name in ("expected", "drive", "breakaway", "correction")}
+        inputs = _name_inputs(law, fields)
+        q, dq, period, b = (inputs[name] for name in ("q", "dq", "period", "breakaway"))
+        payload = [inputs["payload"]] if "payload" in inputs else []
+        p, rate = _build_momentum(law.problem.robot.tree, bool(payload), model.gravity == "law")(q, dq, *payload)
+
+        # How far the error is beyond the tolerance, while the law commands and no limit cuts it.
+        error = law._compute_errors(inputs)[0]
+        beyond = ca.fmin(ca.fmax(ca.mmax(ca.fabs(error) / ca.DM(tolerance)) - 1, 0), 1)
+        gate = ca.if_else(inputs["active"] > 0, inputs["active"] * beyond, 0)
+
+        # r, and the momentum that the last tick foresaw; none after a start.
+        foreseen = inputs["expected"] + period * inputs["drive"]
+        surprise = ca.if_else(ca.logic_and(period > 0, ca.fabs(foreseen) <= LARGEST), p - foreseen, 0)
+        r = _clip(b - inputs["correction"] + gate * self.rate * surprise, bound)
+
+        # b, from the law's own torque: at rest, what the command has beyond gravity and the correction.
+        explained = inputs["command"] - model.feed_forward(law.problem.robot, inputs) + rate
+        growth = period * RULES.breaking * gate * ca.exp(-((dq / RULES.sticking) ** 2))
+        grown = b + growth * (explained - inputs["correction"])
+        b = _clip(grown * ca.exp(-ca.fabs(dq) * period / RULES.travel), bound)
+        values = {"expected": p, "drive": explained + r - b, "breakaway": b, "correction": b - r}
+        return _build_memory(fields, inputs, {name: _replace_invalid(value) for name, value in values.items()})
+
+    def _compute_tolerance(self, law: _OperationalSpace) -> Array:
+        """Tolerances of phi (n,)."""
+        if self.tolerance is not None:
+            return positive_gains("tolerance", self.tolerance, law.problem.n)
+        task = [RULES.metres if unit == "m" else RULES.others for unit in law.problem.task.units]
+        return np.array([*task, *[RULES.extra] * law.problem.r])
+
+
+MEMORIES: Mapping[str, type[MomentumObserver] | type[Adaptation] | type[FrictionObserver]] = {
+    kind.name: kind for kind in (MomentumObserver, Adaptation, FrictionObserver)
 }
 
 
