@@ -41,9 +41,12 @@ class GainRules:
     """Numbers of gains. What the default stiffness holds: docs/measurements/control.md."""
 
     frequency: float = 12 * np.pi  #: of the springs, 6 Hz [rad/s]
+    fastest: float = 36 * np.pi  #: mode, 18 Hz: stable with a delay of 6.5 ms at a damping ratio of 0.7 [rad/s]
     tracking: float = 16 * np.pi  #: fastest mode of tracking laws, 8 Hz: stable with a delay of 14 ms [rad/s]
     stiff: float = 6.0  #: their springs, in that frequency: modes of heavy directions come near it
-    fastest: float = 36 * np.pi  #: mode, 18 Hz: stable with a delay of 6.5 ms at a damping ratio of 0.7 [rad/s]
+    torque_rate: float = 1000.0  #: of motors, 1 N m in a millisecond, as on many arms [N m/s] or [N/s]
+    taken_over: float = 0.5  #: or the speed limit: speed of a joint that a law takes over [rad/s] or [m/s]
+    late: float = 4.0  #: rate that the springs of such a joint may ask for, in torque_rate; with 10, an arm is lost
     feedback: float = 10.0  #: of velocity laws: 0.23 s to a tenth; no overshoot with up to 36 ms to the motion [1/s]
     margin: float = np.pi / 6  #: 30 degrees of phase that are left to the fastest mode at a stated delay [rad]
     samples: int = 512  #: of the domain
@@ -63,9 +66,18 @@ def tracking_gains(chart: Chart, delay: float = 0.0, damping_ratio: ArrayLike = 
     are slow. Each spring K is therefore in series with one of omega^2 M_phi (`limit_stiffness`), and its squared
     frequency s becomes lambda = omega^2 s / (omega^2 + s) <= omega^2. K is then large: `matched_stiffness` at 6 omega.
     Light directions have the frequency omega, heavy ones nearly so, and where coordinates fold (M_phi grows) the
-    stiffness stays below K. With a delay T, omega <= omega_T leaves 30 deg of phase, see `matched_stiffness`.
+    stiffness stays below K.
+
+    omega is 8 Hz, or less where motors could not follow: a joint of the speed v = 0.5 rad/s (or its speed limit, if
+    that is less) changes the torque of a spring of omega^2 M_ii by v omega^2 M_ii, at most 4 N m in a millisecond
+    anywhere in the domain. With a delay T, omega <= omega_T leaves 30 deg of phase, see `matched_stiffness`.
     """
-    omega = min(RULES.tracking, find_fastest_frequency(delay, damping_ratio, chart))
+    require_mass(chart.problem.robot, "gains by modes")
+    robot, points = chart.problem.robot, sample_uniform(chart.problem.domain, RULES.samples, RULES.seed)
+    heaviest = np.diagonal(robot.mass_matrix(points), axis1=1, axis2=2).max(axis=0)
+    rates = heaviest * np.minimum(RULES.taken_over, robot.velocity_limits)
+    followed = float(np.sqrt(RULES.late * RULES.torque_rate / rates.max()))
+    omega = min(RULES.tracking, followed, find_fastest_frequency(delay, damping_ratio, chart))
     return matched_stiffness(chart, RULES.stiff * omega, np.inf), omega
 
 
