@@ -155,6 +155,7 @@ def _build_law(law: Impedance | PDPlus) -> Form:
         "stiffness": law.stiffness,
         "damping_stiffness": stiffness,
         "damping_ratio": law.damping_ratio,
+        "compliance": law.compliance,
         "limit": law.limit,
     }
     tables = {name: value[:, None] for name, value in columns.items()}

@@ -27,9 +27,10 @@ from orthocas.tools.checks import (
 )
 from orthocas.tools.display import Shown, number_list, percent
 
-STIFFNESS, FASTEST, DAMPING_RATIO, FEEDBACK, LIMIT = (  #: units of gains, in words
+STIFFNESS, FASTEST, COMPLIANCE, DAMPING_RATIO, FEEDBACK, LIMIT = (  #: units of gains, in words
     "J per squared unit of the quantity, > 0",
     "frequency that no mode of the loop exceeds [rad/s], > 0",
+    "of each joint, in series with the springs [rad/(N m)], >= 0",
     ">= 0, 1 is critical damping",
     "1/s, >= 0",
     "largest command per joint, > 0; INFINITY for no limit",
@@ -42,8 +43,7 @@ class GainRules:
 
     frequency: float = 12 * np.pi  #: of the springs, 6 Hz [rad/s]
     fastest: float = 36 * np.pi  #: mode, 18 Hz: stable with a delay of 6.5 ms at a damping ratio of 0.7 [rad/s]
-    tracking: float = 16 * np.pi  #: fastest mode of tracking laws, 8 Hz: stable with a delay of 14 ms [rad/s]
-    stiff: float = 6.0  #: their springs, in that frequency: modes of heavy directions come near it
+    stiff: float = 2.0  #: springs of tracking laws, in their fastest frequency: modes of heavy directions come near it
     torque_rate: float = 1000.0  #: of motors, 1 N m in a millisecond, as on many arms [N m/s] or [N/s]
     taken_over: float = 0.5  #: or the speed limit: speed of a joint that a law takes over [rad/s] or [m/s]
     late: float = 4.0  #: rate that the springs of such a joint may ask for, in torque_rate; with 10, an arm is lost
@@ -59,34 +59,36 @@ class GainRules:
 RULES = GainRules()
 
 
-def tracking_gains(chart: Chart, delay: float = 0.0, damping_ratio: ArrayLike = 0.7) -> tuple[Array, float]:
-    """Stiffness of [x; xi], (n,), and the fastest mode omega [rad/s], with which every mode settles in the domain.
+def tracking_gains(chart: Chart, delay: float = 0.0, damping_ratio: ArrayLike = 0.7) -> tuple[Array, float, Array]:
+    """Stiffness of [x; xi], (n,), fastest mode omega [rad/s], and joint compliances (n,), with which all modes settle.
 
     No constant K does this on a wide chart: wrists turn from light to heavy directions, so if no mode may be fast, some
     are slow. Each spring K is therefore in series with one of omega^2 M_phi (`limit_stiffness`), and its squared
-    frequency s becomes lambda = omega^2 s / (omega^2 + s) <= omega^2. K is then large: `matched_stiffness` at 6 omega.
-    Light directions have the frequency omega, heavy ones nearly so, and where coordinates fold (M_phi grows) the
-    stiffness stays below K.
+    frequency s becomes s omega^2 / (omega^2 + s) <= omega^2. omega is 18 Hz, and K that of `matched_stiffness` at
+    2 omega without a bound. Light directions come near omega, and where coordinates fold (M_phi grows) the stiffness
+    stays below K.
 
-    omega is 8 Hz, or less where motors could not follow: a joint of the speed v = 0.5 rad/s (or its speed limit, if
-    that is less) changes the torque of a spring of omega^2 M_ii by v omega^2 M_ii, at most 4 N m in a millisecond
-    anywhere in the domain. With a delay T, omega <= omega_T leaves 30 deg of phase, see `matched_stiffness`.
+    Heavy joints are softer, because motors could not follow: a joint that moves at v = 0.5 rad/s (or its speed limit,
+    if that is less) changes the torque of a spring k by k v. It is at most 4 N m in a millisecond, so joints have the
+    compliance v / (4000 N m/s) in series. With a delay T, omega <= omega_T leaves 30 deg of phase, see
+    `matched_stiffness`.
     """
-    require_mass(chart.problem.robot, "gains by modes")
-    robot, points = chart.problem.robot, sample_uniform(chart.problem.domain, RULES.samples, RULES.seed)
-    heaviest = np.diagonal(robot.mass_matrix(points), axis1=1, axis2=2).max(axis=0)
-    rates = heaviest * np.minimum(RULES.taken_over, robot.velocity_limits)
-    followed = float(np.sqrt(RULES.late * RULES.torque_rate / rates.max()))
-    omega = min(RULES.tracking, followed, find_fastest_frequency(delay, damping_ratio, chart))
-    return matched_stiffness(chart, RULES.stiff * omega, np.inf), omega
+    omega = min(RULES.fastest, find_fastest_frequency(delay, damping_ratio, chart))
+    speeds = np.minimum(RULES.taken_over, chart.problem.robot.velocity_limits)
+    return matched_stiffness(chart, RULES.stiff * omega, np.inf), omega, speeds / (RULES.late * RULES.torque_rate)
 
 
-def limit_stiffness(mobility: Array, stiffness: Array, fastest: float, blocks: Sequence[int]) -> Array:
-    """K(q) = (K^-1 + M_phi^-1 / omega^2)^-1 of each block of coordinates, (N, n, n), for M_phi^-1 (N, n, n), K (n,)."""
-    result = np.zeros_like(mobility)
+def limit_stiffness(
+    mobility: Array, J: Array, stiffness: Array, fastest: float, compliance: Array, blocks: Sequence[int]
+) -> Array:
+    """K(q) = (K^-1 + M_phi^-1 / omega^2 + J diag(c) J^T)^-1 of each block of coordinates, (N, n, n).
+
+    For M_phi^-1 and J (N, n, n), and K, c (n,).
+    """
+    result, added = np.zeros_like(mobility), mobility / fastest**2 + (J * compliance) @ J.transpose(0, 2, 1)
     for part in np.split(np.arange(len(stiffness)), np.cumsum(blocks)[:-1]):
         place = np.ix_(np.arange(len(mobility)), part, part)
-        result[place] = np.linalg.inv(np.diag(1 / stiffness[part]) + mobility[place] / fastest**2)
+        result[place] = np.linalg.inv(np.diag(1 / stiffness[part]) + added[place])
     return result
 
 

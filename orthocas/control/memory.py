@@ -369,7 +369,7 @@ class FrictionObserver(_Correcting):
 
     b breaks joints away: it grows where a joint is off and stands, and is forgotten as soon as it moves, so that its
     own friction stops it. Joints that are off by little, s_i = 0, are left alone. k_i is M_ii times the squared
-    frequency of the law's fastest mode, or twice the joint's limit, if that is more: light joints are not slower.
+    frequency of the law's fastest mode in series with the compliance of the joint, or twice the joint's limit, if that is more: light joints are not slower.
 
     Between ticks nothing stops a joint: where friction falls by b / 4, it moves on by b / 4 (3 period)^2 / (2 M_ii), and
     no law resolves less. tolerance_k is at least what that moves phi_k: nothing for arms with rotors, but 20 mrad for a
@@ -427,7 +427,8 @@ class FrictionObserver(_Correcting):
         r = _clip(b - inputs["correction"] + gate * self.rate * surprise, bound)
 
         # b grows where a joint stands and is off, and is forgotten on its way.
-        firmness = ca.fmax(inertia * self._compute_fastest(law) ** 2, RULES.firm * ca.DM(np.fmin(law.limit, LARGEST)))
+        firmness = 1 / (1 / (inertia * self._compute_fastest(law) ** 2) + ca.DM(law.compliance))
+        firmness = ca.fmax(firmness, RULES.firm * ca.DM(np.fmin(law.limit, LARGEST)))
         growth = period * RULES.breaking * gate * ca.exp(-((dq / RULES.sticking) ** 2))
         grown = b - growth * _clip(firmness * off, bound)
         b = _clip(grown * ca.exp(-ca.fabs(dq) * period / RULES.travel), bound)

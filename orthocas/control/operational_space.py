@@ -27,6 +27,7 @@ from orthocas.control.controller import (
     named_inputs,
 )
 from orthocas.control.gains import (
+    COMPLIANCE,
     DAMPING_RATIO,
     FASTEST,
     LIMIT,
@@ -105,8 +106,11 @@ class _OperationalSpace(LawOfChart):
             without a spring, K_i = 0, is free, but does not swing. Default: damping follows the stiffness.
         model: where the law gets the robot's model from, and its additional inputs. Default: the model of the problem.
         fastest: frequency omega > 0 that no mode exceeds [rad/s]: K is then in series with omega^2 M_phi(q),
-            K(q) = (K^-1 + M_phi^-1 / omega^2)^-1, and the damping is designed for K(q). For `double_diagonal`, without
-            `damping_stiffness`. Default, and infinity: K itself, but 8 Hz for PD+ without a stiffness.
+            K(q) = (K^-1 + M_phi^-1 / omega^2 + J diag(c) J^T)^-1, and the damping is designed for K(q). For
+            `double_diagonal`, without `damping_stiffness`. Default, and infinity: K itself, but 18 Hz for PD+ without a
+            stiffness.
+        compliance: c >= 0 of each joint, in series with the springs, (n,) or one number [rad/(N m)]; used with a finite
+            `fastest`. Default: 0, but that of `tracking_gains` for PD+ without a stiffness.
         remembers: integral action against a wrong model: `FrictionObserver()`, `MomentumObserver()`, `Adaptation()`.
             It needs the input `extra_torque`, which it adds to `model`, and ticks: a `control_rate` in simulations, the
             supervised law in C, `Remembering` in programs of your own. Default: none.
@@ -124,6 +128,7 @@ class _OperationalSpace(LawOfChart):
     limit: Array
     damping_stiffness: Array | None
     fastest: float
+    compliance: Array
     model: RunTimeModel
     remembers: Remembers | None
 
@@ -133,9 +138,10 @@ class _OperationalSpace(LawOfChart):
     command: ClassVar[Command] = "torque"
     options: ClassVar[Mapping[str, Setting]] = {
         "stiffness": Setting(
-            '"100", or "100,50,..." per quantity; default: modes up to 8 Hz (PD+), around 6 Hz (impedance).'
+            '"100", or "100,50,..." per quantity; default: modes up to 18 Hz (PD+), around 6 Hz (impedance).'
         ),
         "fastest": Setting("Frequency that no mode exceeds [rad/s]; default: none with a given stiffness."),
+        "compliance": Setting("Of each joint, in series with the springs [rad/(N m)], with --fastest; default: none."),
         "delay": Setting("Delay from measurement to torque that the default stiffness is to bear [s]; default: 0."),
         "damping_ratio": Setting('"0.7", or "0.7,1,..." per quantity; default: 0.7.'),
         "coupling": Setting("coupled (default) or decoupled.", is_word=True),
@@ -172,6 +178,7 @@ class _OperationalSpace(LawOfChart):
         remembers: Remembers | None = None,
         *,
         fastest: float | None = None,
+        compliance: ArrayLike | None = None,
         delay: float = 0.0,
     ) -> None:
         require_known("coupling", coupling, get_args(Coupling))
@@ -192,8 +199,9 @@ class _OperationalSpace(LawOfChart):
         if damping_stiffness is not None:
             damping_stiffness = positive_gains("damping_stiffness", damping_stiffness, n)
         model.gains(chart.problem, self.feed_forward)
-        stiffness, fastest = self._choose_springs(
-            chart, stiffness, fastest, delay, damping_ratio, damping, as_stiffness
+        can_limit = as_stiffness and damping == "double_diagonal"
+        stiffness, fastest, compliance = self._choose_springs(
+            chart, stiffness, fastest, compliance, delay, damping_ratio, can_limit
         )
         for name, value in {
             "chart": chart,
@@ -204,6 +212,7 @@ class _OperationalSpace(LawOfChart):
             "coupling": coupling,
             "damping": damping,
             "fastest": fastest,
+            "compliance": non_negative_gains("compliance", compliance, n),
             "limit": command_limit("limit", limit, chart.problem.robot.effort_limits),
             "remembers": remembers,
         }.items():
@@ -224,16 +233,15 @@ class _OperationalSpace(LawOfChart):
         chart: Chart,
         stiffness: ArrayLike | None,
         fastest: float | None,
+        compliance: ArrayLike | None,
         delay: float,
         damping_ratio: ArrayLike,
-        damping: DampingDesign,
-        as_stiffness: bool,
-    ) -> tuple[ArrayLike, float]:
-        """The stiffness, and the frequency that no mode exceeds: what was given, or the default."""
-        can_limit = as_stiffness and damping == "double_diagonal"
+        can_limit: bool,
+    ) -> tuple[ArrayLike, float, ArrayLike]:
+        """Stiffness, the frequency that no mode exceeds, and compliance: what was given, or the default."""
         if stiffness is not None and delay:
             raise InvalidValueError("delay", delay, "none with a given stiffness")
-        if stiffness is None and fastest is None and cls.feed_forward and can_limit:
+        if stiffness is None and fastest is None and compliance is None and cls.feed_forward and can_limit:
             return tracking_gains(chart, delay, damping_ratio)
         if stiffness is None:
             stiffness = matched_stiffness(chart, delay=delay, damping_ratio=damping_ratio)
@@ -242,7 +250,9 @@ class _OperationalSpace(LawOfChart):
             raise InvalidValueError("fastest", fastest, "a number > 0 or infinity")
         if np.isfinite(omega) and not can_limit:
             raise InvalidValueError("fastest", fastest, "infinity with damping_stiffness and with square_root damping")
-        return stiffness, omega
+        if compliance is not None and not np.isfinite(omega):
+            raise InvalidValueError("compliance", compliance, "none without a finite `fastest`")
+        return stiffness, omega, 0.0 if compliance is None else compliance
 
     @classmethod
     def on_chart(
@@ -260,6 +270,7 @@ class _OperationalSpace(LawOfChart):
         inputs: str = "",
         memory: Literal["none", "momentum", "adaptive", "friction"] = "none",
         fastest: float | None = None,
+        compliance: ArrayLike | None = None,
         delay: float = 0.0,
     ) -> Self:
         """Build the law on a chart from numbers and words; other settings are those of the law itself.
@@ -280,7 +291,7 @@ class _OperationalSpace(LawOfChart):
             require_known("input", name, zeros)
         run_time = RunTimeModel(model, gravity, **{name: zeros[name] for name in names})
         settings = (stiffness, damping_ratio, coupling, damping, limit, damping_stiffness, run_time, remembers)
-        return cls(chart, *settings, fastest=fastest, delay=delay)
+        return cls(chart, *settings, fastest=fastest, compliance=compliance, delay=delay)
 
     @cached_property
     def memory(self) -> Memory | None:
@@ -309,8 +320,8 @@ class _OperationalSpace(LawOfChart):
     def gain_units(self) -> Mapping[str, str]:
         """Units and admissible values of the gains, in words, by name."""
         design = {"damping_stiffness": "like stiffness, > 0; damping is designed for it"}
-        springs = {"stiffness": STIFFNESS, "fastest": FASTEST, "damping_ratio": DAMPING_RATIO, "limit": LIMIT}
-        return {**springs, **design, **UNITS}
+        springs = {"stiffness": STIFFNESS, "fastest": FASTEST, "compliance": COMPLIANCE}
+        return {**springs, "damping_ratio": DAMPING_RATIO, "limit": LIMIT, **design, **UNITS}
 
     def remarks(self) -> list[str]:
         """Warnings.
@@ -349,8 +360,8 @@ class _OperationalSpace(LawOfChart):
 
     @property
     def gains(self) -> dict[str, Array]:
-        """Stiffness, the fastest mode if it is finite, damping ratio and limit, then the inputs that were asked for."""
-        springs = {"fastest": np.array([self.fastest])} if self.is_limited else {}
+        """Stiffness, fastest mode and compliance if K(q) varies, damping ratio, limit, inputs that were asked for."""
+        springs = {"fastest": np.array([self.fastest]), "compliance": self.compliance} if self.is_limited else {}
         design = {} if self.damping_stiffness is None else {"damping_stiffness": self.damping_stiffness}
         inputs = self.model.gains(self.problem, self.feed_forward)
         return {
@@ -371,7 +382,7 @@ class _OperationalSpace(LawOfChart):
         # f_imp = -K(q) e - D de, (33); Lambda is M_phi, or its blocks.
         e, de, J = self._compute_errors(inputs)
         B, Lambda, volume = self._compute_inertia(J, model.mass_matrix(robot, inputs))
-        spring, damper = self._apply_springs(Lambda, inputs, e, de)
+        spring, damper = self._apply_springs(J, B, Lambda, inputs, e, de)
         force = -spring - damper
 
         # f_FF = Lambda (dd_phi_d + (J M^-1 C - dJ/dt) w), (35), with w = J^-1 d_phi_d: by (8) also when decoupled.
@@ -410,7 +421,8 @@ class _OperationalSpace(LawOfChart):
         # Kinetic and spring energy, and the power of the damping.
         M = self.model.own_mass_matrix(self.problem.robot, inputs)
         e, de, J = self._compute_errors(inputs)
-        spring, damping_force = self._apply_springs(self._compute_inertia(J, M)[1], inputs, e, de)
+        B, Lambda, _ = self._compute_inertia(J, M)
+        spring, damping_force = self._apply_springs(J, B, Lambda, inputs, e, de)
         M_phi = build_block_inertia(self.chart.n, (self.chart.n,))(J, M)[1]
         kinetic = ca.bilin(M_phi, de, de) if self.feed_forward else ca.bilin(M, inputs["dq"], inputs["dq"])
         storage = (kinetic + ca.dot(e, spring)) / 2
@@ -419,12 +431,13 @@ class _OperationalSpace(LawOfChart):
 
     @cached_property
     def damping_matrix(self) -> ca.Function:
-        """q, stiffness, damping_ratio, then fastest, damping_stiffness, payload if they are inputs -> D(q), (n, n)."""
+        """q, stiffness, damping_ratio, then those of `_damping_inputs` that are inputs -> D(q), (n, n)."""
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
         chosen = {name: inputs[name] for name in ("q", *self._damping_inputs)}
         J, M = self.chart.parts.rates(inputs["q"]), self.model.own_mass_matrix(self.problem.robot, inputs)
         identity = ca.MX.eye(self.chart.n)
-        D = self._apply_springs(self._compute_inertia(J, M)[1], inputs, identity, identity)[1]
+        B, Lambda, _ = self._compute_inertia(J, M)
+        D = self._apply_springs(J, B, Lambda, inputs, identity, identity)[1]
         return self.chart.parts.runnable(build_function("damping_matrix", chosen, {"D": D}))
 
     def check_damping(self, samples: int = 1000, seed: int = 0) -> DampingCheck:
@@ -452,7 +465,8 @@ class _OperationalSpace(LawOfChart):
         W = compute_mobility(self.chart, points, self.model.robot(self.problem))
         K = np.tile(np.diag(self.stiffness), (len(points), 1, 1))
         if self.is_limited:
-            K = limit_stiffness(W, self.stiffness, self.fastest, self._blocks)
+            J = self.chart.parts.batched_rates(points)
+            K = limit_stiffness(W, J, self.stiffness, self.fastest, self.compliance, self._blocks)
         result = compute_modes(W, K, self._compute_damping(points))
         return Modes(*(values[0] for values in vars(result).values())) if single else result
 
@@ -464,7 +478,7 @@ class _OperationalSpace(LawOfChart):
     @property
     def _damping_inputs(self) -> tuple[str, ...]:
         """The inputs that the damping depends on."""
-        names = ("stiffness", "damping_ratio", "fastest", "damping_stiffness", "payload")
+        names = ("stiffness", "damping_ratio", "fastest", "compliance", "damping_stiffness", "payload")
         return tuple(name for name in names if name in self.gains)
 
     @property
@@ -481,19 +495,21 @@ class _OperationalSpace(LawOfChart):
         B, Lambda, volume = build_block_inertia(self.chart.n, self._blocks)(J, M)
         return B, Lambda, volume
 
-    def _apply_springs(self, Lambda: ca.MX, inputs: dict[str, ca.MX], e: ca.MX, de: ca.MX) -> tuple[ca.MX, ca.MX]:
+    def _apply_springs(
+        self, J: ca.MX, B: ca.MX, Lambda: ca.MX, inputs: dict[str, ca.MX], e: ca.MX, de: ca.MX
+    ) -> tuple[ca.MX, ca.MX]:
         """K(q) E and D V, with the same blocks, for E (n, c) and V (n, d)."""
         # A function of its own, block by block, so that its code appears once.
         n, c, d = self.chart.n, e.shape[1], de.shape[1]
-        shapes = {"Lambda": (n, n), "K": (n, 1), "Z": (n, 1), "omega": (1, 1), "E": (n, c), "V": (n, d)}
-        symbols = {name: ca.MX.sym(name, *shape) for name, shape in shapes.items()}
-        inertia, K, Z, omega, E, V = symbols.values()
         places = [place.tolist() for place in np.split(np.arange(n), np.cumsum(self._blocks)[:-1])]
+        inertia, C, K, Z = (ca.MX.sym(name, n, size) for name, size in {"Lambda": n, "C": n, "K": 1, "Z": 1}.items())
+        E, V = ca.MX.sym("E", n, c), ca.MX.sym("V", n, d)
         if self.is_limited:
-            parts = [apply_limited_springs(inertia[p, p], K[p], Z[p], omega, E[p, :], V[p, :]) for p in places]
+            compliance = J @ B / inputs["fastest"] ** 2 + (J * ca.repmat(inputs["compliance"].T, n, 1)) @ J.T
+            parts = [apply_limited_springs(inertia[p, p], C[p, p], K[p], Z[p], E[p, :], V[p, :]) for p in places]
             outputs = [ca.densify(ca.vertcat(*blocks)) for blocks in zip(*parts, strict=True)]
-            springs = ca.Function("springs", list(symbols.values()), outputs)
-            spring, damper = springs(Lambda, inputs["stiffness"], inputs["damping_ratio"], inputs["fastest"], e, de)
+            springs = ca.Function("springs", [inertia, C, K, Z, E, V], outputs)
+            spring, damper = springs(Lambda, compliance, inputs["stiffness"], inputs["damping_ratio"], e, de)
             return spring, damper
         dampers = [apply_damping(self.damping, inertia[p, p], K[p], Z[p], V[p, :]) for p in places]
         damping = ca.Function("damping", [inertia, K, Z, V], [ca.densify(ca.vertcat(*dampers))])
