@@ -1,13 +1,13 @@
 """Default gains on arms that stick, with wrong masses and unknown loads, on wide and tight charts (about 40 min).
 
-xi1 is asked to move by 0.3 through a filter of 1 Hz, at 1 kHz with torques a tick late, on `StickingPlant`: dry friction
-of 2, 5 and 10 N m, at most 10 % of the effort limit, a quarter more to break away; masses 40 % more; 3 kg in the hand.
-The start is a random posture from which the whole way lies in the domain, and motors hold the arm with at most 70 % of
-their limits. PD+ in Python with springs of 6 Hz (`matched_stiffness`, once the default), with default gains, and with
+xi1 is asked to move by 0.3 through a filter of 1 Hz, at 1 kHz with torques a tick late, on `StickingPlant`: dry
+friction of 2, 5 and 10 N m, at most 10 % of the effort limit, a quarter more to break away; masses 40 % more; 3 kg in
+the hand. The start is a random posture from which the whole way lies in the domain, and motors hold the arm with at
+most 70 % of their limits. PD+ in Python with springs of 6 Hz (`matched_stiffness`, once the default), with default gains, and with
 default gains and the `FrictionObserver`.
 
-What is left after 5 s, and when the arm with the observer stands for good: joints are at rest, exactly, and nothing
-that the law remembers changes, for a quarter of a second. That is an equilibrium. Arms that still move after 60 s hunt.
+What is left after 5 s, and when the arm with the observer stands for good: joints are at rest, exactly, and
+what the law remembers changes by less than 1 mN m/s, for a quarter of a second. Arms that still move after 60 s hunt.
 """
 
 import argparse
@@ -30,8 +30,8 @@ CHARTS = (
     *("panda-pose", "iiwa7-pose", "xarm7-pose", "tiago-pro-left-pose"),
 )
 TICK, SECONDS, LONG, STILL = 1e-3, 5.0, 60.0, 0.25  # [s]
+SLOW = 1e-6  # change of the correction in a tick [N m], 0.06 N m in a minute
 WAY, BREAKING, HELD, DRAWS = 0.3, 1.25, 0.7, 20_000
-FAST = True
 RUNAWAY = 30.0  # [rad/s]
 HEADER = "| chart | case | x off [mm] | xi off | stands after [s] |\n| --- | --- | --- | --- | --- |"
 
@@ -70,15 +70,14 @@ def measure(name: str, seconds: float) -> Iterator[tuple[str, str, tuple[float, 
         if (np.abs(true.gravity(q)) > robot.effort_limits).any():
             yield case, "motors cannot hold it | |", (np.inf, np.inf)
             continue
-        if "N m" not in case and FAST: continue
         found = [lead(law, StickingPlant(true, friction=friction), q, seconds, friction is not None) for law in laws]
         errors = (" -> ".join(f"{row[k]:{form}}" for row in found) for k, form in ((0, ".2f"), (1, ".3f")))
-        after = found[-1][2]
-        yield case, f"{' | '.join(errors)} | {'' if friction is None else 'not' if np.isnan(after) else f'{after:.1f}'}", found[-1][:2]
+        after = "" if friction is None else "not" if np.isnan(found[-1][2]) else f"{found[-1][2]:.1f}"
+        yield case, f"{' | '.join(errors)} | {after}", found[-1][:2]
 
 
 def find_start(chart: oc.Chart) -> Array:
-    """A posture in the inner half of the domain from which xi1 can go its whole way, while motors hold the arm easily."""
+    """A posture in the inner half of the domain from which xi1 can go its whole way, and motors hold the arm easily."""
     rng, domain, robot = np.random.default_rng(3), chart.problem.domain, chart.problem.robot
     draws = domain.centre + 0.5 * np.minimum(domain.half_width, 1.5) * rng.uniform(-1, 1, (DRAWS, chart.n))
     for q in draws[(np.abs(robot.gravity(draws)) < HELD * robot.effort_limits).all(axis=1)]:
@@ -114,7 +113,7 @@ def lead(law: PDPlus, plant: StickingPlant, q: Array, seconds: float, sticks: bo
             return np.inf, np.inf, np.nan
         # Whether the arm stands, and has done so for long.
         remembered = np.concatenate([plant.dq, ticks.fields.get("correction", np.empty(0))])
-        changed = before.shape != remembered.shape or np.abs(remembered - before).max() > 1e-12 or plant.dq.any()
+        changed = before.shape != remembered.shape or np.abs(remembered - before).max() > SLOW or plant.dq.any()
         since, before = (k + 1 if changed else since), remembered
         if k + 1 == round(seconds / TICK):
             error = chart.phi(plant.q) - row[0]

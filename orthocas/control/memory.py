@@ -369,13 +369,14 @@ class FrictionObserver(_Correcting):
 
     b breaks joints away: it grows where a joint is off and stands, and is forgotten as soon as it moves, so that its
     own friction stops it. Joints that are off by little, s_i = 0, are left alone. k_i is M_ii times the squared
-    frequency of the law's fastest mode in series with the compliance of the joint, or twice the joint's limit, if that is more: light joints are not slower.
+    frequency of the law's fastest mode, in series with the joint's compliance, or twice the joint's limit, if that is
+    more: light joints are not slower.
 
-    Between ticks nothing stops a joint: where friction falls by b / 4, it moves on by b / 4 (3 period)^2 / (2 M_ii), and
+    Between ticks nothing stops a joint. Where friction falls by b / 4, it goes on by b / 4 (3 period)^2 / (2 M_ii), and
     no law resolves less. tolerance_k is at least what that moves phi_k: nothing for arms with rotors, but 20 mrad for a
-    bare flange of 1e-4 kg m^2, which would otherwise jump to and fro. Slow r bears wrong masses: with rate = alpha omega,
-    a joint whose true inertia is kappa times that of the model is stable up to kappa = (2 zeta + alpha)
-    (1 + 2 zeta alpha) / alpha (docs/explanation/derivations_control.md#observers).
+    bare flange of 1e-4 kg m^2, which would otherwise jump to and fro. Slow r bears wrong masses: with the rate
+    alpha omega, a joint whose true inertia is kappa times that of the model is stable up to
+    kappa = (2 zeta + alpha) (1 + 2 zeta alpha) / alpha (docs/explanation/derivations_control.md#observers).
 
     Args:
         rate: > 0 [1/s].

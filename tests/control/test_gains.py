@@ -200,7 +200,12 @@ def test_default_gains_let_every_mode_of_a_wide_chart_settle_within_a_second(nam
     points = sample_uniform(law.problem.domain, 64, 1)
     J = law.chart.jacobian(points)
     K = limit_stiffness(
-        compute_mobility(law.chart, points, law.problem.robot), J, law.stiffness, law.fastest, law.compliance, (law.chart.n,)
+        compute_mobility(law.chart, points, law.problem.robot),
+        J,
+        law.stiffness,
+        law.fastest,
+        law.compliance,
+        (law.chart.n,),
     )
     most = 4000.0 / np.minimum(0.5, law.problem.robot.velocity_limits)
     assert (np.einsum("kai,kab,kbi->ki", J, K, J) < most).all()

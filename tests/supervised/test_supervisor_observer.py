@@ -96,8 +96,8 @@ def test_it_begins_anew_after_starts_brakes_missing_measurements_and_jumps(
 
 def test_the_catcher_of_a_fast_arm_damps_what_is_observed(observed: Supervisor, planar_for_control: oc.Chart) -> None:
     """Joints pass 1 rad/s, and counts of 2 mrad claim 0 or 2 rad/s: the estimate is within a quarter of the truth, and
-    the catcher's torque changes by less than its limit of 1 N m a tick. The law held against the motion with all 120 N m,
-    which takes a quarter of a second to go."""
+    the catcher's torque changes by less than its limit of 1 N m a tick. Before, the law held against the motion with
+    all of its 120 N m, which takes a quarter of a second to go."""
     chart, q = planar_for_control, planar_for_control.problem.domain.centre
     reference, speed, commands = at_rest(chart, q), np.array([1.0, -1.0, 1.0]), []
     observed.start(q)
