@@ -3,8 +3,8 @@
 xi1 is asked to move by 0.3 through a filter of 1 Hz, at 1 kHz with torques a tick late, on `StickingPlant`: dry
 friction of 2, 5 and 10 N m, at most 10 % of the effort limit, a quarter more to break away; masses 40 % more; 3 kg in
 the hand. The start is a random posture from which the whole way lies in the domain, and motors hold the arm with at
-most 70 % of their limits. PD+ in Python with springs of 6 Hz (`matched_stiffness`, once the default), with default gains, and with
-default gains and the `FrictionObserver`.
+most 70 % of their limits. PD+ in Python with springs of 6 Hz (`matched_stiffness`, once the default), with default
+gains, and with default gains and the `FrictionObserver`.
 
 What is left after 5 s, and when the arm with the observer stands for good: joints are at rest, exactly, and
 what the law remembers changes by less than 1 mN m/s, for a quarter of a second. Arms that still move after 60 s hunt.
