@@ -63,11 +63,7 @@ class SelfMotionCurves:
 
     boxed: BoxedPhi
     starts: Starts
-
-    @cached_property
-    def tracer(self) -> CurveTracer:
-        """Traces the curves."""
-        return CurveTracer(self.boxed)
+    tracer: CurveTracer
 
     def search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
         """The nearest points for targets (N, n) of phi, from stored starts and one of the caller's (N, n)."""
