@@ -134,7 +134,15 @@ def judge_by_columns(samples: Samples, J: Array) -> dict[str, Array]:
         data.append(inverse.reshape(N, -1))
     function, sizes = _function(n - r, n, inverse is None)
     rows = _evaluated(function, sum(sizes.values()), data)
-    _finish(function, rows, data)
+    # samples that need more steps go on with the search for the smallest eigenvalue
+    left = np.flatnonzero(unfinished(rows[:, -1]))
+    for _ in range(_MOST_ROUNDS):
+        if not left.size:
+            break
+        some = [array[left] for array in data]
+        some[2] = rows[left, -2:-1]
+        rows[left] = _evaluated(function, rows.shape[1], some)
+        left = left[unfinished(rows[left, -1])]
     found = dict(zip(sizes, np.split(rows, np.cumsum(list(sizes.values()))[:-1], axis=1), strict=True))
     del found["last_step"]
     conditioning = np.sqrt(found.pop("eigenvalue")[:, 0])
@@ -152,18 +160,6 @@ def _evaluated(function: ColumnFunction, size: int, data: list[Array]) -> Array:
     results = np.empty((len(data[0]), size))
     fill(results, data[0], build_block_function, *data[1:])
     return results
-
-
-def _finish(function: ColumnFunction, rows: Array, data: list[Array]) -> None:
-    """Go on with the search for the smallest eigenvalue at samples that need more steps, and update their rows."""
-    left = np.flatnonzero(unfinished(rows[:, -1]))
-    for _ in range(_MOST_ROUNDS):
-        if not left.size:
-            break
-        some = [array[left] for array in data]
-        some[2] = rows[left, -2:-1]
-        rows[left] = _evaluated(function, rows.shape[1], some)
-        left = left[unfinished(rows[left, -1])]
 
 
 @cache
@@ -216,21 +212,16 @@ def judge_by_lapack(samples: Samples, J: Array) -> dict[str, Array]:
     first, second = (np.array([pair[k] for pair in pairs(J.shape[1])], dtype=int) for k in (0, 1))
     in_metric = gradients @ covectors / own[:, :, None] / own[:, None, :]
     along = samples.task_basis @ covectors / own[:, None]
+    m = along.shape[1]
+    gram = np.block([[np.broadcast_to(np.eye(m), (len(along), m, m)), along], [along.transpose(0, 2, 1), in_metric]])
     return {
         "task_cosines": samples.unit_task_gradients @ unit.transpose(0, 2, 1),
         "mutual_cosines": np.einsum("spi,spi->sp", _unit(gradients)[:, first], unit[:, second]),
         "metric_mutual_cosines": in_metric[:, first, second],
         "leak_sines": np.linalg.norm(along, axis=1),
-        "conditioning": _conditioning(along, in_metric),
+        "conditioning": np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[:, 0], 0.0))),
         "signs": np.sign(np.linalg.det(np.concatenate([samples.task_jacobian, J], axis=1))),
     }
-
-
-def _conditioning(along: Array, in_metric: Array) -> Array:
-    """Roots of the smallest eigenvalues of [[I, along], [along^T, in_metric]], (N,)."""
-    m = along.shape[1]
-    gram = np.block([[np.broadcast_to(np.eye(m), (len(along), m, m)), along], [along.transpose(0, 2, 1), in_metric]])
-    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[:, 0], 0.0)))
 
 
 def _unit(rows: Array) -> Array:

@@ -163,7 +163,20 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes, Certifi
     header, arrays = read_archive(path, CHART)
     try:
         problem = read_problem(header, arrays)
-        coordinates = _coordinates(problem, get_part(header, "coordinates", dict), arrays)
+        data = get_part(header, "coordinates", dict)
+        if "leaf" in data:
+            own = {name.removeprefix(_LEAF): array for name, array in arrays.items() if name.startswith(_LEAF)}
+            coordinates = GrownCoordinates(problem, read_leaf(problem, get_part(data, "leaf", str), own))
+        else:
+            parametrisation = parametrisation_from_data(data)
+            coordinates = Coordinates(
+                parametrisation,
+                JointSpace.of(problem),
+                _idle(get_part(data, "idle", list), problem.n),
+                *(get_part(arrays, name, np.ndarray) for name in ("theta", "offset", "scale")),
+            )
+            if isinstance(parametrisation, CyclicParametrisation):
+                require_cyclic(problem, parametrisation.cyclic)
         if coordinates.r != problem.r:
             raise ChartFileError(f"{path} has {coordinates.r} coordinates, expected r = {problem.r}")
         _require_finite(problem, coordinates)
@@ -245,22 +258,6 @@ def _coordinates_to_data(coordinates: CoordinateMap) -> tuple[dict[str, Any], di
     assert isinstance(coordinates, Coordinates)
     data = {**parametrisation_to_data(coordinates.parametrisation), "idle": list(coordinates.idle)}
     return data, {"theta": coordinates.theta, "offset": coordinates.offset, "scale": coordinates.scale}
-
-
-def _coordinates(problem: Problem, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> CoordinateMap:
-    if "leaf" in data:
-        own = {name.removeprefix(_LEAF): array for name, array in arrays.items() if name.startswith(_LEAF)}
-        return GrownCoordinates(problem, read_leaf(problem, get_part(data, "leaf", str), own))
-    parametrisation = parametrisation_from_data(data)
-    found = Coordinates(
-        parametrisation,
-        JointSpace.of(problem),
-        _idle(get_part(data, "idle", list), problem.n),
-        *(get_part(arrays, name, np.ndarray) for name in ("theta", "offset", "scale")),
-    )
-    if isinstance(parametrisation, CyclicParametrisation):
-        require_cyclic(problem, parametrisation.cyclic)
-    return found
 
 
 def _idle(joints: list[int], n: int) -> tuple[int, ...]:

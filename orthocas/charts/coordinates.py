@@ -350,11 +350,7 @@ class Coordinates:
     def _column_graphs(self) -> dict[str, NumpyGraph]:
         """Functions xi and vec(J_xi^T) of many joint positions side by side, where dense products are fast."""
         q = ca.MX.sym("q", self.space.n, COLUMNS)
-        J_xi = ca.vertcat(*self._gradients(q))
-        return {"xi": NumpyGraph("xi", [q], [self.expression(q)]), "jacobian": NumpyGraph("J_xi", [q], [J_xi])}
-
-    def _gradients(self, q: ca.MX) -> list[ca.MX]:
-        """Gradients of all coordinates, r matrices (n, N), for joint positions as columns (n, N)."""
+        # gradients of all coordinates, r matrices (n, N), for joint positions as columns (n, N)
         N = q.shape[1]
         unit = np.eye(self.space.n)
         gradients: list[ca.MX] = []
@@ -362,7 +358,8 @@ class Coordinates:
             own = self.family.jacobian(q[self.active, :], ca.MX(ca.DM(self.theta)))
             spread = ca.DM(unit[:, self.active])
             gradients += [spread @ gradient * scale for gradient, scale in zip(own, self.scale, strict=True)]
-        return gradients + [ca.MX(_columns(unit[k], N)) for k in self.idle]
+        J_xi = ca.vertcat(*gradients, *(ca.MX(_columns(unit[k], N)) for k in self.idle))
+        return {"xi": NumpyGraph("xi", [q], [self.expression(q)]), "jacobian": NumpyGraph("J_xi", [q], [J_xi])}
 
 
 def _columns(values: Sequence[float] | Array, columns: int) -> ca.DM:

@@ -159,13 +159,7 @@ class SelfMotionCurves:
         Returns:
             xi - xi(q) at both ends of the steps, (S, 2); NaN far from the box.
         """
-        left = self._xi_left_of(targets, steps)
-        step, share = self._crossed(left)
-        self._take_solutions(targets, steps.row[step], steps.point(step, share), tolerance, best)
-        return left
-
-    def _xi_left_of(self, targets: Array, steps: "Steps") -> Array:
-        """xi - xi(q) at both ends of steps, (S, 2); NaN far from the box."""
+        # xi - xi(q) at both ends of steps, (S, 2); NaN far from the box
         left, low, high = np.full(steps.q.shape[:2], np.nan), *self.boxed.domain.bounds
         slack = RULES.step / RULES.parts
         near = np.asarray(((steps.q >= low - slack) & (steps.q <= high + slack)).all(axis=2))
@@ -175,6 +169,8 @@ class SelfMotionCurves:
         left[begins] = self._xi_left(targets[rows[begins]], steps.q[begins])
         joined = near[:, 0] & ~begins[:, 0]
         left[joined, 0] = left[np.flatnonzero(joined) - 1, 1]
+        step, share = self._crossed(left)
+        self._take_solutions(targets, steps.row[step], steps.point(step, share), tolerance, best)
         return left
 
     def _crossed(self, left: Array) -> tuple[Indices, Array]:
@@ -283,7 +279,10 @@ class SelfMotionCurves:
             J = phi_map.jacobian(q) / phi_map.sizes[:, None]
             left_over = phi_map.difference(targets[rows], phi_map.phi(q)) / phi_map.sizes
             q = q + solutions_of(J, left_over[:, :, None])[:, :, 0]
-        q = self._snapped(q)
+        # points that miss the boundary by rounding, on it
+        moved = np.clip(q, *self.boxed.domain.bounds)
+        near = np.abs(moved - q) <= 1e-9 * self.boxed.domain.half_width
+        q = np.where(near.all(axis=1, keepdims=True), moved, q)
         q = np.where(np.isfinite(q), q, best.q[rows])
         solved = (largest(phi_map.residual(targets[rows], q)) <= tolerance) & self.boxed.domain.contains(q)
         best.take(rows[solved], q[solved], np.zeros(int(solved.sum())))
@@ -373,12 +372,6 @@ class SelfMotionCurves:
             within = self._contains(middle)
             a, b = np.where(within[:, None], middle, a), np.where(within[:, None], b, middle)
         return a
-
-    def _snapped(self, q: Array) -> Array:
-        """Points that miss the boundary by rounding, on it."""
-        moved = np.clip(q, *self.boxed.domain.bounds)
-        near = np.abs(moved - q) <= 1e-9 * self.boxed.domain.half_width
-        return np.where(near.all(axis=1, keepdims=True), moved, q)
 
     def _xi_left(self, targets: Array, q: Array) -> Array:
         """xi - xi(q), (N,)."""

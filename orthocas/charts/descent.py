@@ -132,7 +132,13 @@ class _Run:
         undefined = ~np.isfinite(self._J[rows]).all(axis=(1, 2))
         self.damping[rows[undefined]] = np.inf
         rows = rows[~undefined]
-        programs = self._programs(rows)
+        # the quadratic models of some rows
+        G, n = self._J[rows], self.u.shape[1]
+        H = G.transpose(0, 2, 1) @ G
+        mean = np.trace(H, axis1=1, axis2=2) / n + np.finfo(float).tiny
+        H += (self.damping[rows] * mean)[:, None, None] * np.eye(n)
+        g = -np.matmul(self._errors[rows, None], G)[:, 0]
+        programs = Programs(H, g, self._equations.low - self.u[rows], self._equations.high - self.u[rows])
         d, self._at[rows], solved = solve_programs(programs, self._at[rows])
         slope, bend = (programs.g * d).sum(axis=1), (d * (programs.H @ d[:, :, None])[:, :, 0]).sum(axis=1)
         promised = -slope - bend / 2
@@ -149,15 +155,6 @@ class _Run:
         slower = np.where(gain > RULES.foreseen, RULES.shrinks, np.where(gain < RULES.missed, 2.0, 1.0))
         self.damping[rows] *= np.where(better, slower, RULES.grows)
         np.maximum(self.damping, RULES.least_damping, out=self.damping)
-
-    def _programs(self, rows: Indices) -> "Programs":
-        """The quadratic models of some rows."""
-        G, n = self._J[rows], self.u.shape[1]
-        H = G.transpose(0, 2, 1) @ G
-        mean = np.trace(H, axis1=1, axis2=2) / n + np.finfo(float).tiny
-        H += (self.damping[rows] * mean)[:, None, None] * np.eye(n)
-        g = -np.matmul(self._errors[rows, None], G)[:, 0]
-        return Programs(H, g, self._equations.low - self.u[rows], self._equations.high - self.u[rows])
 
 
 @dataclass(frozen=True, eq=False)

@@ -99,7 +99,13 @@ class Inside:
         ends = self._slid(targets, self._turned(targets, Points.of(near, self.boxed), q), RULES.steps)
         left, bare = np.flatnonzero(ends.best(N)[1] > RULES.nearly), np.zeros(0, dtype=np.int64)
         if left.size:
-            on_slices = self._ranked(targets, self._slices.points(targets, q, left), q)
+            # points after full turns, and about how far joints have to move from there to xi
+            points = self._slices.points(targets, q, left)
+            points = self._turned(targets, points, q)
+            J = self.boxed.phi_map.jacobian(self.boxed.points(points.u)) * self.boxed.domain.half_width
+            with np.errstate(all="ignore"):
+                reach = np.linalg.norm(inverses(J)[0][:, :, self.boxed.m :], axis=(1, 2))
+            on_slices = Points(points.row, points.u, points.away * reach, np.zeros(len(points.row)))
             bare = np.setdiff1d(left, on_slices.row)
             starts = on_slices.apart(N, RULES.short).joined(self._again(targets, q, bare))
             ends = ends.joined(self._slid(targets, starts, RULES.steps))
@@ -133,14 +139,6 @@ class Inside:
         """Where slides from points end."""
         end = slide(self.boxed, targets[points.row], points.u, most)
         return Points(points.row, end.u, end.distance, end.error)
-
-    def _ranked(self, targets: Array, points: "Points", q: Array) -> "Points":
-        """Points after full turns, and about how far joints have to move from there to xi."""
-        points = self._turned(targets, points, q)
-        J = self.boxed.phi_map.jacobian(self.boxed.points(points.u)) * self.boxed.domain.half_width
-        with np.errstate(all="ignore"):
-            reach = np.linalg.norm(inverses(J)[0][:, :, self.boxed.m :], axis=(1, 2))
-        return Points(points.row, points.u, points.away * reach, np.zeros(len(points.row)))
 
     def _turned(self, targets: Array, points: "Points", q: Array) -> "Points":
         """Points after the full turns near those of q (N, n) that bring xi nearest to targets (N, n)."""

@@ -16,7 +16,6 @@ from orthocas.charts.newton import Attempt, Continuation, LocalSolver
 from orthocas.charts.phi import PhiMap, largest
 from orthocas.charts.search import InDomain, Starts
 from orthocas.errors import InverseError
-from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, Indices
@@ -174,17 +173,15 @@ def beyond_reach(task: Task, x: Array) -> NDArray[np.bool_]:
     columns = [k for k, label in enumerate(task.labels) if label in ("x", "y", "z") and task.units[k] == "m"]
     if not task.of_tip or not columns:
         return np.zeros(len(x), dtype=bool)
-    origin, length = _origin_and_length(task.robot.tree)
+    # place of the first joint that moves the tip, (3,), and the largest distance of the tip from it [m]
+    chain = task.robot.tree.carriers(task.robot.tree.tip_parent)
+    offsets = [*task.robot.tree.translations[chain], task.robot.tree.tip_translation]
+    strokes = np.maximum(np.abs(task.robot.tree.lower[chain]), np.abs(task.robot.tree.upper[chain]))[
+        np.array(task.robot.tree.prismatic)[chain]
+    ]
+    origin, length = offsets[0], float(sum(np.linalg.norm(offset) for offset in offsets[1:]) + strokes.sum())
     away = x[:, columns] - origin[["xyz".index(task.labels[k]) for k in columns]]
     return np.asarray(np.linalg.norm(away, axis=1) > (1 + RULES.rounding) * length)
-
-
-def _origin_and_length(tree: KinematicTree) -> tuple[Array, float]:
-    """Place of the first joint that moves the tip, (3,), and the largest distance of the tip from it [m]."""
-    chain = tree.carriers(tree.tip_parent)
-    offsets = [*tree.translations[chain], tree.tip_translation]
-    strokes = np.maximum(np.abs(tree.lower[chain]), np.abs(tree.upper[chain]))[np.array(tree.prismatic)[chain]]
-    return offsets[0], float(sum(np.linalg.norm(offset) for offset in offsets[1:]) + strokes.sum())
 
 
 @dataclass(eq=False)

@@ -209,12 +209,9 @@ class Walls:
         guess = np.zeros(self.low.shape, dtype=np.int8)
         shared = min(self.low.shape[1], held.shape[1])
         guess[:, :shared] = held[:, :shared]
-        gone = self._values(back)
+        gone = np.concatenate([back, _times(self.slopes, back)], axis=1) if self.slopes.shape[1] else back
         whole = np.concatenate([B, self.slopes @ B], axis=1) if self.slopes.shape[1] else B
         return project(whole, self.low - gone, self.high - gone, wanted, guess)
-
-    def _values(self, d: Array) -> Array:
-        return np.concatenate([d, _times(self.slopes, d)], axis=1) if self.slopes.shape[1] else d
 
 
 def project(B: Array, low: Array, high: Array, wanted: Array, held: NDArray[np.int8]) -> tuple[Array, NDArray[np.int8]]:

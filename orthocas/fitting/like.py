@@ -77,10 +77,6 @@ def _require_finite(slopes: Array) -> Array:
     return slopes
 
 
-def _hash(function: ca.Function) -> str:
-    return hashlib.sha256(json.dumps(write_tape(function)).encode()).hexdigest()[:12]
-
-
 @dataclass(frozen=True, eq=False)
 class Like:
     """Quantities y(q) (k, 1) that the first k coordinates follow.
@@ -180,7 +176,9 @@ class Like:
         values = self.function(whole)
         slopes = dense_function("like_jacobian", [q], [ca.cse(ca.jacobian(values, q))])
         # functions of a loss are kept by names
-        return LikeTerm(f"like {_hash(slopes)}", len(self.names), slopes)
+        return LikeTerm(
+            f"like {hashlib.sha256(json.dumps(write_tape(slopes)).encode()).hexdigest()[:12]}", len(self.names), slopes
+        )
 
     def project(self, samples: Samples) -> tuple[Array, Array]:
         """An orthonormal basis (N, n, n), the last r of ker J_x, and gradients of quantities along it, (N, k, n).
