@@ -164,6 +164,7 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes, Certifi
     try:
         problem = read_problem(header, arrays)
         data = get_part(header, "coordinates", dict)
+        coordinates: CoordinateMap
         if "leaf" in data:
             own = {name.removeprefix(_LEAF): array for name, array in arrays.items() if name.startswith(_LEAF)}
             coordinates = GrownCoordinates(problem, read_leaf(problem, get_part(data, "leaf", str), own))

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocas.charts.angles import pairs
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
-from orthocas.charts.point_quality import Judged, WorstPoints, measure_held_speeds, worst_points
+from orthocas.charts.point_quality import Judged, WorstPoints, measure_held_speeds, pairs, worst_points
 from orthocas.errors import InvalidValueError, SingularTaskError
 from orthocas.robots.collisions import Collisions
 from orthocas.tasks.samples import evaluate_samples, find_idle_joints, sample_uniform

@@ -14,7 +14,7 @@ from orthocas.bases.family import LinearFamily
 from orthocas.bases.given import Given, find_periods, sew_angle
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError, RobotError
-from orthocas.fitting.basis_gradients import BasisGradients
+from orthocas.fitting.basis_objective import BasisGradients
 from orthocas.fitting.terms import Data, Sizes, metric_lengths
 from orthocas.robots.robot import Robot
 from orthocas.tasks.problem import Problem

@@ -11,8 +11,7 @@ from orthocas.bases.products import Polynomial, ProductFamily
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import in_the_metric, worst_points
-from orthocas.fitting.basis_gradients import build_gradients
-from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.basis_objective import BasisObjective, build_gradients
 from orthocas.fitting.starts import find_spectral_start
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Weights
 from orthocas.solvers.gauss_newton import GaussNewton

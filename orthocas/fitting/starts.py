@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.bases.family import JointSpace, LinearFamily
-from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
+from orthocas.fitting.basis_objective import BasisGradients, build_gradients
 from orthocas.fitting.terms import Pairs, coordinates_of
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import Samples, compute_directions

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.bases.cyclic import cyclic_joints
-from orthocas.bases.family import Parametrisation
+from orthocas.bases.family import Parametrisation, require_parametrisation
 from orthocas.charts.point_quality import worst_points
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.fit import Fit, fit_from
 from orthocas.fitting.probe import RULES, Bounds, Miss, Prober, Quality, describe_conditioning, evaluate_chart
-from orthocas.fitting.settings import choose_parametrisation, require_parametrisation
+from orthocas.fitting.settings import choose_parametrisation
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM, require_driven

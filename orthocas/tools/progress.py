@@ -114,18 +114,7 @@ class TerminalBars:
             if self._stop is not None:
                 self._bar.update(self._bar.task_ids[0], completed=1.0)
             self.close()
-            from rich import progress as rich  # takes longer to import than all the rest, and few processes draw bars
-            from rich.console import Console
-
-            text, detail = (
-                rich.TextColumn(field, markup=False) for field in ("{task.description}", "{task.fields[detail]}")
-            )
-            columns = (text, rich.BarColumn(), rich.TimeElapsedColumn(), detail)
-            self._stage = progress.stage
-            self._bar = rich.Progress(*columns, console=Console(file=self._stream), transient=self._transient)
-            self._bar.add_task(progress.stage, total=1.0, detail="")
-            self._stop = weakref.finalize(self, self._bar.stop)
-            self._bar.start()
+            self._start(progress.stage)
         self._bar.update(self._bar.task_ids[0], completed=progress.fraction, detail=progress.detail)
         if progress.fraction >= 1:
             self.close()
@@ -135,6 +124,20 @@ class TerminalBars:
         if self._stop is not None:
             self._stop()
             self._stop = None
+
+    def _start(self, stage: str) -> None:
+        from rich import progress as rich  # takes longer to import than all the rest, and few processes draw bars
+        from rich.console import Console
+
+        text, detail = (
+            rich.TextColumn(field, markup=False) for field in ("{task.description}", "{task.fields[detail]}")
+        )
+        columns = (text, rich.BarColumn(), rich.TimeElapsedColumn(), detail)
+        self._stage = stage
+        self._bar = rich.Progress(*columns, console=Console(file=self._stream), transient=self._transient)
+        self._bar.add_task(stage, total=1.0, detail="")
+        self._stop = weakref.finalize(self, self._bar.stop)
+        self._bar.start()
 
 
 def as_bars(stages: dict[str, Progress]) -> str:
