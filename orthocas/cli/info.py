@@ -34,7 +34,7 @@ from orthocas.tools.display import percent
 from orthocas.tools.json import clean
 
 if TYPE_CHECKING:
-    pass
+    from orthocas.charts.chart import Chart
 
 _FAULTS = ("near_singular_share", "half_turn_share", "touching_share")
 _SHARES = ("share", "clear_share", "share of the branch", "branches", *_FAULTS)  #: names of numbers to show in percent
@@ -71,12 +71,7 @@ def info(
         raise OptionError(f"--branches requires a robot file or a named problem, not the chart {target}")
     else:
         words.require_no_robot(f"the chart {target}")
-        # the chart of a file or a ready one; a target that looks like a name, and is none, raises the known ones
-        from orthocas.charts.ready import load, names  # takes long to import, and problems and robots do not need it
-
-        if target not in names() and not Path(target).exists() and not Path(target).suffix:
-            ProblemOptions().build_problem(target)
-        chart = load(target)
+        chart = _load_chart(target)
         data = {
             **_describe_problem(chart.problem),
             "parametrisation": chart.coordinates.label,
@@ -96,6 +91,15 @@ def info(
         print_rows(rows, "" if branches else then)
         if branches:
             print_table(_tabulate_branches(data), f"{then} --task pose --domain branch")
+
+
+def _load_chart(target: str) -> "Chart":
+    """The chart of a file or a ready one; a target that looks like a name, and is none, raises the known ones."""
+    from orthocas.charts.ready import load, names  # takes long to import, and problems and robots do not need it
+
+    if target not in names() and not Path(target).exists() and not Path(target).suffix:
+        ProblemOptions().build_problem(target)
+    return load(target)
 
 
 def _describe_robot(robot: Robot) -> dict[str, Any]:
