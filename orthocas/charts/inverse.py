@@ -234,7 +234,11 @@ class Inverse:
             if rows.size:
                 found = self._searched(targets[rows], None if starts is None else starts[rows], tolerance, inside)
                 q[rows], status[rows], iterations[rows] = found.q, found.status, found.iterations
-                error[rows], distance[rows] = found.error, self._distance(targets[rows], found.residual)
+                error[rows] = found.error
+                # |xi(q) - xi|: infinite where xi(q) is undefined
+                of_xi = (found.residual * self.phi_map.scale(targets[rows]))[:, self.problem.m :]
+                apart = np.sqrt((of_xi**2).sum(axis=1))
+                distance[rows] = np.where(np.isfinite(apart), apart, np.inf)
                 kept = np.isin(found.status, _KEPT) if inside else np.zeros(len(rows), dtype=bool)
                 error[rows[kept]] = largest(found.residual[kept, : self.problem.m])
         return Solutions(q, status, iterations, error, distance, tolerance)
@@ -244,7 +248,10 @@ class Inverse:
         follows = inside or (self.curves is not None and starts is None)
         first = self.local if self.brief is None or not follows else self.brief
         best = self._attempt(targets, self.starts.guess(targets) if starts is None else starts, tolerance, first)
-        self._tell_beyond(targets, best)
+        # rows without a solution, because the arm is too short
+        rows = np.flatnonzero(best.status == InverseStatus.NOT_FOUND)
+        beyond = beyond_reach(self.problem.task, targets[rows, : self.problem.m])
+        best.status[rows[beyond]] = InverseStatus.OUT_OF_REACH
         if inside and self.inside is not None:
             own = best.q.copy() if starts is None else starts
             if self.curves is not None:
@@ -261,12 +268,6 @@ class Inverse:
             rows = self._open(best)
             best.improve(rows, self._judged(self.along(targets[rows], starts[rows]), tolerance))
         return best
-
-    def _tell_beyond(self, targets: Array, best: Found) -> None:
-        """Say of rows without a solution whether the arm is too short."""
-        rows = np.flatnonzero(best.status == InverseStatus.NOT_FOUND)
-        beyond = beyond_reach(self.problem.task, targets[rows, : self.problem.m])
-        best.status[rows[beyond]] = InverseStatus.OUT_OF_REACH
 
     def _open(self, best: Found) -> Indices:
         """Rows that may have another solution, inside the domain."""
@@ -399,9 +400,3 @@ class Inverse:
         good = largest(residual) <= tolerance
         attempt.q[rows[good]], attempt.residual[rows[good]] = moved[rows[good]], residual[good]
         return attempt
-
-    def _distance(self, targets: Array, residual: Array) -> Array:
-        """|xi(q) - xi|, (N,): infinite where xi(q) is undefined."""
-        difference = (residual * self.phi_map.scale(targets))[:, self.problem.m :]
-        distance = np.sqrt((difference**2).sum(axis=1))
-        return np.where(np.isfinite(distance), distance, np.inf)

@@ -344,14 +344,6 @@ def whitened(gram: ca.SX, columns: ca.SX, least: float) -> ca.SX:
     return found
 
 
-def determinant_sign(matrix: ca.SX) -> ca.SX:
-    """Sign of the determinant of a square matrix; 0 if a pivot is exactly 0."""
-    sign = ca.SX(1)
-    for pivot in triangle(matrix):
-        sign *= ca.sign(pivot)
-    return sign
-
-
 def triangle(matrix: ca.SX) -> list[ca.SX]:
     """Numbers whose product is the determinant of a square matrix, by reflections of its rows.
 
@@ -398,12 +390,26 @@ def _or_one(x: ca.SX) -> ca.SX:
 def laguerre(diagonal: ca.SX, squares: ca.SX, at: ca.SX, steps: int) -> tuple[ca.SX, ca.SX]:
     """Steps towards the smallest eigenvalue of a tridiagonal matrix, from below: where they end, and the last step.
 
-    Steps from below never pass the eigenvalue, but by rounding. No step follows then.
+    Steps from below never pass the eigenvalue, but by rounding. No step follows then. The characteristic polynomial is
+    the product of the pivots q_i of T - at I, so the sums of 1 / (lambda_i - at) and of its square, which Laguerre's
+    step needs, follow from q_i and two derivatives.
     """
-    step = ca.SX(0)
+    n, step = diagonal.size1(), ca.SX(0)
     for _ in range(steps):
-        found, before = _laguerre_step(diagonal, squares, at)
-        step = ca.if_else(before, found, 0.0)
+        q, slope, bend = diagonal[0] - at, ca.SX(-1), ca.SX(0)
+        inverse, least = 1 / q, q
+        first, second = inverse, inverse * inverse
+        for i in range(1, n):
+            ratio, share = squares[i - 1] * inverse, slope * inverse
+            bend = ratio * (bend * inverse - 2 * share * share)
+            q, slope = diagonal[i] - at - ratio, ratio * share - 1
+            inverse, least = 1 / q, ca.fmin(least, q)
+            share = slope * inverse
+            first -= share
+            second += share * share - bend * inverse
+        ahead = n / (first + ca.sqrt(ca.fmax((n - 1) * (n * second - first * first), 0.0)))
+        # the eigenvalue is ahead while all pivots are positive
+        step = ca.if_else(least > 0, ahead, 0.0)
         at = at + step
     return at, step
 
@@ -411,28 +417,6 @@ def laguerre(diagonal: ca.SX, squares: ca.SX, at: ca.SX, steps: int) -> tuple[ca
 def unfinished(last_steps: Array) -> NDArray[np.bool_]:
     """Where the last step of `laguerre` was more than rounding."""
     return np.asarray(last_steps > _ROUNDING)
-
-
-def _laguerre_step(diagonal: ca.SX, squares: ca.SX, at: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Laguerre's step towards the smallest eigenvalue, and whether it is ahead.
-
-    The characteristic polynomial is the product of the pivots q_i of T - at I, so the sums of 1 / (lambda_i - at) and
-    of its square follow from q_i and two derivatives.
-    """
-    n = diagonal.size1()
-    q, slope, bend = diagonal[0] - at, ca.SX(-1), ca.SX(0)
-    inverse, least = 1 / q, q
-    first, second = inverse, inverse * inverse
-    for i in range(1, n):
-        ratio, share = squares[i - 1] * inverse, slope * inverse
-        bend = ratio * (bend * inverse - 2 * share * share)
-        q, slope = diagonal[i] - at - ratio, ratio * share - 1
-        inverse, least = 1 / q, ca.fmin(least, q)
-        share = slope * inverse
-        first -= share
-        second += share * share - bend * inverse
-    step = n / (first + ca.sqrt(ca.fmax((n - 1) * (n * second - first * first), 0.0)))
-    return step, least > 0
 
 
 def judge_by_columns(samples: Samples, J: Array) -> dict[str, Array]:
@@ -498,12 +482,16 @@ def _formulas(task: ca.SX, covectors: ca.SX, inverse: ca.SX | None, at: ca.SX) -
         return ca.vertcat(ca.SX(0, 1), *(matrix[i, j] for i, j in pairs(r)))
 
     eigenvalue, last_step = laguerre(*tridiagonal(gram), at, _STEPS)
+    # of the determinant; 0 if a pivot is exactly 0
+    sign = ca.SX(1)
+    for pivot in triangle(ca.vertcat(task, covectors)):
+        sign *= ca.sign(pivot)
     return {
         "task_cosines": ca.vec((shares / (_lengths(raised) @ euclidean.T)).T),
         "mutual_cosines": of_pairs(products / (_lengths(gradients) @ euclidean.T)),
         **({} if inverse is None else {"metric_mutual_cosines": of_pairs(unit)}),
         "leak_sines": ca.sqrt(ca.sum1(along * along)).T,
-        "signs": determinant_sign(ca.vertcat(task, covectors)),
+        "signs": sign,
         "eigenvalue": eigenvalue,
         "last_step": last_step,
     }
