@@ -203,7 +203,8 @@ def _certificate(
     data = get_part(header, "certificate", dict)
     certificate = certificate_from_data(data, arrays, problem.n)
     certificate.require_for(fingerprint(problem, coordinates))
-    if "notes" in data and data["notes"] != _digest_of(header["notes"]):  # missing in older files
+    # missing in older files
+    if "notes" in data and data["notes"] != _digest_of(header["notes"]):
         raise CertifyError("the notes have been changed since the file was written")
     return certificate
 
@@ -236,7 +237,8 @@ def _require_finite(problem: Problem, coordinates: CoordinateMap) -> None:
     """
     q = sample_uniform(problem.domain, _PROBES, 0)
     values = {"the task": problem.task.batched(q)[0], "the Jacobian of the task": problem.task.batched_jacobian(q)[0]}
-    if isinstance(coordinates, Coordinates) and not _surely_finite(coordinates):  # grown ones may be NaN
+    # grown ones may be NaN
+    if isinstance(coordinates, Coordinates) and not _surely_finite(coordinates):
         values |= {"xi": coordinates.xi(q), "the Jacobian of xi": coordinates.jacobian(q)}
     for what, numbers in values.items():
         if not np.isfinite(numbers.reshape(_PROBES, -1)).all(axis=1).any():

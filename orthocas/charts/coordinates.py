@@ -88,7 +88,8 @@ def point_functions(family: Family, theta: Array, n: int) -> dict[str, ca.Functi
         return _from_basis(family, theta, n)
     kind: Any = ca.MX if family.as_matrices else ca.SX
     q, v, w = (kind.sym(name, n) for name in ("q", "v", "w"))
-    parameters: Any = ca.DM(theta)  # constants, so that weights are not sliced and transposed at every call
+    # constants, so that weights are not sliced and transposed at every call
+    parameters: Any = ca.DM(theta)
     xi = family.expression(q, parameters)
     jacobian = ca.horzcat(*family.jacobian(q, parameters)).T
     return _functions(xi, jacobian, second_derivative(xi, q, v, w), q, v, w)
@@ -219,7 +220,8 @@ class Coordinates:
 
     def __post_init__(self) -> None:
         fitted = len(self.offset)
-        if isinstance(self.parametrisation, GradedParametrisation):  # before a basis is built that may be enormous
+        # before a basis is built that may be enormous
+        if isinstance(self.parametrisation, GradedParametrisation):
             terms = self.parametrisation.term_count(len(self.active)) if fitted else 0
             require_shape("theta", np.shape(self.theta), (fitted * terms,))
         size = self.family.size if fitted else 0

@@ -33,7 +33,8 @@ class Nearest:
 
     def take(self, rows: Indices, q: Array, distance: Array, between: bool = False) -> None:
         """Take over points (M, n) that are nearer than those of their rows (M,), which may occur several times."""
-        farthest_first = np.argsort(-distance, kind="stable")  # what is written last stays
+        # what is written last stays
+        farthest_first = np.argsort(-distance, kind="stable")
         better = farthest_first[distance[farthest_first] < self.distance[rows[farthest_first]]]
         self.q[rows[better]], self.distance[rows[better]] = q[better], distance[better]
         self.between[rows[better]] = between
@@ -321,7 +322,8 @@ class SelfMotionCurves:
             best.take(rows[good], q[good], left, between=True)
             for other in (a[good], b[good]):
                 found = found.joined(Ends(rows[good], q[good], other, np.zeros(len(left))))
-            again = ~good & ~self._in_box(q)  # conditions are not looked at so closely
+            # conditions are not looked at so closely
+            again = ~good & ~self._in_box(q)
             a, b, rows = (
                 np.concatenate([a[again], q[again]]),
                 np.concatenate([q[again], b[again]]),

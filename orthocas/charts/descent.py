@@ -121,8 +121,10 @@ class _Run:
         self.minimal = np.zeros(N, dtype=bool)
         self.damping = np.full(N, RULES.damping)
         self._J = np.zeros((N, self._errors.shape[1], n))
-        self._fresh = np.zeros(N, dtype=bool)  # rows whose J belongs to u
-        self._at = np.zeros((N, n), dtype=np.int8)  # which bounds hold: -1 low, 1 high
+        # rows whose J belongs to u
+        self._fresh = np.zeros(N, dtype=bool)
+        # which bounds hold: -1 low, 1 high
+        self._at = np.zeros((N, n), dtype=np.int8)
 
     def advance(self, rows: Indices) -> None:
         """Try a step in some rows."""
@@ -183,7 +185,8 @@ def solve_programs(programs: Programs, at: NDArray[np.int8]) -> tuple[Array, NDA
         part = programs if len(left) == N else programs.part(left)
         d[left], now = _solve_held(part, held[left])
         changes = now != held[left]
-        if k >= RULES.rounds // 3:  # the first bound alone, so that they do not change back and forth
+        # the first bound alone, so that they do not change back and forth
+        if k >= RULES.rounds // 3:
             changes &= np.cumsum(changes, axis=1) == 1
         held[left] = np.where(changes, now, held[left])
         left = left[changes.any(axis=1)]

@@ -74,7 +74,8 @@ def self_motion_figure(chart: "Chart", postures: int = 9, reach: float | None = 
 
 
 def _draw_angles(axes: Axes, angles: "AngleStatistics", colour: str, label: str) -> None:
-    first = 3  # groups of five bins, so that 90 degrees lies in the middle of its group
+    # groups of five bins, so that 90 degrees lies in the middle of its group
+    first = 3
     counts = angles.histogram[first:-3].reshape(-1, 5).sum(axis=1)
     edges = (first - 0.5) / 10 + 0.5 * np.arange(len(counts) + 1)
     axes.stairs(counts / max(counts.sum(), 1) / 0.5, edges, fill=True, color=colour, alpha=0.85)
@@ -101,7 +102,8 @@ def _sweep(chart: "Chart", j: int, postures: int, reach: float | None) -> Array:
         for k in order:
             target = base.copy()
             target[chart.m + j] = values[k]
-            q = chart.inverse(target, q, outside=True)  # as far as was asked
+            # as far as was asked
+            q = chart.inverse(target, q, outside=True)
             found[k] = q
     return found
 

@@ -167,7 +167,8 @@ def _region(problem: Problem, x0: Array) -> Box:
     """A box around the part of the leaf that the domain is pulled to."""
     domain = problem.domain
     whole = (domain.half_width >= np.pi - 1e-9) & find_turning_joints(problem)
-    if whole.sum() > 1:  # cut the domain open, as in [AS2023] Sec. 5.2
+    # cut the domain open, as in [AS2023] Sec. 5.2
+    if whole.sum() > 1:
         return Box(domain.centre, domain.half_width)
     pulled = TaskFlow(problem).pull(sample_evenly(domain, _PROBES, 0), x0)
     if not pulled.reached.any():

@@ -96,7 +96,8 @@ class Inside:
         if left.size:
             points = Points.of(self.starts.nearest(targets[left], RULES.starts, self.boxed.m), self.boxed, left)
             end = descend(self.boxed.task_equations, targets[points.row], points.u)
-            farthest_first = np.argsort(-end.error, kind="stable")  # what is written last stays
+            # what is written last stays
+            farthest_first = np.argsort(-end.error, kind="stable")
             better = farthest_first[end.error[farthest_first] < error[points.row[farthest_first]]]
             u[points.row[better]], error[points.row[better]] = end.u[better], end.error[better]
         return self.boxed.points(u), np.asarray(error <= DESCENT.kept)
@@ -222,7 +223,8 @@ class Points:
         away = np.where(self.error <= SLIDE.bent, self.away, np.inf)
         order, distance = np.argsort(-away, kind="stable"), np.full(N, np.inf)
         place = np.zeros(N, dtype=np.int64)
-        place[self.row[order]], distance[self.row[order]] = order, away[order]  # what is written last stays
+        # what is written last stays
+        place[self.row[order]], distance[self.row[order]] = order, away[order]
         return place, distance
 
     def apart(self, N: int, count: int, settled: float = SLIDE.bent) -> "Points":
@@ -369,9 +371,12 @@ class _Run:
         self.u = start.copy()
         self.gap = self._gaps(np.arange(len(start)), start)  #: phi - phi(q), x relative to sizes, (N, n)
         self._longest = np.full(len(start), SLIDE.longest)
-        self._before = np.zeros((len(start), 2, start.shape[1] - boxed.m))  # the last z, as projected and as taken
-        self._held = np.zeros(start.shape, dtype=np.int8)  # which bounds the last steps held
-        self._meets = np.zeros(len(start), dtype=bool)  # rows that met the end of a condition
+        # the last z, as projected and as taken
+        self._before = np.zeros((len(start), 2, start.shape[1] - boxed.m))
+        # which bounds the last steps held
+        self._held = np.zeros(start.shape, dtype=np.int8)
+        # rows that met the end of a condition
+        self._meets = np.zeros(len(start), dtype=bool)
 
     def advance(self, rows: Indices) -> Indices:
         """Try a step in some rows; returns those that go on."""
@@ -522,7 +527,8 @@ def project(B: Array, low: Array, high: Array, wanted: Array, held: NDArray[np.i
         values = _times(B[left], z[left])
         now = (values > high[left]) * 1 - (values < low[left]) * 1
         changes = now != held[left]
-        if k >= SLIDE.rounds // 6:  # the first bound alone, so that they do not change back and forth
+        # the first bound alone, so that they do not change back and forth
+        if k >= SLIDE.rounds // 6:
             changes &= np.cumsum(changes, axis=1) == 1
         some = changes.any(axis=1)
         held[left[some]] = np.where(changes, now, held[left])[some]

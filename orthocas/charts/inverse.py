@@ -327,7 +327,8 @@ class Inverse:
         near = curves.search(targets[rows], own, tolerance)
         has = np.isfinite(near.distance)
         between = np.flatnonzero(near.between & has)
-        if between.size:  # xi turns back there
+        # xi turns back there
+        if between.size:
             near.q[between] = inside.nearer(targets[rows[between]], near.q[between])
         self._replace(targets, best, rows[has], near.q[has], tolerance)
         return np.asarray(rows[~has], dtype=np.int64)

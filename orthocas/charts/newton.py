@@ -87,7 +87,8 @@ class Newton:
 
     def __call__(self, targets: Array, starts: Array) -> Attempt:
         """Search from starts (N, n)."""
-        with np.errstate(all="ignore"):  # steps of nearly singular J may overflow
+        # steps of nearly singular J may overflow
+        with np.errstate(all="ignore"):
             run = _Run(self._map, targets, starts)
             rows = np.flatnonzero(np.isfinite(run.error))
             run.refresh(rows)
@@ -115,7 +116,8 @@ class _Run:
         self.error = largest(self.residual)
         self.iterations = np.zeros(N, dtype=np.int64)
         self.stale = np.zeros(N, dtype=bool)  #: rows that need J anew
-        self._fresh = np.zeros(N, dtype=bool)  # rows whose J belongs to q
+        # rows whose J belongs to q
+        self._fresh = np.zeros(N, dtype=bool)
         self._inverse = np.full((N, n, n), np.nan)  # of J / scale
         self._condition = np.full(N, np.inf)
 
@@ -302,7 +304,8 @@ class PointFunctions:
         H = ca.MX.sym("H", n, n)
         scale = ca.DM(sizes) + ROUNDING * ca.fabs(target)
         now, value, left = q, known, difference(target, known)
-        errors = [ca.norm_2(left / scale)]  # norm_inf drops NaN
+        # norm_inf drops NaN
+        errors = [ca.norm_2(left / scale)]
         for _ in range(NEWTON.steps):
             now = now + H @ left
             value = phi(now)
@@ -388,7 +391,8 @@ class FewRows:
         if len(targets) > NEWTON.few:
             return self._other(targets, starts)
         attempt = Attempt.empty(*targets.shape)
-        with deferred():  # otherwise CasADi turns Ctrl-C into a RuntimeError, or swallows it
+        # otherwise CasADi turns Ctrl-C into a RuntimeError, or swallows it
+        with deferred():
             solver, done = PointSolver(self._functions), np.zeros(len(targets), dtype=bool)
             for k in range(len(targets)):
                 solver.q[:], solver.target[:] = starts[k], targets[k]
@@ -405,7 +409,8 @@ class Bound:
     """A function on arrays that stay in place: `run()` evaluates it."""
 
     def __init__(self, function: ca.Function, inputs: list[Array], outputs: list[Array]) -> None:
-        buffer: Any  # the stubs of set_arg and set_res ask for a size, the methods take none
+        # the stubs of set_arg and set_res ask for a size, the methods take none
+        buffer: Any
         buffer, run = function.buffer()
         for i, array in enumerate(inputs):
             buffer.set_arg(i, array.data)

@@ -81,7 +81,8 @@ def _judged(problem: Problem, coordinates: CoordinateMap, points: Array) -> dict
     J = coordinates.jacobian(samples.points)
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         squares = np.einsum("sij,sij->si", J, J)
-    alive = ((squares > 0) & (squares < WORST.longest**2)).all(axis=1)  # false for NaN, as grown coordinates have it
+    # false for NaN, as grown coordinates have it
+    alive = ((squares > 0) & (squares < WORST.longest**2)).all(axis=1)
     kept[kept] = alive
     if not alive.all():
         samples, J = samples[alive], J[alive]
@@ -141,7 +142,8 @@ def measure_held_speeds(problem: Problem, points: Array, J: Array, seed: int) ->
     rows = problem.task.batched_frame_jacobian(points)[0].reshape(N, n - r, n)
     whole = np.concatenate([rows, J], axis=1)
     if inverse is not None:
-        whole = whole @ np.linalg.cholesky(inverse)  # A^-1 = W W^T, and |W^-1 dq| = |dq|_A
+        # A^-1 = W W^T, and |W^-1 dq| = |dq|_A
+        whole = whole @ np.linalg.cholesky(inverse)
     u = np.random.default_rng((seed, WORST.velocities)).normal(size=(N, n - r))
     velocity = np.concatenate([u / np.linalg.norm(u, axis=1, keepdims=True), np.zeros((N, r))], axis=1)
     regular, speeds = np.linalg.det(whole) != 0, np.full(N, np.inf)
@@ -191,7 +193,8 @@ def point_quality(problem: Problem, coordinates: CoordinateMap, points: Array) -
     conditioning[judged.kept] = judged.conditioning
     lower, upper = problem.domain.bounds
     distance = np.minimum(points - lower, upper - points).min(axis=1)
-    distance = np.where(problem.domain.contains(points), distance, np.minimum(distance, 0.0))  # too near a singularity
+    # too near a singularity
+    distance = np.where(problem.domain.contains(points), distance, np.minimum(distance, 0.0))
     return PointQuality(leak, conditioning, distance)
 
 
@@ -353,7 +356,8 @@ def triangle(matrix: ca.SX) -> list[ca.SX]:
     found = []
     for k in range(n - 1):
         v, norm, half = _reflection(A[k, k:].T)
-        found.append(ca.if_else(A[k, k] >= 0, norm, -norm))  # the pivot is of the other sign, and so is the reflection
+        # the pivot is of the other sign, and so is the reflection
+        found.append(ca.if_else(A[k, k] >= 0, norm, -norm))
         shares = A[k + 1 :, k:] @ v / _or_one(half)
         A[k + 1 :, k + 1 :] -= shares @ v[1:].T
     return [*found, A[n - 1, n - 1]]
@@ -473,7 +477,8 @@ def _formulas(task: ca.SX, covectors: ca.SX, inverse: ca.SX | None, at: ca.SX) -
     raised, gradients = (rows if inverse is None else rows @ inverse for rows in (task, covectors))
     products, shares = gradients @ covectors.T, raised @ covectors.T
     euclidean, own = _lengths(covectors), ca.sqrt(ca.diag(products))
-    scale = ca.sqrt(ca.sum2(raised * task))  # normalise rows first, so that units do not matter
+    # normalise rows first, so that units do not matter
+    scale = ca.sqrt(ca.sum2(raised * task))
     along = whitened(raised @ task.T / (scale @ scale.T), shares / (scale @ own.T), _SMALLEST_PIVOT)
     unit = products / (own @ own.T)
     gram = ca.vertcat(ca.horzcat(ca.SX.eye(m), along), ca.horzcat(along.T, ca.tril2symm(ca.tril(unit))))
