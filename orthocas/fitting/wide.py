@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.bases.cyclic import keeps_self_motions, turns_tool, widen_over_cyclic_joints
-from orthocas.bases.family import CyclicParametrisation, JointSpace, LinearFamily, Parametrisation
+from orthocas.bases.family import (
+    CyclicParametrisation,
+    JointSpace,
+    LinearFamily,
+    Parametrisation,
+    require_parametrisation,
+)
 from orthocas.bases.mlp import MLP
 from orthocas.bases.products import Polynomial
 from orthocas.bases.registry import warn_unless_savable
@@ -26,7 +32,6 @@ from orthocas.errors import BranchWarning, DomainError, Interrupted, InvalidValu
 from orthocas.fitting.exact_quantity import choose_quantities, take_exactly
 from orthocas.fitting.fit import Fit, fix_gauge, normalise
 from orthocas.fitting.like import Like, Likeness, MeaningError
-from orthocas.fitting.settings import require_parametrisation
 from orthocas.fitting.terms import Weights, find_least_volume, find_term
 from orthocas.fitting.wide_search import (
     RULES,

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from orthocas.bases.family import ArrayFamily, CombinableFamily, JointSpace, LinearFamily, Parametrisation
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError
-from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
-from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.basis_objective import BasisGradients, BasisObjective, build_gradients
 from orthocas.fitting.like import Like, QuadraticTerm
 from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
 from orthocas.fitting.stages import Resampled, Stage, WeightedSum
