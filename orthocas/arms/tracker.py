@@ -155,11 +155,16 @@ class ArmTracker(Shown):
         Raises:
             InvalidValueError: if x is no task value of this task, or xi and a posture are given.
         """
+        wish = None if xi is None else self._read_wish(xi)
         if posture is not None:
             if xi is not None:
                 raise InvalidValueError("posture", "given with xi", "one of the two")
-            self._engine.stay_near(self._read_wished_posture(posture))
-        wish = None if xi is None else self._read_wish(xi)
+            near = as_float_array("posture", posture)
+            require_shape("posture", near.shape, (self._maps.robot.n,))
+            if np.isfinite(near).all():
+                self._engine.stay_near(near)
+            else:
+                wish = np.nan  # BAD_INPUT
         if type(x) is np.ndarray and x.dtype == np.float64 and x.shape == (self._maps.task.m,):
             return self._engine.step(x, None, wish)
         targets, single = self._maps.targets.read(x)
@@ -178,11 +183,6 @@ class ArmTracker(Shown):
             return as_number("xi", xi)
         values = as_float_array("xi", xi)
         require_shape("xi", values.shape, (self._r,))
-        return values
-
-    def _read_wished_posture(self, posture: ArrayLike) -> Array:
-        values = as_float_array("posture", posture)
-        require_shape("posture", values.shape, (self._maps.robot.n,))
         return values
 
     def _read_posture(self, q: ArrayLike) -> Array:
