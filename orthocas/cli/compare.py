@@ -129,7 +129,7 @@ def _choose_branch(domain: str | None, problem: Problem) -> Branch | None:
     if kind != "branch":
         raise InvalidValueError("--domain", repr(domain), "branch or branch:NAME")
     parts = branches(problem.robot, problem.task)
-    return parts[name.strip()] if name else parts.of(problem.domain.centre) or parts[0]
+    return parts[name.strip()] if name else parts.of(problem.domain.home) or parts[0]
 
 
 def write_comparison(comparison: Comparison, folder: Path, force: bool) -> None:

@@ -99,7 +99,7 @@ def follow(
     if collisions is not None:
         require_kind("collisions", collisions, Collisions)
         collisions.require_for(chart.problem.robot.tree)
-    start = chart.problem.domain.centre if q_start is None else as_point("q_start", q_start, chart.n)
+    start = chart.problem.domain.home if q_start is None else as_point("q_start", q_start, chart.n)
     distances = LinkDistances(chart.problem.robot, obstacles, link_radius)
     limits = _read_limits(chart, velocity_limits, acceleration_limits, distances, clearance)
     stamp = as_number("period", period)
