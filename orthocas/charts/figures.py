@@ -65,7 +65,7 @@ def self_motion_figure(chart: "Chart", postures: int = 9, reach: float | None = 
         panel = figure.add_subplot(rows, columns, j + 1, projection="3d")
         for points, colour in zip(chart.problem.robot.joint_points(sweep), colours, strict=True):
             panel.plot(*points.T, "-o", color=colour, markersize=3, linewidth=1.8)
-        moved = np.abs(chart.x(sweep) - chart.x(chart.problem.domain.centre)).max()
+        moved = np.abs(chart.x(sweep) - chart.x(chart.problem.domain.home)).max()
         low, high = chart.xi(sweep[[0, -1]])[:, j]
         title = rf"$\xi_{{{j + 1}}}$ from {low:.3g} to {high:.3g}, dark to light"
         panel.set_title(f"{title}\ntask moves {_bound(moved)}", fontsize=10)
@@ -88,7 +88,7 @@ def _draw_angles(axes: Axes, angles: "AngleStatistics", colour: str, label: str)
 
 def _sweep(chart: "Chart", j: int, postures: int, reach: float | None) -> Array:
     """Joint positions along xi_j with all else held. Each is solved from its neighbour, from the middle outwards."""
-    centre = chart.problem.domain.centre
+    centre = chart.problem.domain.home
     base = chart.phi(centre)
     if reach is None:
         fan = fan_along(chart, centre, j)

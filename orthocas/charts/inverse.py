@@ -359,7 +359,7 @@ class Inverse:
         """Points of the table near the targets, nearest first, and the centre of the domain, (N, n) each."""
         if len(targets):
             yield from self.starts.nearest(targets, count, self.problem.n)
-            yield np.broadcast_to(self.problem.domain.centre, targets.shape)
+            yield np.broadcast_to(self.problem.domain.home, targets.shape)
 
     def _attempt(self, targets: Array, starts: Array, tolerance: float, local: LocalSolver | None = None) -> Found:
         """One search from starts (N, n), judged."""

@@ -91,7 +91,7 @@ def compare(
         if kind != "branch":
             raise InvalidValueError("--domain", repr(domain), "branch or branch:NAME")
         parts = branches(built.robot, built.task)
-        branch = parts[name.strip()] if name else parts.of(built.domain.centre) or parts[0]
+        branch = parts[name.strip()] if name else parts.of(built.domain.home) or parts[0]
     losses = [parse_weights(text, None) for text in weights] if weights else None
     with open_output_folder("--out", out) as folder, open_output_folder("--out", folder / "charts") as charts:
         require_replaceable_files(folder, _FILES, force)

@@ -103,7 +103,7 @@ class Like:
         if isinstance(like, Task):
             if like.robot.joint_names != robot.joint_names:
                 raise InvalidValueError("like", "a task of another robot", "one of the problem's robot")
-            like = like.with_reference_at(problem.domain.centre)
+            like = like.with_reference_at(problem.domain.home)
             labels = zip(like.labels, like.units, strict=True)
             names = tuple(f"{label} [{unit}]" if unit else label for label, unit in labels)
             return cls(names, _require_arms(robot, q, like.smooth_function(q)))
@@ -171,7 +171,7 @@ class Like:
         """
         self.require_at_most(problem.r - (problem.n - len(active)))
         q = ca.SX.sym("q", len(active))
-        whole = ca.SX(ca.DM(problem.domain.centre))
+        whole = ca.SX(ca.DM(problem.domain.home))
         whole[active] = q
         values = self.function(whole)
         slopes = dense_function("like_jacobian", [q], [ca.cse(ca.jacobian(values, q))])

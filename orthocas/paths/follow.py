@@ -96,7 +96,7 @@ def follow(
     if collisions is not None:
         require_kind("collisions", collisions, Collisions)
         collisions.require_for(chart.problem.robot.tree)
-    start = chart.problem.domain.centre if q_start is None else as_point("q_start", q_start, chart.n)
+    start = chart.problem.domain.home if q_start is None else as_point("q_start", q_start, chart.n)
     # limits of all joints, > 0 and finite
     most = chart.problem.robot.velocity_limits if velocity_limits is None else velocity_limits
     speeds = _spread_limits(chart, "velocity_limits", most)
