@@ -107,8 +107,8 @@ class ChartPanel:
         lines += [f"task {task}; {chart.r} coordinate{'s' if chart.r > 1 else ''}"]
         self._head = f'<div class="name">{escape(name_robot(robot))}</div><div class="about">{"<br>".join(lines)}</div>'
 
-    def format_html(self, readings: Readings, nearest: str = "") -> str:
-        """The page; `nearest` is a part about collisions."""
+    def format_html(self, readings: Readings, nearest: str = "", ends: str = "") -> str:
+        """The page; `nearest` is a part about collisions, `ends` one about what ends a coordinate."""
         m = len(readings.x)
         # What stopped the last motion, and the leak of each coordinate.
         stop = f'<div class="stop">stopped by {escape(readings.stop)}</div>' if readings.stop else ""
@@ -141,11 +141,21 @@ class ChartPanel:
         drift = format_number("drift", float(readings.drift.max()), format_drift(readings.drift, self._units))
         parts = [
             STYLE, '<div class="oc">', self._head, f'<div class="held"><span>task moved by</span>{drift}</div>',
-            stop, "<h4>leak of the coordinates</h4>", *leaks,
+            stop, ends, "<h4>leak of the coordinates</h4>", *leaks,
             "<h4>chart</h4>", conditioning, boundary, nearest,
             "<h4>joints</h4>", self._joints.format_html(readings.q), self._joints.format_copy(readings.q), "</div>",
         ]  # fmt: skip
         return "".join(parts)
+
+
+def format_ends(label: str, ends: tuple[float, float], stops: Sequence[str]) -> str:
+    """What ends a coordinate on both sides, with the task and the other coordinates held."""
+    rows = [
+        f'<div class="row"><span>{escape(label)} {side}</span><span class="about">{escape(stop)}</span>'
+        f"{format_number(f'{label} {side}', value, f'{value:.3f}')}</div>"
+        for side, value, stop in zip(("from", "to"), ends, stops, strict=True)
+    ]
+    return f"<h4>how far {escape(label)} goes from here</h4>{''.join(rows)}"
 
 
 class JointBars:
