@@ -45,7 +45,7 @@ class ViewRules:
     centre: Colour = (64, 168, 116)
     high: Colour = (245, 118, 10)
     trace: float = 0.004  #: thickness of a line
-    same_place: float = 0.1  #: of two labels, over the size of what moves
+    same_place: float = 0.3  #: of two labels, over the size of what moves
 
     most_instants: int = 1_000_000  #: of a motion in a file
     cycle: float = 5.0  #: of a closed path [s]

@@ -126,7 +126,7 @@ def view(
         width = np.shape(path)[1:]
         points, _ = as_point_set("path", path, shown.n if width == (shown.n,) else shown.m)
     shape = build_shape(arm, robot_file, locked)
-    server, url = open_window(host, port, name_robot(arm))
+    server, url = open_window(host, port, name_robot(arm, shown.problem.name if isinstance(shown, Chart) else ""))
     try:
         page: ChartPage | RobotPage | PlayerPage
         if motions:
