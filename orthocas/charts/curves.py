@@ -114,7 +114,7 @@ class SelfMotionCurves:
             left = np.flatnonzero(~known.all(axis=1) & (best.distance[rows] > 0))
             if not left.size:
                 break
-            # with many rows one start each, the nearest to the boundary; with few all at once
+            # with many rows one start each, the nearest to the domain; with few all at once
             if left.size > RULES.few:
                 of, start = left, np.argmin(np.where(known[left], np.inf, away[left]), axis=1)
             else:

@@ -276,7 +276,7 @@ class Slices:
         whose turns change xi unevenly towards the centre of the domain, and once more to both sides.
         """
         domain, (low, high), turning = self.boxed.domain, self.boxed.domain.bounds, self.tracer.turning
-        # endless joints whose turns change xi: of each point, the turns on both sides as well
+        # of endless joints whose turns change xi unevenly, the turns on both sides as well
         uneven = turning & ~np.isfinite(low) & ~self.boxed.even
         several = ~uneven & ((domain.half_width > np.pi) | ~np.isfinite(low))
         turns = 2 * np.pi * np.array(list(product(*((-1, 0, 1) if more else (0,) for more in uneven))))
