@@ -199,6 +199,7 @@ def _note_impossible_inertias(path: str | Path, root: ElementTree.Element) -> No
         if inertia is not None:
             values = (float(inertia.get(name, 0)) for name in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
             xx, yy, zz, xy, xz, yz = values
+            # a mass distribution has moments that fulfil the triangle inequality
             moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
             slack = RULES.inertia * np.abs(moments).max() + RULES.least_inertia
             if moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack:
@@ -356,6 +357,7 @@ def _lock_mimics(
 def _find_leader(name: str, mimics: Mapping[str, ElementTree.Element]) -> tuple[str, float, float]:
     """The independent joint that a joint follows, along all leaders; the multiplier and the offset."""
     factor, offset, passed = 1.0, 0.0, set()
+    # leaders may follow others: factors multiply, offsets add up
     while name in mimics:
         if name in passed:
             raise RobotError(f"joint '{name}' mimics itself")
@@ -379,6 +381,7 @@ def read_srdf_postures(urdf: Path, joint_names: Sequence[str]) -> dict[str, Arra
     if path is None:
         return {}
     states: dict[str, dict[str, float]] = {}
+    # numbers only: values of joints with several are left out
     for state in read_xml(path, "SRDF", "robot").iter("group_state"):
         joints = states.setdefault(state.get("name", ""), {})
         for joint in state.iter("joint"):
