@@ -376,7 +376,7 @@ class FrictionObserver(_Correcting):
     no law resolves less. tolerance_k is at least what that moves phi_k: nothing for arms with rotors, but 20 mrad for a
     bare flange of 1e-4 kg m^2, which would otherwise jump to and fro. Slow r bears wrong masses: with the rate
     alpha omega, a joint whose true inertia is kappa times that of the model is stable up to
-    kappa = (2 zeta + alpha) (1 + 2 zeta alpha) / alpha (docs/explanation/derivations_control.md#observers).
+    kappa = (2 zeta + alpha) (1 + 2 zeta alpha) / alpha (docs/explanation/derivations_springs.md#observers).
 
     Args:
         rate: > 0 [1/s].
