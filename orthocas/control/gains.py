@@ -280,13 +280,13 @@ def find_holding_doubts(robot: Robot, domain: Domain, limit: Array) -> list[str]
         domain: where it is to be held.
         limit: largest torque or force of each joint, (n,) [N m] or [N], infinite where there is none.
     """
-    points = np.vstack([domain.centre, sample_uniform(domain, RULES.samples, RULES.seed)])
+    points = np.vstack([domain.home, sample_uniform(domain, RULES.samples, RULES.seed)])
     needed = np.abs(robot.gravity(points))
     excess = needed / limit
     heavy = (excess > 1).any(axis=1)
     if not heavy.any():
         return []
-    # The centre comes first among the points.
+    # The home comes first among the points.
     worst = 0 if heavy[0] else int(np.argmax(excess.max(axis=1)))
     joint = int(np.argmax(excess[worst]))
     unit = "N" if robot.tree.prismatic[joint] else "N m"

@@ -330,8 +330,8 @@ class Adaptation(_Correcting):
 
         # dp/dt = -rate gain Y^T J^-1 (de / c + e), while the law commands; gains follow its stiffness at the joints,
         # the diagonal of J^T K J at the centre of the domain.
-        J_centre = chart.parts.batched_rates(problem.domain.centre[None])[0]
-        stiffness = np.asarray((J_centre**2 * law.stiffness[:, None]).sum(axis=0))
+        J_home = chart.parts.batched_rates(problem.domain.home[None])[0]
+        stiffness = np.asarray((J_home**2 * law.stiffness[:, None]).sum(axis=0))
         springs = stiffness[list(joints)] / RULES.gravity**2
         slowest = self._compute_crossing(law)
         slope = -min(self.rate, slowest) * springs * (Y.T @ (B @ (Lambda @ (de / slowest + e))))
@@ -348,7 +348,7 @@ class Adaptation(_Correcting):
     def _compute_crossing(self, law: _OperationalSpace) -> float:
         """c [1/s]; larger weights, and faster learning, make soft laws swing."""
         # The slowest mode with a spring.
-        modes = law.modes(law.problem.domain.centre)
+        modes = law.modes(law.problem.domain.home)
         sprung = modes.frequencies > 0
         decays = 2 * np.pi * modes.frequencies[sprung] * np.minimum(modes.damping_ratios[sprung], 1.0)
         if not (decays > 0).any():

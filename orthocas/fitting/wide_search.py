@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from orthocas.bases.family import ArrayFamily, CombinableFamily, JointSpace, LinearFamily, Parametrisation
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError
-from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
-from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.basis_objective import BasisGradients, BasisObjective, build_gradients
 from orthocas.fitting.like import Like, QuadraticTerm
 from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
 from orthocas.fitting.stages import Resampled, Stage, WeightedSum
 from orthocas.fitting.terms import RULES as LOSS
 from orthocas.fitting.terms import Weights, find_least_volume
+from orthocas.robots.collisions import Collisions
 from orthocas.solvers.adam import Adam
 from orthocas.solvers.lbfgs import LBFGS
 from orthocas.solvers.protocol import Objective, Solver, SolveResult
@@ -66,6 +66,7 @@ class WideRules:
     fresh_of_networks: int = 200_000
     worst_of_networks: int = 10_000
 
+    divided: float = 0.9  #: regular share below which a branch with a singular middle has a smaller box, if it has more
     held_out: int = 20_000  #: samples that evaluate coordinates
     enough: float = 5e-4  #: fraction of bad positions, many near limits, that is as good as none
     well: float = 0.28  #: over r, volume of all but 1 % of positions that is enough: a conditioning of 0.2
@@ -103,6 +104,7 @@ class WideSettings:
     monitor: Monitor = silent
     weights: Weights | Mapping[str, float] | None = None  #: of terms that join the loss; `Weights` also of the angles
     quantities: Like | None = None  #: what the first coordinates follow
+    collisions: Collisions | None = None  #: samples that touch something are left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,12 +255,16 @@ class Search:
         points = points[is_on_side_of_centre(self.problem, points)]
         if not len(points):
             raise InvalidValueError("samples", count, "more: none lies on the centre's side of singular positions")
+        if self.settings.collisions is not None:
+            points = points[self.settings.collisions.check_free(points)]
+            if not len(points):
+                raise InvalidValueError("collisions", "a contact at all samples of the branch", "free postures")
         return points
 
     def _sample_near_centre(self) -> Array:
         """Nonsingular samples near the centre of the domain, whose sign decides which part of it is kept."""
         domain = self.problem.domain
-        near, count = Box(domain.centre, RULES.near * domain.half_width), max(2, int(RULES.near * self.samples))
+        near, count = Box(domain.home, RULES.near * domain.half_width), max(2, int(RULES.near * self.samples))
         points = sample_uniform(near, count, (self.settings.seed, RULES.tag, RULES.centre_tag))
         return np.asarray(points[domain.contains(points)])
 
@@ -429,7 +435,7 @@ class Search:
     @cached_property
     def _centre(self) -> Samples:
         """The centre of the domain."""
-        return sample_frames(self.problem, self.problem.domain.centre[None])
+        return sample_frames(self.problem, self.problem.domain.home[None])
 
     @cached_property
     def _held_out(self) -> Samples:
@@ -439,7 +445,7 @@ class Search:
 
 def is_on_side_of_centre(problem: Problem, points: Array) -> NDArray[np.bool_]:
     """Whether points (N, n) are on the centre's side of singular positions, (N,), if r joints do not move the task."""
-    q, task = np.vstack([problem.domain.centre, points]), problem.task
+    q, task = np.vstack([problem.domain.home, points]), problem.task
     J = task.batched_frame_jacobian(q)[0].reshape(len(q), task.m, problem.n)
     moving = np.abs(J).max(axis=(0, 1)) > NEGLIGIBLE * np.abs(J).max()
     if moving.sum() != task.m:
