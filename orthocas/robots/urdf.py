@@ -10,7 +10,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, files
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
