@@ -262,12 +262,14 @@ def _build_problems(
         most = f"at most {math.floor(1e3 * float(values.max()) / BRANCH_RULES.of_centre) / 1e3:g} can serve it"
         raise DomainError(f"branch '{branch.name}' has {missing}, expected one for clearance = {clearance:g}: {most}")
     best = int(np.argmax(np.log(room).sum(axis=1)))
-    whole = ClearBox(box, task, clearance, home=clear[best])
-    smaller = Box(clear[best], room[best], box.unbounded)
-    return (
-        Problem(robot, task, metric, whole, branch.name),
-        Problem(robot, task, metric, smaller, branch.name, clearance),
-    )
+    home, half_width, centre = clear[best], room[best], box.centre.copy()
+    smaller = Problem(robot, task, metric, Box(home, half_width, box.unbounded), branch.name, clearance)
+    # a smaller box leaves nothing out of joints without limits; these have their turn around the home
+    if {*np.flatnonzero(half_width < box.half_width)} <= {*box.unbounded}:
+        return (smaller,)
+    centre[list(box.unbounded)] = home[list(box.unbounded)]
+    whole = ClearBox(Box(centre, box.half_width, box.unbounded), task, clearance, home=home)
+    return Problem(robot, task, metric, whole, branch.name), smaller
 
 
 def _fit_most(problems: tuple[Problem, ...], fit_on: Callable[[Problem], WideFit]) -> WideFit:
