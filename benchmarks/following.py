@@ -14,7 +14,8 @@ from benchmark import run
 import orthocas as oc
 from orthocas import problems
 from orthocas.paths import JointMotion
-from orthocas.robots.obstacles import Obstacle, Sphere
+from orthocas.robots.collisions import Collisions
+from orthocas.robots.obstacles import Sphere
 from orthocas.tools.checks import Array
 
 T = TypeVar("T")
@@ -49,16 +50,14 @@ def raster(chart: oc.Chart, poses: int) -> Array:
     return np.asarray(chart.x(chart.problem.domain.centre) + np.vstack(lines))
 
 
-def row(name: str, chart: oc.Chart, path: Array, xi: str, obstacles: list[Obstacle], calls: int) -> str:
+def row(name: str, chart: oc.Chart, path: Array, xi: str, around: Collisions | None, calls: int) -> str:
     """One path; the least time of some calls."""
-    seconds, motion = _best(
-        lambda: oc.follow(chart, path, xi, obstacles=obstacles, link_radius=0.05, clearance=0.01 if obstacles else 0.0),
-        calls,
-    )
+    clearance = 0.0 if around is None else 0.01
+    seconds, motion = _best(lambda: oc.follow(chart, path, xi, collisions=around, clearance=clearance), calls)
     kept = motion.margins
-    distance = f"{kept.distance:.3f}" if obstacles else "-"
+    distance = "-" if around is None else f"{kept.distance:.3f}"
     return (
-        f"| {name} | {xi}{', a ball in the way' if obstacles else ''} | {seconds:.2f} | {motion.duration:.2f} "
+        f"| {name} | {xi}{'' if around is None else ', a ball in the way'} | {seconds:.2f} | {motion.duration:.2f} "
         f"| {100 * kept.velocity:.0f} %, {100 * kept.acceleration:.0f} % | {kept.boundary:.3f} | {distance} "
         f"| {_tool_error(chart, motion):.1e} | {_closed(motion)} |"
     )
@@ -76,7 +75,8 @@ def main(quick: bool = False) -> list[str]:
     """All rows; `quick` takes few poses and a coarse chart, and one call of each."""
     poses, degree, calls = (100, 2, 1) if quick else (1000, 4, 3)
     chart = iiwa("position", degree)
-    ways: list[tuple[str, list[Obstacle]]] = [("hold", []), ("objective", []), ("objective", [BALL])]
+    around = chart.robot.with_rods(0.05).collisions.with_scene(oc.Scene({"ball": BALL}))
+    ways: list[tuple[str, Collisions | None]] = [("hold", None), ("objective", None), ("objective", around)]
     rows = [row(f"iiwa, degree {degree}, circle", chart, circle(chart, 0.12, poses), *way, calls) for way in ways]
     rows += [row(f"iiwa, degree {degree}, raster", chart, raster(chart, poses), *way, calls) for way in ways[:2]]
     if not quick:

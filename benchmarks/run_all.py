@@ -35,6 +35,7 @@ SCRIPTS = (
     "choices",
     "elbow_angle",
     "scaling",
+    "many_machines",
     "gradients",
     "compiled_loss",
     "ipopt_front",

@@ -10,7 +10,7 @@ from matplotlib.patches import Circle
 
 import orthocas as oc
 from orthocas.paths import JointMotion
-from orthocas.robots.obstacles import Capsule, LinkDistances
+from orthocas.robots.collisions import Collisions
 
 START = np.array([0.6, 0.8, 0.8])
 RADIUS = 0.35  # of the tool path [m]
@@ -33,7 +33,8 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     robot = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
     problem = oc.Problem(robot, oc.Task.position(robot, "xy"), domain=oc.Box(START, 0.75))
     chart = oc.fit(problem, oc.Polynomial(3 if quick else 5), samples=500 if quick else None).chart
-    post = Capsule([*POST, -1.0], [*POST, 1.0], POST_RADIUS)
+    post = oc.obstacles.Capsule([*POST, -1.0], [*POST, 1.0], POST_RADIUS)
+    around = robot.with_rods(LINK_RADIUS).collisions.with_scene(oc.Scene({"post": post}))
     angle = np.linspace(0, 2 * np.pi, 100)
     path = chart.x(START) + RADIUS * np.column_stack([np.cos(angle) - 1, np.sin(angle)])
     motions = {
@@ -43,21 +44,19 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
             path,
             "objective",
             velocity_limits=1.0,
-            obstacles=[post],
-            link_radius=LINK_RADIUS,
+            collisions=around,
             clearance=CLEARANCE,
         ),
     }
-    distances = LinkDistances(robot, [post], LINK_RADIUS)
     figure = Figure(figsize=(10.5, 4.2), layout="constrained")
     axes = figure.subplots(1, 3, width_ratios=(1, 1, 1.1))
     for ax, (name, motion) in zip(axes, motions.items(), strict=False):
         draw_arms(ax, robot, motion, name)
-    draw_distances(axes[2], motions, distances)
+    draw_distances(axes[2], motions, around)
     figure.savefig(out / "follow_path.png", dpi=150)
     found: dict[str, float] = {}
     for name, motion in motions.items():
-        found[f"{name}: distance from the post [m]"] = float(distances(motion.q).min())
+        found[f"{name}: distance from the post [m]"] = float(around.distance(motion.q).distance.min())
         found[f"{name}: distance from the boundary [half-widths]"] = motion.margins.boundary
         found[f"{name}: duration [s]"] = motion.duration
         found[f"{name}: joints away from their start at the end [rad]"] = float(
@@ -78,10 +77,10 @@ def draw_arms(ax: Axes, robot: oc.Robot, motion: JointMotion, name: str) -> None
     ax.set_title("xi held" if name == "hold" else "xi by objective")
 
 
-def draw_distances(ax: Axes, motions: dict[str, JointMotion], distances: LinkDistances) -> None:
+def draw_distances(ax: Axes, motions: dict[str, JointMotion], around: Collisions) -> None:
     """Distance of the links from the post along the path."""
     for name, motion in motions.items():
-        values = 1e3 * distances(motion.q).min(axis=1)
+        values = 1e3 * around.distance(motion.q).distance
         ax.plot(motion.s, values, color=COLOURS[name], label="xi held" if name == "hold" else "xi by objective")
     ax.axhline(1e3 * CLEARANCE, color="black", ls=":", lw=1)
     ax.text(0.01, 1e3 * CLEARANCE, "clearance", va="bottom", fontsize=8)

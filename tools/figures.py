@@ -18,6 +18,7 @@ take values. Numbers that nobody measured (settings, limits, versions) are the p
 import argparse
 import contextlib
 import importlib
+import importlib.util
 import inspect
 import io
 import json
@@ -27,6 +28,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
+import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
@@ -361,16 +363,20 @@ def renumbered(text: str, after: str) -> str:
 
 
 def main(names: Sequence[str], keep: bool) -> int:
-    """Rerun records, and show what moved; the number of records with moved figures."""
-    known, count = records(), 0
-    for record in [known[name] for name in names] or [r for r in known.values() if r.cheap]:
+    """Rerun records, and show what moved; the number of records with moved figures, or that failed."""
+    known, count, failed = records(), 0, list[str]()
+    chosen = [known[name] for name in names] or [r for r in known.values() if r.cheap]
+    missing = {record.name: why for record in chosen if (why := find_missing(record))}
+    for name, why in missing.items():
+        print(f"{name} is left out: {why}", flush=True)
+    for record in [record for record in chosen if record.name not in missing]:
         print(f"{record.name}: {record.command}", flush=True)
+        # What fails says why, and does not stop the others.
         try:
             new = measured(record)
-        except ModuleNotFoundError as error:
-            if error.name == Path(record.script).stem:
-                raise  # it is no package of others
-            print(f"  left out: {error}", flush=True)
+        except Exception:
+            traceback.print_exc()
+            failed.append(record.name)
             continue
         changes = moved(record, new)
         print("".join(f"  moved: {change}\n" for change in changes), end="", flush=True)
@@ -379,7 +385,23 @@ def main(names: Sequence[str], keep: bool) -> int:
             write(new)
             renew(record, new)
     print(f"{count} records with figures that moved by more than their tolerance")
-    return count
+    if failed:
+        print(f"{len(failed)} failed: {', '.join(failed)}")
+    return count + len(failed)
+
+
+def find_missing(record: Record) -> str:
+    """What the script of a record imports that is not here, and how to get it; "" if nothing is missing."""
+    if not (record.script and (ROOT / record.script).exists()):
+        return ""
+    folder = (ROOT / record.script).parent
+    imports = re.findall(r"^ *(?:import|from) (\w+)", (ROOT / record.script).read_text(), re.MULTILINE)
+    for name in dict.fromkeys(imports):
+        if name == "browser" and imported("benchmarks/browser.py").PROGRAM is None:
+            return "it needs the browser chromium (apt install chromium)"
+        if not (folder / f"{name}.py").exists() and importlib.util.find_spec(name) is None:
+            return f"it needs the package {name} (pip install -e '.[bench]')"
+    return ""
 
 
 if __name__ == "__main__":

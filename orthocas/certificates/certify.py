@@ -83,7 +83,7 @@ def certify(
             The condition used is sufficient, and misses 4 to 14 % of the true conditioning.
         time_limit: seconds after which the certificate holds the share proved so far.
         executor: shares the work, for example `concurrent.futures.ProcessPoolExecutor`, or
-            `distributed.Client(...).get_executor()` of Dask. Default: this process.
+            `distributed.Client(...).get_executor(pure=False)` of Dask. Default: this process.
         monitor: called with progress.
         resume: an unfinished certificate of the same chart and bound, to go on from.
 

@@ -15,7 +15,7 @@ from orthocas.tools.picture import Picture, equal_axes
 
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
-    from orthocas.charts.quality import AngleStatistics, LeakStatistics, Report
+    from orthocas.charts.quality import AngleStatistics, Report
 
 _MOST_POSTURES = 1000
 _PANELS = 2  #: side by side
@@ -29,7 +29,12 @@ def quality_figure(report: "Report") -> Figure:
     left, middle, right = figure.subplots(1, 3)
     _draw_angles(left, report.task_angle, _TASK, r"task angle $\angle(\mathrm{d}\xi_j, \nabla_A h_i)$")
     _draw_angles(middle, report.mutual_angle, _EXTRA, r"mutual angle $\angle(\mathrm{d}\xi_i, \mathrm{d}\xi_j)$")
-    _draw_leaks(right, report.leak)
+    counts = report.leak.histogram[:900].reshape(-1, 5).sum(axis=1)
+    right.stairs(counts / max(counts.sum(), 1) / 0.5, 0.5 * np.arange(len(counts) + 1) - 0.05, fill=True, color=_LEAK)
+    right.set_xlim(0, max(6.0, 3 * report.leak.rms))
+    right.set_xlabel(r"leak, in the metric [deg]")
+    right.set_title(f"rms {report.leak.rms:.2f}°, largest {report.leak.max:.1f}°", fontsize=10)
+    right.grid(alpha=0.3)
     left.set_ylabel("share of angles per degree")
     figure.suptitle(f"{report.samples:,} held-out samples, conditioning mean {report.conditioning.mean:.2f}")
     return figure
@@ -69,7 +74,8 @@ def self_motion_figure(chart: "Chart", postures: int = 9, reach: float | None = 
 
 
 def _draw_angles(axes: Axes, angles: "AngleStatistics", colour: str, label: str) -> None:
-    first = 3  # groups of five bins, so that 90 degrees lies in the middle of its group
+    # groups of five bins, so that 90 degrees lies in the middle of its group
+    first = 3
     counts = angles.histogram[first:-3].reshape(-1, 5).sum(axis=1)
     edges = (first - 0.5) / 10 + 0.5 * np.arange(len(counts) + 1)
     axes.stairs(counts / max(counts.sum(), 1) / 0.5, edges, fill=True, color=colour, alpha=0.85)
@@ -77,15 +83,6 @@ def _draw_angles(axes: Axes, angles: "AngleStatistics", colour: str, label: str)
     axes.set_xlim(90 - width, 90 + width)
     axes.set_xlabel(f"{label} [deg]")
     axes.set_title(f"mean {angles.mean:.2f}°, std {angles.std:.2f}°", fontsize=10)
-    axes.grid(alpha=0.3)
-
-
-def _draw_leaks(axes: Axes, leak: "LeakStatistics") -> None:
-    counts = leak.histogram[:900].reshape(-1, 5).sum(axis=1)
-    axes.stairs(counts / max(counts.sum(), 1) / 0.5, 0.5 * np.arange(len(counts) + 1) - 0.05, fill=True, color=_LEAK)
-    axes.set_xlim(0, max(6.0, 3 * leak.rms))
-    axes.set_xlabel(r"leak, in the metric [deg]")
-    axes.set_title(f"rms {leak.rms:.2f}°, largest {leak.max:.1f}°", fontsize=10)
     axes.grid(alpha=0.3)
 
 
@@ -105,7 +102,8 @@ def _sweep(chart: "Chart", j: int, postures: int, reach: float | None) -> Array:
         for k in order:
             target = base.copy()
             target[chart.m + j] = values[k]
-            q = chart.inverse(target, q, outside=True)  # as far as was asked
+            # as far as was asked
+            q = chart.inverse(target, q, outside=True)
             found[k] = q
     return found
 

@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike
 
 from orthocas.charts.clearance import Clearance
 from orthocas.charts.coordinates import Coordinates, InvertibleMap
+from orthocas.charts.curve_tracer import CurveTracer
 from orthocas.charts.curves import SelfMotionCurves
+from orthocas.charts.descent import RULES as DESCENT
 from orthocas.charts.descent import BoxedPhi
 from orthocas.charts.inside import Inside
 from orthocas.charts.inverse import Inverse, InverseStatus, Solutions, join_solutions
@@ -32,6 +34,7 @@ from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, 
 from orthocas.robots.collisions import Collisions
 from orthocas.tasks.problem import measure_task_sizes
 from orthocas.tasks.relative import Relative
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
     Array,
@@ -485,18 +488,44 @@ class ChartParts:
         return PhiMap(chart.phi, self.batched_rates, self.phi_sizes, Differences(self.turns, self.relative))
 
     @cached_property
+    def boxed(self) -> BoxedPhi:
+        """phi in the box of the domain."""
+        return BoxedPhi(self.chart.problem.task, self.chart.problem.domain, self.phi_map, self.chart.xi)
+
+    @cached_property
+    def tracer(self) -> CurveTracer:
+        """Traces self-motion curves, r = 1."""
+        return CurveTracer(self.boxed)
+
+    @cached_property
+    def turn_shifts(self) -> dict[str, Array]:
+        """What a full turn of a joint that turns without end adds to xi everywhere, (r,) by the joint's name.
+
+        One posture then has many values of xi, these apart. Joints whose turns do not change xi are missing, and so are
+        those whose turns change it by different amounts in different postures.
+        """
+        chart, shifts = self.chart, {}
+        q = sample_uniform(chart.problem.domain, 8, 0)
+        for k in chart.problem.turning:
+            turned = chart.phi(q + 2 * np.pi * np.eye(chart.n)[k])
+            shift = self.phi_map.difference(turned, chart.phi(q))[:, chart.m :]
+            if np.abs(shift[0]).max() > DESCENT.same and np.ptp(shift, axis=0).max() < DESCENT.same:
+                shifts[chart.problem.robot.joint_names[k]] = np.asarray(shift[0])
+        return shifts
+
+    @cached_property
     def inverse(self) -> Inverse:
         """The search of `InverseMethods.solve`."""
         chart, phi_map, domain = self.chart, self.phi_map, self.chart.problem.domain
         starts = Starts(phi_map, domain)
         if isinstance(chart.coordinates, InvertibleMap):
             return Inverse(chart.problem, phi_map, OwnInverse(chart.coordinates, phi_map), starts)
-        boxed = BoxedPhi(chart.problem.task, domain, phi_map, chart.xi)
+        boxed = self.boxed
         local, brief = (
             FewRows(phi_map, self.point_functions, Newton(phi_map, k)) for k in (NEWTON.halvings, NEWTON.brief)
         )
         in_domain, inside = InDomain(boxed, Cells(boxed)), Inside(boxed, starts)
-        curves = SelfMotionCurves(boxed, starts) if chart.r == 1 else None
+        curves = SelfMotionCurves(boxed, starts, self.tracer) if chart.r == 1 else None
         return Inverse(chart.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves, brief)
 
     @cached_property

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocas.bases.family import JointSpace
 from orthocas.bases.registry import parametrisation_from_data, parametrisation_to_data
-from orthocas.charts.angles import triangle
 from orthocas.charts.coordinates import Coordinates
+from orthocas.charts.point_quality import triangle
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.tasks.clear_box import ClearBox
 from orthocas.tasks.domains import Box, Domain, StopKind, Wall, register_domain

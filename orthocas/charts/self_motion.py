@@ -11,14 +11,13 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from orthocas.charts.descent import RULES as DESCENT
+from orthocas.charts.curve_tracer import solutions_of
 from orthocas.charts.newton import Newton
 from orthocas.charts.phi import counted_on, largest, require_no_turns
 from orthocas.errors import InvalidValueError, degrees_hint
 from orthocas.robots.collisions import Collisions
 from orthocas.tasks.domains import StopKind, Wall
 from orthocas.tasks.problem import Problem
-from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array, Indices, as_number, as_point, freeze_array, require_count, require_kind
 from orthocas.tools.display import Shown, listed, number_list
 from orthocas.tools.expressions import wrap_shortest
@@ -32,13 +31,19 @@ class SelfMotionRules:
     """Numbers of ranges and self-motions."""
 
     at_limit: float = 1e-9  #: half-widths: boundaries closer to a joint limit are that limit
-    tolerance: float = 1e-11  #: largest error of the components that are held, relative to `ChartParts.phi_sizes`
-    corrections: int = 8  #: of a step
+    step: float = 0.4  #: longest step along a curve [rad] or [m]
+    shortest: float = 1e-6  #: a curve that needs shorter ones ends [rad] or [m]
+    missed: float = 0.08  #: largest correction of the longest step [rad] or [m]; of shorter ones as much less
     sharpest: float = float(np.cos(0.35))  #: of the angle between the tangents at both ends of a step
-    shortest: float = 1e-5  #: fraction of the largest step below which there is no way on
+    straight: float = 0.985  #: cosine from which the next step may be longer
+    divided: float = 0.95  #: parts of a step between two points, of the spacing that is wanted
+    at_once: int = 64  #: steps after which the curve is looked at
+    corrections: int = 8  #: of a point, at most
+    settled: float = 1e-7  #: [rad] or [m]: correction after which the next one is rounding
+    same: float = 0.02  #: [rad] or [m]: distance from the start at which the curve is back there
     longest: float = 1000.0  #: length of a curve [rad] or [m] after which it counts as endless
     rounding: float = 2e-12  #: of the place of a boundary on a step
-    step: float = 0.1  #: [rad] or [m], of the widest step
+    spacing: float = 0.1  #: of points on the curves of ranges [rad] or [m]
     phi_tolerance: float = 1e-10  #: of phi, relative to `ChartParts.phi_sizes`
     farthest: float = 3.0  #: distance of a point from its neighbour, in lengths of the predicted step
     grazing: float = 1e-4  #: [rad] or [m]: shorter steps are not checked for contacts between their ends
@@ -100,6 +105,7 @@ class Walls:
         domain = problem.domain
         self._domain, self._robot, self._collisions = domain, problem.robot, collisions
         self._low, self._high = domain.bounds
+        self.solid = collisions is not None  #: whether there is something to hit
         self._curved = domain.walls
         if collisions is not None:
             require_kind("collisions", collisions, Collisions)
@@ -114,6 +120,10 @@ class Walls:
         rooms = np.array([wall.room(q) for wall in self._curved])
         parts = [(q - self._low) / width, (self._high - q) / width, np.where(np.isfinite(rooms), rooms, -1.0)]
         return np.concatenate(parts)
+
+    def box_has(self, q: Array) -> bool:
+        """Whether q (n,) lies in the box of the domain."""
+        return bool(((q >= self._low) & (q <= self._high)).all())
 
     def stop(self, k: int, q: Array) -> Stop:
         """What the k-th function stands for, at q (n,)."""
@@ -150,7 +160,7 @@ class Walls:
         return np.asarray(wrap_shortest(q - start, 2 * np.pi * self.turning))
 
 
-Signs = Callable[[Array, Array], float]  #: q and tangent -> a number that turns negative at a fold
+Signs = Callable[[Array, Array], Array]  #: q and tangents (N, n) -> numbers (N,) that turn negative at a fold
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,21 +180,23 @@ class Branch:
 class LevelCurve:
     """The curve through q on which n - 1 components of phi are constant, within the domain of a chart.
 
-    Its unit tangent t spans the null space of the held rows of J. Steps along t are corrected by Gauss-Newton steps of
-    least norm. A step is halved until that converges and the tangent turns by less than 20 degrees.
+    Its unit tangent t spans the null space of the n - 1 held rows of J. A step of length h goes to
+
+        q + h t + h^2 / 2 dt/ds    and from there by    [J; t] dq = [e; 0],    [J; t] u = [0; 1],
+
+    where e is what is left of the held components, and u / |u| the tangent there. It is halved where dq is long or the
+    tangent turns far. Between the ends of a step the curve is a cubic, brought to the held components by two more dq.
 
     Args:
         chart: the chart. If only task components are held, its coordinates are not evaluated.
         held: indices of the held components, (n - 1,).
-        step: length of the longest step [rad] or [m].
+        spacing: largest distance of the points of the curve [rad] or [m].
         collisions: what the robot may hit; the curve ends at a contact.
     """
 
-    def __init__(self, chart: Chart, held: Indices, step: float, collisions: Collisions | None = None) -> None:
-        self.walls, self._step = Walls(chart.problem, collisions), step
-        whole = bool((held >= chart.m).any())
-        self._value, self._jacobian, self._difference = _of_phi(chart) if whole else _of_task(chart)
-        self._held, self._sizes = held, chart.parts.phi_sizes[held]
+    def __init__(self, chart: Chart, held: Indices, spacing: float, collisions: Collisions | None = None) -> None:
+        self.walls, self._spacing, self._chart, self._held = Walls(chart.problem, collisions), spacing, chart, held
+        self._with_xi = bool((held >= chart.m).any())
 
     def follow(self, q: Array, direction: Array, signs: Signs | None = None) -> Branch:
         """Follow the curve from q (n,) until it leaves the domain, meets a fold, or returns to q.
@@ -194,122 +206,157 @@ class LevelCurve:
             direction: (n,), not perpendicular to the curve.
             signs: sign of det J, to notice folds; None: they do not end the curve.
         """
-        t = self.tangent(q, direction)
-        if t is None:
+        target = self._chart.phi(q)
+        t = self._correct(target, q[None], direction[None])[1][0]
+        if not np.isfinite(t).all():
             return Branch(q[None], np.zeros(1), Stop(StopKind.SINGULAR))
-        points, tangents, lengths, h = [q], [t], [0.0], self._step
-        target, stop = self._value(q), None
+        points, tangents, steps, stop = [q[None]], [t[None]], [(q, t)], None
+        for new, onward, ended in self._step_on(target, q, t):
+            steps.append((new, onward))
+            if ended is None and len(steps) <= RULES.at_once and self.walls.box_has(new):
+                continue
+            ahead, turned = self._divide(target, *(np.array(part) for part in zip(*steps, strict=True)))
+            ahead, turned, stop = self._find_end(target, ahead, turned, signs) or (ahead, turned, ended)
+            points.append(ahead[1:])
+            tangents.append(turned[1:])
+            steps = [(new, onward)]
+            if stop is not None:
+                break
+        assert stop is not None
+        q, t = np.concatenate(points), np.concatenate(tangents)
+        return Branch(q, np.concatenate([[0.0], np.cumsum(_measure_arcs(q, t))]), stop)
+
+    def _step_on(self, target: Array, q: Array, t: Array) -> Iterator[tuple[Array, Array, Stop | None]]:
+        """Points (n,) and tangents of long steps from q (n,) along t, near the curve, and at last what ended it."""
+        start, bend, h, length, count, stop = (q, t), np.zeros(len(q)), RULES.step / 2, 0.0, 0, None
         while stop is None:
-            found = self._stepped(points[-1], tangents[-1], h, target)
+            found = self._correct_step(target, q, t, q + h * t + h**2 / 2 * bend)
             if found is None:
                 h /= 2
-                stop = Stop(StopKind.SINGULAR) if h < RULES.shortest * self._step else None
+                if h < RULES.shortest:
+                    yield q, t, Stop(StopKind.SINGULAR)
+                    return
                 continue
-            if self.walls.may_touch(points[-1], tangents[-1], *found):
-                h /= 2
-                continue
-            if self._margin(*found, signs) < 0:
-                found, stop = self._end(points[-1], tangents[-1], h, target, signs)
-            elif self._returns(points, found[0], tangents[0]):
-                found = self._back_at_start(points[-1], tangents[-1], h, target, q, tangents[0])
-                stop = Stop(StopKind.ENDLESS)
-            lengths.append(lengths[-1] + _arc(points[-1], tangents[-1], *found))
-            stop = Stop(StopKind.ENDLESS) if stop is None and lengths[-1] > RULES.longest else stop
-            points.append(found[0])
-            tangents.append(found[1])
-            h = min(1.5 * h, self._step)
-        return Branch(np.array(points), np.array(lengths), stop)
+            new, onward = found
+            if count > 2 and (closing := self._return_to_start(target, q, new, onward, *start)) is not None:
+                (new, onward), stop = closing, Stop(StopKind.ENDLESS)
+            length, count, turned = length + float(np.linalg.norm(new - q)), count + 1, float(onward @ t)
+            bend = (onward - t) / h
+            q, t, h = new, onward, min(1.6 * h, RULES.step) if turned > RULES.straight else h
+            stop = Stop(StopKind.ENDLESS) if length > RULES.longest else stop
+            yield q, t, stop
 
-    def tangent(self, q: Array, along: Array) -> Array | None:
-        """The unit tangent at q (n,) with a positive component along a direction; None where J is not finite."""
-        J = self._rows(q)
-        if J is None:
+    def _correct_step(self, target: Array, q: Array, t: Array, ahead: Array) -> tuple[Array, Array] | None:
+        """The point of the curve next to one ahead (n,) of q (n,), and its tangent; None if that is too far to tell."""
+        change, onward = (part[0] for part in self._correct(target, ahead[None], t[None]))
+        missed, h = float(np.linalg.norm(change)), float(np.linalg.norm(ahead - q))
+        if not (missed < RULES.missed * min(1.0, h / RULES.step) and onward @ t > RULES.sharpest):
             return None
-        t: Array = np.linalg.qr(J.T, mode="complete")[0][:, -1]
-        return t if t @ along >= 0 else -t
+        return ahead + change, onward
 
-    def _rows(self, q: Array) -> Array | None:
-        """The held rows of J, relative to the sizes of the components; None where they are not finite."""
-        J = self._jacobian(q)[self._held] / self._sizes[:, None]
-        return J if np.isfinite(J).all() else None
+    def _correct(self, target: Array, q: Array, t: Array) -> tuple[Array, Array]:
+        """Newton's steps (N, n) from points q (N, n) across directions t (N, n), and unit tangents, on their side."""
+        if self._with_xi:
+            phi_map, held = self._chart.parts.phi_map, self._held
+            targets, n = np.broadcast_to(target, q.shape), q.shape[1]
+            bordered, right = np.empty((len(q), n, n)), np.zeros((len(q), n, 2))
+            bordered[:, :-1], bordered[:, -1] = (phi_map.jacobian(q) / phi_map.sizes[:, None])[:, held], t
+            right[:, :-1, 0] = (phi_map.difference(targets, phi_map.phi(q)) / phi_map.sizes)[:, held]
+            right[:, -1, 1] = 1.0
+            change, onward = np.moveaxis(solutions_of(bordered, right), 2, 0)
+        else:
+            x = np.broadcast_to(target[: self._chart.m], (len(q), self._chart.m))
+            change, onward = self._chart.parts.tracer.correct(x, q, t)
+        return change, onward / np.maximum(np.linalg.norm(onward, axis=1, keepdims=True), 1e-300)
 
-    def _stepped(self, q: Array, t: Array, h: float, target: Array) -> tuple[Array, Array] | None:
-        """The point a step ahead and the tangent there; None if the corrector fails or the curve turns too far."""
-        new = q + h * t
-        for _ in range(RULES.corrections):
-            error = -self._difference(target, self._value(new))[self._held] / self._sizes
-            J = self._rows(new)
-            if J is None or not np.abs(error).max() < np.inf:
-                return None
-            change = np.linalg.lstsq(J, -error, rcond=None)[0]
-            new = new + change
-            if np.linalg.norm(new - q) > 2 * h + self._step / 10:
-                return None
-            if np.abs(error).max() < RULES.tolerance:
-                onward = self.tangent(new, t)
-                return None if onward is None or onward @ t < RULES.sharpest else (new, onward)
+    def _divide(self, target: Array, q: Array, t: Array) -> tuple[Array, Array]:
+        """Points close to one another on steps between points q (K, n), with tangents t (K, n): both for each."""
+        chords = np.linalg.norm(np.diff(q, axis=0), axis=1)
+        parts = np.maximum(1, np.ceil(chords / (RULES.divided * self._spacing)).astype(int))
+        step = np.repeat(np.arange(len(parts)), parts)
+        u = (np.arange(len(step)) - np.repeat(np.cumsum(parts) - parts, parts))[:, None] / parts[step, None]
+        h, bend = chords[step, None], 3 * u**2 - 2 * u**3
+        points = (1 - bend) * q[step] + bend * q[step + 1]
+        points += h * ((u - 2 * u**2 + u**3) * t[step] + (u**3 - u**2) * t[step + 1])
+        along = (1 - u) * t[step] + u * t[step + 1]
+        points, along = np.concatenate([points, q[-1:]]), np.concatenate([along, t[-1:]])
+        for _ in range(2):
+            change, along = self._correct(target, points, along)
+            points = points + change
+        return points, along
+
+    def _find_end(self, target: Array, q: Array, t: Array, signs: Signs | None) -> tuple[Array, Array, Stop] | None:
+        """Points (K, n) and tangents up to what ends the curve between them, and what that is; None if nothing does."""
+        doubtful = ~self._chart.domain.contains(q[1:])
+        if signs is not None:
+            doubtful |= signs(q[1:], t[1:]) < 0
+        k = 0
+        while k < len(q) - 1:
+            # A step that may pass through a contact is halved.
+            if self.walls.may_touch(q[k], t[k], q[k + 1], t[k + 1]):
+                ahead = q[k] + ((q[k + 1] - q[k]) @ t[k]) / 2 * t[k]
+                middle, onward = self._settle(target, ahead, t[k])
+                q, t = np.insert(q, k + 1, middle, axis=0), np.insert(t, k + 1, onward, axis=0)
+                doubtful = np.insert(doubtful, k, True)
+                continue
+            if (doubtful[k] or self.walls.solid) and self._margin(q[k + 1], t[k + 1], signs) < 0:
+                point, onward, stop = self._end(target, q[k : k + 2], t[k], signs)
+                return np.vstack([q[: k + 1], point]), np.vstack([t[: k + 1], onward]), stop
+            k += 1
         return None
 
     def _margin(self, q: Array, t: Array, signs: Signs | None) -> float:
         """Positive before the end of the curve, negative beyond it."""
-        return float(min(self.walls.values(q).min(), np.inf if signs is None else signs(q, t)))
+        fold = np.inf if signs is None else float(signs(q[None], t[None])[0])
+        return float(min(self.walls.values(q).min(), fold))
 
-    def _end(
-        self, q: Array, t: Array, h: float, target: Array, signs: Signs | None
-    ) -> tuple[tuple[Array, Array], Stop]:
-        """The last point within a step of length h that leaves the domain or passes a fold, and what it meets."""
+    def _end(self, target: Array, q: Array, t: Array, signs: Signs | None) -> tuple[Array, Array, Stop]:
+        """The last point between two points (2, n) that is in the domain and before a fold, and what it meets.
+
+        Points are told by their distance along the tangent t (n,) at the first one.
+        """
+        h = float((q[1] - q[0]) @ t)
 
         def margin(s: float) -> float:
-            found = self._stepped(q, t, s, target)
-            return -1.0 if found is None else self._margin(*found, signs)
+            return self._margin(*self._settle(target, q[0] + s * t, t), signs)
 
-        s = 0.0
-        if self._margin(q, t, signs) > 0:
+        s = h if margin(h) >= 0 else 0.0
+        if s == 0 and margin(0.0) > 0:
             s = scipy.optimize.brentq(margin, 0.0, h, xtol=RULES.rounding)
-        point, onward = self._stepped(q, t, max(0.0, s - 2 * RULES.rounding), target) or (q, t)
+        point, onward = self._settle(target, q[0] + max(0.0, s - 2 * RULES.rounding) * t, t)
         # What ends the curve is told just beyond its end: a domain that only answers `contains` has no slope inside.
-        beyond, further = self._stepped(q, t, min(h, s + 2 * RULES.rounding), target) or (point, onward)
+        beyond, further = self._settle(target, q[0] + min(h, s + 2 * RULES.rounding) * t, t)
         values = self.walls.values(beyond)
-        if signs is not None and signs(beyond, further) < values.min():
-            return (point, onward), Stop(StopKind.FOLD)
-        return (point, onward), self.walls.stop(int(np.argmin(values)), point)
+        if signs is not None and float(signs(beyond[None], further[None])[0]) < values.min():
+            return point, onward, Stop(StopKind.FOLD)
+        return point, onward, self.walls.stop(int(np.argmin(values)), point)
 
-    def _returns(self, points: list[Array], new: Array, t_start: Array) -> bool:
-        """Whether the last step has passed the start."""
-        before, after = (self.walls.gap(q, points[0]) for q in (points[-1], new))
-        near = np.linalg.norm(after) < 1.5 * self._step
-        return bool(len(points) > 2 and near and before @ t_start < 0 <= after @ t_start)
+    def _settle(self, target: Array, q: Array, t: Array) -> tuple[Array, Array]:
+        """The point of the curve across a direction t (n,) from a point q (n,) near it, and its tangent."""
+        for _ in range(RULES.corrections):
+            change, onward = (part[0] for part in self._correct(target, q[None], t[None]))
+            q = q + change
+            if np.abs(change).max() < RULES.settled:
+                break
+        return q, onward
 
-    def _back_at_start(
-        self, q: Array, t: Array, h: float, target: Array, start: Array, t_start: Array
-    ) -> tuple[Array, Array]:
-        """The point within a step of length h that is the start, up to full turns."""
-
-        def ahead(s: float) -> float:
-            point, _ = self._stepped(q, t, s, target) or (q, t)
-            return float(self.walls.gap(point, start) @ t_start)
-
-        return self._stepped(q, t, scipy.optimize.brentq(ahead, 0.0, h, xtol=RULES.rounding), target) or (q, t)
-
-
-Functions = tuple[Callable[[Array], Array], Callable[[Array], Array], Callable[[Array, Array], Array]]
-
-
-def _of_phi(chart: Chart) -> Functions:
-    """phi and its rates at one joint position, and differences of two values."""
-    return chart.phi, lambda q: chart.parts.batched_rates(q[None])[0], chart.parts.phi_map.difference
+    def _return_to_start(
+        self, target: Array, q: Array, new: Array, onward: Array, start: Array, t: Array
+    ) -> tuple[Array, Array] | None:
+        """The start, up to full turns, and its tangent t, if the step from q (n,) to a new point passes it."""
+        before, after = (self.walls.gap(point, start) for point in (q, new))
+        if not before @ t < 0 <= after @ t or np.linalg.norm(after) > 1.6 * RULES.step:
+            return None
+        passed = self._settle(target, new - (after @ t) * onward, onward)[0]
+        return (
+            (start + (new - start - after), t) if np.linalg.norm(self.walls.gap(passed, start)) < RULES.same else None
+        )
 
 
-def _of_task(chart: Chart) -> Functions:
-    """The same of the task alone."""
-    relative = chart.parts.relative
-    return chart.task, lambda q: relative.batched_rates(q[None])[0].reshape(chart.m, chart.n), relative.difference
-
-
-def _arc(q: Array, t: Array, new: Array, onward: Array) -> float:
-    """Length of an arc from its chord and the angle a between its end tangents: chord (a / 2) / sin(a / 2)."""
-    half = np.arccos(np.clip(t @ onward, -1.0, 1.0)) / 2
-    return float(np.linalg.norm(new - q) / np.sinc(half / np.pi))
+def _measure_arcs(q: Array, t: Array) -> Array:
+    """Lengths of arcs (K,) by chords and angles a between the tangents at their ends: chord (a / 2) / sin(a / 2)."""
+    half = np.arccos(np.clip((t[:-1] * t[1:]).sum(axis=1), -1.0, 1.0)) / 2
+    return np.asarray(np.linalg.norm(np.diff(q, axis=0), axis=1) / np.sinc(half / np.pi))
 
 
 @dataclass(frozen=True, repr=False)
@@ -343,7 +390,7 @@ class XiRange(Shown):
     """
 
     intervals: tuple[Interval, ...]
-    turn_shifts: Mapping[str, Array] = field(default_factory=dict)  #: (r,) by joint, see `find_turn_shifts`
+    turn_shifts: Mapping[str, Array] = field(default_factory=dict)  #: (r,) by joint, see `ChartParts.turn_shifts`
 
     def __getitem__(self, label: str | int) -> Interval:
         names = {interval.label: interval for interval in self.intervals}
@@ -385,22 +432,7 @@ class XiRange(Shown):
 def xi_range(chart: Chart, q: ArrayLike, collisions: Collisions | None = None) -> XiRange:
     """How far each coordinate reaches alone; see `Chart.xi_range`."""
     start = start_inside(chart, q, collisions)
-    return XiRange(tuple(_interval(chart, start, k, collisions) for k in range(chart.r)), find_turn_shifts(chart))
-
-
-def find_turn_shifts(chart: Chart) -> dict[str, Array]:
-    """What a full turn of a joint that turns without end adds to xi everywhere, (r,) by the joint's name.
-
-    One posture then has many values of xi, these apart. Joints whose turns do not change xi are missing, and so are
-    those whose turns change it by different amounts in different postures.
-    """
-    q, shifts = sample_uniform(chart.problem.domain, 8, 0), {}
-    for k in chart.problem.turning:
-        turned = chart.phi(q + 2 * np.pi * np.eye(chart.n)[k])
-        shift = chart.parts.phi_map.difference(turned, chart.phi(q))[:, chart.m :]
-        if np.abs(shift[0]).max() > DESCENT.same and np.ptp(shift, axis=0).max() < DESCENT.same:
-            shifts[chart.problem.robot.joint_names[k]] = np.asarray(shift[0])
-    return shifts
+    return XiRange(tuple(_interval(chart, start, k, collisions) for k in range(chart.r)), chart.parts.turn_shifts)
 
 
 def too_far(chart: Chart, q: Array, wanted: Array) -> str:
@@ -443,11 +475,12 @@ def start_inside(chart: Chart, q: ArrayLike, collisions: Collisions | None = Non
 def branch_along(chart: Chart, q: Array, k: int, sign: float, collisions: Collisions | None = None) -> Branch:
     """The curve from q (n,) on which x and all coordinates but the k-th stay, and that one rises (sign 1) or falls."""
     row = chart.m + k
-    curve = LevelCurve(chart, np.delete(np.arange(chart.n), row), RULES.step, collisions)
+    curve = LevelCurve(chart, np.delete(np.arange(chart.n), row), RULES.spacing, collisions)
 
-    def rising(point: Array, t: Array) -> float:
-        gradient = chart.coordinates.jacobian(point[None])[0, k]
-        return float(sign * gradient @ t / (np.linalg.norm(gradient) or 1.0))
+    def rising(points: Array, t: Array) -> Array:
+        gradient = chart.coordinates.jacobian(points)[:, k]
+        lengths = np.linalg.norm(gradient, axis=1)
+        return np.asarray(sign * (gradient * t).sum(axis=1) / np.where(lengths > 0, lengths, 1.0))
 
     return curve.follow(q, sign * chart.parts.batched_rates(q[None])[0, row], rising)
 

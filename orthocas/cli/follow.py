@@ -21,13 +21,13 @@ from orthocas.cli.options import (
     read_solids,
 )
 from orthocas.cli.output import print_json, print_rows
-from orthocas.errors import InvalidValueError
+from orthocas.errors import InvalidValueError, OptionError
 from orthocas.paths.follow import HOLD, OBJECTIVE
 from orthocas.paths.follow import follow as follow_path
 from orthocas.paths.joint_motion import JointMotion, require_place
 from orthocas.paths.tool_path import read_path
-from orthocas.robots.obstacles import Capsule, Obstacle, Plane, Sphere
-from orthocas.robots.scene import Scene
+from orthocas.robots.obstacles import Capsule, Plane, Sphere
+from orthocas.robots.scene import Scene, Solid
 from orthocas.tools.checks import Array, require_known
 from orthocas.tools.interrupts import deferred
 
@@ -65,11 +65,16 @@ def follow(
         ),
     ] = None,
     link_radius: Annotated[
-        float, typer.Option("--link-radius", parser=parse_number, help="Radius of the robot's links [m].")
-    ] = 0.0,
+        float | None,
+        typer.Option(
+            "--link-radius", parser=parse_number, help="Take rods of this radius for links, without --collisions [m]."
+        ),
+    ] = None,
     clearance: Annotated[
         float,
-        typer.Option("--clearance", parser=parse_number, help="Smallest distance of obstacles and links [m]."),
+        typer.Option(
+            "--clearance", parser=parse_number, help="Smallest distance of links, and of links and obstacles [m]."
+        ),
     ] = 0.0,
     collisions: Solids = None,
     srdf: DisabledPairs = None,
@@ -84,12 +89,17 @@ def follow(
         # Raises for grown charts.
         loaded.function("xi")
     waypoints, choice = _read_task(path, loaded, xi)
-    solids, obstacles = (
-        read_solids(loaded.problem.robot, collisions, srdf),
-        [_build_obstacle(t) for t in obstacle or ()],
-    )
-    if solids is not None:
-        solids = solids.with_scene(Scene({f"obstacle {k}": solid for k, solid in enumerate(obstacles)}))
+    solids = read_solids(loaded.problem.robot, collisions, srdf)
+    if link_radius is not None and (solids is not None or not obstacle):
+        raise OptionError("--link-radius requires --obstacle, and no --collisions, which has the true links")
+    if obstacle:
+        scene = Scene({f"obstacle {k}": _build_obstacle(text) for k, text in enumerate(obstacle)})
+        if link_radius is None and solids is None and loaded.problem.robot.solids is None:
+            raise OptionError(
+                "--obstacle requires --collisions FILE.urdf, or --link-radius: the links' solids are unknown"
+            )
+        robot = loaded.problem.robot if link_radius is None else loaded.problem.robot.with_rods(link_radius)
+        solids = (robot.collisions if solids is None else solids).with_scene(scene)
     begin = time.perf_counter()
     motion = follow_path(
         loaded,
@@ -99,8 +109,6 @@ def follow(
         period=period,
         velocity_limits=None if velocity is None else parse_one_or_all("--velocity-limit", velocity),
         acceleration_limits=None if acceleration is None else parse_one_or_all("--acceleration-limit", acceleration),
-        obstacles=obstacles,
-        link_radius=link_radius,
         clearance=clearance,
         collisions=solids,
     )
@@ -127,7 +135,7 @@ def _read_task(path: Path, chart: Chart, xi: str | None) -> tuple[Array, Any]:
     return waypoints, choice if schedule is None else schedule
 
 
-def _build_obstacle(text: str) -> Obstacle:
+def _build_obstacle(text: str) -> Solid:
     """Read sphere:X,Y,Z,RADIUS and the like."""
     kind, _, numbers = text.partition(":")
     counts = {"sphere": 4, "capsule": 7, "plane": 6}

@@ -1,4 +1,4 @@
-"""The least distance between a robot's links in C, with its gradient: of capsules that contain them."""
+"""The least distance between a robot's links in C and in exported modules: of capsules that contain them."""
 
 from __future__ import annotations
 
@@ -6,13 +6,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
+from orthocas.charts.clearance import RULES as CLEARANCE
+from orthocas.codegen.export_forms import Form, write_function
 from orthocas.codegen.rendering import Precision, clean_word, clean_words, render
 from orthocas.robots.capsules import FittedCapsules
 from orthocas.robots.collisions import Collisions
+from orthocas.robots.kinematics import build_body_poses
 from orthocas.robots.robot import Robot
 from orthocas.robots.shapes import HalfSpaceGeometry
+from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
 from orthocas.tools.display import listed
 
@@ -25,6 +30,10 @@ class DistanceRules:
     seed: int = 0  #: of them
     grown: float = 1e-9  #: of the balls around links, relative: more than rounding
     locals_bytes: int = 1024  #: of stack for other variables
+    rounds: int = 16  #: distances by which a way is checked, at most
+    resolution: float = 1e-6  #: [m]: nearer to what is kept counts as too near
+    parallel: float = 1e-6  #: of the squared sine between two axes in modules, which may have single precision
+    least_square: float = 1e-18  #: [m^2], keeps square roots in modules differentiable
 
 
 RULES = DistanceRules()
@@ -60,7 +69,9 @@ def render_distance(fitted: FittedCapsules, values: Mapping[str, Any], precision
         carried[tree.carriers(parts[0].body)] = 1
         ball = {"centre": centre, "radius": float(max(far)) * (1 + RULES.grown)}
         links.append({"body": parts[0].body, "first": len(capsules), "count": len(parts), "carried": carried, **ball})
-        capsules += [{"start": p[0], "end": p[1], "radius": float(r)} for p, r in zip(rows, radii, strict=True)]
+        for (start, end), r in zip(rows, radii, strict=True):
+            reach = float(np.linalg.norm(end - start) / 2 + r) * (1 + RULES.grown)
+            capsules.append({"start": start, "end": end, "radius": float(r), "reach": reach})
     pairs, plane_pairs = list[tuple[int, int, int]](), list[tuple[int, int, int]]()
     for number in _order_pairs(model):
         first, second = model.pairs[number]
@@ -70,7 +81,9 @@ def render_distance(fitted: FittedCapsules, values: Mapping[str, Any], precision
     up = (lambda value: value) if precision.scalar is np.float64 else lambda value: _round_up(value, precision)
     for item in (*capsules, *links):
         item["radius"] = up(item["radius"])
-    numbers_held = 12 * tree.n + 3 * len(links) + 6 * len(capsules)
+    for capsule in capsules:
+        capsule["reach"] = up(capsule["reach"])
+    numbers_held = 18 * tree.n + 3 * len(links) + 9 * len(capsules)
     values = {
         **values,
         "n": tree.n,
@@ -87,10 +100,80 @@ def render_distance(fitted: FittedCapsules, values: Mapping[str, Any], precision
         "pairs": pairs,
         "planes": planes if plane_pairs else [],
         "plane_pairs": plane_pairs,
+        "rates": [up(rate) for rate in model.rates.max(axis=0, initial=0.0).tolist()],
+        "clear": {
+            "zone": CLEARANCE.zone,
+            "left": 1 - CLEARANCE.fall,
+            "between": CLEARANCE.between,
+            "halvings": CLEARANCE.halvings,
+            "rounds": RULES.rounds,
+            "resolution": RULES.resolution,
+            "most": 1 + CLEARANCE.halvings * (1 + RULES.rounds),
+        },
         "stack": precision.size * numbers_held + len(links) + RULES.locals_bytes,
     }
     files = {f"{values['name']}_distance.{kind}": render(f"distance.{kind}", values) for kind in ("h", "c")}
     return {file: precision.translate(text) for file, text in files.items()}
+
+
+def build_distance_form(fitted: FittedCapsules) -> Form:
+    """The functions `distance` and `pair_distances` of an exported module."""
+    model = fitted.collisions
+    tree, parts = model.tree, [part for part in model.parts if part.shape.bounded]
+    # Poses of the bodies, and of the world, which comes last.
+    q = ca.SX.sym("q", tree.n)
+    poses = [*build_body_poses(tree, q), (ca.SX.eye(3), ca.SX.zeros(3))]
+    rows = ca.vertcat(*(ca.vec(ca.horzcat(rotation, translation).T) for rotation, translation in poses))
+    code = write_function(
+        "_body_poses", "Rotations and places of the bodies, row by row, (12 B, N).", dense_function("f", [q], [rows])
+    )
+    corners = [part.shape.list_corners() for part in parts]
+    radii = np.array([radius for _, radius in corners])
+    own: dict[str, list[int]] = {}
+    for k, part in enumerate(parts):
+        own.setdefault(part.name, []).append(k)
+    # Pairs of capsules, as many for each pair of names: the last one counts several times.
+    pairs = [(k, pair) for k, pair in enumerate(model.pairs) if pair[1] in own]
+    rows_of = [[(i, j) for i in own[a] for j in own[b]] for _, (a, b) in pairs]
+    most = max(map(len, rows_of), default=1)
+    numbers = np.array([[*row, *(most - len(row)) * [row[-1]]] for row in rows_of], dtype=int).reshape(-1, 2)
+    # Half-spaces: normals and offsets.
+    solids = {part.name: part.shape for part in model.parts}
+    planes = [(k, pair) for k, pair in enumerate(model.pairs) if pair[1] not in own]
+    most_planes = max((len(own[first]) for _, (first, _) in planes), default=1)
+    below = [[*own[a], *(most_planes - len(own[a])) * own[a][-1:]] for _, (a, _) in planes]
+    normals = [
+        np.append(shape.rotation[:, 2], shape.rotation[:, 2] @ shape.translation)
+        for shape in (solids[b] for _, (_, b) in planes)
+    ]
+    order = np.argsort([k for k, _ in (*pairs, *planes)])
+    flat = np.array(below, dtype=int).ravel()
+    tables = {
+        "capsule_ends": np.array([*(points[0] for points, _ in corners), *(points[-1] for points, _ in corners)]),
+        "radii": (radii[numbers[:, 0]] + radii[numbers[:, 1]])[:, None],
+        "plane_normals": np.repeat(np.reshape(normals, (-1, 4)), most_planes, axis=0)[:, :, None],
+        "plane_radii": radii[flat][:, None],
+    }
+    bodies = [part.body if part.body >= 0 else tree.n for part in parts]
+    indices = {
+        "capsule_bodies": [*bodies, *bodies],
+        "first": numbers[:, 0].tolist(),
+        "second": numbers[:, 1].tolist(),
+        "plane_first": flat.tolist(),
+        "pair_order": order.tolist(),
+    }
+    values = {
+        "pairs": ascii(model.pairs),
+        "bodies": tree.n + 1,
+        "capsules": len(parts),
+        "count": len(pairs),
+        "most": most,
+        "planes": len(planes),
+        "most_planes": most_planes,
+        "parallel": RULES.parallel,
+        "least_square": RULES.least_square,
+    }
+    return Form("distance", values, code, tables, indices)
 
 
 _BOX = ((np.min, -1.0), (np.max, 1.0))  #: how a box around balls begins and ends

@@ -14,12 +14,14 @@ import numpy as np
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
+from orthocas.codegen.distance import build_distance_form
 from orthocas.codegen.export_forms import Form, build_form, build_inverse_forms, write_function, write_statuses
 from orthocas.codegen.rendering import is_generated, render
 from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, ControlStatus
 from orthocas.control.linear_algebra import ROUNDS, SOFTEST
 from orthocas.control.operational_space import Impedance, PDPlus
 from orthocas.errors import ArchiveError, InvalidValueError
+from orthocas.robots.capsules import FittedCapsules
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array, as_path, require_kind, require_known
 from orthocas.tools.expressions import wrap_shortest
@@ -35,7 +37,13 @@ TORQUE_LAWS = (Impedance, PDPlus)  #: that can be exported
 _LAW_STATUSES = ("OK", "OUTSIDE_DOMAIN", "SINGULAR", "NOT_FINITE", "SATURATED")
 
 
-def export(chart: Chart | Impedance | PDPlus, to: str, path: str | Path, force: bool = False) -> Path:
+def export(
+    chart: Chart | Impedance | PDPlus,
+    to: str,
+    path: str | Path,
+    force: bool = False,
+    capsules: FittedCapsules | None = None,
+) -> Path:
     """Write a chart as a Python module that needs one library only: "numpy", "torch" or "jax".
 
     The module has the functions `task`, `xi`, `phi` and `jacobian` of joint positions (n,) or (N, n), as a chart does,
@@ -50,6 +58,8 @@ def export(chart: Chart | Impedance | PDPlus, to: str, path: str | Path, force: 
         to: the library.
         path: the file to write, NAME.py. It replaces an exported module of that name.
         force: replace any other file too.
+        capsules: of `oc.fit_capsules(robot.collisions)`: the module also has `distance`, the least distance of the
+            capsules around the links, and `pair_distances`, those of all pairs.
 
     Returns:
         The path of the file.
@@ -58,7 +68,7 @@ def export(chart: Chart | Impedance | PDPlus, to: str, path: str | Path, force: 
         NoExpressionError: if the chart is grown. `orthocas.distil` fits an expression to it.
         UnknownNameError: if there is no such library.
         InvalidValueError: if the path is not that of a module, or has the name of the library; for laws with inputs at
-            run time, and for laws with NumPy.
+            run time, and for laws with NumPy; for capsules of another robot, or without pairs.
         ArchiveError: if the file cannot be written, or there is one that was not exported.
 
     Example:
@@ -79,7 +89,7 @@ def export(chart: Chart | Impedance | PDPlus, to: str, path: str | Path, force: 
         raise InvalidValueError("path", repr(str(target))[:200], f"a module NAME.py, other than {to}.py")
     require_writable(target)
     require_replaceable(target, is_generated(target), force)
-    text = write_module(chart, to)
+    text = write_module(chart, to, capsules)
     try:
         with publish(target.parent) as drafts:
             (drafts / target.name).write_text(text, encoding="utf-8")
@@ -88,8 +98,13 @@ def export(chart: Chart | Impedance | PDPlus, to: str, path: str | Path, force: 
     return target
 
 
-def write_module(chart: Chart | Impedance | PDPlus, to: str) -> str:
+def write_module(chart: Chart | Impedance | PDPlus, to: str, capsules: FittedCapsules | None = None) -> str:
     """The module as text."""
+    if capsules is not None:
+        require_kind("capsules", capsules, FittedCapsules)
+        capsules.collisions.require_for((chart if isinstance(chart, Chart) else chart.chart).problem.robot.tree)
+        if not capsules.collisions.pairs:
+            raise InvalidValueError("capsules", "without pairs", "pairs of links")
     # A law comes with its chart.
     laws = []
     if isinstance(chart, TORQUE_LAWS):
@@ -97,7 +112,8 @@ def write_module(chart: Chart | Impedance | PDPlus, to: str) -> str:
             raise InvalidValueError("library", "'numpy'", "'torch' or 'jax' for a law, which differentiates")
         laws, chart = [_build_law(chart)], chart.chart
     library, problem, task = LIBRARIES[to], chart.problem, chart.problem.task
-    coordinates, *others = forms = [build_form(chart), *build_inverse_forms(chart), *laws]
+    distances = [] if capsules is None else [build_distance_form(capsules)]
+    coordinates, *others = forms = [build_form(chart), *build_inverse_forms(chart), *laws, *distances]
     task_code = write_function("_task", "Task values, (m, N), of columns q (n, N).", task.function)
     both = "Task values, then their Jacobian row by row, (m + m n, N)."
     task_code += "\n\n" + write_function("_task_and_slopes", both, task.function, task.jacobian_function)
@@ -121,6 +137,7 @@ def write_module(chart: Chart | Impedance | PDPlus, to: str) -> str:
         "centre": tuple(problem.domain.centre.tolist()),
         "half_width": tuple(problem.domain.half_width.tolist()),
         "statuses": write_statuses(),
+        "distances": bool(distances),
         "numbers": [(name, table.shape, _encode(table)) for form in forms for name, table in form.tables.items()],
         "indices": [
             (name, textwrap.wrap("".join(f"{row}, " for row in rows), _WIDTH))
@@ -155,6 +172,7 @@ def _build_law(law: Impedance | PDPlus) -> Form:
         "stiffness": law.stiffness,
         "damping_stiffness": stiffness,
         "damping_ratio": law.damping_ratio,
+        "compliance": law.compliance,
         "limit": law.limit,
     }
     tables = {name: value[:, None] for name, value in columns.items()}
@@ -164,6 +182,7 @@ def _build_law(law: Impedance | PDPlus) -> Form:
         "formula": law.formula,
         "feed_forward": law.feed_forward,
         "damping": law.damping,
+        "fastest": law.fastest if law.is_limited else None,
         "blocks": f"((0, {n}),)" if law.coupling == "coupled" else f"((0, {m}), ({m}, {n}))",
         "statuses": ", ".join(_LAW_STATUSES),
         "numbers": ", ".join(str(int(ControlStatus[name])) for name in _LAW_STATUSES),

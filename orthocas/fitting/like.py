@@ -14,7 +14,7 @@ from orthocas.bases.family import LinearFamily
 from orthocas.bases.given import Given, find_periods, sew_angle
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError, RobotError
-from orthocas.fitting.basis_gradients import BasisGradients
+from orthocas.fitting.basis_objective import BasisGradients
 from orthocas.fitting.terms import Data, Sizes, metric_lengths
 from orthocas.robots.robot import Robot
 from orthocas.tasks.problem import Problem
@@ -75,10 +75,6 @@ def _require_finite(slopes: Array) -> Array:
             "like", "quantities without a finite gradient in the domain", "others, or a smaller domain"
         )
     return slopes
-
-
-def _hash(function: ca.Function) -> str:
-    return hashlib.sha256(json.dumps(write_tape(function)).encode()).hexdigest()[:12]
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +176,9 @@ class Like:
         values = self.function(whole)
         slopes = dense_function("like_jacobian", [q], [ca.cse(ca.jacobian(values, q))])
         # functions of a loss are kept by names
-        return LikeTerm(f"like {_hash(slopes)}", len(self.names), slopes)
+        return LikeTerm(
+            f"like {hashlib.sha256(json.dumps(write_tape(slopes)).encode()).hexdigest()[:12]}", len(self.names), slopes
+        )
 
     def project(self, samples: Samples) -> tuple[Array, Array]:
         """An orthonormal basis (N, n, n), the last r of ker J_x, and gradients of quantities along it, (N, k, n).

@@ -13,11 +13,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.bases.cyclic import keeps_self_motions, turns_tool, widen_over_cyclic_joints
-from orthocas.bases.family import CyclicParametrisation, JointSpace, LinearFamily, Parametrisation
+from orthocas.bases.family import (
+    CyclicParametrisation,
+    JointSpace,
+    LinearFamily,
+    Parametrisation,
+    require_parametrisation,
+)
 from orthocas.bases.mlp import MLP
 from orthocas.bases.products import Polynomial
 from orthocas.bases.registry import warn_unless_savable
 from orthocas.charts.chart import Chart
+from orthocas.charts.chart_file import FREE
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import worst_points
 from orthocas.charts.regular_part import RegularPart
@@ -25,7 +32,6 @@ from orthocas.errors import BranchWarning, DomainError, Interrupted, InvalidValu
 from orthocas.fitting.exact_quantity import choose_quantities, take_exactly
 from orthocas.fitting.fit import Fit, fix_gauge, normalise
 from orthocas.fitting.like import Like, Likeness, MeaningError
-from orthocas.fitting.settings import require_parametrisation
 from orthocas.fitting.terms import Weights, find_least_volume, find_term
 from orthocas.fitting.wide_search import (
     RULES,
@@ -70,6 +76,7 @@ def fit_wide(
     weights: Weights | Mapping[str, float] | None = None,
     samples: int | None = None,
     seed: int = 0,
+    collisions: bool = False,
     monitor: Monitor = silent,
 ) -> WideFit:
     """Find coordinates that are regular on a whole branch of the joint range, and as orthogonal as that permits.
@@ -155,6 +162,9 @@ def fit_wide(
             search for folds has no place here. Default: none.
         samples: number of samples. Default: 30 for each function, 5,000 to 20,000; 100,000 for a network.
         seed: seed of the samples, and of the first network.
+        collisions: whether the arm may leave postures in self-collision aside, by `robot.collisions`: their samples
+            do not count, neither in the loss nor in `regular_share`, which is that of the free part. Chart files hold
+            the solids then, and `evaluate` measures free postures.
         monitor: called with progress.
 
     Returns:
@@ -187,17 +197,20 @@ def fit_wide(
     require_count("seed", seed, least=0)
     count = None if samples is None else require_count("samples", samples, least=2)
     terms = None if weights is None else _check_weights(weights)
+    require_kind("collisions", collisions, bool)
+    solids = robot.collisions if collisions else None
 
     # positions of the branch that count for its share, and the posture at which xi has the value of its quantity
     chosen = _choose_branch(robot, task, branch, home)
     posture = chosen.posture if home is None else find_home(robot, task, home).q
     counted = sample_nonsingular(robot, task, chosen.box, RULES.held_out, (seed, RULES.counted_tag))
+    counted = counted if solids is None else counted[solids.check_free(counted)]
     finish = partial(_finish, branch=chosen, posture=posture, counted=counted, start=start)
 
     def fit_on(problem: Problem) -> WideFit:
         """The chart of one problem."""
         quantities, wanted = choose_quantities(problem, like, exact, parametrisation)
-        settings = WideSettings(count, seed, monitor, terms, quantities)
+        settings = WideSettings(count, seed, monitor, terms, quantities, solids)
         solution = _solve_at_once(problem, quantities, parametrisation, wanted, counted, seed)
         if solution is not None:
             return finish(solution, settings=settings, interrupted=pressed())
@@ -402,6 +415,7 @@ def _finish(
         "branch": branch.name,
         "share of the branch": share,
         "least conditioning": worst.least,
+        **({} if settings.collisions is None else {FREE: settings.collisions.origin}),
         **meaning,
         **({} if error is None else error.write_notes()),
         **{f"weight of {name}": weight for name, weight in users.items() if weight},
@@ -473,13 +487,14 @@ class WideFit(Fit):
         facts = super().facts()
         share = percent(self.regular_share, 2)
         named, meaning = self.chart.parts.named_coordinates, ""
+        clear = "clear and free" if FREE in self.chart.notes else "clear"
         if "exact" in self.chart.notes:
             meaning = f"{'; '.join(named)}, exactly"
         elif self.meaning is not None:
             meaning = f"{self.meaning.explained}: {named[0]}"
         own = {
             "branch": self.branch.name,
-            "regular": f"{share} of the branch's clear positions (samples); the domain is this part",
+            "regular": f"{share} of the branch's {clear} positions (samples); the domain is this part",
             **({"left out": self.left_out} if self.left_out else {}),
             **({"meaning": meaning} if meaning else {}),
         }

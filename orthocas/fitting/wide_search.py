@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from orthocas.bases.family import ArrayFamily, CombinableFamily, JointSpace, LinearFamily, Parametrisation
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError
-from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
-from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.basis_objective import BasisGradients, BasisObjective, build_gradients
 from orthocas.fitting.like import Like, QuadraticTerm
 from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
 from orthocas.fitting.stages import Resampled, Stage, WeightedSum
 from orthocas.fitting.terms import RULES as LOSS
 from orthocas.fitting.terms import Weights, find_least_volume
+from orthocas.robots.collisions import Collisions
 from orthocas.solvers.adam import Adam
 from orthocas.solvers.lbfgs import LBFGS
 from orthocas.solvers.protocol import Objective, Solver, SolveResult
@@ -104,6 +104,7 @@ class WideSettings:
     monitor: Monitor = silent
     weights: Weights | Mapping[str, float] | None = None  #: of terms that join the loss; `Weights` also of the angles
     quantities: Like | None = None  #: what the first coordinates follow
+    collisions: Collisions | None = None  #: samples that touch something are left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,6 +255,10 @@ class Search:
         points = points[is_on_side_of_centre(self.problem, points)]
         if not len(points):
             raise InvalidValueError("samples", count, "more: none lies on the centre's side of singular positions")
+        if self.settings.collisions is not None:
+            points = points[self.settings.collisions.check_free(points)]
+            if not len(points):
+                raise InvalidValueError("collisions", "a contact at all samples of the branch", "free postures")
         return points
 
     def _sample_near_centre(self) -> Array:

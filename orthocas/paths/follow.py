@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -17,9 +17,9 @@ from orthocas.charts.self_motion import Walls, xi_range
 from orthocas.errors import InvalidValueError, PathError, SolveError
 from orthocas.paths.joint_curve import JointCurve, LostCurve, PhiSolver, TimeLaw, compute_fastest_law, list_places
 from orthocas.paths.joint_motion import JointMotion, Margins
-from orthocas.paths.tool_path import RULES, ToolPath
+from orthocas.paths.tool_path import RULES, ToolPath, build_spline
+from orthocas.paths.xi_search import search_xi
 from orthocas.robots.collisions import Collisions
-from orthocas.robots.obstacles import LinkDistances, Obstacle
 from orthocas.robots.tree import require_driven
 from orthocas.tasks.samples import compute_row_scale, sample_uniform
 from orthocas.tools.batch import Batched, dense_function
@@ -40,8 +40,6 @@ def follow(
     period: float = 0.01,
     velocity_limits: ArrayLike | None = None,
     acceleration_limits: ArrayLike | None = None,
-    obstacles: Sequence[Obstacle] = (),
-    link_radius: ArrayLike = 0.0,
     clearance: float = 0.0,
     collisions: Collisions | None = None,
 ) -> JointMotion:
@@ -58,22 +56,21 @@ def follow(
             `Task.target` takes them.
         xi: "hold" keeps the coordinates of `q_start`. An array (N, r) gives them at the waypoints, a function of s in
             [0, 1] along the path. "objective" chooses them: away from the boundary of the domain, from positions where
-            the task is near-singular, and from obstacles, and with little motion. Circle-valued coordinates go from
+            the task is near-singular, and from contacts, and with little motion; where a contact stops what a descent
+            finds, and r = 1, all xi along the path are searched. Circle-valued coordinates go from
             each waypoint to the next by the shorter way, and count on beyond pi.
         q_start: a joint position (n,) near the start of the path. Default: the centre of the domain.
         period: distance of the time stamps [s].
         velocity_limits: (n,) or one number [rad/s] or [m/s]. Default: those of the robot's file.
         acceleration_limits: (n,) or one number [rad/s^2] or [m/s^2]. Default: full speed within 0.5 s.
-        obstacles: spheres, capsules and planes of `orthocas.robots.obstacles`, which the links must not touch.
-        link_radius: radius of the links, see `orthocas.robots.obstacles.LinkDistances` [m].
-        clearance: smallest distance from obstacles, and of pairs of `collisions` [m].
+        clearance: smallest distance of the pairs of `collisions` [m].
         collisions: of the chart's robot, such as `robot.collisions.with_scene(scene)`: no pair may come nearer than
-            the clearance, at the time stamps and between them.
+            the clearance, at the time stamps and between them. Robots without solids get rods: `Robot.with_rods`.
 
     Raises:
-        PathError: if the path leaves the reach or the domain, touches an obstacle, or a pair of `collisions` may come
-            nearer than the clearance; then the message names the pair and the time. The message names the waypoint,
-            what stops the motion there, and how far the coordinates reach before it.
+        PathError: if the path leaves the reach or the domain, or a pair of `collisions` may come nearer than the
+            clearance; then the message names the pair and the time. The message names the waypoint, what stops the
+            motion there, and how far the coordinates reach before it.
         InvalidValueError, ShapeError: for arguments of the wrong value or shape.
         NoExpressionError: for grown charts.
 
@@ -100,8 +97,14 @@ def follow(
         require_kind("collisions", collisions, Collisions)
         collisions.require_for(chart.problem.robot.tree)
     start = chart.problem.domain.home if q_start is None else as_point("q_start", q_start, chart.n)
-    distances = LinkDistances(chart.problem.robot, obstacles, link_radius)
-    limits = _read_limits(chart, velocity_limits, acceleration_limits, distances, clearance)
+    # limits of all joints, > 0 and finite
+    most = chart.problem.robot.velocity_limits if velocity_limits is None else velocity_limits
+    speeds = _spread_limits(chart, "velocity_limits", most)
+    accelerations = speeds / RULES.to_full_speed if acceleration_limits is None else acceleration_limits
+    gap = as_number("clearance", clearance)
+    if not 0 <= gap < np.inf:
+        raise InvalidValueError("clearance", clearance, "a length >= 0 [m]")
+    limits = MotionLimits(chart, speeds, _spread_limits(chart, "acceleration_limits", accelerations), collisions, gap)
     stamp = as_number("period", period)
     if not 1e-5 <= stamp <= 10:
         raise InvalidValueError("period", period, "a time from 1e-5 to 10 s")
@@ -114,15 +117,49 @@ def follow(
     else:
         raise InvalidValueError("xi", repr(xi)[:80], f"'{HOLD}', '{OBJECTIVE}', an array or a function")
     solver = PhiSolver(chart)
+    if not (isinstance(xi, str) and xi == OBJECTIVE):
+        return _move(path, JointCurve.trace(solver, path.phi, start), limits, stamp)
+    # The first choice of xi that can be followed, or why the first one cannot.
+    first: PathError | None = None
+    for chosen, q in _choose_xi(path, solver, limits, start):
+        try:
+            return _move(chosen, JointCurve.trace(solver, chosen.phi, q), limits, stamp)
+        except PathError as error:
+            first = first or error
+    assert first is not None
+    raise first
+
+
+def _choose_xi(
+    path: ToolPath, solver: PhiSolver, limits: MotionLimits, start: Array
+) -> Iterator[tuple[ToolPath, Array]]:
+    """Tool paths with chosen coordinates, each with a start (n,): by descent, then from a search of all xi."""
+    chart, costs = solver.chart, Costs(limits)
+    choice = XiChoice(path, costs, solver)
+    # From coordinates that are held, or from a walk where that is not possible.
     curve = JointCurve.trace(solver, path.phi, start)
-    if isinstance(xi, str) and xi == OBJECTIVE:
-        # From coordinates that are held, or from a walk where that is not possible.
-        costs = Costs(limits)
-        choice = XiChoice(path, costs, solver)
-        q = walk(chart, costs, path.x(choice.s), start) if isinstance(curve, LostCurve) else curve.q(choice.s)
-        path = choice.optimise(q)
-        curve = JointCurve.trace(solver, path.phi, q[0])
-    # Where it ends early, leaves the domain or comes too near to an obstacle, an error says why.
+    q = walk(chart, costs, path.x(choice.s), start) if isinstance(curve, LostCurve) else curve.q(choice.s)
+    yield choice.optimise(q), q[0]
+    if limits.collisions is None or chart.r > 1:
+        return
+    for clearance in (limits.clearance + RULES.away, limits.clearance):
+        found = search_xi(
+            chart, path, limits.collisions, clearance, Costs(replace(limits, collisions=None)).sum_squares
+        )
+        if found is None:
+            continue
+        s, q = found
+        near = np.column_stack([np.interp(choice.s, s, column) for column in q.T])
+        yield choice.optimise(near), q[0]
+        xi = counted_on(chart.xi(q), chart.parts.turns[chart.m :])
+        if path.closed:
+            xi[-1] = xi[0]
+        yield path.replace_xi(build_spline(s, xi, path.closed)), q[0]
+
+
+def _move(path: ToolPath, curve: JointCurve | LostCurve, limits: MotionLimits, period: float) -> JointMotion:
+    """The motion along a curve, from rest to rest, if it can be followed."""
+    # Where it ends early or leaves the domain, an error says why.
     if isinstance(curve, LostCurve):
         limits.check_kept(path, curve.s, curve.q)
         raise limits.build_lost_error(path, curve)
@@ -132,27 +169,9 @@ def follow(
     # The fastest s(t), then time stamps, slower until they keep the limits.
     _, first, second = curve.evaluate(list_places())
     law = compute_fastest_law(first, second, limits.velocity, limits.acceleration)
-    motion = _sample_on_stamps(path, curve, law, limits, stamp)
-    if collisions is not None:
-        limits.check_contacts(path, motion, collisions)
+    motion = _sample_on_stamps(path, curve, law, limits, period)
+    limits.check_contacts(path, motion)
     return motion
-
-
-def _read_limits(
-    chart: Chart,
-    velocity: ArrayLike | None,
-    acceleration: ArrayLike | None,
-    distances: LinkDistances,
-    clearance: float,
-) -> MotionLimits:
-    """Limits of all joints, > 0 and finite."""
-    most = chart.problem.robot.velocity_limits if velocity is None else velocity
-    speeds = _spread_limits(chart, "velocity_limits", most)
-    accelerations = speeds / RULES.to_full_speed if acceleration is None else acceleration
-    gap = as_number("clearance", clearance)
-    if not 0 <= gap < np.inf:
-        raise InvalidValueError("clearance", clearance, "a length >= 0 [m]")
-    return MotionLimits(chart, speeds, _spread_limits(chart, "acceleration_limits", accelerations), distances, gap)
 
 
 def _spread_limits(chart: Chart, name: str, value: ArrayLike) -> Array:
@@ -215,8 +234,8 @@ class MotionLimits:
     chart: Chart
     velocity: Array  #: (n,) [rad/s] or [m/s]
     acceleration: Array  #: (n,) [rad/s^2] or [m/s^2]
-    distances: LinkDistances
-    clearance: float  #: smallest distance from obstacles to allow [m]
+    collisions: Collisions | None
+    clearance: float  #: smallest distance of their pairs to allow [m]
 
     @property
     def rows(self) -> ca.Function:
@@ -247,20 +266,21 @@ class MotionLimits:
         return BlockedFunction(self.rows)
 
     def check_kept(self, path: ToolPath, s: Array, q: Array) -> None:
-        """Raise PathError at the first place (P,) whose joint position (P, n) is lost, outside, or at an obstacle."""
+        """Raise PathError at the first place (P,) whose joint position (P, n) is lost or outside."""
         finite = np.flatnonzero(np.isfinite(q).all(axis=1))
-        free = (self.distances(q[finite]) >= self.clearance).all(axis=1)
-        kept = finite[self.chart.problem.domain.contains(q[finite]) & free]
+        kept = finite[self.chart.problem.domain.contains(q[finite])]
         if len(kept) < len(q):
             raise self._build_error(path, s, q, int(np.setdiff1d(np.arange(len(q)), kept)[0]))
 
-    def check_contacts(self, path: ToolPath, motion: JointMotion, collisions: Collisions) -> None:
+    def check_contacts(self, path: ToolPath, motion: JointMotion) -> None:
         """Raise PathError where a pair may come nearer than the clearance, at time stamps or between them.
 
         Between two stamps a motion is at most a h^2 / 8 from the straight way, with the limits a of acceleration.
         """
+        if self.collisions is None:
+            return
         bend = self.acceleration * (motion.times[1] - motion.times[0]) ** 2 / 8
-        contact = collisions.find_contact(motion.q, self.clearance, bend)
+        contact = self.collisions.find_contact(motion.q, self.clearance, bend)
         if contact is None:
             return
         k, (first, second) = contact.segment, contact.pair
@@ -278,18 +298,8 @@ class MotionLimits:
         if not np.isfinite(q[k]).all():
             return self.build_lost_error(path, LostCurve(s[:k], q[:k], float(s[k])))
         where = path.describe_place(float(s[k]), self.chart.labels)
-        if not self.chart.problem.domain.contains(q[k]):
-            reason = f"it leaves the domain, stopped by {Walls(self.chart.problem).worst(q[k])}"
-            return PathError(f"the path cannot be followed {where}: {reason}{self._describe_reach(q[last])}")
-        # Neither lost nor outside: an obstacle.
-        distance = self.distances(q[k])
-        pair = self.distances.pairs[int(np.argmin(distance))]
-        least = float(distance.min())
-        gap = f"are {least:.3g} m apart" if least >= 0 else f"overlap by {-least:.3g} m"
-        return PathError(
-            f"the path cannot be followed {where}: {pair} {gap}, "
-            f"expected a distance of at least clearance = {self.clearance:g} m"
-        )
+        reason = f"it leaves the domain, stopped by {Walls(self.chart.problem).worst(q[k])}"
+        return PathError(f"the path cannot be followed {where}: {reason}{self._describe_reach(q[last])}")
 
     def build_lost_error(self, path: ToolPath, end: LostCurve) -> PathError:
         """The error for a path that ends before s = 1."""
@@ -315,18 +325,18 @@ class MotionLimits:
         room = np.minimum(q - low, high - q) / self.chart.problem.domain.half_width
         worst = int(np.argmin(room.min(axis=0)))
         bounded = bool(np.isfinite(room).any())
-        # The least singular value, and the obstacle that a link comes nearest to.
+        # The least singular value, and the nearest pair.
         values = np.linalg.svd(self.compute_scaled_jacobian(q), compute_uv=False)
-        distances = self.distances(q)
-        pair = int(np.argmin(distances.min(axis=0))) if distances.size else -1
+        near = None if self.collisions is None else self.collisions.distance(q)
+        k = -1 if near is None else int(np.argmin(near.distance))
         return Margins(
             float(room.min()),
             self.chart.problem.robot.joint_names[worst] if bounded else "",
             float((np.abs(dq) / self.velocity).max()),
             float((np.abs(ddq) / self.acceleration).max()),
             float(values[:, -1].min()),
-            float(distances.min()) if distances.size else np.inf,
-            self.distances.pairs[pair] if distances.size else "",
+            np.inf if near is None else float(near.distance[k]),
+            "" if near is None else f"'{near.pair[k][0]}' and '{near.pair[k][1]}'",
         )
 
 
@@ -339,11 +349,15 @@ class Costs:
     def __call__(self, q: Array) -> tuple[Array, Array]:
         """Residuals (P, k) and gradients (P, k, n) at joint positions (P, n)."""
         parts = [self._evaluate_boundaries(q), self._evaluate_task(q)]
-        if self.limits.distances.obstacles:
-            values, gradients = self.limits.distances.evaluate_gradients(q)
+        if self.limits.collisions is not None:
+            values, gradients = self.limits.collisions.measure_nearest(q, RULES.nearest)
             residuals, slopes = _evaluate_inverse(values - self.limits.clearance, RULES.away, RULES.too_near)
             parts.append((residuals, slopes[..., None] * gradients))
         return np.concatenate([part[0] for part in parts], axis=1), np.concatenate([part[1] for part in parts], axis=1)
+
+    def sum_squares(self, q: Array) -> Array:
+        """Of the residuals at joint positions (P, n), (P,)."""
+        return np.asarray((self(q)[0] ** 2).sum(axis=1))
 
     def _evaluate_boundaries(self, q: Array) -> tuple[Array, Array]:
         domain = self.limits.chart.problem.domain

@@ -30,8 +30,8 @@ class Margins:
     velocity: float  #: largest share of a velocity limit that is used, at most 1
     acceleration: float  #: largest share of an acceleration limit that is used, at most 1
     singular_value: float  #: smallest relative singular value of the task, see `orthocas.ClearBox`
-    distance: float  #: smallest distance of a link to an obstacle [m]; inf without obstacles
-    distance_pair: str  #: which link and obstacle, or ""
+    distance: float  #: smallest distance of a pair [m]; inf without a collision model
+    distance_pair: str  #: the names of the two, or ""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -95,12 +95,25 @@ class JointMotion(Shown):
             "boundary": f"{kept.boundary:.3g} half-widths away{near}",
             "speed": f"{100 * kept.velocity:.3g} % of the limits, acceleration {100 * kept.acceleration:.3g} %",
             "task": f"relative singular value at least {kept.singular_value:.3g}",
-            **({"obstacles": f"{kept.distance:.3g} m away: {kept.distance_pair}"} if kept.distance_pair else {}),
+            **({"collisions": f"{kept.distance:.3g} m between {kept.distance_pair}"} if kept.distance_pair else {}),
         }
 
     def plot(self) -> "Figure":
         """Joints, speeds, task values and coordinates over time, as a matplotlib figure."""
-        return _draw_figure(self)
+        # joint positions and speeds on the left, task values and coordinates on the right, all over time
+        from orthocas.tools.picture import Picture  # matplotlib takes a third of a second
+
+        figure = Picture(figsize=(10.5, 5.0), layout="constrained")
+        grid: Any = figure.subplots(2, 2, sharex=True)
+        m, names = self.x.shape[1], self.joint_names
+        _draw(grid[0, 0], self.times, self.q, names, "joints q [rad or m]")
+        _draw(grid[1, 0], self.times, self.dq, (), "speeds [rad/s or m/s]")
+        _draw(grid[0, 1], self.times, self.x, self.labels[:m], "task x")
+        _draw(grid[1, 1], self.times, self.xi, self.labels[m:], "coordinates ξ")
+        for axes in grid[1]:
+            axes.set_xlabel("time [s]", fontsize=9)
+        figure.suptitle(self.heading, fontsize=10.5)
+        return figure
 
     def save_csv(self, path: str | Path, force: bool = False) -> None:
         """Write a CSV file: time_s, then q, dq and ddq of each joint, task values, and coordinates.
@@ -140,23 +153,6 @@ def _is_ours(path: Path) -> bool:
             return stream.read(len(_HEAD) + 1) == f"{_HEAD},".encode()
     except OSError:
         return False
-
-
-def _draw_figure(motion: JointMotion) -> "Figure":
-    """Joint positions and speeds on the left, task values and coordinates on the right, all over time."""
-    from orthocas.tools.picture import Picture  # matplotlib takes a third of a second
-
-    figure = Picture(figsize=(10.5, 5.0), layout="constrained")
-    grid: Any = figure.subplots(2, 2, sharex=True)
-    m, names = motion.x.shape[1], motion.joint_names
-    _draw(grid[0, 0], motion.times, motion.q, names, "joints q [rad or m]")
-    _draw(grid[1, 0], motion.times, motion.dq, (), "speeds [rad/s or m/s]")
-    _draw(grid[0, 1], motion.times, motion.x, motion.labels[:m], "task x")
-    _draw(grid[1, 1], motion.times, motion.xi, motion.labels[m:], "coordinates ξ")
-    for axes in grid[1]:
-        axes.set_xlabel("time [s]", fontsize=9)
-    figure.suptitle(motion.heading, fontsize=10.5)
-    return figure
 
 
 def _draw(axes: Any, times: Array, values: Array, names: Sequence[str], label: str) -> None:

@@ -55,7 +55,12 @@ class PathRules:
     inside: float = 0.97  #: fraction of the half-width beyond which the residual of a joint is a straight line
     regular: float = 0.1  #: relative singular value: scale of its residual
     nearly_singular: float = 0.02  #: where the line of that residual begins
-    away: float = 0.02  #: distance from obstacles: scale of its residual [m]
+    away: float = 0.02  #: distance of a pair: scale of its residual [m]
+    nearest: int = 6  #: pairs of parts with such residuals, the nearest ones by the bounds of their capsules
+    stations: int = 49  #: of the search of all xi along a path that contacts stop
+    lattice: int = 64  #: values of xi at each station
+    lattice_samples: int = 2000  #: of the domain, by which they are spread
+    lattice_step: float = 0.35  #: longest between stations, of a joint [rad] or [m]
     too_near: float = 0.004  #: where the line of that residual begins [m]
 
     walk_steps: int = 3  #: at each place
@@ -280,7 +285,14 @@ def read_path(path: str | Path, chart: Chart) -> tuple[Array, Array | None]:
     def find(names: Sequence[str]) -> list[int]:
         nonlocal task
         task = POSE if "qw" in names else chart.labels[: chart.m]
-        return _find_columns(names, task, chart.labels[chart.m :])
+        # the columns of the task, then those of the coordinates if there are any
+        extra = chart.labels[chart.m :]
+        columns = (*task, *extra) if set(extra) & set(names) else task
+        for name in names:
+            if name not in (*task, *extra):
+                expected = f"{', '.join(task)}, and if the path has a schedule {', '.join(extra)}"
+                raise ValueError(f"line 1: unknown column {name[: FILE_RULES.cell]!r}, expected {expected}")
+        return find_columns(names, columns)
 
     values = read_table(path, "path file", "waypoints", MOST_WAYPOINTS, find)
     x, xi = values[:, : len(task)], values[:, len(task) :]
@@ -293,13 +305,3 @@ def read_path(path: str | Path, chart: Chart) -> tuple[Array, Array | None]:
         x[:, 3:] /= lengths[:, None]
         x = chart.task.target((x[:, :3], x[:, 3:]))
     return x, xi if xi.size else None
-
-
-def _find_columns(names: Sequence[str], task: tuple[str, ...], extra: tuple[str, ...]) -> list[int]:
-    """The columns of the task, then those of the coordinates if there are any."""
-    columns = (*task, *extra) if set(extra) & set(names) else task
-    for name in names:
-        if name not in (*task, *extra):
-            expected = f"{', '.join(task)}, and if the path has a schedule {', '.join(extra)}"
-            raise ValueError(f"line 1: unknown column {name[: FILE_RULES.cell]!r}, expected {expected}")
-    return find_columns(names, columns)

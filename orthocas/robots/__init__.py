@@ -5,7 +5,7 @@
   compares its orientation with a reference.
 - `urdf` and `mjcf` read URDF, SRDF and MJCF files; `pinocchio_model` locks joints of a `pin.Model`, converts it to a
   tree, and builds planar arms.
-- `obstacles` has solids and their distances to the links.
+- `collisions` measures distances between links and from scenes; `obstacles` has the solids of these.
 """
 
 from orthocas.robots.robot import Robot

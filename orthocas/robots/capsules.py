@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import scipy
+from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError
 from orthocas.robots.collisions import Collisions, Part
-from orthocas.robots.shapes import CapsuleGeometry, CloudGeometry, Shape
+from orthocas.robots.shapes import BallGeometry, CapsuleGeometry, CloudGeometry, Geometry, Shape
 from orthocas.robots.spatial import rotate_z_to
-from orthocas.tools.checks import Array, Flags, require_kind
+from orthocas.robots.tree import BASE_JOINTS, KinematicTree
+from orthocas.tools.checks import Array, Flags, as_float_array, require_kind
 from orthocas.tools.display import Shown, listed
 
 __all__ = ["FittedCapsules", "fit_capsules"]
@@ -33,6 +36,8 @@ class CapsuleRules:
     points: int = 20_000  #: by which volumes are measured
     few: int = 2000  #: of them, to choose a cut
     chunk: int = 1000  #: of these points, at once
+    thickest: float = 1e6  #: [m], of rods
+    point: float = 1e-9  #: [m]: shorter rods are balls
     seed: int = 0  #: of these points
 
 
@@ -111,6 +116,36 @@ def fit_capsules(collisions: Collisions) -> FittedCapsules:
     return FittedCapsules(model, ratios, float(volumes[0] / volumes[1]) if volumes[1] else 1.0, tuple(pieces))
 
 
+def build_rods(tree: KinematicTree, radius: ArrayLike) -> Collisions:
+    """Capsules from each joint's origin to the next one's, or to a tip; see `Robot.with_rods`.
+
+    Raises:
+        InvalidValueError: if a radius is not above 0, or there are neither one nor n.
+    """
+    sizes = as_float_array("radius", radius)
+    if sizes.shape not in ((), (tree.n,)):
+        raise InvalidValueError("radius", f"an array of shape {sizes.shape}", f"one number, or {tree.n}")
+    radii = np.broadcast_to(sizes, (tree.n,))
+    if not ((radii > 0) & (radii < RULES.thickest)).all():
+        raise InvalidValueError("radius", sizes.tolist(), "lengths above 0 [m]")
+    # Body and far end of the rods on the ways to the tips, each once; nothing solid is between the joints of a base.
+    ends: dict[tuple[int, int | str], Array] = {}
+    for frame in (tree.tip, *map(tree.frame, tree.tips)):
+        for start, end in pairwise(tree.carriers(frame.parent)):
+            if tree.joint_names[end] not in BASE_JOINTS:
+                ends[start, end] = tree.translations[end]
+        ends.setdefault((frame.parent, frame.name), frame.translation)
+    parts = []
+    for (body, _), end in ends.items():
+        if body < 0:
+            continue
+        length, thick = float(np.linalg.norm(end)), float(radii[body])
+        solid: Geometry = BallGeometry(thick) if length < RULES.point else CapsuleGeometry(thick, length)
+        turn = np.eye(3) if length < RULES.point else rotate_z_to(end / length)
+        parts.append(Part(f"link of {tree.joint_names[body]}", body, Shape(solid, turn, np.asarray(end) / 2)))
+    return Collisions(tree, parts, (), origin="rods")
+
+
 @dataclass(frozen=True, eq=False)
 class Capsule:
     """All points within a radius of a segment."""
@@ -122,7 +157,7 @@ class Capsule:
     @property
     def volume(self) -> float:
         """[m^3]."""
-        return _measure_volume(self.radius, float(np.linalg.norm(self.end - self.start)))
+        return float(np.pi * self.radius**2 * (float(np.linalg.norm(self.end - self.start)) + 4 / 3 * self.radius))
 
     @property
     def shape(self) -> Shape:
@@ -267,10 +302,6 @@ def _list_cuts(corners: Array) -> list[list[Array]]:
             if min(map(len, sides)) and len(seam) > 2:
                 cuts.append([np.concatenate([side, seam]) for side in sides])
     return cuts
-
-
-def _measure_volume(radius: float, length: float) -> float:
-    return float(np.pi * radius**2 * (length + 4 / 3 * radius))
 
 
 def _measure_hull(corners: Array) -> float:

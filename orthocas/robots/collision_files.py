@@ -44,6 +44,7 @@ class PairRules:
 
 
 RULES = PairRules()
+_SOLIDS = "solids of the links: robot.with_rods(radius) takes rods in their place"
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ def read_collisions(tree: KinematicTree, source: CollisionSource) -> Collisions:
                 parts.append(Part(name, place.body, shape.move(place.pose.rotation, place.pose.translation)))
     if not parts:
         lost = f" that can be read: no mesh of {', '.join(missing)}" if missing else ""
-        raise RobotError(f"{source.urdf} has no <collision> element{lost}, expected solids of the links")
+        raise RobotError(f"{source.urdf} has no <collision> element{lost}, expected {_SOLIDS}")
 
     # All pairs of links on different bodies, less those that an SRDF file disables.
     bodies = {part.name: part.body for part in parts}
@@ -134,7 +135,7 @@ def _read_geoms(tree: KinematicTree, source: CollisionSource) -> Collisions:
         pose = place.pose * build_pose(compiled.geom_pos[i], compiled.geom_quat[i])
         parts.append(Part(names[i], place.body, Shape(geometry, pose.rotation, pose.translation)))
     if not parts:
-        raise RobotError(f"{source.urdf} has no geom that can collide, expected solids of the links")
+        raise RobotError(f"{source.urdf} has no geom that can collide, expected {_SOLIDS}")
     known = {part.name: part.body for part in parts}
     pairs: dict[tuple[str, str], None] = {}
     for i, k in combinations(solid, 2):

@@ -367,6 +367,25 @@ class Collisions(Shown):
                 distances[owner] = min(found, distances.get(owner, np.inf))
             yield from ((owner, found) for owner, found in distances.items() if found < least)
 
+    def measure_nearest(self, points: Array, count: int) -> tuple[Array, Array]:
+        """Distances (N, k) and gradients (N, k, n) at postures (N, n), of `count` pairs of parts, or of all if fewer.
+
+        They are those whose capsules are nearest, of the pairs with the nearest balls.
+        """
+        N, most = len(points), len(self._owners)
+        k = min(count, most)
+        if not k or not N:
+            return np.zeros((N, 0)), np.zeros((N, 0, self.tree.n))
+        bounds, capsules = self._bound_by_balls(points)
+        first = min(RULES.first, most)
+        chosen = np.argpartition(bounds, first - 1, axis=1)[:, :first]
+        self._refine_bounds(bounds, capsules, np.repeat(np.arange(N), first), chosen.ravel())
+        order = np.argsort(np.take_along_axis(bounds, chosen, axis=1), axis=1)[:, :k]
+        measured = [
+            self.measure_parts(q, row) for q, row in zip(points, np.take_along_axis(chosen, order, 1), strict=True)
+        ]
+        return np.array([row[0] for row in measured]), np.array([row[1] for row in measured])
+
     def list_near_parts(self, q: Array, within: float | Array) -> Indices:
         """Numbers of pairs of parts whose bounds at q (n,) are nearer than a distance, or each than its own (K,)."""
         return np.flatnonzero(self._bound_distances(q[None], within)[0] < within)

@@ -14,13 +14,13 @@ from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, RobotError, ShapeError
 from orthocas.robots import dynamics, kinematics
+from orthocas.robots.capsules import build_rods
 from orthocas.robots.collision_data import KnownSolids
 from orthocas.robots.collision_files import CollisionSource
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.dynamics import PAYLOAD, add_payload
 from orthocas.robots.kinematics import add_tool
 from orthocas.robots.mjcf import read_mjcf
-from orthocas.robots.named import find_robot_file
 from orthocas.robots.pinocchio_model import (
     TIP,
     build_planar,
@@ -32,7 +32,7 @@ from orthocas.robots.pinocchio_model import (
     read_model_postures,
 )
 from orthocas.robots.tree import PRISMATIC_ROOM, KinematicTree
-from orthocas.robots.urdf import read_srdf_postures, read_urdf
+from orthocas.robots.urdf import find_robot_file, read_srdf_postures, read_urdf
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import BuiltOnUse, cached_property
 from orthocas.tools.checks import (
@@ -316,6 +316,26 @@ class Robot(Shown):
         pairs = None if srdf is None else as_path("srdf", srdf)
         return type(self)(self.tree, self.homes, CollisionSource(as_path("urdf", urdf), pairs, locked))
 
+    def with_rods(self, radius: ArrayLike) -> Self:
+        """The same robot with rods for links, for `collisions` of robots whose files have no solids.
+
+        A link is a capsule from the origin of its joint to that of the next joint, or to a tip, for all links that move
+        on the ways to the tips. Rods are checked against what is around, `collisions.with_scene(...)`, and not against
+        each other. Where a slide takes the next joint away, its rod begins there.
+
+        Args:
+            radius: of all rods, or of each joint's, (n,), > 0 [m].
+
+        Example:
+            >>> import orthocas as oc
+            >>> robot = oc.Robot.planar(lengths=[1.0, 1.0], masses=[1.0, 1.0]).with_rods(0.1)
+            >>> ball = oc.obstacles.Sphere([0.5, 1.0, 0.0], 0.2)
+            >>> near = robot.collisions.with_scene(oc.Scene({"ball": ball})).distance([0.0, 0.0])
+            >>> near.pair, round(near.distance, 3)
+            (('link of q1', 'ball'), 0.7)
+        """
+        return type(self)(self.tree, self.homes, KnownSolids(build_rods(self.tree, radius)))
+
     @cached_property
     def collisions(self) -> Collisions:
         """Distances between the links, from <collision> elements of a URDF file, MJCF geoms, or a chart file.
@@ -324,7 +344,7 @@ class Robot(Shown):
             RobotError: if the robot comes from no file, the file or all its solids are missing.
         """
         if self.solids is None:
-            hint = "robot.with_solids(urdf) names its file"
+            hint = "robot.with_solids(urdf) names its file, robot.with_rods(radius) takes rods for links"
             raise RobotError(f"nothing is known of the links' solids, expected a robot of a URDF or MJCF file: {hint}")
         return self.solids.read(self.tree)
 

@@ -407,7 +407,7 @@ def simulate_many(
         q_start: joint positions at t = 0, (n,) [rad] or [m].
         changes: for each run, arguments of `simulate` by name: plant, pushes, friction, noise, controller, q_start, ...
         executor: shares the runs, for example `concurrent.futures.ProcessPoolExecutor`, or
-            `distributed.Client(...).get_executor()` of Dask. Default: this process, with as many threads as
+            `distributed.Client(...).get_executor(pure=False)` of Dask. Default: this process, with as many threads as
             OMP_NUM_THREADS or the number of cores says where runs are compiled.
         monitor: called with progress.
         settings: further arguments of `simulate` that all runs share, such as `control_rate` and `compiled`. With

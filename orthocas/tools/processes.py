@@ -203,6 +203,7 @@ def scheduler_executor(address: str) -> Iterator[Executor]:
         client = distributed.Client(address, timeout="10s")
     except (OSError, ValueError, TimeoutError) as error:
         raise SchedulerError(f"the scheduler {address} does not answer: {error}") from None
+    # Jobs are new ones, so Dask need not compare their arguments: a digest of them takes longer than sending them.
     with client:
-        executor: Executor = client.get_executor()
+        executor: Executor = client.get_executor(pure=False)
         yield executor

@@ -310,7 +310,7 @@ def test_dask_shares_the_work() -> None:
     distributed = pytest.importorskip("distributed")
     with (
         distributed.Client(processes=False, n_workers=2, threads_per_worker=1, dashboard_address=None) as client,
-        client.get_executor() as executor,
+        client.get_executor(pure=False) as executor,
     ):
         assert oc.certify(chart(), executor=executor).regular.codes.tolist() == certified().regular.codes.tolist()
 

@@ -76,12 +76,14 @@ def test_schedules_objectives_and_obstacles(run: Run, chart: oc.Chart) -> None:
         (["--obstacle", "cone:1,2"], "unknown kind of --obstacle 'cone', known: sphere, capsule, plane"),
         (["--sphere", "1,2,3,1"], "no such option: --sphere; use --obstacle sphere:X,Y,Z,RADIUS"),
         (["--obstacle", "plane:0,0,0,0,0,0"], "normal is [0.0, 0.0, 0.0], expected a direction"),
+        (["--link-radius", "0.1"], "--link-radius requires --obstacle"),
         (["--start", "1,2"], "q_start has shape (2,), expected (3,)"),
         (["--period", "often"], "received 'often', expected a number"),
         (["--velocity-limit", "-1"], "velocity_limits of joint 'q1' is -1.0"),
         (["--out", "no/q.csv"], "folder no does not exist"),
         (["--out", "a.orthocas"], "orthocas did not write the file"),
-        (["--obstacle", "sphere:1,1.5,0,3"], "cannot be followed at waypoint 0"),
+        (["--obstacle", "sphere:1,1.5,0,0.1"], "--obstacle requires --collisions FILE.urdf, or --link-radius"),
+        (["--obstacle", "sphere:1,1.5,0,3", "--link-radius", "0.1"], "cannot be followed at waypoint 0"),
     ],
 )
 def test_refusals(run: Run, chart: oc.Chart, words: list[str], message: str) -> None:

@@ -199,3 +199,58 @@ def test_the_command_writes_distances(run: Run) -> None:
     assert (code, err) == (0, "")
     assert '{"link0", "link2"}' in Path("c/arm_distance.c").read_text()
     assert "arm_distance.c" in Path("c/CMakeLists.txt").read_text()
+
+
+class KeepClear:
+    """NAME_keep_clear of the same library."""
+
+    def __init__(self, compiled: Compiled, library: Path) -> None:
+        self.run, self.n = ctypes.CDLL(str(library)).arm_keep_clear, compiled.n
+
+    def __call__(self, q: Array, goal: Array, margin: float) -> tuple[Array, float, int]:
+        """The result (n,), the distance there, and the status."""
+        result, distance = np.empty(self.n), np.empty(1)
+        inputs = [np.ascontiguousarray(row, dtype=float) for row in (q, goal)]
+        first, second, place, least = (ctypes.c_void_p(row.ctypes.data) for row in (*inputs, result, distance))
+        status = int(self.run(first, second, ctypes.c_double(margin), place, least))
+        return result, float(distance[0]), status
+
+
+def test_steps_in_c_keep_clear_between_postures_too(arm: tuple[oc.Robot, FittedCapsules], tmp_path: Path) -> None:
+    """Hostile steps, over half of a joint's range at once: never a contact, and no step that could have been longer."""
+    robot, fitted = arm
+    compiled = write(tmp_path, robot, fitted)
+    keep_clear = KeepClear(compiled, tmp_path / "distance.so")
+    model, margin, rng = fitted.collisions, 0.02, np.random.default_rng(5)
+    starts = robot.sample(200, seed=6)
+    q = starts[np.argmax([compiled(posture)[0] for posture in starts])]
+    way, counts = [q], np.zeros(4, dtype=int)
+    for k in range(1500):
+        goal = q + rng.normal(size=3) * (0.02, 0.2, 1.0)[k % 3]
+        new, distance, status = keep_clear(q, goal, margin)
+        counts[status] += 1
+        before = compiled(q)[0]
+        floor = margin + 0.5 * (min(before, 3 * margin) - margin) if before > margin else before
+        assert distance == compiled(new)[0]
+        assert distance >= floor - 1e-12
+        shares = (new - q) / (goal - q)
+        np.testing.assert_allclose(shares, shares[0], atol=1e-9)
+        assert np.isclose(shares[0], [0, 1, 0.5, 0.25, 0.125, 0.0625, 0.03125]).any()
+        assert (status == 0) == (shares[0] == 1)
+        if np.abs(new - q).max() > 0 and status:
+            # The step of twice the length comes too near at its end, or may do so on its way.
+            longer = q + 2 * (new - q)
+            low = 0.5 * min(margin, before)
+            assert (
+                compiled(longer)[0] < floor + 1e-12
+                or model.find_contact(np.array([q, longer]), low)
+                or (np.abs(longer - q).max() > 0.05)
+            )
+        q = new
+        way.append(q)
+    assert (counts[:3] > 20).all()
+    assert robot.collisions.check_free(np.array(way)).all()
+    assert model.find_contact(np.array(way), 0.49 * margin) is None
+    for bad in ((np.nan, 0.02), (0.0, 0.0), (0.0, -1.0), (0.0, np.nan)):
+        result, distance, status = keep_clear(q + bad[0], q, bad[1])
+        assert (status, distance, result.any()) == (3, 0.0, False)

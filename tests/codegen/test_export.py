@@ -24,6 +24,7 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.codegen.export import LIBRARIES, write_module
 from orthocas.codegen.export_forms import write_function
 from orthocas.errors import ArchiveError, InvalidValueError, NoExpressionError, UnknownNameError
+from orthocas.robots.capsules import FittedCapsules
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tasks.task import TASK_KINDS
 from orthocas.tools.batch import Batched, dense_function
@@ -34,8 +35,8 @@ FITTED = [name for name in CHARTS if name not in ("circle chart", "disk chart", 
 AGREED = 1e-10
 
 
-def module_of(chart: oc.Chart, library: str, folder: Path) -> ModuleType:
-    path = oc.export(chart, library, folder / "arm.py", force=True)
+def module_of(chart: oc.Chart, library: str, folder: Path, capsules: FittedCapsules | None = None) -> ModuleType:
+    path = oc.export(chart, library, folder / "arm.py", force=True, capsules=capsules)
     spec = importlib.util.spec_from_file_location("arm", path)
     assert spec is not None
     assert spec.loader is not None

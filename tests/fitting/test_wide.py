@@ -37,8 +37,7 @@ from orthocas.errors import (
     UnknownNameError,
 )
 from orthocas.fitting import wide as wide_fits
-from orthocas.fitting.basis_gradients import build_gradients
-from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.basis_objective import BasisObjective, build_gradients
 from orthocas.fitting.like import Like, QuadraticTerm
 from orthocas.fitting.network_objective import ArrayObjective
 from orthocas.fitting.stages import Resampled

@@ -20,7 +20,6 @@ from public_objects import (
     fitted,
     impedance,
     joint_motion,
-    link_distances,
     planar,
     steps,
     trajectory,
@@ -33,10 +32,8 @@ from orthocas.certificates import certified_box, check_certificate
 from orthocas.charts.chart import GrownChart
 from orthocas.charts.figures import quality_figure, self_motion_figure
 from orthocas.charts.regular_part import RegularPart
-from orthocas.charts.singularities import jumps, singular_points
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.errors import CompileError
-from orthocas.exact.involutivity import lie_bracket
 from orthocas.fitting.loss import loss
 from orthocas.paths import corridor_problem
 from orthocas.robots.collisions import Collisions
@@ -319,7 +316,6 @@ def _makers() -> dict[str, Call]:
 
 def _functions() -> dict[str, Call]:
     problem, chart, q = planar(), fitted().chart, np.array([0.3, 0.4, 0.5])
-    symbol = ca.SX.sym("q", 3)
     box = {"problem": problem, "parametrisation": oc.Polynomial(1)}
     return {
         "fit of a robot": (
@@ -382,8 +378,6 @@ def _functions() -> dict[str, Call]:
         ),
         "grow linear": (oc.grow, {"problem": planar("euclidean"), "leaf": "linear", "level": 0.5, "region": None}),
         "involutivity": (oc.involutivity, {"problem": problem, "samples": 30, "seed": 1}),
-        "jumps": (jumps, {"chart": circle(), "radius": 0.02}),
-        "lie_bracket": (lie_bracket, {"f": symbol, "g": symbol**2, "q": symbol}),
         "load": (oc.load, {"path": "no.orthocas"}),
         "charts.load": (oc.charts.load, {"path": "ur5-position"}),
         "charts.card": (oc.charts.card, {"name": "ur5-position"}),
@@ -401,7 +395,6 @@ def _functions() -> dict[str, Call]:
                 "held_out": 50,
             },
         ),
-        "singular_points": (singular_points, {"problem": problems.get("planar_2r"), "seed": 0}),
         "register_parametrisation": (
             oc.register_parametrisation,
             {"name": "polynomial", "kind": oc.MLP, "parse": None},
@@ -467,9 +460,8 @@ def _methods() -> dict[str, Call]:
                 "period": 0.05,
                 "velocity_limits": 1.0,
                 "acceleration_limits": 2.0,
-                "obstacles": [oc.obstacles.Sphere([9.0, 0, 0], 0.1)],
-                "link_radius": 0.1,
                 "clearance": 0.01,
+                "collisions": collisions(),
             },
         ),
         "follow by objective": (
@@ -481,8 +473,7 @@ def _methods() -> dict[str, Call]:
         "Sphere": (oc.obstacles.Sphere, {"centre": q, "radius": 0.1}),
         "Capsule": (oc.obstacles.Capsule, {"start": q, "end": -q, "radius": 0.1}),
         "Plane": (oc.obstacles.Plane, {"normal": q, "point": q}),
-        "LinkDistances": (oc.obstacles.LinkDistances, {"robot": robot, "obstacles": [], "radius": 0.1}),
-        "distances": (link_distances(), {"q": q}),
+        "robot.with_rods": (robot.with_rods, {"radius": 0.1}),
         "obstacles.Box": (oc.obstacles.Box, {"size": q, "centre": q, "rotation": np.eye(3)}),
         "Mesh": (oc.obstacles.Mesh, {"points": np.eye(4, 3), "position": q, "rotation": np.eye(3), "scale": 0.5}),
         "PointCloud": (oc.obstacles.PointCloud, {"points": [q, -q], "cell": 0.1}),

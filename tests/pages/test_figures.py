@@ -157,10 +157,28 @@ def test_records_whose_packages_are_missing_are_left_out_but_no_missing_script(
     monkeypatch.setattr(figures, "ROOT", tmp_path)
     monkeypatch.setattr(figures, "records", lambda: {"needs": record})
     assert figures.main([], keep=False) == 0
-    assert "left out: No module named 'package_that_nobody_has'" in capsys.readouterr().out
+    assert "needs is left out: it needs the package package_that_nobody_has" in capsys.readouterr().out
     script.unlink()
-    with pytest.raises(ModuleNotFoundError, match="needs_of_figures"):
-        figures.main([], keep=False)
+    assert figures.main([], keep=False) == 1
+
+
+def test_what_fails_is_named_and_does_not_stop_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "examples").mkdir()
+    (tmp_path / "examples" / "fails_of_figures.py").write_text("def main():\n    raise AssertionError('no such arm')\n")
+    (tmp_path / "examples" / "works_of_figures.py").write_text("def main():\n    return {'a': 1.0}\n")
+    found = {
+        name: figures.Record(name, "measured", script=f"examples/{name}_of_figures.py", cpu_seconds=1.0)
+        for name in ("fails", "works")
+    }
+    monkeypatch.setattr(figures, "ROOT", tmp_path)
+    monkeypatch.setattr(figures, "records", lambda: found)
+    assert figures.main([], keep=False) == 1
+    captured = capsys.readouterr()
+    assert captured.out.splitlines()[-1] == "1 failed: fails"
+    assert "works: " in captured.out
+    assert "no such arm" in captured.err
 
 
 def test_rows_belong_together_by_their_labels_whatever_their_order() -> None:

@@ -20,7 +20,8 @@ from orthocas.paths import JointMotion
 from orthocas.paths.follow import Costs, MotionLimits, XiChoice, walk
 from orthocas.paths.joint_curve import JointCurve, PhiSolver
 from orthocas.paths.tool_path import ToolPath
-from orthocas.robots.obstacles import LinkDistances, Sphere
+from orthocas.robots.collisions import Collisions
+from orthocas.robots.obstacles import Sphere
 from orthocas.tools.checks import Array
 
 START = np.array([0.6, 0.8, 0.8])
@@ -198,15 +199,25 @@ def test_costs_have_the_gradients_of_finite_differences(bound: float | None) -> 
     known = planar().problem
     problem = oc.Problem(known.robot, known.task, domain=oc.Box(START, 0.7), least_singular_value=bound)
     chart = oc.fit(problem, oc.Linear()).chart
-    distances = LinkDistances(known.robot, [Sphere([0.5, 1.2, 0.0], 0.2)], 0.1)
-    costs = Costs(MotionLimits(chart, np.ones(3), np.ones(3), distances, 0.01))
+    model = put_ball(known.robot, [0.5, 1.2, 0.0], 0.2, 0.1)
+    costs = Costs(MotionLimits(chart, np.ones(3), np.ones(3), model, 0.01))
     q = START + np.random.default_rng(8).uniform(-0.8, 0.8, (30, 3))  # also outside
     residuals, gradients = costs(q)
     assert (residuals[:, -3:] > 1).any()  # near the ball
+    # The pairs come in the order of their distance; overlaps are good to a micrometre.
+    pairs = model.pair_distances(q)
+    certain = (np.diff(np.sort(pairs), axis=1) > 1e-4).all(axis=1) & (pairs > 0).all(axis=1)
+    assert certain.sum() > 5
+    q, gradients = q[certain], gradients[certain]
     for i in range(3):
-        step = 1e-7 * np.eye(3)[i]
-        expected = (costs(q + step)[0] - costs(q - step)[0]) / 2e-7
+        step = 1e-6 * np.eye(3)[i]
+        expected = (costs(q + step)[0] - costs(q - step)[0]) / 2e-6
         np.testing.assert_allclose(gradients[:, :, i], expected, rtol=1e-4, atol=1e-4)
+
+
+def put_ball(robot: oc.Robot, centre: list[float], radius: float, thick: float) -> Collisions:
+    """Rods for links, and a ball."""
+    return robot.with_rods(thick).collisions.with_scene(oc.Scene({"ball": Sphere(centre, radius)}))
 
 
 @pytest.mark.slow
@@ -226,7 +237,7 @@ def test_objective_is_that_of_ipopt() -> None:
 
 
 def _limits(chart: oc.Chart) -> MotionLimits:
-    return MotionLimits(chart, np.ones(chart.n), np.ones(chart.n), LinkDistances(chart.problem.robot, []), 0.0)
+    return MotionLimits(chart, np.ones(chart.n), np.ones(chart.n), None, 0.0)
 
 
 def cost(choice: XiChoice, values: Array) -> float:
@@ -259,17 +270,18 @@ def by_ipopt(choice: XiChoice, limits: MotionLimits, first: Array) -> Array:
 @pytest.mark.slow
 def test_objective_goes_round_obstacles() -> None:
     chart = iiwa()
-    path, ball = loop(chart, 0.1, 200), Sphere([0.2, 0.15, 0.6], 0.1)
-    with pytest.raises(PathError, match=r"waypoint.*link of joint 'A\d' and obstacle 0 .* expected a distance"):
-        oc.follow(chart, path, obstacles=[ball], link_radius=0.05, clearance=0.01)
-    found = oc.follow(chart, path, "objective", obstacles=[ball], link_radius=0.05, clearance=0.01)
+    path, centre = loop(chart, 0.1, 200), [0.2, 0.15, 0.6]
+    around = put_ball(chart.robot, centre, 0.1, 0.05)
+    with pytest.raises(PathError, match=r"waypoint.* s 'link of A\d' and 'ball' .* expected a distance"):
+        oc.follow(chart, path, collisions=around, clearance=0.01)
+    found = oc.follow(chart, path, "objective", collisions=around, clearance=0.01)
     points = chart.problem.robot.joint_points(found.q)
     shares = np.linspace(0, 1, 50)[:, None, None, None]
     links = points[:, 1:-1] + shares * (points[:, 2:] - points[:, 1:-1])
-    nearest = np.linalg.norm(links - ball.centre, axis=-1).min() - 0.15
+    nearest = np.linalg.norm(links - centre, axis=-1).min() - 0.15
     assert nearest >= 0.01 - 1e-4
     assert found.margins.distance == pytest.approx(nearest, abs=1e-3)
-    assert "obstacle 0" in found.margins.distance_pair
+    assert "'ball'" in found.margins.distance_pair
 
 
 @pytest.mark.slow
@@ -365,8 +377,9 @@ def test_two_arms_follow_a_path_of_their_relative_pose() -> None:
     task = oc.Task.relative_pose(robot, *tips)
     chart = oc.fit(oc.Problem(robot, task, domain=oc.Box(home, 0.3)), oc.Polynomial(2)).chart
     path = chart.x(home) + np.linspace(0, 1, 10)[:, None] * [0.03, 0.02, 0, 0, 0, 0]
-    floor = oc.obstacles.Plane([0, 0, 1], [0, 0, -1.0])
-    motion = oc.follow(chart, path, q_start=home, obstacles=[floor])
+    floor = oc.Scene({"floor": oc.obstacles.Plane([0, 0, 1], [0, 0, -1.0])})
+    around = robot.with_rods(0.01).collisions.with_scene(floor)
+    motion = oc.follow(chart, path, q_start=home, collisions=around)
     np.testing.assert_allclose(chart.x(motion.q), motion.x, atol=1e-9)
     np.testing.assert_allclose(motion.x[-1], path[-1], atol=1e-9)
-    assert len(oc.obstacles.LinkDistances(robot, [floor]).pairs) == robot.n
+    assert len(around.pairs) == robot.n

@@ -19,7 +19,6 @@ from orthocas import control, paths, problems, solvers
 from orthocas.arms import Arc, ArmTracker, SelfMotions
 from orthocas.charts.certificate import Certificate
 from orthocas.charts.chart import GrownChart
-from orthocas.charts.singularities import jumps, singular_points
 from orthocas.charts.trackers import Tracker
 from orthocas.codegen.compiled_inverse import CompiledInverse
 from orthocas.control import Controller, Reference
@@ -226,10 +225,6 @@ def joint_motion() -> paths.JointMotion:
     return oc.follow(fitted().chart, [x, x + 0.05, x], velocity_limits=1.0, period=0.05)
 
 
-def link_distances() -> oc.obstacles.LinkDistances:
-    return oc.obstacles.LinkDistances(planar().robot, [oc.obstacles.Sphere([0.5, 0.0, 0.5], 0.1)], 0.05)
-
-
 def collisions() -> Collisions:
     """Balls on the base and on two links, and a scene."""
     ball = Shape(BallGeometry(0.1), np.eye(3), np.zeros(3))
@@ -343,7 +338,6 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "sphere": lambda: oc.obstacles.Sphere([0.5, 0.0, 0.5], 0.1),
     "capsule": lambda: oc.obstacles.Capsule([0.5, 0.0, 0.0], [0.5, 0.0, 1.0], 0.1),
     "plane": lambda: oc.obstacles.Plane([0.0, 0.0, 1.0], [0.0, 0.0, -0.1]),
-    "distances of links": link_distances,
     "solid box": lambda: oc.obstacles.Box([0.2, 0.2, 0.2], [0.0, 2.0, 0.0]),
     "mesh": mesh,
     "point cloud": lambda: oc.obstacles.PointCloud([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], 0.1),
@@ -367,8 +361,6 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "tracker of an arm": lambda: arm().tracker(BENT_POSTURE),
     "nearest tracker": lambda: fitted().chart.tracker(planar().domain.centre, nearest=True),
     "involutivity": lambda: oc.involutivity(planar(), 100),
-    "singular point": lambda: singular_points(problems.get("planar_2r"))[0],
-    "jump": lambda: jumps(circle())[0],
     "distilled": distilled,
     "steps": steps,
     "spline": lambda: Reference.through(("a", "b"), [0.0, 1.0, 2.0], [[0.0, 1.0], [1.0, 0.5], [0.0, 2.0]]),
@@ -497,11 +489,6 @@ def _of_problem(problem: oc.Problem) -> Iterator[Any]:
 @_numbers.register
 def _of_domain(domain: oc.Box | oc.Torus) -> Iterator[Any]:
     yield from (domain.name, sample_uniform(domain, 5, 0))
-
-
-@_numbers.register
-def _of_distances(distances: oc.obstacles.LinkDistances) -> Iterator[Any]:
-    yield from (distances.pairs, distances(np.linspace(-1, 1, 6).reshape(2, 3)))
 
 
 @_numbers.register
