@@ -20,7 +20,7 @@ from benchmark import run, table
 from c_timing import nanoseconds_per_call
 
 import orthocas as oc
-from orthocas.robots.named import find_robot_file
+from orthocas.robots.urdf import find_robot_file
 
 ROOT = Path(__file__).parent.parent
 HEADER = (

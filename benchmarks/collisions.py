@@ -28,7 +28,7 @@ from orthocas.codegen.library import find_compilers
 from orthocas.robots.capsules import FittedCapsules
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.kinematics import build_body_poses
-from orthocas.robots.named import find_robot_file
+from orthocas.robots.urdf import find_robot_file
 from orthocas.tools.checks import Array
 
 CHARTS = {

@@ -8,7 +8,7 @@ import numpy as np
 from benchmark import run
 from c_timing import nanoseconds_per_call
 
-from orthocas.fitting.loss import Loss, build_loss_with_slopes
+from orthocas.fitting.sample_loss import Loss, build_loss_with_slopes
 from orthocas.fitting.terms import Sizes, Weights
 from orthocas.tools.columns import COLUMNS
 

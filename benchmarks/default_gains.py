@@ -26,7 +26,7 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.codegen import Supervisor
 from orthocas.codegen.library import CompiledLibrary, compile_shared, gain_numbers
-from orthocas.control import ControlStatus, PDPlus, Reference, Safety
+from orthocas.control import ControlStatus, PDPlus, Reference, Safety, matched_stiffness
 from orthocas.control.gains import compute_mobility, find_fastest_posture
 from orthocas.errors import UnreachableReferenceError
 from orthocas.problems import urdf_path
@@ -208,10 +208,10 @@ def delay_row(name: str) -> str:
     """For each delay: fastest mode [Hz], and the fastest joint in the end, with default gains and matched ones."""
     chart = oc.charts.load(name)
     words = [name]
-    default = PDPlus.on_chart(chart)
+    default = PDPlus(chart, matched_stiffness(chart))
     with compiled(default) as library:  # gains are arguments
         for delay in DELAYS:
-            law = PDPlus.on_chart(chart, delay=delay / RATE)
+            law = PDPlus(chart, matched_stiffness(chart, delay=delay / RATE))
             ends = [settled(each, library, delay) for each in (default, law)]
             words += [f"{law.modes().frequencies.max():.1f}", " -> ".join(f"{end:.3f}" for end in ends)]
     return f"| {' | '.join(words)} |"
@@ -240,7 +240,8 @@ def main(quick: bool = False, modes_alone: bool = False, delays: bool = False) -
     """Print the tables; `quick` takes one arm and one start, `modes_alone` and `delays` each one table."""
     if delays:
         return table(DELAY_HEADER, map(delay_row, ARMS[:1] if quick else ARMS))
-    laws = {f"{', '.join(case)}": PDPlus.on_chart(chart_of(*case)) for case in (CASES[:1] if quick else CASES)}
+    charts = {", ".join(case): chart_of(*case) for case in (CASES[:1] if quick else CASES)}
+    laws = {name: PDPlus(chart, matched_stiffness(chart)) for name, chart in charts.items()}
     rows = [modes_row(label, law) for label, law in laws.items()]
     print("\n".join(rows), flush=True)
     for row in () if modes_alone else (sag_row, integral_row):

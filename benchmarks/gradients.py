@@ -18,8 +18,7 @@ from torch_loss import WEIGHTS, Step, basis_step, network_step
 import orthocas as oc
 from orthocas import problems
 from orthocas.bases import JointSpace, LinearFamily
-from orthocas.fitting.basis_gradients import build_gradients
-from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.basis_objective import BasisObjective, build_gradients
 from orthocas.fitting.network_objective import ArrayObjective
 from orthocas.fitting.terms import Weights
 from orthocas.tasks.samples import sample_problem

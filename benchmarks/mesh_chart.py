@@ -8,8 +8,7 @@ import igl
 import numpy as np
 from benchmark import run, table
 
-from orthocas.exact.harmonic import build_level_surface, map_to_disk
-from orthocas.exact.mesh import TriangleLocator, TriangleMesh, require_disk
+from orthocas.exact.mesh import TriangleLocator, TriangleMesh, build_level_surface, map_to_disk, require_disk
 
 HEADER = (
     "| triangles | surface [s] | harmonic map [s] | closest points [s] | libigl: harmonic map [s] "

@@ -26,6 +26,7 @@ from paper.planar_flow import (
     mark_singular,
     planar_problem,
 )
+from paper.singularities import singular_points
 from paper.style import joint_plane
 
 import orthocas as oc
@@ -33,7 +34,6 @@ from orthocas.bases import JointSpace
 from orthocas.bases.circle import CircleFamily
 from orthocas.bases.products import ProductFamily
 from orthocas.charts.coordinates import Coordinates
-from orthocas.charts.singularities import singular_points
 from orthocas.solvers import GaussNewton
 from orthocas.tasks.samples import evaluate_samples
 from orthocas.tools.checks import Array

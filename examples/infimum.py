@@ -24,7 +24,7 @@ from scipy.sparse.linalg import spsolve
 
 import orthocas as oc
 from orthocas import problems, solvers
-from orthocas.fitting.loss import Loss
+from orthocas.fitting.sample_loss import Loss
 from orthocas.fitting.terms import Sizes
 from orthocas.tasks.samples import Samples, evaluate_samples
 from orthocas.tools.batch import Batched

@@ -20,7 +20,7 @@ def __getattr__(name: str) -> object:
     if name == "__all__":
         return sorted(_HOMES, key=lambda public: (not public.isupper(), not public[0].isupper(), public))
     if name not in homes:
-        guesses = import_module("orthocas.tools.guesses")
+        guesses = import_module("orthocas.tools.display")
         raise AttributeError(guesses.explain_missing("orthocas", name))
     home, own_name = homes[name]
     members = vars(import_module(home))

@@ -15,7 +15,7 @@ from matplotlib.patheffects import withStroke
 from orthocas.bases import Polynomial
 from orthocas.charts.chart import Chart
 from orthocas.exact.flow import TaskFlow
-from orthocas.exact.involutivity import TaskBrackets, lie_bracket
+from orthocas.exact.involutivity import TaskBrackets
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched, dense_function
@@ -135,12 +135,11 @@ def _gap(problem: Problem, start: Array, change: float) -> float:
 def _bracket(problem: Problem, at: Array) -> tuple[float, float]:
     """|[X_1, X_2]| of the lifts at a point, and its expected value d / sqrt(det(J J^T))."""
     q = ca.SX.sym("q", problem.n)
-    lifts = [TaskFlow(problem).field(q, ca.DM.eye(2)[:, k]) for k in range(2)]
+    f, g = (TaskFlow(problem).field(q, ca.DM.eye(2)[:, k]) for k in range(2))
+    commutator = ca.jtimes(g, q, f) - ca.jtimes(f, q, g)  # (dg/dq) f - (df/dq) g
     J = problem.task.jacobian_function(q)
     defect = TaskBrackets.build(problem).build_defect_function()(q)
-    evaluate = dense_function(
-        "bracket", [q], [ca.norm_2(lie_bracket(lifts[0], lifts[1], q)), defect / ca.sqrt(ca.det(J @ J.T))]
-    )
+    evaluate = dense_function("bracket", [q], [ca.norm_2(commutator), defect / ca.sqrt(ca.det(J @ J.T))])
     bracket, formula = Batched(evaluate)(at[None])
     return float(bracket[0, 0]), float(formula[0, 0])
 

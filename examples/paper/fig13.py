@@ -18,7 +18,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.singularities import Jump, SingularPoint, jumps, singular_points
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
@@ -40,6 +39,7 @@ from .planar_flow import (
     singular_symbols,
 )
 from .self_motion import wrapped
+from .singularities import Jump, SingularPoint, jumps, singular_points
 from .style import INK, LABEL, TICK, TURN, find_axis, joint_plane, new_figure, pi_text
 
 _COLOURS = "twilight"  # this map is light at +-pi

@@ -15,8 +15,8 @@ from matplotlib.colors import to_rgb, to_rgba
 from orthocas import problems
 from orthocas.charts.grow import grow
 from orthocas.exact.flow import GrownCoordinates, TaskFlow
-from orthocas.exact.harmonic import build_level_surface, compute_signed_areas
 from orthocas.exact.leaves import DiskLeaf, build_disk_leaf
+from orthocas.exact.mesh import build_level_surface, compute_signed_areas
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import sample_uniform

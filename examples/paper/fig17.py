@@ -13,7 +13,6 @@ from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.singularities import singular_points
 from orthocas.exact.flow import TaskFlow
 from orthocas.exact.leaves import trace_circle_leaf
 from orthocas.tools.checks import Array
@@ -31,6 +30,7 @@ from .planar_flow import (
     planar_problem,
     singular_symbols,
 )
+from .singularities import singular_points
 from .style import EXTRA, LABEL, TASK, TICK, joint_plane, new_figure
 
 _LEAVES = (-1.5, -1.0, -0.5, 0.5, 1.0, 1.5)  # task values of the leaves on which values of xi are counted [m]

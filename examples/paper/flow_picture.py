@@ -7,7 +7,6 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.singularities import SingularPoint, singular_points
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
@@ -33,6 +32,7 @@ from .planar_flow import (
 )
 from .scene import Scene
 from .self_motion import wrapped
+from .singularities import SingularPoint, singular_points
 from .style import EXTRA, GREY, INK, LABEL, TASK, TICK, TURN, add_3d, joint_plane, new_figure
 
 _LEVELS = np.linspace(-1.8, 1.8, 10)  #: task values of the drawn leaves [m]

@@ -7,7 +7,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
-from orthocas.exact.harmonic import build_level_surface
+from orthocas.exact.mesh import build_level_surface
 from orthocas.tools.checks import Array
 
 from .closed_loop_picture import COLOURS

@@ -12,7 +12,6 @@ from matplotlib.lines import Line2D
 from orthocas import problems
 from orthocas.charts.chart import Chart
 from orthocas.charts.grow import grow
-from orthocas.charts.singularities import SingularPoint
 from orthocas.exact.flow import GrownCoordinates, TaskFlow
 from orthocas.exact.leaves import CircleLeaf
 from orthocas.tasks.domains import Torus
@@ -21,6 +20,7 @@ from orthocas.tasks.samples import evaluate_samples
 from orthocas.tools.checks import Array
 
 from .self_motion import pieces_in_cube, wrapped
+from .singularities import SingularPoint
 from .style import INK, TURN
 
 NAMES = {"euclidean": "A = I", "inertia": "A = M"}

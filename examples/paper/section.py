@@ -4,8 +4,7 @@ import numpy as np
 
 from orthocas import problems
 from orthocas.charts.chart import Chart
-from orthocas.exact.harmonic import build_level_surface
-from orthocas.exact.mesh import TriangleMesh
+from orthocas.exact.mesh import TriangleMesh, build_level_surface
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.task import Task

@@ -759,7 +759,7 @@ def _repeat_rows(name: str, rows: Array, count: int) -> Array:
 
 def _agree(chart: Chart, task: Task) -> bool:
     """Whether a chart's task has the values of another one."""
-    q = chart.problem.domain.centre[None]
+    q = chart.problem.domain.home[None]
     same = chart.m == task.m and chart.n == task.robot.n
     return same and bool(np.allclose(chart.problem.task.batched(q)[0], task.batched(q)[0], rtol=0, atol=1e-9))
 

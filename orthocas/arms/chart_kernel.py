@@ -102,7 +102,7 @@ class RangeInC(ctypes.Structure):
 
 def tracker_type(n: int, r: int, target: int) -> np.dtype[Any]:
     """`NAME_tracker` of templates/arm_track.h.jinja."""
-    rows = ("q", "most", "change", "weight", "moved", "last", "goal")
+    rows = ("q", "most", "change", "weight", "near", "moved", "last", "goal")
     fields: list[Any] = [(name, "f8", (n,)) for name in rows]
     fields += [("wish", "f8", (r,)), ("target", "f8", (target,)), ("far", "f8"), ("best", "f8")]
     numbers = ("detours", "patience", "chart", "inside", "status", "mode", "ticks", "pause", "rested", "next", "listed")

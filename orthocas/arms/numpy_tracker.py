@@ -87,12 +87,12 @@ class NumpyTracker:
     @property
     def memory(self) -> Any:
         """What another tracker needs to go on here, but for detours under way."""
-        return self._q.copy(), self._wish, self._last.copy(), self.status
+        return self._q.copy(), self._wish, self._near.copy(), self._last.copy(), self.status
 
     @memory.setter
     def memory(self, memory: Any) -> None:
         self.reset(memory[0])
-        _, self._wish, self._last, self.status = memory
+        _, self._wish, self._near, self._last, self.status = memory
 
     def reset(self, q: Array) -> None:
         """Continue from another posture (n,)."""
@@ -100,11 +100,15 @@ class NumpyTracker:
             self._clearance.start(q)
         self._q, self._last = np.array(q, dtype=float), np.array(q, dtype=float)
         self._chart: Chart | None = None
-        self._inside, self._wish = False, float("nan")
+        self._inside, self._wish, self._near = False, float("nan"), np.full(len(q), np.nan)
         self._goal: Array | None = None  # of a detour
         self._ticks, self._error = 0, np.inf  # since x was met or the error fell, and the error then
         self.status = TrackStatus.OK  #: how the last call ended
         self._look_for_chart()
+
+    def stay_near(self, posture: Array) -> None:
+        """Instead of holding xi, until it is given."""
+        self._near = posture
 
     def step(self, vector: Array | None, target: Array | None, xi: float | None) -> Array:
         """The next posture (n,), clear of contacts, for x as the task's vector or as a target."""
@@ -124,9 +128,10 @@ class NumpyTracker:
         if not np.isfinite(np.concatenate(parts)).all():
             self.status = TrackStatus.BAD_INPUT
             return self._q.copy()
-        self._wish = self._wish if xi is None else xi
+        if xi is not None:
+            self._wish, self._near = xi, np.full(len(self._q), np.nan)
         targets = self._maps.targets
-        if self._inside and np.isfinite(self._wish):
+        if self._holds_xi:
             x = targets.vector(np.asarray(target)[None])[0] if vector is None else vector
             if self._step_in_chart(x):
                 self._ticks, self._goal = 0, None
@@ -223,7 +228,7 @@ class NumpyTracker:
         self._q = ahead
         if not met:
             return TrackStatus.BEHIND if fast or moved.any() else TrackStatus.NEAREST
-        if not asked and not np.isfinite(self._wish):
+        if np.isfinite(self._near).all() or not (asked or np.isfinite(self._wish)):
             return TrackStatus.OK
         return TrackStatus.YIELDING
 
@@ -285,13 +290,18 @@ class NumpyTracker:
     def _find_own_wishes(self) -> tuple[Array, Array, float]:
         """Without a collision model."""
         n = len(self._q)
-        if self._inside and np.isfinite(self._wish):
+        if self._holds_xi:
             value, gradient = self._measure_xi()
             left = self._wish - value
             period = float(self._chart.parts.turns[-1]) if self._chart is not None else 0.0
             left -= period * np.round(left / period) if period else 0.0
             return gradient[None], np.array([left]), RULES.xi_weight
-        return np.eye(n), self._last - self._q, RULES.posture_weight
+        end = self._near if np.isfinite(self._near).all() else self._last
+        return np.eye(n), end - self._q, RULES.posture_weight
+
+    @property
+    def _holds_xi(self) -> bool:
+        return self._inside and bool(np.isfinite(self._wish)) and not np.isfinite(self._near).all()
 
     def _look_for_chart(self) -> None:
         """Whether the posture is in the domain of the tracker's chart; without one, the first that holds it."""

@@ -30,9 +30,10 @@ class ArmTracker(Shown):
         min |J d - e|^2 + w^2 |g d - e_xi|^2 + damping |d|^2,  with bounds of position and velocity,
 
     with the errors e of x and e_xi of xi, their rates J and g, and w = 1e-3; where there is no chart, a small pull back
-    to the last posture that had one takes the place of xi. Then Gauss-Newton steps within the same bounds bring the
-    error of x to zero, or to a minimum, at which the arm rests. As damping grows where a step does not lower the error,
-    the error of a target at rest never rises.
+    to the last posture that had one takes the place of xi. So does a posture that is given instead of xi: joints go as
+    near to it as x lets them, which is what a posture task of lower priority does. Then Gauss-Newton steps within the
+    same bounds bring the error of x to zero, or to a minimum, at which the arm rests. As damping grows where a step
+    does not lower the error, the error of a target at rest never rises.
 
     xi is that of the chart in whose domain the tracker began, or came to be first. When the arm comes back to the
     domain, xi goes from the value that it has there to what is asked as fast as the joints may. Where it does not come
@@ -141,18 +142,29 @@ class ArmTracker(Shown):
         """
         self._engine.reset(self._read_posture(q))
 
-    def step(self, x: Any, xi: ArrayLike | None = None) -> Array:
+    def step(self, x: Any, xi: ArrayLike | None = None, posture: ArrayLike | None = None) -> Array:
         """The next posture (n,); see `status`.
 
         Args:
             x: one task value.
             xi: wished value in the tracker's chart, a number, or (r,); None holds the last one, at first that of the
                 begin.
+            posture: to stay near to instead of holding xi, (n,): of the postures with x, the one at which
+                |q - posture|, with weights, is least. It counts until xi or another posture is given.
 
         Raises:
-            InvalidValueError: if x is no task value of this task.
+            InvalidValueError: if x is no task value of this task, or xi and a posture are given.
         """
         wish = None if xi is None else self._read_wish(xi)
+        if posture is not None:
+            if xi is not None:
+                raise InvalidValueError("posture", "given with xi", "one of the two")
+            near = as_float_array("posture", posture)
+            require_shape("posture", near.shape, (self._maps.robot.n,))
+            if np.isfinite(near).all():
+                self._engine.stay_near(near)
+            else:
+                wish = np.nan  # BAD_INPUT
         if type(x) is np.ndarray and x.dtype == np.float64 and x.shape == (self._maps.task.m,):
             return self._engine.step(x, None, wish)
         targets, single = self._maps.targets.read(x)
@@ -223,6 +235,10 @@ class _Compiled:
             if fraction < 1:
                 self._kernel.hold(self._at, pointer(np.ascontiguousarray(q)), int(TrackStatus.BRAKED))
         return np.array(self._q)
+
+    def stay_near(self, posture: Array) -> None:
+        """Instead of holding xi."""
+        self._state["near"] = posture
 
     def reset(self, q: Array) -> None:
         """Continue from another posture (n,)."""

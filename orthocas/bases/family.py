@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from orthocas.errors import InvalidValueError
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_shape
 
@@ -217,6 +218,12 @@ class Parametrisation(Protocol):
 
     def family(self, space: JointSpace, outputs: int) -> Family:
         """The family on the given joints, with `outputs` components."""
+
+
+def require_parametrisation(value: object) -> None:
+    """Raise InvalidValueError unless it is a parametrisation."""
+    if not isinstance(value, Parametrisation) or isinstance(value, type):
+        raise InvalidValueError("parametrisation", repr(value), "an object such as Polynomial(degree=4)")
 
 
 @runtime_checkable

@@ -103,35 +103,23 @@ def build_product_family(
     """
 
     def basis(q: Any) -> Any:
-        return _multiply(terms, ca.vertcat(*one_joint_functions(q)))
+        # the terms and what they are made of, by the number of their factors
+        by_factors: dict[int, list[Term]] = {}
+        for term in sorted(with_parts(terms)):
+            by_factors.setdefault(len(term) - term.count(0), []).append(term)
+        # all terms with as many factors are one product of columns: one by one takes CasADi ten times as long
+        factors, n = ca.vertcat(*one_joint_functions(q)), len(terms[0])
+        levels: list[Any] = []
+        rows: list[dict[Term, int]] = []
+        for _, level in sorted(by_factors.items()):
+            parts = [split(term) for term in level]
+            values = factors[[n * (index - 1) + joint for _, joint, index in parts], :]
+            levels.append(levels[-1][[rows[-1][rest] for rest, *_ in parts], :] * values if levels else values)
+            rows.append({term: k for k, term in enumerate(level)})
+        places = {term: k for k, term in enumerate(term for level in rows for term in level)}
+        return ca.vertcat(*levels)[[places[term] for term in terms], :]
 
     return ProductFamily(space, outputs, basis, terms=terms, one_joint_derivatives=one_joint_derivatives)
-
-
-def _multiply(terms: tuple[Term, ...], factors: Any) -> Any:
-    """Values of terms, (K, N), from those of the one-joint functions f_1 of all joints, then f_2 and so on.
-
-    All terms with as many factors are one product of columns: to build them one by one takes CasADi ten times as long.
-    """
-    n = len(terms[0])
-    levels: list[Any] = []
-    # of the terms in their levels
-    rows: list[dict[Term, int]] = []
-    for level in group_by_factors(terms):
-        parts = [split(term) for term in level]
-        values = factors[[n * (index - 1) + joint for _, joint, index in parts], :]
-        levels.append(levels[-1][[rows[-1][rest] for rest, *_ in parts], :] * values if levels else values)
-        rows.append({term: k for k, term in enumerate(level)})
-    places = {term: k for k, term in enumerate(term for level in rows for term in level)}
-    return ca.vertcat(*levels)[[places[term] for term in terms], :]
-
-
-def group_by_factors(terms: Iterable[Term]) -> list[list[Term]]:
-    """Terms and what they are made of, by the number of factors; each level is sorted."""
-    levels: dict[int, list[Term]] = {}
-    for term in sorted(with_parts(terms)):
-        levels.setdefault(len(term) - term.count(0), []).append(term)
-    return [levels[k] for k in sorted(levels)]
 
 
 def with_parts(terms: Iterable[Term]) -> set[Term]:

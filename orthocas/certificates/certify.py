@@ -314,17 +314,17 @@ def require_same(chart: Chart, certificate: Certificate) -> None:
 
 
 def _sample_suspects(chart: Chart) -> Array:
-    """The centre, and the sample with the least sign(det J(centre)) det J: uniform, near faces, and near corners."""
+    """The home, and the sample with the least sign(det J(home)) det J: uniform, near faces, and near corners."""
     domain = chart.problem.domain
     # Powers of uniform samples lie near faces and corners.
     rng = np.random.default_rng(0)
     unit = rng.uniform(-1, 1, (RULES.samples, chart.n))
     powers = rng.choice([1.0, 0.5, 0.25], (RULES.samples, 1))
-    points = np.vstack([domain.centre, domain.centre + domain.half_width * np.sign(unit) * np.abs(unit) ** powers])
+    points = np.vstack([domain.home, domain.centre + domain.half_width * np.sign(unit) * np.abs(unit) ** powers])
     points = points[domain.contains(points)]
     if domain.draws_itself:
         points = sample_boundary_weighted(domain, RULES.samples, 0)
-    # det J of the samples, relative to its sign at the centre.
+    # det J of the samples, relative to its sign at the home.
     J_x = chart.problem.task.batched_jacobian(points)[0].reshape(-1, chart.m, chart.n)
     volumes = np.linalg.det(np.nan_to_num(np.concatenate([J_x, chart.coordinates.jacobian(points)], axis=1)))
     worst = int(np.argmin(volumes * np.sign(volumes[0])))

@@ -75,7 +75,7 @@ def choose_one_to_one_check(chart: Chart, rows: ChartRows, base: Subdivision) ->
     # Rows without derivatives in closed form have the convex check.
     if tip is None or not closed_form:
         true = replace(rows, task=build_true_gradients(chart.problem.task, active)[0])
-        centre = chart.problem.domain.centre[None]
+        centre = chart.problem.domain.home[None]
         inverse = np.asarray(np.linalg.pinv(true(centre, centre).centre[:, :, 0]), dtype=float)
         return ConvexCheck(true, inverse, base.low, base.high)
     own: ProductRows | None = None

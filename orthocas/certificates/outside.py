@@ -86,7 +86,7 @@ def choose_check(chart: Chart, rows: ChartRows, bound: float, method: str | None
     own, variables = _choose_rows(chart, singular)
     require_all_positions(chart, variables)
     # The sign is that of these rows, which have other scales than the chart's.
-    sign = float(check(domain.centre[None], domain.centre[None]).sign[0])
+    sign = float(check(domain.home[None], domain.home[None]).sign[0])
     return OutsideCheck(check, own, singular, sign, tuple(sorted(variables)), domain.room_to_fold is not None)
 
 

@@ -41,7 +41,18 @@ class Subdivision:
             raise InvalidValueError("codes", f"{codes.dtype} of shape {codes.shape}", "bytes of a tree of boxes")
         if not (low < high).all():
             raise InvalidValueError("low", low.tolist(), "a corner below the opposite one")
-        _check_tree(codes, len(low))
+        n = len(low)
+        require_shape("codes", codes.shape, (None,))
+        inner = codes < PROVED
+        if (codes[inner] >= n).any():
+            raise InvalidValueError(
+                "codes", int(codes[inner].max()), f"numbers of joints below {n}, {PROVED} or {OPEN}"
+            )
+        missing = 1 + np.cumsum(np.where(inner, 1, -1))
+        if missing[-1] != 0 or (missing[:-1] <= 0).any():
+            raise InvalidValueError("codes", f"{codes.size} bytes", "a tree of boxes")
+        if missing.max() > _DEEPEST:
+            raise InvalidValueError("codes", "a tree that is too deep", f"at most {_DEEPEST} open halves at once")
         codes.setflags(write=False)
         for name, value in (("low", low), ("high", high), ("codes", codes)):
             object.__setattr__(self, name, value)
@@ -122,18 +133,6 @@ class Subdivision:
 def halve_interval(low: Any, high: Any) -> Any:
     """The numbers between two corners where boxes are halved."""
     return (low + high) / 2
-
-
-def _check_tree(codes: Array, n: int) -> None:
-    require_shape("codes", codes.shape, (None,))
-    inner = codes < PROVED
-    if (codes[inner] >= n).any():
-        raise InvalidValueError("codes", int(codes[inner].max()), f"numbers of joints below {n}, {PROVED} or {OPEN}")
-    missing = 1 + np.cumsum(np.where(inner, 1, -1))
-    if missing[-1] != 0 or (missing[:-1] <= 0).any():
-        raise InvalidValueError("codes", f"{codes.size} bytes", "a tree of boxes")
-    if missing.max() > _DEEPEST:
-        raise InvalidValueError("codes", "a tree that is too deep", f"at most {_DEEPEST} open halves at once")
 
 
 @dataclass(frozen=True, eq=False, repr=False)

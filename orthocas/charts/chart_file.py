@@ -164,7 +164,21 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes, Certifi
     header, arrays = read_archive(path, CHART)
     try:
         problem = read_problem(header, arrays)
-        coordinates = _coordinates(problem, get_part(header, "coordinates", dict), arrays)
+        data = get_part(header, "coordinates", dict)
+        coordinates: CoordinateMap
+        if "leaf" in data:
+            own = {name.removeprefix(_LEAF): array for name, array in arrays.items() if name.startswith(_LEAF)}
+            coordinates = GrownCoordinates(problem, read_leaf(problem, get_part(data, "leaf", str), own))
+        else:
+            parametrisation = parametrisation_from_data(data)
+            coordinates = Coordinates(
+                parametrisation,
+                JointSpace.of(problem),
+                _idle(get_part(data, "idle", list), problem.n),
+                *(get_part(arrays, name, np.ndarray) for name in ("theta", "offset", "scale")),
+            )
+            if isinstance(parametrisation, CyclicParametrisation):
+                require_cyclic(problem, parametrisation.cyclic)
         if coordinates.r != problem.r:
             raise ChartFileError(f"{path} has {coordinates.r} coordinates, expected r = {problem.r}")
         _require_finite(problem, coordinates)
@@ -190,7 +204,8 @@ def _certificate(
     data = get_part(header, "certificate", dict)
     certificate = certificate_from_data(data, arrays, problem.n)
     certificate.require_for(fingerprint(problem, coordinates))
-    if "notes" in data and data["notes"] != _digest_of(header["notes"]):  # missing in older files
+    # missing in older files
+    if "notes" in data and data["notes"] != _digest_of(header["notes"]):
         raise CertifyError("the notes have been changed since the file was written")
     return certificate
 
@@ -223,7 +238,8 @@ def _require_finite(problem: Problem, coordinates: CoordinateMap) -> None:
     """
     q = sample_uniform(problem.domain, _PROBES, 0)
     values = {"the task": problem.task.batched(q)[0], "the Jacobian of the task": problem.task.batched_jacobian(q)[0]}
-    if isinstance(coordinates, Coordinates) and not _surely_finite(coordinates):  # grown ones may be NaN
+    # grown ones may be NaN
+    if isinstance(coordinates, Coordinates) and not _surely_finite(coordinates):
         values |= {"xi": coordinates.xi(q), "the Jacobian of xi": coordinates.jacobian(q)}
     for what, numbers in values.items():
         if not np.isfinite(numbers.reshape(_PROBES, -1)).all(axis=1).any():
@@ -246,22 +262,6 @@ def _coordinates_to_data(coordinates: CoordinateMap) -> tuple[dict[str, Any], di
     assert isinstance(coordinates, Coordinates)
     data = {**parametrisation_to_data(coordinates.parametrisation), "idle": list(coordinates.idle)}
     return data, {"theta": coordinates.theta, "offset": coordinates.offset, "scale": coordinates.scale}
-
-
-def _coordinates(problem: Problem, data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> CoordinateMap:
-    if "leaf" in data:
-        own = {name.removeprefix(_LEAF): array for name, array in arrays.items() if name.startswith(_LEAF)}
-        return GrownCoordinates(problem, read_leaf(problem, get_part(data, "leaf", str), own))
-    parametrisation = parametrisation_from_data(data)
-    found = Coordinates(
-        parametrisation,
-        JointSpace.of(problem),
-        _idle(get_part(data, "idle", list), problem.n),
-        *(get_part(arrays, name, np.ndarray) for name in ("theta", "offset", "scale")),
-    )
-    if isinstance(parametrisation, CyclicParametrisation):
-        require_cyclic(problem, parametrisation.cyclic)
-    return found
 
 
 def _idle(joints: list[int], n: int) -> tuple[int, ...]:

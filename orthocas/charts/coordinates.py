@@ -88,7 +88,8 @@ def point_functions(family: Family, theta: Array, n: int) -> dict[str, ca.Functi
         return _from_basis(family, theta, n)
     kind: Any = ca.MX if family.as_matrices else ca.SX
     q, v, w = (kind.sym(name, n) for name in ("q", "v", "w"))
-    parameters: Any = ca.DM(theta)  # constants, so that weights are not sliced and transposed at every call
+    # constants, so that weights are not sliced and transposed at every call
+    parameters: Any = ca.DM(theta)
     xi = family.expression(q, parameters)
     jacobian = ca.horzcat(*family.jacobian(q, parameters)).T
     return _functions(xi, jacobian, second_derivative(xi, q, v, w), q, v, w)
@@ -219,7 +220,8 @@ class Coordinates:
 
     def __post_init__(self) -> None:
         fitted = len(self.offset)
-        if isinstance(self.parametrisation, GradedParametrisation):  # before a basis is built that may be enormous
+        # before a basis is built that may be enormous
+        if isinstance(self.parametrisation, GradedParametrisation):
             terms = self.parametrisation.term_count(len(self.active)) if fitted else 0
             require_shape("theta", np.shape(self.theta), (fitted * terms,))
         size = self.family.size if fitted else 0
@@ -350,11 +352,7 @@ class Coordinates:
     def _column_graphs(self) -> dict[str, NumpyGraph]:
         """Functions xi and vec(J_xi^T) of many joint positions side by side, where dense products are fast."""
         q = ca.MX.sym("q", self.space.n, COLUMNS)
-        J_xi = ca.vertcat(*self._gradients(q))
-        return {"xi": NumpyGraph("xi", [q], [self.expression(q)]), "jacobian": NumpyGraph("J_xi", [q], [J_xi])}
-
-    def _gradients(self, q: ca.MX) -> list[ca.MX]:
-        """Gradients of all coordinates, r matrices (n, N), for joint positions as columns (n, N)."""
+        # gradients of all coordinates, r matrices (n, N), for joint positions as columns (n, N)
         N = q.shape[1]
         unit = np.eye(self.space.n)
         gradients: list[ca.MX] = []
@@ -362,7 +360,8 @@ class Coordinates:
             own = self.family.jacobian(q[self.active, :], ca.MX(ca.DM(self.theta)))
             spread = ca.DM(unit[:, self.active])
             gradients += [spread @ gradient * scale for gradient, scale in zip(own, self.scale, strict=True)]
-        return gradients + [ca.MX(_columns(unit[k], N)) for k in self.idle]
+        J_xi = ca.vertcat(*gradients, *(ca.MX(_columns(unit[k], N)) for k in self.idle))
+        return {"xi": NumpyGraph("xi", [q], [self.expression(q)]), "jacobian": NumpyGraph("J_xi", [q], [J_xi])}
 
 
 def _columns(values: Sequence[float] | Array, columns: int) -> ca.DM:

@@ -33,7 +33,8 @@ class Nearest:
 
     def take(self, rows: Indices, q: Array, distance: Array, between: bool = False) -> None:
         """Take over points (M, n) that are nearer than those of their rows (M,), which may occur several times."""
-        farthest_first = np.argsort(-distance, kind="stable")  # what is written last stays
+        # what is written last stays
+        farthest_first = np.argsort(-distance, kind="stable")
         better = farthest_first[distance[farthest_first] < self.distance[rows[farthest_first]]]
         self.q[rows[better]], self.distance[rows[better]] = q[better], distance[better]
         self.between[rows[better]] = between
@@ -155,13 +156,7 @@ class SelfMotionCurves:
         Returns:
             xi - xi(q) at both ends of the steps, (S, 2); NaN far from the box.
         """
-        left = self._xi_left_of(targets, steps)
-        step, share = self._crossed(left)
-        self._take_solutions(targets, steps.row[step], steps.point(step, share), tolerance, best)
-        return left
-
-    def _xi_left_of(self, targets: Array, steps: "Steps") -> Array:
-        """xi - xi(q) at both ends of steps, (S, 2); NaN far from the box."""
+        # xi - xi(q) at both ends of steps, (S, 2); NaN far from the box
         left, low, high = np.full(steps.q.shape[:2], np.nan), *self.boxed.domain.bounds
         slack = RULES.step / RULES.parts
         near = np.asarray(((steps.q >= low - slack) & (steps.q <= high + slack)).all(axis=2))
@@ -171,6 +166,8 @@ class SelfMotionCurves:
         left[begins] = self._xi_left(targets[rows[begins]], steps.q[begins])
         joined = near[:, 0] & ~begins[:, 0]
         left[joined, 0] = left[np.flatnonzero(joined) - 1, 1]
+        step, share = self._crossed(left)
+        self._take_solutions(targets, steps.row[step], steps.point(step, share), tolerance, best)
         return left
 
     def _crossed(self, left: Array) -> tuple[Indices, Array]:
@@ -279,7 +276,10 @@ class SelfMotionCurves:
             J = phi_map.jacobian(q) / phi_map.sizes[:, None]
             left_over = phi_map.difference(targets[rows], phi_map.phi(q)) / phi_map.sizes
             q = q + solutions_of(J, left_over[:, :, None])[:, :, 0]
-        q = self._snapped(q)
+        # points that miss the boundary by rounding, on it
+        moved = np.clip(q, *self.boxed.domain.bounds)
+        near = np.abs(moved - q) <= 1e-9 * self.boxed.domain.half_width
+        q = np.where(near.all(axis=1, keepdims=True), moved, q)
         q = np.where(np.isfinite(q), q, best.q[rows])
         solved = (largest(phi_map.residual(targets[rows], q)) <= tolerance) & self.boxed.domain.contains(q)
         best.take(rows[solved], q[solved], np.zeros(int(solved.sum())))
@@ -318,7 +318,8 @@ class SelfMotionCurves:
             best.take(rows[good], q[good], left, between=True)
             for other in (a[good], b[good]):
                 found = found.joined(Ends(rows[good], q[good], other, np.zeros(len(left))))
-            again = ~good & ~self._in_box(q)  # conditions are not looked at so closely
+            # conditions are not looked at so closely
+            again = ~good & ~self._in_box(q)
             a, b, rows = (
                 np.concatenate([a[again], q[again]]),
                 np.concatenate([q[again], b[again]]),
@@ -369,12 +370,6 @@ class SelfMotionCurves:
             within = self._contains(middle)
             a, b = np.where(within[:, None], middle, a), np.where(within[:, None], b, middle)
         return a
-
-    def _snapped(self, q: Array) -> Array:
-        """Points that miss the boundary by rounding, on it."""
-        moved = np.clip(q, *self.boxed.domain.bounds)
-        near = np.abs(moved - q) <= 1e-9 * self.boxed.domain.half_width
-        return np.where(near.all(axis=1, keepdims=True), moved, q)
 
     def _xi_left(self, targets: Array, q: Array) -> Array:
         """xi - xi(q), (N,)."""

@@ -121,8 +121,10 @@ class _Run:
         self.minimal = np.zeros(N, dtype=bool)
         self.damping = np.full(N, RULES.damping)
         self._J = np.zeros((N, self._errors.shape[1], n))
-        self._fresh = np.zeros(N, dtype=bool)  # rows whose J belongs to u
-        self._at = np.zeros((N, n), dtype=np.int8)  # which bounds hold: -1 low, 1 high
+        # rows whose J belongs to u
+        self._fresh = np.zeros(N, dtype=bool)
+        # which bounds hold: -1 low, 1 high
+        self._at = np.zeros((N, n), dtype=np.int8)
 
     def advance(self, rows: Indices) -> None:
         """Try a step in some rows."""
@@ -132,7 +134,13 @@ class _Run:
         undefined = ~np.isfinite(self._J[rows]).all(axis=(1, 2))
         self.damping[rows[undefined]] = np.inf
         rows = rows[~undefined]
-        programs = self._programs(rows)
+        # the quadratic models of some rows
+        G, n = self._J[rows], self.u.shape[1]
+        H = G.transpose(0, 2, 1) @ G
+        mean = np.trace(H, axis1=1, axis2=2) / n + np.finfo(float).tiny
+        H += (self.damping[rows] * mean)[:, None, None] * np.eye(n)
+        g = -np.matmul(self._errors[rows, None], G)[:, 0]
+        programs = Programs(H, g, self._equations.low - self.u[rows], self._equations.high - self.u[rows])
         d, self._at[rows], solved = solve_programs(programs, self._at[rows])
         slope, bend = (programs.g * d).sum(axis=1), (d * (programs.H @ d[:, :, None])[:, :, 0]).sum(axis=1)
         promised = -slope - bend / 2
@@ -149,15 +157,6 @@ class _Run:
         slower = np.where(gain > RULES.foreseen, RULES.shrinks, np.where(gain < RULES.missed, 2.0, 1.0))
         self.damping[rows] *= np.where(better, slower, RULES.grows)
         np.maximum(self.damping, RULES.least_damping, out=self.damping)
-
-    def _programs(self, rows: Indices) -> "Programs":
-        """The quadratic models of some rows."""
-        G, n = self._J[rows], self.u.shape[1]
-        H = G.transpose(0, 2, 1) @ G
-        mean = np.trace(H, axis1=1, axis2=2) / n + np.finfo(float).tiny
-        H += (self.damping[rows] * mean)[:, None, None] * np.eye(n)
-        g = -np.matmul(self._errors[rows, None], G)[:, 0]
-        return Programs(H, g, self._equations.low - self.u[rows], self._equations.high - self.u[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +185,8 @@ def solve_programs(programs: Programs, at: NDArray[np.int8]) -> tuple[Array, NDA
         part = programs if len(left) == N else programs.part(left)
         d[left], now = _solve_held(part, held[left])
         changes = now != held[left]
-        if k >= RULES.rounds // 3:  # the first bound alone, so that they do not change back and forth
+        # the first bound alone, so that they do not change back and forth
+        if k >= RULES.rounds // 3:
             changes &= np.cumsum(changes, axis=1) == 1
         held[left] = np.where(changes, now, held[left])
         left = left[changes.any(axis=1)]

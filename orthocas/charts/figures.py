@@ -15,7 +15,7 @@ from orthocas.tools.picture import Picture, equal_axes
 
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
-    from orthocas.charts.quality import AngleStatistics, LeakStatistics, Report
+    from orthocas.charts.quality import AngleStatistics, Report
 
 _MOST_POSTURES = 1000
 _PANELS = 2  #: side by side
@@ -29,7 +29,12 @@ def quality_figure(report: "Report") -> Figure:
     left, middle, right = figure.subplots(1, 3)
     _draw_angles(left, report.task_angle, _TASK, r"task angle $\angle(\mathrm{d}\xi_j, \nabla_A h_i)$")
     _draw_angles(middle, report.mutual_angle, _EXTRA, r"mutual angle $\angle(\mathrm{d}\xi_i, \mathrm{d}\xi_j)$")
-    _draw_leaks(right, report.leak)
+    counts = report.leak.histogram[:900].reshape(-1, 5).sum(axis=1)
+    right.stairs(counts / max(counts.sum(), 1) / 0.5, 0.5 * np.arange(len(counts) + 1) - 0.05, fill=True, color=_LEAK)
+    right.set_xlim(0, max(6.0, 3 * report.leak.rms))
+    right.set_xlabel(r"leak, in the metric [deg]")
+    right.set_title(f"rms {report.leak.rms:.2f}°, largest {report.leak.max:.1f}°", fontsize=10)
+    right.grid(alpha=0.3)
     left.set_ylabel("share of angles per degree")
     figure.suptitle(f"{report.samples:,} held-out samples, conditioning mean {report.conditioning.mean:.2f}")
     return figure
@@ -60,7 +65,7 @@ def self_motion_figure(chart: "Chart", postures: int = 9, reach: float | None = 
         panel = figure.add_subplot(rows, columns, j + 1, projection="3d")
         for points, colour in zip(chart.problem.robot.joint_points(sweep), colours, strict=True):
             panel.plot(*points.T, "-o", color=colour, markersize=3, linewidth=1.8)
-        moved = np.abs(chart.x(sweep) - chart.x(chart.problem.domain.centre)).max()
+        moved = np.abs(chart.x(sweep) - chart.x(chart.problem.domain.home)).max()
         low, high = chart.xi(sweep[[0, -1]])[:, j]
         title = rf"$\xi_{{{j + 1}}}$ from {low:.3g} to {high:.3g}, dark to light"
         panel.set_title(f"{title}\ntask moves {_bound(moved)}", fontsize=10)
@@ -69,7 +74,8 @@ def self_motion_figure(chart: "Chart", postures: int = 9, reach: float | None = 
 
 
 def _draw_angles(axes: Axes, angles: "AngleStatistics", colour: str, label: str) -> None:
-    first = 3  # groups of five bins, so that 90 degrees lies in the middle of its group
+    # groups of five bins, so that 90 degrees lies in the middle of its group
+    first = 3
     counts = angles.histogram[first:-3].reshape(-1, 5).sum(axis=1)
     edges = (first - 0.5) / 10 + 0.5 * np.arange(len(counts) + 1)
     axes.stairs(counts / max(counts.sum(), 1) / 0.5, edges, fill=True, color=colour, alpha=0.85)
@@ -80,18 +86,9 @@ def _draw_angles(axes: Axes, angles: "AngleStatistics", colour: str, label: str)
     axes.grid(alpha=0.3)
 
 
-def _draw_leaks(axes: Axes, leak: "LeakStatistics") -> None:
-    counts = leak.histogram[:900].reshape(-1, 5).sum(axis=1)
-    axes.stairs(counts / max(counts.sum(), 1) / 0.5, 0.5 * np.arange(len(counts) + 1) - 0.05, fill=True, color=_LEAK)
-    axes.set_xlim(0, max(6.0, 3 * leak.rms))
-    axes.set_xlabel(r"leak, in the metric [deg]")
-    axes.set_title(f"rms {leak.rms:.2f}°, largest {leak.max:.1f}°", fontsize=10)
-    axes.grid(alpha=0.3)
-
-
 def _sweep(chart: "Chart", j: int, postures: int, reach: float | None) -> Array:
     """Joint positions along xi_j with all else held. Each is solved from its neighbour, from the middle outwards."""
-    centre = chart.problem.domain.centre
+    centre = chart.problem.domain.home
     base = chart.phi(centre)
     if reach is None:
         fan = fan_along(chart, centre, j)
@@ -105,7 +102,8 @@ def _sweep(chart: "Chart", j: int, postures: int, reach: float | None) -> Array:
         for k in order:
             target = base.copy()
             target[chart.m + j] = values[k]
-            q = chart.inverse(target, q, outside=True)  # as far as was asked
+            # as far as was asked
+            q = chart.inverse(target, q, outside=True)
             found[k] = q
     return found
 

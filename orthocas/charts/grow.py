@@ -89,15 +89,30 @@ def grow(
     """
     require_kind("problem", problem, Problem)
     require_driven("growing", problem.robot.tree)
-    leaf = _default_leaf(problem) if leaf is None else leaf
+    if leaf is None:
+        closed = problem.r == 1 and problem.domain.full_turns
+        leaf = "circle" if closed else "disk" if (problem.n, problem.m) == (3, 1) else "linear"
     if not isinstance(leaf, str):
         raise InvalidValueError("leaf", repr(leaf), f"one of {', '.join(LEAVES)}")
     require_known("leaf", leaf, LEAVES)
-    _require_fitting_options(leaf, region, cells)
+    # raise InvalidValueError for options that would be ignored or make no sense
+    for name, value in (("region", region), ("cells", cells)):
+        if leaf != "disk" and value is not None:
+            raise InvalidValueError(name, value, f"None for a {leaf} leaf, because {name} applies to disk leaves only")
+    if region is not None and not isinstance(region, Box):
+        raise InvalidValueError("region", repr(region), "a Box")
+    if cells is not None:
+        require_count("cells", cells, least=_FEWEST_CELLS)
     check(problem)
     require_involutive(problem)
     origin = None if origin is None else as_point("origin", origin, problem.n)
-    x0 = _level(problem, level, origin)
+    if level is None:
+        q = problem.domain.centre if origin is None else origin
+        x0 = np.asarray(problem.task.batched(q[None])[0][0])
+    else:
+        values = np.atleast_1d(as_float_array("level", level))
+        require_shape("level", values.shape, (problem.m,))
+        x0 = freeze_array("level", values, (problem.m,))
     coordinates = GrownCoordinates(problem, _leaf_chart(problem, leaf, x0, origin, region, cells or CELLS))
     reached = np.isfinite(coordinates.xi(sample_evenly(problem.domain, _PROBES, 1))).all(axis=1)
     if not reached.any():
@@ -123,49 +138,12 @@ def require_involutive(problem: Problem) -> None:
         )
 
 
-def _default_leaf(problem: Problem) -> Leaf:
-    if problem.r == 1 and problem.domain.full_turns:
-        return "circle"
-    return "disk" if (problem.n, problem.m) == (3, 1) else "linear"
-
-
-def _require_fitting_options(leaf: str, region: Box | None, cells: int | None) -> None:
-    """Raise InvalidValueError for options that would be ignored or make no sense."""
-    for name, value in (("region", region), ("cells", cells)):
-        if leaf != "disk" and value is not None:
-            raise InvalidValueError(name, value, f"None for a {leaf} leaf, because {name} applies to disk leaves only")
-    if region is not None and not isinstance(region, Box):
-        raise InvalidValueError("region", repr(region), "a Box")
-    if cells is not None:
-        require_count("cells", cells, least=_FEWEST_CELLS)
-
-
 def _leaf_chart(
     problem: Problem, leaf: str, x0: Array, origin: Array | None, region: Box | None, cells: int
 ) -> LeafChart:
     if leaf == "disk":
         return build_disk_leaf(problem, x0, _region(problem, x0) if region is None else region, cells)
-    start = _start(problem, x0, origin)
-    if leaf == "linear":
-        if problem.domain.full_turns:
-            raise GrowError("a linear leaf is not periodic and the domain is a torus: use a Box domain or another leaf")
-        return build_linear_leaf(problem, start)
-    if problem.r != 1:
-        raise GrowError(f"the problem has r = {problem.r} extra coordinates, expected r = 1 for a circle leaf")
-    return trace_circle_leaf(problem, x0, start)
-
-
-def _level(problem: Problem, level: ArrayLike | None, origin: Array | None) -> Array:
-    if level is None:
-        q = problem.domain.centre if origin is None else origin
-        return np.asarray(problem.task.batched(q[None])[0][0])
-    values = np.atleast_1d(as_float_array("level", level))
-    require_shape("level", values.shape, (problem.m,))
-    return freeze_array("level", values, (problem.m,))
-
-
-def _start(problem: Problem, x0: Array, origin: Array | None) -> Array:
-    """The point of the leaf that the origin is pulled to, (n,)."""
+    # the point of the leaf that the origin is pulled to, (n,)
     if origin is not None:
         candidates = origin[None]
     else:
@@ -175,14 +153,22 @@ def _start(problem: Problem, x0: Array, origin: Array | None) -> Array:
     if reached.size == 0:
         where = "the origin" if origin is not None else "any sample of the domain"
         raise GrowError(f"the leaf h(q) = {x0.tolist()} cannot be reached from {where}")
-    return np.asarray(pulled.points[reached[0]])
+    start = np.asarray(pulled.points[reached[0]])
+    if leaf == "linear":
+        if problem.domain.full_turns:
+            raise GrowError("a linear leaf is not periodic and the domain is a torus: use a Box domain or another leaf")
+        return build_linear_leaf(problem, start)
+    if problem.r != 1:
+        raise GrowError(f"the problem has r = {problem.r} extra coordinates, expected r = 1 for a circle leaf")
+    return trace_circle_leaf(problem, x0, start)
 
 
 def _region(problem: Problem, x0: Array) -> Box:
     """A box around the part of the leaf that the domain is pulled to."""
     domain = problem.domain
     whole = (domain.half_width >= np.pi - 1e-9) & find_turning_joints(problem)
-    if whole.sum() > 1:  # cut the domain open, as in [AS2023] Sec. 5.2
+    # cut the domain open, as in [AS2023] Sec. 5.2
+    if whole.sum() > 1:
         return Box(domain.centre, domain.half_width)
     pulled = TaskFlow(problem).pull(sample_evenly(domain, _PROBES, 0), x0)
     if not pulled.reached.any():

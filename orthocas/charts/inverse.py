@@ -16,7 +16,6 @@ from orthocas.charts.newton import Attempt, Continuation, LocalSolver
 from orthocas.charts.phi import PhiMap, largest
 from orthocas.charts.search import InDomain, Starts
 from orthocas.errors import InverseError
-from orthocas.robots.tree import KinematicTree
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, Indices
@@ -174,17 +173,15 @@ def beyond_reach(task: Task, x: Array) -> NDArray[np.bool_]:
     columns = [k for k, label in enumerate(task.labels) if label in ("x", "y", "z") and task.units[k] == "m"]
     if not task.of_tip or not columns:
         return np.zeros(len(x), dtype=bool)
-    origin, length = _origin_and_length(task.robot.tree)
+    # place of the first joint that moves the tip, (3,), and the largest distance of the tip from it [m]
+    chain = task.robot.tree.carriers(task.robot.tree.tip_parent)
+    offsets = [*task.robot.tree.translations[chain], task.robot.tree.tip_translation]
+    strokes = np.maximum(np.abs(task.robot.tree.lower[chain]), np.abs(task.robot.tree.upper[chain]))[
+        np.array(task.robot.tree.prismatic)[chain]
+    ]
+    origin, length = offsets[0], float(sum(np.linalg.norm(offset) for offset in offsets[1:]) + strokes.sum())
     away = x[:, columns] - origin[["xyz".index(task.labels[k]) for k in columns]]
     return np.asarray(np.linalg.norm(away, axis=1) > (1 + RULES.rounding) * length)
-
-
-def _origin_and_length(tree: KinematicTree) -> tuple[Array, float]:
-    """Place of the first joint that moves the tip, (3,), and the largest distance of the tip from it [m]."""
-    chain = tree.carriers(tree.tip_parent)
-    offsets = [*tree.translations[chain], tree.tip_translation]
-    strokes = np.maximum(np.abs(tree.lower[chain]), np.abs(tree.upper[chain]))[np.array(tree.prismatic)[chain]]
-    return offsets[0], float(sum(np.linalg.norm(offset) for offset in offsets[1:]) + strokes.sum())
 
 
 @dataclass(eq=False)
@@ -237,7 +234,11 @@ class Inverse:
             if rows.size:
                 found = self._searched(targets[rows], None if starts is None else starts[rows], tolerance, inside)
                 q[rows], status[rows], iterations[rows] = found.q, found.status, found.iterations
-                error[rows], distance[rows] = found.error, self._distance(targets[rows], found.residual)
+                error[rows] = found.error
+                # |xi(q) - xi|: infinite where xi(q) is undefined
+                of_xi = (found.residual * self.phi_map.scale(targets[rows]))[:, self.problem.m :]
+                apart = np.sqrt((of_xi**2).sum(axis=1))
+                distance[rows] = np.where(np.isfinite(apart), apart, np.inf)
                 kept = np.isin(found.status, _KEPT) if inside else np.zeros(len(rows), dtype=bool)
                 error[rows[kept]] = largest(found.residual[kept, : self.problem.m])
         return Solutions(q, status, iterations, error, distance, tolerance)
@@ -247,7 +248,10 @@ class Inverse:
         follows = inside or (self.curves is not None and starts is None)
         first = self.local if self.brief is None or not follows else self.brief
         best = self._attempt(targets, self.starts.guess(targets) if starts is None else starts, tolerance, first)
-        self._tell_beyond(targets, best)
+        # rows without a solution, because the arm is too short
+        rows = np.flatnonzero(best.status == InverseStatus.NOT_FOUND)
+        beyond = beyond_reach(self.problem.task, targets[rows, : self.problem.m])
+        best.status[rows[beyond]] = InverseStatus.OUT_OF_REACH
         if inside and self.inside is not None:
             own = best.q.copy() if starts is None else starts
             if self.curves is not None:
@@ -264,12 +268,6 @@ class Inverse:
             rows = self._open(best)
             best.improve(rows, self._judged(self.along(targets[rows], starts[rows]), tolerance))
         return best
-
-    def _tell_beyond(self, targets: Array, best: Found) -> None:
-        """Say of rows without a solution whether the arm is too short."""
-        rows = np.flatnonzero(best.status == InverseStatus.NOT_FOUND)
-        beyond = beyond_reach(self.problem.task, targets[rows, : self.problem.m])
-        best.status[rows[beyond]] = InverseStatus.OUT_OF_REACH
 
     def _open(self, best: Found) -> Indices:
         """Rows that may have another solution, inside the domain."""
@@ -329,7 +327,8 @@ class Inverse:
         near = curves.search(targets[rows], own, tolerance)
         has = np.isfinite(near.distance)
         between = np.flatnonzero(near.between & has)
-        if between.size:  # xi turns back there
+        # xi turns back there
+        if between.size:
             near.q[between] = inside.nearer(targets[rows[between]], near.q[between])
         self._replace(targets, best, rows[has], near.q[has], tolerance)
         return np.asarray(rows[~has], dtype=np.int64)
@@ -360,7 +359,7 @@ class Inverse:
         """Points of the table near the targets, nearest first, and the centre of the domain, (N, n) each."""
         if len(targets):
             yield from self.starts.nearest(targets, count, self.problem.n)
-            yield np.broadcast_to(self.problem.domain.centre, targets.shape)
+            yield np.broadcast_to(self.problem.domain.home, targets.shape)
 
     def _attempt(self, targets: Array, starts: Array, tolerance: float, local: LocalSolver | None = None) -> Found:
         """One search from starts (N, n), judged."""
@@ -402,9 +401,3 @@ class Inverse:
         good = largest(residual) <= tolerance
         attempt.q[rows[good]], attempt.residual[rows[good]] = moved[rows[good]], residual[good]
         return attempt
-
-    def _distance(self, targets: Array, residual: Array) -> Array:
-        """|xi(q) - xi|, (N,): infinite where xi(q) is undefined."""
-        difference = (residual * self.phi_map.scale(targets))[:, self.problem.m :]
-        distance = np.sqrt((difference**2).sum(axis=1))
-        return np.where(np.isfinite(distance), distance, np.inf)

@@ -349,7 +349,7 @@ def solve_with(
     targets = rows_of(chart, "phi", phi)
     starts = None if q_start is None else rows_of(chart, "q_start", q_start)
     if starts is None and isinstance(chart.coordinates, InvertibleMap):
-        starts = chart.problem.domain.centre[None]
+        starts = chart.problem.domain.home[None]
     if starts is not None:
         if len(starts) not in (1, len(targets)):
             raise ShapeError("q_start", starts.shape, targets.shape)

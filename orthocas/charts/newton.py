@@ -87,7 +87,8 @@ class Newton:
 
     def __call__(self, targets: Array, starts: Array) -> Attempt:
         """Search from starts (N, n)."""
-        with np.errstate(all="ignore"):  # steps of nearly singular J may overflow
+        # steps of nearly singular J may overflow
+        with np.errstate(all="ignore"):
             run = _Run(self._map, targets, starts)
             rows = np.flatnonzero(np.isfinite(run.error))
             run.refresh(rows)
@@ -115,7 +116,8 @@ class _Run:
         self.error = largest(self.residual)
         self.iterations = np.zeros(N, dtype=np.int64)
         self.stale = np.zeros(N, dtype=bool)  #: rows that need J anew
-        self._fresh = np.zeros(N, dtype=bool)  # rows whose J belongs to q
+        # rows whose J belongs to q
+        self._fresh = np.zeros(N, dtype=bool)
         self._inverse = np.full((N, n, n), np.nan)  # of J / scale
         self._condition = np.full(N, np.inf)
 
@@ -226,35 +228,32 @@ class Continuation:
     def __call__(self, targets: Array, starts: Array) -> Attempt:
         """Follow the lines to targets (N, n) from starts (N, n)."""
         with np.errstate(all="ignore"):
-            return self._followed(targets, starts)
-
-    def _followed(self, targets: Array, starts: Array) -> Attempt:
-        q, residual = starts.copy(), self._map.residual(targets, starts)
-        error = largest(residual)
-        step, sign = self._steps(targets, q, residual)
-        h, iterations = np.full(len(q), CONTINUATION.first), np.zeros(len(q), dtype=np.int64)
-        left = np.flatnonzero(np.isfinite(error) & np.isfinite(step).all(axis=1))
-        for _ in range(CONTINUATION.most):
-            left = left[(error[left] > NEWTON.goal) & (h[left] > CONTINUATION.shortest)]
-            if not left.size:
-                break
-            share = np.minimum(1.0, h[left] / np.abs(step[left]).max(axis=1))
-            new = q[left] + share[:, None] * step[left]
-            after = self._map.residual(targets[left], new)
-            miss = largest(after - (1 - share[:, None]) * residual[left]) / (share * error[left])
-            onward, side = self._steps(targets[left], new, after)
-            rounded = (share == 1) & (error[left] < CONTINUATION.rounding)
-            good = (miss <= CONTINUATION.bent) & (side == sign[left]) & np.isfinite(onward).all(axis=1)
-            good &= ~rounded | (largest(after) < error[left])
-            moved = left[good]
-            q[moved], residual[moved], step[moved] = new[good], after[good], onward[good]
-            error[moved] = largest(after[good])
-            iterations[moved] += 1
-            longer = miss[good] <= CONTINUATION.straight
-            h[moved] = np.where(longer, np.minimum(1.5 * h[moved], CONTINUATION.longest), h[moved])
-            h[left[~good]] /= 2
-            left = left[good | ~rounded]
-        return Attempt(q, residual, iterations, np.ones(len(q), dtype=bool))
+            q, residual = starts.copy(), self._map.residual(targets, starts)
+            error = largest(residual)
+            step, sign = self._steps(targets, q, residual)
+            h, iterations = np.full(len(q), CONTINUATION.first), np.zeros(len(q), dtype=np.int64)
+            left = np.flatnonzero(np.isfinite(error) & np.isfinite(step).all(axis=1))
+            for _ in range(CONTINUATION.most):
+                left = left[(error[left] > NEWTON.goal) & (h[left] > CONTINUATION.shortest)]
+                if not left.size:
+                    break
+                share = np.minimum(1.0, h[left] / np.abs(step[left]).max(axis=1))
+                new = q[left] + share[:, None] * step[left]
+                after = self._map.residual(targets[left], new)
+                miss = largest(after - (1 - share[:, None]) * residual[left]) / (share * error[left])
+                onward, side = self._steps(targets[left], new, after)
+                rounded = (share == 1) & (error[left] < CONTINUATION.rounding)
+                good = (miss <= CONTINUATION.bent) & (side == sign[left]) & np.isfinite(onward).all(axis=1)
+                good &= ~rounded | (largest(after) < error[left])
+                moved = left[good]
+                q[moved], residual[moved], step[moved] = new[good], after[good], onward[good]
+                error[moved] = largest(after[good])
+                iterations[moved] += 1
+                longer = miss[good] <= CONTINUATION.straight
+                h[moved] = np.where(longer, np.minimum(1.5 * h[moved], CONTINUATION.longest), h[moved])
+                h[left[~good]] /= 2
+                left = left[good | ~rounded]
+            return Attempt(q, residual, iterations, np.ones(len(q), dtype=bool))
 
     def _steps(self, targets: Array, q: Array, residual: Array) -> tuple[Array, Indices]:
         """J^-1 e at points (N, n), and the signs of det J, (N,)."""
@@ -295,12 +294,18 @@ class PointFunctions:
     ) -> "PointFunctions":
         """For phi and J of a column q (n, 1), and the sizes and differences of phi, as in `PhiMap`."""
         n = len(sizes)
+        # J^-1, and the product of the norms of D^-1 J and its inverse; by QR, so NaN for singular J
+        J, D = ca.SX.sym("J", n, n), ca.repmat(ca.DM(sizes), 1, n)
+        own = ca.solve(J, ca.SX.eye(n))
+        inversion = ca.Function("inversion", [J], [own, ca.norm_fro(J / D) * ca.norm_fro(own * D.T)])
         q, known, target = (ca.MX.sym(name, n) for name in ("q", "phi", "target"))
+        inverted = dense_function("inverted", [q], [phi(q), *inversion.call([jacobian(q)])])
+        # steps with the same J^-1
         H = ca.MX.sym("H", n, n)
-        inverted = dense_function("inverted", [q], [phi(q), *_inversion(sizes).call([jacobian(q)])])
         scale = ca.DM(sizes) + ROUNDING * ca.fabs(target)
         now, value, left = q, known, difference(target, known)
-        errors = [ca.norm_2(left / scale)]  # norm_inf drops NaN
+        # norm_inf drops NaN
+        errors = [ca.norm_2(left / scale)]
         for _ in range(NEWTON.steps):
             now = now + H @ left
             value = phi(now)
@@ -346,7 +351,9 @@ class PointSolver:
     def step(self) -> bool:
         """Take steps from q with the last J. Returns whether all of them reduced the error; q stays."""
         self._step.run()
-        return decreasing(self.errors.tolist())
+        # whether errors fall until they are rounding
+        errors = self.errors.tolist()
+        return all(after < before or after <= NEWTON.goal for before, after in pairwise(errors))
 
     def shorten(self) -> bool:
         """Halve the steps with a fresh J until they reduce the error; whether they do. The next J gives whole ones."""
@@ -384,26 +391,26 @@ class FewRows:
         if len(targets) > NEWTON.few:
             return self._other(targets, starts)
         attempt = Attempt.empty(*targets.shape)
-        with deferred():  # otherwise CasADi turns Ctrl-C into a RuntimeError, or swallows it
-            solver = PointSolver(self._functions)
-            done = [_solved(solver, attempt, k, targets[k], starts[k]) for k in range(len(targets))]
+        # otherwise CasADi turns Ctrl-C into a RuntimeError, or swallows it
+        with deferred():
+            solver, done = PointSolver(self._functions), np.zeros(len(targets), dtype=bool)
+            for k in range(len(targets)):
+                solver.q[:], solver.target[:] = starts[k], targets[k]
+                done[k] = solver.solve()
+                attempt.q[k], attempt.residual[k], attempt.iterations[k] = solver.q, solver.phi, solver.iterations
         attempt.residual[:] = self._map.difference(targets, attempt.residual) / self._map.scale(targets)
-        failed = np.flatnonzero(~np.array(done, dtype=bool))
+        failed = np.flatnonzero(~done)
         if failed.size:
             attempt.replace(failed, self._other(targets[failed], starts[failed]))
         return attempt
-
-
-def decreasing(errors: list[float]) -> bool:
-    """Whether errors fall until they are rounding."""
-    return all(after < before or after <= NEWTON.goal for before, after in pairwise(errors))
 
 
 class Bound:
     """A function on arrays that stay in place: `run()` evaluates it."""
 
     def __init__(self, function: ca.Function, inputs: list[Array], outputs: list[Array]) -> None:
-        buffer: Any  # the stubs of set_arg and set_res ask for a size, the methods take none
+        # the stubs of set_arg and set_res ask for a size, the methods take none
+        buffer: Any
         buffer, run = function.buffer()
         for i, array in enumerate(inputs):
             buffer.set_arg(i, array.data)
@@ -411,22 +418,6 @@ class Bound:
             buffer.set_res(i, array.data)
         self.run: Callable[[], Any] = run
         self._alive = buffer, inputs, outputs
-
-
-def _solved(solver: PointSolver, attempt: Attempt, k: int, target: Array, start: Array) -> bool:
-    """Put q and phi for row k into `attempt`. Returns whether that succeeded, which it does not near singular J."""
-    solver.q[:], solver.target[:] = start, target
-    done = solver.solve()
-    attempt.q[k], attempt.residual[k], attempt.iterations[k] = solver.q, solver.phi, solver.iterations
-    return done
-
-
-def _inversion(sizes: Array) -> ca.Function:
-    """J -> J^-1, and the product of the norms of D^-1 J and its inverse; by QR, so NaN for singular J."""
-    n = len(sizes)
-    J, D = ca.SX.sym("J", n, n), ca.repmat(ca.DM(sizes), 1, n)
-    inverse = ca.solve(J, ca.SX.eye(n))
-    return ca.Function("inversion", [J], [inverse, ca.norm_fro(J / D) * ca.norm_fro(inverse * D.T)])
 
 
 def inverse_function(phi: ca.Function, sizes: Array, difference: Differences) -> ca.Function:

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocas.charts.angles import pairs
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import FREE
 from orthocas.charts.coordinates import Coordinates
-from orthocas.charts.point_quality import Judged, WorstPoints, measure_held_speeds, worst_points
+from orthocas.charts.point_quality import Judged, WorstPoints, measure_held_speeds, pairs, worst_points
 from orthocas.errors import InvalidValueError, SingularTaskError
 from orthocas.robots.collisions import Collisions
 from orthocas.tasks.samples import evaluate_samples, find_idle_joints, sample_uniform
@@ -291,13 +290,25 @@ class Report(Shown):
     def facts(self) -> dict[str, str]:
         """Angles, conditioning, lengths, and the faults of the chart if there are any."""
         values = self.conditioning
+        faults = {}
+        if self.folded_samples:
+            at = ", ".join(f"{value:.2f}" for value in self.worst_point)
+            share = percent(self.folded_samples / self.samples, 3, fault=True)
+            worst = f"conditioning worst at q = ({at})"
+            faults["folded"] = f"{share} of the {self._where}, where det J changes sign; {worst}"
+        if self.singular_samples:
+            share = percent(self.singular_samples / self.samples, 3, fault=True)
+            faults["left out"] = f"{share} of the {self._where}: singular, or without a value"
+        if self.degenerate:
+            advice = "another domain, a larger lambda2 of the fit, or another leaf of a grown chart may help"
+            faults["DEGENERATE"] = f"coordinates are nearly parallel to each other or to the task: {advice}"
         return {
             "problem": f"n = {self.n} joints, m = {self.m} task, r = {self.r} extra, metric {self.metric}",
             **self._angles(),
             "xi held": f"joints at most {self.held_speed:.3g} times as fast as with least norm, for 90 % of velocities",
             "conditioning": f"mean {values.mean:.3f}, 1 % quantile {values.p01:.3f}, min {values.min:.3g}",
             **({} if self.worst is None else {"searched": f"least conditioning {self.worst.explained}"}),
-            **self._faults(),
+            **faults,
             **({} if self.contacts is None else {"collisions": str(self.contacts)}),
             "lengths": f"of gradients differ by a factor of {self.length_ratio:.3g} (99 % to 1 % quantile)",
             "samples": f"{self.samples} given" if self.seed is None else f"{self.samples} held out, seed {self.seed}",
@@ -326,21 +337,6 @@ class Report(Shown):
                 f"{flatters} makes the mean look better"
             )
         return found
-
-    def _faults(self) -> dict[str, str]:
-        faults = {}
-        if self.folded_samples:
-            at = ", ".join(f"{value:.2f}" for value in self.worst_point)
-            share = percent(self.folded_samples / self.samples, 3, fault=True)
-            worst = f"conditioning worst at q = ({at})"
-            faults["folded"] = f"{share} of the {self._where}, where det J changes sign; {worst}"
-        if self.singular_samples:
-            share = percent(self.singular_samples / self.samples, 3, fault=True)
-            faults["left out"] = f"{share} of the {self._where}: singular, or without a value"
-        if self.degenerate:
-            advice = "another domain, a larger lambda2 of the fit, or another leaf of a grown chart may help"
-            faults["DEGENERATE"] = f"coordinates are nearly parallel to each other or to the task: {advice}"
-        return faults
 
     @property
     def _where(self) -> str:
@@ -447,11 +443,20 @@ def _report(
     if len(judged.points) == 0:
         where = "given points" if seed is None else "samples of the domain"
         raise SingularTaskError(f"a gradient vanishes, or a coordinate has no value, at all {len(points)} {where}")
-    idle = _idle_coordinates(chart, judged)
+    # coordinates that are functions of one idle joint alone, with the names of these joints
+    first = evaluate_samples(chart.problem, sample_uniform(chart.problem.domain, RULES.telling, 0))
+    idle: dict[int, str] = {}
+    for joint in find_idle_joints(chart.problem, first):
+        likely = _functions_of(joint, judged.jacobian[: RULES.telling])
+        sure = likely[_functions_of(joint, judged.jacobian[:, likely])]
+        idle |= {int(j): chart.problem.robot.joint_names[joint] for j in sure}
     others = [j for j in range(chart.r) if j not in idle]
     floating = {chart.problem.robot.joint_names[k] for k in chart.problem.robot.tree.floating}
     angles, without_idle = Angles.of(judged, [range(chart.r), others])
     short, long = np.quantile(_lengths(judged.jacobian), [0.01, 0.99], axis=0)
+    # the point of least conditioning, (n,)
+    k = int(np.argmin(judged.conditioning))
+    point: Array = judged.points[k]
     return Report(
         n=chart.n,
         m=chart.m,
@@ -464,7 +469,9 @@ def _report(
         leak=angles.leak,
         metric_mutual_angle=angles.metric_mutual_angle,
         conditioning=Conditioning.of(judged.conditioning, worst),
-        worst_point=tuple(_worst_point(judged, worst).tolist()),
+        worst_point=tuple(
+            (point if worst is None or worst.least > judged.conditioning[k] else worst.points[0]).tolist()
+        ),
         worst=worst,
         singular_samples=len(points) - len(judged.points),
         held_speed=_held_speed(chart, judged, seed or 0),
@@ -481,24 +488,6 @@ def _held_speed(chart: Chart, judged: Judged, seed: int) -> float:
     some = slice(RULES.held)
     speeds = measure_held_speeds(chart.problem, judged.points[some], judged.jacobian[some], seed)
     return float(np.quantile(speeds, RULES.mostly))
-
-
-def _worst_point(judged: Judged, worst: WorstPoints | None) -> Array:
-    """The point of least conditioning, (n,)."""
-    k = int(np.argmin(judged.conditioning))
-    point: Array = judged.points[k]
-    return point if worst is None or worst.least > judged.conditioning[k] else worst.points[0]
-
-
-def _idle_coordinates(chart: Chart, judged: Judged) -> dict[int, str]:
-    """Coordinates that are functions of one idle joint alone, with the names of these joints."""
-    first = evaluate_samples(chart.problem, sample_uniform(chart.problem.domain, RULES.telling, 0))
-    found: dict[int, str] = {}
-    for joint in find_idle_joints(chart.problem, first):
-        likely = _functions_of(joint, judged.jacobian[: RULES.telling])
-        sure = likely[_functions_of(joint, judged.jacobian[:, likely])]
-        found |= {int(j): chart.problem.robot.joint_names[joint] for j in sure}
-    return found
 
 
 def _functions_of(joint: int, J: Array) -> NDArray[np.int_]:

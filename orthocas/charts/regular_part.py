@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocas.bases.family import JointSpace
 from orthocas.bases.registry import parametrisation_from_data, parametrisation_to_data
-from orthocas.charts.angles import triangle
 from orthocas.charts.coordinates import Coordinates
+from orthocas.charts.point_quality import triangle
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.tasks.clear_box import ClearBox
 from orthocas.tasks.domains import Box, Domain, StopKind, Wall, register_domain
@@ -35,7 +35,7 @@ class RegularPart(ClearBox):
     The volume v(q) of coordinates is det [N; G] with an orthonormal basis N of the span of the frame Jacobian's rows
     and unit gradients G, rows of coordinates after those of the task. For r = 1, it is the cosine of the angle between
     gradient and self-motion. It has the sign of det J, so a chart whose domain keeps |v| > bound and the sign of the
-    centre has no fold. `fit_wide` builds it.
+    home has no fold. `fit_wide` builds it.
 
     Args:
         box: a clear box.
@@ -43,7 +43,7 @@ class RegularPart(ClearBox):
         least_volume: the bound, > 0 and < 1.
 
     Raises:
-        DomainError: if coordinates are not regular at the centre.
+        DomainError: if coordinates are not regular at the home of the box.
     """
 
     name: str = REGULAR_PART
@@ -64,13 +64,12 @@ class RegularPart(ClearBox):
         object.__setattr__(self, "least_volume", bound)
         object.__setattr__(self, "orientation", 1.0)
         whole = Box(box.centre, box.half_width, box.unbounded)
-        at_centre = float(_volume(box.task, coordinates)(box.centre))
-        object.__setattr__(self, "orientation", -1.0 if at_centre < 0 else 1.0)
-        if not abs(at_centre) > bound:
-            raise DomainError(
-                f"coordinates have the volume {at_centre:.3g} at the centre, expected one above {bound:g}"
-            )
-        super().__init__(whole, box.task, box.least_singular_value, box.scale, box.rows)
+        at_home = float(_volume(box.task, coordinates)(box.home))
+        object.__setattr__(self, "orientation", -1.0 if at_home < 0 else 1.0)
+        if not abs(at_home) > bound:
+            place = "centre" if box.posture is None else "home"
+            raise DomainError(f"coordinates have the volume {at_home:.3g} at the {place}, expected one above {bound:g}")
+        super().__init__(whole, box.task, box.least_singular_value, box.scale, box.rows, box.posture)
 
     @property
     def heading(self) -> str:
@@ -120,7 +119,7 @@ class RegularPart(ClearBox):
         return RegularPart(super().apply_to(box), self.coordinates, self.least_volume)
 
     def volumes(self, q: ArrayLike) -> Any:
-        """v(q), positive as at the centre, at points (n,) or (N, n): a number, or (N,)."""
+        """v(q), positive as at the home, at points (n,) or (N, n): a number, or (N,)."""
         points, single = as_point_set("q", q, len(self.centre))
         values: NDArray[np.float64] = self.orientation * self._batched_volume(points)[0][:, 0]
         return values[0] if single else values

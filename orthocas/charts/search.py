@@ -137,7 +137,8 @@ def where_known(phi_map: PhiMap, points: Array) -> tuple[Array, Array]:
 def _terms(u: Array, degree: int) -> Array:
     """All monomials of the columns of u (N, n) up to a degree, (N, terms)."""
     columns = np.ascontiguousarray(u.T)
-    level = [(0, np.ones(len(u)))]  # index of the last factor, product
+    # index of the last factor, product
+    level = [(0, np.ones(len(u)))]
     terms = [level[0][1]]
     for _ in range(degree):
         level = [(j, product * columns[j]) for i, product in level for j in range(i, len(columns))]
@@ -294,7 +295,8 @@ class InDomain:
         """The best points u (N, n), and their errors (N,)."""
         places, best = self.cells.places(targets), _Best(np.zeros_like(targets), np.full(len(targets), np.inf))
         order, done = np.argsort(places.overshoot, axis=1), 0
-        likely = np.maximum((places.overshoot <= RULES.margin).sum(axis=1), 1)  # cells to search, in this order
+        # cells to search, in this order
+        likely = np.maximum((places.overshoot <= RULES.margin).sum(axis=1), 1)
         for count in (*RULES.cells, order.shape[1]):
             rows = np.flatnonzero((best.error > tolerance) & (likely > done))
             rank = np.arange(done, min(done + count, order.shape[1]))
@@ -331,6 +333,7 @@ class _Best:
 
     def take(self, rows: Indices, u: Array, error: Array) -> None:
         """Take over what searches (M,) found for some rows (M,), which may occur several times."""
-        worst_first = np.argsort(-error, kind="stable")  # what is written last stays
+        # what is written last stays
+        worst_first = np.argsort(-error, kind="stable")
         better = worst_first[error[worst_first] < self.error[rows[worst_first]]]
         self.u[rows[better]], self.error[rows[better]] = u[better], error[better]

@@ -12,8 +12,7 @@ from typing import Annotated
 import typer
 
 from orthocas.charts import quality
-from orthocas.charts.certificate import METHODS, Certificate
-from orthocas.charts.chart import Chart
+from orthocas.charts.certificate import METHODS
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.ready import Card, card, load, names
 from orthocas.cli.options import (
@@ -158,7 +157,19 @@ def certify(
                 print_rows({"check": line, **loaded.certificate.facts()})
             raise typer.Exit(0 if holds and loaded.certificate.proved else _NOT_PROVED)
         # Prove, from where the file's certificate stopped; Ctrl-C keeps what is proved so far.
-        resume = _find_unfinished(loaded, bound)
+        # the certificate in the file if there is more to prove, it is about the same bound, and it can be resumed
+        saved = loaded.certificate
+        if (
+            saved is None
+            or saved.method not in METHODS
+            or not saved.digest
+            or saved.proved
+            or saved.fold
+            or (bound is not None and bound != saved.bound)
+        ):
+            resume = None
+        else:
+            resume = saved
         try:
             certificate = certificates.certify(
                 loaded,
@@ -197,13 +208,3 @@ def _start_workers(processes: int, address: str) -> Iterator[Executor | None]:
             yield executor
     else:
         yield None
-
-
-def _find_unfinished(chart: Chart, bound: float | None) -> Certificate | None:
-    """The certificate in the file if there is more to prove, it is about the same bound, and it can be resumed."""
-    saved = chart.certificate
-    if saved is None or saved.method not in METHODS or not saved.digest:
-        return None
-    if saved.proved or saved.fold or (bound is not None and bound != saved.bound):
-        return None
-    return saved

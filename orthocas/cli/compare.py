@@ -29,8 +29,7 @@ from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
 from orthocas.solvers import get as get_solver
 from orthocas.solvers.protocol import Solver
-from orthocas.tasks.branches import Branch, branches
-from orthocas.tasks.problem import Problem
+from orthocas.tasks.branches import branches
 from orthocas.tools.files import open_output_folder, publish, require_replaceable_files
 from orthocas.tools.interrupts import INTERRUPTED
 
@@ -84,7 +83,15 @@ def compare(
     built = ProblemOptions().build_problem(problem) if is_name else load(problem).problem
     parametrisations = [parse_parametrisation(name) for name in param or _PARAMETRISATIONS]
     minimisers: list[Solver] | None = [get_solver(name) for name in solver] if solver else None
-    branch = _choose_branch(domain, built)
+    # the branch that --domain names, that of the problem's centre by default; None without the option
+    if domain is None:
+        branch = None
+    else:
+        kind, _, name = domain.partition(":")
+        if kind != "branch":
+            raise InvalidValueError("--domain", repr(domain), "branch or branch:NAME")
+        parts = branches(built.robot, built.task)
+        branch = parts[name.strip()] if name else parts.of(built.domain.home) or parts[0]
     losses = [parse_weights(text, None) for text in weights] if weights else None
     with open_output_folder("--out", out) as folder, open_output_folder("--out", folder / "charts") as charts:
         require_replaceable_files(folder, _FILES, force)
@@ -119,17 +126,6 @@ def compare(
     if comparison.interrupted:
         note(f"interrupted after {len(comparison.results)} fits")
         raise typer.Exit(INTERRUPTED)
-
-
-def _choose_branch(domain: str | None, problem: Problem) -> Branch | None:
-    """The branch that --domain names, that of the problem's centre by default; None without the option."""
-    if domain is None:
-        return None
-    kind, _, name = domain.partition(":")
-    if kind != "branch":
-        raise InvalidValueError("--domain", repr(domain), "branch or branch:NAME")
-    parts = branches(problem.robot, problem.task)
-    return parts[name.strip()] if name else parts.of(problem.domain.centre) or parts[0]
 
 
 def write_comparison(comparison: Comparison, folder: Path, force: bool) -> None:

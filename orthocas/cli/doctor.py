@@ -148,7 +148,7 @@ def run_checks(compiler: bool) -> Iterator[tuple[str, str]]:
     from orthocas.fitting.fit import fit
 
     chart = fit(problems.get("planar_3r_xy"), Linear(), samples=100).chart
-    q = chart.problem.domain.centre
+    q = chart.problem.domain.home
     error = float(np.abs(chart.inverse(chart.phi(q), q + 0.01) - q).max())
     yield "a chart", "fits and inverts" if error < 1e-9 else f"fails: the inverse is off by {error:.1e} rad"
     if compiler:

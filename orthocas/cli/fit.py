@@ -309,7 +309,7 @@ def _suggest_problem(
     # A named problem, or what the options describe for a robot file.
     base = None if is_robot_file(name) else words.build_problem(name)
     robot, task, metric = _build_parts(name, words, base)
-    home = words.home or (words.find_centre(robot) if base is None else base.domain.centre)
+    home = words.home or (words.find_centre(robot) if base is None else base.domain.home)
     suggestion = suggest_domain(
         robot,
         task,
@@ -341,7 +341,7 @@ def _fit_wide(
     words.require_none(("centre", "half_width"), "--domain branch is a domain")
     base = None if is_robot_file(name) else replace(words, least_singular_value=None).build_problem(name)
     robot, task, metric = _build_parts(name, words, base)
-    centre = None if base is None or branch else base.domain.centre
+    centre = None if base is None or branch else base.domain.home
     with warnings.catch_warnings():
         # commands print a note instead
         warnings.simplefilter("ignore", BranchWarning)

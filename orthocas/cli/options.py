@@ -14,8 +14,8 @@ from orthocas.cli.output import note
 from orthocas.errors import InvalidValueError, OptionError, UnknownNameError
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Angles, Weights
 from orthocas.robots.collisions import Collisions
-from orthocas.robots.named import find_robot_file, list_robot_files
 from orthocas.robots.robot import Robot
+from orthocas.robots.urdf import find_robot_file, list_robot_files
 from orthocas.tasks.domains import default_box
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.regular_box import regular_box

@@ -114,7 +114,7 @@ def _find_reach(chart: "Chart") -> "XiRange | None":
     if isinstance(chart.coordinates, InvertibleMap):
         return None
     try:
-        return chart.xi_range(chart.problem.domain.centre)
+        return chart.xi_range(chart.problem.domain.home)
     except InvalidValueError:
         return None
 

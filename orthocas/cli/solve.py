@@ -65,7 +65,7 @@ def solve(
             raise OptionError("--branch and --all require an arm file, such as orthocas fit --domain all writes")
         chart = load(file)
         target = _read_target(chart.task, x)
-        q_start = chart.domain.centre if near is None else near
+        q_start = chart.domain.home if near is None else near
         if xi is None:
             found = chart.nearest_xi(q_start, target)
         else:

@@ -139,7 +139,7 @@ def _compare_chart_and_dynamics(library: CompiledLibrary, chart: Chart, q: Array
     domain, robot = chart.problem.domain, chart.problem.robot
     largest = library.precision.largest
     finite, moving = _are_numbers(largest, q), _are_numbers(largest, q, dq)
-    somewhere, speed = np.where(finite[:, None], q, domain.centre), np.where(moving[:, None], dq, 0)
+    somewhere, speed = np.where(finite[:, None], q, domain.home), np.where(moving[:, None], dq, 0)
     inside = np.where(domain.contains(somewhere), ControlStatus.OK, ControlStatus.OUTSIDE_DOMAIN)
     expected = {"phi": chart.phi(somewhere), "jacobian": chart.jacobian(somewhere)}
     has_value = finite & np.isfinite(expected["phi"]).all(axis=1) & np.isfinite(expected["jacobian"]).all(axis=(1, 2))

@@ -172,6 +172,7 @@ def _build_law(law: Impedance | PDPlus) -> Form:
         "stiffness": law.stiffness,
         "damping_stiffness": stiffness,
         "damping_ratio": law.damping_ratio,
+        "compliance": law.compliance,
         "limit": law.limit,
     }
     tables = {name: value[:, None] for name, value in columns.items()}
@@ -181,6 +182,7 @@ def _build_law(law: Impedance | PDPlus) -> Form:
         "formula": law.formula,
         "feed_forward": law.feed_forward,
         "damping": law.damping,
+        "fastest": law.fastest if law.is_limited else None,
         "blocks": f"((0, {n}),)" if law.coupling == "coupled" else f"((0, {m}), ({m}, {n}))",
         "statuses": ", ".join(_LAW_STATUSES),
         "numbers": ", ".join(str(int(ControlStatus[name])) for name in _LAW_STATUSES),

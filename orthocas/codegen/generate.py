@@ -331,14 +331,15 @@ def _write_row(values: Array) -> str:
 def _compute_check(chart: Chart, controller: Controller | None, precision: Precision) -> dict[str, Any]:
     """A state, and what every function gives there, for `NAME_check`."""
     n, robot = chart.n, chart.problem.robot
-    # Between the centre and a corner of the domain, or in the middle of the path of a corridor.
+    # Between the home and a corner of the domain, or in the middle of the path of a corridor.
     domain = chart.problem.domain
     if (path := domain.path_bound) is not None:
         inside = path.postures[path.contains(path.postures)]
         q = np.asarray(inside[len(inside) // 2])
     else:
-        fractions = [0.5**k for k in range(1, 20) if domain.contains(domain.centre + 0.5**k * domain.half_width)]
-        q = np.round(domain.centre + (fractions[0] if fractions else 0.0) * domain.half_width, 3)
+        corner = domain.centre + domain.half_width - domain.home
+        fractions = [0.5**k for k in range(1, 20) if domain.contains(domain.home + 0.5**k * corner)]
+        q = np.round(domain.home + (fractions[0] if fractions else 0.0) * corner, 3)
     q = precision.round(q)
     dq = precision.round(np.round(np.linspace(0.1, -0.2, n), 3))
     check: dict[str, Any] = {

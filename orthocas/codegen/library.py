@@ -391,8 +391,8 @@ def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int =
 def _sample_states(law: Controller) -> Array:
     """States inside the domain with references nearby, (64, 2 n + 3 k)."""
     rng, domain, n, k = np.random.default_rng(0), law.problem.domain, law.problem.n, len(law.labels)
-    # The inner part of a box may lie outside a condition: the centre does not.
+    # The inner part of a box may lie outside a condition: the home does not.
     q = domain.centre + 0.4 * domain.half_width * rng.uniform(-1, 1, (_STATES, n))
-    q[~domain.contains(q)] = domain.centre
+    q[~domain.contains(q)] = domain.home
     reference = np.array([law.measured(point).full().ravel() for point in q]) + 0.01 * rng.normal(size=(_STATES, k))
     return np.hstack([q, rng.normal(size=(_STATES, n)), reference, rng.normal(size=(_STATES, 2 * k))])

@@ -3,7 +3,7 @@
 from orthocas.control.controller import Controller, ControlStatus, Law, Setting, law_names, law_of, register
 from orthocas.control.gains import Modes, matched_stiffness
 from orthocas.control.kinematic import Kinematic, XiTask
-from orthocas.control.memory import Adaptation, Memory, MomentumObserver, Remembering
+from orthocas.control.memory import Adaptation, FrictionObserver, Memory, MomentumObserver, Remembering
 from orthocas.control.operational_space import DampingCheck, Impedance, PDPlus
 from orthocas.control.reference import Reference, joint_path
 from orthocas.control.run_time_model import RunTimeModel
@@ -14,6 +14,7 @@ __all__ = [
     "ControlStatus",
     "Controller",
     "DampingCheck",
+    "FrictionObserver",
     "Impedance",
     "Kinematic",
     "Law",

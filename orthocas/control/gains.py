@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,8 +27,10 @@ from orthocas.tools.checks import (
 )
 from orthocas.tools.display import Shown, number_list, percent
 
-STIFFNESS, DAMPING_RATIO, FEEDBACK, LIMIT = (  #: units of gains, in words
+STIFFNESS, FASTEST, COMPLIANCE, DAMPING_RATIO, FEEDBACK, LIMIT = (  #: units of gains, in words
     "J per squared unit of the quantity, > 0",
+    "frequency that no mode of the loop exceeds [rad/s], > 0",
+    "of each joint, in series with the springs [rad/(N m)], >= 0",
     ">= 0, 1 is critical damping",
     "1/s, >= 0",
     "largest command per joint, > 0; INFINITY for no limit",
@@ -40,6 +43,10 @@ class GainRules:
 
     frequency: float = 12 * np.pi  #: of the springs, 6 Hz [rad/s]
     fastest: float = 36 * np.pi  #: mode, 18 Hz: stable with a delay of 6.5 ms at a damping ratio of 0.7 [rad/s]
+    stiff: float = 2.0  #: springs of tracking laws, in their fastest frequency: modes of heavy directions come near it
+    torque_rate: float = 1000.0  #: of motors, 1 N m in a millisecond, as on many arms [N m/s] or [N/s]
+    taken_over: float = 0.5  #: or the speed limit: speed of a joint that a law takes over [rad/s] or [m/s]
+    late: float = 4.0  #: rate that the springs of such a joint may ask for, in torque_rate; with 10, an arm is lost
     feedback: float = 10.0  #: of velocity laws: 0.23 s to a tenth; no overshoot with up to 36 ms to the motion [1/s]
     margin: float = np.pi / 6  #: 30 degrees of phase that are left to the fastest mode at a stated delay [rad]
     samples: int = 512  #: of the domain
@@ -50,6 +57,59 @@ class GainRules:
 
 
 RULES = GainRules()
+
+
+def tracking_gains(chart: Chart, delay: float = 0.0, damping_ratio: ArrayLike = 0.7) -> tuple[Array, float, Array]:
+    """Stiffness of [x; xi], (n,), fastest mode omega [rad/s], and joint compliances (n,), with which all modes settle.
+
+    No constant K does this on a wide chart: wrists turn from light to heavy directions, so if no mode may be fast, some
+    are slow. Each spring K is therefore in series with one of omega^2 M_phi (`limit_stiffness`), and its squared
+    frequency s becomes s omega^2 / (omega^2 + s) <= omega^2. omega is 18 Hz, and K that of `matched_stiffness` at
+    2 omega without a bound. Light directions come near omega, and where coordinates fold (M_phi grows) the stiffness
+    stays below K.
+
+    Heavy joints are softer, because motors could not follow: a joint that moves at v = 0.5 rad/s (or its speed limit,
+    if that is less) changes the torque of a spring k by k v. It is at most 4 N m in a millisecond, so joints have the
+    compliance v / (4000 N m/s) in series. With a delay T, omega <= omega_T leaves 30 deg of phase, see
+    `matched_stiffness`.
+    """
+    omega = min(RULES.fastest, find_fastest_frequency(delay, damping_ratio, chart))
+    speeds = np.minimum(RULES.taken_over, chart.problem.robot.velocity_limits)
+    return matched_stiffness(chart, RULES.stiff * omega, np.inf), omega, speeds / (RULES.late * RULES.torque_rate)
+
+
+def limit_stiffness(
+    mobility: Array, J: Array, stiffness: Array, fastest: float, compliance: Array, blocks: Sequence[int]
+) -> Array:
+    """K(q) = (K^-1 + M_phi^-1 / omega^2 + J diag(c) J^T)^-1 of each block of coordinates, (N, n, n).
+
+    For M_phi^-1 and J (N, n, n), and K, c (n,).
+    """
+    result, added = np.zeros_like(mobility), mobility / fastest**2 + (J * compliance) @ J.transpose(0, 2, 1)
+    for part in np.split(np.arange(len(stiffness)), np.cumsum(blocks)[:-1]):
+        place = np.ix_(np.arange(len(mobility)), part, part)
+        result[place] = np.linalg.inv(np.diag(1 / stiffness[part]) + added[place])
+    return result
+
+
+def find_fastest_frequency(delay: float, damping_ratio: ArrayLike, chart: Chart) -> float:
+    """omega_T [rad/s]: the fastest mode that keeps 30 deg of phase with a delay T >= 0 [s]; infinite without one.
+
+    Raises:
+        InvalidValueError: for other delays, and a damping ratio that leaves less than 30 deg without any delay.
+    """
+    if not 0 <= as_number("delay", delay) < np.inf:
+        raise InvalidValueError("delay", delay, "a finite number >= 0")
+    if not delay:
+        return float(np.inf)
+    # At the crossing a omega, the phase of (2 zeta omega s + omega^2) exp(-s T) / s^2 is atan(2 zeta a) - a omega T.
+    ratio = float(positive_gains("damping_ratio", damping_ratio, chart.n).min())
+    crossing = np.sqrt(2 * ratio**2 + np.sqrt(4 * ratio**4 + 1))
+    phase = np.arctan(2 * ratio * crossing) - RULES.margin
+    if phase <= 0:
+        need = "a larger one: this leaves less than 30 deg without a delay"
+        raise InvalidValueError("damping_ratio", ratio, need)
+    return float(phase / (crossing * delay))
 
 
 def matched_stiffness(
@@ -92,18 +152,7 @@ def matched_stiffness(
     # Grown charts raise here.
     chart.function("xi")
     require_mass(chart.problem.robot, "gains by modes")
-    if not 0 <= as_number("delay", delay) < np.inf:
-        raise InvalidValueError("delay", delay, "a finite number >= 0")
-    bound = as_number("fastest", fastest)
-    if delay:
-        # The fastest mode that has the phase margin at this delay.
-        ratio = float(positive_gains("damping_ratio", damping_ratio, chart.n).min())
-        crossing = np.sqrt(2 * ratio**2 + np.sqrt(4 * ratio**4 + 1))
-        phase = np.arctan(2 * ratio * crossing) - RULES.margin
-        if phase <= 0:
-            need = "a larger one: this leaves less than 30 deg without a delay"
-            raise InvalidValueError("damping_ratio", ratio, need)
-        bound = min(bound, float(phase / (crossing * delay)))
+    bound = min(as_number("fastest", fastest), find_fastest_frequency(delay, damping_ratio, chart))
     points = sample_uniform(chart.problem.domain, RULES.samples, RULES.seed)
     mobilities = compute_mobility(chart, points, chart.problem.robot)
     return _match(mobilities, frequency, bound) if not delay else _match_everywhere(chart, mobilities, frequency, bound)
@@ -199,14 +248,14 @@ class Modes(Shown):
 
 
 def compute_modes(mobility: Array, stiffness: Array, damping: Array) -> Modes:
-    """Modes for M_phi^-1 (N, n, n), the diagonal of K (n,), and D (N, n, n).
+    """Modes for M_phi^-1 (N, n, n), K (N, n, n), and D (N, n, n).
 
     With S = M_phi^-1/2 and the unit eigenvectors u_i of S K S, v_i = S u_i.
     """
     # The root S of M_phi^-1.
     values, vectors = np.linalg.eigh(mobility)
     half = (vectors * np.sqrt(values.clip(0))[:, None, :]) @ vectors.transpose(0, 2, 1)
-    squares, shapes = np.linalg.eigh((half * stiffness) @ half)
+    squares, shapes = np.linalg.eigh(half @ stiffness @ half)
     omega = np.sqrt(squares.clip(0))
     # 2 zeta omega of each mode [1/s].
     rates = np.einsum("kij,kij->kj", shapes, half @ damping @ half @ shapes)
@@ -231,13 +280,13 @@ def find_holding_doubts(robot: Robot, domain: Domain, limit: Array) -> list[str]
         domain: where it is to be held.
         limit: largest torque or force of each joint, (n,) [N m] or [N], infinite where there is none.
     """
-    points = np.vstack([domain.centre, sample_uniform(domain, RULES.samples, RULES.seed)])
+    points = np.vstack([domain.home, sample_uniform(domain, RULES.samples, RULES.seed)])
     needed = np.abs(robot.gravity(points))
     excess = needed / limit
     heavy = (excess > 1).any(axis=1)
     if not heavy.any():
         return []
-    # The centre comes first among the points.
+    # The home comes first among the points.
     worst = 0 if heavy[0] else int(np.argmax(excess.max(axis=1)))
     joint = int(np.argmax(excess[worst]))
     unit = "N" if robot.tree.prismatic[joint] else "N m"

@@ -167,3 +167,39 @@ def apply_damping(
     root_K = ca.sqrt(stiff)
     scale = ca.repmat(root_K * ca.sqrt(damping_ratio), 1, c)
     return 2 * scale * multiply_by_root(inertia / (root_K @ root_K.T), scale * velocities)
+
+
+def apply_limited_springs(
+    inertia: Expression,
+    compliance: Expression,
+    stiffness: Expression,
+    damping_ratio: Expression,
+    errors: Expression,
+    velocities: Expression,
+) -> tuple[Expression, Expression]:
+    """K(q) E and D V, for an inertia M and a compliance C (k, k), the diagonals of K and Z (k, 1), E (k, c), V (k, d).
+
+    K(q) = (K^-1 + C)^-1 is the spring K in series with the compliance C, symmetric positive semi-definite. With the
+    factor of I + K^1/2 C K^1/2 = L L^T, K(q) = K^1/2 L^-T L^-1 K^1/2, and the geometric mean of M and K(q) is
+    M # K(q) = K^1/2 L^-T (L^T K^-1/2 M K^-1/2 L)^1/2 L^-1 K^1/2. So D = 2 Z^1/2 (M # K(q)) Z^1/2 gives every mode the
+    damping ratio z if all have the same, and is always positive semi-definite.
+
+    Source:
+        ours, docs/explanation/derivations_control.md#springs-that-no-mode-is-too-fast-for
+    """
+    k, c, d = inertia.shape[0], errors.shape[1], velocities.shape[1]
+    root, ratio = ca.sqrt(stiffness), ca.sqrt(damping_ratio)
+    scale = root @ root.T
+    LT, inverse = _build_factor(k)(ca.DM.eye(k) + scale * compliance)
+    wide_root, damped = ca.repmat(root, 1, c), ca.repmat(root * ratio, 1, d)
+    spring = wide_root * (inverse @ (inverse.T @ (wide_root * errors)))
+    rooted = multiply_by_root(LT @ (inertia / scale) @ LT.T, inverse.T @ (damped * velocities))
+    return spring, 2 * damped * (inverse @ rooted)
+
+
+@cache
+def _build_factor(k: int) -> ca.Function:
+    """H (k, k) -> L^T and L^-T, upper triangular, with H = L L^T symmetric positive definite."""
+    H = ca.SX.sym("H", k, k)
+    LT = ca.chol(ca.tril2symm(ca.tril(H)))
+    return ca.Function("factor", [H], [ca.densify(LT), ca.densify(ca.solve(LT, ca.SX.eye(k)))])

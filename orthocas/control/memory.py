@@ -1,4 +1,4 @@
-"""Laws with a state: what a law remembers from tick to tick, and the two memories that come with orthocas."""
+"""Laws with a state: what a law remembers from tick to tick, and the memories that come with orthocas."""
 
 from __future__ import annotations
 
@@ -49,6 +49,16 @@ class MemoryRules:
     fraction: float = 0.5  #: of the law's limit that a correction may use, by default
     gravity: float = 9.81  #: to compare moments with torques [m/s^2]
     crossed: float = 0.5  #: weight of the error in J^-1 (de + weight e), in the decay rate of the slowest mode
+    #: error at which a friction observer stops: half of what it may leave, 0.5 mm, 0.01 rad and 0.02 of xi
+    metres: float = 2.5e-4
+    others: float = 5e-3
+    extra: float = 1e-2
+    breaking: float = 60.0  #: rate at which the torque of a spring breaks a joint away [1/s]
+    firm: float = 2.0  #: least stiffness of that spring, in limits of the joint [1/rad] or [1/m]
+    sticking: float = 5e-3  #: speed below which a joint may stick [rad/s] or [m/s]
+    travel: float = 3e-3  #: way on which a joint that broke away forgets that torque [rad] or [m]
+    drop: float = 0.25  #: share of that torque by which friction may fall as a joint breaks away
+    unseen: float = 3.0  #: ticks until a law stops that: torque a tick late, held for one, seen in the next
 
 
 RULES = MemoryRules()
@@ -320,8 +330,8 @@ class Adaptation(_Correcting):
 
         # dp/dt = -rate gain Y^T J^-1 (de / c + e), while the law commands; gains follow its stiffness at the joints,
         # the diagonal of J^T K J at the centre of the domain.
-        J_centre = chart.parts.batched_rates(problem.domain.centre[None])[0]
-        stiffness = np.asarray((J_centre**2 * law.stiffness[:, None]).sum(axis=0))
+        J_home = chart.parts.batched_rates(problem.domain.home[None])[0]
+        stiffness = np.asarray((J_home**2 * law.stiffness[:, None]).sum(axis=0))
         springs = stiffness[list(joints)] / RULES.gravity**2
         slowest = self._compute_crossing(law)
         slope = -min(self.rate, slowest) * springs * (Y.T @ (B @ (Lambda @ (de / slowest + e))))
@@ -338,7 +348,7 @@ class Adaptation(_Correcting):
     def _compute_crossing(self, law: _OperationalSpace) -> float:
         """c [1/s]; larger weights, and faster learning, make soft laws swing."""
         # The slowest mode with a spring.
-        modes = law.modes(law.problem.domain.centre)
+        modes = law.modes(law.problem.domain.home)
         sprung = modes.frequencies > 0
         decays = 2 * np.pi * modes.frequencies[sprung] * np.minimum(modes.damping_ratios[sprung], 1.0)
         if not (decays > 0).any():
@@ -346,8 +356,101 @@ class Adaptation(_Correcting):
         return RULES.crossed * float(decays[decays > 0].min())
 
 
-MEMORIES: Mapping[str, type[MomentumObserver] | type[Adaptation]] = {
-    kind.name: kind for kind in (MomentumObserver, Adaptation)
+@dataclass(frozen=True)
+class FrictionObserver(_Correcting):
+    """Finds what the model does not explain, also in joints that stick, and stops where the error is small enough.
+
+    A momentum observer r alone hunts: friction changes its sign with the motion, and what was found while a joint moved
+    pushes it on where it stands. Here the law gets the `extra_torque` b - r. With d = J^-1 e, what each joint is off,
+
+        s = clip(max_k |e_k| / tolerance_k - 1), s_i = s clip(max_k n |J_ki d_i| / tolerance_k - 1), clip to [0, 1],
+        dr_i/dt = s_i rate (the torque that momentum shows beyond command, C^T dq - g, r and -b),
+        db_i/dt = -s_i 60/s k_i d_i exp(-(dq_i / 5 mrad/s)^2) - b_i |dq_i| / 3 mrad.
+
+    b breaks joints away: it grows where a joint is off and stands, and is forgotten as soon as it moves, so that its
+    own friction stops it. Joints that are off by little, s_i = 0, are left alone. k_i is M_ii times the squared
+    frequency of the law's fastest mode, in series with the joint's compliance, or twice the joint's limit, if that is
+    more: light joints are not slower.
+
+    Between ticks nothing stops a joint. Where friction falls by b / 4, it goes on by b / 4 (3 period)^2 / (2 M_ii), and
+    no law resolves less. tolerance_k is at least what that moves phi_k: nothing for arms with rotors, but 20 mrad for a
+    bare flange of 1e-4 kg m^2, which would otherwise jump to and fro. Slow r bears wrong masses: with the rate
+    alpha omega, a joint whose true inertia is kappa times that of the model is stable up to
+    kappa = (2 zeta + alpha) (1 + 2 zeta alpha) / alpha (docs/explanation/derivations_control.md#observers).
+
+    Args:
+        rate: > 0 [1/s].
+        bound: largest r and b of each joint, > 0, (n,) or one number [N m] or [N]; default half of the law's limit.
+        tolerance: errors of phi at which it stops, > 0, (n,) or one number; up to twice that may be left. Default
+            0.25 mm, 5 mrad, and 0.01 of each xi.
+
+    Example:
+        >>> import orthocas as oc
+        >>> chart = oc.charts.load("panda-wide")
+        >>> law = oc.control.PDPlus(chart, remembers=oc.control.FrictionObserver())
+        >>> list(law.memory.start)
+        ['expected', 'drive', 'breakaway', 'correction']
+    """
+
+    tolerance: ArrayLike | None = None
+
+    name: ClassVar[str] = "friction"
+
+    def of(self, law: _OperationalSpace) -> Memory:
+        """The memory of a law: expected momentum, its rate, b, and the correction b - r.
+
+        Raises:
+            ShapeError, InvalidValueError: for a bound or tolerance of another shape or value, none for a law without a
+                limit, and laws whose model is given.
+        """
+        n, model = law.problem.n, law.model
+        bound, tolerance = _check_bound(self.bound, law), self._compute_tolerance(law)
+        fields = {name: np.zeros(n) for name in ("expected", "drive", "breakaway", "correction")}
+        inputs = _name_inputs(law, fields)
+        q, dq, period, b = (inputs[name] for name in ("q", "dq", "period", "breakaway"))
+        payload = [inputs["payload"]] if "payload" in inputs else []
+        p, rate = _build_momentum(law.problem.robot.tree, bool(payload), model.gravity == "law")(q, dq, *payload)
+
+        # How far joints are off, and beyond the tolerance, while the law commands and no limit cuts it.
+        error, _, J = law._compute_errors(inputs)
+        M = law.model.own_mass_matrix(law.problem.robot, inputs)
+        B, Lambda, _ = build_block_inertia(n, (n,))(J, M)
+        off, inertia = B @ (Lambda @ error), ca.diag(M)
+        jump = RULES.drop * ca.fabs(b) * (RULES.unseen * period) ** 2 / (2 * inertia)
+        allowed = ca.fmax(ca.DM(tolerance), ca.fabs(J) @ jump)
+        beyond = _clip_share(ca.mmax(ca.fabs(error) / allowed) - 1)
+        parts = n * ca.fabs(off) * ca.vertcat(*(ca.mmax(ca.fabs(J[:, i]) / allowed) for i in range(n)))
+        gate = ca.if_else(inputs["active"] > 0, inputs["active"] * beyond, 0) * _clip_share(parts - 1)
+
+        # r, and the momentum that the last tick foresaw; none after a start.
+        foreseen = inputs["expected"] + period * inputs["drive"]
+        surprise = ca.if_else(ca.logic_and(period > 0, ca.fabs(foreseen) <= LARGEST), p - foreseen, 0)
+        r = _clip(b - inputs["correction"] + gate * self.rate * surprise, bound)
+
+        # b grows where a joint stands and is off, and is forgotten on its way.
+        firmness = 1 / (1 / (inertia * self._compute_fastest(law) ** 2) + ca.DM(law.compliance))
+        firmness = ca.fmax(firmness, RULES.firm * ca.DM(np.fmin(law.limit, LARGEST)))
+        growth = period * RULES.breaking * gate * ca.exp(-((dq / RULES.sticking) ** 2))
+        grown = b - growth * _clip(firmness * off, bound)
+        b = _clip(grown * ca.exp(-ca.fabs(dq) * period / RULES.travel), bound)
+        explained = inputs["command"] - model.feed_forward(law.problem.robot, inputs) + rate
+        values = {"expected": p, "drive": explained + r - b, "breakaway": b, "correction": b - r}
+        return _build_memory(fields, inputs, {name: _replace_invalid(value) for name, value in values.items()})
+
+    def _compute_fastest(self, law: _OperationalSpace) -> float:
+        """Frequency of the law's fastest mode [rad/s]."""
+        return law.fastest if law.is_limited else 2 * np.pi * float(law.modes().frequencies.max())
+
+    def _compute_tolerance(self, law: _OperationalSpace) -> Array:
+        """Tolerances of phi (n,)."""
+        if self.tolerance is not None:
+            return positive_gains("tolerance", self.tolerance, law.problem.n)
+        task = [RULES.metres if unit == "m" else RULES.others for unit in law.problem.task.units]
+        return np.array([*task, *[RULES.extra] * law.problem.r])
+
+
+MEMORIES: Mapping[str, type[MomentumObserver] | type[Adaptation] | type[FrictionObserver]] = {
+    kind.name: kind for kind in (MomentumObserver, Adaptation, FrictionObserver)
 }
 
 
@@ -374,6 +477,11 @@ def _build_memory(fields: Mapping[str, Array], inputs: dict[str, ca.MX], values:
     """A memory whose `correction` is a torque."""
     outputs = {f"next_{name}": value for name, value in values.items()}
     return Memory(fields, {"extra_torque": "correction"}, build_function("memory", inputs, outputs))
+
+
+def _clip_share(values: ca.MX) -> Any:
+    """Values within 0 and 1."""
+    return ca.fmin(ca.fmax(values, 0), 1)
 
 
 def _clip(values: ca.MX, bound: Array) -> Any:

@@ -27,7 +27,9 @@ from orthocas.control.controller import (
     named_inputs,
 )
 from orthocas.control.gains import (
+    COMPLIANCE,
     DAMPING_RATIO,
+    FASTEST,
     LIMIT,
     STIFFNESS,
     Modes,
@@ -36,14 +38,17 @@ from orthocas.control.gains import (
     compute_modes,
     find_fastest_posture,
     find_holding_doubts,
+    limit_stiffness,
     matched_stiffness,
     non_negative_gains,
     positive_gains,
+    tracking_gains,
 )
 from orthocas.control.linear_algebra import (
     DAMPING_DESIGNS,
     DampingDesign,
     apply_damping,
+    apply_limited_springs,
     build_block_inertia,
     compute_median_volume,
 )
@@ -55,7 +60,7 @@ from orthocas.tasks.metric import Metric
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_point_set, require_kind, require_known
+from orthocas.tools.checks import Array, as_number, as_point_set, require_kind, require_known
 from orthocas.tools.display import percent
 
 
@@ -90,7 +95,7 @@ class _OperationalSpace(LawOfChart):
     Args:
         chart: a chart with a closed expression (not a grown one).
         stiffness: diagonal of K, > 0, (n,) or one number for all; [N/m] for positions, [J] for coordinates. With
-            `damping_stiffness`, 0 is allowed. Default: `matched_stiffness`, modes around 6 Hz.
+            `damping_stiffness`, 0 is allowed. Default: `tracking_gains` for PD+, `matched_stiffness` for impedance.
         damping_ratio: diagonal of Z, >= 0, (n,) or one number.
         coupling: `coupled` uses the full M_phi = (J M^-1 J^T)^-1; `decoupled` adds one controller for the task and one
             for the extra coordinates, each with its own inertia, and relies on condition (5).
@@ -100,9 +105,15 @@ class _OperationalSpace(LawOfChart):
         damping_stiffness: damping is designed as if this were the stiffness, > 0, (n,) or one number. So a coordinate
             without a spring, K_i = 0, is free, but does not swing. Default: damping follows the stiffness.
         model: where the law gets the robot's model from, and its additional inputs. Default: the model of the problem.
-        remembers: integral action against a wrong model: `MomentumObserver()` or `Adaptation()`. It needs the input
-            `extra_torque`, which it adds to `model`, and ticks: a `control_rate` in simulations, the supervised law
-            in C, `Remembering` in programs of your own. Default: none.
+        fastest: frequency omega > 0 that no mode exceeds [rad/s]: K is then in series with omega^2 M_phi(q),
+            K(q) = (K^-1 + M_phi^-1 / omega^2 + J diag(c) J^T)^-1, and the damping is designed for K(q). For
+            `double_diagonal`, without `damping_stiffness`. Default, and infinity: K itself, but 18 Hz for PD+ without a
+            stiffness.
+        compliance: c >= 0 of each joint, in series with the springs, (n,) or one number [rad/(N m)]; used with a finite
+            `fastest`. Default: 0, but that of `tracking_gains` for PD+ without a stiffness.
+        remembers: integral action against a wrong model: `FrictionObserver()`, `MomentumObserver()`, `Adaptation()`.
+            It needs the input `extra_torque`, which it adds to `model`, and ticks: a `control_rate` in simulations, the
+            supervised law in C, `Remembering` in programs of your own. Default: none.
 
     Raises:
         ShapeError, InvalidValueError, UnknownNameError: for settings of the wrong shape, value or name.
@@ -116,6 +127,8 @@ class _OperationalSpace(LawOfChart):
     damping: DampingDesign
     limit: Array
     damping_stiffness: Array | None
+    fastest: float
+    compliance: Array
     model: RunTimeModel
     remembers: Remembers | None
 
@@ -124,7 +137,11 @@ class _OperationalSpace(LawOfChart):
     force: ClassVar[str]  #: the formula, without torques that do not act through the coordinates
     command: ClassVar[Command] = "torque"
     options: ClassVar[Mapping[str, Setting]] = {
-        "stiffness": Setting('"100", or "100,50,..." per quantity; default: modes around 6 Hz.'),
+        "stiffness": Setting(
+            '"100", or "100,50,..." per quantity; default: modes up to 18 Hz (PD+), around 6 Hz (impedance).'
+        ),
+        "fastest": Setting("Frequency that no mode exceeds [rad/s]; default: none with a given stiffness."),
+        "compliance": Setting("Of each joint, in series with the springs [rad/(N m)], with --fastest; default: none."),
         "delay": Setting("Delay from measurement to torque that the default stiffness is to bear [s]; default: 0."),
         "damping_ratio": Setting('"0.7", or "0.7,1,..." per quantity; default: 0.7.'),
         "coupling": Setting("coupled (default) or decoupled.", is_word=True),
@@ -143,7 +160,7 @@ class _OperationalSpace(LawOfChart):
             "Additional inputs: payload, wrench, extra_torque, with commas between.", is_word=True, codegen_only=True
         ),
         "memory": Setting(
-            "none (default), momentum or adaptive: integral action against a wrong model; simulations need a rate.",
+            "none (default), momentum, adaptive or friction: against wrong models; simulations need a rate.",
             is_word=True,
         ),
     }
@@ -159,6 +176,10 @@ class _OperationalSpace(LawOfChart):
         damping_stiffness: ArrayLike | None = None,
         model: RunTimeModel | None = None,
         remembers: Remembers | None = None,
+        *,
+        fastest: float | None = None,
+        compliance: ArrayLike | None = None,
+        delay: float = 0.0,
     ) -> None:
         require_known("coupling", coupling, get_args(Coupling))
         require_known("damping", damping, DAMPING_DESIGNS)
@@ -178,8 +199,10 @@ class _OperationalSpace(LawOfChart):
         if damping_stiffness is not None:
             damping_stiffness = positive_gains("damping_stiffness", damping_stiffness, n)
         model.gains(chart.problem, self.feed_forward)
-        if stiffness is None:
-            stiffness = matched_stiffness(chart)
+        can_limit = as_stiffness and damping == "double_diagonal"
+        stiffness, fastest, compliance = self._choose_springs(
+            chart, stiffness, fastest, compliance, delay, damping_ratio, can_limit
+        )
         for name, value in {
             "chart": chart,
             "stiffness": (positive_gains if as_stiffness else non_negative_gains)("stiffness", stiffness, n),
@@ -188,6 +211,8 @@ class _OperationalSpace(LawOfChart):
             "damping_ratio": non_negative_gains("damping_ratio", damping_ratio, n),
             "coupling": coupling,
             "damping": damping,
+            "fastest": fastest,
+            "compliance": non_negative_gains("compliance", compliance, n),
             "limit": command_limit("limit", limit, chart.problem.robot.effort_limits),
             "remembers": remembers,
         }.items():
@@ -203,6 +228,33 @@ class _OperationalSpace(LawOfChart):
             warnings.warn(doubt, LawWarning, stacklevel=2)
 
     @classmethod
+    def _choose_springs(
+        cls,
+        chart: Chart,
+        stiffness: ArrayLike | None,
+        fastest: float | None,
+        compliance: ArrayLike | None,
+        delay: float,
+        damping_ratio: ArrayLike,
+        can_limit: bool,
+    ) -> tuple[ArrayLike, float, ArrayLike]:
+        """Stiffness, the frequency that no mode exceeds, and compliance: what was given, or the default."""
+        if stiffness is not None and delay:
+            raise InvalidValueError("delay", delay, "none with a given stiffness")
+        if stiffness is None and fastest is None and compliance is None and cls.feed_forward and can_limit:
+            return tracking_gains(chart, delay, damping_ratio)
+        if stiffness is None:
+            stiffness = matched_stiffness(chart, delay=delay, damping_ratio=damping_ratio)
+        omega = np.inf if fastest is None else as_number("fastest", fastest)
+        if not omega > 0:
+            raise InvalidValueError("fastest", fastest, "a number > 0 or infinity")
+        if np.isfinite(omega) and not can_limit:
+            raise InvalidValueError("fastest", fastest, "infinity with damping_stiffness and with square_root damping")
+        if compliance is not None and not np.isfinite(omega):
+            raise InvalidValueError("compliance", compliance, "none without a finite `fastest`")
+        return stiffness, omega, 0.0 if compliance is None else compliance
+
+    @classmethod
     def on_chart(
         cls,
         chart: Chart,
@@ -216,14 +268,16 @@ class _OperationalSpace(LawOfChart):
         model: Source = "own",
         gravity: Gravity = "law",
         inputs: str = "",
-        memory: Literal["none", "momentum", "adaptive"] = "none",
+        memory: Literal["none", "momentum", "adaptive", "friction"] = "none",
+        fastest: float | None = None,
+        compliance: ArrayLike | None = None,
         delay: float = 0.0,
     ) -> Self:
         """Build the law on a chart from numbers and words; other settings are those of the law itself.
 
         `model`, `gravity` and `inputs` ("payload,wrench,extra_torque") are those of a `RunTimeModel`, `memory` names a
-        `MomentumObserver` or an `Adaptation`. Without a stiffness, `matched_stiffness` puts the modes around 6 Hz, or
-        lower so that they bear a `delay` from the measurement to the torque [s].
+        `MomentumObserver`, an `Adaptation` or a `FrictionObserver`. Without a stiffness, modes are slow enough to bear
+        a `delay` from the measurement to the torque [s].
 
         Raises:
             ShapeError, InvalidValueError, UnknownNameError: as for the law itself, and for a delay beside a stiffness.
@@ -231,16 +285,13 @@ class _OperationalSpace(LawOfChart):
         # Words become the objects that they name.
         require_known("memory", memory, ("none", *MEMORIES))
         remembers = None if memory == "none" else MEMORIES[memory]()
-        if stiffness is None:
-            stiffness = matched_stiffness(chart, delay=delay, damping_ratio=damping_ratio)
-        elif delay:
-            raise InvalidValueError("delay", delay, "none with a given stiffness")
         zeros: dict[str, ArrayLike] = {"payload": 0.0, "wrench": np.zeros(6), "extra_torque": 0.0}
         names = inputs.split(",") if inputs else []
         for name in names:
             require_known("input", name, zeros)
         run_time = RunTimeModel(model, gravity, **{name: zeros[name] for name in names})
-        return cls(chart, stiffness, damping_ratio, coupling, damping, limit, damping_stiffness, run_time, remembers)
+        settings = (stiffness, damping_ratio, coupling, damping, limit, damping_stiffness, run_time, remembers)
+        return cls(chart, *settings, fastest=fastest, compliance=compliance, delay=delay)
 
     @cached_property
     def memory(self) -> Memory | None:
@@ -269,7 +320,8 @@ class _OperationalSpace(LawOfChart):
     def gain_units(self) -> Mapping[str, str]:
         """Units and admissible values of the gains, in words, by name."""
         design = {"damping_stiffness": "like stiffness, > 0; damping is designed for it"}
-        return {"stiffness": STIFFNESS, "damping_ratio": DAMPING_RATIO, "limit": LIMIT, **design, **UNITS}
+        springs = {"stiffness": STIFFNESS, "fastest": FASTEST, "compliance": COMPLIANCE}
+        return {**springs, "damping_ratio": DAMPING_RATIO, "limit": LIMIT, **design, **UNITS}
 
     def remarks(self) -> list[str]:
         """Warnings.
@@ -308,11 +360,13 @@ class _OperationalSpace(LawOfChart):
 
     @property
     def gains(self) -> dict[str, Array]:
-        """Stiffness, damping ratio and limit, then the inputs that were asked for."""
+        """Stiffness, fastest mode and compliance if K(q) varies, damping ratio, limit, inputs that were asked for."""
+        springs = {"fastest": np.array([self.fastest]), "compliance": self.compliance} if self.is_limited else {}
         design = {} if self.damping_stiffness is None else {"damping_stiffness": self.damping_stiffness}
         inputs = self.model.gains(self.problem, self.feed_forward)
         return {
             "stiffness": self.stiffness,
+            **springs,
             "damping_ratio": self.damping_ratio,
             "limit": self.limit,
             **design,
@@ -325,10 +379,11 @@ class _OperationalSpace(LawOfChart):
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
         q, dq, robot, model = inputs["q"], inputs["dq"], self.problem.robot, self.model
 
-        # f_imp = -K e - D de, (33); Lambda is M_phi, or its blocks.
+        # f_imp = -K(q) e - D de, (33); Lambda is M_phi, or its blocks.
         e, de, J = self._compute_errors(inputs)
         B, Lambda, volume = self._compute_inertia(J, model.mass_matrix(robot, inputs))
-        force = -inputs["stiffness"] * e - self._apply_damping(Lambda, inputs, de)
+        spring, damper = self._apply_springs(J, B, Lambda, inputs, e, de)
+        force = -spring - damper
 
         # f_FF = Lambda (dd_phi_d + (J M^-1 C - dJ/dt) w), (35), with w = J^-1 d_phi_d: by (8) also when decoupled.
         if self.feed_forward:
@@ -356,7 +411,7 @@ class _OperationalSpace(LawOfChart):
 
     @cached_property
     def energy_graph(self) -> ca.Function:
-        """V = 1/2 de^T M_phi de + 1/2 e^T K e [J] and P = de^T D de [W], e = phi - phi_d.
+        """V = 1/2 de^T M_phi de + 1/2 e^T K(q) e [J] and P = de^T D de [W], e = phi - phi_d.
 
         Impedance control uses the velocity J dq instead of de, so V is the kinetic energy plus that of the springs.
         M_phi is the full inertia even for decoupled controllers, because the robot's energy is not block diagonal. M is
@@ -364,23 +419,25 @@ class _OperationalSpace(LawOfChart):
         """
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
         # Kinetic and spring energy, and the power of the damping.
-        K = ca.diag(inputs["stiffness"])
         M = self.model.own_mass_matrix(self.problem.robot, inputs)
         e, de, J = self._compute_errors(inputs)
-        damping_force = self._apply_damping(self._compute_inertia(J, M)[1], inputs, de)
+        B, Lambda, _ = self._compute_inertia(J, M)
+        spring, damping_force = self._apply_springs(J, B, Lambda, inputs, e, de)
         M_phi = build_block_inertia(self.chart.n, (self.chart.n,))(J, M)[1]
         kinetic = ca.bilin(M_phi, de, de) if self.feed_forward else ca.bilin(M, inputs["dq"], inputs["dq"])
-        storage = (kinetic + ca.bilin(K, e, e)) / 2
+        storage = (kinetic + ca.dot(e, spring)) / 2
         outputs = {"storage": storage, "dissipated_power": ca.dot(de, damping_force)}
         return build_function("energy", inputs, outputs)
 
     @cached_property
     def damping_matrix(self) -> ca.Function:
-        """q, stiffness, damping_ratio, then damping_stiffness and payload if they are inputs -> D(q), (n, n)."""
+        """q, stiffness, damping_ratio, then those of `_damping_inputs` that are inputs -> D(q), (n, n)."""
         inputs = named_inputs(self.chart.n, self.gains, self.chart.n)
         chosen = {name: inputs[name] for name in ("q", *self._damping_inputs)}
         J, M = self.chart.parts.rates(inputs["q"]), self.model.own_mass_matrix(self.problem.robot, inputs)
-        D = self._apply_damping(self._compute_inertia(J, M)[1], inputs, ca.MX.eye(self.chart.n))
+        identity = ca.MX.eye(self.chart.n)
+        B, Lambda, _ = self._compute_inertia(J, M)
+        D = self._apply_springs(J, B, Lambda, inputs, identity, identity)[1]
         return self.chart.parts.runnable(build_function("damping_matrix", chosen, {"D": D}))
 
     def check_damping(self, samples: int = 1000, seed: int = 0) -> DampingCheck:
@@ -392,7 +449,7 @@ class _OperationalSpace(LawOfChart):
         return DampingCheck(samples, float(ratio[worst]), float((ratio < -1e-12).mean()), tuple(points[worst].tolist()))
 
     def modes(self, q: ArrayLike | None = None) -> Modes:
-        """Modes of the closed loop M_phi dde + D de + K e = 0 at rest, without disturbances.
+        """Modes of the closed loop M_phi dde + D de + K(q) e = 0 at rest, without disturbances.
 
         Args:
             q: one posture (n,) or several (N, n); default: 256 uniform samples of the domain, and last the posture
@@ -406,7 +463,11 @@ class _OperationalSpace(LawOfChart):
             q = np.vstack([sample_uniform(self.problem.domain, RULES.samples, 0), fastest])
         points, single = as_point_set("q", q, self.chart.n)
         W = compute_mobility(self.chart, points, self.model.robot(self.problem))
-        result = compute_modes(W, self.stiffness, self._compute_damping(points))
+        K = np.tile(np.diag(self.stiffness), (len(points), 1, 1))
+        if self.is_limited:
+            J = self.chart.parts.batched_rates(points)
+            K = limit_stiffness(W, J, self.stiffness, self.fastest, self.compliance, self._blocks)
+        result = compute_modes(W, K, self._compute_damping(points))
         return Modes(*(values[0] for values in vars(result).values())) if single else result
 
     def _compute_damping(self, points: Array) -> Array:
@@ -417,7 +478,13 @@ class _OperationalSpace(LawOfChart):
     @property
     def _damping_inputs(self) -> tuple[str, ...]:
         """The inputs that the damping depends on."""
-        return tuple(n for n in ("stiffness", "damping_ratio", "damping_stiffness", "payload") if n in self.gains)
+        names = ("stiffness", "damping_ratio", "fastest", "compliance", "damping_stiffness", "payload")
+        return tuple(name for name in names if name in self.gains)
+
+    @property
+    def is_limited(self) -> bool:
+        """Whether springs are in series with the inertia, so that no mode is faster than `fastest`."""
+        return bool(np.isfinite(self.fastest))
 
     @property
     def _blocks(self) -> tuple[int, ...]:
@@ -428,16 +495,27 @@ class _OperationalSpace(LawOfChart):
         B, Lambda, volume = build_block_inertia(self.chart.n, self._blocks)(J, M)
         return B, Lambda, volume
 
-    def _apply_damping(self, Lambda: ca.MX, inputs: dict[str, ca.MX], velocities: ca.MX) -> ca.MX:
-        """D V, with the same blocks, for V (n, c)."""
+    def _apply_springs(
+        self, J: ca.MX, B: ca.MX, Lambda: ca.MX, inputs: dict[str, ca.MX], e: ca.MX, de: ca.MX
+    ) -> tuple[ca.MX, ca.MX]:
+        """K(q) E and D V, with the same blocks, for E (n, c) and V (n, d)."""
         # A function of its own, block by block, so that its code appears once.
-        n, c = velocities.shape
-        inertia, K, Z, V = (ca.MX.sym(*of) for of in (("Lambda", n, n), ("K", n), ("Z", n), ("V", n, c)))
+        n, c, d = self.chart.n, e.shape[1], de.shape[1]
         places = [place.tolist() for place in np.split(np.arange(n), np.cumsum(self._blocks)[:-1])]
-        parts = [apply_damping(self.damping, inertia[p, p], K[p], Z[p], V[p, :]) for p in places]
-        damping = ca.Function("damping", [inertia, K, Z, V], [ca.densify(ca.vertcat(*parts))])
+        inertia, C, K, Z = (ca.MX.sym(name, n, size) for name, size in {"Lambda": n, "C": n, "K": 1, "Z": 1}.items())
+        E, V = ca.MX.sym("E", n, c), ca.MX.sym("V", n, d)
+        if self.is_limited:
+            compliance = J @ B / inputs["fastest"] ** 2 + (J * ca.repmat(inputs["compliance"].T, n, 1)) @ J.T
+            parts = [apply_limited_springs(inertia[p, p], C[p, p], K[p], Z[p], E[p, :], V[p, :]) for p in places]
+            outputs = [ca.densify(ca.vertcat(*blocks)) for blocks in zip(*parts, strict=True)]
+            springs = ca.Function("springs", [inertia, C, K, Z, E, V], outputs)
+            spring, damper = springs(Lambda, compliance, inputs["stiffness"], inputs["damping_ratio"], e, de)
+            return spring, damper
+        dampers = [apply_damping(self.damping, inertia[p, p], K[p], Z[p], V[p, :]) for p in places]
+        damping = ca.Function("damping", [inertia, K, Z, V], [ca.densify(ca.vertcat(*dampers))])
         designed_for = inputs.get("damping_stiffness", inputs["stiffness"])
-        return damping(Lambda, designed_for, inputs["damping_ratio"], velocities)
+        damper = damping(Lambda, designed_for, inputs["damping_ratio"], de)
+        return ca.repmat(inputs["stiffness"], 1, c) * e, damper
 
     def _compute_errors(self, inputs: dict[str, ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
         """The error e, how fast it changes, and J = de/dq."""

@@ -77,7 +77,7 @@ class RunTimeModel:
         return {name: word for name, word in choices.items() if word not in ("own", "law")}
 
     def gains(self, problem: Problem, coriolis: bool) -> dict[str, Array]:
-        """The default values of the inputs by name; a given model is that of the centre of the domain at rest."""
+        """The default values of the inputs by name; a given model is that of the home of the domain at rest."""
         # What was asked for becomes an input; a given model takes the place of the law's own.
         result: dict[str, Array] = {}
         for name in ("payload", "wrench"):
@@ -86,7 +86,7 @@ class RunTimeModel:
         if self.extra_torque is not None:
             result["extra_torque"] = spread_gains("extra_torque", self.extra_torque, problem.n)
         if self.source == "given":
-            robot, q = problem.robot, problem.domain.centre
+            robot, q = problem.robot, problem.domain.home
             result["mass_matrix"] = freeze_array("mass_matrix", robot.mass_matrix(q).ravel(), (problem.n**2,))
             if coriolis:
                 result["coriolis_torque"] = np.zeros(problem.n)

@@ -155,7 +155,7 @@ class GrownCoordinates:
 
     def _evaluate_leaf(self, moved: Moved) -> LeafValues:
         """The leaf's chart at end points; an arbitrary point replaces those of trajectories that did not arrive."""
-        return self.leaf.values(np.where(moved.reached[:, None], moved.points, self.problem.domain.centre))
+        return self.leaf.values(np.where(moved.reached[:, None], moved.points, self.problem.domain.home))
 
     @staticmethod
     def _find_status(moved: Moved, values: LeafValues) -> NDArray[np.int_]:

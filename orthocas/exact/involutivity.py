@@ -8,12 +8,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from orthocas.errors import InvalidValueError, SingularTaskError
+from orthocas.errors import SingularTaskError
 from orthocas.robots.tree import require_driven
 from orthocas.tasks.problem import Problem, check, is_regular
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched, dense_function
-from orthocas.tools.checks import Array, require_count, require_kind, require_memory, require_shape
+from orthocas.tools.checks import Array, require_count, require_kind, require_memory
 from orthocas.tools.display import Shown, number_list
 from orthocas.tools.json import collect_attributes
 
@@ -165,41 +165,6 @@ def _compute_squared_turns(T: Array, basis: Array, half_width: Array) -> Array:
     turned = V.transpose(0, 2, 1)[:, None] @ T @ V[:, None]
     squared = (turned**2).sum(axis=1) / (k[:, :, None] + k[:, None, :])
     return np.asarray(squared.sum(axis=(1, 2)) / 2)
-
-
-def lie_bracket(f: ca.SX, g: ca.SX, q: ca.SX) -> ca.SX:
-    """Lie bracket [f, g] = (dg/dq) f - (df/dq) g of two vector fields, (n, 1).
-
-    A flow along f, g, -f and -g, for a short time t each, ends at q + t^2 [f, g] + O(t^3).
-
-    Args:
-        f: vector field, an expression in q, (n, 1).
-        g: vector field, an expression in q, (n, 1).
-        q: the symbol, (n, 1).
-
-    Raises:
-        ShapeError: if a field does not have the shape of q.
-
-    Source:
-        Standard definition, with the sign of [L2012].
-
-    Example:
-        >>> import casadi as ca
-        >>> from orthocas.exact.involutivity import lie_bracket
-        >>> q = ca.SX.sym("q", 2)
-        >>> lie_bracket(ca.vertcat(1, 0), ca.vertcat(0, q[0]), q)
-        SX([0, 1])
-    """
-    # Symbols, and fields of the same kind over them.
-    if not isinstance(q, ca.SX | ca.MX) or not q.is_valid_input():
-        raise InvalidValueError("q", f"a {type(q).__name__}", "a column of symbols")
-    for name, field in (("f", f), ("g", g)):
-        if not isinstance(field, ca.DM | type(q)):
-            raise InvalidValueError(name, f"a {type(field).__name__}", f"a vector field, an {type(q).__name__} of q")
-    require_shape("q", q.shape, (None, 1))
-    require_shape("f", f.shape, q.shape)
-    require_shape("g", g.shape, q.shape)
-    return ca.jtimes(g, q, f) - ca.jtimes(f, q, g)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from orthocas.errors import GrowError, InvalidValueError
-from orthocas.exact.harmonic import build_level_surface, map_to_disk
-from orthocas.exact.mesh import TriangleLocator, TriangleMesh
+from orthocas.exact.mesh import TriangleLocator, TriangleMesh, build_level_surface, map_to_disk
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import evaluate_samples, sample_uniform

@@ -4,13 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthocas.bases.family import JointSpace, Parametrisation
+from orthocas.bases.family import JointSpace, Parametrisation, require_parametrisation
 from orthocas.bases.given import Given
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.regular_part import RegularPart
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.like import Like, Likeness
-from orthocas.fitting.settings import require_parametrisation
 from orthocas.fitting.terms import find_least_volume
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import sample_problem

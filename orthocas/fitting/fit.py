@@ -211,7 +211,7 @@ def _evaluate_closed_form(problem: Problem, parametrisation: Parametrisation, sa
     values = parametrisation.closed_form(problem)
     r = problem.r
     raw = Coordinates(parametrisation, JointSpace.of(problem), (), values.theta, np.zeros(r), np.ones(r))
-    origin = problem.domain.centre if values.origin is None else values.origin
+    origin = problem.domain.home if values.origin is None else values.origin
     scaled = normalise(raw, origin, samples)
     return scaled if values.scaled else replace(scaled, scale=np.ones(r))
 
@@ -241,12 +241,12 @@ def _solve(
     solution = Continuation(runner, r, begin).run()
     # angles leave free where xi is zero, how long its gradient is, the order and the signs
     raw = Coordinates(solution.parametrisation, space, idle, solution.theta, np.zeros(r), np.ones(r))
-    coordinates = normalise(raw, problem.domain.centre, samples)
+    coordinates = normalise(raw, problem.domain.home, samples)
     if settings.like is not None:
-        return solution, settings.like.name_units(coordinates, problem.domain.centre)
+        return solution, settings.like.name_units(coordinates, problem.domain.home)
     if align_to is not None:
         return solution, align(coordinates, align_to, samples)
-    return solution, fix_gauge(coordinates, problem.domain.centre)
+    return solution, fix_gauge(coordinates, problem.domain.home)
 
 
 def normalise(raw: Coordinates, origin: Array, samples: Samples) -> Coordinates:

@@ -14,7 +14,7 @@ from orthocas.bases.family import LinearFamily
 from orthocas.bases.given import Given, find_periods, sew_angle
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError, RobotError
-from orthocas.fitting.basis_gradients import BasisGradients
+from orthocas.fitting.basis_objective import BasisGradients
 from orthocas.fitting.terms import Data, Sizes, metric_lengths
 from orthocas.robots.robot import Robot
 from orthocas.tasks.problem import Problem
@@ -77,10 +77,6 @@ def _require_finite(slopes: Array) -> Array:
     return slopes
 
 
-def _hash(function: ca.Function) -> str:
-    return hashlib.sha256(json.dumps(write_tape(function)).encode()).hexdigest()[:12]
-
-
 @dataclass(frozen=True, eq=False)
 class Like:
     """Quantities y(q) (k, 1) that the first k coordinates follow.
@@ -107,7 +103,7 @@ class Like:
         if isinstance(like, Task):
             if like.robot.joint_names != robot.joint_names:
                 raise InvalidValueError("like", "a task of another robot", "one of the problem's robot")
-            like = like.with_reference_at(problem.domain.centre)
+            like = like.with_reference_at(problem.domain.home)
             labels = zip(like.labels, like.units, strict=True)
             names = tuple(f"{label} [{unit}]" if unit else label for label, unit in labels)
             return cls(names, _require_arms(robot, q, like.smooth_function(q)))
@@ -175,12 +171,14 @@ class Like:
         """
         self.require_at_most(problem.r - (problem.n - len(active)))
         q = ca.SX.sym("q", len(active))
-        whole = ca.SX(ca.DM(problem.domain.centre))
+        whole = ca.SX(ca.DM(problem.domain.home))
         whole[active] = q
         values = self.function(whole)
         slopes = dense_function("like_jacobian", [q], [ca.cse(ca.jacobian(values, q))])
         # functions of a loss are kept by names
-        return LikeTerm(f"like {_hash(slopes)}", len(self.names), slopes)
+        return LikeTerm(
+            f"like {hashlib.sha256(json.dumps(write_tape(slopes)).encode()).hexdigest()[:12]}", len(self.names), slopes
+        )
 
     def project(self, samples: Samples) -> tuple[Array, Array]:
         """An orthonormal basis (N, n, n), the last r of ker J_x, and gradients of quantities along it, (N, k, n).

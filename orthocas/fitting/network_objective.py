@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from orthocas.bases.family import ArrayFamily, ArrayMemory, Family, Memories
 from orthocas.fitting.basis_objective import RULES
-from orthocas.fitting.loss import Loss, build_loss_columns, build_loss_with_slopes, build_value_columns
+from orthocas.fitting.sample_loss import Loss, build_loss_columns, build_loss_with_slopes, build_value_columns
 from orthocas.fitting.terms import Sizes, Weights
 from orthocas.tasks.samples import Draw, Samples, split_samples
 from orthocas.tools.batch import count_threads, run_in_threads, run_in_threads_with

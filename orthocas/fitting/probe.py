@@ -11,13 +11,12 @@ from orthocas.bases.products import Polynomial, ProductFamily
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import in_the_metric, worst_points
-from orthocas.fitting.basis_gradients import build_gradients
-from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.basis_objective import BasisObjective, build_gradients
 from orthocas.fitting.starts import find_spectral_start
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Weights
 from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.lbfgs import QuasiNewton
-from orthocas.solvers.protocol import SolveResult, Status
+from orthocas.solvers.protocol import Status
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import (
     NEAR_HALF_A_TURN,
@@ -210,7 +209,37 @@ class Prober:
                 if leap or quality.keeps(enough):
                     self._kept = self._start if quality.keeps(enough) else self._kept
                     return quality
-            theta = self._fit(problem, family)
+            # parameters, (size,)
+            # even samples for the start, and more near faces and corners, where charts fail first
+            even = sample_evenly(problem.domain, RULES.training, RULES.seed)
+            heavy = sample_boundary_weighted(problem.domain, RULES.near_faces, RULES.seed + 1)
+            samples = evaluate_samples(problem, np.vstack([even, heavy])).restricted_to(self.active)
+            with deferred():
+                fresh = self._start is None
+                start = (
+                    find_spectral_start(family, samples[: len(even)]) if self._start is None else self._start.on(family)
+                )
+                objective = self._build_loss(problem, family, samples, start)
+            if self.outputs < RULES.many:
+                result = GaussNewton().coarser().minimise(objective, start)
+            else:
+                solver = QuasiNewton().coarser()
+                if fresh:
+                    result = solver.minimise(objective, start)
+                else:
+                    steered = self._steered
+                    if steered is None or np.abs(np.log(family.space.half_width / steered.half_width)).max() > np.log(
+                        RULES.other
+                    ):
+                        self._steered = _Steered(
+                            objective, family.space.half_width, objective.curvature_estimate(start)
+                        )
+                    else:
+                        self._steered = replace(steered, loss=objective)
+                    result = solver.minimise(self._steered, start)
+            if result.status is Status.INTERRUPTED:
+                raise KeyboardInterrupt
+            theta: Array = result.theta
             quality = self._evaluate(problem, self._gradients(family, theta))
         if quality.conditioning > 0:
             self._start = _Start(space.half_width, theta)
@@ -259,36 +288,6 @@ class Prober:
             return J
 
         return jacobian
-
-    def _fit(self, problem: Problem, family: ProductFamily) -> Array:
-        """Parameters, (size,)."""
-        # even samples for the start, and more near faces and corners, where charts fail first
-        even = sample_evenly(problem.domain, RULES.training, RULES.seed)
-        heavy = sample_boundary_weighted(problem.domain, RULES.near_faces, RULES.seed + 1)
-        samples = evaluate_samples(problem, np.vstack([even, heavy])).restricted_to(self.active)
-        with deferred():
-            fresh = self._start is None
-            start = find_spectral_start(family, samples[: len(even)]) if self._start is None else self._start.on(family)
-            objective = self._build_loss(problem, family, samples, start)
-        result = self._minimise(objective, start, fresh, family.space.half_width)
-        if result.status is Status.INTERRUPTED:
-            raise KeyboardInterrupt
-        theta: Array = result.theta
-        return theta
-
-    def _minimise(self, objective: BasisObjective, start: Array, fresh: bool, half_width: Array) -> SolveResult:
-        if self.outputs < RULES.many:
-            return GaussNewton().coarser().minimise(objective, start)
-        solver = QuasiNewton().coarser()
-        if fresh:
-            return solver.minimise(objective, start)
-        # the matrix of a similar box is nearly that of this one
-        steered = self._steered
-        if steered is None or np.abs(np.log(half_width / steered.half_width)).max() > np.log(RULES.other):
-            self._steered = _Steered(objective, half_width, objective.curvature_estimate(start))
-        else:
-            self._steered = replace(steered, loss=objective)
-        return solver.minimise(self._steered, start)
 
     def _build_loss(self, problem: Problem, family: ProductFamily, samples: Samples, start: Array) -> BasisObjective:
         """The loss of the fit that confirms the box."""

@@ -5,7 +5,7 @@ from typing import Literal, Self
 
 import numpy as np
 
-from orthocas.bases.family import GradedParametrisation, Parametrisation
+from orthocas.bases.family import GradedParametrisation, Parametrisation, require_parametrisation
 from orthocas.bases.products import Polynomial
 from orthocas.errors import InvalidValueError
 from orthocas.fitting.like import RULES as LIKE_RULES
@@ -104,7 +104,8 @@ class FitSettings:
         # the solver; only Ipopt knows bounds
         if solver is None:
             solver = choose_solver(bound, problem) if max_mutual_deg is None else Ipopt()
-        require_solver(solver)
+        if not isinstance(solver, Solver) or isinstance(solver, type):
+            raise InvalidValueError("solver", repr(solver), "an object such as GaussNewton()")
         if max_mutual_deg is not None and not isinstance(solver, Ipopt):
             raise InvalidValueError("solver", solver.name, "ipopt, the only solver that supports max_mutual_deg")
         count = None if samples is None else require_count("samples", samples, least=2)
@@ -157,18 +158,6 @@ def choose_solver(parametrisation: Parametrisation, problem: Problem) -> Solver:
     if terms and problem.n > RULES.many_joints:
         return QuasiNewton(tolerance=RULES.tolerance_of_many)
     return QuasiNewton() if terms > RULES.many_terms else GaussNewton()
-
-
-def require_parametrisation(value: object) -> None:
-    """Raise InvalidValueError unless it is a parametrisation."""
-    if not isinstance(value, Parametrisation) or isinstance(value, type):
-        raise InvalidValueError("parametrisation", repr(value), "an object such as Polynomial(degree=4)")
-
-
-def require_solver(value: object) -> None:
-    """Raise InvalidValueError unless it is a solver."""
-    if not isinstance(value, Solver) or isinstance(value, type):
-        raise InvalidValueError("solver", repr(value), "an object such as GaussNewton()")
 
 
 def _check_bound(parametrisation: Parametrisation, max_mutual_deg: float) -> float:

@@ -20,18 +20,17 @@ from orthocas.bases.family import (
     Parametrisation,
 )
 from orthocas.bases.products import Fourier, Polynomial, ProductFamily
-from orthocas.charts.angles import pairs
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import WorstPoints, worst_points
-from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
-from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
+from orthocas.errors import InvalidValueError
 from orthocas.fitting.basis_objective import RULES as OBJECTIVE_RULES
-from orthocas.fitting.basis_objective import BasisObjective, BoundedMutual, expand
+from orthocas.fitting.basis_objective import BasisGradients, BasisObjective, build_gradients, expand
+from orthocas.fitting.bounded_mutual import BoundedMutual, bound_mutual_angles
 from orthocas.fitting.like import LikeTerm
 from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
 from orthocas.fitting.settings import RULES, FitSettings
 from orthocas.fitting.starts import Mirror, find_mirror, find_spectral_start
-from orthocas.fitting.terms import DEFAULT_WEIGHTS, FOLD_TERM
+from orthocas.fitting.terms import FOLD_TERM
 from orthocas.fitting.terms import RULES as LOSS_RULES
 from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.protocol import Objective, SampledObjective, Solver, SolveResult, Status
@@ -339,7 +338,7 @@ class StageRunner:
         if isinstance(objective, BoundedMutual) and not np.isfinite(result.value):
             if plan.final:
                 assert self.settings.max_mutual is not None
-                raise explain_missed_bound(plan.label, self.settings.max_mutual, objective, result)
+                raise objective.explain_missed_bound(plan.label, self.settings.max_mutual, result)
         else:
             result.raise_if_failed()
         # back from the free components to all coefficients
@@ -354,7 +353,7 @@ class StageRunner:
             objective, start = self._build_in_basis(family, samples, theta, mirror)
             if settings.max_mutual is None:
                 return self.folds.add_to(objective), start
-            return self._bound_mutual_angles(objective, start, fresh=theta is None)
+            return bound_mutual_angles(objective, start, settings.max_mutual, self.problem.r, fresh=theta is None)
         if settings.max_mutual is not None:
             expected = "a parametrisation linear in its parameters, such as polynomial"
             raise InvalidValueError("max_mutual_deg", f"given with {plan.label}", expected)
@@ -398,20 +397,6 @@ class StageRunner:
                 start = self.like.turn(family, start, samples, self._gradients(family))
             self._starts[key] = start
         return self._starts[key]
-
-    def _bound_mutual_angles(self, objective: BasisObjective, theta: Array, fresh: bool) -> tuple[Objective, Array]:
-        """The problem with a bound on the mutual angles, and its start."""
-        assert self.settings.max_mutual is not None
-        fitted, all_pairs = len(pairs(objective.r)), len(pairs(self.problem.r))
-        if not fitted:
-            raise InvalidValueError("max_mutual_deg", "given", "a problem with two or more coordinates to fit")
-        # pairs with an idle joint are exactly orthogonal, so the other pairs may use their part
-        bounded = BoundedMutual(objective, self.settings.max_mutual * (all_pairs / fitted) ** 0.5)
-        # solve the weighted problem first: minima far from its own are worse
-        if fresh:
-            weighted = replace(self.settings.weights, mutual=DEFAULT_WEIGHTS.mutual)
-            theta = GaussNewton().minimise(objective.reweigh(weighted), theta).require_finished().theta
-        return bounded, bounded.normalise_gradients(theta)
 
     @property
     def space(self) -> JointSpace:
@@ -492,18 +477,3 @@ class StageRunner:
             number = np.float32 if self.settings.single else np.float64
             self._bases[family] = build_gradients(family, self.space.n, number)
         return self._bases[family]
-
-
-def explain_missed_bound(label: str, bound: float, objective: BoundedMutual, result: SolveResult) -> SolveError:
-    """The error of a missed bound on mutual angles [rad]: by how much it was missed, and why."""
-    target = np.degrees(bound)
-    reached = target * objective.constraints(result.theta)[0][0] ** 0.5
-    missing = f"{label} coordinates with mutual angles within {target:.4g} deg"
-    if result.status is Status.INFEASIBLE:
-        return InfeasibleError(
-            f"there are no {missing} nearby, the closest have {reached:.4g} deg: raise max_mutual_deg or the degree"
-        )
-    return SolveError(
-        f"no {missing} found in {result.iterations} iterations, the closest have {reached:.4g} deg: "
-        "raise max_mutual_deg, the degree, or the number of iterations"
-    )

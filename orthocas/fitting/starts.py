@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.bases.family import JointSpace, LinearFamily
-from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
+from orthocas.fitting.basis_objective import BasisGradients, build_gradients
 from orthocas.fitting.terms import Pairs, coordinates_of
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import Samples, compute_directions
@@ -150,28 +150,24 @@ class Mirror:
     def kept(self, family: LinearFamily) -> NDArray[np.bool_] | None:
         """The coefficients (r, K) that the components may have; None if a basis function is neither even nor odd."""
         if family not in self._kept:
-            self._kept[family] = self._find_allowed(family)
+            q = ca.SX.sym("q", self.space.n)
+            basis = ca.Function("basis", [q], [ca.densify(family.basis(q))])
+            u = np.random.default_rng(RULES.seed).uniform(-1.0, 1.0, (self.space.n, RULES.points))
+            here, there = (
+                np.array(basis(self.space.centre[:, None] + self.space.half_width[:, None] * side))
+                for side in (u, self.signs[:, None] * u)
+            )
+            # each function is even, odd, or neither
+            size = np.abs(here).max(axis=1)
+            even, odd = (np.abs(there - sign * here).max(axis=1) <= RULES.tolerance * size for sign in (1, -1))
+            allowed: NDArray[np.bool_] = np.where(even, 1, -1) == self.parities[:, None]
+            self._kept[family] = allowed if (even | odd).all() else None
         return self._kept[family]
 
     @cached_property
     def _kept(self) -> dict[LinearFamily, NDArray[np.bool_] | None]:
         """Results of `kept` so far."""
         return {}
-
-    def _find_allowed(self, family: LinearFamily) -> NDArray[np.bool_] | None:
-        # the basis at points and at their images
-        q = ca.SX.sym("q", self.space.n)
-        basis = ca.Function("basis", [q], [ca.densify(family.basis(q))])
-        u = np.random.default_rng(RULES.seed).uniform(-1.0, 1.0, (self.space.n, RULES.points))
-        here, there = (
-            np.array(basis(self.space.centre[:, None] + self.space.half_width[:, None] * side))
-            for side in (u, self.signs[:, None] * u)
-        )
-        # each function is even, odd, or neither
-        size = np.abs(here).max(axis=1)
-        even, odd = (np.abs(there - sign * here).max(axis=1) <= RULES.tolerance * size for sign in (1, -1))
-        allowed: NDArray[np.bool_] = np.where(even, 1, -1) == self.parities[:, None]
-        return allowed if (even | odd).all() else None
 
 
 def find_mirror(problem: Problem, active: list[int]) -> Mirror | None:

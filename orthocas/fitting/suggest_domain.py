@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.bases.cyclic import cyclic_joints
-from orthocas.bases.family import Parametrisation
+from orthocas.bases.family import Parametrisation, require_parametrisation
 from orthocas.charts.point_quality import worst_points
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.fit import Fit, fit_from
 from orthocas.fitting.probe import RULES, Bounds, Miss, Prober, Quality, describe_conditioning, evaluate_chart
-from orthocas.fitting.settings import choose_parametrisation, require_parametrisation
+from orthocas.fitting.settings import choose_parametrisation
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM, require_driven
@@ -108,7 +108,15 @@ def suggest_domain(
         (True, True)
     """
     start = time.perf_counter()
-    bounds, loss = _check_bounds(robot, task, leak_deg, conditioning, seed), Weights.of(weights)
+    require_kind("robot", robot, Robot)
+    require_driven("suggesting a domain", robot.tree)
+    require_kind("task", task, Task)
+    require_count("seed", seed, least=0)
+    if not 0 < as_number("leak_deg", leak_deg) < 90:
+        raise InvalidValueError("leak_deg", leak_deg, "an angle between 0 and 90 degrees")
+    if not 0 < as_number("conditioning", conditioning) < 1:
+        raise InvalidValueError("conditioning", conditioning, "a number between 0 and 1")
+    bounds, loss = Bounds(float(leak_deg), float(conditioning)), Weights.of(weights)
     if parametrisation is not None:
         require_parametrisation(parametrisation)
     # the problem around the home, and the joints whose half-widths are searched
@@ -134,19 +142,6 @@ def suggest_domain(
         worst_point=tuple(quality.worst_point.tolist()),
         seconds=time.perf_counter() - start,
     )
-
-
-def _check_bounds(robot: Robot, task: Task, leak_deg: float, conditioning: float, seed: int) -> Bounds:
-    # a robot with joints that are all driven, a task, and bounds that can be met
-    require_kind("robot", robot, Robot)
-    require_driven("suggesting a domain", robot.tree)
-    require_kind("task", task, Task)
-    require_count("seed", seed, least=0)
-    if not 0 < as_number("leak_deg", leak_deg) < 90:
-        raise InvalidValueError("leak_deg", leak_deg, "an angle between 0 and 90 degrees")
-    if not 0 < as_number("conditioning", conditioning) < 1:
-        raise InvalidValueError("conditioning", conditioning, "a number between 0 and 1")
-    return Bounds(float(leak_deg), float(conditioning))
 
 
 @dataclass(frozen=True)
@@ -289,15 +284,6 @@ class WidestBox:
     def _measure_excess(self, widths: Array) -> float:
         return max(self.evaluate(widths, leap=True).excess(self.bounds).values())
 
-    def _explain_refusal(self, widths: Array) -> DomainError:
-        """Which bound breaks even on a box of these half-widths (n,), and what may help."""
-        quality = self.evaluate(widths)
-        miss = next(iter(quality.excess(self.bounds)))
-        return DomainError(
-            f"no box around the home {np.round(self.home, 4).tolist()} keeps the bounds: with half-widths of "
-            f"{widths[self.free].max():.1g} {quality.explained(miss, self.bounds)}; {REMEDIES}"
-        )
-
     def _scale_to_boundary(self, unit: Array, scale: float) -> Array:
         """The widest multiple of half-widths that keeps the bounds."""
         low, high = 0.0, np.inf
@@ -310,7 +296,13 @@ class WidestBox:
             else:
                 high = scale
             if high < RULES.smallest:
-                raise self._explain_refusal(widths)
+                # which bound breaks even on a box of these half-widths (n,), and what may help
+                quality = self.evaluate(widths)
+                miss = next(iter(quality.excess(self.bounds)))
+                raise DomainError(
+                    f"no box around the home {np.round(self.home, 4).tolist()} keeps the bounds: with half-widths of "
+                    f"{widths[self.free].max():.1g} {quality.explained(miss, self.bounds)}; {REMEDIES}"
+                )
             scale = (
                 low * RULES.step if np.isinf(high) else high / RULES.step if low == 0 else float(np.sqrt(low * high))
             )

@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import casadi as ca
 import numpy as np
 
-from orthocas.charts.angles import pairs
+from orthocas.charts.point_quality import pairs
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, as_float_array, as_number, require_kind, require_known

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.bases.cyclic import keeps_self_motions, turns_tool, widen_over_cyclic_joints
-from orthocas.bases.family import CyclicParametrisation, JointSpace, LinearFamily, Parametrisation
+from orthocas.bases.family import (
+    CyclicParametrisation,
+    JointSpace,
+    LinearFamily,
+    Parametrisation,
+    require_parametrisation,
+)
 from orthocas.bases.mlp import MLP
 from orthocas.bases.products import Polynomial
 from orthocas.bases.registry import warn_unless_savable
@@ -26,7 +32,6 @@ from orthocas.errors import BranchWarning, DomainError, Interrupted, InvalidValu
 from orthocas.fitting.exact_quantity import choose_quantities, take_exactly
 from orthocas.fitting.fit import Fit, fix_gauge, normalise
 from orthocas.fitting.like import Like, Likeness, MeaningError
-from orthocas.fitting.settings import require_parametrisation
 from orthocas.fitting.terms import Weights, find_least_volume, find_term
 from orthocas.fitting.wide_search import (
     RULES,
@@ -42,6 +47,7 @@ from orthocas.robots.tree import require_driven
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.branches import RULES as BRANCH_RULES
 from orthocas.tasks.branches import Branch, Branches, branches, sample_centres, sample_nonsingular
+from orthocas.tasks.clear_box import ClearBox
 from orthocas.tasks.domains import Box
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.problem import Problem, check
@@ -129,8 +135,9 @@ def fit_wide(
         robot: the robot.
         task: a task of that robot. A missing reference orientation is taken at the centre of the branch.
         branch: a branch of `orthocas.branches`, its name, or a box of your own. Default: the branch of the home; with
-            none there, the largest. If its middle is not clear, the largest box around a clear position takes its
-            place, see `left_out`.
+            none there, the largest. If its middle is not clear, signs and references begin at `domain.home`, the clear
+            position with the most room. If coordinates then leave out much, the largest box around it may take the
+            place of the branch, see `left_out`.
         metric: as in `Problem`.
         clearance: least relative singular value of the task, > 0; see `orthocas.ClearBox`.
         parametrisation: a family, as in `fit`. Those that are not linear in their parameters descend like networks;
@@ -193,29 +200,32 @@ def fit_wide(
     require_kind("collisions", collisions, bool)
     solids = robot.collisions if collisions else None
 
-    # the problem, and what coordinates are or follow
+    # positions of the branch that count for its share, and the posture at which xi has the value of its quantity
     chosen = _choose_branch(robot, task, branch, home)
-    problem = _build_problem(robot, task, metric, chosen, bound)
     posture = chosen.posture if home is None else find_home(robot, task, home).q
-    quantities, exact = choose_quantities(problem, like, exact, parametrisation)
-    settings = WideSettings(count, seed, monitor, terms, quantities, solids)
     counted = sample_nonsingular(robot, task, chosen.box, RULES.held_out, (seed, RULES.counted_tag))
     counted = counted if solids is None else counted[solids.check_free(counted)]
-    finish = partial(_finish, settings=settings, branch=chosen, posture=posture, counted=counted, start=start)
+    finish = partial(_finish, branch=chosen, posture=posture, counted=counted, start=start)
+
+    def fit_on(problem: Problem) -> WideFit:
+        """The chart of one problem."""
+        quantities, wanted = choose_quantities(problem, like, exact, parametrisation)
+        settings = WideSettings(count, seed, monitor, terms, quantities, solids)
+        solution = _solve_at_once(problem, quantities, parametrisation, wanted, counted, seed)
+        if solution is not None:
+            return finish(solution, settings=settings, interrupted=pressed())
+        # families to try; the domain of each covers all positions of its cyclic joints
+        families = _choose_families(problem, like) if parametrisation is None else (parametrisation,)
+        searches = [Search(*_prepare(problem, family, like), settings) for family in families]
+        try:
+            return finish(search_families(searches).solution, settings=settings, interrupted=pressed())
+        except KeyboardInterrupt:
+            if searches[0].best is None:
+                raise
+            return finish(find_best(searches).solution, settings=settings, interrupted=True)
 
     with remembered() as pressed:
-        if (solution := _solve_at_once(problem, quantities, parametrisation, exact, counted, seed)) is not None:
-            result = finish(solution, interrupted=pressed())
-        else:
-            # families to try; the domain of each covers all positions of its cyclic joints
-            families = _choose_families(problem, like) if parametrisation is None else (parametrisation,)
-            searches = [Search(*_prepare(problem, family, like), settings) for family in families]
-            try:
-                result = finish(search_families(searches).solution, interrupted=pressed())
-            except KeyboardInterrupt:
-                if searches[0].best is None:
-                    raise
-                result = finish(find_best(searches).solution, interrupted=True)
+        result = _fit_most(_build_problems(robot, task, metric, chosen, bound), fit_on)
         if result.status is Status.INTERRUPTED or pressed():
             raise Interrupted(result)
     if result.left_out:
@@ -245,14 +255,19 @@ def _choose_branch(robot: Robot, task: Task, branch: Branch | Box | str | None, 
     return parts.of(find_home(robot, task, home).q) or parts[0]
 
 
-def _build_problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Branch, clearance: float) -> Problem:
-    """The problem on the clear part of a branch; if its middle is not clear, of the largest box whose middle is."""
+def _build_problems(
+    robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Branch, clearance: float
+) -> tuple[Problem, ...]:
+    """The problem on the clear part of a branch.
+
+    If its middle is not clear, its home is the clear position with the most room around it. The box around this
+    position is a second problem, because a singular middle may part the branch.
+    """
     box = branch.box
     try:
-        return Problem(robot, task, metric, box, branch.name, clearance)
+        return (Problem(robot, task, metric, box, branch.name, clearance),)
     except DomainError:
         points, values = sample_centres(robot, task, box)
-    # of the clear positions, the one with the largest box around it
     clear = points[values > BRANCH_RULES.of_centre * clearance]
     room = box.half_width - np.abs(clear - box.centre)
     if not len(clear):
@@ -260,8 +275,26 @@ def _build_problem(robot: Robot, task: Task, metric: Metric | MetricSpec, branch
         most = f"at most {math.floor(1e3 * float(values.max()) / BRANCH_RULES.of_centre) / 1e3:g} can serve it"
         raise DomainError(f"branch '{branch.name}' has {missing}, expected one for clearance = {clearance:g}: {most}")
     best = int(np.argmax(np.log(room).sum(axis=1)))
-    domain = Box(clear[best], room[best], box.unbounded)
-    return Problem(robot, task, metric, domain, branch.name, clearance)
+    whole = ClearBox(box, task, clearance, home=clear[best])
+    smaller = Box(clear[best], room[best], box.unbounded)
+    return (
+        Problem(robot, task, metric, whole, branch.name),
+        Problem(robot, task, metric, smaller, branch.name, clearance),
+    )
+
+
+def _fit_most(problems: tuple[Problem, ...], fit_on: Callable[[Problem], WideFit]) -> WideFit:
+    """The chart of the whole branch; of a smaller box, if its middle is singular and this is regular on more of it."""
+    whole, *smaller = problems
+    try:
+        result = fit_on(whole)
+    except DomainError:
+        if not smaller:
+            raise
+        return fit_on(smaller[0])
+    if not smaller or result.regular_share >= RULES.divided or result.status is Status.INTERRUPTED:
+        return result
+    return max(result, fit_on(smaller[0]), key=lambda fit: fit.regular_share)
 
 
 def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomial | MLP, ...]:
@@ -394,7 +427,7 @@ def _finish(
         seconds=time.perf_counter() - start,
         branch=branch,
         regular_share=share,
-        left_out=_describe_left_out(clear, branch, counted),
+        left_out=_describe_left_out(clear, branch, counted, share),
         meaning=error,
         like=quantities.measure_distances(problem, coordinates, seed) if quantities is not None and followed else {},
     )
@@ -411,19 +444,22 @@ def _name_coordinates(
     if not raw.size:
         return raw, quantities, {} if quantities is None else {"meaning": "; ".join(quantities.names), "exact": "yes"}
     first = sample_problem(problem, RULES.first, (seed, RULES.first_tag))
-    coordinates = normalise(raw, problem.domain.centre, first)
+    coordinates = normalise(raw, problem.domain.home, first)
     if quantities is not None:
         return quantities.name_units(coordinates, posture), quantities, {"meaning": quantities.label}
     swivel = Like.by_default(problem)
     scaled = None if swivel is None else swivel.scale(coordinates, problem, posture, seed)
     if swivel is None or scaled is None:
-        return fix_gauge(coordinates, problem.domain.centre), None, {}
+        return fix_gauge(coordinates, problem.domain.home), None, {}
     return scaled, swivel, {"meaning": swivel.label}
 
 
-def _describe_left_out(problem: Problem, branch: Branch, counted: Array) -> str:
-    """What a problem leaves out of a branch, of which some positions (N, n) are clear; empty for nothing."""
+def _describe_left_out(problem: Problem, branch: Branch, counted: Array, share: float) -> str:
+    """What a chart leaves out of a branch, of which some positions (N, n) are clear; empty for little."""
     domain, reasons = problem.domain, []
+    if isinstance(domain, ClearBox) and domain.posture is not None and share < RULES.divided:
+        reason = "its middle is not clear, and coordinates have one direction on a part of it only"
+        return f"all but {percent(share)} of the clear positions: {reason}"
     inside = np.asarray(Box(domain.centre, domain.half_width, domain.unbounded).contains(counted))
     if not inside.all():
         box = f"around q = ({number_list(domain.centre)}) with half-widths ({number_list(domain.half_width)})"

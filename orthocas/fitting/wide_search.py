@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from orthocas.bases.family import ArrayFamily, CombinableFamily, JointSpace, LinearFamily, Parametrisation
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError
-from orthocas.fitting.basis_gradients import BasisGradients, build_gradients
-from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.basis_objective import BasisGradients, BasisObjective, build_gradients
 from orthocas.fitting.like import Like, QuadraticTerm
 from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
 from orthocas.fitting.stages import Resampled, Stage, WeightedSum
@@ -67,6 +66,7 @@ class WideRules:
     fresh_of_networks: int = 200_000
     worst_of_networks: int = 10_000
 
+    divided: float = 0.9  #: regular share below which a branch with a singular middle has a smaller box, if it has more
     held_out: int = 20_000  #: samples that evaluate coordinates
     enough: float = 5e-4  #: fraction of bad positions, many near limits, that is as good as none
     well: float = 0.28  #: over r, volume of all but 1 % of positions that is enough: a conditioning of 0.2
@@ -264,7 +264,7 @@ class Search:
     def _sample_near_centre(self) -> Array:
         """Nonsingular samples near the centre of the domain, whose sign decides which part of it is kept."""
         domain = self.problem.domain
-        near, count = Box(domain.centre, RULES.near * domain.half_width), max(2, int(RULES.near * self.samples))
+        near, count = Box(domain.home, RULES.near * domain.half_width), max(2, int(RULES.near * self.samples))
         points = sample_uniform(near, count, (self.settings.seed, RULES.tag, RULES.centre_tag))
         return np.asarray(points[domain.contains(points)])
 
@@ -435,7 +435,7 @@ class Search:
     @cached_property
     def _centre(self) -> Samples:
         """The centre of the domain."""
-        return sample_frames(self.problem, self.problem.domain.centre[None])
+        return sample_frames(self.problem, self.problem.domain.home[None])
 
     @cached_property
     def _held_out(self) -> Samples:
@@ -445,7 +445,7 @@ class Search:
 
 def is_on_side_of_centre(problem: Problem, points: Array) -> NDArray[np.bool_]:
     """Whether points (N, n) are on the centre's side of singular positions, (N,), if r joints do not move the task."""
-    q, task = np.vstack([problem.domain.centre, points]), problem.task
+    q, task = np.vstack([problem.domain.home, points]), problem.task
     J = task.batched_frame_jacobian(q)[0].reshape(len(q), task.m, problem.n)
     moving = np.abs(J).max(axis=(0, 1)) > NEGLIGIBLE * np.abs(J).max()
     if moving.sum() != task.m:

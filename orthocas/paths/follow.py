@@ -96,8 +96,15 @@ def follow(
     if collisions is not None:
         require_kind("collisions", collisions, Collisions)
         collisions.require_for(chart.problem.robot.tree)
-    start = chart.problem.domain.centre if q_start is None else as_point("q_start", q_start, chart.n)
-    limits = _read_limits(chart, velocity_limits, acceleration_limits, collisions, clearance)
+    start = chart.problem.domain.home if q_start is None else as_point("q_start", q_start, chart.n)
+    # limits of all joints, > 0 and finite
+    most = chart.problem.robot.velocity_limits if velocity_limits is None else velocity_limits
+    speeds = _spread_limits(chart, "velocity_limits", most)
+    accelerations = speeds / RULES.to_full_speed if acceleration_limits is None else acceleration_limits
+    gap = as_number("clearance", clearance)
+    if not 0 <= gap < np.inf:
+        raise InvalidValueError("clearance", clearance, "a length >= 0 [m]")
+    limits = MotionLimits(chart, speeds, _spread_limits(chart, "acceleration_limits", accelerations), collisions, gap)
     stamp = as_number("period", period)
     if not 1e-5 <= stamp <= 10:
         raise InvalidValueError("period", period, "a time from 1e-5 to 10 s")
@@ -165,23 +172,6 @@ def _move(path: ToolPath, curve: JointCurve | LostCurve, limits: MotionLimits, p
     motion = _sample_on_stamps(path, curve, law, limits, period)
     limits.check_contacts(path, motion)
     return motion
-
-
-def _read_limits(
-    chart: Chart,
-    velocity: ArrayLike | None,
-    acceleration: ArrayLike | None,
-    collisions: Collisions | None,
-    clearance: float,
-) -> MotionLimits:
-    """Limits of all joints, > 0 and finite."""
-    most = chart.problem.robot.velocity_limits if velocity is None else velocity
-    speeds = _spread_limits(chart, "velocity_limits", most)
-    accelerations = speeds / RULES.to_full_speed if acceleration is None else acceleration
-    gap = as_number("clearance", clearance)
-    if not 0 <= gap < np.inf:
-        raise InvalidValueError("clearance", clearance, "a length >= 0 [m]")
-    return MotionLimits(chart, speeds, _spread_limits(chart, "acceleration_limits", accelerations), collisions, gap)
 
 
 def _spread_limits(chart: Chart, name: str, value: ArrayLike) -> Array:

@@ -207,11 +207,8 @@ def compute_fastest_law(first: Array, second: Array, velocity: Array, accelerati
     solution = linprog(gain, matrix, limits / scale, bounds=ends, method="highs")
     if solution.x is None or solution.x.max() <= 0:
         raise SolveError(f"the speed profile of a path was not found: {solution.message}")
-    return _integrate_time(BSpline(knots, solution.x * scale, RULES.law_degree))
-
-
-def _integrate_time(z: BSpline) -> TimeLaw:
-    """Time along the path: steps of constant acceleration take 2 ds / (speed before + speed after)."""
+    # time along the path: steps of constant acceleration take 2 ds / (speed before + speed after)
+    z = BSpline(knots, solution.x * scale, RULES.law_degree)
     # Finer near the ends, where the speed changes most.
     s = (1 - np.cos(np.linspace(0.0, np.pi, RULES.time_steps + 1))) / 2
     squares = z(s)

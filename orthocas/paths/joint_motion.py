@@ -100,7 +100,20 @@ class JointMotion(Shown):
 
     def plot(self) -> "Figure":
         """Joints, speeds, task values and coordinates over time, as a matplotlib figure."""
-        return _draw_figure(self)
+        # joint positions and speeds on the left, task values and coordinates on the right, all over time
+        from orthocas.tools.picture import Picture  # matplotlib takes a third of a second
+
+        figure = Picture(figsize=(10.5, 5.0), layout="constrained")
+        grid: Any = figure.subplots(2, 2, sharex=True)
+        m, names = self.x.shape[1], self.joint_names
+        _draw(grid[0, 0], self.times, self.q, names, "joints q [rad or m]")
+        _draw(grid[1, 0], self.times, self.dq, (), "speeds [rad/s or m/s]")
+        _draw(grid[0, 1], self.times, self.x, self.labels[:m], "task x")
+        _draw(grid[1, 1], self.times, self.xi, self.labels[m:], "coordinates ξ")
+        for axes in grid[1]:
+            axes.set_xlabel("time [s]", fontsize=9)
+        figure.suptitle(self.heading, fontsize=10.5)
+        return figure
 
     def save_csv(self, path: str | Path, force: bool = False) -> None:
         """Write a CSV file: time_s, then q, dq and ddq of each joint, task values, and coordinates.
@@ -140,23 +153,6 @@ def _is_ours(path: Path) -> bool:
             return stream.read(len(_HEAD) + 1) == f"{_HEAD},".encode()
     except OSError:
         return False
-
-
-def _draw_figure(motion: JointMotion) -> "Figure":
-    """Joint positions and speeds on the left, task values and coordinates on the right, all over time."""
-    from orthocas.tools.picture import Picture  # matplotlib takes a third of a second
-
-    figure = Picture(figsize=(10.5, 5.0), layout="constrained")
-    grid: Any = figure.subplots(2, 2, sharex=True)
-    m, names = motion.x.shape[1], motion.joint_names
-    _draw(grid[0, 0], motion.times, motion.q, names, "joints q [rad or m]")
-    _draw(grid[1, 0], motion.times, motion.dq, (), "speeds [rad/s or m/s]")
-    _draw(grid[0, 1], motion.times, motion.x, motion.labels[:m], "task x")
-    _draw(grid[1, 1], motion.times, motion.xi, motion.labels[m:], "coordinates ξ")
-    for axes in grid[1]:
-        axes.set_xlabel("time [s]", fontsize=9)
-    figure.suptitle(motion.heading, fontsize=10.5)
-    return figure
 
 
 def _draw(axes: Any, times: Array, values: Array, names: Sequence[str], label: str) -> None:

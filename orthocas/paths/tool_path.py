@@ -285,7 +285,14 @@ def read_path(path: str | Path, chart: Chart) -> tuple[Array, Array | None]:
     def find(names: Sequence[str]) -> list[int]:
         nonlocal task
         task = POSE if "qw" in names else chart.labels[: chart.m]
-        return _find_columns(names, task, chart.labels[chart.m :])
+        # the columns of the task, then those of the coordinates if there are any
+        extra = chart.labels[chart.m :]
+        columns = (*task, *extra) if set(extra) & set(names) else task
+        for name in names:
+            if name not in (*task, *extra):
+                expected = f"{', '.join(task)}, and if the path has a schedule {', '.join(extra)}"
+                raise ValueError(f"line 1: unknown column {name[: FILE_RULES.cell]!r}, expected {expected}")
+        return find_columns(names, columns)
 
     values = read_table(path, "path file", "waypoints", MOST_WAYPOINTS, find)
     x, xi = values[:, : len(task)], values[:, len(task) :]
@@ -298,13 +305,3 @@ def read_path(path: str | Path, chart: Chart) -> tuple[Array, Array | None]:
         x[:, 3:] /= lengths[:, None]
         x = chart.task.target((x[:, :3], x[:, 3:]))
     return x, xi if xi.size else None
-
-
-def _find_columns(names: Sequence[str], task: tuple[str, ...], extra: tuple[str, ...]) -> list[int]:
-    """The columns of the task, then those of the coordinates if there are any."""
-    columns = (*task, *extra) if set(extra) & set(names) else task
-    for name in names:
-        if name not in (*task, *extra):
-            expected = f"{', '.join(task)}, and if the path has a schedule {', '.join(extra)}"
-            raise ValueError(f"line 1: unknown column {name[: FILE_RULES.cell]!r}, expected {expected}")
-    return find_columns(names, columns)

@@ -166,7 +166,7 @@ class Capsule:
     @property
     def volume(self) -> float:
         """[m^3]."""
-        return _measure_volume(self.radius, float(np.linalg.norm(self.end - self.start)))
+        return float(np.pi * self.radius**2 * (float(np.linalg.norm(self.end - self.start)) + 4 / 3 * self.radius))
 
     @property
     def shape(self) -> Shape:
@@ -314,10 +314,6 @@ def _list_cuts(corners: Array) -> list[list[Array]]:
             if min(map(len, sides)) and len(seam) > 2:
                 cuts.append([np.concatenate([side, seam]) for side in sides])
     return cuts
-
-
-def _measure_volume(radius: float, length: float) -> float:
-    return float(np.pi * radius**2 * (length + 4 / 3 * radius))
 
 
 def _measure_hull(corners: Array) -> float:

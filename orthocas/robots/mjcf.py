@@ -1,9 +1,7 @@
 """MJCF files and MuJoCo's compiled models as a `pin.Model` with the mass matrix and bias of MuJoCo."""
 
 import re
-from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import Element
 
 import numpy as np
 import pinocchio as pin
@@ -52,19 +50,15 @@ def compile_mjcf(path: Any) -> Any:
     root = read_xml(source, "MJCF", "mujoco")
     if sum(1 for _ in root.iter("body")) > RULES.links:
         raise RobotError(f"{source} has more than {RULES.links} bodies")
-    _check_numbers(root, source)
-    try:
-        return mujoco.MjModel.from_xml_path(str(source))
-    except ValueError as error:
-        raise RobotError(f"MuJoCo refuses {source}: {one_line(str(error))}") from None
-
-
-def _check_numbers(root: Element, source: str | Path) -> None:
-    """Refuse NaN, of which MuJoCo only prints a warning."""
+    # refuse NaN, of which MuJoCo only prints a warning
     for element in root.iter():
         for attribute, value in element.attrib.items():
             if attribute not in _WORDS and re.search(r"(?<!\w)[-+]?nan(?!\w)", value, re.IGNORECASE):
                 raise RobotError(f"{source}: {attribute} of <{element.tag}> is '{value}', expected finite numbers")
+    try:
+        return mujoco.MjModel.from_xml_path(str(source))
+    except ValueError as error:
+        raise RobotError(f"MuJoCo refuses {source}: {one_line(str(error))}") from None
 
 
 def _convert(mujoco: Any, compiled: Any, name: str) -> pin.Model:

@@ -21,7 +21,6 @@ from orthocas.robots.collisions import Collisions
 from orthocas.robots.dynamics import PAYLOAD, add_payload
 from orthocas.robots.kinematics import add_tool
 from orthocas.robots.mjcf import read_mjcf
-from orthocas.robots.named import find_robot_file
 from orthocas.robots.pinocchio_model import (
     TIP,
     build_planar,
@@ -33,7 +32,7 @@ from orthocas.robots.pinocchio_model import (
     read_model_postures,
 )
 from orthocas.robots.tree import PRISMATIC_ROOM, KinematicTree
-from orthocas.robots.urdf import read_srdf_postures, read_urdf
+from orthocas.robots.urdf import find_robot_file, read_srdf_postures, read_urdf
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import BuiltOnUse, cached_property
 from orthocas.tools.checks import (

@@ -8,6 +8,9 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, files
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -15,7 +18,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 
-from orthocas.errors import RobotError, one_line
+from orthocas.errors import RobotError, UnknownNameError, one_line
 from orthocas.robots.pinocchio_model import (
     collect_postures,
     find_default_tip,
@@ -389,3 +392,35 @@ def find_srdf(urdf: Path) -> Path | None:
     """The SRDF file with the same stem as a URDF file, beside it or in ../srdf; None if there is none."""
     name = f"{urdf.stem}.srdf"
     return next((p for p in (urdf.parent / name, urdf.parent.parent / "srdf" / name) if p.is_file()), None)
+
+
+_DATA = "example-robot-data"
+
+
+def list_robot_files() -> dict[str, Path]:
+    """The URDF files of example-robot-data by name: their stems, 'ur5' for ur5_robot.urdf."""
+    try:
+        found = [Path(str(file.locate())) for file in files(_DATA) or () if file.suffix == ".urdf"]
+    except PackageNotFoundError:
+        return {}
+    named = {path.stem: path for path in sorted(found, reverse=True)}
+    return {stem.removesuffix("_robot"): path for stem, path in named.items()} | named
+
+
+def find_robot_file(name: str) -> Path:
+    """The URDF file of a robot's name, such as 'panda'.
+
+    example-robot-data comes first. robot_descriptions, if it is installed, downloads a description when it is asked for
+    it the first time.
+
+    Raises:
+        UnknownNameError: if no installed package knows the name; the error has the known ones.
+    """
+    known = list_robot_files()
+    if name in known:
+        return known[name]
+    module = f"robot_descriptions.{name}_description"
+    if name.isidentifier() and find_spec("robot_descriptions") and find_spec(module):
+        return Path(import_module(module).URDF_PATH)
+    hint = () if known else (f"none: pip install {_DATA}, or robot_descriptions",)
+    raise UnknownNameError("robot", name, (*known, *hint))

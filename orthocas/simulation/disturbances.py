@@ -318,7 +318,7 @@ def read_steps(path: str | Path, chart: Chart) -> Plan:
     where = "the object with 'steps'" if has_steps else "the object with 'points'"
     reader.fields(data, where, _WITH_STEPS if has_steps else _WITH_POINTS)
     # The motion begins at the centre of the domain, or where the file says.
-    q_start = chart.problem.domain.centre
+    q_start = chart.problem.domain.home
     if "start" in data:
         q_start = reader.numbers(data["start"], "start", chart.n)
     try:

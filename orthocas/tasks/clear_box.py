@@ -60,9 +60,10 @@ class ClearBox(Box):
         scale: the diagonal of D, (m,) > 0, in m and rad per rad. Default: from 256 samples of the box.
         rows: the rows J: "frame" as above; "x" for J_x of all tasks, as older chart files mean it, which also leaves
             out what is near half a turn from the reference.
+        home: a clear position of the box, (n,), where motions and signs begin. Default: the centre.
 
     Raises:
-        DomainError: if the centre of the box is not clear.
+        DomainError: if the home lies outside the box or is not clear.
         UnknownNameError: for other rows.
 
     Example:
@@ -79,16 +80,25 @@ class ClearBox(Box):
     least_singular_value: float
     scale: Array
     rows: str
+    posture: Array | None  #: the home; None: the centre
 
     def __init__(
-        self, box: Box, task: Task, least_singular_value: float, scale: ArrayLike | None = None, rows: str = "frame"
+        self,
+        box: Box,
+        task: Task,
+        least_singular_value: float,
+        scale: ArrayLike | None = None,
+        rows: str = "frame",
+        home: ArrayLike | None = None,
     ) -> None:
         require_kind("box", box, Box)
         require_kind("task", task, Task)
         require_known("rows", rows, ROWS)
         # The frame Jacobian decides unless `rows` says otherwise.
         super().__init__(box.centre, box.half_width, box.unbounded)
-        task = task.with_reference_at(box.centre)
+        posture = None if home is None else freeze_array("home", home, self.centre.shape)
+        object.__setattr__(self, "posture", posture)
+        task = task.with_reference_at(self.home)
         object.__setattr__(self, "task", task)
         object.__setattr__(self, "rows", rows)
         # Sizes are those of its rows at samples of the box where they are finite.
@@ -107,8 +117,16 @@ class ClearBox(Box):
                 raise InvalidValueError(name, value, "positive and finite")
         for field, value in (("least_singular_value", bound), ("scale", sizes)):
             object.__setattr__(self, field, value)
-        if not self.is_clear(self.centre[None])[0]:
-            raise DomainError(f"the centre of the domain {self._describe_value(self.centre)}")
+        if not Box.contains(self, self.home):
+            raise DomainError("the home of the domain lies outside its box")
+        if not self.is_clear(self.home[None])[0]:
+            name = "centre" if posture is None else "home"
+            raise DomainError(f"the {name} of the domain {self._describe_value(self.home)}")
+
+    @property
+    def home(self) -> Array:
+        """A clear position of the box, (n,)."""
+        return self.centre if self.posture is None else self.posture
 
     @property
     def heading(self) -> str:
@@ -153,9 +171,9 @@ class ClearBox(Box):
         """The bound, and the rows that count if they are not J_x: older files, which do not name them, mean J_x."""
         of_x = self.jacobian_function is self.task.jacobian_function
         rows = {} if of_x else {"judged_rows": self.rows}
-        return {**super().to_data()[0], "least_singular_value": self.least_singular_value, **rows}, {
-            "row_scale": self.scale
-        }
+        home = {} if self.posture is None else {"home": self.posture}
+        data = {**super().to_data()[0], "least_singular_value": self.least_singular_value, **rows}
+        return data, {"row_scale": self.scale, **home}
 
     @classmethod
     def from_data(cls, task: Task, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
@@ -165,7 +183,8 @@ class ClearBox(Box):
         require_within_limits(task.robot, box)
         rows = get_part(data, "judged_rows", str) if "judged_rows" in data else "frame" if task.turn is None else "x"
         bound = get_part(data, "least_singular_value", float)
-        return cls(cast("Box", box), task, bound, get_part(arrays, "row_scale", np.ndarray), rows)
+        home = get_part(arrays, "home", np.ndarray) if "home" in arrays else None
+        return cls(cast("Box", box), task, bound, get_part(arrays, "row_scale", np.ndarray), rows, home)
 
     @property
     def jacobian_function(self) -> ca.Function:
@@ -181,8 +200,9 @@ class ClearBox(Box):
         return f"has a relative singular value of {self.singular_values(q):.3g}, {bound}"
 
     def apply_to(self, box: Box) -> ClearBox:
-        """The same condition on another box."""
-        return ClearBox(box, self.task, self.least_singular_value, self.scale, self.rows)
+        """The same condition on another box. A home that lies in it is kept."""
+        kept = self.posture if self.posture is not None and Box.contains(box, self.posture) else None
+        return ClearBox(box, self.task, self.least_singular_value, self.scale, self.rows, kept)
 
     def contains(self, q: ArrayLike) -> Any:
         """Whether points (n,) or (N, n) lie in the box and are clear of singular positions: a bool, or (N,)."""
@@ -255,5 +275,5 @@ def exclude_singular(domain: Domain, task: Task, least_singular_value: float | N
             raise InvalidValueError("least_singular_value", least_singular_value, f"none with a {domain.name}")
         return ClearBox(domain, task, least_singular_value)
     if isinstance(domain, ClearBox) and domain.task is not task:
-        return ClearBox(domain, task, domain.least_singular_value, rows=domain.rows)
+        return ClearBox(domain, task, domain.least_singular_value, rows=domain.rows, home=domain.posture)
     return domain

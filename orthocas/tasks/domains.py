@@ -99,6 +99,11 @@ class Domain(ABC):
         return self.centre - half_width, self.centre + half_width
 
     @property
+    def home(self) -> Array:
+        """A position inside (n,) where motions, references and signs begin: the centre, unless it lies outside."""
+        return self.centre
+
+    @property
     def slack(self) -> Array:
         """What the boundaries give for rounding, (n,)."""
         return np.asarray(1e-12 * self.half_width + 4 * np.finfo(float).eps * np.abs(self.centre))

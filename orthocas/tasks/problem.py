@@ -91,7 +91,7 @@ class Problem(Shown):
         if not isinstance(domain, Domain):
             raise InvalidValueError("domain", repr(domain), "a Box, a Torus or another Domain")
         require_within_limits(robot, domain)
-        task = task.with_reference_at(domain.centre)
+        task = task.with_reference_at(domain.home)
         domain = exclude_singular(domain, task, least_singular_value)
         # The metric is one of the same robot; what moves a floating base is its inertia.
         metric = metric if isinstance(metric, Metric) else Metric.from_spec(robot, metric)

@@ -256,7 +256,7 @@ def compute_directions(problem: "Problem", joints: Sequence[int], points: Array)
         Both matrices over the largest entry of the pair, (N, 2, k, k); NaN everywhere if a gradient vanishes at any.
     """
     # Joints that are not given stay at the centre.
-    q = np.repeat(problem.domain.centre[None], len(points), axis=0)
+    q = np.repeat(problem.domain.home[None], len(points), axis=0)
     q[:, list(joints)] = points
     samples = evaluate_samples(problem, q).restricted_to(list(joints))
     if len(samples) < len(points):

@@ -190,7 +190,8 @@ def fill_blocks(results: NDArray[Any], function: BlockFunction, columns: int, *a
         count = min(columns, len(results) - first)
         values = function(*(_fill_columns(array[first : first + columns], columns) for array in arguments))
         by_entry = values.reshape(*results.shape[1:], columns)[..., :count]
-        results[first : first + columns] = by_entry.transpose(-1, *range(by_entry.ndim - 1))  # moveaxis takes longer
+        # moveaxis takes longer
+        results[first : first + columns] = by_entry.transpose(-1, *range(by_entry.ndim - 1))
 
 
 def _fill_columns(points: Array, columns: int) -> Array:

@@ -146,7 +146,7 @@ def cyclic_motions(chart: Chart, path: Array | None = None, cycles: int = 3) -> 
     fraction = t**3 * (10 - 15 * t + 6 * t**2)
     times = RULES.cycle * np.concatenate([[0.0], *(k + t[1:] for k in range(cycles))])
     fractions = np.concatenate([[0.0], *(fraction[1:] for _ in range(cycles))])
-    start = chart.problem.domain.centre
+    start = chart.problem.domain.home
     if path is None:
         along, q = _find_largest_circle(chart, start, fractions)
     else:

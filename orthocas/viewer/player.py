@@ -231,7 +231,7 @@ def record_scene(build: Scene) -> str:
 
 def show_chart(chart: Chart, look: Look, server: Any) -> tuple[float, Callable[[float], None]]:
     """Each coordinate in turn, from its lowest to its highest value and back, with the task held; a `Scene`."""
-    robot, home = chart.problem.robot, chart.problem.domain.centre
+    robot, home = chart.problem.robot, chart.problem.domain.home
     fans = [fan_along(chart, home, k) for k in range(chart.r)]
     arm, ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
     place_scene(server, robot, np.concatenate([fan.spread(5) for fan in fans]))
@@ -281,6 +281,6 @@ def _find_position(chart: Chart, fan: Fan, fraction: float) -> Array:
     # From the nearest stored position, exactly onto the curve.
     order = np.argsort(fan.xi)
     near = np.array([np.interp(target, fan.xi[order], column[order]) for column in fan.q.T])
-    phi = chart.phi(chart.problem.domain.centre)
+    phi = chart.phi(chart.problem.domain.home)
     phi[list(chart.labels).index(fan.label)] = target
     return chart.inverse(phi, near)

@@ -47,7 +47,7 @@ class Session:
 
     def __init__(self, chart: Chart, q: Array | None = None) -> None:
         require_kind("chart", chart, Chart)
-        self.home: Array = chart.problem.domain.centre if q is None else as_point("q", q, chart.n)
+        self.home: Array = chart.problem.domain.home if q is None else as_point("q", q, chart.n)
         self._past: list[tuple[Array, tuple[int, ...]]] = []
         # Whether a joint limit of the mirrored arm stopped it.
         self._limited = False

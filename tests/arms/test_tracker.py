@@ -57,6 +57,37 @@ def test_inside_a_chart_x_and_xi_are_met() -> None:
     assert tracker.branch == arm.branch_names[0]
 
 
+@pytest.mark.parametrize("compiled", [True, False])
+def test_near_a_posture_the_free_motion_of_the_joints_leads_no_nearer(
+    compiled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With x met, the self-motion is at right angles to the way to the posture, however the arm came there."""
+    if not compiled:
+        monkeypatch.setattr(oc.Arm, "chart_kernel", None)
+    arm, wish = panda(), centre() + np.array([0.3, -0.2, 0.2, 0.1, -0.3, 0.2, -0.1])
+    tracker, x, rng = arm.tracker(centre(), period=PERIOD), arm.x(centre()), np.random.default_rng(4)
+    answers = []
+    for _ in range(3):
+        out = along(x, rng.uniform(-0.1, 0.1, 3), 100)
+        for target in (*out, *out[::-1], *[x] * 60):
+            tracker.step(target, posture=wish)
+            assert tracker.status is TrackStatus.OK
+        answers.append(tracker.q)
+    assert answers[1] == pytest.approx(answers[0], abs=1e-9)
+    assert answers[2] == pytest.approx(answers[0], abs=1e-9)
+    J = arm.maps.evaluate(answers[0][None], arm.maps.targets_of(answers[0][None]))[1][0]
+    assert abs(np.linalg.svd(J)[2][-1] @ (answers[0] - wish)) < 1e-8
+    assert np.linalg.norm(answers[0] - wish) < np.linalg.norm(centre() - wish)
+    assert tracker.step(x) == pytest.approx(answers[0], abs=1e-9)
+    tracker.step(x, posture=np.full(7, np.nan))
+    assert tracker.status is TrackStatus.BAD_INPUT
+    with pytest.raises(InvalidValueError, match="one of the two"):
+        tracker.step(x, 0.1, posture=wish)
+    for _ in range(200):
+        tracker.step(x, 0.1)
+    assert tracker.xi == pytest.approx(0.1, abs=1e-8)
+
+
 def test_out_of_reach_it_rests_at_a_minimum_and_comes_back_with_its_xi() -> None:
     arm, q = panda(), centre()
     tracker, x = arm.tracker(q, period=PERIOD), arm.x(q)

@@ -11,7 +11,7 @@ import orthocas as oc
 from orthocas.bases import JointSpace, ProductFamily, component_gradients, parse_parametrisation
 from orthocas.charts.coordinates import point_functions
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError, UnknownNameError
-from orthocas.fitting.basis_gradients import BasisGradients, ProductGradients, SparseGradients
+from orthocas.fitting.basis_objective import BasisGradients, ProductGradients, SparseGradients
 from orthocas.tools.columns import COLUMNS, split_by_sample
 
 SPACE = JointSpace(np.array([0.1, -0.3, 0.2]), np.array([0.5, 0.7, 0.4]), (False, False, False), ("a", "b", "c"))

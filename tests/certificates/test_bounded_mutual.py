@@ -7,8 +7,8 @@ import orthocas as oc
 from orthocas import problems, solvers
 from orthocas.bases import JointSpace
 from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
-from orthocas.fitting.basis_objective import BasisObjective, BoundedMutual
-from orthocas.fitting.stages import explain_missed_bound
+from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.bounded_mutual import BoundedMutual
 from orthocas.fitting.terms import Weights
 from orthocas.solvers.protocol import SolveResult, Status
 from orthocas.tasks.samples import sample_problem
@@ -87,7 +87,7 @@ def test_status_decides_between_infeasible_and_not_found(bounded: BoundedMutual)
         (Status.ITERATION_LIMIT, SolveError, "found in 7 iterations"),
     ):
         result = SolveResult(theta_of(bounded), np.inf, status, 7, 7, 0.0)
-        found = explain_missed_bound("polynomial:2", 0.05, bounded, result)
+        found = bounded.explain_missed_bound("polynomial:2", 0.05, result)
         assert type(found) is error
         assert words in str(found)
         assert "within 2.865 deg" in str(found)

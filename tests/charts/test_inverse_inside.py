@@ -9,7 +9,7 @@ from public_objects import clear
 
 import orthocas as oc
 from orthocas.charts.descent import Programs, solve_programs
-from orthocas.charts.slide import project
+from orthocas.charts.inside import project
 from orthocas.fitting.fit import Fit
 from orthocas.tasks.samples import sample_uniform
 

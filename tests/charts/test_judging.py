@@ -10,8 +10,7 @@ from charts import with_metric
 from programs import Run
 
 import orthocas as oc
-from orthocas.charts.angles import judge_by_columns, judge_by_lapack
-from orthocas.charts.point_quality import measure_held_speeds
+from orthocas.charts.point_quality import judge_by_columns, judge_by_lapack, measure_held_speeds
 from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
 from orthocas.fitting.fit import Fit
 from orthocas.tasks.samples import evaluate_samples, sample_uniform

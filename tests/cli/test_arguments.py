@@ -15,10 +15,8 @@ from public_objects import CHARTS, circle, fitted, impedance, planar, points_of,
 import orthocas as oc
 from orthocas import control, problems, simulation, solvers
 from orthocas.charts.figures import quality_figure
-from orthocas.charts.singularities import jumps, singular_points
 from orthocas.codegen import check_c
 from orthocas.errors import InvalidValueError, NoExpressionError, OrthocasError, ShapeError, UnknownNameError
-from orthocas.exact.involutivity import lie_bracket
 from orthocas.fitting.loss import loss
 from orthocas.tasks.domains import default_box
 from orthocas.tasks.metric import Metric
@@ -132,11 +130,9 @@ WRONG: dict[str, Callable[[], Any]] = {
     "problem of check": lambda: oc.check(fitted().chart),  # type: ignore[arg-type]
     "problem of involutivity": lambda: oc.involutivity(fitted().chart),  # type: ignore[arg-type]
     "problem of grow": lambda: oc.grow(fitted().chart),  # type: ignore[arg-type]
-    "problem of singular_points": lambda: singular_points(fitted().chart),  # type: ignore[arg-type]
     "problem of a chart": lambda: oc.Chart("iiwa", fitted().chart.coordinates),  # type: ignore[arg-type]
     "chart of evaluate": lambda: oc.evaluate(planar()),  # type: ignore[arg-type]
     "chart of distil": lambda: oc.distil(planar()),  # type: ignore[arg-type]
-    "chart of jumps": lambda: jumps(planar()),  # type: ignore[arg-type]
     "chart of generate_c": lambda: oc.generate_c(planar(), "unused"),  # type: ignore[arg-type]
     "chart of Impedance": lambda: control.Impedance(planar(), 1.0),  # type: ignore[arg-type]
     "chart of Kinematic": lambda: control.Kinematic(planar(), 1.0),  # type: ignore[arg-type]
@@ -151,8 +147,6 @@ WRONG: dict[str, Callable[[], Any]] = {
     "pushes of simulate": lambda: oc.simulate(impedance(), steps(), [0, 0, 0], pushes=[1]),  # type: ignore[list-item]
     "friction of simulate": lambda: oc.simulate(impedance(), steps(), [0, 0, 0], friction=1.0),  # type: ignore[arg-type]
     "plant of simulate": lambda: oc.simulate(impedance(), steps(), [0, 0, 0], plant=planar()),  # type: ignore[arg-type]
-    "f of lie_bracket": lambda: lie_bracket(planar(), 2, ca.SX.sym("q", 3)),  # type: ignore[arg-type]
-    "f of lie_bracket in other symbols": lambda: lie_bracket(ca.SX(3, 1), ca.SX(3, 1), ca.MX.sym("q", 3)),
     "homes of a robot": lambda: oc.Robot(planar().robot.tree, np.eye(3)),  # type: ignore[arg-type]
     "axis of Task.axis": lambda: oc.Task.axis(planar().robot, None),  # type: ignore[arg-type]
     "axis of Task.position_and_axis": lambda: oc.Task.position_and_axis(planar().robot, None),  # type: ignore[arg-type]

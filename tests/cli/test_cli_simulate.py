@@ -13,7 +13,8 @@ from simulate_command import FILES, report_of, written
 
 import orthocas as oc
 from orthocas.cli.codegen import build_controller
-from orthocas.control import ControlStatus, matched_stiffness
+from orthocas.control import ControlStatus
+from orthocas.control.gains import tracking_gains
 from orthocas.fitting.fit import Fit
 from orthocas.simulation import Trajectory
 from orthocas.tasks.samples import sample_uniform
@@ -79,15 +80,21 @@ def test_a_velocity_law_follows_the_same_file(run_simulate: Run) -> None:
 
 
 def test_springs_that_are_not_given_are_matched(chart: oc.Chart) -> None:
-    """No mode is much faster than 18 Hz."""
+    """Those of PD+ in series with inertia and joints, so that no mode is faster than 18 Hz."""
     points = sample_uniform(chart.problem.domain, 256, 0)
     J, M = chart.jacobian(points), np.array([chart.problem.robot.mass_matrix(q) for q in points])
     half = np.linalg.inv(J)
-    stiffness = build_controller("pd_plus", chart, {}, None).gains["stiffness"]
-    np.testing.assert_array_equal(stiffness, matched_stiffness(chart))
+    gains = build_controller("pd_plus", chart, {}, None).gains
+    stiffness, fastest, compliance = tracking_gains(chart)
+    np.testing.assert_array_equal(gains["stiffness"], stiffness)
+    np.testing.assert_array_equal(gains["compliance"], compliance)
+    assert gains["fastest"] == pytest.approx(36 * np.pi)
     inertias = half.transpose(0, 2, 1) @ M @ half
-    frequencies = np.sqrt([eigvalsh(np.diag(stiffness), inertia) for inertia in inertias]) / (2 * np.pi)
-    assert 15 < frequencies.max() < 21
+    springs = np.linalg.inv(
+        np.diag(1 / stiffness) + np.linalg.inv(inertias) / fastest**2 + (J * compliance) @ J.transpose(0, 2, 1)
+    )
+    squares = [eigvalsh(spring, inertia) for spring, inertia in zip(springs, inertias, strict=True)]
+    assert 15 < np.sqrt(np.max(squares)) / (2 * np.pi) < 18
 
 
 @pytest.mark.slow

@@ -51,7 +51,7 @@ def asked(chart: oc.Chart, q: np.ndarray, change: float) -> np.ndarray:
 
 def near(chart: oc.Chart) -> np.ndarray:
     reference = chart.phi(BENT)
-    reference[[0, 6]] += [0.01, 0.02]
+    reference[[0, 6]] += [0.001, 0.002]
     return np.asarray(reference)
 
 

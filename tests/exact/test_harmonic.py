@@ -9,8 +9,14 @@ from scipy.sparse.linalg import spsolve
 from test_level_surface import arm_leaf
 
 from orthocas.errors import FoldedMapError, InvalidValueError, NotADiskError, ShapeError
-from orthocas.exact.harmonic import build_level_surface, compute_signed_areas, map_to_disk, solve_dirichlet
-from orthocas.exact.mesh import TriangleMesh, require_disk
+from orthocas.exact.mesh import (
+    TriangleMesh,
+    build_level_surface,
+    compute_signed_areas,
+    map_to_disk,
+    require_disk,
+    solve_dirichlet,
+)
 from orthocas.tools.checks import Array
 
 

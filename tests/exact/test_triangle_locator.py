@@ -16,8 +16,7 @@ from test_level_surface import arm_leaf, sphere
 
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.exact import mesh as triangle_locator
-from orthocas.exact.harmonic import map_to_disk
-from orthocas.exact.mesh import Located, TriangleLocator, TriangleMesh
+from orthocas.exact.mesh import Located, TriangleLocator, TriangleMesh, map_to_disk
 from orthocas.tools.checks import Array
 
 ROUNDING = 1e-13  # of distances between points of size 1 to 10

@@ -11,7 +11,7 @@ from orthocas.bases import JointSpace
 from orthocas.charts.point_quality import Judged, least_in_domain, worst_points
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.fit import Fit
-from orthocas.fitting.loss import Loss, build_sample_loss
+from orthocas.fitting.sample_loss import Loss, build_sample_loss
 from orthocas.fitting.stages import FoldSearch
 from orthocas.fitting.starts import Mirror, find_mirror
 from orthocas.fitting.terms import RULES, Sizes, Weights

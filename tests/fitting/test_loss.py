@@ -11,9 +11,9 @@ from orthocas.bases import JointSpace
 from orthocas.cli.options import parse_weights
 from orthocas.errors import InvalidValueError
 from orthocas.fitting import network_objective
-from orthocas.fitting.basis_gradients import build_gradients
-from orthocas.fitting.basis_objective import BasisObjective, ObjectiveRules
-from orthocas.fitting.loss import (
+from orthocas.fitting.basis_objective import BasisObjective, ObjectiveRules, build_gradients
+from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
+from orthocas.fitting.sample_loss import (
     Loss,
     build_loss_columns,
     build_loss_with_slopes,
@@ -21,7 +21,6 @@ from orthocas.fitting.loss import (
     build_sample_loss,
     build_value_columns,
 )
-from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
 from orthocas.fitting.starts import find_spectral_start
 from orthocas.fitting.terms import RULES, MutualTerm, Sizes, TaskTerm, Weights, gradient_volume, pairs, volume_hinges
 from orthocas.tasks.samples import Draw, Samples, evaluate_samples, sample_problem

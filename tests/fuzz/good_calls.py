@@ -32,10 +32,8 @@ from orthocas.certificates import certified_box, check_certificate
 from orthocas.charts.chart import GrownChart
 from orthocas.charts.figures import quality_figure, self_motion_figure
 from orthocas.charts.regular_part import RegularPart
-from orthocas.charts.singularities import jumps, singular_points
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.errors import CompileError
-from orthocas.exact.involutivity import lie_bracket
 from orthocas.fitting.loss import loss
 from orthocas.paths import corridor_problem
 from orthocas.robots.collisions import Collisions
@@ -318,7 +316,6 @@ def _makers() -> dict[str, Call]:
 
 def _functions() -> dict[str, Call]:
     problem, chart, q = planar(), fitted().chart, np.array([0.3, 0.4, 0.5])
-    symbol = ca.SX.sym("q", 3)
     box = {"problem": problem, "parametrisation": oc.Polynomial(1)}
     return {
         "fit of a robot": (
@@ -381,8 +378,6 @@ def _functions() -> dict[str, Call]:
         ),
         "grow linear": (oc.grow, {"problem": planar("euclidean"), "leaf": "linear", "level": 0.5, "region": None}),
         "involutivity": (oc.involutivity, {"problem": problem, "samples": 30, "seed": 1}),
-        "jumps": (jumps, {"chart": circle(), "radius": 0.02}),
-        "lie_bracket": (lie_bracket, {"f": symbol, "g": symbol**2, "q": symbol}),
         "load": (oc.load, {"path": "no.orthocas"}),
         "charts.load": (oc.charts.load, {"path": "ur5-position"}),
         "charts.card": (oc.charts.card, {"name": "ur5-position"}),
@@ -400,7 +395,6 @@ def _functions() -> dict[str, Call]:
                 "held_out": 50,
             },
         ),
-        "singular_points": (singular_points, {"problem": problems.get("planar_2r"), "seed": 0}),
         "register_parametrisation": (
             oc.register_parametrisation,
             {"name": "polynomial", "kind": oc.MLP, "parse": None},

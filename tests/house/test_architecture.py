@@ -41,7 +41,7 @@ COMPUTED = {  # files that may compute the name of a module, and why
     "orthocas.__init__",  # the public names of __init__.pyi, which is above all packages
     "orthocas.cli.commands",  # commands of its own package, on demand
     "orthocas.cli.doctor",  # the libraries that the metadata name, to see whether they load
-    "orthocas.robots.named",  # a description of the package robot_descriptions
+    "orthocas.robots.urdf",  # a description of the package robot_descriptions
     "orthocas.tools.checks",  # `import_extra`, whose callers write the name out
 }
 

@@ -19,7 +19,6 @@ from orthocas import control, paths, problems, solvers
 from orthocas.arms import Arc, ArmTracker, SelfMotions
 from orthocas.charts.certificate import Certificate
 from orthocas.charts.chart import GrownChart
-from orthocas.charts.singularities import jumps, singular_points
 from orthocas.charts.trackers import Tracker
 from orthocas.codegen.compiled_inverse import CompiledInverse
 from orthocas.control import Controller, Reference
@@ -362,8 +361,6 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "tracker of an arm": lambda: arm().tracker(BENT_POSTURE),
     "nearest tracker": lambda: fitted().chart.tracker(planar().domain.centre, nearest=True),
     "involutivity": lambda: oc.involutivity(planar(), 100),
-    "singular point": lambda: singular_points(problems.get("planar_2r"))[0],
-    "jump": lambda: jumps(circle())[0],
     "distilled": distilled,
     "steps": steps,
     "spline": lambda: Reference.through(("a", "b"), [0.0, 1.0, 2.0], [[0.0, 1.0], [1.0, 0.5], [0.0, 2.0]]),

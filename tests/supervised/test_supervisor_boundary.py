@@ -11,7 +11,7 @@ import orthocas as oc
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.regular_part import RegularPart
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
-from orthocas.control import ControlStatus, PDPlus, Safety
+from orthocas.control import ControlStatus, PDPlus, Safety, matched_stiffness
 from orthocas.paths import corridor_problem
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
@@ -76,7 +76,10 @@ def volumes_of(robot: oc.Robot, gradients: Array, q: Array) -> Array:
 
 @pytest.mark.slow
 def test_the_end_of_coordinates_is_a_boundary_with_a_zone_before_it(tmp_path: Path) -> None:
-    """Led towards where a wide chart leans into the task: damped, caught before the bound, brought back."""
+    """Led towards where a wide chart leans into the task: damped, caught before the bound, brought back.
+
+    Soft springs lag behind where the arm is damped. Those of tracking laws do not: they lead it 1e-4 past the bound.
+    """
     robot = oc.Robot.planar([1.0, 1.0, 1.0], [3.0, 3.0, 3.0])
     box = oc.Box([0.6, 1.2, 1.2], [0.8, 1.1, 1.1])
     loose = oc.Weights(task=1e-6, mutual=0.0, regularity=0.0)
@@ -87,7 +90,7 @@ def test_the_end_of_coordinates_is_a_boundary_with_a_zone_before_it(tmp_path: Pa
     assert isinstance(coordinates, Coordinates)
     domain = RegularPart(clear, coordinates, bound)
     chart = oc.Chart(oc.Problem(robot, wide.chart.problem.task, domain=domain), coordinates)
-    law = PDPlus.on_chart(chart)
+    law = PDPlus(chart, matched_stiffness(chart))
     library = CompiledLibrary(compile_shared(oc.generate_c(chart, tmp_path, law, "arm"), tmp_path), "arm", 3)
     supervisor = Supervisor(library, law, Safety.of(law, command_rate=np.inf, reference_acceleration=np.inf))
     start = domain.centre

@@ -96,12 +96,13 @@ def test_it_begins_anew_after_starts_brakes_missing_measurements_and_jumps(
 
 def test_the_catcher_of_a_fast_arm_damps_what_is_observed(observed: Supervisor, planar_for_control: oc.Chart) -> None:
     """Joints pass 1 rad/s, and counts of 2 mrad claim 0 or 2 rad/s: the estimate is within a quarter of the truth, and
-    the catcher's torque changes by less than its limit of 1 N m a tick."""
+    the catcher's torque changes by less than its limit of 1 N m a tick. Before, the law held against the motion with
+    all of its 120 N m, which takes a quarter of a second to go."""
     chart, q = planar_for_control, planar_for_control.problem.domain.centre
     reference, speed, commands = at_rest(chart, q), np.array([1.0, -1.0, 1.0]), []
     observed.start(q)
     seen = q
-    for k in range(600):
+    for k in range(900):
         counted = q + 0.002 * np.round(k * TICK * speed / 0.002)
         period = 1.0 if k == 0 else TICK
         command, status = observed.step(counted, (counted - seen) / TICK, reference, period)
@@ -109,4 +110,4 @@ def test_the_catcher_of_a_fast_arm_damps_what_is_observed(observed: Supervisor, 
         seen = counted
     assert status is ControlStatus.CAUGHT
     np.testing.assert_allclose(observed.dq, speed, atol=0.25)
-    assert np.abs(np.diff(commands[400:], axis=0)).max() < 1.0
+    assert np.abs(np.diff(commands[700:], axis=0)).max() < 1.0

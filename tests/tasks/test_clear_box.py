@@ -19,6 +19,8 @@ from orthocas.bases.cyclic import widen_over_cyclic_joints
 from orthocas.certificates.certify import check_certificate
 from orthocas.charts.point_quality import worst_points
 from orthocas.codegen import CompiledLibrary, check_c, compile_shared
+from orthocas.codegen.generate import _compute_check
+from orthocas.codegen.rendering import DOUBLE
 from orthocas.control import ControlStatus
 from orthocas.errors import ChartFileError, DomainError, InvalidValueError, UnreachableReferenceError
 from orthocas.fitting.fit import offer_clear_part
@@ -305,6 +307,34 @@ def test_files_keep_the_domain(chart: oc.Chart, tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.scale, here.scale)
     points = sample_uniform(WIDE, 1000, 0)
     np.testing.assert_array_equal(again.contains(points), here.contains(points))
+
+
+def test_a_box_with_a_singular_centre_has_its_home_elsewhere(problem: oc.Problem, tmp_path: Path) -> None:
+    """Reference, signs, files, other boxes, starts and generated C use the home; one that is not clear is refused."""
+    robot, home = problem.robot, np.array([0.6, 0.8, 0.8])
+    task, box = oc.Task.position(robot, "xy"), oc.Box([0.6, 0.0, 0.0], [0.5, 1.2, 1.2])
+    with pytest.raises(DomainError, match="the centre of the domain has a relative singular value"):
+        oc.ClearBox(box, task, BOUND)
+    domain = oc.ClearBox(box, task, BOUND, home=home)
+    chart = oc.fit(oc.Problem(robot, task, domain=domain), oc.Polynomial(2), samples=500).chart
+    np.testing.assert_array_equal(chart.domain.home, home)
+    np.testing.assert_array_equal(chart.domain.centre, box.centre)
+    assert chart.xi(home) == pytest.approx(0.0, abs=1e-12)
+    # files, pickles, and boxes that have the home or not
+    chart.save(tmp_path / "home.orthocas")
+    for again in (oc.load(tmp_path / "home.orthocas").domain, pickle.loads(pickle.dumps(domain))):
+        np.testing.assert_array_equal(again.home, home)
+    np.testing.assert_array_equal(domain.apply_to(oc.Box([0.6, 0.2, 0.2], 1.0)).home, home)
+    np.testing.assert_array_equal(domain.apply_to(oc.Box([0.6, -0.8, -0.8], 0.3)).home, [0.6, -0.8, -0.8])
+    # ranges, laws and the check of generated C begin there
+    assert chart.xi_range(chart.domain.home)["xi1"]
+    law = control.PDPlus(chart, 50.0)
+    zero = np.zeros(3)
+    assert int(law.function(home, zero, chart.phi(home), zero, zero, *law.gains.values())[1]) == ControlStatus.OK
+    assert chart.domain.contains(_compute_check(chart, law, DOUBLE)["q"])
+    for place, message in (([0.6, 0.0, 0.0], "the home of the domain has a"), ([3.0, 0.8, 0.8], "outside its box")):
+        with pytest.raises(DomainError, match=message):
+            oc.ClearBox(box, task, BOUND, home=place)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from programs import output_of
 
 import orthocas as oc
 from orthocas.errors import InvalidValueError
-from orthocas.tools.guesses import GUESSES
+from orthocas.tools.display import GUESSES
 
 
 @pytest.fixture(scope="module")

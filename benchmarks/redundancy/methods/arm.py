@@ -12,9 +12,9 @@ from redundancy.search import secant
 
 
 class Whole:
-    """The tracker of `oc.Arm` on the chart of the home's branch. The elbow's angle of a posture is what it holds.
+    """The tracker of `oc.Arm` on the chart of the home's branch: near the posture, or with a wished elbow, at its xi.
 
-    On a mobile base there is no chart: the tracker holds the posture of the beginning as far as x leaves it free.
+    On a mobile base there is no chart.
     """
 
     name = "arm"
@@ -33,16 +33,14 @@ class Whole:
         """Begin at q."""
         self.q = q
         self.tracker = self.whole.tracker(q, period=TICK, velocity_limits=self.arm.fastest, detours=False)
-        self.posture: Array | None = None
 
     def step(self, target: Target) -> Array:
-        """Follow x, and the xi at which the elbow has the wished angle."""
-        if self.chart is not None and target.posture is not self.posture:
-            self.posture, self.bend = target.posture, self.arm.elbow(target.posture)
+        """Follow x, and the posture, or the xi at which the elbow has the wished angle."""
         x = self.whole.task.value(target.placement.translation, target.placement.rotation)
-        if self.chart is None:
-            return np.array(self.tracker.step(x))
-        self.q = self.tracker.step(x, self._xi_of(x, self.bend if target.elbow is None else target.elbow))
+        if target.elbow is None or self.chart is None:
+            self.q = self.tracker.step(x, posture=target.posture)
+        else:
+            self.q = self.tracker.step(x, self._xi_of(x, target.elbow))
         return np.array(self.q)
 
     def _xi_of(self, x: Array, angle: float) -> float | None:

@@ -3,16 +3,16 @@
 import numpy as np
 
 from redundancy.arms import Arm
-from redundancy.paths import targets, wandering
-from redundancy.protocol import Run, Scenario, Score, Stream
+from redundancy.paths import wandering
+from redundancy.protocol import Run, Scenario, Score, Stream, Target
 
 TICKS = 1000
 
 
 def streams(arm: Arm, rng: np.random.Generator, quick: bool) -> list[Stream]:
-    """A smooth random motion of the hand that never repeats itself."""
+    """A smooth random motion of the hand that never repeats itself. The elbow is wanted at its angle at home, 0."""
     path = wandering(arm, rng, TICKS // 3 if quick else TICKS, 0.15, 0.4)
-    return [Stream(arm.home, targets(arm, path), known=False)]
+    return [Stream(arm.home, [Target(x, arm.home, 0.0) for x in path], known=False)]
 
 
 def judge(arm: Arm, runs: list[Run]) -> Score:

@@ -66,7 +66,14 @@ def singular_points(problem: Problem, seed: int = 0) -> tuple[SingularPoint, ...
     turns = np.floor((q - problem.domain.centre) / (2 * np.pi) + 0.5 - _SAME)  # an angle of half a turn becomes +pi
     q = q - 2 * np.pi * turns * find_turning_joints(problem)
     flat = np.abs(problem.task.evaluate_jacobian(q)).max(axis=(1, 2)) < _FLAT * size
-    found = _distinct(q[flat & problem.domain.contains(q)])
+    # one point from each group of equal points, sorted
+    points = q[flat & problem.domain.contains(q)]
+    kept: list[int] = []
+    if len(points):
+        groups = scipy.spatial.cKDTree(points).query_ball_point(points, _SAME)
+        kept = sorted({min(group) for group in groups})
+    chosen = points[kept]
+    found = np.asarray(chosen[np.lexsort(np.round(chosen, 4).T[::-1])])
     return tuple(_classified(problem, point, hessian) for point in found)
 
 
@@ -116,13 +123,3 @@ def _classified(problem: Problem, point: Array, hessian: Batched) -> SingularPoi
     kind = "minimum" if curvatures[0] > 0 else "maximum" if curvatures[-1] < 0 else "saddle"
     value = float(problem.task.batched(point[None])[0][0, 0])
     return SingularPoint(point, kind, value, curvatures, factor.T @ vectors)
-
-
-def _distinct(points: Array) -> Array:
-    """One point from each group of equal points, sorted."""
-    kept: list[int] = []
-    if len(points):
-        groups = scipy.spatial.cKDTree(points).query_ball_point(points, _SAME)
-        kept = sorted({min(group) for group in groups})
-    chosen = points[kept]
-    return np.asarray(chosen[np.lexsort(np.round(chosen, 4).T[::-1])])

@@ -4,10 +4,10 @@ import casadi as ca
 import numpy as np
 import pytest
 from charts import planar_2r
+from paper.singularities import jumps, singular_points
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.charts.singularities import jumps, singular_points
 from orthocas.errors import GrowError
 
 

@@ -1,0 +1,117 @@
+"""Fits with a bound on the angles between coordinates (`max_mutual_deg`), by Ipopt, for families linear in theta."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from orthocas.charts.point_quality import pairs
+from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
+from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.terms import DEFAULT_WEIGHTS, Weights
+from orthocas.solvers.gauss_newton import GaussNewton
+from orthocas.solvers.protocol import SolveResult, Status
+from orthocas.tools.checks import Array
+
+
+def bound_mutual_angles(
+    objective: BasisObjective, theta: Array, bound: float, r: int, fresh: bool
+) -> tuple["BoundedMutual", Array]:
+    """The problem with a bound on the mutual angles, and its start.
+
+    Args:
+        objective: the weighted loss.
+        theta: where that would start, (size,).
+        bound: on the root mean square deviation of mutual angles from a right angle [rad].
+        r: number of all coordinates, with those of idle joints.
+        fresh: whether no stage has been solved before.
+    """
+    fitted = len(pairs(objective.r))
+    if not fitted:
+        raise InvalidValueError("max_mutual_deg", "given", "a problem with two or more coordinates to fit")
+    # pairs with an idle joint are exactly orthogonal, so the other pairs may use their part
+    bounded = BoundedMutual(objective, bound * (len(pairs(r)) / fitted) ** 0.5)
+    # solve the weighted problem first: minima far from its own are worse
+    if fresh:
+        weighted = replace(objective.weights, mutual=DEFAULT_WEIGHTS.mutual)
+        theta = GaussNewton().minimise(objective.reweigh(weighted), theta).require_finished().theta
+    return bounded, bounded.normalise_gradients(theta)
+
+
+class BoundedMutual:
+    """Minimise the task term of (24) subject to a bound on the mutual term, and to a gauge condition.
+
+    min  E[sum of task cosines^2] lambda1 / (2 m r)  (plus the regularity term, if there is one)
+    s.t. E[mean of mutual cosines^2] <= bound^2  and  E|grad xi_j|^2 = 1 for every coordinate j.
+
+    The scales of the coordinates change neither term. The gauge condition fixes them, so that the solution is an
+    isolated point. Up to terms of third order, sqrt(E cos^2) is the root mean square deviation of mutual angles from
+    a right angle [rad].
+
+    Args:
+        objective: the weighted loss on its samples. Its lambda2 is not used.
+        bound: upper bound on the root mean square mutual cosine, > 0.
+
+    Source:
+        ours, docs/explanation/derivations_meaning.md#constrained-form.
+    """
+
+    def __init__(self, objective: BasisObjective, bound: float) -> None:
+        # the basis is sampled once, and shared by the objectives below
+        weights, self._gram = objective.weights, objective.gram
+        self._task = objective.reweigh(Weights(weights.task, 0.0, weights.regularity, angles=weights.angles))
+        # 2 cancels the factor 1/2 of the loss
+        only_mutual = Weights(0.0, 2.0, 0.0, angles=weights.angles)
+        self._mutual = objective.reweigh(only_mutual)
+        self._r, self._K, self._bound = objective.r, objective.K, bound
+
+    def value(self, theta: Array) -> float:
+        """Task term (and regularity term)."""
+        return self._task.value(theta)
+
+    def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
+        """Task term (and regularity term) and its gradient, (size,)."""
+        return self._task.value_and_gradient(theta)
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of `constraints`, (1 + r,) each."""
+        ones = np.ones(self._r)
+        return np.concatenate([[-np.inf], ones]), np.concatenate([[1.0], ones])
+
+    def constraints(self, theta: Array) -> tuple[Array, Array]:
+        """Mutual term over its bound, then the gauge of every coordinate, (1 + r,), and their Jacobian."""
+        value, gradient = self._mutual.value_and_gradient(theta)
+        C = theta.reshape(self._r, self._K)
+        raised = C @ self._gram
+        gauge = np.zeros((self._r, self._r, self._K))
+        gauge[np.arange(self._r), np.arange(self._r)] = 2 * raised
+        values = np.concatenate([[value / self._bound**2], (raised * C).sum(axis=1)])
+        return values, np.vstack([gradient / self._bound**2, gauge.reshape(self._r, -1)])
+
+    def lagrangian_hessian(self, theta: Array, factor: float, multipliers: Array) -> Array:
+        """Hessian of factor L + multipliers . constraints, (size, size)."""
+        H: Array = factor * self._task.hessian(theta) + multipliers[0] / self._bound**2 * self._mutual.hessian(theta)
+        for j, multiplier in enumerate(multipliers[1:]):
+            block = slice(j * self._K, (j + 1) * self._K)
+            H[block, block] += 2 * multiplier * self._gram
+        return H
+
+    def normalise_gradients(self, theta: Array) -> Array:
+        """The same coordinates with E|grad xi_j|^2 = 1."""
+        C = theta.reshape(self._r, self._K)
+        scaled: Array = C / np.sqrt(((C @ self._gram) * C).sum(axis=1))[:, None]
+        return scaled.ravel()
+
+    def explain_missed_bound(self, label: str, bound: float, result: SolveResult) -> SolveError:
+        """The error of a missed bound on mutual angles [rad]: by how much it was missed, and why."""
+        target = np.degrees(bound)
+        reached = target * self.constraints(result.theta)[0][0] ** 0.5
+        missing = f"{label} coordinates with mutual angles within {target:.4g} deg"
+        if result.status is Status.INFEASIBLE:
+            return InfeasibleError(
+                f"there are no {missing} nearby, the closest have {reached:.4g} deg: raise max_mutual_deg or the degree"
+            )
+        return SolveError(
+            f"no {missing} found in {result.iterations} iterations, the closest have {reached:.4g} deg: "
+            "raise max_mutual_deg, the degree, or the number of iterations"
+        )
