@@ -3,8 +3,8 @@
 Lines of 30 and 40 cm from Franka's ready posture, in random directions at constant orientation: of those that damped
 least squares can follow within the limits of position and velocity, how many the tracker follows, and how far xi goes.
 Streams of a minute that no operator would send: jumps to poses anywhere, out of reach, behind the base, numbers that
-are not finite, xi far outside; then the pose of the beginning for ten seconds. Poses of random postures within the limits,
-on arms of makers and of random shape. `--quick` takes few of each.
+are not finite, xi far outside; then the pose of the beginning for ten seconds. Poses of random postures within the
+limits, on arms of makers and of random shape. `--quick` takes few of each.
 """
 
 import time
@@ -83,7 +83,7 @@ def lead_astray(arms: dict[str, oc.Arm], seconds: float) -> Iterator[str]:
         robot, rng = arm.robot, np.random.default_rng(1)
         low, high, most = robot.lower, robot.upper, robot.velocity_limits * PERIOD
         home = np.array(arm.charts[0].domain.centre) if arm.charts else Arm(name).home
-        stream: list[tuple[Array, float | None]] = []
+        stream: list[tuple[Array, Array | None]] = []
         for number in range(int(seconds / PERIOD / HOLD)):
             x, kind = arm.x(sample(arm, rng, 1)[0]), number % 5
             if kind == 1:
@@ -94,11 +94,12 @@ def lead_astray(arms: dict[str, oc.Arm], seconds: float) -> Iterator[str]:
                 x[:2] *= -1.0
             for _ in range(HOLD):
                 shake = 1e-3 * rng.normal(size=6) if kind == 4 else 0.0
-                stream.append((x + shake, float(rng.uniform(-3, 3)) if arm.charts and rng.uniform() < 0.3 else None))
+                xi = rng.uniform(-3, 3, robot.n - 6) if arm.charts and rng.uniform() < 0.3 else None
+                stream.append((x + shake, xi))
         tracker, times, broken = arm.tracker(home, period=PERIOD), [], 0
         for x, xi in stream + [(arm.x(home), None)] * BACK:
             before, began = tracker.q, time.thread_time()
-            q = tracker.step(x, xi)
+            q = tracker.step(x, xi if xi is None or len(xi) > 1 else xi[0])
             times.append(time.thread_time() - began)
             broken += not ((q >= low) & (q <= high) & (np.abs(q - before) <= most * (1 + 1e-9))).all()
         lost = tracker.status not in (TrackStatus.OK, TrackStatus.YIELDING)
@@ -110,6 +111,7 @@ def lead_astray(arms: dict[str, oc.Arm], seconds: float) -> Iterator[str]:
 
 def find_poses(arms: dict[str, oc.Arm], count: int) -> Iterator[str]:
     """A row for each arm."""
+    arms = {name: arm for name, arm in arms.items() if arm.robot.n == 7}  # others have trackers only
     for name, arm in (arms | {f"random {k}": oc.Arm(oc.Task.pose(random_arm(k))) for k in RANDOM}).items():
         rng = np.random.default_rng(3)
         x = arm.x(sample(arm, rng, count))
