@@ -430,12 +430,12 @@ class MobileFamily:
 
     @property
     def as_matrices(self) -> bool:
-        """As the functions of the arm."""
+        """What the functions of the arm say."""
         return self.arm.as_matrices
 
     @property
     def width(self) -> int:
-        """As the functions of the arm."""
+        """What the functions of the arm say."""
         return self.arm.width
 
     def expression(self, q: Expression, theta: Expression) -> Expression:

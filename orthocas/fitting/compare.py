@@ -307,7 +307,7 @@ class CellResult:
 
     @property
     def names(self) -> tuple[str, str, str, str, int]:
-        """Those of its cell."""
+        """Names of its cell."""
         return self.problem, self.parametrisation, self.solver, self.weights, self.seed
 
     @property

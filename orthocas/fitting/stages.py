@@ -231,7 +231,7 @@ class WeightedSum:
 
 
 class LinearSum(WeightedSum):
-    """The same for families linear in theta, with second derivatives."""
+    """A weighted sum for families linear in theta, with second derivatives."""
 
     def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
         """The sum, its gradient and its Gauss-Newton matrix."""
@@ -473,7 +473,7 @@ class StageRunner:
         return fresh.restricted_to(self.active)
 
     def _gradients(self, family: LinearFamily) -> BasisGradients:
-        """Those of a basis, built once."""
+        """Gradients of a basis, built once."""
         if family not in self._bases:
             number = np.float32 if self.settings.single else np.float64
             self._bases[family] = build_gradients(family, self.space.n, number)

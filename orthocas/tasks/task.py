@@ -62,7 +62,7 @@ class Frames:
 
     @classmethod
     def from_recipe(cls, recipe: Mapping[str, Any]) -> Self:
-        """Those of a task's recipe."""
+        """Frames of a task's recipe."""
         return cls(recipe.get("frame"), recipe.get("relative_to"))
 
     @property
