@@ -316,11 +316,6 @@ def indices(cyclic: Cyclic, space: JointSpace) -> list[int]:
     return [k for k, name in enumerate(space.joint_names) if name in cyclic]
 
 
-def count(cyclic: Cyclic) -> int:
-    """Number of cyclic joints; 0 as long as "auto" has not been resolved."""
-    return 0 if cyclic == "auto" else len(cyclic)
-
-
 @dataclass(frozen=True)
 class Mobile:
     """Coordinates that turn and shift with a base that moves on a plane.
