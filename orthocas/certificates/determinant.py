@@ -165,6 +165,7 @@ class WaveSeries:
     @classmethod
     def build(cls, sums: "Sequence[Waves]", joints: Variables) -> "WaveSeries":
         """Build for sums that depend on these joints only."""
+        # frequencies of all sums, each up to its sign
         every = np.concatenate([each.frequencies[:, joints] for each in sums])
         kept = sorted({max(k, tuple(-i for i in k)) for k in map(tuple, every.tolist())})
         place = {k: i for i, k in enumerate(kept)}
@@ -176,10 +177,12 @@ class WaveSeries:
                     own[place[k]] += value
                 else:
                     own[place[tuple(-i for i in k)]] += np.conj(value)
+        # derivatives of each wave, as one table from cosines and sines
         waves: Array = np.array(kept, dtype=float).reshape(len(kept), len(joints))
         slopes = [np.prod(1j * waves[:, list(m)], axis=1) for m in list_indices(len(joints), SERIES_DEGREE)]
         products = c[:, None] * np.array(slopes)
         table = np.concatenate([products.real, -products.imag], axis=2).reshape(-1, 2 * len(kept))
+        # and what rounding adds
         sizes = np.abs(c) * UP
         rounding = RULES.roundings * UNIT * sizes.sum(axis=1)
         return cls(waves, sizes, table, (np.array([each.error for each in sums]) + rounding) * UP)

@@ -230,6 +230,7 @@ class Like:
         terms = []
         for k in range(len(self.names)):
             squares = (slopes[:, k, m:] ** 2).sum(axis=1)
+            # samples count alike, whatever the size of the quantity's rate there
             even = 1 / (np.median(squares) + squares)
             if r == 1:
                 even *= slopes[:, k, m] * np.median(slopes[:, k, m]) > 0

@@ -349,11 +349,13 @@ class StageRunner:
     def _build_objective(self, plan: Plan, samples: Samples, mirror: Mirror | None) -> tuple[Objective, Array]:
         """The loss of a family on samples, and the start in the parameters that it leaves free."""
         family, theta, settings = plan.family, plan.start, self.settings
+        # linear families: least squares in their coefficients
         if isinstance(family, LinearFamily):
             objective, start = self._build_in_basis(family, samples, theta, mirror)
             if settings.max_mutual is None:
                 return self.folds.add_to(objective), start
             return bound_mutual_angles(objective, start, settings.max_mutual, self.problem.r, fresh=theta is None)
+        # all others: networks by arrays, anything else by CasADi's graphs
         if settings.max_mutual is not None:
             expected = "a parametrisation linear in its parameters, such as polynomial"
             raise InvalidValueError("max_mutual_deg", f"given with {plan.label}", expected)
