@@ -16,7 +16,7 @@ from benchmark import run, table
 import orthocas as oc
 from orthocas.errors import PathError
 from orthocas.robots.collisions import Collisions
-from orthocas.robots.named import find_robot_file
+from orthocas.robots.urdf import find_robot_file
 from orthocas.tools.checks import Array
 
 LENGTH, STATIONS, STEP = 0.2, 60, 0.04  # [m]; of the search; along self-motions [rad]

@@ -222,7 +222,7 @@ class InverseMethods(PhiFunctions):
         return Solutions(q, status[order], steps, error, np.linalg.norm(own, axis=1), float(tolerance))
 
     def _prefer_free(self, targets: Array, found: Solutions, collisions: Collisions) -> Solutions:
-        """The same with free solutions in place of those that touch, where there are any."""
+        """Solutions with free ones in place of those that touch, where there are any."""
         rows = np.flatnonzero(np.isin(found.status, (InverseStatus.FOUND, InverseStatus.NEAREST)))
         # rows whose solution touches something
         rows = rows[~collisions.check_free(found.q[rows])] if rows.size else rows
@@ -488,7 +488,7 @@ class ChartParts:
         return ca.Function("rates", [q], [ca.densify(rows)], ["q"], ["rates"])
 
     def batched_rates(self, points: Array) -> Array:
-        """Those rows at points (N, n), (N, n, n); NaN where the task has no finite Jacobian."""
+        """The rows of `rates` at points (N, n), (N, n, n); NaN where the task has no finite Jacobian."""
         chart = self.chart
         J = np.empty((len(points), chart.n, chart.n))
         J[:, : chart.m] = self.relative.batched_rates(points)[0].reshape(-1, chart.m, chart.n)
@@ -545,7 +545,7 @@ class ChartParts:
 
     @cached_property
     def point_functions(self) -> PointFunctions:
-        """Those of trackers."""
+        """The functions that trackers and `solve` call for one row."""
         phi_map = self.phi_map
         phi = self.chart.function("phi")
         return PointFunctions.of(phi, self.rates, phi_map.sizes, phi_map.difference, self.chart.problem.turning)
