@@ -369,6 +369,7 @@ class FrictionObserver(_Correcting):
         db_i/dt = -s_i 60/s k_i d_i exp(-(dq_i / 5 mrad/s)^2) - b_i |dq_i| / 3 mrad,
 
     where clip is 0 below 0, and then between 0.2 and 1, so that nothing creeps.
+
     b breaks joints away: it grows where a joint is off and stands, and is forgotten as soon as it moves, so that its
     own friction stops it. Joints that are off by little, s_i = 0, are left alone. k_i is M_ii times the squared
     frequency of the law's fastest mode, in series with the joint's compliance, or twice the joint's limit, if that is
