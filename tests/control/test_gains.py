@@ -212,7 +212,7 @@ def test_default_gains_let_every_mode_of_a_wide_chart_settle_within_a_second(nam
 
 
 def test_integral_action_is_bounded_by_the_slowest_mode(planar_chart: oc.Chart) -> None:
-    """Poles of M de'' + D de' + K (e + z) = 0, z' = L e: stable below the bound with 2 M, unstable at twice the bound."""
+    """Poles of M de'' + D de' + K (e + z) = 0, z' = L e: stable below the bound with 2 M, lost at twice the bound."""
     law, domain, n = PDPlus(planar_chart, [200.0, 30.0, 5.0]), planar_chart.problem.domain, planar_chart.n
     points = sample_uniform(domain, 2000, 4)
     modes = law.modes(points)
