@@ -383,7 +383,8 @@ class FrictionObserver(_Correcting):
 
     Args:
         rate: > 0 [1/s].
-        bound: largest r and b of each joint, > 0, (n,) or one number [N m] or [N]; default half of the law's limit.
+        bound: largest r, b and correction of each joint, > 0, (n,) or one number [N m] or [N]; default half of the law's
+            limit.
         tolerance: errors of phi at which it stops, > 0, (n,) or one number; up to twice that may be left. Default
             0.25 mm, 5 mrad, and 0.01 of each xi.
 
@@ -437,7 +438,8 @@ class FrictionObserver(_Correcting):
         grown = b - growth * _clip(firmness * off, bound)
         b = _clip(grown * ca.exp(-ca.fabs(dq) * period / RULES.travel), bound)
         explained = inputs["command"] - model.feed_forward(law.problem.robot, inputs) + rate
-        values = {"expected": p, "drive": explained + r - b, "breakaway": b, "correction": b - r}
+        correction = _clip(b - r, bound)
+        values = {"expected": p, "drive": explained - correction, "breakaway": b, "correction": correction}
         return _build_memory(fields, inputs, {name: _replace_invalid(value) for name, value in values.items()})
 
     def _compute_fastest(self, law: _OperationalSpace) -> float:
