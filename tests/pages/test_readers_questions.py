@@ -55,6 +55,23 @@ SEARCHED = {
     "collision": "how-to/collisions",
     "collision avoidance": "how-to/collisions_in_motion",
     "install": "how-to/install",
+    "manipulability": "how-to/manipulability",
+    "xacro": "tutorials/own_arm",
+    "self-motion": "how-to/paths",
+    "trajectory": "how-to/paths",
+    "nullspace": "how-to/coming_from",
+    "arm angle": "how-to/elbow",
+    "redundancy resolution": "explanation/ideas",
+    "mobile manipulator": "how-to/mobile_base",
+    "URDF": "tutorials/own_arm",
+    "Franka": "how-to/robots",
+    "self-collision": "how-to/collisions",
+    "Jacobian": "how-to/casadi_dynamics",
+    "forward kinematics": "how-to/casadi_dynamics",
+    "jerk": "how-to/limits",
+    "TCP": "tutorials/own_arm",
+    "operational space": "explanation/projectors",
+    "stiffness": "explanation/control",
 }
 
 
