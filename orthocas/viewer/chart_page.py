@@ -6,6 +6,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.self_motion import Fan, fan_along
@@ -37,7 +38,7 @@ class ChartPage:
         self._arm, self._ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
         place_scene(server, robot, self.session.home[None])
         self._contacts = None if collisions is None else Contacts(server.scene, collisions)
-        self._handle = self._add_handle()
+        self._handle, self._rings = self._add_handle(), self._add_rings()
         self._readings = place_panels(server)
         self._sliders = self._add_sliders()
         self._add_buttons()
@@ -152,6 +153,27 @@ class ChartPage:
         handle.on_update(dragged)
         return handle
 
+    def _add_rings(self) -> Any:
+        """Rings that turn the tool about its own axes, if the task has its whole orientation."""
+        chart = self._chart
+        task, robot = chart.problem.task, chart.problem.robot
+        if not task.of_tip or task.turn is None or not task.turn.whole:
+            return None
+        size = RULES.rings * compute_chain_length(robot.tree)
+        rings = self._server.scene.add_transform_controls(
+            "/turn", scale=size, disable_axes=True, disable_sliders=True, depth_test=False, opacity=0.8
+        )
+        first = 3 if task.turn.with_position else 0
+
+        async def dragged(event: Any) -> None:
+            turned = task.value(np.zeros(3) if first else None, event.target.wxyz)[first:].tolist()
+            self._dragging = event.phase != "end"
+            labels = chart.labels[first : chart.m]
+            self._loop.ask("turn", lambda: self._move_towards(dict(zip(labels, turned, strict=True))))
+
+        rings.on_update(dragged)
+        return rings
+
     def _move_towards(self, values: dict[str, float]) -> None:
         """Move towards what the user wishes, as the first or a later part of a gesture."""
         self._rest()
@@ -226,8 +248,13 @@ class ChartPage:
         """Draw the arm and its handle, for a position of the chart (n,)."""
         with self._server.atomic():
             self._arm.show(self.session.mirror(q[None])[0])
-            if self._handle is not None and not self._dragging:
-                self._handle.position = tuple(self._chart.problem.robot.tip_position(q))
+            if self._dragging:
+                return
+            robot = self._chart.problem.robot
+            for handle in filter(None, (self._handle, self._rings)):
+                handle.position = tuple(robot.tip_position(q))
+            if self._rings is not None:
+                self._rings.wxyz = tuple(Rotation.from_matrix(robot.tip_rotation(q)).as_quat(scalar_first=True))
 
     def _settle(self) -> None:
         """After a gesture: ranges of the sliders, the fan, and values that were not reached."""

@@ -71,6 +71,9 @@ SEARCHED = {
     "jerk": "how-to/limits",
     "TCP": "tutorials/own_arm",
     "operational space": "explanation/projectors",
+    "nullspace projector": "explanation/projectors",
+    "closed chain": "explanation/limits",
+    "mimic joint": "explanation/limits",
     "stiffness": "explanation/control",
 }
 
