@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from orthocas.tools.checks import Array
 from orthocas.viewer.contacts import Contacts
 from orthocas.viewer.looks import RULES, Arm, Ghosts, Look, compute_chain_length
 from orthocas.viewer.panel import ChartPanel
-from orthocas.viewer.session import Session
+from orthocas.viewer.session import Session, describe_stop
 from orthocas.viewer.window import Loop, place_panels, place_scene, show_error
 
 _NONE = "none"
@@ -104,7 +105,7 @@ class ChartPage:
             self._branches = gui.add_folder("Other branches: the tip stays")
             with self._branches:
                 self._search = self._add_button("Search", "arrows-split", self._find_branches)
-        self._chosen.on_update(self._loop.build_handler("fan", self._show_fan))
+        self._chosen.on_update(self._loop.build_handler("fan", self._show_chosen))
 
     def _add_button(self, label: str, icon: str, job: Callable[[], None]) -> Any:
         button = self._server.gui.add_button(label, icon=icon)
@@ -236,7 +237,7 @@ class ChartPage:
             self._show_arm(readings.q)
             shown = replace(readings, q=self.session.mirror(readings.q[None])[0])
             nearest = "" if self._contacts is None else self._contacts.show(shown.q)
-            self._readings.content = self._panel.format_html(shown, nearest)
+            self._readings.content = self._panel.format_html(shown, nearest, self._format_ends())
             values = np.concatenate([readings.x, readings.xi]).tolist()
             for label, value in zip(self._chart.labels, values, strict=True):
                 slider = self._sliders[label]
@@ -269,12 +270,26 @@ class ChartPage:
             high = np.floor(max(ends) / RULES.slider_step) * RULES.slider_step
             if np.isfinite([low, high]).all():
                 slider.min, slider.max = round(float(min(low, high)), 3), round(float(max(low, high)), 3)
-        self._show()
-        self._show_fan()
+        self._show_chosen()
 
     def _find_fan(self) -> Fan | None:
         """The fan of the chosen coordinate."""
         return next((fan for fan in self._fans if fan.label == self._chosen.value), None)
+
+    def _show_chosen(self) -> None:
+        """Draw another coordinate's fan and ends."""
+        self._show()
+        self._show_fan()
+
+    def _format_ends(self) -> str:
+        """What ends the chosen coordinate, as a part of the readings; a mirrored arm ends elsewhere."""
+        fan = self._find_fan()
+        if fan is None or self.session.flips:
+            return ""
+        ends = ((fan.xi[0], fan.low_stop), (fan.xi[-1], fan.high_stop))
+        robot = self._chart.problem.robot
+        lines = [f"{value:.3f}: {escape(describe_stop(stop, robot))}" for value, stop in ends]
+        return f'<h4>ends of {escape(fan.label)}</h4><div class="about">{"<br>".join(lines)}</div>'
 
     def _show_fan(self) -> None:
         fan = self._find_fan()

@@ -76,6 +76,8 @@ def test_rings_turn_the_tool_of_a_pose_task() -> None:
         here = Rotation.from_matrix(robot.tip_rotation(home))
         np.testing.assert_allclose(np.abs(page._rings.wxyz @ here.as_quat(scalar_first=True)), 1, atol=1e-12)
         wished = here * Rotation.from_rotvec([0, 0, 0.2])
+        for end in (chart.xi_range(home)["xi1"].low_stop, chart.xi_range(home)["xi1"].high_stop):
+            assert end.joint in page._readings.content
         page._rings.wxyz = tuple(wished.as_quat(scalar_first=True))
         for phase in ("start", "update", "end"):
             asyncio.run(page._rings._impl_aux.update_cb[0](SimpleNamespace(target=page._rings, phase=phase)))
