@@ -103,7 +103,8 @@ class ChartPanel:
         lines = [escape(place)] if place else [f"branch {escape(branch)}"] if isinstance(branch, str) else []
         if not lines and problem.name:
             lines = [f"problem {escape(problem.name)}"]
-        lines += [f"{escape(chart.coordinates.label)}, {chart.n} joints"]
+        family, _, _ = chart.coordinates.label.partition(":cyclic")
+        lines += [f"{escape(family)}, {chart.n} joints"]
         lines += [f"task {task}; {chart.r} coordinate{'s' if chart.r > 1 else ''}"]
         self._head = f'<div class="name">{escape(name_robot(robot))}</div><div class="about">{"<br>".join(lines)}</div>'
 
