@@ -80,8 +80,8 @@ def read_urdf(path: str | Path, tips: Sequence[str] = (), locked: Mapping[str, f
     _check_macros(path, root)
     _add_lost_root(path, root)
 
-    # Missing limits of effort and velocity become 0, which means unlimited, as does -1 in some files. Joints without any
-    # limit become unlimited.
+    # Missing limits of effort and velocity become 0, which means unlimited, as does -1 in some files. Joints without
+    # any limit become unlimited.
     unlimited = []
     for joint in root.findall("joint"):
         if joint.get("type") in ("revolute", "prismatic") and joint.find("limit") is None:
