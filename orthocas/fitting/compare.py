@@ -198,10 +198,12 @@ def _build_cells(
     """
     cells = []
     for parametrisation in parametrisations:
+        # closed forms have one fit for all solvers, weights and seeds
         closed = parametrisation.closed_form is not None
         fitting = [choose_solver(parametrisation, first.problem)] if closed or solvers is None else solvers
         for solver, loss, seed in product(fitting, losses[:1] if closed else losses, range(1 if closed else seeds)):
             cell = replace(first, parametrisation=parametrisation, solver=solver, weights=loss, seed=seed)
+            # a chart file for each cell, refused before the first fit if it exists
             if folder is not None:
                 words = [parametrisation.label, solver.name if first.branch is None else WIDE, str(seed)]
                 words += [cell.weights_label] if len(losses) > 1 else []
@@ -219,6 +221,7 @@ def _check_grid(
     families: Any = parametrisations
     if isinstance(parametrisations, list | tuple):
         families = [parse_parametrisation(one) if isinstance(one, str) else one for one in parametrisations]
+    # members of the right kind, and names that differ: tables and files go by them
     for name, members, kinds, example in (
         ("parametrisations", families, Parametrisation, "Polynomial(degree=4)"),
         ("solvers", [GaussNewton()] if solvers is None else solvers, Solver, "GaussNewton()"),
