@@ -212,8 +212,8 @@ class Arm(Shown):
     def load(cls, path: str | Path) -> Self:
         """Read an arm file, or take a known arm by its name, such as "panda". Loading never runs code from a file.
 
-        "panda" and "iiwa7" have charts of all their branches, which `Arm.fit` made; the others have that of one branch,
-        `oc.load(f"{name}-wide")`.
+        "panda", "iiwa7", "xarm7" and "baxter-left" have charts of all their branches, which `Arm.fit` made; the others
+        have that of one branch, `oc.load(f"{name}-wide")`.
 
         Raises:
             UnknownNameError: for a word that is neither a file nor the name of a known arm.

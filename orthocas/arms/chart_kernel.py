@@ -61,14 +61,15 @@ class ChartKernelRules:
     largest: float = 0.7  #: norm of a step of Newton's method
     in_chart: int = 10  #: rounds of it at a tick in the chart
     seek_rounds: int = 24  #: of it, from a stored posture
-    solve_rounds: int = 14  #: of it, from one of many near ones
+    solve_rounds: int = 8  #: of it, from one of many near ones
     searched: int = 24  #: stored postures that a tracker tries, one a tick
     longest: int = 16  #: windows that it waits after a search that found nothing, at most
     near_starts: int = 6  #: stored postures of a chart that a row tries before all curves of x are searched
     spacing: float = 0.05  #: between points of curves at which xi is looked at
     room: float = 0.05  #: beyond limits, within which a point between nodes may be inside
     lifts: int = 32  #: combinations of full turns of joints that are looked at
-    bisections: int = 30  #: between two of these points
+    bisections: int = 30  #: between two of these points, at most
+    halved: int = 3  #: of them, before Newton's method is tried
     curve_starts: int = CURVES.starts  #: of the search of all curves
     patience: int = 32  #: of them in turn that find no new curve, after which the search ends
     postures: int = 2000  #: stored in the domain of each chart, and in all of the joint range

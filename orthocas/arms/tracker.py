@@ -29,11 +29,10 @@ class ArmTracker(Shown):
 
         min |J d - e|^2 + w^2 |g d - e_xi|^2 + damping |d|^2,  with bounds of position and velocity,
 
-    with the errors e of x and e_xi of xi, their rates J and g, and w = 1e-3; where there is no chart, a small pull back
-    to the last posture that had one takes the place of xi. So does a posture that is given instead of xi: joints go as
-    near to it as x lets them, which is what a posture task of lower priority does. Then Gauss-Newton steps within the
-    same bounds bring the error of x to zero, or to a minimum, at which the arm rests. As damping grows where a step
-    does not lower the error, the error of a target at rest never rises.
+    with the errors e of x and e_xi of xi, their rates J and g, and w = 1e-3. A posture given instead of xi takes its
+    place: joints go as near to it as x lets them. Where there is no chart, the last posture that had one does. Then
+    Gauss-Newton steps within the same bounds bring the error of x to zero, or to a minimum, at which the arm rests. As
+    damping grows where a step does not lower the error, the error of a target at rest never rises.
 
     xi is that of the chart in whose domain the tracker began, or came to be first. When the arm comes back to the
     domain, xi goes from the value that it has there to what is asked as fast as the joints may. Where it does not come

@@ -234,6 +234,7 @@ def _cover(
 def _fit_capsule(corners: Array, rounding: float, quick: bool = False) -> Capsule:
     """A capsule of little volume around points (K, 3), each at least 1e-9 m within its surface."""
     centre = corners.mean(axis=0)
+    # the best of the principal axes, then a search from there
     axes = np.linalg.svd(corners - centre, full_matrices=False)[2] if len(corners) > 2 else np.eye(3)
     if len(corners) == 2:
         axes = (corners[1:] - corners[:1]) / max(float(np.linalg.norm(corners[1] - corners[0])), 1e-300)
@@ -241,6 +242,7 @@ def _fit_capsule(corners: Array, rounding: float, quick: bool = False) -> Capsul
     if not quick and len(corners) > 2:
         found = _refine(corners, best)
         best = found if found.volume < best.volume else best
+    # room for rounding, and more if a corner still lacks some
     wide = Capsule(best.start, best.end, best.radius + rounding + RULES.room)
     short = float(wide.measure_rooms(corners).min()) - rounding - RULES.room / 2
     return wide if short >= 0 else Capsule(wide.start, wide.end, wide.radius - short)
@@ -270,6 +272,7 @@ def _refine(corners: Array, start: Capsule) -> Capsule:
     middle, along = (start.start + start.end) / 2, start.end - start.start
     length = float(np.linalg.norm(along))
     axis = along / length if length > 0 else np.array([0.0, 0.0, 1.0])
+    # two tilts, two shifts and the radius
     side = np.linalg.svd(axis[None])[2][1:]
     size = float(start.radius)
 
@@ -303,12 +306,14 @@ def _list_cuts(corners: Array) -> list[list[Array]]:
     for axis in np.linalg.svd(corners[hull.vertices] - corners[hull.vertices].mean(axis=0), full_matrices=False)[2]:
         along = corners @ axis
         low, high = float(along.min()), float(along.max())
+        # planes at several places along each principal axis
         for fraction in RULES.places:
             level = low + fraction * (high - low)
             a, b = edges.T
             crossed = (along[a] - level) * (along[b] - level) < 0
             a, b = a[crossed], b[crossed]
             s = ((level - along[a]) / (along[b] - along[a]))[:, None]
+            # where the plane cuts edges, both pieces get new corners
             seam = corners[a] + s * (corners[b] - corners[a])
             sides = [corners[along <= level], corners[along >= level]]
             if min(map(len, sides)) and len(seam) > 2:
@@ -327,6 +332,7 @@ def _measure_union(solids: Sequence[Shape | Capsule], count: int = RULES.points)
         low, high = solid.list_box()
         points = rng.uniform(low, high, (count, 3))
         pieces = [points[first : first + RULES.chunk] for first in range(0, len(points), RULES.chunk)]
+        # a point in k solids counts one k-th in each of them
         held = [np.concatenate([other.contains(piece) for piece in pieces]) for other in (solid, *solids)]
         share = float((held[0] / np.maximum(np.sum(held[1:], axis=0), 1)).mean())
         total += share * float(np.prod(high - low))

@@ -61,7 +61,7 @@ def test_inside_a_chart_x_and_xi_are_met() -> None:
 def test_near_a_posture_the_free_motion_of_the_joints_leads_no_nearer(
     compiled: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With x met, the self-motion is at right angles to the way to the posture, however the arm came there."""
+    """With x met, the self-motion is at right angles to the way to the posture; the way plays no part."""
     if not compiled:
         monkeypatch.setattr(oc.Arm, "chart_kernel", None)
     arm, wish = panda(), centre() + np.array([0.3, -0.2, 0.2, 0.1, -0.3, 0.2, -0.1])
