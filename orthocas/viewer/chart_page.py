@@ -4,10 +4,11 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from html import escape
 from typing import Any
 
 import numpy as np
-import scipy
+from scipy.spatial.transform import Rotation
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.self_motion import Fan, fan_along
@@ -17,7 +18,7 @@ from orthocas.tools.checks import Array
 from orthocas.viewer.contacts import Contacts
 from orthocas.viewer.looks import RULES, Arm, Ghosts, Look, compute_chain_length
 from orthocas.viewer.motion import join_waypoints, write_joints
-from orthocas.viewer.panel import ChartPanel, format_ends
+from orthocas.viewer.panel import ChartPanel
 from orthocas.viewer.session import Session, describe_stop
 from orthocas.viewer.window import Loop, place_panels, place_scene, show_error
 
@@ -36,7 +37,6 @@ class ChartPage:
         self._panel = ChartPanel(session.chart, session.place)
         self._loop = Loop(self._settle, self._show_failure)
         self._gesture = self._dragging = self._sweeping = False
-        self._ends = ""  # what ends the chosen coordinate, as HTML
         self._play: Any = None  # the button of a path
         self._recorded: list[tuple[float, Array]] | None = None  # times [s] and joints (n,), while it records
         # The scene, with room for all that the coordinates reach, then what the user moves, then what it shows first.
@@ -45,7 +45,7 @@ class ChartPage:
         self._arm, self._ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
         place_scene(server, robot, np.concatenate([session.home[None], *(fan.spread(5) for fan in self._fans)]))
         self._contacts = None if collisions is None else Contacts(server.scene, collisions)
-        self._handle = self._add_handle()
+        self._handle, self._rings = self._add_handle(), self._add_rings()
         self._readings = place_panels(server)
         self._sliders = self._add_sliders()
         self._add_buttons()
@@ -118,7 +118,7 @@ class ChartPage:
             self._branches = gui.add_folder("Other branches: the tip stays")
             with self._branches:
                 self._search = self._add_button("Search", "arrows-split", self._find_branches)
-        self._chosen.on_update(self._loop.build_handler("fan", self._show_fan))
+        self._chosen.on_update(self._loop.build_handler("fan", self._show_chosen))
 
     def _add_button(self, label: str, icon: str, job: Callable[[], None]) -> Any:
         button = self._server.gui.add_button(label, icon=icon)
@@ -194,34 +194,47 @@ class ChartPage:
         self._show()
 
     def _add_handle(self) -> Any:
-        """A handle at the tool: arrows for components of its position, rings for a whole orientation."""
+        """A handle at the tool, if the task has components of its position."""
         chart = self._chart
         kind = str(chart.problem.task.recipe["kind"])
         axes = tuple(kind.startswith(("position", "pose")) and axis in chart.labels[: chart.m] for axis in "xyz")
-        self._turns = kind in ("pose", "orientation")
-        if not (any(axes) or self._turns) or not chart.problem.task.of_tip:
+        if not any(axes) or not chart.problem.task.of_tip:
             return None
         size = RULES.handle * compute_chain_length(chart.problem.robot.tree)
         handle = self._server.scene.add_transform_controls(
-            "/tool", scale=size, active_axes=axes if any(axes) else (True, True, True), disable_axes=not any(axes),
-            disable_sliders=not any(axes), disable_rotations=not self._turns, depth_test=False, opacity=0.8,
-        )  # fmt: skip
+            "/tool", scale=size, active_axes=axes, disable_rotations=True, depth_test=False, opacity=0.8
+        )
         # Axes that the task leaves free stay where they are.
         moved = [axis for axis, active in zip("xyz", axes, strict=True) if active]
 
         async def dragged(event: Any) -> None:
-            position, turn = np.array(event.target.position), np.array(event.target.wxyz)
+            place = dict(zip("xyz", map(float, event.target.position), strict=True))
             self._dragging = event.phase != "end"
-            if self._turns:
-                x = chart.problem.task.target((position, turn))
-                wish = dict(zip(chart.labels[: chart.m], x.tolist(), strict=True))
-            else:
-                place = dict(zip("xyz", position.tolist(), strict=True))
-                wish = {axis: place[axis] for axis in moved}
-            self._loop.ask("tool", lambda: self._move_towards(wish))
+            self._loop.ask("tool", lambda: self._move_towards({axis: place[axis] for axis in moved}))
 
         handle.on_update(dragged)
         return handle
+
+    def _add_rings(self) -> Any:
+        """Rings that turn the tool about its own axes, if the task has its whole orientation."""
+        chart = self._chart
+        task, robot = chart.problem.task, chart.problem.robot
+        if not task.of_tip or task.turn is None or not task.turn.whole:
+            return None
+        size = RULES.rings * compute_chain_length(robot.tree)
+        rings = self._server.scene.add_transform_controls(
+            "/turn", scale=size, disable_axes=True, disable_sliders=True, depth_test=False, opacity=0.8
+        )
+        first = 3 if task.turn.with_position else 0
+
+        async def dragged(event: Any) -> None:
+            turned = task.value(np.zeros(3) if first else None, event.target.wxyz)[first:].tolist()
+            self._dragging = event.phase != "end"
+            labels = chart.labels[first : chart.m]
+            self._loop.ask("turn", lambda: self._move_towards(dict(zip(labels, turned, strict=True))))
+
+        rings.on_update(dragged)
+        return rings
 
     def _move_towards(self, values: dict[str, float]) -> None:
         """Move towards what the user wishes, as the first or a later part of a gesture."""
@@ -287,7 +300,7 @@ class ChartPage:
             self._show_arm(readings.q)
             shown = replace(readings, q=self.session.mirror(readings.q[None])[0])
             nearest = "" if self._contacts is None else self._contacts.show(shown.q)
-            self._readings.content = self._panel.format_html(shown, nearest, self._ends)
+            self._readings.content = self._panel.format_html(shown, nearest, self._format_ends())
             values = np.concatenate([readings.x, readings.xi]).tolist()
             for label, value in zip(self._chart.labels, values, strict=True):
                 slider = self._sliders[label]
@@ -298,15 +311,17 @@ class ChartPage:
     def _show_arm(self, q: Array) -> None:
         """Draw the arm and its handle, for a position of the chart (n,)."""
         with self._server.atomic():
-            shown, robot = self.session.mirror(q[None])[0], self._chart.problem.robot
+            shown = self.session.mirror(q[None])[0]
             self._arm.show(shown)
             if self._recorded is not None and len(self._recorded) < RULES.most_recorded:
                 self._recorded.append((time.monotonic(), shown))
-            if self._handle is not None and not self._dragging:
-                self._handle.position = tuple(robot.tip_position(q))
-                if self._turns:
-                    turn = scipy.spatial.transform.Rotation.from_matrix(robot.tip_rotation(q))
-                    self._handle.wxyz = tuple(turn.as_quat(scalar_first=True))
+            if self._dragging:
+                return
+            robot = self._chart.problem.robot
+            for handle in filter(None, (self._handle, self._rings)):
+                handle.position = tuple(robot.tip_position(q))
+            if self._rings is not None:
+                self._rings.wxyz = tuple(Rotation.from_matrix(robot.tip_rotation(q)).as_quat(scalar_first=True))
 
     def _settle(self) -> None:
         """After a gesture: ranges of the sliders, the fan, and values that were not reached."""
@@ -321,26 +336,37 @@ class ChartPage:
             high = np.floor(max(ends) / RULES.slider_step) * RULES.slider_step
             if np.isfinite([low, high]).all():
                 slider.min, slider.max = round(float(min(low, high)), 3), round(float(max(low, high)), 3)
-        self._show_fan()
+        self._show_chosen()
 
     def _find_fan(self) -> Fan | None:
         """The fan of the chosen coordinate."""
         return next((fan for fan in self._fans if fan.label == self._chosen.value), None)
+
+    def _show_chosen(self) -> None:
+        """Draw another coordinate's fan and ends."""
+        self._show()
+        self._show_fan()
+
+    def _format_ends(self) -> str:
+        """What ends the chosen coordinate, as a part of the readings; a mirrored arm ends elsewhere."""
+        fan = self._find_fan()
+        if fan is None or self.session.flips:
+            return ""
+        ends = ((fan.xi[0], fan.low_stop), (fan.xi[-1], fan.high_stop))
+        robot = self._chart.problem.robot
+        lines = [f"{value:.3f}: {escape(describe_stop(stop, robot))}" for value, stop in ends]
+        return f'<h4>ends of {escape(fan.label)}</h4><div class="about">{"<br>".join(lines)}</div>'
 
     def _show_fan(self) -> None:
         fan = self._find_fan()
         with self._server.atomic():
             if fan is None:
                 self._ghosts.hide()
-                self._ends = ""
             else:
                 # What the arm can have of the fan.
                 fans = (fan.spread(RULES.ghosts), fan.spread(4 * RULES.ghosts))
                 few, many = (self.session.mirror(q[self.session.find_allowed(q)]) for q in fans)
                 self._ghosts.show(few, many, [f"{fan.label} = {value:.3f}" for value in (fan.xi[0], fan.xi[-1])])
-                stops = [describe_stop(stop, self._chart.problem.robot) for stop in (fan.low_stop, fan.high_stop)]
-                self._ends = format_ends(fan.label, (float(fan.xi[0]), float(fan.xi[-1])), stops)
-            self._show()
 
     def _show_failure(self, error: Exception) -> None:
         self._rest()

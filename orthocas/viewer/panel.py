@@ -103,13 +103,14 @@ class ChartPanel:
         lines = [escape(place)] if place else [f"branch {escape(branch)}"] if isinstance(branch, str) else []
         if not lines and problem.name:
             lines = [f"problem {escape(problem.name)}"]
-        lines += [f"{escape(chart.coordinates.label)}, {chart.n} joints"]
+        family, _, _ = chart.coordinates.label.partition(":cyclic")
+        lines += [f"{escape(family)}, {chart.n} joints"]
         lines += [f"task {task}; {chart.r} coordinate{'s' if chart.r > 1 else ''}"]
         title = escape(name_robot(robot, problem.name))
         self._head = f'<div class="name">{title}</div><div class="about">{"<br>".join(lines)}</div>'
 
     def format_html(self, readings: Readings, nearest: str = "", ends: str = "") -> str:
-        """The page; `nearest` is a part about collisions, `ends` one about what ends a coordinate."""
+        """The page; `nearest` is a part about collisions, and `ends` about the range of a coordinate."""
         m = len(readings.x)
         # What stopped the last motion, and the leak of each coordinate.
         stop = f'<div class="stop">stopped by {escape(readings.stop)}</div>' if readings.stop else ""
@@ -147,16 +148,6 @@ class ChartPanel:
             "<h4>joints</h4>", self._joints.format_html(readings.q), self._joints.format_copy(readings.q), "</div>",
         ]  # fmt: skip
         return "".join(parts)
-
-
-def format_ends(label: str, ends: tuple[float, float], stops: Sequence[str]) -> str:
-    """What ends a coordinate on both sides, with the task and the other coordinates held."""
-    rows = [
-        f'<div class="row"><span>{escape(label)} {side}</span><span class="about">{escape(stop)}</span>'
-        f"{format_number(f'{label} {side}', value, f'{value:.3f}')}</div>"
-        for side, value, stop in zip(("from", "to"), ends, stops, strict=True)
-    ]
-    return f"<h4>how far {escape(label)} goes from here</h4>{''.join(rows)}"
 
 
 class JointBars:

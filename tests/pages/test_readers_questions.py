@@ -65,6 +65,21 @@ SEARCHED = {
     "collision": "how-to/collisions",
     "collision avoidance": "how-to/collisions_in_motion",
     "install": "how-to/install",
+    "xacro": "tutorials/own_arm",
+    "self-motion": "how-to/paths",
+    "trajectory": "how-to/paths",
+    "arm angle": "how-to/elbow",
+    "redundancy resolution": "explanation/ideas",
+    "mobile manipulator": "how-to/mobile_base",
+    "Franka": "how-to/robots",
+    "self-collision": "how-to/collisions",
+    "forward kinematics": "how-to/casadi_dynamics",
+    "jerk": "how-to/limits",
+    "TCP": "tutorials/own_arm",
+    "operational space": "explanation/projectors",
+    "nullspace projector": "explanation/projectors",
+    "closed chain": "explanation/limits",
+    "mimic joint": "explanation/limits",
 }
 
 

@@ -68,23 +68,25 @@ def test_handle_sweep_undo_and_home(build: Callable[[], oc.Chart]) -> None:
         wait(lambda: all(abs(page._sliders[label].value - value) < 6e-4 for label, value in values.items()))
 
 
-def test_a_ring_turns_the_tool_and_the_coordinates_stay() -> None:
+def test_rings_turn_the_tool_of_a_pose_task() -> None:
+    """By 0.2 rad about the tool's own z axis; place and xi stay."""
     chart = oc.load("panda-wide")
     robot = chart.problem.robot
     with oc.view(chart, port=0) as view:
         page = view._page
         session, home = page.session, page.session.home
-        turned = Rotation.from_rotvec([0.0, 0.1, 0.0]) * Rotation.from_matrix(robot.tip_rotation(home))
-        page._handle.wxyz = tuple(turned.as_quat(scalar_first=True))
-        for phase in ("start", "end"):
-            asyncio.run(page._handle._impl_aux.update_cb[0](SimpleNamespace(target=page._handle, phase=phase)))
+        here = Rotation.from_matrix(robot.tip_rotation(home))
+        np.testing.assert_allclose(np.abs(page._rings.wxyz @ here.as_quat(scalar_first=True)), 1, atol=1e-12)
+        wished = here * Rotation.from_rotvec([0, 0, 0.2])
+        for end in (chart.xi_range(home)["xi1"].low_stop, chart.xi_range(home)["xi1"].high_stop):
+            assert end.joint in page._readings.content
+        page._rings.wxyz = tuple(wished.as_quat(scalar_first=True))
+        for phase in ("start", "update", "end"):
+            asyncio.run(page._rings._impl_aux.update_cb[0](SimpleNamespace(target=page._rings, phase=phase)))
         wait(lambda: not page._undo.disabled and not page._gesture)
-        np.testing.assert_allclose(robot.tip_rotation(session.q), turned.as_matrix(), atol=1e-8)
-        np.testing.assert_allclose(robot.tip_position(session.q), robot.tip_position(home), atol=1e-8)
-        np.testing.assert_allclose(chart.xi(session.q), chart.xi(home), atol=1e-8)
-        stop = chart.xi_range(session.q)["xi1"].high_stop
-        assert "xi1 to" in page._readings.content
-        assert stop.joint in page._readings.content
+        np.testing.assert_allclose(robot.tip_rotation(session.q), wished.as_matrix(), atol=1e-8)
+        np.testing.assert_allclose(robot.tip_position(session.q), robot.tip_position(home), atol=1e-9)
+        np.testing.assert_allclose(chart.xi(session.q), chart.xi(home), atol=1e-9)
 
 
 def test_a_path_plays_and_its_recording_can_be_viewed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
