@@ -383,7 +383,7 @@ class FrictionObserver(_Correcting):
 
     Args:
         rate: > 0 [1/s].
-        bound: largest r, b and correction of each joint, > 0, (n,) or one number [N m] or [N]; default half of the limit.
+        bound: largest r, b and correction of each joint, > 0, (n,) or one number [N m] or [N]; default half the limit.
         tolerance: errors of phi at which it stops, > 0, (n,) or one number; up to twice that may be left. Default
             0.25 mm, 5 mrad, and 0.01 of each xi.
 
