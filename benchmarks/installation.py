@@ -13,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 ROOT = Path(__file__).parent.parent
-EXTRAS = ("robots", "view", "mesh", "mujoco", "learn", "dask")
+EXTRAS = ("robots", "xacro", "view", "mesh", "mujoco", "learn", "dask")
 _IMPORTED = (
     "import sys, time; start = time.perf_counter(); import orthocas; orthocas.fit; print(time.perf_counter() - start)"
 )

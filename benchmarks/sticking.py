@@ -27,7 +27,7 @@ from orthocas.tools.checks import Array
 
 CHARTS = (
     *("panda-wide", "xarm7-wide", "iiwa7-wide", "baxter-left-wide", "tiago-pro-left-wide", "pr2-left-wide"),
-    *("panda-pose", "iiwa7-pose", "xarm7-pose", "tiago-pro-left-pose"),
+    *("panda-pose", "iiwa7-pose"),
 )
 TICK, SECONDS, LONG, STILL = 1e-3, 5.0, 60.0, 0.25  # [s]
 SLOW = 1e-6  # change of the correction in a tick [N m], 0.06 N m in a minute

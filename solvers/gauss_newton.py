@@ -82,6 +82,7 @@ class _Run:
     def _step(self, gradient: Array, H: Array) -> bool:
         """Try steps with growing damping until the loss falls, and return whether it fell."""
         diagonal = H.diagonal()
+        # Levenberg and Marquardt: damping in proportion to the diagonal
         scale = np.maximum(diagonal, 1e-3 * diagonal.mean())
         for _ in range(RULES.most_rejections):
             damped = H.copy()
@@ -91,6 +92,7 @@ class _Run:
             except np.linalg.LinAlgError:
                 self.damping *= 10
                 continue
+            # less damping after a success, more after a failure
             self.best.evaluations += 1
             if self.best.offer(candidate, self.objective.value(candidate)):
                 self.damping = max(self.damping / 5, 1e-7)

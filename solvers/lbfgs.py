@@ -121,6 +121,7 @@ class QuasiNewton(LBFGS):
                 return Status.FAILED
             if not gradient.any():
                 return Status.CONVERGED
+            # a new matrix whenever the old one does not serve any more
             status = self._descend_with_matrix(best, gradient)
             if status is not None:
                 return status
@@ -196,6 +197,7 @@ def _factor(H: Array) -> Array:
     scale = np.maximum(diagonal, 1e-3 * diagonal.mean())
     damping = RULES.damping
     while True:
+        # until the matrix is positive definite
         damped = H + np.diag(damping * scale)
         if not np.isfinite(damped).all():
             raise SolveError("the curvature of the loss is not finite: parameters are huge")

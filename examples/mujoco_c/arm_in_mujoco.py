@@ -18,7 +18,7 @@ from arm_scene import HAND_RADIUS, write_scene
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.control import ControlStatus, PDPlus
+from orthocas.control import ControlStatus, PDPlus, matched_stiffness
 
 HERE = Path(__file__).parent
 WEIGHTS = (1000, 30, 150, 1, 1000)
@@ -41,7 +41,8 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     problem = problems.get("iiwa")
     problem = oc.Problem(problem.robot, problem.task, "inertia", problem.domain, "iiwa")
     chart = oc.fit(problem, oc.Polynomial(3), weights=WEIGHTS, samples=1500 if quick else None).chart
-    oc.generate_c(chart, out / "generated", PDPlus.on_chart(chart), name="arm")
+    # Constant springs, which people and walls can push back.
+    oc.generate_c(chart, out / "generated", PDPlus(chart, matched_stiffness(chart)), name="arm")
     x, _, z = chart.phi(problem.domain.centre)[: chart.m]
     write_scene(problem.robot.tree, out / "scene.xml", x + HAND_RADIUS + GAP, z)
     subprocess.run([build(out), out / "scene.xml", out / "log.csv"], check=True)

@@ -269,6 +269,7 @@ def parse_suffix(text: str, before: str) -> tuple[Cyclic, tuple[str, ...]]:
     cyclic: Cyclic = ()
     without: tuple[str, ...] = ()
     for part in text.split(":") if text else ():
+        # each part is a word, with names behind it
         word, equals, names = part.partition("=")
         if word not in (_WORD, _WITHOUT) or (not names if equals else word == _WITHOUT):
             wanted = f"{before}, then 'cyclic' or 'cyclic=JOINT,JOINT', then 'without=JOINT'"

@@ -164,6 +164,7 @@ def list_terms(degrees: list[list[int]], total: int, joints: int | None = None) 
             if any(prefix):
                 yield prefix
             return
+        # joint by joint, with what is left of the degree and of the number of factors
         for k, degree in enumerate(degrees[len(prefix)]):
             if degree <= left and (others or not k):
                 yield from extend((*prefix, k), left - degree, others - (k > 0))

@@ -475,6 +475,7 @@ def _check_parts(check: BoxCheck, parts: Subdivision, mapped: Mapped, monitor: M
     # In pieces, whose results come in order.
     # Leaves of the tree that count as proved, in pieces for the workers.
     low, high = parts.leaves(PROVED)
+    # pieces of boxes, on many machines if there is an executor
     pieces = [slice(k, k + RULES.at_once) for k in range(0, len(low), RULES.at_once)]
     results = []
     try:

@@ -315,9 +315,11 @@ def _plan_products(n: int, degree: int) -> tuple[tuple[bool, int, slice, NDArray
 def _multiply_expansions(A: Array, B: Array, degree: int, n: int) -> Expansion:
     """sum_i A_i B_i for factors (pairs, monomials, boxes), and what the degree leaves out, (pairs, boxes)."""
     out = np.zeros((B.shape[1], A.shape[2]))
+    # products up to the degree, monomial by monomial
     for of_a, k, others, where in _plan_products(n, degree):
         one, many = (A[:, k], B[:, others]) if of_a else (B[:, k], A[:, others])
         out[where] += np.einsum("in,ikn->kn", one, many)
+    # bounds of all products beyond it
     size_a, size_b = _sum_by_degree(A, n, degree), _sum_by_degree(B, n, SERIES_DEGREE)
     left_out = np.zeros(A[:, 0].shape)
     for i, a in enumerate(size_a):

@@ -36,6 +36,7 @@ class Subdivision:
     def __post_init__(self) -> None:
         low = freeze_array("low", self.low, (None,))
         high = freeze_array("high", self.high, low.shape)
+        # one byte for each box: the joint that is halved, or how it ended
         codes = np.array(self.codes)
         if codes.dtype != np.uint8 or codes.ndim != 1 or not 0 < codes.size <= MOST_BOXES:
             raise InvalidValueError("codes", f"{codes.dtype} of shape {codes.shape}", "bytes of a tree of boxes")
@@ -43,11 +44,13 @@ class Subdivision:
             raise InvalidValueError("low", low.tolist(), "a corner below the opposite one")
         n = len(low)
         require_shape("codes", codes.shape, (None,))
+        # boxes that are halved name one of the joints
         inner = codes < PROVED
         if (codes[inner] >= n).any():
             raise InvalidValueError(
                 "codes", int(codes[inner].max()), f"numbers of joints below {n}, {PROVED} or {OPEN}"
             )
+        # in the order of the codes, each halved box brings two: the tree ends with the last code, not before
         missing = 1 + np.cumsum(np.where(inner, 1, -1))
         if missing[-1] != 0 or (missing[:-1] <= 0).any():
             raise InvalidValueError("codes", f"{codes.size} bytes", "a tree of boxes")
@@ -213,6 +216,7 @@ class Certificate(Shown):
     def facts(self) -> dict[str, str]:
         """What is proved, of how many boxes, and what is not."""
         facts = {"certificate": self._describe()}
+        # what is proved beyond "no fold"
         if self.conditioning > 0:
             facts["conditioning"] = f"at least {self.conditioning:.3g} there"
         if self.injective is not None:
@@ -220,10 +224,12 @@ class Certificate(Shown):
             facts["one-to-one"] = f"on the box of half-width {number_list(half)} around the centre"
         elif self.method not in METHODS:
             facts["one-to-one"] = f"void, of an older method ({self.method}): certify the chart again"
+        # which part of the box the proof is about
         if self.least_singular_value > 0:
             facts["left out"] = f"where the task's relative singular value is at most {self.least_singular_value:g}"
         if self.least_volume > 0 and not self.proved:
             facts["the rest"] = f"guarded at run time: the domain leaves out volumes up to {self.least_volume:g}"
+        # where a proof would have to go on
         low, high = self.unproved
         if len(low) and not self.fold:
             largest = int(np.argmax((high - low).prod(axis=1)))
@@ -249,6 +255,7 @@ class Certificate(Shown):
         if self.fold:
             at = ", ".join(f"{value:.3f}" for value in self.fold[-1])
             return f"refuted, the chart folds at q = ({at})"
+        # the verdict, with shares rounded down
         verdict = "no fold everywhere on the domain"
         if not self.proved:
             share, clear = percent(self.share, 4), percent(self.clear_share, 3)

@@ -67,11 +67,13 @@ def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored],
     Raises:
         InvalidValueError: if something is missing or makes no sense. The message names it.
     """
+    # the two trees of boxes, and a fold if there is one
     regular = _tree(arrays, "regular", n)
     injective = _tree(arrays, "injective", n) if "certificate_injective_codes" in arrays else None
     fold = get_part(data, "fold", list)
     if len(fold) not in (0, 2) or any(not isinstance(point, list) or len(point) != n for point in fold):
         raise InvalidValueError("fold of a certificate", repr(fold)[:80], f"no or two joint positions of {n} numbers")
+    # numbers that came later are missing in older files
     known = Certificate(
         get_part(data, "fingerprint", str),
         get_part(data, "method", str),
@@ -87,6 +89,7 @@ def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored],
         _number(data, "clear_share") if "clear_share" in data else 0.0,
         get_part(data, "digest", str) if "digest" in data else "",  # missing in older files
     )
+    # older files count boxes that were given up
     if "dead" not in data:
         return known
     return known.remove_given_up(require_count("dead boxes of a certificate", int(_number(data, "dead")), least=0))
@@ -128,9 +131,11 @@ def write_chart(
     """
     header, arrays = _content(problem, coordinates)
     header["notes"] = _checked_notes(notes)
+    # the proof holds for these notes only
     if certificate is not None:
         data, proof = certificate_to_data(certificate)
         header["certificate"], arrays = {**data, "notes": _digest_of(header["notes"])}, {**arrays, **proof}
+    # solids that came from a chart file go into the next one
     if collisions is None and (isinstance(problem.robot.solids, KnownSolids) or FREE in notes):
         collisions = problem.robot.collisions
     if collisions is not None:
@@ -164,6 +169,7 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes, Certifi
     header, arrays = read_archive(path, CHART)
     try:
         problem = read_problem(header, arrays)
+        # coordinates: grown from a leaf, or the parameters of a family
         data = get_part(header, "coordinates", dict)
         coordinates: CoordinateMap
         if "leaf" in data:
@@ -179,12 +185,14 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes, Certifi
             )
             if isinstance(parametrisation, CyclicParametrisation):
                 require_cyclic(problem, parametrisation.cyclic)
+        # what a file states must fit together
         if coordinates.r != problem.r:
             raise ChartFileError(f"{path} has {coordinates.r} coordinates, expected r = {problem.r}")
         _require_finite(problem, coordinates)
         if "collisions" in header:
             solids = collisions_from_data(problem.robot.tree, get_part(header, "collisions", dict), arrays)
             problem.robot.solids = KnownSolids(solids)
+        # a proof of other coordinates is refused
         certificate = _certificate(problem, coordinates, header, arrays)
         return problem, coordinates, _checked_notes(get_part(header, "notes", dict)), certificate
     except ChartFileError:

@@ -106,11 +106,13 @@ class Clearance:
         """The farthest of some postures on the straight way from q to new (n,) that keeps clear, and its fraction."""
         least = self._least if np.array_equal(q, self._q) else self.measure(q)
         fraction = 1.0
+        # halve the way until a posture on it keeps clear
         for _ in range(RULES.halvings):
             place = new if fraction == 1.0 else q + fraction * (new - q)
             if self._allow(q, least, place):
                 return place, fraction
             fraction /= 2
+        # nowhere on the way: stay
         self._q, self._least = q.copy(), least
         return q, 0.0
 
@@ -148,10 +150,12 @@ class Clearance:
             Cyclic projections onto half-spaces (Kaczmarz); ours.
         """
         assert self.avoid is not None
+        # pairs that the wished change may bring nearer than `avoid`
         near = self.collisions.find_near(q, self.avoid + self._reach(slopes @ wish))
         rates = near.gradient @ slopes
         squares = np.einsum("pr,pr->p", rates, rates)
         change = wish.copy()
+        # one pair after the other, by Kaczmarz's projections
         for _ in range(RULES.sweeps):
             for rate, square, room in zip(rates, squares, near.distance - self.avoid, strict=True):
                 short = -room - float(rate @ change)
@@ -165,9 +169,11 @@ class Clearance:
 
     def _allow(self, q: Array, least: float, new: Array) -> bool:
         """Whether a step from q with a least distance to a new posture keeps clear; if so, it is the last posture."""
+        # the distance at the end of the step
         value = self.measure(new)
         if value < float(self.floor(np.array(least))):
             return False
+        # and between both ends, where the links may move farther than half of what is left
         speed = self._reach(new - q)
         kept = RULES.between * min(self.margin, least, value)
         if (least + value - speed) / 2 <= kept and self.collisions.find_contact(np.array([q, new]), kept) is not None:

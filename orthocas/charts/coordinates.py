@@ -119,6 +119,7 @@ def _from_tables(family: SelfDerivativeFamily, theta: Array, n: int) -> dict[str
     """
     r = family.outputs
     tables = family.derivative_tables(theta)
+    # psi' holds the terms that occur in derivatives
     places = np.flatnonzero(tables.any(axis=(0, 1)))
     x, u = ca.SX.sym("q", n), ca.SX.sym("v", n)
     psi = family.basis(x)
@@ -126,6 +127,7 @@ def _from_tables(family: SelfDerivativeFamily, theta: Array, n: int) -> dict[str
     basis = ca.Function("basis", [x], [psi])
     smaller_basis = ca.Function("smaller_basis", [x], [smaller])
     change = ca.Function("smaller_basis_change", [x, u], [ca.densify(ca.jtimes(smaller, x, u))])
+    # coefficients as matrices, so that products are loops in C
     values = ca.MX(ca.DM(theta.reshape(r, family.width)))
     slopes = ca.MX(ca.DM(tables[:, :, places].reshape(n * r, len(places))))
     q, v, w = (ca.MX.sym(name, n) for name in ("q", "v", "w"))
@@ -158,6 +160,7 @@ def block_function(coordinates: "Coordinates", name: str) -> Maker:
 def _values(coordinates: "Coordinates", family: SelfDerivativeFamily) -> Maker:
     """xi = scale (C psi - offset), and the idle joints."""
     r, active, idle = family.outputs, coordinates.active, list(coordinates.idle)
+    # scale and offset go into the coefficients
     C = coordinates.scale[:, None] * coordinates.theta.reshape(r, -1)
     shift, centre = (coordinates.scale * coordinates.offset)[:, None], coordinates.space.centre[idle, None]
     q = ca.SX.sym("q", len(active))
@@ -181,10 +184,12 @@ def _slopes(coordinates: "Coordinates", family: SelfDerivativeFamily) -> Maker:
     """J_xi = scale C_i psi', where psi' holds the basis functions that occur in derivatives, and 1 for idle joints."""
     n, r, active = coordinates.space.n, family.outputs, coordinates.active
     by_joint = family.derivative_tables(coordinates.theta)  # (active, r, 1 + K)
+    # one table for all joints, with scales and only the functions that occur
     places = np.flatnonzero(by_joint.any(axis=(0, 1)))
     table = np.zeros((r, n, len(places)))
     table[:, active] = coordinates.scale[:, None, None] * by_joint[:, :, places].transpose(1, 0, 2)
     flat = table.reshape(r * n, len(places))
+    # gradients of idle joints never change
     of_idle = np.eye(n)[list(coordinates.idle)].reshape(-1, 1)
     q = ca.SX.sym("q", len(active))
     smaller = ca.vertcat(1, family.basis(q))[places.tolist()]
@@ -270,6 +275,7 @@ class Coordinates:
         """xi(q), (r, N), for joint positions as columns (n, N)."""
         columns = q.shape[1]
         rows: list[Expression] = []
+        # fitted coordinates, then the joints that are coordinates themselves
         if len(self.offset):
             theta = type(q)(ca.DM(self.theta))
             fitted = self.family.expression(q[self.active, :], theta)

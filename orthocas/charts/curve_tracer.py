@@ -74,6 +74,7 @@ class CurveTracer:
     def reach(self, x: Array, starts: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Where damped least squares lead from starts (M, n), whatever the limits, and whether near x (M, m), (M,)."""
         q, arrived, left = starts.copy(), np.zeros(len(starts), dtype=bool), np.arange(len(starts))
+        # rows drop out when they arrive, or where the step has no value
         for _ in range(RULES.reach):
             found = self._damped_step(q[left], x[left])[0]
             q[left] += found[:, :-1]
@@ -86,10 +87,12 @@ class CurveTracer:
     def trace(self, x: Array, q: Array, rows: Indices) -> Traces:
         """The curves through points q (K, n), from end to end, for x (K, n - 1)."""
         m, n = self.boxed.m, q.shape[1]
+        # the tangent is what all n - 1 held values leave free
         J = np.empty((len(q), n - 1, n))
         J[:, :m] = self.boxed.phi_map.jacobian(q)[:, :m] / self.boxed.phi_map.sizes[:m, None]
         J[:, m:] = np.eye(n)[list(self.held)]
         t = np.linalg.qr(J.transpose(0, 2, 1), mode="complete")[0][:, :, -1]
+        # one way, and for curves that do not close the other way
         ahead, tangents, count, closed = self._follow(x, q, t)
         back = np.flatnonzero(~closed)
         if not back.size:
@@ -97,6 +100,7 @@ class CurveTracer:
         behind, behind_tangents, behind_count, _ = self._follow(x[back], q[back], -t[back])
         before = np.zeros(len(q), dtype=np.int64)
         before[back] = behind_count - 1
+        # both halves in one order: the second one reversed, then the first
         total = count + before
         place = np.arange(total.max())
         after = np.clip(place - before[:, None], 0, (count - 1)[:, None])
@@ -111,12 +115,15 @@ class CurveTracer:
 
     def on_curves(self, q: Array, traces: Traces) -> NDArray[np.bool_]:
         """Which of the positions q (K, S, n) lie on the curves, up to full turns, (K, S)."""
+        # angles as points on circles, so that full turns do not count
         mine, exists = self._on_circles(q), np.arange(traces.q.shape[1]) < traces.count[:, None]
         points = np.zeros((*exists.shape, mine.shape[2]))
         points[exists] = self._on_circles(traces.q[exists])
+        # the nearest vertex of each curve
         squares = np.where(exists, (points**2).sum(axis=2), np.inf)[:, None] - 2 * mine @ points.transpose(0, 2, 1)
         nearest = np.argmin(squares, axis=2)
         found = np.zeros(nearest.shape, dtype=bool)
+        # the distance to the segments on both sides of this vertex
         for place in (np.maximum(nearest - 1, 0), nearest):
             start = np.take_along_axis(traces.q, place[:, :, None], axis=1)
             after = np.minimum(place + 1, traces.q.shape[1] - 1)
@@ -149,20 +156,25 @@ class CurveTracer:
         points, tangents = np.empty((K, size, n)), np.empty((K, size, n))
         points[:, 0], tangents[:, 0] = q0, t0
         count, closed = np.ones(K, dtype=np.int64), np.zeros(K, dtype=bool)
+        # what `_step` takes for each curve: where it is, tangent, bend, length of the step, and where it began
         state = np.concatenate([q0, t0, np.zeros((K, n)), np.full((K, 1), RULES.step / 2), q0, t0], axis=1)
         left, before = np.arange(K), np.zeros(K)
         for _ in range(RULES.most):
             found = self._step(state, x)[0]
+            # a step counts if it hits the curve and hardly turns
             new, onward, (missed, turned, gap, ahead) = found[:, :n], found[:, n : 2 * n], found[:, 2 * n :].T
             good = (missed < RULES.missed) & (turned > RULES.turned)
             moved, h = left[good], state[:, 3 * n]
+            # back at the start: near it, and passing it in the direction of the beginning
             around = good & (gap < 1.6 * RULES.step) & (before < 0) & (ahead >= 0) & (count[left] > 3)
             closed[left] = around
             points[moved, count[moved]], tangents[moved, count[moved]] = new[good], onward[good]
             count[moved] += 1
+            # the next step predicts with the curvature of this one
             bend = (onward - state[:, n : 2 * n]) / h[:, None]
             state[:, : 3 * n] = np.where(good[:, None], np.hstack([new, onward, bend]), state[:, : 3 * n])
             before = np.where(good, ahead, before)
+            # lengths follow success
             longer = np.where(turned > RULES.straight, np.minimum(1.6 * h, RULES.step), h)
             h[:] = np.where(good, longer, h / 2)
             goes_on = ~around & (h > RULES.shortest) & self._slides_near(state[:, :n])
@@ -170,6 +182,7 @@ class CurveTracer:
                 state, x, left, before = state[goes_on], x[goes_on], left[goes_on], before[goes_on]
             if not left.size:
                 break
+        # curves that ended earlier repeat their last point
         last = np.minimum(np.arange(count.max()), count[:, None] - 1)[:, :, None]
         points, tangents = (np.take_along_axis(part, last, axis=1) for part in (points, tangents))
         return points, tangents, count, closed
@@ -218,9 +231,11 @@ class CurveTracer:
         n = q.shape[0]
         state = ca.SX.sym("state", 5 * n + 1)
         at, t, bend, h, q0, t0 = ca.vertsplit(state, [0, n, 2 * n, 3 * n, 3 * n + 1, 4 * n + 1, 5 * n + 1])
+        # predict to second order, then correct orthogonally to the tangent
         ahead = at + h * t + h**2 / 2 * bend
         change, onward = ca.horzsplit(ca.reshape(self._bordered(ahead, x, t), n, 2))
         new, onward = ahead + change, onward / ca.norm_2(onward)
+        # how far it is from the start, less full turns
         gap = new - q0
         gap -= 2 * np.pi * ca.DM(self.turning.astype(float)) * ca.floor(gap / (2 * np.pi) + 0.5)
         numbers = ca.vertcat(ca.norm_2(change), ca.dot(t, onward), ca.norm_2(gap), ca.dot(gap, t0))

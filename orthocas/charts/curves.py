@@ -103,15 +103,18 @@ class SelfMotionCurves:
         q, known = self._reached(targets[rows], starts)
         place, ends = np.full(len(targets), -1), Ends.empty(q.shape[2])
         place[rows] = np.arange(len(rows))
+        # starts on curves that are known already need no search
         for traces in traced:
             here = np.flatnonzero(place[traces.row] >= 0)
             of = place[traces.row[here]]
             known[of] |= self.tracer.on_curves(q[of], traces.part(here))
         away = self.tracer.away(q)
+        # in each round, trace from starts that no curve has reached
         for _ in range(q.shape[1]):
             left = np.flatnonzero(~known.all(axis=1) & (best.distance[rows] > 0))
             if not left.size:
                 break
+            # with many rows one start each, the nearest to the domain; with few all at once
             if left.size > RULES.few:
                 of, start = left, np.argmin(np.where(known[left], np.inf, away[left]), axis=1)
             else:
@@ -119,12 +122,14 @@ class SelfMotionCurves:
                 of = left[at]
             traces = self.tracer.trace(targets[rows[of], : self.boxed.m], q[of, start], rows[of])
             known[of, start] = True
+            # roots on the steps, then on arcs that may hold one
             steps = self._steps(traces, own[traces.row])
             xi_left = self._take_crossed(targets, steps, tolerance, best)
             more = best.distance[steps.row] > 0
             arcs = self._arcs(targets, steps.part(more), xi_left[more])
             self._take_roots(targets, arcs, tolerance, best)
             ends = ends.joined(self._take_points(targets, arcs, best))
+            # other starts on these curves are done, too
             on = np.flatnonzero((best.distance[traces.row] > 0) & ~known[of].all(axis=1))
             np.logical_or.at(known, of[on], self.tracer.on_curves(q[of[on]], traces.part(on)))
             traced.append(traces)
@@ -141,12 +146,14 @@ class SelfMotionCurves:
         """The steps of curves in and around the box of the domain, after all full turns that bring them there."""
         curve, shift = self._sheets(traces, own)
         low, high = self.boxed.domain.bounds
+        # steps of which one end is near the box
         moved = traces.q[curve] + shift[:, None]
         near = np.asarray(((moved >= low - RULES.step) & (moved <= high + RULES.step)).all(axis=2))
         at, place = np.nonzero((near[:, :-1] | near[:, 1:]) & (np.arange(1, near.shape[1]) < traces.count[curve, None]))
         of, turn = curve[at], shift[at]
         q = np.stack([traces.q[of, place] + turn, traces.q[of, place + 1] + turn], axis=1)
         t = np.stack([traces.tangent[of, place], traces.tangent[of, place + 1]], axis=1)
+        # whether a step begins where the one before it ends
         follows = np.diff(at * near.shape[1] + place, prepend=-2) == 1
         return Steps(traces.row[of], q, t, follows)
 
@@ -181,6 +188,7 @@ class SelfMotionCurves:
         """Points on the steps that may hold a root, an end of an arc, or a place where xi turns back."""
         steps = steps.part(self._matters(steps, left))
         low, high = self.boxed.domain.bounds
+        # points between, corrected back onto the curve; twice where they may count
         q, along = steps.divided()
         slack = RULES.step / RULES.parts
         close = np.asarray(((q >= low - slack) & (q <= high + slack)).all(axis=2))
@@ -193,6 +201,7 @@ class SelfMotionCurves:
         inside, xi_left = np.zeros(close.shape, dtype=bool), np.full(close.shape, np.nan)
         inside[close] = self._contains(points)
         xi_left[close] = self._xi_left(targets[np.repeat(steps.row, close.sum(axis=1))], points)
+        # pieces that may pass a corner of the domain between two points outside
         passing = close[:, :-1] & close[:, 1:] & ~inside[:, :-1] & ~inside[:, 1:]
         arc, place = np.nonzero(passing)
         first, last = self._shares_inside(q[arc, place], q[arc, place + 1], RULES.sagitta)
@@ -207,20 +216,24 @@ class SelfMotionCurves:
         """
         inside = np.zeros(steps.q.shape[:2], dtype=bool)
         inside[:, 1] = self._contains(steps.q[:, 1])
+        # where the domain is entered and left; joined steps share their ends
         begins = np.flatnonzero(~steps.follows)
         inside[begins, 0] = self._contains(steps.q[begins, 0])
         joined = np.flatnonzero(steps.follows)
         inside[joined, 0] = inside[joined - 1, 1]
         both, none = np.asarray(inside.all(axis=1)), np.asarray(~inside.any(axis=1))
+        # steps that change sides, pass a corner, or cross the target
         first, last = self._shares_inside(steps.q[:, 0], steps.q[:, 1], RULES.missed)
         changes = np.where(none, first < last, ~both)
         changes[self._crossed(left)[0]] = True
         ahead = wrap_shortest((left[:, 1] - left[:, 0])[:, None], self.boxed.phi_map.difference.turns[self.boxed.m :])[
             :, 0
         ]
+        # where xi turns back between two steps
         bends = steps.follows.copy()
         bends[1:] &= ~(ahead[1:] * ahead[:-1] > 0) & both[1:] & both[:-1]
         changes |= bends
+        # with their neighbours, which bound the root
         after = np.append(steps.follows[1:], False)
         around = changes.copy()
         around[1:] |= changes[:-1] & steps.follows[1:]
@@ -235,12 +248,15 @@ class SelfMotionCurves:
         """
         low, high = self.boxed.domain.bounds
         turn, room, bounded = 2 * np.pi, RULES.step, np.isfinite(low)
+        # the box, widened by a step; endless joints have turns around their own place
         low = np.where(bounded, low - room, own - np.where(self.boxed.winding, 3 * np.pi, np.pi))[:, None]
         high = np.where(bounded, high + room, np.inf)
+        # the first full turn that brings each point into it, and where that changes along the curve
         first = np.where(self.tracer.turning, np.ceil((low - traces.q) / turn), 0.0)
         at = traces.q + turn * first
         passed = np.ones(at.shape[:2], dtype=bool)
         passed[:, 1:] = (first[:, 1:] != first[:, :-1]).any(axis=2)
+        # further turns that still fit
         width = np.where(bounded, (high - low[0, 0]) // turn, np.where(self.boxed.winding, 2, 0))
         choices = [range(1 + int(k)) for k in np.where(self.tracer.turning, width, 0)]
         near = [
@@ -248,6 +264,7 @@ class SelfMotionCurves:
             for j in range(len(high))
         ]
         found = []
+        # each choice of turns: a sheet begins where the curve enters
         for extra in product(*choices):
             close = np.all([near[j][k] for j, k in enumerate(extra)], axis=0)
             changes = np.asarray(close & passed)
@@ -286,11 +303,13 @@ class SelfMotionCurves:
 
     def _take_points(self, targets: Array, arcs: "Arcs", best: Nearest) -> "Ends":
         """Points of arcs that lie in the domain; returns the ends that may be nearer."""
+        # points inside are candidates for the nearest xi
         inside = arcs.inside & (best.distance > 0)[arcs.row][:, None]
         arc, place = np.nonzero(inside)
         rows, here = arcs.row[arc], arcs.xi_left[arc, place]
         best.take(rows, arcs.q[arc, place], np.abs(here), between=True)
         found = []
+        # an arc may end between a point inside and its neighbour, nearer than both
         for side in (-1, 1):
             beyond = np.clip(place + side, 0, inside.shape[1] - 1)
             there = arcs.xi_left[arc, beyond]

@@ -99,6 +99,7 @@ def descend(
         run = _Run(equations, targets, start)
         rows, before = np.flatnonzero(np.isfinite(run.square)), run.error.copy()
         for k in range(1, most + 1):
+            # rows that do not halve their error in some steps end
             if k % patience == 0:
                 rows = rows[run.error[rows] <= before[rows] / 2]
                 before[rows] = run.error[rows]
@@ -200,10 +201,12 @@ def solve_programs(programs: Programs, at: NDArray[np.int8]) -> tuple[Array, NDA
 def _solve_held(programs: Programs, held: NDArray[np.int8]) -> tuple[Array, NDArray[np.int8]]:
     """d (N, n) where the bounds that are held, (N, n), are equations, and those that hold next by d."""
     K, joint = programs.H.copy(), held != 0
+    # joints at a bound get the equation d = bound
     here, j = np.nonzero(joint)
     K[here, j], K[here, j, j] = 0.0, 1.0
     bounds = np.where(held < 0, programs.low, programs.high)
     d = np.asarray(np.linalg.solve(K, np.where(joint, bounds, -programs.g)[:, :, None])[:, :, 0], dtype=float)
+    # bounds stay while the slope pushes against them; others begin where d passes them
     slope = (programs.H @ d[:, :, None])[:, :, 0] + programs.g
     now = np.where(joint, held * (slope * held < 0), 0)
     now += ~joint * ((d > programs.high + RULES.slack) * 1 - (d < programs.low - RULES.slack) * 1)

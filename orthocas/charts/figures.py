@@ -29,6 +29,7 @@ def quality_figure(report: "Report") -> Figure:
     left, middle, right = figure.subplots(1, 3)
     _draw_angles(left, report.task_angle, _TASK, r"task angle $\angle(\mathrm{d}\xi_j, \nabla_A h_i)$")
     _draw_angles(middle, report.mutual_angle, _EXTRA, r"mutual angle $\angle(\mathrm{d}\xi_i, \mathrm{d}\xi_j)$")
+    # leaks begin at 0, in bins of half a degree
     counts = report.leak.histogram[:900].reshape(-1, 5).sum(axis=1)
     right.stairs(counts / max(counts.sum(), 1) / 0.5, 0.5 * np.arange(len(counts) + 1) - 0.05, fill=True, color=_LEAK)
     right.set_xlim(0, max(6.0, 3 * report.leak.rms))
@@ -58,6 +59,7 @@ def self_motion_figure(chart: "Chart", postures: int = 9, reach: float | None = 
     columns = min(chart.r, _PANELS)
     rows = -(-chart.r // columns)
     figure = Picture(figsize=(4.5 * columns, 3.9 * rows), layout=ConstrainedLayoutEngine(h_pad=0.15, w_pad=0.1))
+    # all panels have the same axes
     sweeps = [_sweep(chart, j, postures, reach) for j in range(chart.r)]
     everything = chart.problem.robot.joint_points(np.concatenate(sweeps)).reshape(-1, 3)
     colours = mpl.colormaps["viridis"](np.linspace(0.1, 0.9, postures))
@@ -65,6 +67,7 @@ def self_motion_figure(chart: "Chart", postures: int = 9, reach: float | None = 
         panel = figure.add_subplot(rows, columns, j + 1, projection="3d")
         for points, colour in zip(chart.problem.robot.joint_points(sweep), colours, strict=True):
             panel.plot(*points.T, "-o", color=colour, markersize=3, linewidth=1.8)
+        # what a title claims is measured on the postures drawn
         moved = np.abs(chart.x(sweep) - chart.x(chart.problem.domain.home)).max()
         low, high = chart.xi(sweep[[0, -1]])[:, j]
         title = rf"$\xi_{{{j + 1}}}$ from {low:.3g} to {high:.3g}, dark to light"
@@ -79,6 +82,7 @@ def _draw_angles(axes: Axes, angles: "AngleStatistics", colour: str, label: str)
     counts = angles.histogram[first:-3].reshape(-1, 5).sum(axis=1)
     edges = (first - 0.5) / 10 + 0.5 * np.arange(len(counts) + 1)
     axes.stairs(counts / max(counts.sum(), 1) / 0.5, edges, fill=True, color=colour, alpha=0.85)
+    # as wide as the distribution, and never narrower than six degrees
     width = max(6.0, 5 * (0.0 if np.isnan(angles.std) else angles.std))
     axes.set_xlim(90 - width, 90 + width)
     axes.set_xlabel(f"{label} [deg]")

@@ -232,6 +232,7 @@ class Points:
 
         Points with errors of x up to `settled` come first, then those with the least distance.
         """
+        # the best of each row first, up to a number of them
         order = np.lexsort((self.away, self.error > settled, self.row))
         order = order[np.isfinite(self.away[order])]
         if not order.size:
@@ -241,6 +242,7 @@ class Points:
         order, row, rank = (array[rank < RULES.most] for array in (order, row, rank))
         place = np.full((N, RULES.most), -1)
         place[row, rank] = order
+        # take the best that is left, and drop what lies near it
         u, left, chosen = self.u[place], place >= 0, [np.zeros(0, dtype=np.int64)]
         for _ in range(count):
             first = np.argmax(left, axis=1)
@@ -250,6 +252,7 @@ class Points:
             best = place[rows, first[rows]]
             chosen.append(best)
             left[rows] &= np.abs(u[rows] - self.u[best][:, None]).max(axis=2) >= RULES.apart
+            # a row that is nearly solved needs no other point
             left[rows[(self.away[best] <= RULES.nearly) & (self.error[best] <= settled)]] = False
         return self.part(np.concatenate(chosen))
 
@@ -273,12 +276,14 @@ class Slices:
         whose turns change xi unevenly towards the centre of the domain, and once more to both sides.
         """
         domain, (low, high), turning = self.boxed.domain, self.boxed.domain.bounds, self.tracer.turning
+        # of endless joints whose turns change xi unevenly, the turns on both sides as well
         uneven = turning & ~np.isfinite(low) & ~self.boxed.even
         several = ~uneven & ((domain.half_width > np.pi) | ~np.isfinite(low))
         turns = 2 * np.pi * np.array(list(product(*((-1, 0, 1) if more else (0,) for more in uneven))))
         found = [Points.of(own[:0, None], self.boxed)]
         with np.errstate(all="ignore"):
             for traces in self._curves(targets[rows]):
+                # points of the curves, moved by full turns next to where the row is, then into the box
                 curve, place = np.nonzero(np.arange(traces.q.shape[1]) < traces.count[:, None])
                 row, q = rows[traces.row[curve] // len(RULES.places)], traces.q[curve, place]
                 towards = np.where(several, own[row], domain.centre)
@@ -287,6 +292,7 @@ class Slices:
                 q = turns[:, None] + q + np.where(turning, 2 * np.pi * back, 0.0)
                 inside = np.asarray(((q >= low - RULES.slack) & (q <= high + RULES.slack)).all(axis=2))
                 number = np.arange(inside.size).reshape(inside.shape)
+                # of points inside, every few from where a curve enters
                 enters = inside & ~np.roll(inside, 1, axis=1)
                 inside &= (number - np.maximum.accumulate(np.where(enters, number, 0), axis=1)) % RULES.stride == 0
                 inside[inside] = domain.contains(np.clip(q[inside], low, high))
@@ -296,6 +302,7 @@ class Slices:
     def _curves(self, targets: Array) -> list[Traces]:
         """Curves of all slices; number k of K of target j is row K j + k."""
         m, n, K = self.boxed.m, targets.shape[1], len(RULES.places)
+        # stored positions near each target, put onto each slice
         near = self.starts.nearest(targets, RULES.near_phi, n), self.starts.nearest(targets, RULES.near_x, m)
         start = np.repeat(np.concatenate(near).transpose(1, 0, 2), K, axis=0)
         held, domain = list(self.tracer.held), self.boxed.domain
@@ -304,6 +311,7 @@ class Slices:
         x = np.concatenate(
             [np.repeat(targets[:, :m], K, axis=0)[:, None].repeat(start.shape[1], axis=1), start[:, :, held]], axis=2
         )
+        # from there to x, and along the curves; starts on known curves are done
         q, arrived = self.tracer.reach(x.reshape(-1, n - 1), start.reshape(-1, n))
         q, known, found = q.reshape(start.shape), ~arrived.reshape(start.shape[:2]), []
         away = self.tracer.away(q)
@@ -354,6 +362,7 @@ def slide(boxed: BoxedPhi, targets: Array, start: Array, most: int = SLIDE.most)
     with np.errstate(all="ignore"):
         run = _Run(boxed, targets, start)
         rows = np.flatnonzero(np.isfinite(run.gap).all(axis=1))
+        # all rows at once; each ends where its steps gain nothing
         for _ in range(most):
             if not rows.size:
                 break
@@ -383,20 +392,25 @@ class _Run:
         boxed, m, gap, u = self._boxed, self._boxed.m, self.gap[rows], self.u[rows]
         J = boxed.phi_map.jacobian(boxed.points(u)) * boxed.domain.half_width / self._sizes[:, None]
         H = inverses(J)[0]
+        # P moves x, and B moves xi along the self-motions
         P, B, left = H[:, :, :m], H[:, :, m:], gap[:, m:]
         longest, walls = self._longest[rows, None], self._walls(rows, u)
         back = _times(P, gap[:, :m])
         wanted = left * np.minimum(1.0, longest / _size(_times(B, left)))
+        # the step of xi that the boundaries allow, after the step back to x
         z, held = walls.project(B, back, wanted, self._held[rows])
         stretch, plain = self._stretches(rows, z), z
+        # longer where several steps went the same way
         some = np.flatnonzero(stretch != 1)
         if some.size:
             z = z.copy()
             z[some] = walls.part(some).project(B[some], back[some], stretch[some, None] * z[some], held[some])[0]
         d = back + _times(B, z)
+        # cut to the trust region, and corrected once
         part = np.minimum(1.0, longest / _size(d))
         d, z = np.clip(part * d, boxed.low - u, boxed.high - u), part * z
         new, after = self._corrected(rows, u + d, P, B, walls.slopes, held)
+        # accept if x stays near and xi comes nearer, about as the linear model promised
         error, before = largest(after[:, :m]), largest(gap[:, :m])
         square = (left**2).sum(axis=1)
         promised = 2 * (left * z).sum(axis=1) - (z**2).sum(axis=1) / stretch
@@ -407,6 +421,7 @@ class _Run:
             | (before > SLIDE.bent)
             | ((before > SLIDE.kept) & (error < before / 2))
         )
+        # points outside the domain: from now on, the row sees its condition as a wall
         inside = good.copy()
         inside[good] = boxed.domain.contains(boxed.points(new[good]))
         met = good & ~inside & ~self._meets[rows] & boxed.has_rooms
@@ -415,10 +430,12 @@ class _Run:
         self.u[moved], self.gap[moved] = new[inside], after[inside]
         self._held[rows] = held[:, : u.shape[1]]
         self._before[moved] = np.stack([plain, z], axis=1)[inside]
+        # the trust region grows where the model was right
         foreseen = (error < SLIDE.straight) | (gain > promised - (1 - SLIDE.foreseen) * size)
         longer = np.where(foreseen, np.minimum(2 * longest[:, 0], SLIDE.longest), longest[:, 0])
         shorter = np.minimum(longest[:, 0], np.abs(d).max(axis=1)) / 3
         self._longest[rows] = np.where(inside, longer, np.where(met, longest[:, 0], shorter))
+        # where nothing is promised any more
         ended = (size <= SLIDE.converged * square + SLIDE.rounded) | (np.abs(d).max(axis=1) <= SLIDE.still)
         ended &= (before <= SLIDE.kept) & ~met
         return np.asarray(rows[~ended & (self._longest[rows] > SLIDE.shortest)])
@@ -445,6 +462,7 @@ class _Run:
         m, boxed = self._boxed.m, self._boxed
         after = self._gaps(rows, new)
         error = largest(after[:, :m])
+        # rows that missed x by little, and those at a condition, take one more Newton step
         some = np.flatnonzero(((error > SLIDE.kept) | self._meets[rows]) & (error < SLIDE.corrected * SLIDE.bent))
         if some.size:
             back, walls = _times(P[some], after[some, :m]), self._walls(rows[some], new[some], slopes[some])
@@ -459,6 +477,7 @@ class _Run:
         """The boundaries as seen from points u of some rows; the slopes of conditions may be those of other points."""
         boxed = self._boxed
         low, high = boxed.low - u, boxed.high - u
+        # conditions count only in rows that met one
         meets = np.flatnonzero(self._meets[rows])
         if not meets.size:
             return Walls(low, high, np.zeros((len(rows), 0, u.shape[1])))

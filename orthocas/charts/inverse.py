@@ -132,6 +132,7 @@ class Solutions(Shown):
         Raises:
             InverseError: if a row is not solved; the message names the rows.
         """
+        # from the worst to the mildest, so that a message names the reason that matters
         accepted = _ACCEPTED if inside else (*_ACCEPTED, *_BEYOND)
         missing = np.flatnonzero(np.isin(self.status, _FAILED))
         if missing.size:
@@ -275,6 +276,7 @@ class Inverse:
 
     def _search_domain(self, targets: Array, best: Found, rows: Indices, tolerance: float) -> None:
         """Search all of the domain in some rows."""
+        # r = 1: all self-motion curves of x are known, so a root on them is a solution
         if rows.size and self.curves is not None:
             near = self.curves.search(targets[rows], best.q[rows], tolerance)
             found = near.distance == 0
@@ -286,6 +288,7 @@ class Inverse:
             q = self.in_domain.search(targets[rows], tolerance)[0]
         else:  # it may be a small part of its box, and most cells lie outside
             q = self.inside.nearest(targets[rows], best.q[rows])[0]
+        # other coordinates: the best point of the cells, or near stored ones
         attempt = Attempt(q, self.phi_map.residual(targets[rows], q), best.iterations[rows], np.ones(len(q), bool))
         best.improve(rows, self._judged(attempt, tolerance))
 
@@ -347,6 +350,7 @@ class Inverse:
         moved = np.isin(best.status[rows], _MOVED)
         rows, q = rows[moved], q[moved]
         residual = self.phi_map.residual(targets[rows], q)
+        # a status claims no more than was checked: x, all of phi, the domain
         kept, inside = largest(residual[:, : self.problem.m]) <= tolerance, self.problem.domain.contains(q)
         whole = kept & (largest(residual) <= tolerance)
         best.q[rows], best.residual[rows] = q, residual
@@ -394,6 +398,7 @@ class Inverse:
         low, high = self.problem.domain.bounds
         moved = np.clip(attempt.q, low, high)
         off = np.abs(moved - attempt.q)
+        # only points that are as good on the boundary as before
         rows = np.flatnonzero((off > 0).any(axis=1) & (off <= RULES.snap * self.problem.domain.half_width).all(axis=1))
         if not rows.size:
             return attempt

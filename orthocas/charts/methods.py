@@ -98,11 +98,13 @@ class InverseMethods(PhiFunctions):
             as_point_set("q_start", q_start, self.n)
         require_kind("outside", outside, bool)
         found = self.solve(targets, q_start, tolerance=tolerance)
+        # a row without any solution is an error, whatever `outside` says
         try:
             found.require(inside=False)
         except InverseError as error:
             hint = units_hint(self.problem.task.units, np.abs(targets[:, : self.m]).max(axis=0).tolist())
             raise InverseError(f"{error}{hint}") from None
+        # solutions outside the domain are refused, with the nearest ones inside
         beyond = np.flatnonzero(~found.found)
         if beyond.size and not outside:
             raise self._outside_error(targets, q_start, found, beyond, single)
@@ -160,6 +162,7 @@ class InverseMethods(PhiFunctions):
         Source:
             ours: docs/how-to/inverse.md.
         """
+        # check what is asked
         if local is not None and not callable(local):
             raise InvalidValueError("local", repr(local)[:80], "a function of targets and starts")
         phi = build_phi(self, phi, x, xi)
@@ -167,10 +170,12 @@ class InverseMethods(PhiFunctions):
             require_kind("collisions", collisions, Collisions)
             collisions.require_for(self.problem.robot.tree)
         require_kind("all", all, bool)
+        # all solutions of one phi
         if all:
             if q_start is not None or inside:
                 raise InvalidValueError("all", "given with q_start or inside", "all alone")
             return self._solve_all(as_point("phi", phi, self.n), tolerance, collisions)
+        # one solution for each row, and where it touches something another one
         search = self.parts.inverse if local is None else replace(self.parts.inverse, local=local, brief=local)
         found = solve_with(search, self, phi, q_start, tolerance, inside)
         return found if collisions is None else self._prefer_free(rows_of(self, "phi", phi), found, collisions)
@@ -203,12 +208,14 @@ class InverseMethods(PhiFunctions):
         require_expression(self, "a search for all solutions")
         in_domain = self.parts.inverse.in_domain
         assert in_domain is not None
+        # free ones first, otherwise the nearest to the centre first
         q = in_domain.all_solutions(phi, float(tolerance))
         status = np.full(len(q), int(InverseStatus.FOUND))
         if collisions is not None and len(q):
             status[~collisions.check_free(q)] = InverseStatus.COLLIDING
         order = np.argsort(status, kind="stable")
         q, rows = q[order], np.broadcast_to(phi, q.shape)
+        # their errors, and what is left of xi
         error = largest(self.parts.phi_map.residual(rows, q)) if len(q) else np.zeros(0)
         own = self.parts.phi_map.difference(rows, np.asarray(self.phi(q)))[:, self.m :] if len(q) else q[:, self.m :]
         steps = np.zeros(len(q), dtype=np.int64)
@@ -217,12 +224,14 @@ class InverseMethods(PhiFunctions):
     def _prefer_free(self, targets: Array, found: Solutions, collisions: Collisions) -> Solutions:
         """The same with free solutions in place of those that touch, where there are any."""
         rows = np.flatnonzero(np.isin(found.status, (InverseStatus.FOUND, InverseStatus.NEAREST)))
+        # rows whose solution touches something
         rows = rows[~collisions.check_free(found.q[rows])] if rows.size else rows
         if not rows.size:
             return found
         status = found.status.copy()
         status[rows] = InverseStatus.COLLIDING
         parts = [replace(found, status=status).row(k) for k in range(len(found))]
+        # of all solutions of such a row, the free one nearest to the first
         for k in rows[found.status[rows] == InverseStatus.FOUND].tolist():
             if not isinstance(self.coordinates, InvertibleMap):
                 every = self._solve_all(targets[k], found.tolerance, collisions)
@@ -322,10 +331,12 @@ class InverseMethods(PhiFunctions):
     ) -> InverseError:
         """What to raise for solutions (N, n) of which some rows lie outside the domain."""
         nearest = None
+        # the nearest inside, for those who catch the error
         if not isinstance(self.coordinates, InvertibleMap):
             nearest = found.q.copy()
             own = None if q_start is None else np.broadcast_to(rows_of(self, "q_start", q_start), targets.shape)[beyond]
             nearest[beyond] = self.solve(targets[beyond], own, tolerance=found.tolerance, inside=True).q
+        # the joint of the first row that is farthest outside
         q, domain = found.q[beyond[0]], self.problem.domain
         low, high = domain.bounds
         j = int(np.argmax(np.maximum(low - q, q - high) / domain.half_width))
@@ -347,6 +358,7 @@ def solve_with(
     """`InverseMethods.solve` by a search of one's own."""
     require_at_least("tolerance", tolerance, 0)
     targets = rows_of(chart, "phi", phi)
+    # one start serves all rows; grown coordinates begin at the centre
     starts = None if q_start is None else rows_of(chart, "q_start", q_start)
     if starts is None and isinstance(chart.coordinates, InvertibleMap):
         starts = chart.problem.domain.home[None]
@@ -367,6 +379,7 @@ def build_phi(chart: InverseMethods, phi: ArrayLike | None, x: Any, xi: ArrayLik
     if phi is not None or x is None or xi is None:
         given = listed(name for name, value in (("phi", phi), ("x", x), ("xi", xi)) if value is not None)
         raise InvalidValueError("target", given or "nothing", "phi, or x and xi; `nearest_xi` takes x and a posture")
+    # x in any form that tasks take, and xi; one may serve many of the other
     first, second = chart.task.target(x), as_float_array("xi", xi)
     if second.ndim == 0 and chart.r == 1:
         second = second[None]
@@ -374,6 +387,7 @@ def build_phi(chart: InverseMethods, phi: ArrayLike | None, x: Any, xi: ArrayLik
         require_shape(name, part.shape, (size,) if part.ndim == 1 else (None, size))
     if first.ndim == second.ndim == 2 and len(first) != len(second) and 1 not in (len(first), len(second)):
         raise ShapeError("xi", second.shape, (len(first), chart.r))
+    # both side by side, row by row
     rows = np.broadcast_shapes(first.shape[:-1], second.shape[:-1])
     return np.concatenate([np.broadcast_to(part, (*rows, part.shape[-1])) for part in (first, second)], axis=-1)
 
@@ -517,6 +531,7 @@ class ChartParts:
     def inverse(self) -> Inverse:
         """The search of `InverseMethods.solve`."""
         chart, phi_map, domain = self.chart, self.phi_map, self.chart.problem.domain
+        # grown coordinates bring their own inverse
         starts = Starts(phi_map, domain)
         if isinstance(chart.coordinates, InvertibleMap):
             return Inverse(chart.problem, phi_map, OwnInverse(chart.coordinates, phi_map), starts)

@@ -138,11 +138,13 @@ class _Run:
         inverse = self._inverse if len(rows) == len(self._inverse) else self._inverse[rows]  # copies take time
         steps = np.matmul(inverse, self.residual[rows, :, None])[:, :, 0]
         goes_on = np.zeros(len(rows), dtype=bool)
+        # halve the steps of rows whose error does not decrease
         left = np.flatnonzero(np.isfinite(steps).all(axis=1))
         for halvings in range(most + 1):
             moved = self._try(rows[left], steps[left], 0.5**halvings)
             goes_on[left[moved]] = True
             left = left[~moved]
+            # before that, rows with an old J ask for a new one, and rows that only rounding stops end
             if halvings == 0:
                 waiting = ~self._fresh[rows[left]]
                 self.stale[rows[left[waiting]]] = goes_on[left[waiting]] = True
@@ -157,6 +159,7 @@ class _Run:
         q = self.q[rows] + share * steps
         residual = self._map.residual(self._targets[rows], q)
         before, error = self.error[rows], largest(residual)
+        # a sufficient decrease, as for line searches; slow rows get a new J
         better = error < (1 - NEWTON.decrease * share) * before
         moved = rows[better]
         self.q[moved], self.residual[moved], self.error[moved] = q[better], residual[better], error[better]
@@ -184,6 +187,7 @@ def inverses(matrices: Array) -> tuple[Array, NDArray[np.bool_]]:
         ):
             found[piece] = inverse
     except np.linalg.LinAlgError:  # it does not say which
+        # LAPACK does not say which matrix is singular
         with np.errstate(invalid="ignore"):
             singular = np.asarray(np.linalg.slogdet(matrices)[0] == 0)
         found = np.empty_like(matrices)
@@ -234,12 +238,15 @@ class Continuation:
             h, iterations = np.full(len(q), CONTINUATION.first), np.zeros(len(q), dtype=np.int64)
             left = np.flatnonzero(np.isfinite(error) & np.isfinite(step).all(axis=1))
             for _ in range(CONTINUATION.most):
+                # rows end at the target, or where steps get too short
                 left = left[(error[left] > NEWTON.goal) & (h[left] > CONTINUATION.shortest)]
                 if not left.size:
                     break
+                # a step towards the target, as long as the trust region allows
                 share = np.minimum(1.0, h[left] / np.abs(step[left]).max(axis=1))
                 new = q[left] + share[:, None] * step[left]
                 after = self._map.residual(targets[left], new)
+                # it counts if phi moved along the line, and det J kept its sign
                 miss = largest(after - (1 - share[:, None]) * residual[left]) / (share * error[left])
                 onward, side = self._steps(targets[left], new, after)
                 rounded = (share == 1) & (error[left] < CONTINUATION.rounding)
@@ -249,6 +256,7 @@ class Continuation:
                 q[moved], residual[moved], step[moved] = new[good], after[good], onward[good]
                 error[moved] = largest(after[good])
                 iterations[moved] += 1
+                # longer steps where the line is nearly straight, shorter ones where a step failed
                 longer = miss[good] <= CONTINUATION.straight
                 h[moved] = np.where(longer, np.minimum(1.5 * h[moved], CONTINUATION.longest), h[moved])
                 h[left[~good]] /= 2
@@ -370,6 +378,7 @@ class PointSolver:
     def solve(self) -> bool:
         """Solve for the target from q. Returns whether the error fell to rounding; then q is the solution."""
         self.iterations = 0
+        # some steps with each Jacobian
         for _ in range(NEWTON.refreshes):
             if not self.refresh() or not self.step():
                 return False

@@ -63,6 +63,7 @@ class Differences:
         """Targets - values, as NumPy rows (..., n) or CasADi columns (n, 1)."""
         if self.task is None or not self.task.turned:
             return wrap_shortest(targets - values, self.turns)
+        # orientations differ by a rotation, other components by numbers
         m, symbolic = self.task.task.m, isinstance(values, ca.SX | ca.MX)
         pair = (targets[:m], values[:m]) if symbolic else (targets[..., :m], values[..., :m])
         first = self.task.difference(*pair)
@@ -214,6 +215,7 @@ class PhiFunctions:
     def _functions(self) -> dict[str, ca.Function]:
         q = ca.MX.sym("q", self.n)
         task, coordinates = self.problem.task, self.coordinates.functions
+        # task first, then coordinates
         x, J_x = task.function(q), task.jacobian_function(q)
         xi, J_xi = coordinates["xi"](q), coordinates["jacobian"](q)
         outputs = {
@@ -222,6 +224,7 @@ class PhiFunctions:
             "jacobian": ca.vertcat(J_x, J_xi),
         }
         functions = {name: ca.Function(name, [q], [ca.densify(out)], ["q"], [name]) for name, out in outputs.items()}
+        # d^2 phi [v, w] is linear in both, so that C calls it with any two directions
         v, w = ca.MX.sym("v", self.n), ca.MX.sym("w", self.n)
         second = ca.vertcat(task.second_derivative_function(q, v, w), coordinates["second_derivative"](q, v, w))
         functions["second_derivative"] = ca.Function(

@@ -168,6 +168,7 @@ class PointQuality(Shown):
     def facts(self) -> dict[str, str]:
         """The worst values of the set, or those of the one position."""
         leak, conditioning, distance = np.atleast_2d(self.leak_deg), np.ravel(self.conditioning), self.boundary_distance
+        # the worst of each, where there are values
         known = np.isfinite(conditioning)
         single = np.ndim(self.conditioning) == 0
         facts = {"quality": "at one joint position" if single else f"at {len(leak)} joint positions"}
@@ -283,6 +284,7 @@ def descended(value: Value, u: Array, found: Array, seed: int, thorough: bool) -
     rng = np.random.default_rng((seed, WORST.candidates))
     order = np.argsort(found)[: min(WORST.descents, int(np.isfinite(found).sum()))]
     u, found, step = u[order], found[order], np.full(len(order), WORST.first_step)
+    # short descents of many, then longer ones of the best
     for _ in range(WORST.steps):
         _step(value, u, found, step, rng)
     order = np.argsort(found)
@@ -310,6 +312,7 @@ def _signed_conditioning(problem: Problem, coordinates: CoordinateMap, u: Array)
     try:
         judged = Judged.at(problem, coordinates, points[inside])
     except SingularTaskError:  # for example at half a turn
+        # points at which the task has no Jacobian are left out
         J = problem.task.batched_jacobian(points[inside])[0]
         inside = inside[np.isfinite(J.reshape(len(inside), problem.m * problem.n)).all(axis=1)]
         judged = Judged.at(problem, coordinates, points[inside])
@@ -368,6 +371,7 @@ def tridiagonal(matrix: ca.SX) -> tuple[ca.SX, ca.SX]:
     A, n = ca.SX(matrix), matrix.size1()
     squares = []
     for k in range(n - 2):
+        # Householder's reflection of column k, from both sides
         v, norm, half = _reflection(A[k + 1 :, k])
         squares.append(norm * norm)
         w = A[k + 1 :, k + 1 :] @ v / _or_one(half)

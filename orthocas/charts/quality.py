@@ -64,6 +64,7 @@ class _Sums:
         bins = round(most / RULES.bin) + 1
         first_bins = bins * np.arange(k)[:, None]
 
+        # pieces of the samples in threads; their sums are added in order
         def one_piece(start: int) -> tuple[Array, Array, Array, Indices]:
             angles = np.degrees(inverse(np.ascontiguousarray(values[start : start + RULES.piece].T)))
             places = (angles / RULES.bin + 0.5).astype(np.intp) + first_bins
@@ -291,6 +292,7 @@ class Report(Shown):
         """Angles, conditioning, lengths, and the faults of the chart if there are any."""
         values = self.conditioning
         faults = {}
+        # what is wrong with the chart
         if self.folded_samples:
             at = ", ".join(f"{value:.2f}" for value in self.worst_point)
             share = percent(self.folded_samples / self.samples, 3, fault=True)
@@ -327,6 +329,7 @@ class Report(Shown):
             "mutual angle": paper(self.mutual_angle),
             "leak": f"rms {leak.rms:.2f}, mean {leak.mean:.2f}, largest sampled {leak.max:.1f} deg (in the metric)",
         }
+        # one coordinate has no mutual angles, and exact ones make means look better than the others are
         if self.r == 1:
             found["mutual angle"] = "none, r = 1"
         if others is not None:
@@ -405,6 +408,7 @@ def evaluate(
     free = FREE in chart.notes
     if free and collisions is None:
         collisions = chart.problem.robot.collisions
+    # samples of one's own, and a search for the worst points, which samples miss
     if points is None:
         count = _count(chart, RULES.samples if samples is None else samples)
         drawn = require_count("seed", RULES.seed if seed is None else seed, least=0)
@@ -412,6 +416,7 @@ def evaluate(
         problem, found = chart.problem, chart.coordinates
         worst = worst_points(problem, found, drawn, thorough=True) if searched else None
         return _report(chart, sample_uniform(chart.problem.domain, count, drawn), drawn, worst, collisions, free)
+    # or the points that were given, and nothing else
     if samples is not None or seed is not None:
         raise InvalidValueError("points", "given with samples or a seed", "points alone")
     given = as_point_set("points", points, chart.n)[0]

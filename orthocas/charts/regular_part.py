@@ -55,11 +55,13 @@ class RegularPart(ClearBox):
         require_kind("box", box, ClearBox)
         assert isinstance(box, ClearBox)
         require_kind("coordinates", coordinates, Coordinates)
+        # numbers and sizes that fit the box
         bound = as_number("least_volume", least_volume)
         if not 0 < bound < 1:
             raise InvalidValueError("least_volume", least_volume, "a number between 0 and 1")
         if coordinates.space.n != len(box.centre) or coordinates.r + box.task.m != len(box.centre):
             raise InvalidValueError("coordinates", f"r = {coordinates.r}", f"n - m = {len(box.centre) - box.task.m}")
+        # the condition needs the orientation of the centre, which lies inside
         object.__setattr__(self, "coordinates", coordinates)
         object.__setattr__(self, "least_volume", bound)
         object.__setattr__(self, "orientation", 1.0)
@@ -93,6 +95,7 @@ class RegularPart(ClearBox):
         """The domain of a file."""
         box = ClearBox.from_data(task, data, arrays)
         kind, robot = get_part(data, "regular", dict), task.robot
+        # the coordinates whose volume counts, on joints of their own space
         theta, centre, half_width = (get_part(arrays, name, np.ndarray) for name in _ARRAYS)
         n = robot.n
         centre, half_width = (
@@ -165,6 +168,7 @@ def _volume(task: Task, coordinates: Coordinates) -> ca.Function:
     """q (n, 1) -> v (1, 1)."""
     n, m, r = task.robot.n, task.m, coordinates.r
     rows, gradients = ca.SX.sym("rows", m, n), ca.SX.sym("gradients", r, n)
+    # what is left of unit gradients across the task and the gradients before them; the task counts with its sign alone
     diagonal = triangle(ca.vertcat(rows, gradients))
     value = ca.SX(1)
     for k in range(n):

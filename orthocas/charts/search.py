@@ -209,10 +209,12 @@ class Cells:
         rng, found = np.random.default_rng(RULES.cell_seed), np.empty(n)
         for j in range(n):
             u, steps = rng.uniform(-1, 1, (RULES.probes, n)), np.zeros((RULES.probes, n))
+            # pairs of points that differ in joint j alone, both inside
             u[:, j] *= 1 - width[j]
             steps[:, j] = width[j] * rng.uniform(-1, 1, RULES.probes)
             here, there = (boxed.phi_map.phi(boxed.points(at)) for at in (u, u + steps))
             inverse = _finite(inverses(self._jacobian(u))[0])
+            # how far a linear map from the first misses the second
             y = np.einsum("kij,kj->ki", inverse, boxed.phi_map.difference(there, here))
             size = np.linalg.norm(y - steps, axis=1)
             found[j] = np.median(np.where(np.isfinite(size), size, 0.0))
@@ -241,10 +243,12 @@ class Cells:
         boxed, middles = self._boxed, self._middles
         phi = boxed.phi_map.phi(boxed.points(middles))
         inverse = inverses(self._jacobian(middles))[0]
+        # phi at the corners of each cell, seen through J^-1 of its middle
         points = (middles[:, None] + self._half_width * self._unit).reshape(-1, middles.shape[1])
         values = boxed.phi_map.phi(boxed.points(points)).reshape(len(middles), -1, middles.shape[1])
         with np.errstate(invalid="ignore"):
             y = np.einsum("gij,gkj->gki", inverse, boxed.phi_map.difference(values, phi[:, None]))
+        # cells without values everywhere have no bounds
         known = np.isfinite(y).all(axis=(1, 2))
         phi, inverse, y = _finite(phi), _finite(inverse), _finite(y)
         return _Linear(phi, inverse, y, y.min(axis=1), y.max(axis=1), known)
@@ -280,12 +284,14 @@ class InDomain:
     def all_solutions(self, target: Array, tolerance: float) -> Array:
         """Different solutions for a target (n,), that nearest to the centre first, (k, n)."""
         places = self.cells.places(target[None])
+        # starts: the place in each cell that may hold a solution, and samples around it
         likely = np.flatnonzero(places.overshoot[0] <= RULES.margin)
         more = self.cells.samples(np.broadcast_to(target, (len(likely), len(target))), likely, RULES.all)
         starts = np.vstack([places.start[0, likely], more.reshape(-1, len(target))])
         u, error = self._solved(np.broadcast_to(target, starts.shape), starts, tolerance)
         u = u[error <= tolerance]
         different: list[Array] = []
+        # solutions that differ, the nearest to the centre first
         for row in u[np.argsort(np.linalg.norm(u, axis=1))]:
             if all(np.abs(row - other).max() > RULES.same for other in different):
                 different.append(row)

@@ -14,9 +14,11 @@ from orthocas.charts.ready import load
 from orthocas.cli.options import (
     AsJson,
     Force,
+    LikeNames,
     ProblemOptions,
     SampleCount,
     is_robot_file,
+    parse_likeness,
     parse_weights,
     parse_whole_number,
 )
@@ -67,6 +69,7 @@ def compare(
         list[str] | None,
         typer.Option("--weights", help='"lambda1,lambda2", up to lambda5, as in fit; repeat for a front.'),
     ] = None,
+    like: LikeNames = None,
     jobs: Annotated[
         int | None,
         typer.Option(
@@ -104,6 +107,7 @@ def compare(
                     branch=branch,
                     seeds=seeds,
                     weights=losses,
+                    like=parse_likeness(like),
                     samples=samples,
                     held_out=held_out,
                     jobs=jobs,

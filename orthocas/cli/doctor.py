@@ -23,6 +23,7 @@ from orthocas.version import VERSION
 
 EXTRAS = {
     "robots": "robots by name, such as panda",
+    "xacro": "robots of xacro files",
     "view": "charts and motions in the browser",
     "mesh": "charts grown on closed surfaces of three joints",
     "mujoco": "MJCF files, and MuJoCo as plant of simulations",

@@ -19,11 +19,13 @@ from orthocas.cli.options import (
     WEIGHTS_TEXT,
     AsJson,
     Force,
+    LikeNames,
     ProblemName,
     ProblemOptions,
     SampleCount,
     add_problem_options,
     is_robot_file,
+    parse_likeness,
     parse_number,
     parse_weights,
     parse_whole_number,
@@ -95,10 +97,7 @@ def fit(
             "see orthocas info --branches; all: a chart of every branch, in an arm file for orthocas solve and oc.Arm.",
         ),
     ] = None,
-    like: Annotated[
-        str | None,
-        typer.Option("--like", help="What the first coordinates are like: a joint or swivel; several: NAME,NAME."),
-    ] = None,
+    like: LikeNames = None,
     exact: Annotated[
         bool,
         typer.Option(
@@ -183,7 +182,7 @@ def fit(
     parametrisation = None if param is None else parse_parametrisation(param)
     minimiser = None if solver is None else get_solver(solver)
     loss, wide_loss = parse_weights(weights, angles), parse_wide_weights(weights, angles) if kind == _BRANCH else None
-    quantities = None if like is None else [word.strip() for word in like.split(",")]
+    quantities = parse_likeness(like)
 
     suggestion, result = None, None
     try:
@@ -329,7 +328,7 @@ def _fit_wide(
     name: str,
     words: ProblemOptions,
     branch: str,
-    like: list[str] | None,
+    like: str | list[str] | None,
     exact: bool | None,
     parametrisation: Parametrisation | None,
     weights: Weights | Mapping[str, float] | None,
@@ -353,7 +352,7 @@ def _fit_wide(
             clearance=CLEARANCE if words.least_singular_value is None else words.least_singular_value,
             parametrisation=parametrisation,
             home=words.home if base is None else centre,
-            like=like[0] if like and len(like) == 1 else like,
+            like=like,
             exact=exact,
             weights=weights,
             samples=samples,

@@ -46,6 +46,10 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on s
 Force = Annotated[bool, typer.Option("--force", help="Replace files of the same names that orthocas did not write.")]
 ChartPath = Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")]
 ProblemName = Annotated[str, typer.Argument(metavar="PROBLEM|FILE.urdf", help="A named problem or a URDF file.")]
+LikeNames = Annotated[
+    str | None,
+    typer.Option("--like", help="What the first coordinates are like: a joint or swivel; several: NAME,NAME."),
+]
 SampleCount = Annotated[
     int | None,
     typer.Option(
@@ -365,3 +369,9 @@ def parse_weights(text: str, angles: str | None) -> Weights:
     for name, _, value in (word.partition("=") for word in words if "=" in word):
         extra[name.strip()] = float(parse_numbers(f"--weights {name}", value)[0])
     return replace(Weights.of(numbers) if numbers else Weights(), extra=extra, angles=cast(Angles | None, angles))
+
+
+def parse_likeness(text: str | None) -> str | list[str] | None:
+    """The name, or several, of --like."""
+    names = [word.strip() for word in (text or "").split(",")]
+    return None if text is None else names[0] if len(names) == 1 else names

@@ -134,6 +134,7 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
         [True, True]
     """
     require_kind("chart", chart, Chart)
+    # the library of the chart, then what takes many rows, then what follows curves
     with open_draft_folder() as drafts:
         generate_c(chart, drafts, name="arm")
         sources = {path.name: path.read_text(encoding="utf-8") for path in sorted(drafts.glob("*.[hc]"))}

@@ -259,6 +259,7 @@ def _silence_warnings(block: str) -> str:
     if match is None:
         return block
     head, body = block.split("{", 1)
+    # parameters that the body never names
     parameters = [part.split()[-1].lstrip("*") for part in head[head.index("(") + 1 : head.rindex(")")].split(",")]
     unused = [name for name in parameters if not re.search(rf"\b{name}\b", body)]
     silenced = "".join(f"\n  (void){name};" for name in unused)

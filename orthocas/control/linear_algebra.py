@@ -185,7 +185,7 @@ def apply_limited_springs(
     damping ratio z if all have the same, and is always positive semi-definite.
 
     Source:
-        ours, docs/explanation/derivations_control.md#springs-that-no-mode-is-too-fast-for
+        ours, docs/explanation/derivations_springs.md#springs
     """
     k, c, d = inertia.shape[0], errors.shape[1], velocities.shape[1]
     root, ratio = ca.sqrt(stiffness), ca.sqrt(damping_ratio)

@@ -58,6 +58,7 @@ class MemoryRules:
     sticking: float = 5e-3  #: speed below which a joint may stick [rad/s] or [m/s]
     travel: float = 3e-3  #: way on which a joint that broke away forgets that torque [rad] or [m]
     drop: float = 0.25  #: share of that torque by which friction may fall as a joint breaks away
+    least: float = 0.2  #: share of its rates with which an observer of friction works if it does: nothing creeps
     unseen: float = 3.0  #: ticks until a law stops that: torque a tick late, held for one, seen in the next
 
 
@@ -363,10 +364,11 @@ class FrictionObserver(_Correcting):
     A momentum observer r alone hunts: friction changes its sign with the motion, and what was found while a joint moved
     pushes it on where it stands. Here the law gets the `extra_torque` b - r. With d = J^-1 e, what each joint is off,
 
-        s = clip(max_k |e_k| / tolerance_k - 1), s_i = s clip(max_k n |J_ki d_i| / tolerance_k - 1), clip to [0, 1],
+        s = clip(max_k |e_k| / tolerance_k - 1), s_i = s clip(max_k n |J_ki d_i| / tolerance_k - 1),
         dr_i/dt = s_i rate (the torque that momentum shows beyond command, C^T dq - g, r and -b),
-        db_i/dt = -s_i 60/s k_i d_i exp(-(dq_i / 5 mrad/s)^2) - b_i |dq_i| / 3 mrad.
+        db_i/dt = -s_i 60/s k_i d_i exp(-(dq_i / 5 mrad/s)^2) - b_i |dq_i| / 3 mrad,
 
+    where clip is 0 below 0, and then between 0.2 and 1, so that nothing creeps.
     b breaks joints away: it grows where a joint is off and stands, and is forgotten as soon as it moves, so that its
     own friction stops it. Joints that are off by little, s_i = 0, are left alone. k_i is M_ii times the squared
     frequency of the law's fastest mode, in series with the joint's compliance, or twice the joint's limit, if that is
@@ -376,7 +378,7 @@ class FrictionObserver(_Correcting):
     no law resolves less. tolerance_k is at least what that moves phi_k: nothing for arms with rotors, but 20 mrad for a
     bare flange of 1e-4 kg m^2, which would otherwise jump to and fro. Slow r bears wrong masses: with the rate
     alpha omega, a joint whose true inertia is kappa times that of the model is stable up to
-    kappa = (2 zeta + alpha) (1 + 2 zeta alpha) / alpha (docs/explanation/derivations_control.md#observers).
+    kappa = (2 zeta + alpha) (1 + 2 zeta alpha) / alpha (docs/explanation/derivations_springs.md#observers).
 
     Args:
         rate: > 0 [1/s].
@@ -480,8 +482,8 @@ def _build_memory(fields: Mapping[str, Array], inputs: dict[str, ca.MX], values:
 
 
 def _clip_share(values: ca.MX) -> Any:
-    """Values within 0 and 1."""
-    return ca.fmin(ca.fmax(values, 0), 1)
+    """0 for values that are not positive, others within `RULES.least` and 1."""
+    return ca.if_else(values > 0, ca.fmin(ca.fmax(values, RULES.least), 1), 0)
 
 
 def _clip(values: ca.MX, bound: Array) -> Any:

@@ -291,6 +291,7 @@ class BasisObjective:
             if smooth:
                 gradients = self._thin(stride)[j : j + 1]
                 H = build_normal_matrix(smooth[j : j + 1], gradients, ()) / len(gradients[0])
+            # a hinge couples coordinates; here each keeps its own part
             for D, G, count in hinges:
                 active = (D[:, j : j + 1] @ G)[:, 0, self.kept[j]]
                 H += (active.T @ active).astype(float) / count

@@ -25,9 +25,10 @@ from orthocas.charts.ready import load
 from orthocas.codegen.library import control_tick
 from orthocas.errors import ChartFileError, Interrupted, InvalidValueError, OrthocasError
 from orthocas.fitting.fit import Fit, fit
+from orthocas.fitting.like import Likeness
 from orthocas.fitting.settings import choose_solver
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
-from orthocas.fitting.wide import WideFit, fit_wide
+from orthocas.fitting.wide import CLEARANCE, WideFit, fit_wide
 from orthocas.solvers.gauss_newton import GaussNewton
 from orthocas.solvers.protocol import Solver, Status
 from orthocas.tasks.branches import Branch, branches
@@ -59,6 +60,8 @@ def compare(
     branch: Branch | Box | str | None = None,
     seeds: int = 1,
     weights: Weights | WeightNumbers | Sequence[Weights | WeightNumbers] | None = None,
+    like: Likeness | None = None,
+    clearance: float | None = None,
     samples: int | None = None,
     held_out: int = 100_000,
     executor: Executor | None = None,
@@ -86,6 +89,9 @@ def compare(
         seeds: number of seeds 0, 1, ... of samples and random starts.
         weights: weights of the loss, or several of them; see `fit`, and `fit_wide` for a branch: there 2 m a weighs
             leaks a times as much as the default. Default: those of these functions.
+        like: what coordinates are like, as in `fit` and `fit_wide`; wide ones are fitted to it, not taken exactly.
+            Processes take names, tasks and functions of modules.
+        clearance: of wide fits, see `fit_wide`. Default: that of the problem's domain, or of `fit_wide`.
         samples: number of training samples. Default: grows with the number of parameters.
         held_out: number of held-out samples.
         executor: any `concurrent.futures.Executor` (processes, threads, Dask, MPI, ...). Default: processes on this
@@ -127,6 +133,11 @@ def compare(
     part = branches(problem.robot, problem.task)[branch] if isinstance(branch, str) else branch
     if part is not None and solvers is not None:
         raise InvalidValueError("solvers", "given with a branch", "no solvers: wide fits have their own")
+    if clearance is not None and part is None:
+        raise InvalidValueError("clearance", "given without a branch", "a branch: it is of wide fits")
+    bound = problem.domain.singular_bound
+    if clearance is None:
+        clearance = CLEARANCE if bound is None else bound.least_singular_value
     folder = None if charts is None else as_path("charts", charts)
     if folder is not None:
         require_writable(folder / "chart", ChartFileError)
@@ -135,7 +146,7 @@ def compare(
     elif control_ticks:
         raise InvalidValueError("charts", None, "a folder for charts: control_ticks are measured on them")
 
-    first = Cell(problem, families[0], None, 0, losses[0], samples, held_out, None, force, part)
+    first = Cell(problem, families[0], None, 0, losses[0], samples, held_out, None, force, part, like, clearance)
     cells = _build_cells(first, families, solvers, losses, seeds, folder)
 
     # Results arrive in any order, and return in that of the grid.
@@ -187,10 +198,12 @@ def _build_cells(
     """
     cells = []
     for parametrisation in parametrisations:
+        # closed forms have one fit for all solvers, weights and seeds
         closed = parametrisation.closed_form is not None
         fitting = [choose_solver(parametrisation, first.problem)] if closed or solvers is None else solvers
         for solver, loss, seed in product(fitting, losses[:1] if closed else losses, range(1 if closed else seeds)):
             cell = replace(first, parametrisation=parametrisation, solver=solver, weights=loss, seed=seed)
+            # a chart file for each cell, refused before the first fit if it exists
             if folder is not None:
                 words = [parametrisation.label, solver.name if first.branch is None else WIDE, str(seed)]
                 words += [cell.weights_label] if len(losses) > 1 else []
@@ -208,6 +221,7 @@ def _check_grid(
     families: Any = parametrisations
     if isinstance(parametrisations, list | tuple):
         families = [parse_parametrisation(one) if isinstance(one, str) else one for one in parametrisations]
+    # members of the right kind, and names that differ: tables and files go by them
     for name, members, kinds, example in (
         ("parametrisations", families, Parametrisation, "Polynomial(degree=4)"),
         ("solvers", [GaussNewton()] if solvers is None else solvers, Solver, "GaussNewton()"),
@@ -241,6 +255,8 @@ class Cell:
     chart_file: Path | None  #: file to save the chart in
     force: bool = False  #: replace a file there that is not a chart
     branch: Branch | Box | None = None  #: of a wide fit
+    like: Likeness | None = None  #: what coordinates are like
+    clearance: float = CLEARANCE  #: of a wide fit
 
     @property
     def solver_name(self) -> str:
@@ -266,11 +282,16 @@ class Cell:
 
     def fit(self, monitor: Monitor) -> Fit:
         """Fit the chart."""
-        settings: dict[str, Any] = {"weights": self.weights, "samples": self.samples, "seed": self.seed}
+        settings: dict[str, Any] = {
+            "weights": self.weights,
+            "samples": self.samples,
+            "seed": self.seed,
+            "like": self.like,
+        }
         if self.branch is None:
             return fit(self.problem, self.parametrisation, self.solver, monitor=monitor, **settings)
         robot, task, metric = self.problem.robot, self.problem.task, self.problem.metric
-        settings |= {"parametrisation": self.parametrisation, "monitor": monitor}
+        settings |= {"parametrisation": self.parametrisation, "clearance": self.clearance, "monitor": monitor}
         return fit_wide(robot, task, self.branch, metric, **settings)
 
 

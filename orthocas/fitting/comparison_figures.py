@@ -78,6 +78,7 @@ def _wide_front_figure(comparison: "Comparison") -> Figure:
     upper, lower = figure.subplots(2, 1, sharex=True)
     summaries = [summary for summary in comparison.summaries() if summary.failed < summary.seeds]
     colours = _colours([result for result in comparison.results if not result.failed])
+    # a line for each parametrisation, a point for each set of weights
     for name, colour in colours.items():
         own = [summary for summary in summaries if summary.parametrisation == name]
         leaks = [summary.leak_rms_deg for summary in own]

@@ -188,6 +188,7 @@ class Like:
         """
         m, B = samples.task_jacobian.shape[1], _split_directions(samples)
         slopes = self.differentiate(samples.points) @ B
+        # what self-motions move of each quantity, and whether that is enough to tell them apart
         left = slopes[:, :, m:]
         gram = np.einsum("skj,slj->kl", left, left) / len(left)
         squares, least = gram.diagonal(), RULES.still_motion**2
@@ -271,13 +272,16 @@ class Like:
         """What the first coordinate misses of the first quantity at samples of the domain, where it has a value."""
         samples = sample_problem(problem, RULES.held_out_of_meaning, (seed, RULES.held_out_of_meaning))
         value = Batched(self.function)(samples.points)[0].reshape(len(samples), -1)[:, 0]
+        # where both have a value, angles by the shorter way
         own, left = self._compare_rates(coordinates, samples)
         finite = np.isfinite(value) & np.isfinite(left)
         xi, value = coordinates.once("xi", samples.points)[finite, 0], value[finite]
         period = float(self.periods[0])
         missed = wrap_shortest((xi - value)[:, None], np.array([period]))[:, 0]
         value = xi - missed
+        # how much of the quantity's rate is left along self-motions
         slow, fast = np.quantile((left / own)[finite], RULES.quantiles)
+        # what no function of xi can explain
         order = np.argsort(xi)
         monotone = scipy.optimize.isotonic_regression(value[order])
         return MeaningError(

@@ -258,6 +258,7 @@ class LossWithVolumes:
                     result[...] = 0.0
             else:
                 written([arguments[0], *(arguments[1 + k] for k in self._places)], results)
+            # then the volume terms, whose determinants LAPACK computes
             for weight, term in self._loss.volume_terms:
                 rho, slope = self._of_block(term, arguments[0], arguments[1:])
                 results[0][...] += (weight / 2 * rho**2).reshape(results[0].shape)

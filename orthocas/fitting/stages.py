@@ -393,6 +393,7 @@ class StageRunner:
             points = sample_evenly(self.problem.domain, count, RULES.start_seed)
             samples = evaluate_samples(self.problem, points).restricted_to(self.active)
             start = find_spectral_start(family, samples, kept, self._gradients(family))
+            # quantities to follow choose among coordinates of equal loss
             if self.like is not None:
                 start = self.like.turn(family, start, samples, self._gradients(family))
             self._starts[key] = start

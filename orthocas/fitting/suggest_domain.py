@@ -256,11 +256,13 @@ class WidestBox:
         exchange, step = None, 1.0
         for end in ends:
             self._next = end, len(self.free) + RULES.trials
+            # wider where joints cost little, narrower where they cost much
             exchange = self._compute_exchange(widths) if exchange is None else exchange
             trial = self._scale_to_boundary(widths * np.exp(-step * exchange), 1.0)
             if np.log(trial[self.free]).sum() > np.log(widths[self.free]).sum():
                 widths, exchange = trial, None
                 continue
+            # the box got smaller: try half of the exchange
             step /= 2
             if step < RULES.least_step:
                 break

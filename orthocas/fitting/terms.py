@@ -272,9 +272,11 @@ def volume_hinges(J: Array, null_basis: Array, metric_inverse: Array | None, bou
     """
     raised = J if metric_inverse is None else J @ metric_inverse
     lengths = np.sqrt((raised * J).sum(axis=2, keepdims=True))
+    # the volume of unit gradients across the task
     D = J @ null_basis / lengths
     volume = np.linalg.det(D)
     hinges, slopes = np.maximum(bound - volume, 0.0), np.zeros(J.shape)
+    # its derivative by cofactors, where the hinge acts
     active = np.flatnonzero(hinges > 0)
     across = _cofactors(D[active], volume[active]) @ null_basis[active].transpose(0, 2, 1) / lengths[active]
     slopes[active] = volume[active, None, None] * raised[active] / lengths[active] ** 2 - across

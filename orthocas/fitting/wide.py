@@ -100,9 +100,9 @@ def fit_wide(
     1. Under a whole pose or orientation, families without the last joint, and linear in the first one, come first. If
        the first one can turn fully, families without both come before these. Then xi stays while base or tool turn
        about their own axes: full turns close, and rolling the hand moves no other joint. The families are polynomials.
-       In another metric than the identity and with r = 1, MLP((24, 24), raw=True) is tried before each polynomial: its
-       leaks are smaller, but it has no proof in a useful time. A family is kept if it leaves out little of the branch
-       after all rounds of 4.
+       In another metric than the identity and with r = 1, MLP((24, 24, 24), raw=True) is tried before each polynomial:
+       its leaks are smaller, but it has no proof in a useful time. A family is kept if it leaves out little of the
+       branch after all rounds of 4.
     2. Polynomials that are linear in each joint on whose position self-motions do not depend, such as the first and the
        last one, descend with L-BFGS from linear coordinates across the task at the centre of the branch. They are best
        to prove, and hold at any turn of these joints. They ask that self-motions turn base and tool in one direction.
@@ -275,12 +275,14 @@ def _build_problems(
         most = f"at most {math.floor(1e3 * float(values.max()) / BRANCH_RULES.of_centre) / 1e3:g} can serve it"
         raise DomainError(f"branch '{branch.name}' has {missing}, expected one for clearance = {clearance:g}: {most}")
     best = int(np.argmax(np.log(room).sum(axis=1)))
-    whole = ClearBox(box, task, clearance, home=clear[best])
-    smaller = Box(clear[best], room[best], box.unbounded)
-    return (
-        Problem(robot, task, metric, whole, branch.name),
-        Problem(robot, task, metric, smaller, branch.name, clearance),
-    )
+    home, half_width, centre = clear[best], room[best], box.centre.copy()
+    smaller = Problem(robot, task, metric, Box(home, half_width, box.unbounded), branch.name, clearance)
+    # a smaller box leaves nothing out of joints without limits; these have their turn around the home
+    if {*np.flatnonzero(half_width < box.half_width)} <= {*box.unbounded}:
+        return (smaller,)
+    centre[list(box.unbounded)] = home[list(box.unbounded)]
+    whole = ClearBox(Box(centre, box.half_width, box.unbounded), task, clearance, home=home)
+    return Problem(robot, task, metric, whole, branch.name), smaller
 
 
 def _fit_most(problems: tuple[Problem, ...], fit_on: Callable[[Problem], WideFit]) -> WideFit:

@@ -38,7 +38,7 @@ class WideRules:
     degree: int = 6  #: of polynomials that are linear in base and tool joints
     degree_of_all: int = 5  #: of polynomials in which these count like all others
     network: tuple[int, ...] = (64, 64, 64)  #: layers where polynomials leave out much
-    small_network: tuple[int, ...] = (24, 24)  #: layers in another metric than the identity; as fast as polynomials
+    small_network: tuple[int, ...] = (24, 24, 24)  #: layers in another metric than the identity; as fast as polynomials
 
     alignment: float = 0.3  #: weight of the mean sin^2 of the leaks
     alignment_in_metric: float = 1.0  #: the same in another metric than the identity
@@ -51,6 +51,7 @@ class WideRules:
     least_samples: int = 5000
     most_samples: int = 20_000
     network_samples: int = 100_000
+    small_network_samples: int = 50_000  #: of networks that leave out joints
     near: float = 0.03  #: fraction of samples of networks that lie near the centre, and of the half-widths there
     watched: int = 5000  #: samples on which the loss of a network is watched
 
@@ -61,10 +62,14 @@ class WideRules:
     every: int = 4  #: steps through the samples that give this matrix
     every_of_networks: int = 50  #: the same for the mean lengths of gradients of networks
     rounds: int = 3  #: with the worst samples
+    rounds_of_networks: int = 1  #: the same of networks, which take long
+    rounds_of_small_networks: int = 2
     fresh: int = 50_000  #: samples of which the worst join
     worst: int = 5000
     fresh_of_networks: int = 200_000
     worst_of_networks: int = 10_000
+    fresh_of_small_networks: int = 100_000
+    worst_of_small_networks: int = 8000
 
     divided: float = 0.9  #: regular share below which a branch with a singular middle has a smaller box, if it has more
     held_out: int = 20_000  #: samples that evaluate coordinates
@@ -91,6 +96,7 @@ RULES = WideRules()
 _ADAM = Adam(epochs=8, steps=500, batch=512, learning_rate=1e-2)
 # Adam once the worst of fresh samples have joined
 _SLOWER = replace(_ADAM, learning_rate=5e-3)
+_SLOWER_OF_SMALL = replace(_SLOWER, epochs=5)
 # the names of first stages begin with it
 _STAGE = "whole branch"
 
@@ -180,7 +186,8 @@ class Search:
         #: names of joints that coordinates do not depend on
         self.left_out: tuple[str, ...] = getattr(parametrisation, "without", ())
         wide = int(np.clip(RULES.per_term * self.family.width, RULES.least_samples, RULES.most_samples))
-        self.samples = settings.samples or (wide if self.linear else RULES.network_samples)
+        of_networks = RULES.small_network_samples if self.left_out else RULES.network_samples
+        self.samples = settings.samples or (wide if self.linear else of_networks)
         self.solver: Solver = LBFGS(RULES.iterations, RULES.tolerance) if self.linear else _ADAM
         self.best: Array | None = None  #: parameters, (size,)
         #: of the best: whether they miss the centre, fraction of bad positions, if too many, and minus their 1 % volume
@@ -207,14 +214,17 @@ class Search:
 
     def go_on(self) -> None:
         """Descend with the worst of fresh samples, as long as coordinates are not regular enough and get better."""
-        # networks in all joints take long, and have one round
-        for turn in range(1, 1 + (RULES.rounds if self.linear or self.left_out else 1)):
+        of_networks = RULES.rounds_of_small_networks if self.left_out else RULES.rounds_of_networks
+        for turn in range(1, 1 + (RULES.rounds if self.linear else of_networks)):
             few = turn > 1 and not self.linear and self.is_enough(RULES.enough)
             if self._done or few or self._last is not self.best:
                 break
             if self.linear:
                 self._add_worst(RULES.fresh, RULES.worst, RULES.fresh_tag + turn)
                 solver: Solver = LBFGS(RULES.further, RULES.tolerance)
+            elif self.left_out:
+                self._add_worst(RULES.fresh_of_small_networks, RULES.worst_of_small_networks, RULES.fresh_tag + turn)
+                solver = _SLOWER_OF_SMALL
             else:
                 self._add_worst(RULES.fresh_of_networks, RULES.worst_of_networks, RULES.fresh_tag + turn)
                 solver = _SLOWER

@@ -279,6 +279,7 @@ class MotionLimits:
         """
         if self.collisions is None:
             return
+        # between samples the joints leave the chord by at most this
         bend = self.acceleration * (motion.times[1] - motion.times[0]) ** 2 / 8
         contact = self.collisions.find_contact(motion.q, self.clearance, bend)
         if contact is None:

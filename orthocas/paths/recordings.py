@@ -42,6 +42,7 @@ def read_joints(path: str | Path, robot: Robot, topic: str | None = None) -> tup
     require_kind("robot", robot, Robot)
     file = as_path("path", path)
     joints = robot.joint_names
+    # messages of rosbag2, or columns of a table
     if _is_mcap(file):
         rows = np.array(list(_read_messages(file, joints, topic))).reshape(-1, robot.n + 1)
     else:
@@ -68,6 +69,7 @@ def _find_columns(names: Sequence[str], joints: Sequence[str]) -> list[int]:
     if not times:
         raise ValueError(f"line 1: a column of times is missing, expected one of {', '.join(_TIMES)}")
     columns = times[:1]
+    # each joint once, by its name or as PlotJuggler writes it
     for joint in joints:
         found = [k for k, name in enumerate(names) if _is_of_joint(name, joint)]
         if len(found) != 1:

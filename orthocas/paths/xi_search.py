@@ -7,7 +7,7 @@ import numpy as np
 from orthocas.charts.chart import Chart
 from orthocas.paths.tool_path import RULES, ToolPath
 from orthocas.robots.collisions import Collisions
-from orthocas.tools.checks import Array
+from orthocas.tools.checks import Array, Indices
 
 
 def search_xi(
@@ -37,13 +37,13 @@ def search_xi(
     clear = np.asarray(collisions.distance(found.q[good]).distance) > clearance
     costs, good = np.full(S * K, np.inf), good[clear]
     costs[good] = cost(found.q[good])
-    costs, q = costs.reshape(S, K), np.where(np.isfinite(found.q), found.q, 0.0).reshape(S, K, -1)
+    table, q = costs.reshape(S, K), np.where(np.isfinite(found.q), found.q, 0.0).reshape(S, K, -1)
 
     # least[i, j]: from value i at the first station to value j at this one.
-    least, before = np.where(np.eye(K, dtype=bool), costs[0], np.inf), list[Array]()
+    least, before = np.where(np.eye(K, dtype=bool), table[0], np.inf), list[Indices]()
     for k in range(1, S):
         steps = q[k][None] - q[k - 1][:, None]
-        edges = np.where(np.abs(steps).max(axis=2) < RULES.lattice_step, (steps**2).sum(axis=2) * S, np.inf) + costs[k]
+        edges = np.where(np.abs(steps).max(axis=2) < RULES.lattice_step, (steps**2).sum(axis=2) * S, np.inf) + table[k]
         totals = least[:, :, None] + edges[None]
         before.append(np.argmin(totals, axis=1))
         least = np.take_along_axis(totals, before[-1][:, None, :], axis=1)[:, 0]

@@ -25,8 +25,10 @@ __all__ = ["FittedCapsules", "fit_capsules"]
 class CapsuleRules:
     """Numbers of fitted capsules."""
 
-    ratio: float = 1.55  #: volume of a link's capsules over that of its solids: with less, it is divided no more
-    most: int = 6  #: capsules of a link
+    ratio: float = 1.5  #: volume of a link's capsules over that of its solids: with less, it is divided no more
+    most: int = 8  #: capsules of a small link
+    more: int = 24  #: further capsules of a large link
+    large: float = 0.2  #: of the volume of all links: of a large link; others have further capsules in proportion
     places: tuple[float, ...] = (0.3, 0.5, 0.7)  #: of cuts, as fractions of the extent along a principal axis
     steps: int = 300  #: of a search for the smallest capsule
     converged: float = 1e-6  #: of its volume, relative
@@ -67,8 +69,9 @@ def fit_capsules(collisions: Collisions) -> FittedCapsules:
     """Capsules around the solids of each link and object, for distances in C and for quick ones.
 
     The convex hull of a link is cut by planes across its principal axes until the union of the capsules around all
-    pieces has at most 1.55 times the volume of the link, or there are six; each cut is the best of nine, of the piece
-    with the most to lose. A link of several solids that is not convex is cut into these first, if that is smaller.
+    pieces has at most 1.5 times the volume of the link, or there are eight, and up to 32 of links that have a fifth of
+    the robot's volume; each cut is the best of nine, of the piece with the most to lose. A link of several solids that
+    is not convex is cut into these first, if that is smaller.
 
     Every corner of a piece lies within its capsule, by 1e-9 m or more. A capsule is convex, so it contains the piece;
     the pieces of a hull are all of it. So distances of capsules are never larger than those of the hulls.
@@ -90,18 +93,24 @@ def fit_capsules(collisions: Collisions) -> FittedCapsules:
                 "collisions", f"with the point cloud '{part.name}'", "solids that capsules can hold"
             )
         solids.setdefault(part.name, []).append(part)
+    held = {
+        name: _measure_union([part.shape for part in parts]) for name, parts in solids.items() if parts[0].shape.bounded
+    }
     kept, pieces, ratios, volumes = list[Part](), list[tuple[str, Array, Part]](), dict[str, float](), np.zeros(2)
     for name, parts in solids.items():
         if not parts[0].shape.bounded:
             kept += parts
             continue
-        volume = _measure_union([part.shape for part in parts])
-        # All of the link as one hull, or each of its solids for itself.
+        volume = held[name]
+        # Large links have more pieces. All of the link as one hull, or each of its solids for itself.
+        most = RULES.most + round(RULES.more * min(1.0, volume / (RULES.large * max(sum(held.values()), 1e-300))))
         corners = [part.shape.list_corners() for part in parts]
         rounding = max(radius for _, radius in corners)
-        found = _cover([np.concatenate([points for points, _ in corners])], rounding, volume)
+        found = _cover([np.concatenate([points for points, _ in corners])], rounding, volume, most)
         if len(parts) > 1 and found[1] > RULES.ratio * volume:
-            found = min(found, _cover([points for points, _ in corners], rounding, volume), key=lambda cover: cover[1])
+            found = min(
+                found, _cover([points for points, _ in corners], rounding, volume, most), key=lambda cover: cover[1]
+            )
         for hull, capsule in found[0]:
             pieces.append((name, hull, Part(name, parts[0].body, capsule.shape)))
         ratios[name] = found[1] / volume
@@ -133,16 +142,16 @@ def build_rods(tree: KinematicTree, radius: ArrayLike) -> Collisions:
     for frame in (tree.tip, *map(tree.frame, tree.tips)):
         for start, end in pairwise(tree.carriers(frame.parent)):
             if tree.joint_names[end] not in BASE_JOINTS:
-                ends[start, end] = tree.translations[end]
-        ends.setdefault((frame.parent, frame.name), frame.translation)
+                ends[start, end] = np.asarray(tree.translations[end])
+        ends[frame.parent, frame.name] = np.asarray(frame.translation)
     parts = []
-    for (body, _), end in ends.items():
+    for (body, _), far in ends.items():
         if body < 0:
             continue
-        length, thick = float(np.linalg.norm(end)), float(radii[body])
+        length, thick = float(np.linalg.norm(far)), float(radii[body])
         solid: Geometry = BallGeometry(thick) if length < RULES.point else CapsuleGeometry(thick, length)
-        turn = np.eye(3) if length < RULES.point else rotate_z_to(end / length)
-        parts.append(Part(f"link of {tree.joint_names[body]}", body, Shape(solid, turn, np.asarray(end) / 2)))
+        turn = np.eye(3) if length < RULES.point else rotate_z_to(far / length)
+        parts.append(Part(f"link of {tree.joint_names[body]}", body, Shape(solid, turn, far / 2)))
     return Collisions(tree, parts, (), origin="rods")
 
 
@@ -182,19 +191,22 @@ class Capsule:
         return np.asarray(self.radius - np.linalg.norm(points - self.start - s[:, None] * along, axis=1))
 
 
-def _cover(hulls: Sequence[Array], rounding: float, volume: float) -> tuple[list[tuple[Array, Capsule]], float]:
+def _cover(
+    hulls: Sequence[Array], rounding: float, volume: float, most: int
+) -> tuple[list[tuple[Array, Capsule]], float]:
     """Pieces of hulls with a capsule around each, and the volume of their union.
 
     Args:
         hulls: corners of each, (K, 3).
         rounding: radius by which all of them are rounded.
         volume: of what they hold [m^3].
+        most: number of pieces.
     """
     found = []
     for overlaps in (True, False):
         pieces = [(hull, _fit_capsule(hull, rounding)) for hull in hulls]
         whole = _measure_union([capsule for _, capsule in pieces])
-        while whole > RULES.ratio * volume and len(pieces) < RULES.most:
+        while whole > RULES.ratio * volume and len(pieces) < most:
             # The piece whose capsule has most to lose, and its best cut.
             order = np.argsort([_measure_hull(hull) - capsule.volume for hull, capsule in pieces])
             k, cuts = next(((int(k), cuts) for k in order if (cuts := _list_cuts(pieces[k][0]))), (0, []))
@@ -222,6 +234,7 @@ def _cover(hulls: Sequence[Array], rounding: float, volume: float) -> tuple[list
 def _fit_capsule(corners: Array, rounding: float, quick: bool = False) -> Capsule:
     """A capsule of little volume around points (K, 3), each at least 1e-9 m within its surface."""
     centre = corners.mean(axis=0)
+    # the best of the principal axes, then a search from there
     axes = np.linalg.svd(corners - centre, full_matrices=False)[2] if len(corners) > 2 else np.eye(3)
     if len(corners) == 2:
         axes = (corners[1:] - corners[:1]) / max(float(np.linalg.norm(corners[1] - corners[0])), 1e-300)
@@ -229,6 +242,7 @@ def _fit_capsule(corners: Array, rounding: float, quick: bool = False) -> Capsul
     if not quick and len(corners) > 2:
         found = _refine(corners, best)
         best = found if found.volume < best.volume else best
+    # room for rounding, and more if a corner still lacks some
     wide = Capsule(best.start, best.end, best.radius + rounding + RULES.room)
     short = float(wide.measure_rooms(corners).min()) - rounding - RULES.room / 2
     return wide if short >= 0 else Capsule(wide.start, wide.end, wide.radius - short)
@@ -258,6 +272,7 @@ def _refine(corners: Array, start: Capsule) -> Capsule:
     middle, along = (start.start + start.end) / 2, start.end - start.start
     length = float(np.linalg.norm(along))
     axis = along / length if length > 0 else np.array([0.0, 0.0, 1.0])
+    # two tilts, two shifts and the radius
     side = np.linalg.svd(axis[None])[2][1:]
     size = float(start.radius)
 
@@ -291,12 +306,14 @@ def _list_cuts(corners: Array) -> list[list[Array]]:
     for axis in np.linalg.svd(corners[hull.vertices] - corners[hull.vertices].mean(axis=0), full_matrices=False)[2]:
         along = corners @ axis
         low, high = float(along.min()), float(along.max())
+        # planes at several places along each principal axis
         for fraction in RULES.places:
             level = low + fraction * (high - low)
             a, b = edges.T
             crossed = (along[a] - level) * (along[b] - level) < 0
             a, b = a[crossed], b[crossed]
             s = ((level - along[a]) / (along[b] - along[a]))[:, None]
+            # where the plane cuts edges, both pieces get new corners
             seam = corners[a] + s * (corners[b] - corners[a])
             sides = [corners[along <= level], corners[along >= level]]
             if min(map(len, sides)) and len(seam) > 2:
@@ -315,6 +332,7 @@ def _measure_union(solids: Sequence[Shape | Capsule], count: int = RULES.points)
         low, high = solid.list_box()
         points = rng.uniform(low, high, (count, 3))
         pieces = [points[first : first + RULES.chunk] for first in range(0, len(points), RULES.chunk)]
+        # a point in k solids counts one k-th in each of them
         held = [np.concatenate([other.contains(piece) for piece in pieces]) for other in (solid, *solids)]
         share = float((held[0] / np.maximum(np.sum(held[1:], axis=0), 1)).mean())
         total += share * float(np.prod(high - low))

@@ -27,7 +27,7 @@ from orthocas.robots.shapes import (
     Shape,
 )
 from orthocas.robots.tree import PRISMATIC_ROOM, KinematicTree
-from orthocas.robots.urdf import find_srdf, read_xml
+from orthocas.robots.urdf import find_srdf, read_urdf_xml, read_xml
 from orthocas.tools.checks import Array
 
 
@@ -80,7 +80,7 @@ def read_collisions(tree: KinematicTree, source: CollisionSource) -> Collisions:
     """
     if source.urdf.suffix.lower() == MJCF:
         return _read_geoms(tree, source)
-    root = read_xml(source.urdf, "URDF", "robot")
+    root = read_urdf_xml(source.urdf)
     links = [link for link in root.findall("link") if link.find("collision") is not None]
     places = place_links(source.urdf, tree, [link.get("name", "") for link in links], source.locked)
     parts: list[Part] = []

@@ -146,6 +146,7 @@ def build_joint_points(tree: KinematicTree, q: ca.SX) -> ca.SX:
     for name in (*reversed(tree.tips), tree.tip_name):
         frame = tree.frame(name)
         chain = tree.carriers(frame.parent)
+        # back along the last chain to where it left this one, then out to the tip
         back = [body for body in here if body not in chain]
         shared = len(here) - len(back)
         points += [poses[body][1] for body in [*reversed(back), *here[shared - 1 : shared]]]
@@ -212,11 +213,13 @@ class TipTurn:
     def quaternion(self, turns: ca.SX) -> ca.SX:
         """The rotation (w, x, y, z) that the components of a whole orientation (3, 1) describe, w >= 0 without axis."""
         half = turns / 2
+        # a whole rotation vector
         if self.axis is None:
             return ca.vertcat(_compute_cosine(half), half)
         axis = _AXES.index(self.axis)
         i, j = _others(axis)
         tilted, along, spun = ca.SX(3, 1), ca.SX(3, 1), ca.SX(3, 1)
+        # a tilt of the axis, then a turn about it
         tilted[i], tilted[j], along[axis], spun[axis] = half[0], half[1], 1, ca.sin(half[2])
         tilting = ca.cross(along, tilted)
         return multiply_quaternions(ca.vertcat(_compute_cosine(tilting), tilting), ca.vertcat(ca.cos(half[2]), spun))

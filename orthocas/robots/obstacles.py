@@ -201,6 +201,7 @@ class Mesh:
         scale: float = 1.0,
     ) -> None:
         factor = _check_size("scale", scale)
+        # PathLike): | corners of a file, or those given
         if isinstance(points, str | PathLike):
             path = as_path("points", points)
             if not path.is_file():

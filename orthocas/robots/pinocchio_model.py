@@ -190,6 +190,7 @@ def lock_others(model: pin.Model, chain: list[int]) -> pin.Model:
     """
     for i in chain:
         find_axis(model, i)
+    # all others stand at neutral, moved into their limits
     ids = [i for i in range(1, model.njoints) if i not in chain]
     position, mimics = pin.neutral(model), set(model.mimicking_joints)
     for i in ids:

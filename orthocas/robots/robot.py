@@ -106,8 +106,9 @@ class Robot(Shown):
         Every joint that moves no tip, of any type, is locked at zero, or at the limit closest to zero.
 
         Args:
-            path: the file. Named postures (`homes`) come from an SRDF file with the same stem, beside it or in ../srdf,
-                or from the keyframes of the MJCF file.
+            path: the file; one whose name ends in .xacro is expanded first, which runs its expressions. Named postures
+                (`homes`) come from an SRDF file with the same stem, beside it or in ../srdf, or from the keyframes of
+                the MJCF file.
             tip: name of any frame. Default: the end of the longest arm; where there are several chains, a TipWarning
                 names the others.
             locked: joints to lock elsewhere, or on the chain to a tip, with their positions [rad] or [m]. Joints that

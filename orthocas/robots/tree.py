@@ -238,8 +238,10 @@ def require_body(joint: str, mass: float, inertia: Array, armature: float, links
     size = float(np.abs(inertia).max())
     smallest = float(np.linalg.eigvalsh((inertia + inertia.T) / 2)[0])
     symmetric = np.abs(inertia - inertia.T).max() <= RULES.symmetric * size
+    # rounding in files may leave a moment a little below zero
     if mass >= 0 and armature >= 0 and symmetric and smallest >= -RULES.indefinite * size - RULES.no_inertia:
         return
+    # what is wrong, of which body
     body = f"the body moved by joint '{joint}'{f' ({listed(links)})' if links else ''}"
     if mass < 0:
         raise RobotError(f"{body} has mass {mass:g} kg, expected >= 0")

@@ -49,7 +49,8 @@ class FileRules:
 
 RULES = FileRules()
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
-_ARTICLE = {"URDF": "a", "MJCF": "an", "SRDF": "an"}
+_ARTICLE = {"URDF": "a", "xacro": "a", "MJCF": "an", "SRDF": "an"}
+_XACRO = ("}macro", "}property", "}include", "}arg", "}if", "}unless", "}insert_block", "}element")  #: beside calls
 #: what kinematics and dynamics use of a file
 _USED = {"link": ("inertial",), "joint": ("origin", "parent", "child", "axis", "limit", "mimic")}
 #: urdfdom's last words on every joint, which say nothing
@@ -75,18 +76,15 @@ def read_urdf(path: str | Path, tips: Sequence[str] = (), locked: Mapping[str, f
         RobotError: if the file is missing or not a URDF model, or a joint has a zero axis; if a mimic joint that had to
             be locked moves the tip and its leader is not in `locked`.
     """
-    root = read_xml(path, "URDF", "robot")
-    # Parsers of URDF skip macros without a word.
-    macros = (element.tag for element in root.iter() if element.tag.startswith("{") and "xacro}" in element.tag)
-    names = (element.get("name", "") for kind in ("link", "joint") for element in root.iter(kind))
-    if next(macros, None) is not None or any("${" in name for name in names):
-        raise RobotError(f"{path} is a xacro file, expected URDF: run xacro first (xacro {Path(path).name} > arm.urdf)")
+    root = read_urdf_xml(path)
+    _check_macros(path, root)
+    _add_lost_root(path, root)
 
-    # Missing limits of effort and velocity become 0, which means unlimited.
+    # Missing limits of effort and velocity become 0, which means unlimited, as does -1 in some files.
     unlimited = []
     for joint in root.findall("joint"):
         for limit in joint.findall("limit"):
-            missing = [what for what in ("effort", "velocity") if what not in limit.attrib]
+            missing = [what for what in ("effort", "velocity") if _is_unlimited(limit.get(what))]
             limit.attrib.update(dict.fromkeys(missing, "0"))
             unlimited += [joint.get("name", "")] if missing else []
 
@@ -106,7 +104,9 @@ def read_urdf(path: str | Path, tips: Sequence[str] = (), locked: Mapping[str, f
         raise RobotError(f"{path} is not a usable URDF model: {fault}")
 
     if unlimited:
-        _log.warning("%s: limits of effort or velocity are missing, so there are none: %s", path, listed(unlimited))
+        _log.warning(
+            "%s: limits of effort or velocity are missing or -1, so there are none: %s", path, listed(unlimited)
+        )
     _note_impossible_inertias(path, used)
     _, beside = _parse_urdf(ElementTree.tostring(root, "unicode"), mimic=False)
     if beside:
@@ -114,12 +114,39 @@ def read_urdf(path: str | Path, tips: Sequence[str] = (), locked: Mapping[str, f
     return model
 
 
+def read_urdf_xml(path: str | Path) -> ElementTree.Element:
+    """The root element of a URDF file; xacro files, whose names end in .xacro, are run through xacro first.
+
+    xacrodoc or xacro has to be installed for these. They run expressions that the file holds.
+
+    Raises:
+        RobotError: as in `read_xml`; if xacro is missing, or fails.
+    """
+    if Path(path).suffix.lower() != ".xacro":
+        return read_xml(path, "URDF", "robot")
+    read_xml(path, "xacro")
+    # xacrodoc finds packages in the folders above the file; xacro alone comes with ROS.
+    name = next((name for name in ("xacrodoc", "xacro") if find_spec(name) is not None), None)
+    if name is None:
+        raise RobotError(f"{path} is a xacro file, which xacro expands first: pip install 'orthocas[xacro]'")
+    expander: Any = import_module(name)
+    try:
+        if name == "xacrodoc":
+            text = expander.XacroDoc.from_file(str(path)).to_urdf_string()
+        else:
+            text = expander.process_file(str(path)).toxml()
+    # Files raise whatever their expressions do.
+    except (Exception, SystemExit) as error:
+        raise RobotError(f"xacro cannot expand {path}: {type(error).__name__}: {one_line(str(error))[:300]}") from None
+    return _parse_xml(text.encode(), path, "URDF", "robot")
+
+
 def read_xml(path: str | Path, kind: str, tag: str | None = None) -> ElementTree.Element:
     """The root element of an XML file that may be broken or malicious.
 
     Args:
         path: the file.
-        kind: expected kind of file for messages, "URDF", "MJCF" or "SRDF".
+        kind: expected kind of file for messages, "URDF", "xacro", "MJCF" or "SRDF".
         tag: expected name of the root element. None allows any name.
 
     Raises:
@@ -128,14 +155,19 @@ def read_xml(path: str | Path, kind: str, tag: str | None = None) -> ElementTree
     """
     try:
         with Path(path).open("rb") as file:
-            data = file.read(RULES.bytes + 1)
+            return _parse_xml(file.read(RULES.bytes + 1), path, kind, tag)
+    except OSError as error:
+        raise RobotError(f"cannot read {kind} file {path}: {error.strerror}") from None
+
+
+def _parse_xml(data: bytes, path: str | Path, kind: str, tag: str | None) -> ElementTree.Element:
+    """The root element of the content of a file; see `read_xml`."""
+    try:
         if len(data) > RULES.bytes:
             raise ValueError(f"it has more than {RULES.bytes} bytes")
         parser = ElementTree.XMLParser(target=_BoundedBuilder())
         parser.feed(data)
         root: ElementTree.Element = parser.close()
-    except OSError as error:
-        raise RobotError(f"cannot read {kind} file {path}: {error.strerror}") from None
     # LookupError stands for an unknown encoding.
     except (ElementTree.ParseError, LookupError, ValueError) as error:
         raise RobotError(f"{path} is not {_ARTICLE[kind]} {kind} file: {error}") from None
@@ -170,6 +202,36 @@ class _BoundedBuilder(ElementTree.TreeBuilder):
         return super().end(tag)
 
 
+def _check_macros(path: str | Path, root: ElementTree.Element) -> None:
+    """Refuse xacro files by another name, and log calls of macros that the file does not have."""
+    # Parsers of URDF skip macros without a word. Some files of generators still have calls of macros that they lost.
+    macros = [element for element in root.iter() if element.tag.startswith("{") and "xacro}" in element.tag]
+    names = (element.get("name", "") for kind in ("link", "joint") for element in root.iter(kind))
+    if any(macro.tag.endswith(_XACRO) for macro in macros) or any("${" in name for name in names):
+        raise RobotError(
+            f"{path} is a xacro file, expected URDF: name it .xacro if you trust it, since xacro runs what is in it"
+        )
+    if macros:
+        lost = listed(dict.fromkeys(macro.tag.rpartition("}")[2] for macro in macros), 3)
+        _log.warning("%s calls xacro macros that it does not have, which are left out: %s", path, lost)
+
+
+def _is_unlimited(text: str | None) -> bool:
+    """Whether a limit of effort or velocity is missing, or -1, by which some files mean the same."""
+    return text is None or (_is_negative(text) and float(text) == -1)
+
+
+def _add_lost_root(path: str | Path, root: ElementTree.Element) -> None:
+    """Add the link that all others hang on, if joints name it and the file lacks it: a part for another robot."""
+    links = {link.get("name", "") for link in root.findall("link")}
+    parents = {end.get("link", "") for end in root.iterfind("joint/parent")}
+    children = {end.get("link", "") for end in root.iterfind("joint/child")}
+    if len(lost := parents - links - {""}) == 1 and links <= children:
+        (name,) = lost
+        ElementTree.SubElement(root, "link", name=name)
+        _log.warning("%s: the link '%s' is missing, and taken as the base", path, name)
+
+
 def _check_urdf(path: str | Path, root: ElementTree.Element) -> None:
     """Refuse zero axes, negative limits and masses, what is not a tree, and more links than any robot has.
 
@@ -199,6 +261,7 @@ def _note_impossible_inertias(path: str | Path, root: ElementTree.Element) -> No
         if inertia is not None:
             values = (float(inertia.get(name, 0)) for name in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
             xx, yy, zz, xy, xz, yz = values
+            # a mass distribution has moments that fulfil the triangle inequality
             moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
             slack = RULES.inertia * np.abs(moments).max() + RULES.least_inertia
             if moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack:
@@ -270,7 +333,10 @@ def _check_tree(path: str | Path, root: ElementTree.Element) -> None:
                 raise RobotError(f"{path}: joint '{name}' has {what}")
         if child in carriers:
             both = f"the joints '{carriers[child]}' and '{name}'"
-            raise RobotError(f"{path}: link '{child}' hangs on {both}, expected a tree of links")
+            raise RobotError(
+                f"{path}: link '{child}' hangs on {both}, expected a tree of links: "
+                "closed chains are not possible, so leave out the joint that closes this one"
+            )
         carriers[child] = name
         children.setdefault(parent, []).append(child)
     roots = [link for link in names if link not in carriers]
@@ -356,6 +422,7 @@ def _lock_mimics(
 def _find_leader(name: str, mimics: Mapping[str, ElementTree.Element]) -> tuple[str, float, float]:
     """The independent joint that a joint follows, along all leaders; the multiplier and the offset."""
     factor, offset, passed = 1.0, 0.0, set()
+    # leaders may follow others: factors multiply, offsets add up
     while name in mimics:
         if name in passed:
             raise RobotError(f"joint '{name}' mimics itself")
@@ -379,6 +446,7 @@ def read_srdf_postures(urdf: Path, joint_names: Sequence[str]) -> dict[str, Arra
     if path is None:
         return {}
     states: dict[str, dict[str, float]] = {}
+    # numbers only: values of joints with several are left out
     for state in read_xml(path, "SRDF", "robot").iter("group_state"):
         joints = states.setdefault(state.get("name", ""), {})
         for joint in state.iter("joint"):

@@ -166,6 +166,7 @@ def as_point_set(name: str, value: ArrayLike, n: int) -> tuple[Array, bool]:
         InvalidValueError: if an entry is not finite.
     """
     array = as_float_array(name, value)
+    # columns, as CasADi returns them, are one point
     if n > 1 and array.shape == (n, 1):
         array = array[:, 0]
     single = array.ndim == 1

@@ -152,6 +152,7 @@ class ColumnFunction:
         shapes = [self._function.size_in(i) for i in range(self._function.n_in())]
         column = ca.SX.sym("x", sum(rows * columns for rows, columns in shapes))
         parts, start = [], 0
+        # one column holds all inputs, matrices column by column
         for rows, columns in shapes:
             parts.append(ca.reshape(column[start : start + rows * columns], rows, columns))
             start += rows * columns
@@ -221,15 +222,18 @@ class BlockedFunction:
     def into(self, results: Array, points: Array, *others: Array) -> Array:
         """Write the values to `results`, which may be part of a larger array, and return it."""
         if len(points) < MANY or self._by_rows is None:
+            # single points, or operations that columns do not know
             results[...] = self._few(points, *others)[0].reshape(results.shape)
         elif len(points) <= 2 * NARROW:
             try:
+                # narrow blocks for few points, with memory that is kept
                 function = self._spare.pop()
             except IndexError:
                 function = self._build_function(narrow=True)
             fill_blocks(results, function, NARROW, points, *others)
             self._spare.append(function)
         else:
+            # wide blocks, shared by threads
             fill(results, points, self._build_function, *others)
         return results
 

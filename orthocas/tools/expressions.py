@@ -144,6 +144,7 @@ def _is_step(step: Any, inputs: int, written: set[int]) -> bool:
         return len(of) == 1 and isinstance(of[0], int | float) and (abs(of[0]) <= _LARGEST or abs(of[0]) == inf)
     if name == "input":
         return len(of) == 1 and _is_index(of[0]) and of[0] < inputs
+    # operands are results of earlier steps
     needs = 2 if name in BINARY else 1
     return (
         (name in UNARY or name in BINARY or name == "output")

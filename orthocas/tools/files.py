@@ -252,11 +252,13 @@ def require_writable(path: Path, error_type: type[ArchiveError] = ArchiveError) 
     try:
         if not path.parent.is_dir():
             raise error_type(f"cannot write {path}: folder {path.parent} does not exist")
+        # drafts of processes that died
         remove_drafts(path.parent)
         if path.is_dir():
             raise error_type(f"cannot write {path}: it is a folder, expected a file name")
         if path.exists() and not (path.is_file() and os.access(path, os.W_OK)):
             raise error_type(f"cannot write {path}: it is not a writable file")
+        # permissions do not tell everything, a file does
         with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:

@@ -121,6 +121,7 @@ def in_order(executor: Executor, work: Callable[..., Any], *columns: Sequence[An
     futures = [executor.submit(work, *row) for row in rows]
     try:
         for k, row in enumerate(rows):
+            # results in the order of the work; what a dead process had is tried again
             for _ in range(ATTEMPTS - 1):
                 wait_for([futures[k]])
                 if worker_died(futures[k]):
@@ -177,6 +178,7 @@ def run_program(command: Sequence[str]) -> str:
     with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, process_group=group) as program:
         try:
             said, complaint = program.communicate()
+        # Ctrl-C and others: the whole group ends, then the exception goes on
         except BaseException:
             if group is not None:
                 os.killpg(program.pid, signal.SIGKILL)

@@ -17,7 +17,7 @@ from orthocas.robots.link_shapes import load_mesh, place_links, read_numbers, re
 from orthocas.robots.robot import Robot
 from orthocas.robots.spatial import rotate_z_to
 from orthocas.robots.tree import KinematicTree
-from orthocas.robots.urdf import read_xml
+from orthocas.robots.urdf import read_urdf_xml
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array, Indices
 
@@ -267,7 +267,7 @@ def read_urdf_look(path: Path, tree: KinematicTree, locked: Mapping[str, float] 
     Raises:
         RobotError: if the file cannot be read, or its joints are not those of the robot.
     """
-    root = read_xml(path, "URDF", "robot")
+    root = read_urdf_xml(path)
     links = root.findall("link")
     places = place_links(path, tree, [link.get("name", "") for link in links], locked)
     colours = {

@@ -253,6 +253,12 @@ def test_front_of_wide_fits_trades_leak_for_the_rest() -> None:
     )
     assert aligned.regular_share == direct.regular_share
     assert aligned.leak_rms_deg == oc.evaluate(direct.chart, 1000, HELD_OUT_SEED).leak.rms
+    (near,) = oc.compare(problem, [oc.Polynomial(3)], branch="whole", like="q2", clearance=0.2, **settings).results
+    follower = oc.fit_wide(
+        robot, task, "whole", like="q2", exact=False, clearance=0.2, parametrisation=oc.Polynomial(3), samples=1000
+    )
+    assert near.leak_rms_deg == oc.evaluate(follower.chart, 1000, HELD_OUT_SEED).leak.rms
+    assert near.regular_share == follower.regular_share
     head, best, worst = found.rows()
     assert [row[head.index("weights")] for row in (best, worst)] == ["40,0", "1e-06,0"]
     assert best[head.index("regular share")] == percent(aligned.regular_share, 3)
@@ -380,6 +386,7 @@ def test_bad_settings_are_refused(planar_x: oc.Problem) -> None:
         ({"solvers": [solvers.LBFGS(), solvers.LBFGS(memory=5)]}, "two called 'lbfgs'"),
         ({"weights": [(1.0, 0.5), oc.Weights(1.0, 0.5, 0.0, 0.0, 0.0)]}, "weights is a list with 1,0.5 twice"),
         ({"solvers": [solvers.LBFGS()], "branch": planar_x.domain}, "wide fits have their own"),
+        ({"clearance": 0.1}, "clearance is given without a branch"),
     ):
         with pytest.raises(InvalidValueError, match=message):
             oc.compare(planar_x, **{"parametrisations": [oc.Linear()], **grid})

@@ -325,7 +325,7 @@ def test_the_first_families_leave_out_the_turn_of_the_tool_and_of_a_base_that_tu
     endless = oc.Robot.from_urdf(Path(__file__).parents[1] / "data" / "robots" / "four_endless_joints.urdf")
     for robot, metric, expected in (
         (iiwa(), "euclidean", ["polynomial:6:cyclic=A1:without=A7"]),
-        (iiwa(), "inertia", ["mlp:24x24:raw:cyclic=A1:without=A7", "polynomial:6:cyclic=A1:without=A7"]),
+        (iiwa(), "inertia", ["mlp:24x24x24:raw:cyclic=A1:without=A7", "polynomial:6:cyclic=A1:without=A7"]),
         (endless, "euclidean", ["polynomial:6:without=j1,j7", "polynomial:6:cyclic=j1:without=j7"]),
     ):
         task = oc.Task.pose(robot)

@@ -545,6 +545,7 @@ def _control() -> dict[str, Call]:
             {"controller": law, "fade_in": 0.1, "command_rate": 100.0, "error_limit": [0.1, 0.1, 0.1], "hold_ticks": 5},
         ),
         "MomentumObserver": (control.MomentumObserver, {"rate": 5.0, "bound": [1.0, 2.0, 3.0]}),
+        "FrictionObserver": (control.FrictionObserver, {"rate": 5.0, "bound": [1.0, 2.0, 3.0], "tolerance": 1e-3}),
         "Adaptation": (control.Adaptation, {"rate": 5.0, "bound": 2.0}),
         "PDPlus with a memory": (
             control.PDPlus,

@@ -108,7 +108,7 @@ def test_python_blocks_of_the_page_on_paths_run(tmp_path: Path) -> None:
     printed = printed_here("\n".join(parts), tmp_path)
     assert printed.startswith("Interval: xi1 in [")
     assert "SelfMotionCurve: curve of length" in printed
-    assert "and obstacle 0 " in printed
+    assert "'link of q3' and 'post'" in printed
     assert "closed path" in printed
     assert (tmp_path / "q.csv").read_text().startswith("time_s,q1,q2,q3,d_q1")
 

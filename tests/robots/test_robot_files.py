@@ -94,6 +94,32 @@ def test_robots_by_name() -> None:
         oc.Robot.from_name("pandaa")
 
 
+ARM_XACRO = f"""<robot name="a" {XACRO}><xacro:property name="reach" value="${{0.1 + 0.2}}"/>
+<xacro:macro name="part" params="name parent"><link name="${{name}}"/><joint name="${{name}}_joint" type="continuous">
+<parent link="${{parent}}"/><child link="${{name}}"/>
+<origin xyz="${{reach}} 0 0"/><axis xyz="0 0 1"/></joint></xacro:macro>
+<link name="base"/><xacro:part name="b" parent="base"/><xacro:part name="c" parent="b"/></robot>"""
+
+
+def test_xacro_files_are_expanded_if_their_name_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf.xacro"
+    path.write_text(ARM_XACRO)
+    robot = oc.Robot.from_file(path)
+    assert robot.joint_names == ("b_joint", "c_joint")
+    np.testing.assert_allclose(robot.tip_position([0.0, 0.0]), [0.6, 0, 0], atol=1e-15)
+    path.write_text(ARM_XACRO.replace("${0.1 + 0.2}", "${1 / 0}"))
+    with pytest.raises(RobotError, match=r"xacro cannot expand .*arm\.urdf\.xacro: .*division by zero"):
+        oc.Robot.from_file(path)
+
+
+def test_xacro_files_without_xacro_say_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "arm.xacro"
+    path.write_text(ARM_XACRO)
+    monkeypatch.setattr("orthocas.robots.urdf.find_spec", lambda name: None)
+    with pytest.raises(RobotError, match=r"arm\.xacro is a xacro file, .*pip install 'orthocas\[xacro\]'"):
+        oc.Robot.from_file(path)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -102,9 +128,12 @@ def test_robots_by_name() -> None:
         ("<sdf/>", "root element is <sdf>"),
         ('<robot name="a"><link name="b"/><joint name="j" type="revolute"/></robot>', "joint 'j' has no parent link"),
         ('<robot name="a"/>', "is not a usable URDF model: No link elements found in urdf file$"),
-        (f'<robot name="a" {XACRO}><xacro:include filename="b"/></robot>', "is a xacro file, expected URDF: run xacro"),
-        (f'<robot name="a" {XACRO}><link name="b"/><xacro:arm/></robot>', "is a xacro file, expected URDF: run xacro"),
-        ('<robot name="a"><link name="${prefix}b"/></robot>', "is a xacro file, expected URDF: run xacro"),
+        (
+            f'<robot name="a" {XACRO}><xacro:include filename="b"/></robot>',
+            "is a xacro file, expected URDF: name it .xacro",
+        ),
+        ('<robot name="a"><link name="${prefix}b"/></robot>', "is a xacro file, expected URDF: name it .xacro"),
+        (f'<robot name="a" {XACRO}><link name="b"/><xacro:arm/></robot>', "no movable joint"),
     ],
 )
 def test_malformed_urdf_gets_one_clear_error(

@@ -148,7 +148,30 @@ def test_missing_limits_of_effort_and_velocity_are_none(
     limits = {"effort": robot.effort_limits, "velocity": robot.velocity_limits}
     np.testing.assert_array_equal(limits.pop(what), [np.inf, 1])
     np.testing.assert_array_equal(*limits.values(), [1, 1])
-    assert caplog.messages == [f"{path}: limits of effort or velocity are missing, so there are none: j"]
+    assert caplog.messages == [f"{path}: limits of effort or velocity are missing or -1, so there are none: j"]
+
+
+def test_limits_of_minus_one_are_none_and_a_lost_base_is_added(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write_joints(tmp_path, *ARM_OF_TWO)
+    plain = oc.Robot.from_urdf(path)
+    path.write_text(path.read_text().replace('effort="1"', 'effort="-1.0"', 1).replace('<link name="a"/>', ""))
+    with caplog.at_level(logging.WARNING, "orthocas"):
+        robot = oc.Robot.from_urdf(path)
+    assert robot.effort_limits.tolist() == [np.inf, 1]
+    np.testing.assert_array_equal(robot.tip_position([0.3, 0.4]), plain.tip_position([0.3, 0.4]))
+    assert "are missing or -1" in caplog.text
+    assert "the link 'a' is missing, and taken as the base" in caplog.text
+
+
+def test_calls_of_lost_macros_are_left_out_with_a_word(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = write_joints(tmp_path, *ARM_OF_TWO)
+    text = path.read_text().replace('<robot name="r">', '<robot name="r" xmlns:xacro="http://ros.org/wiki/xacro">')
+    path.write_text(text.replace("</robot>", "<xacro:camera/></robot>"))
+    with caplog.at_level(logging.WARNING, "orthocas"):
+        assert oc.Robot.from_urdf(path).n == 2
+    assert "calls xacro macros that it does not have, which are left out: camera" in caplog.text
 
 
 def test_mimic_of_a_mimic_off_the_chain_is_locked_and_one_of_nothing_named(tmp_path: Path) -> None:

@@ -283,6 +283,7 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "task": lambda: planar().task,
     "run-time model": run_time_model,
     "momentum observer": control.MomentumObserver,
+    "friction observer": control.FrictionObserver,
     "ticks of a law without a memory": lambda: control.Remembering(control.Kinematic(fitted().chart, 1.0)),
     "law in ticks": lambda: control.Remembering(CONTROLLERS["PD+ with a memory"]()),
     **({"compiled inverse": compiled} if HAS_COMPILER else {}),

@@ -1,9 +1,8 @@
-"""Lines with the elbow free to move, and three scenes for our tracker, a barrier and a sphere cost (10 min; `--quick`).
+"""Lines with the elbow free to move past a post: found by `follow`, of those a search of all postures finds (10 min).
 
-Lines: the panda's hand goes 0.2 m along a straight line with its orientation held, and the elbow would meet a post with
-xi held.
-`oc.follow(..., "objective")` against a search of all postures: from every posture with the x of the start, a flood
-fill over the free part of all self-motions along 60 stations, by steps along the null space and Newton's method.
+The panda's hand goes 0.2 m along a straight line with its orientation held, and with xi held the elbow would meet a
+post. `oc.follow(..., "objective")` against a search of all postures: from every posture with the x of the start, a
+flood fill over the free part of all self-motions at 60 stations, by steps along the null space and Newton's method.
 """
 
 import time
@@ -161,7 +160,7 @@ def main(quick: bool = False) -> dict[str, float]:
         warnings.simplefilter("ignore")
         head = "lines | possible by the search | of these by `follow` | share [%] | time of one [s]"
         print(f"| {head} |")
-        table("| --- " * (head.count("|") + 1) + "|", follow_lines(4 if quick else 200, found))
+        table("| --- " * (head.count("|") + 1) + "|", follow_lines(2 if quick else 60, found))
     return found
 
 
