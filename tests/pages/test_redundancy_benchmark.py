@@ -76,7 +76,7 @@ def test_a_tip_that_is_off_at_two_per_cent_of_the_ticks_did_not_follow() -> None
 
 def row(method: str, *values: float) -> redundancy_page.Row:
     """A method on eight arms."""
-    return redundancy_page.Row(method, {(f"arm {k}", 0): value for k, value in enumerate(values)}, [], "")
+    return redundancy_page.Row(method, {(f"arm {k}", 0): value for k, value in enumerate(values)}, [], [], "")
 
 
 def test_ranks_count_who_is_ahead_on_more_arms_than_a_coin_would_be() -> None:
