@@ -141,14 +141,15 @@ class Branches(Shown, Sequence[Branch]):
         # A panel for each branch, with the arm at its posture.
         columns = min(len(self), 4)
         rows = -(-len(self) // columns)
-        layout = ConstrainedLayoutEngine(h_pad=0.15, w_pad=0.1)
-        figure = Picture(figsize=(3.4 * columns, 3.4 * rows), layout=layout)
+        layout = ConstrainedLayoutEngine(h_pad=0.1, w_pad=0.15, rect=(0, 0, 0.97, 1))
+        figure = Picture(figsize=(2.3 * columns, 2.6 * rows), layout=layout)
         postures = self.robot.joint_points(np.array([item.posture for item in self]))
         for k, (item, points) in enumerate(zip(self, postures, strict=True)):
             panel = figure.add_subplot(rows, columns, k + 1, projection="3d")
             panel.plot(*points.T, "-o", color="#1f5fa8", markersize=4, linewidth=2.2)
             panel.set_title(f"{item.name}\n{percent(item.share)} of the clear positions", fontsize=9)
             equal_axes(panel, postures.reshape(-1, 3))
+            panel.locator_params(nbins=3)
         return figure
 
     def facts(self) -> dict[str, str]:
