@@ -50,7 +50,7 @@ from orthocas.tools.checks import (
 from orthocas.tools.display import listed
 from orthocas.tools.expressions import choose_form
 
-FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian", "inverse")
+FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian", "manipulability", "inverse")
 
 
 class InverseMethods(PhiFunctions):
@@ -222,7 +222,7 @@ class InverseMethods(PhiFunctions):
         return Solutions(q, status[order], steps, error, np.linalg.norm(own, axis=1), float(tolerance))
 
     def _prefer_free(self, targets: Array, found: Solutions, collisions: Collisions) -> Solutions:
-        """The same with free solutions in place of those that touch, where there are any."""
+        """Solutions with free ones in place of those that touch, where there are any."""
         rows = np.flatnonzero(np.isin(found.status, (InverseStatus.FOUND, InverseStatus.NEAREST)))
         # rows whose solution touches something
         rows = rows[~collisions.check_free(found.q[rows])] if rows.size else rows
@@ -303,18 +303,25 @@ class InverseMethods(PhiFunctions):
         return ReachingTracker(*parts, self.parts.reaching) if nearest else Tracker(*parts)
 
     def function(self, name: str) -> ca.Function:
-        """A CasADi function: xi, phi, jacobian, task, task_jacobian, second_derivative or inverse.
+        """A CasADi function: xi, phi, jacobian, task, task_jacobian, manipulability, second_derivative, inverse.
 
         The input q is a column (n, 1). second_derivative takes q, v, w (n, 1) and returns d^2 phi(q)[v, w] =
         (d/ds) J(q + s v) w, (n, 1). For v = dq this is dJ/dt w. inverse takes phi and q_start (n, 1), and returns q
         (n, 1) with phi(q) = phi, or NaN where Newton's method finds none. Its derivatives are those of the implicit
-        function theorem, of any order; so it can be part of an optimal control problem.
+        function theorem, of any order; so it can be part of an optimal control problem. The gradient of the
+        manipulability is `chart.function("manipulability").jacobian()`, away from singular positions.
 
         Raises:
             UnknownNameError: if there is no such function.
             NoExpressionError: if the coordinates are grown. `orthocas.distil` fits an expression to them.
         """
         require_known("chart function", name, FUNCTIONS)
+        if name == "manipulability":
+            # sqrt(det(J J^T)) is the product of the diagonal of the Cholesky factor.
+            q, product = ca.MX.sym("q", self.n), ca.SX.sym("P", self.m, self.m)
+            volume = ca.Function("volume", [product], [ca.det(ca.diag(ca.diag(ca.chol(product))))])
+            J = self._graph("task_jacobian")(q)
+            return ca.Function(name, [q], [volume(J @ J.T)], ["q"], [name])
         return self._inverse_function if name == "inverse" else self._graph(name)
 
     @cached_property
@@ -488,7 +495,7 @@ class ChartParts:
         return ca.Function("rates", [q], [ca.densify(rows)], ["q"], ["rates"])
 
     def batched_rates(self, points: Array) -> Array:
-        """Those rows at points (N, n), (N, n, n); NaN where the task has no finite Jacobian."""
+        """The rows of `rates` at points (N, n), (N, n, n); NaN where the task has no finite Jacobian."""
         chart = self.chart
         J = np.empty((len(points), chart.n, chart.n))
         J[:, : chart.m] = self.relative.batched_rates(points)[0].reshape(-1, chart.m, chart.n)
@@ -545,7 +552,7 @@ class ChartParts:
 
     @cached_property
     def point_functions(self) -> PointFunctions:
-        """Those of trackers."""
+        """The functions that trackers and `solve` call for one row."""
         phi_map = self.phi_map
         phi = self.chart.function("phi")
         return PointFunctions.of(phi, self.rates, phi_map.sizes, phi_map.difference, self.chart.problem.turning)

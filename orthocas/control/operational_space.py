@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.point_quality import Judged
+from orthocas.charts.point_quality import Judged, least_in_domain
 from orthocas.control.controller import (
     Command,
     LawOfChart,
@@ -469,6 +469,23 @@ class _OperationalSpace(LawOfChart):
             K = limit_stiffness(W, J, self.stiffness, self.fastest, self.compliance, self._blocks)
         result = compute_modes(W, K, self._compute_damping(points))
         return Modes(*(values[0] for values in vars(result).values())) if single else result
+
+    @cached_property
+    def integral_bound(self) -> float:
+        """Largest rate of integral action [1/s]: zeta omega of the slowest mode that descents find in the domain.
+
+        With the rate L, a mode becomes kappa s^3 + 2 zeta omega s^2 + omega^2 s + L omega^2, where kappa is the true
+        inertia in that of the model. It is stable for L < 2 zeta omega / kappa, so half of that bears kappa = 2.
+        """
+
+        def find_slowest(q: Array) -> Array:
+            modes = self.modes(q)
+            with np.errstate(invalid="ignore"):
+                decays = 2 * np.pi * modes.frequencies * modes.damping_ratios
+            # Coordinates without a spring have no integral action.
+            return np.where(modes.frequencies > 0, decays, np.inf).min(axis=1)
+
+        return float(find_slowest(least_in_domain(find_slowest, self.problem.domain)[None])[0])
 
     def _compute_damping(self, points: Array) -> Array:
         """D(q) with the law's gains at points (N, n), (N, n, n)."""

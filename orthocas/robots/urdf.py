@@ -80,9 +80,12 @@ def read_urdf(path: str | Path, tips: Sequence[str] = (), locked: Mapping[str, f
     _check_macros(path, root)
     _add_lost_root(path, root)
 
-    # Missing limits of effort and velocity become 0, which means unlimited, as does -1 in some files.
+    # Missing limits of effort and velocity become 0, which means unlimited, as does -1 in some files. Joints without
+    # any limit become unlimited.
     unlimited = []
     for joint in root.findall("joint"):
+        if joint.get("type") in ("revolute", "prismatic") and joint.find("limit") is None:
+            ElementTree.SubElement(joint, "limit", lower=f"{-RULES.largest:g}", upper=f"{RULES.largest:g}")
         for limit in joint.findall("limit"):
             missing = [what for what in ("effort", "velocity") if _is_unlimited(limit.get(what))]
             limit.attrib.update(dict.fromkeys(missing, "0"))
@@ -105,7 +108,9 @@ def read_urdf(path: str | Path, tips: Sequence[str] = (), locked: Mapping[str, f
 
     if unlimited:
         _log.warning(
-            "%s: limits of effort or velocity are missing or -1, so there are none: %s", path, listed(unlimited)
+            "%s: limits are missing, or those of effort or velocity are -1, so there are none: %s",
+            path,
+            listed(unlimited),
         )
     _note_impossible_inertias(path, used)
     _, beside = _parse_urdf(ElementTree.tostring(root, "unicode"), mimic=False)

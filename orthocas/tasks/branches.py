@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 from orthocas.errors import InvalidValueError, SingularTaskError, UnknownNameError
 from orthocas.robots.robot import Robot
 from orthocas.tasks.domains import Box
-from orthocas.tasks.problem import Problem, relative_singular_values
 from orthocas.tasks.regular_box import find_joint_range
 from orthocas.tasks.samples import compute_row_scale, sample_evenly
 from orthocas.tasks.task import Task
@@ -141,14 +140,15 @@ class Branches(Shown, Sequence[Branch]):
         # A panel for each branch, with the arm at its posture.
         columns = min(len(self), 4)
         rows = -(-len(self) // columns)
-        layout = ConstrainedLayoutEngine(h_pad=0.15, w_pad=0.1)
-        figure = Picture(figsize=(3.4 * columns, 3.4 * rows), layout=layout)
+        layout = ConstrainedLayoutEngine(h_pad=0.1, w_pad=0.15, rect=(0, 0, 0.97, 1))
+        figure = Picture(figsize=(2.3 * columns, 2.6 * rows), layout=layout)
         postures = self.robot.joint_points(np.array([item.posture for item in self]))
         for k, (item, points) in enumerate(zip(self, postures, strict=True)):
             panel = figure.add_subplot(rows, columns, k + 1, projection="3d")
             panel.plot(*points.T, "-o", color="#1f5fa8", markersize=4, linewidth=2.2)
             panel.set_title(f"{item.name}\n{percent(item.share)} of the clear positions", fontsize=9)
             equal_axes(panel, postures.reshape(-1, 3))
+            panel.locator_params(nbins=3)
         return figure
 
     def facts(self) -> dict[str, str]:
@@ -360,18 +360,22 @@ def sample_nonsingular(robot: Robot, task: Task, box: Box, samples: int, seed: i
 
 
 def sample_centres(robot: Robot, task: Task, box: Box) -> tuple[Array, Array]:
-    """Positions of a box (N, n), and their relative singular values with rows scaled over the box, (N,)."""
+    """Positions of a box (N, n), and their relative singular values with rows scaled over the joint range, (N,)."""
     points = sample_evenly(Box(box.centre, box.half_width), RULES.centres, RULES.seed)
-    return points, relative_singular_values(Problem(robot, task, domain=box), points)
+    return points, _scale_to_range(robot, task)(points)
+
+
+def compute_range_scale(robot: Robot, task: Task) -> Array:
+    """The sizes of the rows of the frame Jacobian in the joint range, (m,), by which lengths and angles compare."""
+    whole = find_joint_range(robot, 0)
+    centred = task.with_reference_at(whole.centre)
+    samples = sample_evenly(Box(whole.centre, whole.half_width), RULES.samples, RULES.seed)
+    return compute_row_scale(_evaluate_jacobians(centred, samples), centred.units)
 
 
 def _scale_to_range(robot: Robot, task: Task) -> Callable[[Array], Array]:
     """Relative singular values of a task at points (N, n), (N,); rows are scaled over the joint range."""
-    # Rows over their sizes in the joint range, so that lengths and angles compare.
-    whole = find_joint_range(robot, 0)
-    centred = task.with_reference_at(whole.centre)
-    samples = sample_evenly(Box(whole.centre, whole.half_width), RULES.samples, RULES.seed)
-    scale = compute_row_scale(_evaluate_jacobians(centred, samples), centred.units)
+    centred, scale = task.with_reference_at(find_joint_range(robot, 0).centre), compute_range_scale(robot, task)
 
     def values(points: Array) -> Array:
         return np.asarray(np.linalg.svd(_evaluate_jacobians(centred, points) / scale[:, None], compute_uv=False)[:, -1])

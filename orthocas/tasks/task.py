@@ -62,7 +62,7 @@ class Frames:
 
     @classmethod
     def from_recipe(cls, recipe: Mapping[str, Any]) -> Self:
-        """Those of a task's recipe."""
+        """Frames of a task's recipe."""
         return cls(recipe.get("frame"), recipe.get("relative_to"))
 
     @property
@@ -368,6 +368,7 @@ class Task(Shown, HoldsFunctions):
         """
         require_kind("robot", robot, Robot)
         require_text("name of a task", str(name))
+        # the expression, as one column
         q = ca.SX.sym("q", robot.n)
         x = build_expression(f"task '{name}'", function, q)
         if x.shape[1] != 1 or x.shape[0] == 0:
@@ -399,10 +400,12 @@ class Task(Shown, HoldsFunctions):
         """
         require_kind("kind", kind, str)
         frames, base_kind = _OF_TIP, kind
+        # of the second tip in the first one
         if kind.startswith(_RELATIVE):
             if len(robot.tips) != 2:
                 raise InvalidValueError("task", kind, f"a robot with two tips; this one has {listed(robot.tips)}")
             base_kind, frames = kind.removeprefix(_RELATIVE), Frames(robot.tips[1], robot.tips[0])
+        # kinds that orthocas knows
         if (turn := TipTurn.from_kind(base_kind)) is not None:
             reference = None if q_reference is None else frames.evaluate_rotation(robot, q_reference)
             return cls._build_turned(robot, turn, reference, frames)

@@ -3,9 +3,11 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from html import escape
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.self_motion import Fan, fan_along
@@ -15,7 +17,7 @@ from orthocas.tools.checks import Array
 from orthocas.viewer.contacts import Contacts
 from orthocas.viewer.looks import RULES, Arm, Ghosts, Look, compute_chain_length
 from orthocas.viewer.panel import ChartPanel
-from orthocas.viewer.session import Session
+from orthocas.viewer.session import Session, describe_stop
 from orthocas.viewer.window import Loop, place_panels, place_scene, show_error
 
 _NONE = "none"
@@ -37,7 +39,7 @@ class ChartPage:
         self._arm, self._ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
         place_scene(server, robot, self.session.home[None])
         self._contacts = None if collisions is None else Contacts(server.scene, collisions)
-        self._handle = self._add_handle()
+        self._handle, self._rings = self._add_handle(), self._add_rings()
         self._readings = place_panels(server)
         self._sliders = self._add_sliders()
         self._add_buttons()
@@ -103,7 +105,7 @@ class ChartPage:
             self._branches = gui.add_folder("Other branches: the tip stays")
             with self._branches:
                 self._search = self._add_button("Search", "arrows-split", self._find_branches)
-        self._chosen.on_update(self._loop.build_handler("fan", self._show_fan))
+        self._chosen.on_update(self._loop.build_handler("fan", self._show_chosen))
 
     def _add_button(self, label: str, icon: str, job: Callable[[], None]) -> Any:
         button = self._server.gui.add_button(label, icon=icon)
@@ -151,6 +153,27 @@ class ChartPage:
 
         handle.on_update(dragged)
         return handle
+
+    def _add_rings(self) -> Any:
+        """Rings that turn the tool about its own axes, if the task has its whole orientation."""
+        chart = self._chart
+        task, robot = chart.problem.task, chart.problem.robot
+        if not task.of_tip or task.turn is None or not task.turn.whole:
+            return None
+        size = RULES.rings * compute_chain_length(robot.tree)
+        rings = self._server.scene.add_transform_controls(
+            "/turn", scale=size, disable_axes=True, disable_sliders=True, depth_test=False, opacity=0.8
+        )
+        first = 3 if task.turn.with_position else 0
+
+        async def dragged(event: Any) -> None:
+            turned = task.value(np.zeros(3) if first else None, event.target.wxyz)[first:].tolist()
+            self._dragging = event.phase != "end"
+            labels = chart.labels[first : chart.m]
+            self._loop.ask("turn", lambda: self._move_towards(dict(zip(labels, turned, strict=True))))
+
+        rings.on_update(dragged)
+        return rings
 
     def _move_towards(self, values: dict[str, float]) -> None:
         """Move towards what the user wishes, as the first or a later part of a gesture."""
@@ -214,7 +237,7 @@ class ChartPage:
             self._show_arm(readings.q)
             shown = replace(readings, q=self.session.mirror(readings.q[None])[0])
             nearest = "" if self._contacts is None else self._contacts.show(shown.q)
-            self._readings.content = self._panel.format_html(shown, nearest)
+            self._readings.content = self._panel.format_html(shown, nearest, self._format_ends())
             values = np.concatenate([readings.x, readings.xi]).tolist()
             for label, value in zip(self._chart.labels, values, strict=True):
                 slider = self._sliders[label]
@@ -226,8 +249,13 @@ class ChartPage:
         """Draw the arm and its handle, for a position of the chart (n,)."""
         with self._server.atomic():
             self._arm.show(self.session.mirror(q[None])[0])
-            if self._handle is not None and not self._dragging:
-                self._handle.position = tuple(self._chart.problem.robot.tip_position(q))
+            if self._dragging:
+                return
+            robot = self._chart.problem.robot
+            for handle in filter(None, (self._handle, self._rings)):
+                handle.position = tuple(robot.tip_position(q))
+            if self._rings is not None:
+                self._rings.wxyz = tuple(Rotation.from_matrix(robot.tip_rotation(q)).as_quat(scalar_first=True))
 
     def _settle(self) -> None:
         """After a gesture: ranges of the sliders, the fan, and values that were not reached."""
@@ -242,12 +270,26 @@ class ChartPage:
             high = np.floor(max(ends) / RULES.slider_step) * RULES.slider_step
             if np.isfinite([low, high]).all():
                 slider.min, slider.max = round(float(min(low, high)), 3), round(float(max(low, high)), 3)
-        self._show()
-        self._show_fan()
+        self._show_chosen()
 
     def _find_fan(self) -> Fan | None:
         """The fan of the chosen coordinate."""
         return next((fan for fan in self._fans if fan.label == self._chosen.value), None)
+
+    def _show_chosen(self) -> None:
+        """Draw another coordinate's fan and ends."""
+        self._show()
+        self._show_fan()
+
+    def _format_ends(self) -> str:
+        """What ends the chosen coordinate, as a part of the readings; a mirrored arm ends elsewhere."""
+        fan = self._find_fan()
+        if fan is None or self.session.flips:
+            return ""
+        ends = ((fan.xi[0], fan.low_stop), (fan.xi[-1], fan.high_stop))
+        robot = self._chart.problem.robot
+        lines = [f"{value:.3f}: {escape(describe_stop(stop, robot))}" for value, stop in ends]
+        return f'<h4>ends of {escape(fan.label)}</h4><div class="about">{"<br>".join(lines)}</div>'
 
     def _show_fan(self) -> None:
         fan = self._find_fan()

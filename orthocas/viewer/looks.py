@@ -66,7 +66,8 @@ class ViewRules:
     missed: float = 1e-6  #: of the sizes of the components: a target that is not reached
     reach_sizes: float = 2.0  #: of a component, beyond which nobody slides
     endless: float = float(np.pi)  #: half of a slider without limits [rad] or [m]
-    handle: float = 0.17
+    handle: float = 0.17  #: arrows at the tool, of the length of the chain
+    rings: float = 0.13  #: that turn it
     sweep: float = 6.0  #: there and back [s]
     sweep_range: float = 0.97  #: fraction of the range that a sweep uses
     reading_pause: float = 0.1  #: between readings in a sweep, which take longer than a picture [s]

@@ -103,12 +103,13 @@ class ChartPanel:
         lines = [escape(place)] if place else [f"branch {escape(branch)}"] if isinstance(branch, str) else []
         if not lines and problem.name:
             lines = [f"problem {escape(problem.name)}"]
-        lines += [f"{escape(chart.coordinates.label)}, {chart.n} joints"]
+        family, _, _ = chart.coordinates.label.partition(":cyclic")
+        lines += [f"{escape(family)}, {chart.n} joints"]
         lines += [f"task {task}; {chart.r} coordinate{'s' if chart.r > 1 else ''}"]
         self._head = f'<div class="name">{escape(name_robot(robot))}</div><div class="about">{"<br>".join(lines)}</div>'
 
-    def format_html(self, readings: Readings, nearest: str = "") -> str:
-        """The page; `nearest` is a part about collisions."""
+    def format_html(self, readings: Readings, nearest: str = "", ends: str = "") -> str:
+        """The page; `nearest` is a part about collisions, and `ends` about the range of a coordinate."""
         m = len(readings.x)
         # What stopped the last motion, and the leak of each coordinate.
         stop = f'<div class="stop">stopped by {escape(readings.stop)}</div>' if readings.stop else ""
@@ -141,7 +142,7 @@ class ChartPanel:
         drift = format_number("drift", float(readings.drift.max()), format_drift(readings.drift, self._units))
         parts = [
             STYLE, '<div class="oc">', self._head, f'<div class="held"><span>task moved by</span>{drift}</div>',
-            stop, "<h4>leak of the coordinates</h4>", *leaks,
+            stop, ends, "<h4>leak of the coordinates</h4>", *leaks,
             "<h4>chart</h4>", conditioning, boundary, nearest,
             "<h4>joints</h4>", self._joints.format_html(readings.q), self._joints.format_copy(readings.q), "</div>",
         ]  # fmt: skip

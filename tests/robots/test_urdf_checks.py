@@ -148,7 +148,9 @@ def test_missing_limits_of_effort_and_velocity_are_none(
     limits = {"effort": robot.effort_limits, "velocity": robot.velocity_limits}
     np.testing.assert_array_equal(limits.pop(what), [np.inf, 1])
     np.testing.assert_array_equal(*limits.values(), [1, 1])
-    assert caplog.messages == [f"{path}: limits of effort or velocity are missing or -1, so there are none: j"]
+    assert caplog.messages == [
+        f"{path}: limits are missing, or those of effort or velocity are -1, so there are none: j"
+    ]
 
 
 def test_limits_of_minus_one_are_none_and_a_lost_base_is_added(
@@ -161,8 +163,19 @@ def test_limits_of_minus_one_are_none_and_a_lost_base_is_added(
         robot = oc.Robot.from_urdf(path)
     assert robot.effort_limits.tolist() == [np.inf, 1]
     np.testing.assert_array_equal(robot.tip_position([0.3, 0.4]), plain.tip_position([0.3, 0.4]))
-    assert "are missing or -1" in caplog.text
+    assert "so there are none: j" in caplog.text
     assert "the link 'a' is missing, and taken as the base" in caplog.text
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_joints_without_any_limit_are_unlimited(tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "arm.urdf"
+    whole = ARM.format(kind=kind, axis="")
+    path.write_text(whole.replace('<limit lower="-1" upper="1" effort="1" velocity="1"/>', ""))
+    with caplog.at_level(logging.WARNING, "orthocas"):
+        robot = oc.Robot.from_urdf(path)
+    assert (robot.lower[0], robot.upper[0], robot.effort_limits[0]) == (-np.inf, np.inf, np.inf)
+    assert "so there are none: j" in caplog.text
 
 
 def test_calls_of_lost_macros_are_left_out_with_a_word(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -96,6 +96,11 @@ def test_parts_of_a_chart(chart: oc.Chart, q: Any) -> None:
 def test_manipulability_is_the_volume_of_the_task_jacobian(chart: oc.Chart, q: Any) -> None:
     J = chart.jacobian(q)[:6]
     np.testing.assert_allclose(chart.manipulability(q), np.sqrt(np.linalg.det(J @ J.T)), rtol=1e-9)
+    function = chart.function("manipulability")
+    np.testing.assert_allclose(float(function(q)), chart.manipulability(q), rtol=1e-9)
+    gradient, step = np.array(function.jacobian()(q, 0)).ravel(), 1e-6 * np.eye(chart.n)
+    differences = (chart.manipulability(q + step) - chart.manipulability(q - step)) / 2e-6
+    np.testing.assert_allclose(gradient, differences, rtol=1e-5, atol=1e-7)
 
 
 def test_laws_have_default_gains(chart: oc.Chart) -> None:

@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from public_objects import clear, cyclic, fitted, joint_motion, trajectory
+from scipy.spatial.transform import Rotation
 from solid_arms import build_arm
 
 import orthocas as oc
@@ -63,6 +64,27 @@ def test_handle_sweep_undo_and_home(build: Callable[[], oc.Chart]) -> None:
         wait(lambda: bool((session.q == home).all()))
         values = dict(zip(chart.labels, chart.phi(home).tolist(), strict=True))
         wait(lambda: all(abs(page._sliders[label].value - value) < 6e-4 for label, value in values.items()))
+
+
+def test_rings_turn_the_tool_of_a_pose_task() -> None:
+    """By 0.2 rad about the tool's own z axis; place and xi stay."""
+    chart = oc.load("panda-wide")
+    robot = chart.problem.robot
+    with oc.view(chart, port=0) as view:
+        page = view._page
+        session, home = page.session, page.session.home
+        here = Rotation.from_matrix(robot.tip_rotation(home))
+        np.testing.assert_allclose(np.abs(page._rings.wxyz @ here.as_quat(scalar_first=True)), 1, atol=1e-12)
+        wished = here * Rotation.from_rotvec([0, 0, 0.2])
+        for end in (chart.xi_range(home)["xi1"].low_stop, chart.xi_range(home)["xi1"].high_stop):
+            assert end.joint in page._readings.content
+        page._rings.wxyz = tuple(wished.as_quat(scalar_first=True))
+        for phase in ("start", "update", "end"):
+            asyncio.run(page._rings._impl_aux.update_cb[0](SimpleNamespace(target=page._rings, phase=phase)))
+        wait(lambda: not page._undo.disabled and not page._gesture)
+        np.testing.assert_allclose(robot.tip_rotation(session.q), wished.as_matrix(), atol=1e-8)
+        np.testing.assert_allclose(robot.tip_position(session.q), robot.tip_position(home), atol=1e-9)
+        np.testing.assert_allclose(chart.xi(session.q), chart.xi(home), atol=1e-9)
 
 
 def test_a_taken_port_is_named_and_a_closed_one_is_free() -> None:
