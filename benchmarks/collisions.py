@@ -40,7 +40,7 @@ CHARTS = {
     "ur5": "ur5-position",
 }
 DIRECT, TIMED, CAPSULES, TICKS = 2000, 4096, 3000, 20_000  # postures; postures; postures; ticks of an arm
-KEPT = 170_000  # ticks of an arm in C
+KEPT = 150_000  # ticks of an arm in C
 TOLERANCE = 1e-10  # of coal's distances, relative
 MARGIN, AVOID, STEP = 0.01, 0.03, 0.1  # [m]; [m]; largest step of a joint in a tick [rad]
 NOISE, JUMPS, LEG = 0.003, 0.02, 60  # of phi relative to its sizes; share of ticks with a far target; ticks

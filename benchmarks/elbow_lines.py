@@ -6,7 +6,6 @@ flood fill over the free part of all self-motions at 60 stations, by steps along
 """
 
 import sys
-import time
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -127,20 +126,18 @@ class Search:
 def follow_lines(count: int, found: dict[str, float]) -> Iterator[str]:
     """The row of the lines, of which the search finds `count` to be possible."""
     chart, own = load_panda()
-    possible, ours, lines, seconds = 0, 0, 0, list[float]()
+    possible, ours, lines = 0, 0, 0
     for line in draw_lines(chart, own):
         lines += 1
         if not Search(chart, line).find():
             continue
         possible += 1
-        begin = time.process_time()
         ours += follow(chart, line)
-        seconds.append(time.process_time() - begin)
         print(f"{ours} of {possible}, {lines} lines", file=sys.stderr, flush=True)
         if possible == count:
             break
     found |= {"lines, possible": possible, "lines, ours": ours}
-    yield f"| {lines} | {possible} | {ours} | {100 * ours / possible:.1f} | {np.median(seconds):.2f} |"
+    yield f"| {lines} | {possible} | {ours} | {100 * ours / possible:.1f} |"
 
 
 def follow(chart: oc.Chart, line: Line) -> bool:
@@ -160,9 +157,9 @@ def main(quick: bool = False) -> dict[str, float]:
     found = dict[str, float]()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        head = "lines | possible by the search | of these by `follow` | share [%] | time of one [s]"
+        head = "lines | possible by the search | of these by `follow` | share [%]"
         print(f"| {head} |")
-        table("| --- " * (head.count("|") + 1) + "|", follow_lines(2 if quick else 40, found))
+        table("| --- " * (head.count("|") + 1) + "|", follow_lines(2 if quick else 20, found))
     return found
 
 
