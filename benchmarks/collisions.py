@@ -10,7 +10,7 @@ import subprocess
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -40,6 +40,7 @@ CHARTS = {
     "ur5": "ur5-position",
 }
 DIRECT, TIMED, CAPSULES, TICKS = 2000, 4096, 3000, 20_000  # postures; postures; postures; ticks of an arm
+KEPT = 150_000  # ticks of an arm in C
 TOLERANCE = 1e-10  # of coal's distances, relative
 MARGIN, AVOID, STEP = 0.01, 0.03, 0.1  # [m]; [m]; largest step of a joint in a tick [rad]
 NOISE, JUMPS, LEG = 0.003, 0.02, 60  # of phi relative to its sizes; share of ticks with a far target; ticks
@@ -55,14 +56,54 @@ int main(int count, char **words) {
   if (!file || fread(q, sizeof(double), ROWS * JOINTS, file) != ROWS * JOINTS) return 1;
   for (k = 0; k < 20; ++k) {
     struct timespec a, b;
-    clock_gettime(CLOCK_MONOTONIC, &a);
+    clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &a);
     for (i = 0; i < ROWS; ++i) { arm_distance(q + JOINTS * i, &d, g, points, &pair); sum += d; }
-    clock_gettime(CLOCK_MONOTONIC, &b);
+    clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &b);
     double seconds = (double)(b.tv_sec - a.tv_sec) + 1e-9 * (double)(b.tv_nsec - a.tv_nsec);
     if (seconds / ROWS < best) best = seconds / ROWS;
   }
   printf("%.17g %g\\n", 1e6 * best, sum);
   return 0;
+}
+"""
+
+
+KEEPING = """
+#include <stdint.h>
+#include <stdio.h>
+#include <time.h>
+#include "arm_distance.h"
+static double goals[LEGS * JOINTS], ways[(LEGS * LEG + 1) * JOINTS];
+static uint64_t state = 88172645463325252u;
+static double draw(void) { /* from -1 to 1, by xorshift */
+  state ^= state << 13;
+  state ^= state >> 7;
+  state ^= state << 17;
+  return (double)(state >> 11) / 4503599627370496.0 - 1.0;
+}
+int main(int count, char **words) {
+  double wish[JOINTS], distance;
+  long counts[4] = {0, 0, 0, 0};
+  int leg, k, i;
+  FILE *file = count > 2 ? fopen(words[1], "rb") : 0;
+  if (!file || fread(ways, sizeof(double), JOINTS, file) != JOINTS) return 1;
+  if (fread(goals, sizeof(double), LEGS * JOINTS, file) != LEGS * JOINTS) return 1;
+  clock_t begin = clock();
+  for (leg = 0; leg < LEGS; ++leg) {
+    for (k = 0; k < LEG; ++k) {
+      const double *q = ways + JOINTS * (leg * LEG + k);
+      const int far = draw() > 1.0 - 2.0 * JUMPS;
+      for (i = 0; i < JOINTS; ++i) {
+        double step = (goals[JOINTS * leg + i] - q[i]) / (far ? 1 : LEG - k) + NOISE * draw();
+        wish[i] = q[i] + (far ? step : (step > STEP ? STEP : (step < -STEP ? -STEP : step)));
+      }
+      ++counts[arm_keep_clear(q, wish, MARGIN, ways + JOINTS * (leg * LEG + k + 1), &distance)];
+    }
+  }
+  printf("%g %ld %ld %ld %ld\\n", 1e6 * (double)(clock() - begin) / CLOCKS_PER_SEC / (LEGS * LEG), counts[0], counts[1],
+         counts[2], counts[3]);
+  file = fopen(words[2], "wb");
+  return !file || fwrite(ways, sizeof(double), (LEGS * LEG + 1) * JOINTS, file) != (LEGS * LEG + 1) * JOINTS;
 }
 """
 
@@ -131,12 +172,12 @@ def hull_of(vertices: Array) -> Any:
 
 
 def seconds_of(call: Callable[[Array], object], q: Array) -> float:
-    """The least time of three calls."""
+    """The least processor time of three calls."""
     best = np.inf
     for _ in range(3):
-        begin = time.perf_counter()
+        begin = time.process_time()
         call(q)
-        best = min(best, time.perf_counter() - begin)
+        best = min(best, time.process_time() - begin)
     return best
 
 
@@ -194,12 +235,13 @@ def fit(names: list[str], count: int, found: dict[str, float]) -> Iterator[str]:
         yield write_row(name, len(fitted.pieces), *cells)
 
 
-def put_post(collisions: Collisions, robot: oc.Robot, q: Array) -> Collisions:
-    """A post beside the fourth link in posture q, which the elbow meets when it swings."""
+def put_post(collisions: Collisions, robot: oc.Robot, q: Array) -> tuple[Collisions, oc.Scene | None]:
+    """A post beside the fourth link in posture q, which the elbow meets when it swings; none if it is met already."""
     elbow = np.array(ca.DM(build_body_poses(robot.tree, ca.SX(ca.DM(q)))[3][1])).ravel()
     place, up = elbow + np.array([0.0, 0.35, 0.0]), np.array([0.0, 0.0, 0.4])
-    around = collisions.with_scene(oc.Scene({"post": oc.obstacles.Capsule(place - up, place + up, 0.05)}))
-    return around if around.distance(q).distance > MARGIN else collisions
+    scene = oc.Scene({"post": oc.obstacles.Capsule(place - up, place + up, 0.05)})
+    around = collisions.with_scene(scene)
+    return (around, scene) if around.distance(q).distance > 2 * MARGIN else (collisions, None)
 
 
 def find_start(chart: oc.Chart, collisions: Collisions) -> Array:
@@ -219,7 +261,7 @@ def stream(names: list[str], ticks: int, found: dict[str, float]) -> Iterator[st
     for name in names:
         chart, collisions = load(name)
         start = find_start(chart, collisions)
-        around = put_post(collisions, chart.robot, start)
+        around, _ = put_post(collisions, chart.robot, start)
         contacts, nearest, seconds = 0, np.inf, 0.0
         counts = dict.fromkeys(TrackerStatus, 0)
         for part in range(4):
@@ -245,6 +287,54 @@ def stream(names: list[str], ticks: int, found: dict[str, float]) -> Iterator[st
         yield write_row(name, total, contacts, *cells)
 
 
+def keep_clear(names: list[str], ticks: int, found: dict[str, float]) -> Iterator[str]:
+    """Rows of hostile streams of postures through NAME_keep_clear in C, checked against the hulls."""
+    for name in [*names, *(["baxter, both arms"] if "baxter" in names else [])]:
+        # Capsules of tiago's wrist touch those of its hand in all postures.
+        if name == "tiago_pro":
+            continue
+        if name in CHARTS:
+            chart, own = load(name)
+            goals = chart.domain.sample(ticks // LEG, 5)
+        else:
+            path = find_robot_file("baxter")
+            robot = oc.Robot.from_urdf(path, tips=["left_gripper", "right_gripper"])
+            own, middle = robot.collisions, robot.tree.centre_posture
+            problem = oc.Problem(robot, oc.Task.position(robot, "x"), domain=oc.Box(middle, 0.1))
+            chart, goals = oc.fit(problem, oc.Linear(), samples=300).chart, robot.sample(ticks // LEG, 5)
+        fitted = oc.fit_capsules(own)
+        free = goals[fitted.collisions.distance(goals).distance > 2 * MARGIN]
+        around, scene = put_post(own, chart.robot, free[0])
+        if scene is not None:
+            fitted = replace(fitted, collisions=fitted.collisions.with_scene(scene))
+        way, us, counts = run_stream(chart, fitted, free[0], goals)
+        contacts = int((~around.check_free(way)).sum())
+        pieces = range(0, len(way) - LEG, 20 * LEG)
+        contacts += sum(around.find_contact(way[k : k + LEG + 1]) is not None for k in pieces)
+        total = sum(counts)
+        found |= {f"{name}, contacts in C": contacts, f"{name}, ticks in C": total}
+        shares = (f"{100 * count / total:.0f}" for count in counts[:3])
+        yield write_row(name, total, contacts, *shares, f"{us:.1f}")
+
+
+def run_stream(
+    chart: oc.Chart, fitted: FittedCapsules, start: Array, goals: Array
+) -> tuple[Array, float, tuple[int, ...]]:
+    """Postures (N, n), [us] of a tick, and how many ticks had each status."""
+    with TemporaryDirectory() as folder:
+        generated = oc.generate_c(chart, folder, name="arm", capsules=fitted)
+        Path(folder, "keep.c").write_text(KEEPING)
+        np.vstack([start, goals]).tofile(f"{folder}/goals")
+        numbers = {"JOINTS": chart.n, "LEGS": len(goals), "LEG": LEG, "STEP": STEP, "MARGIN": MARGIN}
+        numbers |= {"JUMPS": JUMPS, "NOISE": NOISE}
+        sizes = [f"-D{name}={value}" for name, value in numbers.items()]
+        sources = [f"{folder}/keep.c", str(generated.folder / "arm_distance.c")]
+        subprocess.run([find_compilers()[0], "-O2", *sizes, "-o", f"{folder}/keep", *sources, "-lm"], check=True)
+        words = [f"{folder}/keep", f"{folder}/goals", f"{folder}/way"]
+        us, *counts = subprocess.run(words, check=True, capture_output=True).stdout.split()
+        return np.fromfile(f"{folder}/way").reshape(-1, chart.n), float(us), tuple(map(int, counts))
+
+
 HEADS = (
     "robot | pairs | contacts that differ | largest difference of distances [m] | domain in contact [%] "
     "| distance and gradient [us] | free or not [us]",
@@ -252,16 +342,17 @@ HEADS = (
     "| nearer than hulls, median [mm] | `NAME_distance` [us] | fit [s]",
     "chart of | ticks | contacts | nearest [mm] | as wished or nearest [%] | xi yields [%] | braked [%] "
     "| time of a tick [us]",
+    "robot | ticks in C | contacts of hulls | as wished [%] | shorter [%] | at rest [%] | time of a tick [us]",
 )
 
 
 def main(quick: bool = False) -> dict[str, float]:
     """Print the tables; the numbers of a test."""
     names, found = list(CHARTS)[:1] if quick else list(CHARTS), dict[str, float]()
-    counts = (50, 200, 400) if quick else (DIRECT, CAPSULES, TICKS)
+    counts = (50, 200, 400, 6000) if quick else (DIRECT, CAPSULES, TICKS, KEPT)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for head, rows, count in zip(HEADS, (compare, fit, stream), counts, strict=True):
+        for head, rows, count in zip(HEADS, (compare, fit, stream, keep_clear), counts, strict=True):
             print(f"| {head} |")
             table("| --- " * (head.count("|") + 1) + "|", rows(names, count, found))
     return found

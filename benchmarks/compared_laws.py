@@ -71,7 +71,7 @@ def in_coordinates(name: str, law: PDPlus | Impedance, library: CompiledLibrary)
 
 def integrating(name: str, law: PDPlus, library: CompiledLibrary) -> Law:
     """A supervised law with integral action on x. On xi as well, joints that stick would break loose one by one."""
-    rates = np.repeat([INTEGRAL, 0.0], [law.chart.m, law.chart.r])
+    rates = np.repeat([min(INTEGRAL, law.integral_bound), 0.0], [law.chart.m, law.chart.r])
     supervisor = Supervisor(library, law, Safety.of(law, integral_rate=rates))
 
     def command(q: Array, dq: Array, motion: Motion, k: int) -> tuple[Array, int]:

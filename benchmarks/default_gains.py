@@ -133,7 +133,7 @@ def integral_row(label: str, law: PDPlus, starts: int) -> str:
         for make in PLANTS.values():
             plant, ends = MuJoCoPlant(make(law.problem.robot)), []
             for rate in (0.0, INTEGRAL):
-                supervisor = Supervisor(library, law, Safety.of(law, integral_rate=rate))
+                supervisor = Supervisor(library, law, Safety.of(law, integral_rate=min(rate, law.integral_bound)))
                 found = [held(law, supervisor, plant, start) for start in starts_of(law.problem, starts)]
                 caught = sum(np.isinf(found))
                 ends.append(f"{1e3 * max(np.compress(np.isfinite(found), found), default=np.nan):.2f}")

@@ -1,4 +1,4 @@
-"""A benchmark of redundancy resolution, made of what users report: eleven scenarios, all methods, eight arms (25 min).
+"""A benchmark of redundancy resolution, made of what users report: 14 scenarios, all methods, eight arms (35 min).
 
 Writes `benchmarks/redundancy/results/SCENARIO.json`; `redundancy_page.py` makes tables and pictures of them. How to add
 a method: `benchmarks/redundancy/README.md`.
@@ -35,11 +35,11 @@ if __name__ == "__main__":
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1])
     parser.add_argument("--method", type=Path, action="append", default=[], help="a file with METHODS of your own")
     parser.add_argument("--quick", action="store_true", help="one arm, short runs; prints, and keeps nothing")
-    parser.add_argument("--tune", action="store_true", help="choose the settings first (8 min)")
+    parser.add_argument("--tune", action="store_true", help="choose the settings first (8 min for all methods)")
     parser.add_argument("--methods", nargs="+", default=[], help="names of methods; others keep their results")
     options = parser.parse_args()
     if options.tune:
-        tuning.main()
+        tuning.main(options.methods)
     results = main(options.names, options.arms, options.seeds, options.method, options.quick, options.methods)
     for name, result in results.items():
         print(f"{name}: {result['number']}")

@@ -45,6 +45,7 @@ class Row:
         tuple[str, int], float
     ]  #: by arm and seed, of those on which it ran; infinite where it did not serve
     also: Sequence[float]  #: the second number, where it served
+    ticks: Sequence[float]  #: CPU times of a tick [us], of those on which it ran
     why: str  #: there is no number, if there is none
 
     @property
@@ -74,7 +75,8 @@ def rows_of(result: Mapping[str, Any], seeds: Collection[int]) -> list[Row]:
         values = {(case["arm"], case["seed"]): _value(case) for case in ran}
         also = [case["also"] for case in ran if np.isfinite(_value(case)) and case.get("also") is not None]
         whys = sorted({case["why"] for case in cases if "why" in case})
-        found.append(Row(method, values, also, "; ".join(whys)))
+        ticks = [case["us per tick"] for case in ran if "us per tick" in case]
+        found.append(Row(method, values, also, ticks, "; ".join(whys)))
     return found
 
 
@@ -102,17 +104,22 @@ def table(scenario: Scenario, result: Mapping[str, Any]) -> list[str]:
     own, repeated = ranks(rows, scenario), [ranks(rows_of(result, [seed]), scenario) for seed in seeds]
     what = "mean" if scenario.percent else "median"
     columns = ["method", f"{scenario.number}, {what} where served", "worst", "served", "rank"]
-    columns += [f"rank with seed {', '.join(map(str, seeds))} only", *([scenario.also] if scenario.also else [])]
+    columns += [
+        f"rank with seed {', '.join(map(str, seeds))} only",
+        "tick [us]",
+        *([scenario.also] if scenario.also else []),
+    ]
     lines = [f"| {' | '.join(columns)} |"]
     for row in sorted((row for row in rows if row.values), key=lambda row: (own[row.method], _middle(row, scenario))):
         cells = [row.method, number(_middle(row, scenario)), number(max(row.values))]
         cells += [f"{len(row.values)} of {len(row.cases)}", str(own[row.method])]
         cells += [", ".join(str(found.get(row.method, "-")) for found in repeated)]
+        cells += [f"{np.median(row.ticks):.0f}"]
         cells += [number(float(np.median(row.also))) if row.also else "-"] if scenario.also else []
         lines.append(f"| {' | '.join(cells)} |")
     for row in rows:
         if row.cases and not row.values:
-            cells = [row.method, row.why or "served no arm", "-", f"0 of {len(row.cases)}", "-", "-"]
+            cells = [row.method, row.why or "served no arm", "-", f"0 of {len(row.cases)}", "-", "-", "-"]
             lines.append(f"| {' | '.join([*cells, *(['-'] if scenario.also else [])])} |")
     return lines
 

@@ -66,6 +66,7 @@ class _Run:
             if isinstance(self.objective, SampledObjective):
                 parts = self.objective.batches(self.settings.batch, self.settings.steps, (best.iterations,))
             for k, part in enumerate(parts):
+                # a step for each part, and then the value on all samples
                 gradient = part.value_and_gradient(self.theta)[1]
                 best.evaluations += 1
                 if not np.isfinite(gradient).all():

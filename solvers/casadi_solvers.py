@@ -83,6 +83,7 @@ class _IpoptRun:
         if self.constrained:
             start |= {name: ca.DM(bound) for name, bound in zip(("lbg", "ubg"), self.constrained.bounds, strict=True)}
         try:
+            # signals and exceptions wait until compiled code is done
             with deferred():
                 with building:
                     solver = self._solver()
@@ -102,10 +103,12 @@ class _IpoptRun:
 
     def _solver(self) -> ca.Function:
         x, p = ca.MX.sym("x", self.size), ca.MX.sym("p", 0)
+        # values and gradients come from Python, through nodes
         value = self._node("f", [self.size], [(1, 1)], lambda theta: [self._evaluate(theta)[0]])
         both = self._node("grad_f", [self.size], [(1, 1), (self.size, 1)], self._evaluate)
         problem: dict[str, Any] = {"x": x, "f": value(x)}
         options: dict[str, Any] = {"grad_f": ca.Function("nlp_grad_f", [x, p], list(both(x)))}
+        # constraints, if there are any
         rows = len(self.constrained.bounds[0]) if self.constrained else 0
         if self.constrained:
             constraints = self._node("g", [self.size], [(rows, 1)], lambda theta: [self._constraints(theta)[0]])

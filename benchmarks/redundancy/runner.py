@@ -24,7 +24,17 @@ RESULTS, SETTINGS = FOLDER / "results", FOLDER / "settings.json"
 SCHEMA = 1  #: of the files in results
 FASTER = 1.05  #: than its velocity limit, which a joint may be
 PATIENCE = 51  #: ticks that a method may be late with; one that takes longer is stopped, and its row says so
-ORDER = ("pseudo_inverse", "pink", "mink", "placo", "ssik", "operational_space", "ompl", "charts")  #: of the rows
+ORDER = (
+    "pseudo_inverse",
+    "jparse",
+    "pink",
+    "mink",
+    "placo",
+    "ssik",
+    "operational_space",
+    "ompl",
+    "charts",
+)  #: of the rows
 
 
 class Missing:

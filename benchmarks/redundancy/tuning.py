@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from itertools import product
 from typing import Any
@@ -12,11 +13,11 @@ from redundancy.runner import SCHEMA, SETTINGS, built, case, methods, scenarios
 SEED, SCENARIOS = 100, ("jumps", "drift")
 
 
-def tried(arm_name: str, number: int) -> list[tuple[str, int, list[float]]]:
+def tried(arm_name: str, number: int, only: Sequence[str] = ()) -> list[tuple[str, int, list[float]]]:
     """Of an arm, with the settings of that number: for every method, lines that are lost [%] and drift [rad]."""
     warnings.simplefilter("ignore")
     arm, known, found = Arm(arm_name), scenarios(), []
-    for method in methods():
+    for method in methods(only=only):
         if number >= len(method.grid):
             continue
         settings = method.grid[number]
@@ -37,13 +38,14 @@ def _best(costs: dict[int, list[list[float]]]) -> int:
     return min(sums, key=lambda number: (round(sums[number][0], 6), round(sums[number][1], 3), number))
 
 
-def main() -> None:
-    """Try, choose, and keep the choice."""
-    cases = list(product(TUNED_ON, range(3)))
+def main(only: Sequence[str] = ()) -> None:
+    """Try, choose, and keep the choice; other methods keep theirs."""
+    cases = list(product(TUNED_ON, range(3), [only]))
     with ProcessPoolExecutor(2) as pool:
         found = [one for kept in pool.map(tried, *zip(*cases, strict=True)) for one in kept]
-    chosen, all_costs = {}, {}
-    for method in methods():
+    before = json.loads(SETTINGS.read_text()) if only else {"chosen": {}, "tried": {}}
+    chosen, all_costs = before["chosen"], before["tried"]
+    for method in methods(only=only):
         costs = {number: [c for name, k, c in found if name == method.name and k == number] for number in range(3)}
         costs = {number: rows for number, rows in costs.items() if rows}
         chosen[method.name] = dict(method.grid[_best(costs)])

@@ -96,12 +96,12 @@ class CircleFamily:
 
     @property
     def as_matrices(self) -> bool:
-        """As the pairs."""
+        """What the pairs say."""
         return self.pairs.as_matrices
 
     @property
     def width(self) -> int:
-        """As the pairs."""
+        """What the pairs say."""
         return self.pairs.width
 
     def expression(self, q: Expression, theta: Expression) -> Expression:

@@ -316,11 +316,6 @@ def indices(cyclic: Cyclic, space: JointSpace) -> list[int]:
     return [k for k, name in enumerate(space.joint_names) if name in cyclic]
 
 
-def count(cyclic: Cyclic) -> int:
-    """Number of cyclic joints; 0 as long as "auto" has not been resolved."""
-    return 0 if cyclic == "auto" else len(cyclic)
-
-
 @dataclass(frozen=True)
 class Mobile:
     """Coordinates that turn and shift with a base that moves on a plane.
@@ -430,12 +425,12 @@ class MobileFamily:
 
     @property
     def as_matrices(self) -> bool:
-        """As the functions of the arm."""
+        """What the functions of the arm say."""
         return self.arm.as_matrices
 
     @property
     def width(self) -> int:
-        """As the functions of the arm."""
+        """What the functions of the arm say."""
         return self.arm.width
 
     def expression(self, q: Expression, theta: Expression) -> Expression:

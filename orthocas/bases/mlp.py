@@ -276,6 +276,7 @@ class MLPFamily:
     def pullback(self, points: Array, theta: Array, memory: ArrayMemory | None = None) -> tuple[Array, Pulled]:
         """J_xi at points (N, n), (N, r, n), and the map from dL/dJ_xi to dL/dtheta; see `ArrayFamily`."""
         turning, direct, linear, size = self.turning, self.direct, list(self.linear), self._network_size
+        # sines and cosines of turning joints, and other joints as they are
         angles, t = points[:, turning], len(turning)
         sin, cos = np.sin(angles).astype(theta.dtype), np.cos(angles).astype(theta.dtype)
         inputs = np.concatenate([sin, cos, points[:, direct].astype(theta.dtype)], axis=1)
@@ -287,6 +288,7 @@ class MLPFamily:
         J[:, :, direct] = g[:, :, 2 * t :]
         J[:, :, linear] = self.split_slopes(theta)
 
+        # the same chain backwards
         def back(slopes: Array, result: Array) -> Array:
             by_angle, by_direct = slopes[:, :, turning].astype(theta.dtype), slopes[:, :, direct].astype(theta.dtype)
             parts = [by_angle * cos[:, None], -by_angle * sin[:, None], by_direct]

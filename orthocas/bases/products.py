@@ -208,7 +208,8 @@ class Products:
     def _count_terms(self, n: int, functions: int) -> int:
         """Sum over j of C(n, j) C(d, j) f^j without the constant, for f functions of each degree of a joint."""
         n -= len(self.without)
-        linear = min(n, cyclic_choice.count(self.cyclic))
+        # "auto" counts as none until it is resolved
+        linear = 0 if self.cyclic == "auto" else min(n, len(self.cyclic))
         most = min(n - linear, self.degree, self.degree if self.joints is None else self.joints)
         terms: int = sum(comb(n - linear, j) * comb(self.degree, j) * functions**j for j in range(1, most + 1))
         return terms + linear

@@ -70,15 +70,10 @@ def parametrisation_names() -> tuple[str, ...]:
     return tuple(name for name, each in _REGISTERED.items() if each.parse is not None)
 
 
-def require_savable(parametrisation: Parametrisation) -> None:
-    """Raise InvalidValueError, before a fit, unless charts of this parametrisation can be saved."""
-    parametrisation_to_data(parametrisation)
-
-
 def warn_unless_savable(parametrisation: Parametrisation) -> None:
     """Issue a NotSavableWarning, before a fit, if its chart cannot be saved."""
     try:
-        require_savable(parametrisation)
+        parametrisation_to_data(parametrisation)
     except InvalidValueError as error:
         warnings.warn(f"charts of this fit cannot be saved: {error}", NotSavableWarning, stacklevel=3)
 

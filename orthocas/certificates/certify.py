@@ -427,7 +427,7 @@ def _build_certificate(
 
 
 def _estimate_proved_fraction(domain: Domain, parts: Subdivision) -> float:
-    """Of the clear positions of the box of a domain that keeps folds out, the share in proved parts; 0 for others.
+    """Of all clear positions in the box of a domain that keeps folds out, the share in proved parts; 0 for others.
 
     From samples of the box, and of the parts that are not proved.
     """

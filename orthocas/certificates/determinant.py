@@ -105,7 +105,7 @@ class Determinant:
 
     @classmethod
     def build(cls, chart: Chart) -> "Determinant | None":
-        """Of a chart with one fitted coordinate, a polynomial, and task rows of sines and cosines; None for others."""
+        """Build for a chart with one fitted polynomial, and task rows of sines and cosines; None for other charts."""
         coordinates = chart.coordinates
         if not isinstance(coordinates, Coordinates) or len(coordinates.offset) != 1:
             return None
@@ -164,7 +164,8 @@ class WaveSeries:
 
     @classmethod
     def build(cls, sums: "Sequence[Waves]", joints: Variables) -> "WaveSeries":
-        """Of sums that depend on these joints only."""
+        """Build for sums that depend on these joints only."""
+        # frequencies of all sums, each up to its sign
         every = np.concatenate([each.frequencies[:, joints] for each in sums])
         kept = sorted({max(k, tuple(-i for i in k)) for k in map(tuple, every.tolist())})
         place = {k: i for i, k in enumerate(kept)}
@@ -176,10 +177,12 @@ class WaveSeries:
                     own[place[k]] += value
                 else:
                     own[place[tuple(-i for i in k)]] += np.conj(value)
+        # derivatives of each wave, as one table from cosines and sines
         waves: Array = np.array(kept, dtype=float).reshape(len(kept), len(joints))
         slopes = [np.prod(1j * waves[:, list(m)], axis=1) for m in list_indices(len(joints), SERIES_DEGREE)]
         products = c[:, None] * np.array(slopes)
         table = np.concatenate([products.real, -products.imag], axis=2).reshape(-1, 2 * len(kept))
+        # and what rounding adds
         sizes = np.abs(c) * UP
         rounding = RULES.roundings * UNIT * sizes.sum(axis=1)
         return cls(waves, sizes, table, (np.array([each.error for each in sums]) + rounding) * UP)
@@ -212,7 +215,7 @@ class PolynomialSeries:
 
     @classmethod
     def build(cls, values: Array, doubts: Array, family: ProductFamily, variables: list[int]) -> "PolynomialSeries":
-        """Of derivatives and their errors by `_differentiate_coordinate`, for the variables that they depend on."""
+        """Build from derivatives and errors of `_differentiate_coordinate`, for the variables that they depend on."""
         # Keep the derivatives by the variables that count.
         degree, n = _bound_degree(family), family.space.n
         places = {m: k for k, m in enumerate(list_indices(n, degree))}

@@ -268,7 +268,7 @@ class TipJets:
 
     @classmethod
     def build(cls, rows: TipRows, tree: KinematicTree, columns: tuple[int, ...], domain: Domain) -> "TipJets":
-        """For boxes within a domain."""
+        """Build the check for boxes within a domain."""
         # From the tip inwards, each joint's distance is at most the length of the chain behind it.
         # Rounding of the kinematics, relative to the reach of the arm.
         doubt = 64 * (tree.n + 8) * bound_rotation_error(tree) * bound_reach(tree, domain)

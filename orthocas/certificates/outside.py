@@ -108,7 +108,7 @@ def _choose_rows(chart: Chart, domain: SingularBound) -> tuple[GraphRows, set[in
     """
     task, joints = chart.problem.task, range(chart.n)
     tip = TipRows.build(task)
-    # rows of the tip are cheaper, if the scale does not depend on the axes
+    # the rows of the tip serve if the scale does not depend on the axes
     if tip is not None and tip.axis is None and len(domain.scale) % 3 == 0:
         own_axes = domain.jacobian_function is task.frame_jacobian_function or not tip.rotation
         if own_axes and (domain.scale[::3] == domain.scale.reshape(-1, 3).T).all():
@@ -237,7 +237,7 @@ class OutsideCheck:
 
     @property
     def method(self) -> str:
-        """That of the proofs inside."""
+        """The method of the proofs inside."""
         return self.inside.method
 
     @property
@@ -320,7 +320,7 @@ class CorridorCheck:
 
     @property
     def method(self) -> str:
-        """That of the proofs inside."""
+        """The method of the proofs inside."""
         return self.inside.method
 
     @property

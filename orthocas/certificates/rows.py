@@ -249,7 +249,7 @@ class TipRows:
 
     @classmethod
     def build(cls, task: Task) -> "TipRows | None":
-        """Of a task; None for tasks of other kinds or frames, and for a tip that does not move."""
+        """Build for a task; None for tasks of other kinds or frames, and for a tip that does not move."""
         # The task's recipe says what it compares.
         kind = task.recipe["kind"]
         if task.robot.tree.tip_parent < 0 or not task.of_tip:
@@ -444,7 +444,7 @@ class ProductRows:
         return Jets(derivatives, doubts, left_out.sum(axis=2) * compute_margin(left_out.shape[2]) + TINY)
 
     def _evaluate_derivatives(self, order: int, values: Array, errors: Array) -> tuple[Array, Array]:
-        """Those of J_xi at points, of one order less, and bounds of their errors."""
+        """Derivatives of J_xi at points, of one order less, and bounds of their errors."""
         one = self.orders[order - 1]
         derivatives = one.table @ values[one.used]
         doubt = one.sizes @ (errors[one.used] + one.rounding * np.abs(values[one.used]))

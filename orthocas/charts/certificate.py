@@ -175,7 +175,7 @@ class Certificate(Shown):
         return replace(self, digest=self._compute_digest())
 
     def remove_given_up(self, count: int) -> Self:
-        """The same without a number of parts that were given up, which older files have and no check covers."""
+        """This certificate without a number of parts that were given up, which older files have and no check covers."""
         return self.seal() if self.digest == self._compute_digest(count) else self
 
     def _compute_digest(self, given_up: int = 0) -> str:

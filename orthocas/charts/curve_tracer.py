@@ -208,7 +208,7 @@ class CurveTracer:
 
     @cached_property
     def _bordered_step(self) -> BlockedFunction:
-        """As `_bordered`, at many points."""
+        """`_bordered` at many points."""
         return BlockedFunction(self._bordered)
 
     @cached_property

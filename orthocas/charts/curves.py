@@ -320,7 +320,7 @@ class SelfMotionCurves:
         return found[0].joined(found[1]).joined(self._take_short(targets, arcs, best))
 
     def _take_short(self, targets: Array, arcs: "Arcs", best: Nearest) -> "Ends":
-        """The same of arcs that lie between neighbouring points outside: chords that pass the box are halved."""
+        """Points and ends of arcs that lie between neighbouring points outside: chords that pass the box are halved."""
         arc, place = np.nonzero(arcs.passing & (best.distance > 0)[arcs.row][:, None])
         a, b, rows, found = arcs.q[arc, place], arcs.q[arc, place + 1], arcs.row[arc], Ends.empty(arcs.q.shape[2])
         for level in range(RULES.halvings):
@@ -396,7 +396,7 @@ class SelfMotionCurves:
 
     @cached_property
     def _period(self) -> float:
-        """Of xi; infinite where it has none."""
+        """The period of xi; infinite where it has none."""
         turn = float(self.boxed.phi_map.difference.turns[self.boxed.m])
         return turn if turn > 0 else np.inf
 
@@ -454,7 +454,7 @@ class Ends:
         return cls(np.zeros(0, dtype=np.int64), np.zeros((0, n)), np.zeros((0, n)), np.zeros(0))
 
     def joined(self, other: "Ends") -> "Ends":
-        """Both."""
+        """The ends of both."""
         parts = zip(vars(self).values(), vars(other).values(), strict=True)
         return Ends(*(np.concatenate(pair) for pair in parts))
 

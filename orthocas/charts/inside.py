@@ -123,7 +123,7 @@ class Inside:
         return np.where(good[:, None], self.boxed.points(end.u), q)
 
     def _nearest(self, targets: Array, q: Array) -> tuple[Array, Array]:
-        """The same for few rows: short slides from many points, long ones from the best of their ends."""
+        """`nearest` for few rows: short slides from many points, long ones from the best of their ends."""
         N, n = q.shape
         near = np.concatenate([q[None], self.starts.nearest(targets, RULES.near, n)])
         ends = self._slid(targets, self._turned(targets, Points.of(near, self.boxed), q), RULES.steps)
@@ -211,11 +211,11 @@ class Points:
         return Points(*(array[which] for array in vars(self).values()))
 
     def kept(self) -> "Points":
-        """Those inside that have x."""
+        """Points inside that have x."""
         return self.part((self.error <= SLIDE.kept) & np.isfinite(self.away))
 
     def joined(self, other: "Points") -> "Points":
-        """Both."""
+        """The points of both."""
         return Points(*(np.concatenate(pair) for pair in zip(vars(self).values(), vars(other).values(), strict=True)))
 
     def best(self, N: int) -> tuple[Indices, Array]:
@@ -504,7 +504,7 @@ class Walls:
     slopes: Array  #: of the conditions, (N, k, n)
 
     def part(self, rows: Indices) -> "Walls":
-        """Those of some rows."""
+        """Points of some rows."""
         return Walls(self.low[rows], self.high[rows], self.slopes[rows])
 
     def project(self, B: Array, back: Array, wanted: Array, held: NDArray[np.int8]) -> tuple[Array, NDArray[np.int8]]:

@@ -222,7 +222,7 @@ class InverseMethods(PhiFunctions):
         return Solutions(q, status[order], steps, error, np.linalg.norm(own, axis=1), float(tolerance))
 
     def _prefer_free(self, targets: Array, found: Solutions, collisions: Collisions) -> Solutions:
-        """The same with free solutions in place of those that touch, where there are any."""
+        """Solutions with free ones in place of those that touch, where there are any."""
         rows = np.flatnonzero(np.isin(found.status, (InverseStatus.FOUND, InverseStatus.NEAREST)))
         # rows whose solution touches something
         rows = rows[~collisions.check_free(found.q[rows])] if rows.size else rows
@@ -318,9 +318,10 @@ class InverseMethods(PhiFunctions):
         require_known("chart function", name, FUNCTIONS)
         if name == "manipulability":
             # sqrt(det(J J^T)) is the product of the diagonal of the Cholesky factor.
-            q, product = ca.MX.sym("q", self.n), ca.SX.sym("P", self.m, self.m)
+            q = ca.MX.sym("q", self.n)
+            J = self.problem.task.frame_jacobian_function(q)
+            product = ca.SX.sym("P", J.shape[0], J.shape[0])
             volume = ca.Function("volume", [product], [ca.det(ca.diag(ca.diag(ca.chol(product))))])
-            J = self._graph("task_jacobian")(q)
             return ca.Function(name, [q], [volume(J @ J.T)], ["q"], [name])
         return self._inverse_function if name == "inverse" else self._graph(name)
 
@@ -495,7 +496,7 @@ class ChartParts:
         return ca.Function("rates", [q], [ca.densify(rows)], ["q"], ["rates"])
 
     def batched_rates(self, points: Array) -> Array:
-        """Those rows at points (N, n), (N, n, n); NaN where the task has no finite Jacobian."""
+        """The rows of `rates` at points (N, n), (N, n, n); NaN where the task has no finite Jacobian."""
         chart = self.chart
         J = np.empty((len(points), chart.n, chart.n))
         J[:, : chart.m] = self.relative.batched_rates(points)[0].reshape(-1, chart.m, chart.n)
@@ -552,7 +553,7 @@ class ChartParts:
 
     @cached_property
     def point_functions(self) -> PointFunctions:
-        """Those of trackers."""
+        """The functions that trackers and `solve` call for one row."""
         phi_map = self.phi_map
         phi = self.chart.function("phi")
         return PointFunctions.of(phi, self.rates, phi_map.sizes, phi_map.difference, self.chart.problem.turning)

@@ -300,7 +300,7 @@ class PointFunctions:
     def of(
         cls, phi: ca.Function, jacobian: ca.Function, sizes: Array, difference: Differences, turning: tuple[int, ...]
     ) -> "PointFunctions":
-        """For phi and J of a column q (n, 1), and the sizes and differences of phi, as in `PhiMap`."""
+        """Build from phi and J of a column q (n, 1), and the sizes and differences of phi, as in `PhiMap`."""
         n = len(sizes)
         # J^-1, and the product of the norms of D^-1 J and its inverse; by QR, so NaN for singular J
         J, D = ca.SX.sym("J", n, n), ca.repmat(ca.DM(sizes), 1, n)

@@ -59,7 +59,7 @@ class _Sums:
 
     @classmethod
     def of(cls, inverse: Callable[[Array], Array], values: Array, middle: float, most: int) -> Self:
-        """Of inverse(values), for values (N, k); angles are at most `most` degrees."""
+        """Sums of inverse(values), for values (N, k); angles are at most `most` degrees."""
         N, k = values.shape
         bins = round(most / RULES.bin) + 1
         first_bins = bins * np.arange(k)[:, None]
@@ -79,7 +79,7 @@ class _Sums:
         return cls(N, middle, first, second, largest, counts)
 
     def __getitem__(self, columns: Sequence[int]) -> _Sums:
-        """Those of some of the angles."""
+        """Sums of some of the angles."""
         chosen = list(columns)
         parts = (self.first[chosen], self.second[chosen], self.largest[chosen], self.counts[chosen])
         return _Sums(self.count, self.middle, *parts)
@@ -101,7 +101,7 @@ class _Sums:
 
 
 def _sums_of_cosines(cosines: Array) -> _Sums:
-    """Of arccos(cosines), for cosines (N, k)."""
+    """Sums of arccos(cosines), for cosines (N, k)."""
     return _Sums.of(np.arccos, np.clip(cosines, -1.0, 1.0), 90.0, 180)
 
 
@@ -228,7 +228,7 @@ class ContactShare:
 
     @classmethod
     def of(cls, collisions: Collisions, points: Array) -> ContactShare:
-        """Of postures (N, n)."""
+        """Count contacts of postures (N, n)."""
         found = collisions.distance(points)
         touching = np.flatnonzero(found.distance <= 0)
         pairs = Counter(found.pair[k] for k in touching)
@@ -238,7 +238,7 @@ class ContactShare:
 
     @property
     def fraction(self) -> float:
-        """Of the postures that touch."""
+        """Fraction of the postures that touch."""
         return self.touching / self.samples
 
     def __str__(self) -> str:

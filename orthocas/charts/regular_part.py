@@ -79,11 +79,11 @@ class RegularPart(ClearBox):
         return f"{super().heading}, and volume of the coordinates above {self.least_volume:g}"
 
     def report_condition(self) -> dict[str, Any]:
-        """Those of the clear box, and the bound."""
+        """What the clear box reports, and the bound."""
         return {**super().report_condition(), "least_volume": self.least_volume}
 
     def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
-        """Those of the clear box, bound and coordinates."""
+        """The data of the clear box, bound and coordinates."""
         data, arrays = super().to_data()
         own, space = self.coordinates, self.coordinates.space
         numbers = dict(zip(_ARRAYS, (own.theta, space.centre, space.half_width), strict=True))
@@ -129,7 +129,7 @@ class RegularPart(ClearBox):
 
     @property
     def walls(self) -> tuple[Wall, ...]:
-        """That of the clear box, then v(q) - bound."""
+        """The condition of the clear box, then v(q) - bound."""
         return (*super().walls, Wall(StopKind.FOLD, lambda q: float(self.room_to_fold(q)), self.volumes, self.heading))
 
     @property

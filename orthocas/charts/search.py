@@ -105,7 +105,7 @@ class Starts:
 
     @cached_property
     def _coefficients(self) -> Array:
-        """Of the rough inverse, (terms, n)."""
+        """Coefficients of the rough inverse, (terms, n)."""
         points, phi = self._table
         found = np.linalg.lstsq(_terms(self._normalised(phi), self._degree), points, rcond=None)[0]
         return np.asarray(found, dtype=float)
@@ -228,7 +228,7 @@ class Cells:
 
     @cached_property
     def _half_width(self) -> Array:
-        """Of each cell, (n,)."""
+        """Half-widths of each cell, (n,)."""
         return np.asarray(0.5 ** np.array(self._halved))
 
     @cached_property

@@ -362,7 +362,7 @@ def _fit_wide(
 
 
 def _build_parts(name: str, words: ProblemOptions, base: Problem | None) -> tuple[Robot, Task, Metric | str]:
-    """Those of a named problem, or those that the options describe for a robot file."""
+    """Robot, task, metric and domain of a named problem, or those that the options describe for a robot file."""
     if base is not None:
         return base.robot, base.task, base.metric
     robot = words.build_robot(name)

@@ -53,17 +53,17 @@ class CompiledInverse(Shown):
     def solve(
         self, phi: ArrayLike, q_start: ArrayLike | None = None, *, tolerance: float = 1e-9, inside: bool = False
     ) -> Solutions:
-        """As `Chart.solve`: the same status for each row and the same q to 1e-9, unless starts are far away."""
+        """Solve like `Chart.solve`: the same status for each row and the same q to 1e-9, unless starts are far away."""
         return solve_with(self._parts, self.chart, phi, q_start, tolerance, inside)
 
     def nearest_xi(self, q_wish: ArrayLike, x: ArrayLike | None = None, *, tolerance: float = 1e-9) -> Solutions:
-        """As `Chart.nearest_xi`."""
+        """Solve like `Chart.nearest_xi`."""
         phi, wishes = targets_of_wish(self.chart, q_wish, x)
         return self.solve(phi, wishes, tolerance=tolerance, inside=True)
 
     @cached_property
     def _parts(self) -> Inverse:
-        """Those of the chart, with compiled searches in their places."""
+        """The parts of the chart, with compiled searches in their places."""
         parts = self.chart.parts.inverse
         curves = parts.curves
         if isinstance(curves, SelfMotionCurves):

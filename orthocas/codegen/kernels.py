@@ -273,7 +273,7 @@ def write_power(name: str) -> str:
 
 
 def share_calls(functions: list[ca.Function], states: Mapping[str, int]) -> list[ca.Function]:
-    """The same graphs after a graph `shared` of (q, dq), which computes what they call several times for these alone.
+    """The graphs after a graph `shared` of (q, dq), which computes what they call several times for these alone.
 
     Args:
         functions: graphs whose first inputs are joint positions (n, 1).
@@ -334,7 +334,7 @@ def _are_first(arguments: list[ca.MX], given: list[ca.MX]) -> bool:
 
 
 def share_sines(functions: list[ca.Function]) -> list[ca.Function]:
-    """The same graphs, in which sines and cosines of joint positions are computed once for all that is called.
+    """The graphs, in which sines and cosines of joint positions are computed once for all that is called.
 
     Args:
         functions: graphs whose first inputs are joint positions (n, 1); others are returned as they are.

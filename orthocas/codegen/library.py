@@ -36,7 +36,7 @@ _MICROSECONDS = 3e5
 
 
 def find_compilers() -> tuple[str, ...]:
-    """Those of gcc and clang that are on the PATH, or cc if neither is.
+    """Compilers: those of gcc and clang that are on the PATH, or cc if neither is.
 
     Raises:
         CompileError: if there is no compiler.

@@ -332,7 +332,7 @@ class Adaptation(_Correcting):
         # dp/dt = -rate gain Y^T J^-1 (de / c + e), while the law commands; gains follow its stiffness at the joints,
         # the diagonal of J^T K J at the centre of the domain.
         J_home = chart.parts.batched_rates(problem.domain.home[None])[0]
-        stiffness = np.asarray((J_home**2 * law.stiffness[:, None]).sum(axis=0))
+        stiffness = np.diag(J_home.T @ law.compute_stiffness(problem.domain.home[None])[0] @ J_home)
         springs = stiffness[list(joints)] / RULES.gravity**2
         slowest = self._compute_crossing(law)
         slope = -min(self.rate, slowest) * springs * (Y.T @ (B @ (Lambda @ (de / slowest + e))))
@@ -369,6 +369,7 @@ class FrictionObserver(_Correcting):
         db_i/dt = -s_i 60/s k_i d_i exp(-(dq_i / 5 mrad/s)^2) - b_i |dq_i| / 3 mrad,
 
     where clip is 0 below 0, and then between 0.2 and 1, so that nothing creeps.
+
     b breaks joints away: it grows where a joint is off and stands, and is forgotten as soon as it moves, so that its
     own friction stops it. Joints that are off by little, s_i = 0, are left alone. k_i is M_ii times the squared
     frequency of the law's fastest mode, in series with the joint's compliance, or twice the joint's limit, if that is
@@ -382,7 +383,7 @@ class FrictionObserver(_Correcting):
 
     Args:
         rate: > 0 [1/s].
-        bound: largest r and b of each joint, > 0, (n,) or one number [N m] or [N]; default half of the law's limit.
+        bound: largest r, b and correction of each joint, > 0, (n,) or one number [N m] or [N]; default half the limit.
         tolerance: errors of phi at which it stops, > 0, (n,) or one number; up to twice that may be left. Default
             0.25 mm, 5 mrad, and 0.01 of each xi.
 
@@ -436,7 +437,8 @@ class FrictionObserver(_Correcting):
         grown = b - growth * _clip(firmness * off, bound)
         b = _clip(grown * ca.exp(-ca.fabs(dq) * period / RULES.travel), bound)
         explained = inputs["command"] - model.feed_forward(law.problem.robot, inputs) + rate
-        values = {"expected": p, "drive": explained + r - b, "breakaway": b, "correction": b - r}
+        correction = _clip(b - r, bound)
+        values = {"expected": p, "drive": explained - correction, "breakaway": b, "correction": correction}
         return _build_memory(fields, inputs, {name: _replace_invalid(value) for name, value in values.items()})
 
     def _compute_fastest(self, law: _OperationalSpace) -> float:

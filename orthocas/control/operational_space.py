@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.point_quality import Judged
+from orthocas.charts.point_quality import Judged, least_in_domain
 from orthocas.control.controller import (
     Command,
     LawOfChart,
@@ -463,12 +463,33 @@ class _OperationalSpace(LawOfChart):
             q = np.vstack([sample_uniform(self.problem.domain, RULES.samples, 0), fastest])
         points, single = as_point_set("q", q, self.chart.n)
         W = compute_mobility(self.chart, points, self.model.robot(self.problem))
-        K = np.tile(np.diag(self.stiffness), (len(points), 1, 1))
-        if self.is_limited:
-            J = self.chart.parts.batched_rates(points)
-            K = limit_stiffness(W, J, self.stiffness, self.fastest, self.compliance, self._blocks)
-        result = compute_modes(W, K, self._compute_damping(points))
+        result = compute_modes(W, self.compute_stiffness(points), self._compute_damping(points))
         return Modes(*(values[0] for values in vars(result).values())) if single else result
+
+    @cached_property
+    def integral_bound(self) -> float:
+        """Largest rate of integral action [1/s]: zeta omega of the slowest mode that descents find in the domain.
+
+        With the rate L, a mode becomes kappa s^3 + 2 zeta omega s^2 + omega^2 s + L omega^2, where kappa is the true
+        inertia in that of the model. It is stable for L < 2 zeta omega / kappa, so half of that bears kappa = 2.
+        """
+
+        def find_slowest(q: Array) -> Array:
+            modes = self.modes(q)
+            with np.errstate(invalid="ignore"):
+                decays = 2 * np.pi * modes.frequencies * modes.damping_ratios
+            # Coordinates without a spring have no integral action.
+            return np.where(modes.frequencies > 0, decays, np.inf).min(axis=1)
+
+        return float(find_slowest(least_in_domain(find_slowest, self.problem.domain)[None])[0])
+
+    def compute_stiffness(self, points: Array) -> Array:
+        """K(q) at points (N, n), (N, n, n): the diagonal of the stiffness, or what inertia and joints leave of it."""
+        if not self.is_limited:
+            return np.tile(np.diag(self.stiffness), (len(points), 1, 1))
+        W = compute_mobility(self.chart, points, self.model.robot(self.problem))
+        J = self.chart.parts.batched_rates(points)
+        return limit_stiffness(W, J, self.stiffness, self.fastest, self.compliance, self._blocks)
 
     def _compute_damping(self, points: Array) -> Array:
         """D(q) with the law's gains at points (N, n), (N, n, n)."""

@@ -145,7 +145,8 @@ class Safety:
             changes: other values by name; one number stands for all.
 
         Raises:
-            InvalidValueError, ShapeError: for unknown names, and values of the wrong shape or range.
+            InvalidValueError, ShapeError: for unknown names, values of the wrong shape or range, and integral action
+                faster than the law bears somewhere in its domain (`integral_bound` of torque laws).
         """
         require_controller(controller)
         robot, n, domain = controller.problem.robot, controller.problem.n, controller.problem.domain
@@ -192,6 +193,9 @@ class Safety:
         if unknown:
             raise InvalidValueError("setting", repr(unknown[0]), f"one of {', '.join(settings)}")
         spread = {name: _spread(name, value, settings[name]) for name, value in changes.items()}
+        rate = float(np.max(spread.get("integral_rate", 0.0), initial=0.0))
+        if rate > 0 and rate > (bound := getattr(controller, "integral_bound", np.inf)):
+            raise InvalidValueError("integral_rate", rate, f"at most {bound:.3g}/s, which the slowest mode bears")
         return cls(**{**settings, **spread})
 
 

@@ -453,6 +453,7 @@ def _build_tracer(problem: Problem, level: Array, steps: int) -> Callable[[Array
             "trace", "cvodes", {"x": q, "p": length, "ode": rate}, 0.0, grid[1:].tolist(), options
         )
 
+    # one leaf; the integrator fails where the gradients lose rank
     def trace(start: Array, span: float) -> Array:
         try:
             with deferred():

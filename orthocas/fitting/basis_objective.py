@@ -145,7 +145,7 @@ class BasisObjective:
             losses, slopes = np.empty(COLUMNS), np.empty((self.n * self.r, COLUMNS))
             # one block at a time, so that X leaves memory only once
             for X, share, *data in zip(*(array[part] for array in arrays), strict=True):
-                run([_to_double(T @ X), *data], [losses, slopes])
+                run([(T @ X).astype(np.float64, copy=False), *data], [losses, slopes])
                 value += float(losses @ share)
                 shared = (slopes * share).astype(X.dtype, copy=False).reshape(*T.shape[:2], -1)
                 gradient += shared @ X.transpose(0, 2, 1)
@@ -263,7 +263,7 @@ class BasisObjective:
     def _evaluate_jacobians(self, theta: Array) -> Array:
         """J_xi, (B, n r, c)."""
         T = self._table(theta)
-        J = _to_double(np.concatenate(run_in_threads(lambda part: T @ self.X[part], self._parts)))
+        J = np.concatenate(run_in_threads(lambda part: T @ self.X[part], self._parts)).astype(np.float64, copy=False)
         return J.reshape(len(J), self.n * self.r, -1)
 
     def _build_matrix(self, theta: Array, stride: int) -> Array:
@@ -324,11 +324,6 @@ class BasisObjective:
             G = self._gradients.expand(chosen.transpose(1, 2, 0)[None], len(chosen)).astype(np.float32)
             hinges.append((D, G, self.N / every))
         return smooth, hinges
-
-
-def _to_double(products: Array) -> Array:
-    """Numbers of the type that CasADi's functions read."""
-    return products.astype(np.float64, copy=False)
 
 
 def expand(theta: Array, kept: NDArray[np.bool_]) -> Array:

@@ -18,7 +18,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any, cast
 
 from orthocas.bases.family import Parametrisation
-from orthocas.bases.registry import parse_parametrisation, require_savable
+from orthocas.bases.registry import parametrisation_to_data, parse_parametrisation
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.quality import evaluate
 from orthocas.charts.ready import load
@@ -141,8 +141,9 @@ def compare(
     folder = None if charts is None else as_path("charts", charts)
     if folder is not None:
         require_writable(folder / "chart", ChartFileError)
+        # charts that cannot be saved are refused before the first fit
         for parametrisation in families:
-            require_savable(parametrisation.for_problem(problem))
+            parametrisation_to_data(parametrisation.for_problem(problem))
     elif control_ticks:
         raise InvalidValueError("charts", None, "a folder for charts: control_ticks are measured on them")
 
@@ -325,7 +326,7 @@ class CellResult:
 
     @property
     def names(self) -> tuple[str, str, str, str, int]:
-        """Those of its cell."""
+        """Names of its cell."""
         return self.problem, self.parametrisation, self.solver, self.weights, self.seed
 
     @property

@@ -156,6 +156,7 @@ def _key(summary: "Summary") -> tuple[str, str, str]:
 
 def _label(axes: Axes, summaries: "Sequence[Summary]", single: bool, colours: Mapping[str, Colour]) -> None:
     """Write each parametrisation once, beside its least task angle; labels that would touch move up or down."""
+    # summaries come with the least task angle first
     best: dict[str, Summary] = {}
     for summary in summaries:
         best.setdefault(summary.parametrisation, summary)
@@ -168,6 +169,7 @@ def _label(axes: Axes, summaries: "Sequence[Summary]", single: bool, colours: Ma
     frame = axes.get_window_extent()
     low, high, end = scale * frame.y0 + _HIGH / 2, scale * frame.y1 - _HIGH / 2, scale * frame.x1
     for name, summary in sorted(best.items(), key=lambda entry: points[_key(entry[1])][1]):
+        # on the right if there is room, at a height where nothing else is
         x, y = points[_key(summary)]
         wide = _LETTER * len(name)
         side = 1 if x + _ASIDE + wide < end else -1

@@ -93,7 +93,7 @@ class Like:
 
     @classmethod
     def of(cls, problem: Problem, like: Likeness) -> "Like":
-        """Of a task of lower priority, of a quantity, or of several.
+        """Build from a task of lower priority, a quantity, or of several.
 
         A missing reference orientation of the task is taken at the centre of the domain.
         """
@@ -117,7 +117,7 @@ class Like:
 
     @classmethod
     def of_given(cls, given: Given) -> "Like":
-        """Of coordinates in closed form; angles have the unit rad."""
+        """Build from coordinates in closed form; angles have the unit rad."""
         q = ca.SX.sym("q", given.n)
         values = ca.vertcat(*replay(given.tape, ca.vertsplit(q)))
         several = [""] if values.numel() == 1 else [f" {k + 1}" for k in range(values.numel())]
@@ -230,6 +230,7 @@ class Like:
         terms = []
         for k in range(len(self.names)):
             squares = (slopes[:, k, m:] ** 2).sum(axis=1)
+            # samples count alike, whatever the size of the quantity's rate there
             even = 1 / (np.median(squares) + squares)
             if r == 1:
                 even *= slopes[:, k, m] * np.median(slopes[:, k, m]) > 0
@@ -392,14 +393,14 @@ class MeaningError:
 
     @property
     def explained(self) -> str:
-        """In words."""
+        """The error in words."""
         rates = f"moves it by {self.slow:.2g} to {self.fast:.2g} (5 to 95 %) for each unit"
         off = f"{self.rms:.2g} off (rms), {self.undetermined:.2g} after the best monotone map"
         against = f"against it on {percent(self.against, fault=True)} of the domain, where it turns back"
         return f"{rates}, {off}, correlation {self.correlation:.2f}, {against}"
 
     def write_notes(self) -> dict[str, float]:
-        """For the notes of a chart."""
+        """What the notes of a chart say."""
         return {
             "error of its meaning": self.rms,
             "error after the best monotone map": self.undetermined,

@@ -231,7 +231,7 @@ class WeightedSum:
 
 
 class LinearSum(WeightedSum):
-    """The same for families linear in theta, with second derivatives."""
+    """A weighted sum for families linear in theta, with second derivatives."""
 
     def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
         """The sum, its gradient and its Gauss-Newton matrix."""
@@ -349,11 +349,13 @@ class StageRunner:
     def _build_objective(self, plan: Plan, samples: Samples, mirror: Mirror | None) -> tuple[Objective, Array]:
         """The loss of a family on samples, and the start in the parameters that it leaves free."""
         family, theta, settings = plan.family, plan.start, self.settings
+        # linear families: least squares in their coefficients
         if isinstance(family, LinearFamily):
             objective, start = self._build_in_basis(family, samples, theta, mirror)
             if settings.max_mutual is None:
                 return self.folds.add_to(objective), start
             return bound_mutual_angles(objective, start, settings.max_mutual, self.problem.r, fresh=theta is None)
+        # all others: networks by arrays, anything else by CasADi's graphs
         if settings.max_mutual is not None:
             expected = "a parametrisation linear in its parameters, such as polynomial"
             raise InvalidValueError("max_mutual_deg", f"given with {plan.label}", expected)
@@ -473,7 +475,7 @@ class StageRunner:
         return fresh.restricted_to(self.active)
 
     def _gradients(self, family: LinearFamily) -> BasisGradients:
-        """Those of a basis, built once."""
+        """Gradients of a basis, built once."""
         if family not in self._bases:
             number = np.float32 if self.settings.single else np.float64
             self._bases[family] = build_gradients(family, self.space.n, number)

@@ -330,6 +330,7 @@ class WidestBox:
             self._next = begin + (1 - begin) * done / len(self.free), 2
             before, factor = widths[k], RULES.wider
             while widths[k] < self.room[k]:
+                # the first step too many says what breaks
                 wider = self._widen(widths, k, factor)
                 ratios = self.evaluate(wider, self.bounds, leap=widths[k] > before).excess(self.bounds)
                 misses = [name for name, ratio in ratios.items() if ratio > 1]

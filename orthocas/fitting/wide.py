@@ -46,8 +46,7 @@ from orthocas.robots.robot import Robot
 from orthocas.robots.tree import require_driven
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.branches import RULES as BRANCH_RULES
-from orthocas.tasks.branches import Branch, Branches, branches, sample_centres, sample_nonsingular
-from orthocas.tasks.clear_box import ClearBox
+from orthocas.tasks.branches import Branch, Branches, branches, build_clear_box, sample_centres, sample_nonsingular
 from orthocas.tasks.domains import Box
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.problem import Problem, check
@@ -264,10 +263,17 @@ def _build_problems(
     position is a second problem, because a singular middle may part the branch.
     """
     box = branch.box
+
+    def build(part: Box, home: Array | None = None) -> Problem:
+        """The problem on the clear positions of a box, as `branches` counts them."""
+        own = task.with_reference_at(part.centre if home is None else home)
+        return Problem(robot, own, metric, build_clear_box(robot, own, part, clearance, home), branch.name)
+
     try:
-        return (Problem(robot, task, metric, box, branch.name, clearance),)
+        return (build(box),)
     except DomainError:
         points, values = sample_centres(robot, task, box)
+    # of the clear positions, the one with the most room around it
     clear = points[values > BRANCH_RULES.of_centre * clearance]
     room = box.half_width - np.abs(clear - box.centre)
     if not len(clear):
@@ -276,13 +282,12 @@ def _build_problems(
         raise DomainError(f"branch '{branch.name}' has {missing}, expected one for clearance = {clearance:g}: {most}")
     best = int(np.argmax(np.log(room).sum(axis=1)))
     home, half_width, centre = clear[best], room[best], box.centre.copy()
-    smaller = Problem(robot, task, metric, Box(home, half_width, box.unbounded), branch.name, clearance)
+    smaller = build(Box(home, half_width, box.unbounded))
     # a smaller box leaves nothing out of joints without limits; these have their turn around the home
     if {*np.flatnonzero(half_width < box.half_width)} <= {*box.unbounded}:
         return (smaller,)
     centre[list(box.unbounded)] = home[list(box.unbounded)]
-    whole = ClearBox(Box(centre, box.half_width, box.unbounded), task, clearance, home=home)
-    return Problem(robot, task, metric, whole, branch.name), smaller
+    return build(Box(centre, box.half_width, box.unbounded), home), smaller
 
 
 def _fit_most(problems: tuple[Problem, ...], fit_on: Callable[[Problem], WideFit]) -> WideFit:
@@ -459,7 +464,7 @@ def _name_coordinates(
 def _describe_left_out(problem: Problem, branch: Branch, counted: Array, share: float) -> str:
     """What a chart leaves out of a branch, of which some positions (N, n) are clear; empty for little."""
     domain, reasons = problem.domain, []
-    if isinstance(domain, ClearBox) and domain.posture is not None and share < RULES.divided:
+    if share < RULES.divided and not np.array_equal(domain.home, domain.centre):
         reason = "its middle is not clear, and coordinates have one direction on a part of it only"
         return f"all but {percent(share)} of the clear positions: {reason}"
     inside = np.asarray(Box(domain.centre, domain.half_width, domain.unbounded).contains(counted))

@@ -63,7 +63,7 @@ class WideRules:
     every_of_networks: int = 50  #: the same for the mean lengths of gradients of networks
     rounds: int = 3  #: with the worst samples
     rounds_of_networks: int = 1  #: the same of networks, which take long
-    rounds_of_small_networks: int = 2
+    rounds_of_small_networks: int = 3
     fresh: int = 50_000  #: samples of which the worst join
     worst: int = 5000
     fresh_of_networks: int = 200_000
@@ -229,15 +229,15 @@ class Search:
                 self._add_worst(RULES.fresh_of_networks, RULES.worst_of_networks, RULES.fresh_tag + turn)
                 solver = _SLOWER
             self._descend(f"worst samples, round {turn}", "volume with the worst", solver)
-        if not self.linear:
-            return
         # The gradient comes nearer to self-motions, if it stays regular enough. A user's balance of terms is kept.
         balanced = self.settings.weights or self.settings.quantities
-        if self._done and self._last is self.best and self.problem.r == 1 and not balanced:
+        finished = self._done if self.linear else self.left_out and self.is_enough(RULES.enough)
+        if finished and self._last is self.best and self.problem.r == 1 and not balanced:
             self._alignment *= RULES.closer
-            volume = "volume" if len(self._samples) == 1 else "volume with the worst"
-            rank = self._descend("smaller leaks", volume, LBFGS(RULES.further, RULES.tolerance))
-            if self._done:
+            first = self.linear and len(self._samples) == 1
+            solver = LBFGS(RULES.further, RULES.tolerance) if self.linear else _SLOWER_OF_SMALL
+            rank = self._descend("smaller leaks", "volume" if first else "volume with the worst", solver)
+            if self._done or (not self.linear and not rank[0] and rank[1] <= RULES.enough):
                 self.best, self.rank = self._last, rank
 
     def is_enough(self, bad: float) -> bool:

@@ -113,6 +113,7 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
         if chart.parts.relative.turned:
             none = np.zeros(m)
             target[:m] = np.array(chart.parts.relative.moved(phi[:m], change[:m], phi[:m], none, none)[0]).ravel()
+        # the tracker takes several calls for a large change
         for _ in range(20):
             self._tracker.step(target)
             if self._tracker.status != TrackerStatus.NEARER:

@@ -357,7 +357,7 @@ class Costs:
         return np.concatenate([part[0] for part in parts], axis=1), np.concatenate([part[1] for part in parts], axis=1)
 
     def sum_squares(self, q: Array) -> Array:
-        """Of the residuals at joint positions (P, n), (P,)."""
+        """Sums of squares of the residuals at joint positions (P, n), (P,)."""
         return np.asarray((self(q)[0] ** 2).sum(axis=1))
 
     def _evaluate_boundaries(self, q: Array) -> tuple[Array, Array]:

@@ -69,7 +69,7 @@ def _find_columns(names: Sequence[str], joints: Sequence[str]) -> list[int]:
     if not times:
         raise ValueError(f"line 1: a column of times is missing, expected one of {', '.join(_TIMES)}")
     columns = times[:1]
-    # each joint once, by its name or as PlotJuggler writes it
+    # each joint once, by its name or a path that ends with it
     for joint in joints:
         found = [k for k, name in enumerate(names) if _is_of_joint(name, joint)]
         if len(found) != 1:

@@ -130,7 +130,7 @@ class TaskSpline:
         self._curve = build_spline(s, rows, False)
 
     def close(self) -> TaskSpline:
-        """The same, periodic."""
+        """The path, periodic."""
         self._curve = build_spline(self._s, self._rows, True)
         return self
 

@@ -79,7 +79,7 @@ class CylinderGeometry(Geometry):
         return np.concatenate(ends), 0.0
 
     def contains(self, points: Array) -> Flags:
-        """Within radius and length."""
+        """Whether points lie within radius and length."""
         return np.asarray(
             (np.hypot(points[:, 0], points[:, 1]) <= self.radius) & (np.abs(points[:, 2]) <= self.length / 2)
         )
@@ -101,7 +101,7 @@ class EllipsoidGeometry(Geometry):
         return BoxGeometry(2 * self.radii).list_corners()
 
     def contains(self, points: Array) -> Flags:
-        """Within the unit ball, in units of the radii."""
+        """Whether points lie within the unit ball, in units of the radii."""
         return np.asarray(np.linalg.norm(points / self.radii, axis=1) <= 1)
 
 
@@ -120,7 +120,7 @@ class BallGeometry(Geometry):
         return np.zeros((1, 3)), self.radius
 
     def contains(self, points: Array) -> Flags:
-        """Within the radius."""
+        """Whether points lie within the radius."""
         return np.asarray(np.linalg.norm(points, axis=1) <= self.radius)
 
 
@@ -140,7 +140,7 @@ class CapsuleGeometry(Geometry):
         return np.array([[0.0, 0.0, -self.length / 2], [0.0, 0.0, self.length / 2]]), self.radius
 
     def contains(self, points: Array) -> Flags:
-        """Within the radius of the segment."""
+        """Whether points lie within the radius of the segment."""
         beyond = points[:, 2] - np.clip(points[:, 2], -self.length / 2, self.length / 2)
         return np.asarray(np.linalg.norm(np.column_stack([points[:, :2], beyond]), axis=1) <= self.radius)
 
@@ -223,7 +223,7 @@ class CloudGeometry(Geometry):
         return self.points, float(np.sqrt(3) * self.cell)
 
     def contains(self, points: Array) -> Flags:
-        """In a cube that holds a point of the cloud."""
+        """Whether points lie in a cube that holds a point of the cloud."""
         cells = {tuple(cell) for cell in np.floor(self.points / self.cell).astype(int).tolist()}
         return np.array(
             [tuple(cell) in cells for cell in np.floor(points / self.cell).astype(int).tolist()], dtype=bool
@@ -252,7 +252,7 @@ class Shape:
         return corners.min(axis=0) - rounding, corners.max(axis=0) + rounding
 
     def list_corners(self) -> tuple[Array, float]:
-        """As `Geometry.list_corners`, in the frame of the body."""
+        """Corners as in `Geometry.list_corners`, in the frame of the body."""
         corners, rounding = self.geometry.list_corners()
         return corners @ self.rotation.T + self.translation, rounding
 

@@ -79,6 +79,7 @@ class Corridor(Box):
         sizes.setflags(write=False)
         for field, value in (("postures", path), ("radius", sizes)):
             object.__setattr__(self, field, value)
+        # a corridor outside the box would be empty
         if not self.contains(path).any():
             raise InvalidValueError("postures", "outside the box", "postures of which at least one lies in the box")
 

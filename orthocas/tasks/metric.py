@@ -164,6 +164,7 @@ def require_spd(matrices: Array, points: Array) -> None:
         raise MetricError(
             f"metric is not finite at q = {np.round(at, 4).tolist()}, expected symmetric positive definite"
         )
+    # relative to the largest entry, since units differ
     asymmetry = np.abs(matrices - matrices.transpose(0, 2, 1)).max(axis=(1, 2))
     worst = int(np.argmax(asymmetry - 1e-9 * size))
     if asymmetry[worst] > 1e-9 * size[worst]:
@@ -175,6 +176,7 @@ def require_spd(matrices: Array, points: Array) -> None:
     with suppress(np.linalg.LinAlgError):
         np.linalg.cholesky(matrices - _SINGULAR * size[:, None, None] * np.eye(matrices.shape[1]))
         return
+    # the eigenvalue for the message
     smallest = np.linalg.eigvalsh(matrices)[:, 0]
     worst = int(np.argmin(smallest - _SINGULAR * size))
     if smallest[worst] <= _SINGULAR * size[worst]:

@@ -168,7 +168,7 @@ def run_in_threads(work: Callable[[Piece], Result], pieces: Sequence[Piece]) -> 
 def run_in_threads_with(
     tools: Sequence[Tool], work: Callable[[Tool, Piece], Result], pieces: Sequence[Piece]
 ) -> list[Result]:
-    """The same with tools that only one piece can use at a time; one for each thread, or for each piece, is enough."""
+    """`run_in_threads` with tools that one piece at a time can use; one for each thread, or each piece, is enough."""
     ready: SimpleQueue[Tool] = SimpleQueue()
     for tool in tools:
         ready.put(tool)

@@ -186,7 +186,7 @@ def fill(results: NDArray[Any], points: Array, make: Callable[[], BlockFunction]
 
 
 def fill_blocks(results: NDArray[Any], function: BlockFunction, columns: int, *arguments: Array) -> None:
-    """The same by one function, of blocks of so many columns, in this thread."""
+    """`fill` by one function, of blocks of so many columns, in this thread."""
     for first in range(0, len(results), columns):
         count = min(columns, len(results) - first)
         values = function(*(_fill_columns(array[first : first + columns], columns) for array in arguments))
@@ -257,7 +257,7 @@ class BlockedFunction:
 
     @cached_property
     def _by_narrow_rows(self) -> ColumnFunction:
-        """The same for narrow blocks."""
+        """`_by_rows` for narrow blocks."""
         return ColumnFunction(self._entries, NARROW)
 
     @cached_property

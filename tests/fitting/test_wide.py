@@ -6,6 +6,7 @@ import warnings
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -41,7 +42,7 @@ from orthocas.fitting.basis_objective import BasisObjective, build_gradients
 from orthocas.fitting.like import Like, QuadraticTerm
 from orthocas.fitting.network_objective import ArrayObjective
 from orthocas.fitting.stages import Resampled
-from orthocas.fitting.wide import WideFit
+from orthocas.fitting.wide import WideFit, _build_problems, _describe_left_out, _fit_most
 from orthocas.fitting.wide_search import Search, WideSettings, sample_frames, search_families
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.branches import Branch, Branches, _Arm
@@ -341,9 +342,22 @@ def planar_values(robot: oc.Robot, q: Numbers) -> Numbers:
     return np.asarray(np.linalg.svd(np.cumsum(ends[:, :, ::-1], axis=2)[:, :, ::-1], compute_uv=False)[:, -1])
 
 
+class Shares:
+    """Fits of given regular shares, one after another, or errors."""
+
+    def __init__(self, *shares: float | DomainError) -> None:
+        self.shares = iter(shares)
+
+    def __call__(self, problem: oc.Problem) -> Any:
+        share = next(self.shares)
+        if isinstance(share, DomainError):
+            raise share
+        return SimpleNamespace(regular_share=share, status=None)
+
+
 @pytest.mark.parametrize(("centre", "small"), [([0.0, 0.0, 0.0], True), ([0.0, 1.3, 1.3], False)])
 def test_the_printed_share_is_of_the_branch(centre: list[float], small: bool) -> None:
-    """A straight arm in the middle: the chart has a smaller box, and says which, and how little it is."""
+    """A straight arm in the middle: the chart says how little of the box it has, and why."""
     robot = oc.Robot.planar([1.0, 1.0, 1.0], [3.0, 3.0, 3.0])
     box, task = oc.Box(centre, [3.0, 2.0, 2.0] if small else [3.0, 1.2, 1.2]), oc.Task.position(robot, "xy")
     with warnings.catch_warnings(record=True) as told:
@@ -358,13 +372,23 @@ def test_the_printed_share_is_of_the_branch(centre: list[float], small: bool) ->
     assert fit.facts()["regular"].startswith(percent(fit.regular_share, 2))
     assert [entry.category for entry in told] == [BranchWarning] * small
     if small:
-        assert fit.regular_share < 0.7
-        half = ", ".join(f"{value:.4g}" for value in fit.chart.problem.domain.half_width)
-        assert f"a smaller box, around q = ({number_list(fit.chart.problem.domain.centre)})" in str(told[0].message)
-        assert half in str(told[0].message)
-        inside = np.abs(q - fit.chart.problem.domain.centre) <= fit.chart.problem.domain.half_width
+        assert fit.regular_share < 0.9
+        assert "its middle is not clear, and coordinates have one direction on a part" in str(told[0].message)
+        np.testing.assert_array_equal(fit.chart.domain.half_width, box.half_width)
         share = float(re.search(r"all but ([\d.]+)% of the clear", fit.left_out)[1]) / 100  # type: ignore[index]
-        assert share == pytest.approx(inside.all(axis=1).mean(), abs=0.01)
+        assert share == pytest.approx(fit.regular_share, abs=1e-3)
+        # the box whose middle is clear, which takes the place of the branch where that keeps more
+        whole, smaller = _build_problems(robot, task, "euclidean", Branch("box", box, box.centre, 1.0, 1.0), 0.1)
+        np.testing.assert_array_equal(smaller.domain.centre, whole.domain.home)
+        assert (smaller.domain.half_width < box.half_width).any()
+        reason = _describe_left_out(smaller, Branch("box", box, box.centre, 1.0, 1.0), q, 0.6)
+        inside = np.abs(q - smaller.domain.centre) <= smaller.domain.half_width
+        assert reason.startswith(
+            f"all but {percent(float(inside.all(axis=1).mean()))} of the clear positions: its middle"
+        )
+        assert f"a smaller box, around q = ({number_list(smaller.domain.centre)})" in reason
+        for shares, kept in (((0.95,), 0.95), ((0.5, 0.6), 0.6), ((0.6, 0.5), 0.6), ((DomainError("folds"), 0.4), 0.4)):
+            assert _fit_most((whole, smaller), Shares(*shares)).regular_share == kept
 
 
 @pytest.mark.slow

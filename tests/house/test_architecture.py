@@ -52,6 +52,19 @@ def tree(path: Path) -> ast.Module:
 
 
 @cache
+def every(node: ast.AST) -> tuple[ast.AST, ...]:
+    """All nodes below one, found once for all tests."""
+    return tuple(ast.walk(node))
+
+
+@cache
+def naming(node: ast.AST) -> tuple[ast.AST, ...]:
+    """Those of them that may name a module."""
+    kinds = (ast.ImportFrom, ast.Import, ast.Constant)
+    return tuple(part for part in every(node) if isinstance(part, kinds))
+
+
+@cache
 def imports_of(path: Path, inside: bool = False, types: bool = False, named: bool = True) -> frozenset[str]:
     """Modules of this package that a file takes names from, itself excluded; see `imports_in`."""
     return frozenset(name for name in imports_in(tree(path), inside, types, named) if MODULES[name] != path)
@@ -83,14 +96,14 @@ def nodes(source: ast.Module, inside: bool, types: bool) -> Iterator[ast.AST]:
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
             yield from node.body if types else ()
         elif inside:
-            yield from ast.walk(node)
+            yield from naming(node)
         else:
             yield node
 
 
 def takes_from_the_face(source: ast.Module) -> bool:
     """Whether a text imports `orthocas` itself, through which it could reach every package, or a public name of it."""
-    for node in ast.walk(source):
+    for node in every(source):
         if isinstance(node, ast.ImportFrom) and node.module == "orthocas":
             if any(home("orthocas", alias.name) == "orthocas" for alias in node.names):
                 return True
@@ -103,17 +116,17 @@ def takes_from_the_face(source: ast.Module) -> bool:
 
 def computes_names(source: ast.Module) -> bool:
     """Whether a text imports modules whose names are not written out, or hands a function on that does."""
-    aliases = [alias for node in ast.walk(source) if isinstance(node, ast.ImportFrom) for alias in node.names]
+    aliases = [alias for node in every(source) if isinstance(node, ast.ImportFrom) for alias in node.names]
     loaders = LOADERS | {alias.asname for alias in aliases if alias.name in LOADERS and alias.asname}
     written_out = {
         node.func
-        for node in ast.walk(source)
+        for node in every(source)
         if isinstance(node, ast.Call)
         and node.args
         and isinstance(node.args[0], ast.Constant)
         and isinstance(node.args[0].value, str)
     }
-    for node in ast.walk(source):
+    for node in every(source):
         name = node.id if isinstance(node, ast.Name) else node.attr if isinstance(node, ast.Attribute) else ""
         if name in loaders and node not in written_out:
             return True
@@ -218,7 +231,7 @@ def test_domains_answer_for_themselves() -> None:
     known = {
         name
         for name, path in MODULES.items()
-        if package(name) != "tasks" and any(isinstance(n, ast.Name) and n.id in kinds for n in ast.walk(tree(path)))
+        if package(name) != "tasks" and any(isinstance(n, ast.Name) and n.id in kinds for n in every(tree(path)))
     }
     assert known - {"orthocas.charts.regular_part"} == {  # a kind that is defined above the coordinates that it needs
         "orthocas.fitting.fit",
@@ -268,9 +281,9 @@ def test_imports_in_functions_say_why() -> None:
     """They are for heavy libraries that few calls need: at the top of the function, the first with its reason."""
     for path in SOURCES.values():
         lines = path.read_text().splitlines()
-        for node in ast.walk(tree(path)):
+        for node in every(tree(path)):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                inner = [n for n in ast.walk(node) if isinstance(n, ast.Import | ast.ImportFrom)]
+                inner = [n for n in every(node) if isinstance(n, ast.Import | ast.ImportFrom)]
                 body = node.body[1:] if ast.get_docstring(node) else node.body
                 assert inner == body[: len(inner)], f"{path}: import inside {node.name}"
                 assert not inner or "#" in lines[inner[0].lineno - 1], f"{path}: {node.name} does not say why"
