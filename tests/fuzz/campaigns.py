@@ -62,6 +62,7 @@ READERS = {  #: functions that read files, by module and name, with the campaign
     "robots.robot.from_mjcf": "robots",
     "robots.robot.from_urdf": "robots",
     "robots.urdf.read_urdf": "robots",
+    "robots.urdf.read_urdf_xml": "robots",
     "robots.urdf.read_xml": "robots",
     "simulation.disturbances.read_steps": "steps",
     "simulation.trajectory.load": "runs",
