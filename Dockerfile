@@ -4,7 +4,10 @@ RUN apt-get update \
     && apt-get install --yes --no-install-recommends gcc libc6-dev cmake make \
     && rm -rf /var/lib/apt/lists/*
 COPY . /src
-RUN pip install --no-cache-dir '/src[robots,view,mesh,mujoco]' && rm -rf /src
+# Headers for C++ programs, a fifth of the core, are not needed to run it.
+RUN pip install --no-cache-dir '/src[robots,view,mesh,mujoco]' \
+    && rm -rf /src /usr/local/lib/python3.12/site-packages/cmeel.prefix/include \
+        /usr/local/lib/python3.12/site-packages/casadi/include
 RUN useradd --create-home user
 USER user
 WORKDIR /home/user

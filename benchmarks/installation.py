@@ -5,6 +5,7 @@ Needs the package index: every extra is installed in a fresh environment of its 
 
 import argparse
 import json
+import shutil
 import statistics
 import subprocess
 import sys
@@ -25,18 +26,22 @@ def main(extras: tuple[str, ...] = EXTRAS) -> dict[str, float]:
         folder = Path(name)
         run(sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", name, str(ROOT))
         (wheel,) = folder.glob("*.whl")
-        megabytes, count, seconds = measure(wheel, folder / "core")
+        megabytes, headers, count, seconds = measure(wheel, folder / "core")
         print("| installed | MB | distributions |\n| --- | --- | --- |")
         print(f"| `orthocas` | {megabytes:.0f} | {count} |")
+        print(f"| of it, headers for C++ programs | {headers:.0f} | |")
         for extra in extras:
-            more, others, _ = measure(f"{wheel}[{extra}]", folder / extra)
+            more, _, others, _ = measure(f"{wheel}[{extra}]", folder / extra)
             print(f"| `[{extra}]` adds | {more - megabytes:.0f} | {others - count} |", flush=True)
     print(f"import of what fits: {seconds:.2f} s")
-    return {"megabytes": megabytes, "distributions": count, "import_s": seconds}
+    return {"megabytes": megabytes, "headers": headers, "distributions": count, "import_s": seconds}
 
 
-def measure(requirement: str | Path, folder: Path) -> tuple[float, int, float]:
-    """Megabytes, distributions and median seconds of an import in a new environment, without pip and setuptools."""
+def measure(requirement: str | Path, folder: Path) -> tuple[float, float, int, float]:
+    """Megabytes, those of headers, distributions and median seconds of an import, without pip and setuptools.
+
+    Headers are removed before the import.
+    """
     venv.create(folder, with_pip=True)
     python = str(folder / "bin" / "python")
     run(python, "-m", "pip", "install", "--quiet", "--no-compile", str(requirement))
@@ -45,8 +50,15 @@ def measure(requirement: str | Path, folder: Path) -> tuple[float, int, float]:
     (packages,) = folder.glob("lib/python*/site-packages")
     files = [path for path in packages.rglob("*") if path.is_file() and not path.is_symlink()]
     own = [path for path in files if path.relative_to(packages).parts[0] not in ("pip", "setuptools", "pkg_resources")]
+    places = [packages / "cmeel.prefix" / "include", packages / "casadi" / "include"]
+    total, headers = (
+        sum(path.stat().st_size for path in part) / 1e6
+        for part in (own, [path for path in own if any(place in path.parents for place in places)])
+    )
+    for place in places:
+        shutil.rmtree(place)
     seconds = statistics.median(float(run(python, "-c", _IMPORTED)) for _ in range(5))
-    return sum(path.stat().st_size for path in own) / 1e6, count, seconds
+    return total, headers, count, seconds
 
 
 def run(*words: str) -> str:

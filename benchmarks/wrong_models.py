@@ -46,7 +46,7 @@ def rows(arms: tuple[str, ...], runs: int) -> Iterator[str]:
     for name in arms:
         chart = oc.charts.load(name)
         for memory, remembers in MEMORIES.items():
-            law = PDPlus(chart, PDPlus.on_chart(chart).stiffness, remembers=remembers)
+            law = PDPlus(chart, remembers=remembers)
             with TemporaryDirectory() as folder:
                 path = compile_shared(oc.generate_c(chart, Path(folder), law, "arm"), Path(folder), ("-O1",))
                 library = CompiledLibrary(path, "arm", chart.n)

@@ -103,10 +103,10 @@ def render(layers: Sequence[Layer], camera: Camera, width: int, height: int, flo
     return np.asarray(np.round(255 * np.clip(smooth, 0, 1)), dtype=np.uint8)
 
 
-def on_white(picture: Picture) -> NDArray[np.uint8]:
-    """A picture on white, (height, width, 3)."""
+def on_ground(picture: Picture, ground: tuple[int, int, int] = (255, 255, 255)) -> NDArray[np.uint8]:
+    """A picture on a colour, (height, width, 3)."""
     opacity = picture[..., 3:] / 255
-    return np.asarray(np.round(picture[..., :3] * opacity + 255 * (1 - opacity)), dtype=np.uint8)
+    return np.asarray(np.round(picture[..., :3] * opacity + np.array(ground) * (1 - opacity)), dtype=np.uint8)
 
 
 def _drawn(solids: Sequence[Solid], camera: Camera, size: tuple[int, int]) -> tuple[Array, Array]:

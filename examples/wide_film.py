@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
-from rendering import Camera, Layer, on_white, render
+from rendering import Camera, Layer, on_ground, render
 from scipy.spatial.transform import Rotation
 from self_motion_picture import POSTURE, robot_file
 
@@ -22,14 +22,15 @@ SIZE, BARE, COLOURS = (340, 360), 40, 40  #: of a panel [pixels]; rows for the c
 SECONDS = 0.1  #: between pictures
 CAMERA = Camera((2.9, -1.9, 1.35), (0.2, 0.0, 0.41), 15.5)
 TRACE = (217, 95, 2)
+GROUNDS = {"wide_chart": (255, 255, 255), "wide_chart_dark": (13, 17, 23)}  #: of light pages and of dark ones
 
 
 def main(out: Path, quick: bool = False) -> dict[str, float]:
-    """Compute both motions, and draw the film.
+    """Compute both motions, and draw the film for light and for dark pages.
 
     Args:
-        out: folder for `wide_chart.gif`.
-        quick: a small film of rods.
+        out: folder for `wide_chart.gif` and `wide_chart_dark.gif`.
+        quick: small films of rods.
 
     Returns:
         How far the hand moves while the elbow swings [m, rad], how far the elbow moves [m], and how far the joints are
@@ -42,7 +43,7 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     look = build_stick_arm(robot.tree)
     if not quick:
         look = read_urdf_look(robot_file("panda_description/urdf/panda.urdf"), robot.tree).look
-    draw(out / "wide_chart.gif", robot, look, swung, held, drifted, 8 if quick else 1)
+    draw(out, robot, look, swung, held, drifted, 8 if quick else 1)
     return {
         "hand_moves": float(np.abs(chart.x(swung) - chart.x(q)).max()),
         "elbow_moves_m": float(np.ptp(robot.joint_points(swung), axis=0).max()),
@@ -97,9 +98,9 @@ def least_norm(chart: oc.Chart, q: np.ndarray) -> np.ndarray:
 
 
 def draw(
-    path: Path, robot: oc.Robot, look: Look, swung: np.ndarray, held: np.ndarray, drifted: np.ndarray, smaller: int
+    out: Path, robot: oc.Robot, look: Look, swung: np.ndarray, held: np.ndarray, drifted: np.ndarray, smaller: int
 ) -> None:
-    """Write the film."""
+    """Write the films."""
     size = (SIZE[0] // smaller, SIZE[1] // smaller)
     at = [min(round(k * STEPS / LOOP), len(held) - 1) for k in range(1, LOOPS * LOOP + 1)]
     rows = [(a, swung[0], "xi swings the elbow, the hand stays", "") for a in swung]
@@ -111,28 +112,28 @@ def draw(
         rows += [row] * (1 + PAUSE * (k % STEPS == 0))
     hand = robot.tip_position(held[: STEPS + 1])
     memory: dict[bytes, np.ndarray] = {}
-    frames = []
-    for left, right, *words in rows:
-        panels = []
+    for left, right, *_ in rows[::smaller]:
         for q in (left, right):
             if q.tobytes() not in memory:
                 memory[q.tobytes()] = panel(robot, look, q, held[0], hand, size)
-            panels.append(memory[q.tobytes()])
-        frames.append(captioned(panels, words))
-    if smaller > 1:
-        frames = frames[::smaller]
-    palette = Image.fromarray(np.vstack([np.asarray(frame) for frame in frames[::9]])).quantize(COLOURS)
-    first, *rest = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
-    first.save(path, save_all=True, append_images=rest, duration=round(1000 * SECONDS), loop=0, optimize=True)
+    for name, ground in GROUNDS.items():
+        frames = [
+            captioned([on_ground(memory[q.tobytes()], ground) for q in (left, right)], words, ground)
+            for left, right, *words in rows[::smaller]
+        ]
+        palette = Image.fromarray(np.vstack([np.asarray(frame) for frame in frames[::9]])).quantize(COLOURS)
+        first, *rest = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
+        path, pause = out / f"{name}.gif", round(1000 * SECONDS)
+        first.save(path, save_all=True, append_images=rest, duration=pause, loop=0, optimize=True)
 
 
 def panel(
     robot: oc.Robot, look: Look, q: np.ndarray, start: np.ndarray, hand: np.ndarray, size: tuple[int, int]
 ) -> np.ndarray:
-    """The arm at q, a ghost of it at the start, and the circle of the hand."""
+    """The arm at q, a ghost of it at the start, and the circle of the hand; (height, width, 4)."""
     ring = [build_capsule(a, b, (0.004, 0.004), TRACE, 6) for a, b in zip(hand[:-10:10], hand[10::10], strict=True)]
     layers = [Layer([*placed(robot, look, q), *ring]), Layer(placed(robot, look, start), 0.25)]
-    return on_white(render(layers, CAMERA, *size))
+    return render(layers, CAMERA, *size)
 
 
 def placed(robot: oc.Robot, look: Look, q: np.ndarray) -> list[Solid]:
@@ -143,12 +144,15 @@ def placed(robot: oc.Robot, look: Look, q: np.ndarray) -> list[Solid]:
     return [solid.move(turn, place) for solids, turn, place in places for solid in solids]
 
 
-def captioned(panels: list[np.ndarray], words: list[str]) -> Image.Image:
+def captioned(panels: list[np.ndarray], words: list[str], ground: tuple[int, int, int]) -> Image.Image:
     """Panels side by side, each with words below."""
-    picture = Image.fromarray(np.pad(np.hstack(panels), ((0, BARE), (0, 0), (0, 0)), constant_values=255))
+    row = np.hstack(panels)
+    below = np.broadcast_to(np.array(ground, dtype=np.uint8), (BARE, *row.shape[1:]))
+    picture = Image.fromarray(np.vstack([row, below]))
+    ink = (30, 30, 30) if sum(ground) > 384 else (220, 224, 230)
     pen, font = ImageDraw.Draw(picture), ImageFont.load_default(19)
     for k, text in enumerate(words):
-        pen.text((k * panels[0].shape[1] + 16, panels[0].shape[0] + 8), text, fill=(30, 30, 30), font=font)
+        pen.text((k * panels[0].shape[1] + 16, panels[0].shape[0] + 8), text, fill=ink, font=font)
     return picture
 
 

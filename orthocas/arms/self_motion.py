@@ -18,7 +18,7 @@ from orthocas.errors import InvalidValueError
 from orthocas.tasks.domains import StopKind
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, as_point, require_count, require_kind
+from orthocas.tools.checks import Array, as_float_array, as_point, require_count, require_kind, require_known
 from orthocas.tools.display import Shown
 from orthocas.tools.expressions import call_user, wrap_shortest
 
@@ -259,18 +259,22 @@ class SelfMotions(Shown):
         found = [self._refine(int(owners[row]), float(along[row]), wish) for row in chosen]
         return min(found, key=lambda place: place.value)
 
-    def best(self, f: Callable[[Array], ArrayLike]) -> Place:
+    def best(self, f: Callable[[Array], ArrayLike] | str) -> Place:
         """The posture at which a function is largest, such as the distance from limits.
 
         It is evaluated at postures 0.05 rad or m apart on all components, and then between the best of them.
 
         Args:
-            f: joint positions (N, n) -> values (N,).
+            f: joint positions (N, n) -> values (N,), or "manipulability", `Task.manipulability` of the task.
 
         Raises:
             InvalidValueError: if there are no components, or f returns something else.
         """
         self._require_components()
+
+        if isinstance(f, str):
+            require_known("criterion", f, ("manipulability",))
+            f = self.maps.task.manipulability
 
         def evaluate(q: Array) -> Array:
             values = as_float_array("what f returns", call_user("f", "a function of joint positions (N, n)", f, q))

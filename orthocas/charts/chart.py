@@ -116,16 +116,41 @@ class Chart(InverseMethods, Shown):
         return found
 
     def manipulability(self, q: ArrayLike) -> Array:
-        """sqrt(det(J_x J_x^T)) of the task's Jacobian at q (n,), or at each row of (N, n); 0 at singular positions.
+        """w = sqrt(det(J J^T)) of the task at q (n,), or at each row of (N, n): `Task.manipulability`."""
+        return self.task.manipulability(q)
 
-        Units are mixed for poses: it compares postures of one robot and task.
+    def manipulability_gradient(self, q: ArrayLike, along: str = "q") -> Array:
+        """How the manipulability w changes at q (n,), or at each row of (N, n).
+
+        Args:
+            q: a joint position (n,), or several (N, n).
+            along: "q" gives dw/dq, (n,) or (N, n). "xi" gives the change along each coordinate with x and the others
+                held, (r,) or (N, r): the last r entries of dw/dq J^-1.
+
+        Returns:
+            The gradient; NaN at singular positions of the task.
+
+        Raises:
+            ShapeError, InvalidValueError: for bad positions, or another word for `along`.
 
         Source:
-            [Y1985]
+            Along q: [Y1985], differentiated; along xi: ours.
+
+        Example:
+            >>> import orthocas as oc
+            >>> chart = oc.load("panda-wide")
+            >>> slope = chart.manipulability_gradient(chart.domain.home, along="xi")
+            >>> slope.shape
+            (1,)
         """
-        J = self.jacobian(q)[..., : self.m, :]
-        values = np.linalg.svd(J, compute_uv=False)
-        return np.asarray(np.prod(values, axis=-1))
+        gradient = self.task.manipulability_gradient(q)
+        if along == "q":
+            return gradient
+        if along != "xi":
+            raise InvalidValueError("along", repr(along)[:80], "'q' or 'xi'")
+        J = self.jacobian(q)
+        rows = np.linalg.solve(np.moveaxis(J, -1, -2), gradient[..., None])[..., 0]
+        return np.asarray(rows[..., self.m :])
 
     def xi_range(self, q: ArrayLike, collisions: Collisions | None = None) -> XiRange:
         """How far each extra coordinate reaches alone from q, the task value and the other coordinates held.

@@ -318,9 +318,10 @@ class InverseMethods(PhiFunctions):
         require_known("chart function", name, FUNCTIONS)
         if name == "manipulability":
             # sqrt(det(J J^T)) is the product of the diagonal of the Cholesky factor.
-            q, product = ca.MX.sym("q", self.n), ca.SX.sym("P", self.m, self.m)
+            q = ca.MX.sym("q", self.n)
+            J = self.problem.task.frame_jacobian_function(q)
+            product = ca.SX.sym("P", J.shape[0], J.shape[0])
             volume = ca.Function("volume", [product], [ca.det(ca.diag(ca.diag(ca.chol(product))))])
-            J = self._graph("task_jacobian")(q)
             return ca.Function(name, [q], [volume(J @ J.T)], ["q"], [name])
         return self._inverse_function if name == "inverse" else self._graph(name)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from orthocas import problems
@@ -26,6 +27,7 @@ from orthocas.errors import OptionError
 from orthocas.paths.tool_path import read_path
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.robot import Robot
+from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import deferred
 from orthocas.viewer import view as open_view
 from orthocas.viewer.motion import cyclic_motions, read_joint_motion, read_run
@@ -64,7 +66,7 @@ def view(
         typer.Option("--compare", help="Play a closed path with constant xi beside the pseudo-inverse, which drifts."),
     ] = False,
     path: Annotated[
-        Path | None, typer.Option("--path", metavar="PATH.csv", help="With --compare: waypoints of a closed path.")
+        Path | None, typer.Option("--path", metavar="PATH.csv", help="For charts: waypoints to play.")
     ] = None,
     export: Annotated[
         Path | None,
@@ -83,8 +85,6 @@ def view(
         require_free(host, port)
     else:
         require_page(export, force)
-    if not compare and path is not None:
-        raise OptionError("--path requires --compare, which follows the path")
     # CasADi may lose Ctrl-C while it builds functions.
     with deferred():
         scene = _read_scene(target, chart, robot, words)
@@ -93,7 +93,9 @@ def view(
         if not isinstance(scene.shown, Chart):
             raise OptionError("--compare requires a chart file, whose coordinates are compared")
         points = None if path is None else read_path(path, scene.shown)[0]
-        scene = _Scene(cyclic_motions(scene.shown, points), scene.shown, scene.meshes, scene.locked)
+        scene, played = _Scene(cyclic_motions(scene.shown, points), scene.shown, scene.meshes, scene.locked), None
+    else:
+        played = _read_played(scene, path, export)
     arm, meshes, locks = scene.robot, scene.meshes, scene.locked
     solids = _read_collisions(scene, collisions, srdf, export)
     if export is not None:
@@ -105,7 +107,9 @@ def view(
         else:
             print_rows({"page": str(export), "size": f"{size / 2**20:.1f} MiB, with all it needs: it works offline"})
         return
-    opened = open_view(scene.shown, robot=arm, robot_file=meshes, locked=locks, collisions=solids, host=host, port=port)
+    opened = open_view(
+        scene.shown, robot=arm, robot_file=meshes, locked=locks, collisions=solids, path=played, host=host, port=port
+    )
     with opened as page:
         _note_missing(page.missing)
         local = is_local(host)
@@ -140,6 +144,16 @@ def _read_scene(target: str, chart: Path | None, meshes: Path | None, words: Pro
     if chart is not None:
         raise OptionError(f"{target} is a chart: leave out --chart")
     return _Scene(load(place), None, meshes, locked)
+
+
+def _read_played(scene: _Scene, path: Path | None, export: Path | None) -> Array | None:
+    """The waypoints that the page of a chart plays, with their coordinates if the file has them."""
+    if path is None:
+        return None
+    if not isinstance(scene.shown, Chart) or export is not None:
+        raise OptionError("--path is for live pages of charts, or with --compare: leave it out")
+    x, xi = read_path(path, scene.shown)
+    return x if xi is None else np.hstack([x, xi])
 
 
 def _read_collisions(scene: _Scene, urdf: str | None, srdf: Path | None, export: Path | None) -> Collisions | None:

@@ -332,7 +332,7 @@ class Adaptation(_Correcting):
         # dp/dt = -rate gain Y^T J^-1 (de / c + e), while the law commands; gains follow its stiffness at the joints,
         # the diagonal of J^T K J at the centre of the domain.
         J_home = chart.parts.batched_rates(problem.domain.home[None])[0]
-        stiffness = np.asarray((J_home**2 * law.stiffness[:, None]).sum(axis=0))
+        stiffness = np.diag(J_home.T @ law.compute_stiffness(problem.domain.home[None])[0] @ J_home)
         springs = stiffness[list(joints)] / RULES.gravity**2
         slowest = self._compute_crossing(law)
         slope = -min(self.rate, slowest) * springs * (Y.T @ (B @ (Lambda @ (de / slowest + e))))
@@ -383,7 +383,7 @@ class FrictionObserver(_Correcting):
 
     Args:
         rate: > 0 [1/s].
-        bound: largest r, b and correction of each joint, > 0, (n,) or one number [N m] or [N]; default half of the limit.
+        bound: largest r, b and correction of each joint, > 0, (n,) or one number [N m] or [N]; default half the limit.
         tolerance: errors of phi at which it stops, > 0, (n,) or one number; up to twice that may be left. Default
             0.25 mm, 5 mrad, and 0.01 of each xi.
 

@@ -463,11 +463,7 @@ class _OperationalSpace(LawOfChart):
             q = np.vstack([sample_uniform(self.problem.domain, RULES.samples, 0), fastest])
         points, single = as_point_set("q", q, self.chart.n)
         W = compute_mobility(self.chart, points, self.model.robot(self.problem))
-        K = np.tile(np.diag(self.stiffness), (len(points), 1, 1))
-        if self.is_limited:
-            J = self.chart.parts.batched_rates(points)
-            K = limit_stiffness(W, J, self.stiffness, self.fastest, self.compliance, self._blocks)
-        result = compute_modes(W, K, self._compute_damping(points))
+        result = compute_modes(W, self.compute_stiffness(points), self._compute_damping(points))
         return Modes(*(values[0] for values in vars(result).values())) if single else result
 
     @cached_property
@@ -486,6 +482,14 @@ class _OperationalSpace(LawOfChart):
             return np.where(modes.frequencies > 0, decays, np.inf).min(axis=1)
 
         return float(find_slowest(least_in_domain(find_slowest, self.problem.domain)[None])[0])
+
+    def compute_stiffness(self, points: Array) -> Array:
+        """K(q) at points (N, n), (N, n, n): the diagonal of the stiffness, or what inertia and joints leave of it."""
+        if not self.is_limited:
+            return np.tile(np.diag(self.stiffness), (len(points), 1, 1))
+        W = compute_mobility(self.chart, points, self.model.robot(self.problem))
+        J = self.chart.parts.batched_rates(points)
+        return limit_stiffness(W, J, self.stiffness, self.fastest, self.compliance, self._blocks)
 
     def _compute_damping(self, points: Array) -> Array:
         """D(q) with the law's gains at points (N, n), (N, n, n)."""

@@ -46,8 +46,7 @@ from orthocas.robots.robot import Robot
 from orthocas.robots.tree import require_driven
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.branches import RULES as BRANCH_RULES
-from orthocas.tasks.branches import Branch, Branches, branches, compute_range_scale, sample_centres, sample_nonsingular
-from orthocas.tasks.clear_box import ClearBox
+from orthocas.tasks.branches import Branch, Branches, branches, build_clear_box, sample_centres, sample_nonsingular
 from orthocas.tasks.domains import Box
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.problem import Problem, check
@@ -263,12 +262,12 @@ def _build_problems(
     If its middle is not clear, its home is the clear position with the most room around it. The box around this
     position is a second problem, because a singular middle may part the branch.
     """
-    box, scale = branch.box, compute_range_scale(robot, task)
+    box = branch.box
 
     def build(part: Box, home: Array | None = None) -> Problem:
         """The problem on the clear positions of a box, as `branches` counts them."""
         own = task.with_reference_at(part.centre if home is None else home)
-        return Problem(robot, own, metric, ClearBox(part, own, clearance, scale, home=home), branch.name)
+        return Problem(robot, own, metric, build_clear_box(robot, own, part, clearance, home), branch.name)
 
     try:
         return (build(box),)
@@ -465,7 +464,7 @@ def _name_coordinates(
 def _describe_left_out(problem: Problem, branch: Branch, counted: Array, share: float) -> str:
     """What a chart leaves out of a branch, of which some positions (N, n) are clear; empty for little."""
     domain, reasons = problem.domain, []
-    if isinstance(domain, ClearBox) and domain.posture is not None and share < RULES.divided:
+    if share < RULES.divided and not np.array_equal(domain.home, domain.centre):
         reason = "its middle is not clear, and coordinates have one direction on a part of it only"
         return f"all but {percent(share)} of the clear positions: {reason}"
     inside = np.asarray(Box(domain.centre, domain.half_width, domain.unbounded).contains(counted))

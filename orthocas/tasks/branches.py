@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, SingularTaskError, UnknownNameError
 from orthocas.robots.robot import Robot
+from orthocas.tasks.clear_box import ClearBox
 from orthocas.tasks.domains import Box
 from orthocas.tasks.regular_box import find_joint_range
 from orthocas.tasks.samples import compute_row_scale, sample_evenly
@@ -365,7 +366,16 @@ def sample_centres(robot: Robot, task: Task, box: Box) -> tuple[Array, Array]:
     return points, _scale_to_range(robot, task)(points)
 
 
-def compute_range_scale(robot: Robot, task: Task) -> Array:
+def build_clear_box(robot: Robot, task: Task, box: Box, clearance: float, home: Array | None = None) -> ClearBox:
+    """The positions of a box that are clear as `branches` counts them: rows are scaled over the joint range.
+
+    Raises:
+        DomainError: if the home, by default the centre, is not clear.
+    """
+    return ClearBox(box, task, clearance, _compute_range_scale(robot, task), home=home)
+
+
+def _compute_range_scale(robot: Robot, task: Task) -> Array:
     """The sizes of the rows of the frame Jacobian in the joint range, (m,), by which lengths and angles compare."""
     whole = find_joint_range(robot, 0)
     centred = task.with_reference_at(whole.centre)
@@ -375,7 +385,7 @@ def compute_range_scale(robot: Robot, task: Task) -> Array:
 
 def _scale_to_range(robot: Robot, task: Task) -> Callable[[Array], Array]:
     """Relative singular values of a task at points (N, n), (N,); rows are scaled over the joint range."""
-    centred, scale = task.with_reference_at(find_joint_range(robot, 0).centre), compute_range_scale(robot, task)
+    centred, scale = task.with_reference_at(find_joint_range(robot, 0).centre), _compute_range_scale(robot, task)
 
     def values(points: Array) -> Array:
         return np.asarray(np.linalg.svd(_evaluate_jacobians(centred, points) / scale[:, None], compute_uv=False)[:, -1])

@@ -589,6 +589,52 @@ class Task(Shown, HoldsFunctions):
         plain = self.turn is None and not self.parts
         return self.batched_jacobian if plain else BlockedFunction(self.frame_jacobian_function)
 
+    def manipulability(self, q: ArrayLike) -> Array:
+        """w = sqrt(det(J J^T)) at q (n,), or at each row of (N, n); 0 at singular positions.
+
+        J is `frame_jacobian_function`: of a pose, the geometric Jacobian. Units are mixed for poses, so w compares
+        postures of one robot and task.
+
+        Raises:
+            ShapeError, InvalidValueError: if q has another number of joints, or is not finite.
+
+        Source:
+            [Y1985]
+        """
+        points, single = as_point_set("q", q, self.robot.n)
+        J = self.batched_frame_jacobian(points)[0].reshape(len(points), -1, self.robot.n)
+        w = np.prod(np.linalg.svd(J, compute_uv=False), axis=-1)
+        return np.asarray(w[0] if single else w)
+
+    def manipulability_gradient(self, q: ArrayLike) -> Array:
+        """dw/dq (n,) of the manipulability at q (n,), or (N, n) at each row of (N, n); NaN at singular positions.
+
+        dw/dq_i = w tr(J^+ dJ/dq_i).
+
+        Raises:
+            ShapeError, InvalidValueError: as in `manipulability`.
+
+        Source:
+            The formula: [Y1985], differentiated.
+        """
+        points, single = as_point_set("q", q, self.robot.n)
+        count, n = points.shape
+        J = self.batched_frame_jacobian(points)[0].reshape(count, -1, n)
+        change = self._batched_frame_change(points)[0].reshape(count, n, -1, n)
+        U, sizes, V = np.linalg.svd(J, full_matrices=False)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = np.moveaxis(V, 1, 2) @ (np.moveaxis(U, 1, 2) / sizes[:, :, None])
+            dw = np.prod(sizes, axis=1)[:, None] * np.einsum("kam,kima->ki", inverse, change)
+        return np.asarray(dw[0] if single else dw)
+
+    @cached_property
+    def _batched_frame_change(self) -> Batched:
+        """Evaluates dJ/dq_i of `frame_jacobian_function`, for one joint after another."""
+        q = ca.SX.sym("q", self.robot.n)
+        J = self.frame_jacobian_function(q)
+        changes = [ca.jacobian(ca.vec(J.T), q)[:, i] for i in range(self.robot.n)]
+        return Batched(dense_function("frame_change", [q], [ca.cse(ca.vertcat(*changes))]))
+
     def evaluate_jacobian(self, points: Array, results: Array | None = None) -> Array:
         """J_x at points (N, n), as an array (N, m, n): a new one, or `results`.
 

@@ -1,5 +1,6 @@
-"""The page of a chart: sliders and a handle that are solved live, bars, ghosts, home, undo and a sweep."""
+"""The page of a chart: sliders and a handle solved live, bars, ghosts, home, undo, a sweep, a path, a recording."""
 
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -16,6 +17,7 @@ from orthocas.tasks.branches import branches
 from orthocas.tools.checks import Array
 from orthocas.viewer.contacts import Contacts
 from orthocas.viewer.looks import RULES, Arm, Ghosts, Look, compute_chain_length
+from orthocas.viewer.motion import join_waypoints, write_joints
 from orthocas.viewer.panel import ChartPanel
 from orthocas.viewer.session import Session, describe_stop
 from orthocas.viewer.window import Loop, place_panels, place_scene, show_error
@@ -24,25 +26,31 @@ _NONE = "none"
 
 
 class ChartPage:
-    """The page of a chart on a viser server."""
+    """The page of a chart on a viser server; `path` has waypoints of phi (N, n), or of the task alone (N, m)."""
 
-    def __init__(self, server: Any, session: Session, look: Look, collisions: Collisions | None = None) -> None:
+    def __init__(
+        self, server: Any, session: Session, look: Look, collisions: Collisions | None = None, path: Array | None = None
+    ) -> None:
         # State of the page, and the thread that works for it.
         self.session = session
         self._server = server
         self._panel = ChartPanel(session.chart, session.place)
         self._loop = Loop(self._settle, self._show_failure)
         self._gesture = self._dragging = self._sweeping = False
-        self._fans: list[Fan] = []
-        # The scene, then what the user moves, then what it shows first.
+        self._play: Any = None  # the button of a path
+        self._recorded: list[tuple[float, Array]] | None = None  # times [s] and joints (n,), while it records
+        # The scene, with room for all that the coordinates reach, then what the user moves, then what it shows first.
         robot = session.chart.problem.robot
+        self._fans = [fan_along(session.chart, session.home, k) for k in range(session.chart.r)]
         self._arm, self._ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
-        place_scene(server, robot, self.session.home[None])
+        place_scene(server, robot, np.concatenate([session.home[None], *(fan.spread(5) for fan in self._fans)]))
         self._contacts = None if collisions is None else Contacts(server.scene, collisions)
         self._handle, self._rings = self._add_handle(), self._add_rings()
         self._readings = place_panels(server)
         self._sliders = self._add_sliders()
         self._add_buttons()
+        if path is not None:
+            self._add_path(path)
         self._show()
         self._settle()
         self._loop.start()
@@ -93,9 +101,14 @@ class ChartPage:
         gui = self._server.gui
         self._add_button("Home", "home", partial(self._change, self.session.go_home))
         self._undo = self._add_button("Undo", "arrow-back-up", partial(self._change, self.session.undo))
+        self._record = gui.add_button("Record", icon="player-record", hint="Joints over time, as a CSV file.")
+
+        async def record(event: Any) -> None:
+            self._loop.ask("Record", lambda: self._toggle_record(event.client))
+
+        self._record.on_click(record)
         with gui.add_folder("What a coordinate reaches"):
             # First the coordinate that moves the joints farthest.
-            self._fans = [fan_along(self._chart, self.session.q, k) for k in range(self._chart.r)]
             sweeps = [self._chart.problem.robot.joint_points(fan.spread(5)) for fan in self._fans]
             widest = self._fans[int(np.argmax([np.ptp(points, axis=0).max() for points in sweeps]))].label
             labels = self._chart.labels[self._chart.m :]
@@ -125,6 +138,54 @@ class ChartPage:
                 self._add_button(f"Flip the {branching.cuts[cut].part}", "arrows-left-right", flip)
             if not branching.mirrors:
                 self._server.gui.add_markdown("No mirror image of this arm has the same pose of its tip.")
+
+    def _add_path(self, path: Array) -> None:
+        """A button that plays a path, whose waypoints are drawn where the task has a whole position."""
+        labels = self._chart.labels[: path.shape[1]]
+        kept = "the coordinates stay" if len(labels) == self._chart.m else "with its coordinates"
+        with self._server.gui.add_folder(f"Path: {kept}"):
+            self._play = self._add_button("Play", "player-play", partial(self._toggle_path, path))
+        if labels[:3] == ("x", "y", "z") and self._chart.problem.task.of_tip:
+            thickness = RULES.trace * compute_chain_length(self._chart.problem.robot.tree)
+            ends = np.stack([path[:-1, :3], path[1:, :3]], axis=1)
+            self._server.scene.add_line_segments("/path", ends, RULES.path_colours[0], thickness=thickness)
+
+    def _toggle_path(self, path: Array) -> None:
+        """Move to the first waypoint and along the others, until something else is wished for or stops it; or end."""
+        if self._play.label == "Stop":
+            self._rest()
+            return
+        self._rest()
+        self._begin()
+        self._play.label = "Stop"
+        labels, sizes = self._chart.labels[: path.shape[1]], self._chart.parts.phi_sizes[: path.shape[1]]
+        # From here, so that the arm does not jump to the first waypoint.
+        start = self._chart.phi(self.session.q)[None, : path.shape[1]]
+        along = join_waypoints(np.concatenate([start, path]), sizes)
+
+        def tick(seconds: float) -> bool:
+            fraction = min(seconds / RULES.cycle, 1.0)
+            self.session.wish(dict(zip(labels, along(np.array([fraction]))[0].tolist(), strict=True)))
+            self.session.follow()
+            goes_on = fraction < 1 and not self.session.stop
+            if not goes_on:
+                self._play.label = "Play"
+            self._show()
+            return goes_on
+
+        self._loop.animate(tick)
+
+    def _toggle_record(self, client: Any) -> None:
+        """Begin to record the joints, or end it and send the file to the browser."""
+        recorded = self._recorded
+        if recorded is None:
+            self._recorded, self._record.label = [], "Stop and save"
+            self._show_arm(self.session.q)
+            return
+        self._recorded, self._record.label = None, "Record"
+        times, q = map(np.array, zip(*recorded, strict=True))
+        text = write_joints(self._chart.problem.robot.joint_names, times, q)
+        client.send_file_download("joints.csv", text.encode(), save_immediately=True)
 
     def _change(self, change: Callable[[], None]) -> None:
         """Another position of the session, which ends a sweep."""
@@ -222,9 +283,11 @@ class ChartPage:
         self._loop.animate(tick)
 
     def _rest(self) -> None:
-        """End a sweep."""
+        """End a sweep, and a path."""
         self._loop.animate(None)
         self._sweeping, self._sweep.label = False, "Sweep"
+        if self._play is not None:
+            self._play.label = "Play"
 
     def _show(self, moved: Any = ()) -> None:
         """Draw the arm and the readings, and move the sliders that the user does not hold."""
@@ -248,7 +311,10 @@ class ChartPage:
     def _show_arm(self, q: Array) -> None:
         """Draw the arm and its handle, for a position of the chart (n,)."""
         with self._server.atomic():
-            self._arm.show(self.session.mirror(q[None])[0])
+            shown = self.session.mirror(q[None])[0]
+            self._arm.show(shown)
+            if self._recorded is not None and len(self._recorded) < RULES.most_recorded:
+                self._recorded.append((time.monotonic(), shown))
             if self._dragging:
                 return
             robot = self._chart.problem.robot
@@ -300,7 +366,7 @@ class ChartPage:
                 # What the arm can have of the fan.
                 fans = (fan.spread(RULES.ghosts), fan.spread(4 * RULES.ghosts))
                 few, many = (self.session.mirror(q[self.session.find_allowed(q)]) for q in fans)
-                self._ghosts.show(few, many)
+                self._ghosts.show(few, many, [f"{fan.label} = {value:.3f}" for value in (fan.xi[0], fan.xi[-1])])
 
     def _show_failure(self, error: Exception) -> None:
         self._rest()

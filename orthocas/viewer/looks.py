@@ -45,6 +45,7 @@ class ViewRules:
     centre: Colour = (64, 168, 116)
     high: Colour = (245, 118, 10)
     trace: float = 0.004  #: thickness of a line
+    same_place: float = 0.3  #: of two labels, over the size of what moves
 
     most_instants: int = 1_000_000  #: of a motion in a file
     cycle: float = 5.0  #: of a closed path [s]
@@ -70,6 +71,7 @@ class ViewRules:
     rings: float = 0.13  #: that turn it
     sweep: float = 6.0  #: there and back [s]
     sweep_range: float = 0.97  #: fraction of the range that a sweep uses
+    most_recorded: int = 100_000  #: joint positions, about an hour
     reading_pause: float = 0.1  #: between readings in a sweep, which take longer than a picture [s]
 
     path_colours: tuple[Colour, ...] = ((31, 95, 168), (217, 95, 2), (27, 158, 119))
@@ -402,8 +404,8 @@ class Ghosts:
         self._look = build_stick_arm(robot.tree, RULES.ghost_thickness, RULES.ghost_facets)[1:]
         self._nodes: list[Any] = []
 
-    def show(self, q: Array, curve: Array) -> None:
-        """Show arms at joint positions (N, n), and the way of their joints along a curve (M, n)."""
+    def show(self, q: Array, curve: Array, ends: Sequence[str] = ()) -> None:
+        """Show arms at joint positions (N, n), the way of their joints along a curve (M, n), and texts at its ends."""
         self.hide()
         positions, quaternions = self._poses(q)
         for k, colour in enumerate(compute_shades(len(q)).tolist()):
@@ -421,10 +423,18 @@ class Ghosts:
         moving = points[:, np.ptp(points, axis=0).max(axis=1) > 0.03 * size]
         if moving.size:
             colours = np.repeat(compute_shades(len(curve))[:, None], moving.shape[1], axis=1)
-            ends = np.stack([moving[:-1], moving[1:]], axis=2).reshape(-1, 2, 3)
+            lines = np.stack([moving[:-1], moving[1:]], axis=2).reshape(-1, 2, 3)
             shade = np.stack([colours[:-1], colours[1:]], axis=2).reshape(-1, 2, 3)
             thickness = RULES.trace * max(size, 1e-3)
-            self._nodes.append(self._scene.add_line_segments(f"{self._name}/traces", ends, shade, thickness=thickness))
+            self._nodes.append(self._scene.add_line_segments(f"{self._name}/traces", lines, shade, thickness=thickness))
+            # At the joint that moves farthest; both texts in one place if the curve comes back.
+            way = points[:, int(np.argmax(np.linalg.norm(np.ptp(points, axis=0), axis=1)))]
+            if len(ends) == 2 and np.linalg.norm(way[-1] - way[0]) < RULES.same_place * size:
+                ends, way = [f"{ends[0]} and {ends[1]}"], way[:1]
+            for k, (text, place) in enumerate(zip(ends, (way[0], way[-1]), strict=False)):
+                self._nodes.append(
+                    self._scene.add_label(f"{self._name}/end{k}", text, position=tuple(place), anchor="top-center")
+                )
 
     def hide(self) -> None:
         """Remove all."""

@@ -120,6 +120,14 @@ def read_joint_motion(path: Path, robot: Robot) -> Motion:
     return Motion(Path(path).stem, times[:, 0], next(arrays), labels, next(arrays))
 
 
+def write_joints(names: Sequence[str], times: Array, q: Array) -> str:
+    """A motion file as `read_joint_motion` reads it: times (N,) [s] from 0, and joint positions (N, n)."""
+    kept = np.append(True, np.diff(times) > 0)
+    rows = np.column_stack([times - times[0], q])[kept]
+    lines = [",".join(f"{value:.9g}" for value in row) for row in rows.tolist()]
+    return "\n".join([",".join([_TIME, *names]), *lines, ""])
+
+
 Place = Callable[[Array], Array]  #: shares of a cycle (N,) -> task values (N, m)
 
 
@@ -183,16 +191,20 @@ def _find_largest_circle(chart: Chart, start: Array, fractions: Array) -> tuple[
 
 
 def _build_polygon(chart: Chart, path: Array) -> Place:
-    """Straight lines between waypoints."""
+    """Straight lines between the waypoints of a closed path."""
     # A closed path, measured in the sizes of the task.
     points, _ = as_point_set("path", path, chart.m)
     sizes = chart.parts.phi_sizes[: chart.m]
     if len(points) < 3 or np.abs((points[-1] - points[0]) / sizes).max() > RULES.same_ends:
         raise PathError(f"the path of {len(points)} waypoints is not closed, expected its last to be its first")
+    return join_waypoints(points, sizes)
+
+
+def join_waypoints(points: Array, sizes: Array) -> Place:
+    """Straight lines between waypoints (N, k), by the share of their length in sizes (k,)."""
     lengths = np.linalg.norm(np.diff(points, axis=0) / sizes, axis=1)
     if not lengths.sum() > 0:
         raise InvalidValueError("path", "one point", "waypoints at different places")
-    # Places along it by their share of its length.
     place = np.append(0.0, np.cumsum(lengths)) / lengths.sum()
     return lambda fraction: np.column_stack([np.interp(fraction, place, column) for column in points.T])
 

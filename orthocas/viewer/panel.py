@@ -106,7 +106,8 @@ class ChartPanel:
         family, _, _ = chart.coordinates.label.partition(":cyclic")
         lines += [f"{escape(family)}, {chart.n} joints"]
         lines += [f"task {task}; {chart.r} coordinate{'s' if chart.r > 1 else ''}"]
-        self._head = f'<div class="name">{escape(name_robot(robot))}</div><div class="about">{"<br>".join(lines)}</div>'
+        title = escape(name_robot(robot, problem.name))
+        self._head = f'<div class="name">{title}</div><div class="about">{"<br>".join(lines)}</div>'
 
     def format_html(self, readings: Readings, nearest: str = "", ends: str = "") -> str:
         """The page; `nearest` is a part about collisions, and `ends` about the range of a coordinate."""
@@ -195,11 +196,11 @@ class JointBars:
         )
 
 
-def name_robot(robot: Robot) -> str:
-    """A robot's name for people: the words that its joints' names share, as panda_joint1 has panda, or its tip's."""
+def name_robot(robot: Robot, known: str = "") -> str:
+    """A robot's name for people: the words that its joints' names share, as panda_joint1 has panda, or a known one."""
     first = robot.joint_names[0]
     shared = first.removesuffix(strip_shared_words(robot.joint_names)[0]).strip("_")
-    return shared or robot.tree.tip_name
+    return shared or known or robot.tree.tip_name
 
 
 def strip_shared_words(names: Sequence[str]) -> list[str]:

@@ -9,13 +9,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from orthocas.charts.chart import Chart, GrownChart
 from orthocas.errors import ArchiveError, InvalidValueError, NoExpressionError
 from orthocas.paths.joint_motion import JointMotion
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.robot import Robot
 from orthocas.simulation.trajectory import Trajectory
-from orthocas.tools.checks import as_path, require_kind, suggest_attribute
+from orthocas.tools.checks import as_path, as_point_set, require_kind, suggest_attribute
 from orthocas.tools.files import publish, require_replaceable, require_writable
 from orthocas.viewer.chart_page import ChartPage
 from orthocas.viewer.looks import Look, build_stick_arm, decimate, read_urdf_look
@@ -79,6 +82,7 @@ def view(
     robot_file: str | Path | None = None,
     locked: Mapping[str, float] | None = None,
     collisions: Collisions | None = None,
+    path: ArrayLike | None = None,
     host: str = LOCAL,
     port: int = PORT,
 ) -> View:
@@ -92,6 +96,8 @@ def view(
         locked: joints that were locked when the robot was built from that file, with their positions [rad] or [m].
         collisions: for charts, such as `robot.collisions`: the page shows the nearest pair, in red where it is close,
             and the objects of its scene.
+        path: for charts: waypoints of the task (N, m), or of the task and the coordinates (N, n), joined by straight
+            lines. A button plays it from where the arm is.
         host: address to listen at. By default only this machine can open the page. The page's address holds a random
             token, which stands for a password.
         port: of the page; 0 takes any free one.
@@ -104,7 +110,7 @@ def view(
         ViewError: if the port is taken, or the host is no address of this machine.
         NoExpressionError: for grown charts.
         RobotError: if the robot file is another robot's.
-        InvalidValueError: if collisions are another robot's, or given without a chart.
+        InvalidValueError: if collisions are another robot's, or collisions or a path are given without a chart.
     """
     # What is shown decides which page it gets.
     arm, motions = read_subject(shown, robot)
@@ -113,14 +119,20 @@ def view(
         collisions.require_for(arm.tree)
         if not isinstance(shown, Chart):
             raise InvalidValueError("collisions", f"given with a {type(shown).__name__}", "a chart with it")
+    points = None
+    if path is not None:
+        if not isinstance(shown, Chart):
+            raise InvalidValueError("path", f"given with a {type(shown).__name__}", "a chart with it")
+        width = np.shape(path)[1:]
+        points, _ = as_point_set("path", path, shown.n if width == (shown.n,) else shown.m)
     shape = build_shape(arm, robot_file, locked)
-    server, url = open_window(host, port, name_robot(arm))
+    server, url = open_window(host, port, name_robot(arm, shown.problem.name if isinstance(shown, Chart) else ""))
     try:
         page: ChartPage | RobotPage | PlayerPage
         if motions:
             page = PlayerPage(server, arm, shape.look, motions)
         elif isinstance(shown, Chart):
-            page = ChartPage(server, Session(shown), shape.look, collisions)
+            page = ChartPage(server, Session(shown), shape.look, collisions, points)
         else:
             page = RobotPage(server, arm, shape.look)
     except BaseException:

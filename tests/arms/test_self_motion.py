@@ -14,7 +14,7 @@ from orthocas.arms.kernel import CompiledKernel, Curve
 from orthocas.arms.maps import ArmMaps
 from orthocas.arms.numpy_kernel import NumpyKernel
 from orthocas.arms.self_motion import SelfMotions, find_motions
-from orthocas.errors import InvalidValueError
+from orthocas.errors import InvalidValueError, UnknownNameError
 from orthocas.tasks.domains import StopKind
 from orthocas.tools.checks import Array
 
@@ -166,6 +166,11 @@ def test_best_posture_is_better_than_dense_samples() -> None:
     found = motions.best(lambda q: -np.abs(q[:, 2] - 0.3))
     dense = np.vstack([arc.at(np.linspace(0.0, arc.length, 2000)) for arc in motions])
     assert found.value >= (-np.abs(dense[:, 2] - 0.3)).max() - 1e-9
+    found = motions.best("manipulability")
+    J = panda().robot.jacobian(dense)
+    assert found.value >= np.sqrt(np.linalg.det(J @ J.transpose(0, 2, 1))).max() - 1e-9
+    with pytest.raises(UnknownNameError, match="known: manipulability"):
+        motions.best("dexterity")
     with pytest.raises(InvalidValueError, match="what f returns"):
         motions.best(lambda q: q)
 

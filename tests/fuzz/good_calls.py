@@ -497,6 +497,7 @@ def _methods() -> dict[str, Call]:
         ),
         "evaluate with collisions": (oc.evaluate, {"chart": chart, "samples": 50, "collisions": collisions()}),
         "chart.manipulability": (chart.manipulability, {"q": q}),
+        "chart.manipulability_gradient": (chart.manipulability_gradient, {"q": q, "along": "xi"}),
         "chart.solve x": (chart.solve, {"x": chart.x(q), "xi": chart.xi(q), "q_start": q}),
         "chart.xi_range": (chart.xi_range, {"q": q}),
         "chart.self_motion": (chart.self_motion, {"q": q, "samples": 20}),

@@ -46,7 +46,7 @@ def test_postures_of_the_self_motion_have_the_elbow_that_was_asked_for() -> None
 @pytest.mark.slow
 def test_all_scenarios_have_a_thread_and_streams_that_begin_at_home() -> None:
     known = runner.scenarios()
-    assert len(known) == 11
+    assert len(known) == 14
     for name, scenario in known.items():
         assert scenario.threads, name
         assert all(address.startswith("https://") for address in scenario.threads)
@@ -76,7 +76,7 @@ def test_a_tip_that_is_off_at_two_per_cent_of_the_ticks_did_not_follow() -> None
 
 def row(method: str, *values: float) -> redundancy_page.Row:
     """A method on eight arms."""
-    return redundancy_page.Row(method, {(f"arm {k}", 0): value for k, value in enumerate(values)}, [], "")
+    return redundancy_page.Row(method, {(f"arm {k}", 0): value for k, value in enumerate(values)}, [], [], "")
 
 
 def test_ranks_count_who_is_ahead_on_more_arms_than_a_coin_would_be() -> None:

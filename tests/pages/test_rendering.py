@@ -7,7 +7,7 @@ import pytest
 import self_motion_picture
 import wide_film
 from PIL import Image
-from rendering import Camera, Layer, on_white, render
+from rendering import Camera, Layer, on_ground, render
 
 from orthocas.viewer.looks import Solid, build_ball
 
@@ -20,7 +20,7 @@ def ball_at(x: float, radius: float, colour: tuple[int, int, int]) -> Solid:
 
 
 def middle_of(*layers: Layer) -> np.ndarray:
-    return on_white(render(layers, CAMERA, 60, 40, floor=None))[20, 30].astype(int)
+    return on_ground(render(layers, CAMERA, 60, 40, floor=None))[20, 30].astype(int)
 
 
 def test_ball_has_the_size_that_the_pinhole_gives_it() -> None:
@@ -29,7 +29,7 @@ def test_ball_has_the_size_that_the_pinhole_gives_it() -> None:
     seen = 30 / np.tan(np.radians(30)) * np.tan(np.arcsin(1 / 5))  # [pixels]
     assert np.ptp(rows) + 1 == pytest.approx(2 * seen, abs=1.5)
     assert picture[0, 0, 3] == 0
-    assert (on_white(picture)[0, 0] == 255).all()
+    assert (on_ground(picture)[0, 0] == 255).all()
 
 
 def test_nearer_solids_hide_farther_ones_in_any_order() -> None:
@@ -51,7 +51,7 @@ def test_layers_above_are_seen_through_everything() -> None:
 def test_shadows_fall_on_the_floor() -> None:
     above = ball_at(0.0, 0.5, RED).move(np.eye(3), np.array([0.0, 0.0, 1.0]))
     camera = Camera((3.0, 0.0, 3.0), (0.0, 0.0, 0.0), 60.0)
-    picture = on_white(render([Layer([above])], camera, 60, 40, floor=0.0))
+    picture = on_ground(render([Layer([above])], camera, 60, 40, floor=0.0))
     greys = (np.ptp(picture.astype(int), axis=2) == 0) & (picture[..., 0] < 230)
     assert greys.sum() > 20
 

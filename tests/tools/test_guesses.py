@@ -94,13 +94,30 @@ def test_parts_of_a_chart(chart: oc.Chart, q: Any) -> None:
 
 
 def test_manipulability_is_the_volume_of_the_task_jacobian(chart: oc.Chart, q: Any) -> None:
-    J = chart.jacobian(q)[:6]
+    J = chart.robot.jacobian(q)
     np.testing.assert_allclose(chart.manipulability(q), np.sqrt(np.linalg.det(J @ J.T)), rtol=1e-9)
     function = chart.function("manipulability")
     np.testing.assert_allclose(float(function(q)), chart.manipulability(q), rtol=1e-9)
     gradient, step = np.array(function.jacobian()(q, 0)).ravel(), 1e-6 * np.eye(chart.n)
     differences = (chart.manipulability(q + step) - chart.manipulability(q - step)) / 2e-6
     np.testing.assert_allclose(gradient, differences, rtol=1e-5, atol=1e-7)
+
+
+def test_the_gradient_of_the_manipulability_matches_differences_along_joints_and_along_xi(
+    chart: oc.Chart, q: Any
+) -> None:
+    step = 1e-5
+    pairs = [[q + sign * step * e for sign in (-1, 1)] for e in np.eye(7)]
+    differences = [np.diff(chart.manipulability(pair))[0] / (2 * step) for pair in pairs]
+    np.testing.assert_allclose(chart.manipulability_gradient(q), differences, atol=1e-8)
+    along = chart.phi(q) + np.outer([-step, step], np.eye(7)[-1])
+    ends = chart.inverse(along, q)
+    slope = np.diff(chart.manipulability(ends))[0] / (2 * step)
+    np.testing.assert_allclose(chart.manipulability_gradient(q, along="xi"), [slope], atol=1e-6)
+    both = chart.manipulability_gradient(np.array([q, ends[0]]), along="xi")
+    assert both.shape == (2, 1)
+    with pytest.raises(InvalidValueError, match="'q' or 'xi'"):
+        chart.manipulability_gradient(q, along="x")
 
 
 def test_laws_have_default_gains(chart: oc.Chart) -> None:

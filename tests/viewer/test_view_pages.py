@@ -3,6 +3,7 @@
 import asyncio
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +18,8 @@ from solid_arms import build_arm
 
 import orthocas as oc
 from orthocas.errors import ArchiveError, InvalidValueError, ViewError
-from orthocas.viewer import cyclic_motions, export_page
+from orthocas.viewer import chart_page, cyclic_motions, export_page
+from orthocas.viewer.motion import read_joint_motion
 
 pytestmark = [
     pytest.mark.skipif(find_spec("viser") is None, reason="no viser: pip install 'orthocas[view]'"),
@@ -85,6 +87,29 @@ def test_rings_turn_the_tool_of_a_pose_task() -> None:
         np.testing.assert_allclose(robot.tip_rotation(session.q), wished.as_matrix(), atol=1e-8)
         np.testing.assert_allclose(robot.tip_position(session.q), robot.tip_position(home), atol=1e-9)
         np.testing.assert_allclose(chart.xi(session.q), chart.xi(home), atol=1e-9)
+
+
+def test_a_path_plays_and_its_recording_can_be_viewed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    chart = fitted().chart
+    monkeypatch.setattr(chart_page, "RULES", replace(chart_page.RULES, cycle=0.5))
+    x = chart.x(chart.problem.domain.home)
+    files: dict[str, bytes] = {}
+    client = SimpleNamespace(send_file_download=lambda name, content, save_immediately: files.update({name: content}))
+    with oc.view(chart, path=[x + 0.02, x - 0.03], port=0) as view:
+        page = view._page
+        page._loop.ask("record", lambda: page._toggle_record(client))
+        press(page._play)
+        wait(lambda: bool(np.abs(chart.x(page.session.q) - x + 0.03).max() < 1e-8))
+        wait(lambda: page._play.label == "Play")
+        np.testing.assert_allclose(chart.xi(page.session.q), chart.xi(page.session.home), atol=1e-8)
+        page._loop.ask("record", lambda: page._toggle_record(client))
+        wait(lambda: "joints.csv" in files)
+        (tmp_path / "joints.csv").write_bytes(files["joints.csv"])
+        motion = read_joint_motion(tmp_path / "joints.csv", chart.problem.robot)
+        np.testing.assert_allclose(motion.q[0], page.session.home, atol=1e-8)
+        np.testing.assert_allclose(motion.q[-1], page.session.q, atol=1e-8)
+    with pytest.raises(InvalidValueError, match="a chart with it"):
+        oc.view(chart.problem.robot, path=[x, x], port=0)
 
 
 def test_a_taken_port_is_named_and_a_closed_one_is_free() -> None:
