@@ -252,7 +252,8 @@ class LevelCurve:
         missed, h = float(np.linalg.norm(change)), float(np.linalg.norm(ahead - q))
         if not (missed < RULES.missed * min(1.0, h / RULES.step) and onward @ t > RULES.sharpest):
             return None
-        return ahead + change, onward
+        # What is left of an error would stand beside the next step, however short that becomes.
+        return self._settle(target, ahead + change, onward)
 
     def _correct(self, target: Array, q: Array, t: Array) -> tuple[Array, Array]:
         """Newton's steps (N, n) from points q (N, n) across directions t (N, n), and unit tangents, on their side."""

@@ -479,7 +479,7 @@ class _OperationalSpace(LawOfChart):
             with np.errstate(invalid="ignore"):
                 decays = 2 * np.pi * modes.frequencies * modes.damping_ratios
             # Coordinates without a spring have no integral action.
-            return np.where(modes.frequencies > 0, decays, np.inf).min(axis=1)
+            return np.asarray(np.where(modes.frequencies > 0, decays, np.inf).min(axis=1))
 
         return float(find_slowest(least_in_domain(find_slowest, self.problem.domain)[None])[0])
 

@@ -193,7 +193,7 @@ class Safety:
         if unknown:
             raise InvalidValueError("setting", repr(unknown[0]), f"one of {', '.join(settings)}")
         spread = {name: _spread(name, value, settings[name]) for name, value in changes.items()}
-        rate = float(np.max(spread.get("integral_rate", 0.0), initial=0.0))
+        rate = float(np.asarray(spread.get("integral_rate", 0.0), dtype=float).max(initial=0.0))
         if rate > 0 and rate > (bound := getattr(controller, "integral_bound", np.inf)):
             raise InvalidValueError("integral_rate", rate, f"at most {bound:.3g}/s, which the slowest mode bears")
         return cls(**{**settings, **spread})
