@@ -35,8 +35,8 @@ def test_pushed_arms_slow_down_come_to_rest_and_come_back(iiwa: oc.Problem) -> N
 def test_a_start_with_a_wrong_mass_is_not_caught_and_integral_action_takes_the_sag_away() -> None:
     """With A = M the light wrist makes up for the sag of the tip: a law that faded in over 0.2 s made it too fast.
 
-    That is so with constant springs, whose slow modes bear slow integral action only: after 2 s some sag is left. Those of
-    tracking laws hold it also then.
+    That is so with constant springs, whose slow modes bear slow integral action only: after 2 s some sag is left. Those
+    of tracking laws hold it also then.
     """
     chart = default_gains.chart_of("iiwa", "position", "inertia")
     plant = MuJoCoPlant(chart.problem.robot.with_scaled_masses(1.2))
