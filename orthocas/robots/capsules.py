@@ -338,11 +338,7 @@ def _measure_union(solids: Sequence[Shape | Capsule], count: int = RULES.points)
         shared = np.ones(len(inside))
         for other in np.flatnonzero(((low < high[k]) & (high > low[k])).all(axis=1)):
             if other != k:
-                shared += np.concatenate(
-                    [
-                        solids[other].contains(part)
-                        for part in np.array_split(inside, max(1, len(inside) // RULES.chunk))
-                    ]
-                )
+                parts = np.array_split(inside, max(1, len(inside) // RULES.chunk))
+                shared = shared + np.concatenate([solids[other].contains(part) for part in parts])
         total += float((1 / shared).sum()) / count * float(np.prod(high[k] - low[k]))
     return total
