@@ -3,26 +3,50 @@
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
+from conftest import robot_data
 from programs import needs_c
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
-from orthocas.control import Controller, ControlStatus, Kinematic, PDPlus, Safety
+from orthocas.control import Controller, ControlStatus, Kinematic, PDPlus, Reference, Safety
 from orthocas.errors import InvalidValueError, ShapeError
 from orthocas.simulation import Friction, MuJoCoPlant, StickingPlant
 from orthocas.tools.checks import Array
 
 pytestmark = needs_c
 
-G = 9.81
-MOUNTINGS = {  # gravity in the axes of the base, for arms whose model stands upright
-    "ceiling": (0.0, 0.0, G),
-    "wall, forwards": (G, 0.0, 0.0),
-    "wall, sidewards": (0.0, G, 0.0),
-    "tilted by 45 degrees": (G * np.sin(np.pi / 4), 0.0, -G * np.cos(np.pi / 4)),
-    "tilted by 30 degrees": (0.0, G / 2, -G * np.cos(np.pi / 6)),
+MOUNTINGS = {  # of the base in the world, as in <origin rpy="...">, for arms whose model stands upright
+    "ceiling": (np.pi, 0.0, 0.0),
+    "wall, forwards": (0.0, np.pi / 2, 0.0),
+    "wall, sidewards": (np.pi / 2, 0.0, 0.0),
+    "tilted by 45 degrees": (0.0, np.pi / 4, 0.0),
+    "tilted by 30 degrees": (np.pi / 6, 0.0, 0.0),
 }
+
+
+def mounted(robot: oc.Robot, rpy: tuple[float, float, float]) -> oc.Robot:
+    """An upright robot on another mounting."""
+    return robot.with_gravity(pin.rpy.rpyToMatrix(*rpy).T @ [0.0, 0.0, -9.81])
+
+
+@pytest.mark.parametrize("rpy", MOUNTINGS.values(), ids=MOUNTINGS)
+def test_gravity_of_a_mounting_is_that_of_a_base_turned_in_its_file(
+    rpy: tuple[float, float, float], tmp_path: Path
+) -> None:
+    """By Pinocchio, from a file in which a fixed joint turns the base."""
+    text = robot_data("panda_description/urdf/panda.urdf").read_text()
+    words = " ".join(map(str, rpy))
+    joint = f'<parent link="world"/><child link="panda_link0"/><origin xyz="0 0 0" rpy="{words}"/>'
+    turned = f'<link name="world"/><joint name="mounting" type="fixed">{joint}</joint></robot>'
+    (tmp_path / "turned.urdf").write_text(text.replace("</robot>", turned))
+    model = pin.buildModelFromUrdf(str(tmp_path / "turned.urdf"))
+    robot = oc.Robot.from_file(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")
+    robot = mounted(robot, rpy)
+    for q in np.random.default_rng(7).uniform(-1, 1, (10, robot.n)):
+        wanted = pin.computeGeneralizedGravity(model, model.createData(), np.append(q, np.zeros(model.nq - robot.n)))
+        np.testing.assert_allclose(robot.gravity(q), wanted[: robot.n], atol=1e-9)
 
 
 def test_the_check_of_a_start_is_the_torque_less_the_model(
@@ -90,7 +114,7 @@ def test_limits_of_gains_and_velocity_laws_leave_gravity_as_it_is(
 def holding_torque(plant: MuJoCoPlant, q: Array) -> Array:
     """The torque that holds an arm in MuJoCo, by its own inverse dynamics; the arm does not move under it."""
     plant.reset(q)
-    torque = np.array(plant.data.qfrc_bias)
+    torque = plant.bias
     plant.step(torque, 1e-3)
     assert np.abs(plant.dq).max() < 1e-6
     return torque
@@ -109,7 +133,7 @@ def test_wrong_mountings_and_tools_are_refused_before_anything_moves(name: str, 
     library = CompiledLibrary(compile_shared(oc.generate_c(chart, tmp_path, law, "arm"), tmp_path), "arm", chart.n)
     supervisor, rng = Supervisor(library, law), np.random.default_rng(7)
     true, tooled = MuJoCoPlant(robot), MuJoCoPlant(robot.with_payload(3.0))
-    wrong = {name: MuJoCoPlant(robot.with_gravity(gravity)) for name, gravity in MOUNTINGS.items()}
+    wrong = {name: MuJoCoPlant(mounted(robot, rpy)) for name, rpy in MOUNTINGS.items()}
     wrong["3 kg in the hand"] = tooled
     sticking = StickingPlant(robot, friction=Friction(coulomb=2.0))
     postures = [domain.home, *(q for q in domain.sample(20, 7))]
@@ -134,3 +158,22 @@ def test_wrong_mountings_and_tools_are_refused_before_anything_moves(name: str, 
         mismatch, status = supervisor.check_start(q, holding_torque(tooled, q))
         np.testing.assert_allclose(mismatch, 0.0, atol=1e-6)
         assert status is ControlStatus.OK
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("plant", ["cvodes", "mujoco"])
+def test_simulations_say_that_a_robot_would_refuse_the_start(
+    planar_for_control: oc.Chart, plant: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """They run all the same, to show what happens; a true model goes without a word."""
+    problem = planar_for_control.problem
+    law, q = PDPlus.on_chart(planar_for_control, limit=120.0), problem.domain.centre
+    reference = Reference.steps(law.labels, planar_for_control.phi(q), [], 0.02)
+    for scale, refused in ((1.0, 0), (1.5, 1)):
+        robot = problem.robot.with_scaled_masses(scale)
+        true = oc.simulation.MuJoCo(robot) if plant == "mujoco" else robot
+        caplog.clear()
+        run = oc.simulate(law, reference, q, plant=true, control_rate=1000, safety=Safety.of(law))
+        assert run.outcome is oc.simulation.Outcome.COMPLETE
+        assert len(caplog.records) == refused
+        assert refused == 0 or "a robot would refuse this start" in caplog.text
