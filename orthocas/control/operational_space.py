@@ -250,7 +250,7 @@ class _OperationalSpace(LawOfChart):
             raise InvalidValueError("fastest", fastest, "a number > 0 or infinity")
         if np.isfinite(omega) and not can_limit:
             raise InvalidValueError("fastest", fastest, "infinity with damping_stiffness and with square_root damping")
-        if compliance is not None and not np.isfinite(omega):
+        if compliance is not None and np.any(compliance) and not np.isfinite(omega):
             raise InvalidValueError("compliance", compliance, "none without a finite `fastest`")
         return stiffness, omega, 0.0 if compliance is None else compliance
 

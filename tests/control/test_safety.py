@@ -35,16 +35,17 @@ def test_pushed_arms_slow_down_come_to_rest_and_come_back(iiwa: oc.Problem) -> N
 def test_a_start_with_a_wrong_mass_is_not_caught_and_integral_action_takes_the_sag_away() -> None:
     """With A = M the light wrist makes up for the sag of the tip: a law that faded in over 0.2 s made it too fast.
 
-    That is so with constant springs. Those of tracking laws hold it also then.
+    That is so with constant springs, whose slow modes bear slow integral action only: after 2 s some sag is left. Those
+    of tracking laws hold it also then.
     """
     chart = default_gains.chart_of("iiwa", "position", "inertia")
     plant = MuJoCoPlant(chart.problem.robot.with_scaled_masses(1.2))
     worst = default_gains.starts_of(chart.problem, 3)[2]
     for law, is_lost in ((PDPlus.on_chart(chart), False), (PDPlus(chart, matched_stiffness(chart)), True)):
         with default_gains.compiled(law) as library:
-            default = Supervisor(library, law, Safety.of(law, integral_rate=3.0))
-            slow = Supervisor(library, law, Safety.of(law, integral_rate=3.0, fade_in=0.2))
-            assert default_gains.held(law, default, plant, worst) < 1e-3  # [m] after 2 s
+            default = Supervisor(library, law, Safety.of(law, integral_rate=min(3.0, law.integral_bound)))
+            slow = Supervisor(library, law, Safety.of(law, integral_rate=min(3.0, law.integral_bound), fade_in=0.2))
+            assert default_gains.held(law, default, plant, worst) < (5e-3 if is_lost else 1e-3)  # [m] after 2 s
             left = default_gains.held(law, slow, plant, worst)
             assert np.isinf(left) if is_lost else left < 1e-3  # infinite: caught
 
