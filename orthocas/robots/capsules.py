@@ -328,12 +328,21 @@ def _measure_hull(corners: Array) -> float:
 def _measure_union(solids: Sequence[Shape | Capsule], count: int = RULES.points) -> float:
     """The volume of a union, by seeded points in a box around each solid, weighed by how many solids hold them."""
     rng, total = np.random.default_rng(RULES.seed), 0.0
-    for solid in solids:
-        low, high = solid.list_box()
-        points = rng.uniform(low, high, (count, 3))
-        pieces = [points[first : first + RULES.chunk] for first in range(0, len(points), RULES.chunk)]
-        # a point in k solids counts one k-th in each of them
-        held = [np.concatenate([other.contains(piece) for piece in pieces]) for other in (solid, *solids)]
-        share = float((held[0] / np.maximum(np.sum(held[1:], axis=0), 1)).mean())
-        total += share * float(np.prod(high - low))
+    low, high = (np.array(corners) for corners in zip(*(solid.list_box() for solid in solids), strict=True))
+    for k, solid in enumerate(solids):
+        points = rng.uniform(low[k], high[k], (count, 3))
+        inside = np.concatenate(
+            [part[solid.contains(part)] for part in np.array_split(points, max(1, count // RULES.chunk))]
+        )
+        # a point in k solids counts one k-th in each of them; those whose boxes are apart share none
+        shared = np.ones(len(inside))
+        for other in np.flatnonzero(((low < high[k]) & (high > low[k])).all(axis=1)):
+            if other != k:
+                shared += np.concatenate(
+                    [
+                        solids[other].contains(part)
+                        for part in np.array_split(inside, max(1, len(inside) // RULES.chunk))
+                    ]
+                )
+        total += float((1 / shared).sum()) / count * float(np.prod(high[k] - low[k]))
     return total

@@ -162,7 +162,7 @@ def test_moving_bases_and_slides_are_placed_right(tmp_path: Path) -> None:
     assert robot.n == rail.n - 1
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_panda_s_capsules_hold_its_meshes(tmp_path: Path) -> None:
     robot = oc.Robot.from_urdf(robot_data("panda_description/urdf/panda.urdf"), "panda_hand")
     fitted = oc.fit_capsules(robot.collisions)

@@ -327,7 +327,7 @@ def test_benchmark_beyond_reach_finds_nothing_nearer() -> None:
     assert found["panda-wide, way [m]"] > 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_benchmark_of_collisions_agrees_with_coal_and_touches_nothing() -> None:
     found = collisions.main(quick=True)
     assert found["panda, differ"] == 0
