@@ -584,6 +584,9 @@ class PDPlus(_OperationalSpace):
 
     f_FF = M_phi (dd_phi_d + (J M^-1 C - dJ/dt) J^-1 d_phi_d) + D d_phi_d.
 
+    Without a stiffness, the springs change with q, so that no mode is fast and hardly one slow (`compute_stiffness`).
+    With a given stiffness, the coupled law is passive.
+
     Source:
         [AS2023] eq. (35).
 
