@@ -193,8 +193,10 @@ class Supervisor:
         self._n, self._k, self._library = library.n, len(controller.labels), library
         # Functions of the supervised law; those that take numbers beside pointers state their types.
         self._functions = {
-            name: library.function(name) for name in ("start", "take_over", "resume", "hold", "release", "step")
+            name: library.function(name)
+            for name in ("check_start", "start", "take_over", "resume", "hold", "release", "step")
         }
+        self._functions["check_start"].argtypes = [_POINTER] * 5
         self._functions["step"].argtypes = [*[_POINTER] * 6, library.precision.c_type, _POINTER]
         stream, pace = (library.function(f"reference_{name}") for name in ("stream", "pace"))
         stream.argtypes = [*[_POINTER] * 3, *[library.precision.c_type] * 2]
@@ -218,6 +220,23 @@ class Supervisor:
         self._state = _build_state(self._n, self._k, number, settings, _build_struct("Memory", fields))()
         self._command = library.numbers(np.zeros(self._n))
         self.gains = gain_numbers(controller)  #: numbers of the gains in the order of the C struct
+
+    def check_start(self, q: ArrayLike, torque: ArrayLike) -> tuple[Array, ControlStatus]:
+        """Compare the torque that holds the arm with the model's, before `start`: torque - model (n,), and the status.
+
+        Nothing moves, and no state changes. The model's torque is the law's fallback at `gains`, gravity and their
+        payload without their limit; for velocity laws, gravity. LOAD_MISMATCH: a joint differs by more than
+        `Safety.start_mismatch`, so the mounting or the tool is another one. NOT_FINITE, with zeros: an input is.
+
+        Args:
+            q: joint positions (n,).
+            torque: measured or commanded, in terms of the command: without what the robot adds itself (n,).
+        """
+        mismatch = self._library.numbers(np.zeros(self._n))
+        inputs = [self._numbers(name, value, self._n) for name, value in (("q", q), ("torque", torque))]
+        inputs += [self._library.numbers(self.gains), mismatch]
+        status = self._functions["check_start"](self._safety, *map(_pointer, inputs))
+        return mismatch, ControlStatus(status)
 
     def start(self, q: ArrayLike, command: ArrayLike | None = None) -> None:
         """Begin at joint positions (n,), with the command (n,) that the robot executes now; default the fallback."""

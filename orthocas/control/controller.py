@@ -44,6 +44,7 @@ class ControlStatus(IntEnum):
     LATE = 10  #: why the catcher took over: a tick came too late
     HELD = 11  #: why the catcher took over: brakes held the arm
     STOPPED_EARLY = 12  #: of the inverse map in C: its iterations were not enough
+    LOAD_MISMATCH = 13  #: of the check before a start: another torque holds the arm than the model's
 
     @property
     def words(self) -> str:

@@ -19,7 +19,7 @@ from orthocas.tools.interrupts import deferred
 
 UNBOUNDED = (  #: settings that may be infinite
     *("command_rate", "speed_limit", "stuck_speed", "lower", "upper", "error_limit"),
-    *("reference_speed", "reference_acceleration"),
+    *("reference_speed", "reference_acceleration", "start_mismatch"),
 )
 SIGNED = ("lower", "upper")  #: settings that may be negative
 TORQUE_ONLY = ("observer_rate", "stop_zone", "stop_damping", "brake_stiffness", "brake_yield")  #: not of velocity laws
@@ -43,6 +43,8 @@ class SafetyRules:
     zone: float = 0.05  #: of stops, at most this share of the range of a joint [rad] or [m]
     stuck_speed: float = 0.15  #: that commands must have given to an arm that measures the same [rad/s]
     stuck_way: float = 0.03  #: likewise of velocity laws [rad]
+    friction: float = 2.0  #: that may hold a joint at a start beside its torque [N m] or [N]
+    error: float = 0.02  #: of models and torque sensors, as a share of the effort limit; without one, of gravity
 
 
 RULES = SafetyRules()
@@ -92,6 +94,7 @@ class Safety:
     damping: Annotated[float, "rate of the catcher's damping -d M dq [1/s]; velocity laws: of the way to the anchor"]
     brake_stiffness: Annotated[float, "spring of the catcher, per inertia [1/s^2]"]
     brake_yield: Annotated[Array, "largest torque of that spring, which gives way slowly beyond it [N m]"]
+    start_mismatch: Annotated[Array, "torque by which what holds the arm may differ from the model at a start [N m]"]
 
     def __init__(self, **settings: Any) -> None:
         names = [setting.name for setting in fields(self)]
@@ -159,6 +162,7 @@ class Safety:
         torque = controller.command == "torque"
         speed_limit = np.where(np.isfinite(robot.velocity_limits), robot.velocity_limits, RULES.speed)
         slow = np.minimum(RULES.return_speed, speed_limit / 3)
+        efforts = np.where(np.isfinite(robot.effort_limits), robot.effort_limits, gravity)
         settings = {
             "command_rate": np.full(n, RULES.torque_rate if torque else RULES.acceleration),
             "speed_limit": speed_limit,
@@ -188,6 +192,7 @@ class Safety:
             "damping": RULES.catcher if torque else RULES.anchor,
             "brake_stiffness": RULES.catcher**2,
             "brake_yield": 0.5 * gravity + 10 * np.diag(M),
+            "start_mismatch": RULES.friction + RULES.error * efforts,
         }
         unknown = sorted(set(changes) - set(settings))
         if unknown:

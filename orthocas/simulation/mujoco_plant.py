@@ -429,6 +429,11 @@ class MuJoCoPlant(Shown):
         return np.asarray(self.data.qacc[self._dofs])
 
     @property
+    def bias(self) -> Array:
+        """C dq + g with the payload, (n,) [N m] or [N], a copy: at rest, the torque that holds the arm."""
+        return np.array(self.data.qfrc_bias[self._dofs])
+
+    @property
     def contact_force(self) -> Array:
         """Force of the wall on the tip in the last step, in the world, (3,) [N]; zero without contact."""
         total, wrench = np.zeros(3), np.zeros(6)

@@ -1,5 +1,6 @@
 """Closed loops with MuJoCo as plant, and with the supervised law of generated C."""
 
+import logging
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,8 @@ from orthocas.tools.interrupts import deferred
 
 if TYPE_CHECKING:
     from orthocas.codegen.library import Supervisor
+
+_log = logging.getLogger(__name__)
 
 
 class SupervisedLaw:
@@ -49,6 +52,7 @@ class SupervisedLaw:
         if controller.chart is None:
             raise InvalidValueError("safety", "given", f"none with {controller.name} without a chart")
         self._resume_after, self._period, self._caught_for = resume_after, period, 0.0
+        self._joints, self._torque = controller.problem.robot.joint_names, controller.command == "torque"
         # The law in C, which stays loaded when its folder is gone.
         with open_draft_folder() as folder:
             generated = codegen.generate_c(controller.chart, folder / "law", controller, "law", safety=safety)
@@ -56,8 +60,13 @@ class SupervisedLaw:
             compiled = codegen.CompiledLibrary(library, "law", controller.problem.n)
             self._law: Supervisor = codegen.Supervisor(compiled, controller)
 
-    def start(self, q: Array) -> None:
-        """Begin at joint positions (n,)."""
+    def start(self, q: Array, holding: Array) -> None:
+        """Begin at joint positions (n,), also where the torque (n,) that holds the plant is one that robots refuse."""
+        mismatch, status = self._law.check_start(q, holding)
+        if self._torque and status is ControlStatus.LOAD_MISMATCH:
+            worst = int(np.argmax(np.abs(mismatch)))
+            words = "a robot would refuse this start: the torque that holds it is %.3g off the model's at joint '%s'"
+            _log.warning(words, mismatch[worst], self._joints[worst])
         self._law.start(q)
         self._caught_for = 0.0
 
@@ -82,8 +91,8 @@ class LawWithMemory:
     def __init__(self, controller: Controller, period: float) -> None:
         self._ticks, self._period = Remembering(controller), period
 
-    def start(self, q: Array) -> None:
-        """Begin, at any joint positions."""
+    def start(self, q: Array, holding: Array) -> None:
+        """Begin, at any joint positions, whatever holds the plant."""
         self._ticks.start()
 
     def tick(self, q: Array, dq: Array, reference: Array) -> Array:
@@ -114,7 +123,7 @@ def run_supervised(
     with deferred(), building:
         plant = build_held_plant(loop, 1 / rate, tolerance)
     # Each tick: measure, ask the law, hold its command while the plant moves.
-    law.start(start[:n] + errors[0, :n])
+    law.start(start[:n] + errors[0, :n], np.asarray(loop.plant.gravity(start[:n])))
     state, sent = start, np.zeros(n + 2)
 
     def tick(k: int) -> Array:
@@ -152,6 +161,9 @@ def run_physics(
         timestep=scene.timestep,
         elasticity=scene.elasticity,
     )
+    # What holds the plant at rest, and the start.
+    plant.reset(start[: loop.n])
+    holding = plant.bias
     plant.reset(start[: loop.n], start[loop.n :])
     # What each tick needs: targets with derivatives, errors of the sensors, and the share of it that each push lasts.
     ticks = int(np.floor(reference.duration * rate + 1e-9))
@@ -162,7 +174,7 @@ def run_physics(
     with deferred(), building:
         law = _law(loop, len(reference.labels)) if supervised is None else supervised.tick
     if supervised is not None:
-        supervised.start(start[: loop.n] + errors[0, : loop.n])
+        supervised.start(start[: loop.n] + errors[0, : loop.n], holding)
 
     def tick(k: int) -> Array:
         q, dq = np.split(np.concatenate([plant.q, plant.dq]) + errors[k], 2)

@@ -1,5 +1,5 @@
 /* The runtime alone, under a made-up arm whose kernels do what a test asks them: NaN, singular matrices, overflow. It goes
- * through what no robot does every day, and counts branches (R1 to R30 of docs/reference/runtime.md).
+ * through what no robot does every day, and counts branches (R1 to R31 of docs/reference/runtime.md).
  *
  * Three joints with unit inertia; the third one turns without end. phi = (atan(q0), q1, q2), undefined where |q0| > 50;
  * the law is a spring and a damper. Exits with the number of failed checks, and prints their lines. */
@@ -251,7 +251,7 @@ static const orthocas_arm *arm;
 static orthocas_state state;
 static orthocas_safety safety;
 static orthocas_reference reference, given;
-static double numbers[40 * N + 2 * N * N], settings[17][N], values[6][K], work[WORK];
+static double numbers[40 * N + 2 * N * N], settings[18][N], values[6][K], work[WORK];
 static double q[N], dq[N], command[N], limit[N], used[2 * N];
 static const double anything[N] = {INFINITY, INFINITY, INFINITY};
 
@@ -262,14 +262,14 @@ static void set(double *x, double a, double b, double c) {
 }
 
 static void fill_settings(void) {
-  const double defaults[17] = {1e4, 6, 0.5, 0.15, 4, 20, -3, 3, 900, 0, 0.05, 60, 30, 0.6, 0.5, 0.0, 0.2};
-  const double **places[17] = {&safety.command_rate, &safety.speed_limit, &safety.rest_speed, &safety.stuck_speed,
+  const double defaults[18] = {1e4, 6, 0.5, 0.15, 4, 20, -3, 3, 900, 0, 0.05, 60, 30, 0.6, 0.5, 0.0, 0.2, 2};
+  const double **places[18] = {&safety.command_rate, &safety.speed_limit, &safety.rest_speed, &safety.stuck_speed,
                                &safety.reference_speed, &safety.reference_acceleration, &safety.lower, &safety.upper,
                                &safety.stop_stiffness, &safety.observer_rate, &safety.stop_zone, &safety.stop_damping,
                                &safety.brake_yield, &safety.error_limit, &safety.offset_rate, &safety.integral_rate,
-                               &safety.integral_limit};
+                               &safety.integral_limit, &safety.start_mismatch};
   int i;
-  for (i = 0; i < 17; ++i) {
+  for (i = 0; i < 18; ++i) {
     set(settings[i], defaults[i], defaults[i], defaults[i]);
     *places[i] = settings[i];
   }
@@ -453,8 +453,8 @@ static void test_settings(void) {
   const double bad[] = {NAN, -1.0, 0.0, INFINITY};
   size_t i, b;
   start_law(arm);
-  for (i = 0; i < 17; ++i) {
-    const int any = i < 2 || (i > 2 && i < 8) || i == 13, only_torque = i > 8 && i < 13;
+  for (i = 0; i < 18; ++i) {
+    const int any = i < 2 || (i > 2 && i < 8) || i == 13 || i == 17, only_torque = i > 8 && i < 13;
     fill_settings();
     CHECK(orthocas_check_settings(arm, &safety));
     settings[i][1] = NAN;
@@ -493,6 +493,41 @@ static void test_settings(void) {
 }
 
 /* ---- R6 to R8, R27: sensors ---- */
+
+static void test_start(void) {
+  double torque[N] = {1.0, -1.5, 2.5}, mismatch[N], place[N];
+  int i;
+  open_all(arm);
+  set(q, 0.1, 0.2, 0.3); /* 0.1 q holds it: as fallback, and as gravity of a velocity law */
+  CHECK(orthocas_check_start(arm, &safety, q, torque, gains_of, mismatch, work) == ORTHOCAS_LOAD_MISMATCH);
+  for (i = 0; i < N; ++i) CHECK(fabs(mismatch[i] - (torque[i] - 0.1 * q[i])) < 1e-12);
+  torque[2] = 2.0;
+  CHECK(orthocas_check_start(arm, &safety, q, torque, gains_of, mismatch, work) == ORTHOCAS_OK);
+  torque[0] = -1.98;
+  CHECK(orthocas_check_start(arm, &safety, q, torque, gains_of, mismatch, work) == ORTHOCAS_OK);
+  torque[0] = -2.0;
+  CHECK(orthocas_check_start(arm, &safety, q, torque, gains_of, mismatch, work) == ORTHOCAS_LOAD_MISMATCH);
+  for (i = 0; i < N; ++i) { /* what is no number is refused, wherever it is */
+    set(torque, 0, 0, 0);
+    torque[i] = i == 1 ? INFINITY : NAN;
+    CHECK(orthocas_check_start(arm, &safety, q, torque, gains_of, mismatch, work) == ORTHOCAS_NOT_FINITE);
+    CHECK(!(fabs(mismatch[0]) + fabs(mismatch[1]) + fabs(mismatch[2]) > 0.0));
+    torque[i] = 0;
+    copy(place, q, N);
+    place[i] = NAN;
+    CHECK(orthocas_check_start(arm, &safety, place, torque, gains_of, mismatch, work) == ORTHOCAS_NOT_FINITE);
+    place[i] = 1e9;
+    CHECK(orthocas_check_start(arm, &safety, place, torque, gains_of, mismatch, work) == ORTHOCAS_NOT_FINITE);
+  }
+  *(arm->torque ? &fault.fallback : &fault.gravity) = NAN;
+  CHECK(orthocas_check_start(arm, &safety, q, torque, gains_of, mismatch, work) == ORTHOCAS_NOT_FINITE);
+  good();
+  settings[17][1] = NAN;
+  CHECK(orthocas_check_start(arm, &safety, q, torque, gains_of, mismatch, work) == ORTHOCAS_BAD_INPUT);
+  settings[17][1] = INFINITY; /* a joint that nobody checks */
+  torque[1] = 1e9;
+  CHECK(orthocas_check_start(arm, &safety, q, torque, gains_of, mismatch, work) == ORTHOCAS_OK);
+}
 
 static void test_sensors(void) {
   int k;
@@ -911,6 +946,7 @@ int main(void) {
     test_inverse();
     test_control();
     test_settings();
+    test_start();
     test_sensors();
     test_modes();
     test_reference();
@@ -922,6 +958,7 @@ int main(void) {
   }
   open_all(&velocity);
   test_settings();
+  test_start();
   test_sensors();
   test_modes();
   test_reference();

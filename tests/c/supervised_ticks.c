@@ -106,6 +106,17 @@ static int spoil_settings(arm_safety *safety, arm_gains *gains, int observed) {
   }
 }
 
+/* The check before a start takes any numbers: its result is finite, and zeros where it compared nothing. */
+static int start_is_checked(const arm_safety *safety, const arm_gains *gains, const NUMBER *q, const NUMBER *torque) {
+  NUMBER mismatch[N];
+  const int status = (int)arm_check_start(safety, q, torque, gains, mismatch);
+  const int compared = status == ARM_OK || status == ARM_LOAD_MISMATCH;
+  int i;
+  for (i = 0; i < N; ++i)
+    if (!isfinite(mismatch[i]) || (!compared && fabs(mismatch[i]) > 0.0)) return 0;
+  return compared || status == ARM_NOT_FINITE || status == ARM_BAD_INPUT;
+}
+
 int main(void) {
   long k, counts[11] = {0};
   int still = 0;
@@ -176,6 +187,7 @@ int main(void) {
       if (fabs(command[i] - before[i]) > rate * time * (1.0 + rounding) + rounding) return 3;
     }
     if (!state_makes_sense(&state)) return 4;
+    if (!start_is_checked(&safety, &gains, measured_q, measured_dq)) return 7;
     memcpy(before, command, sizeof before);
   }
   for (i = 0; i < 11; ++i) printf("%ld ", counts[i]);

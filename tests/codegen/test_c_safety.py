@@ -171,7 +171,7 @@ def test_object_holds_no_state_and_calls_only_mathematics(pd_plus: Generated, tm
         ["chart", "chart_curvature", "check", "inverse", "nearest", "dynamics", "control"],
         ["default_gains", "domain_lower", "domain_upper"],
     )
-    functions += ["start", "take_over", "resume", "step", "hold", "release"]
+    functions += ["check_start", "start", "take_over", "resume", "step", "hold", "release"]
     functions += [f"reference_{name}" for name in ("at", "stream", "spline", "pace")]
     tables += ["default_safety"]
     assert public == {f"arm_{name}" for name in (*functions, *tables)}

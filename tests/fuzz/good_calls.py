@@ -206,6 +206,7 @@ def _supervised() -> dict[str, Call]:
     supervisor = Supervisor(library, law)
     return {
         "supervisor": (Supervisor, {"library": library, "controller": law, "safety": control.Safety.of(law)}),
+        "supervisor.check_start": (supervisor.check_start, {"q": q, "torque": q}),
         "supervisor.start": (supervisor.start, {"q": q, "command": q}),
         "supervisor.take_over": (supervisor.take_over, {"q": q, "command": q}),
         "supervisor.hold": (supervisor.hold, {"q": q, "command": q}),

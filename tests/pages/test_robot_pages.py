@@ -68,7 +68,10 @@ def test_ticks_of_how_to_pages_compile(page: str, library: GeneratedC, tmp_path:
 
 
 def test_controller_for_ros2_control_holds_moves_and_resumes(library: GeneratedC, tmp_path: Path) -> None:
-    """On stand-ins for ROS, around the library's own model; a missing measurement is 50 ticks long, a target is NaN."""
+    """On stand-ins for ROS, around the library's own model; a missing measurement is 50 ticks long, a target is NaN.
+
+    Efforts that are not those of the model, or none, are refused at the activation.
+    """
     folders = [f"-I{folder}" for folder in (STUBS / "ros2", ROS / "include", library.folder)]
     output_of("gcc", "-std=c99", "-O1", "-c", library.folder / "arm.c", "-o", tmp_path / "arm.o")
     sources = (ROS / "src" / "arm_controller.cpp", STUBS / "ros2" / "drive.cpp", tmp_path / "arm.o")
@@ -83,6 +86,8 @@ def test_controller_for_ros2_control_holds_moves_and_resumes(library: GeneratedC
         "without joints": "1",
         "first command": "A1/effort",
         "last state": "A7/effort",
+        "held by 100": "1",
+        "held by nan": "1",
         "held": f"{ok}",
         "moved": f"{ok}",
         "spoiled target": f"{ok}",

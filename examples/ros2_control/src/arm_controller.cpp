@@ -121,7 +121,18 @@ CallbackReturn ArmController::on_activate(const rclcpp_lifecycle::State & /*prev
     return CallbackReturn::ERROR;
   }
   const bool held = brakes_closed_;  // then no effort says what the arm needs
-  arm_start(&state_, q, ARM_COMMANDS_TORQUE && effort_states_ && !held ? effort : nullptr);  // NaN counts as not given
+  double mismatch[ARM_JOINTS];
+  const arm_status checked =
+      effort_states_ && !held ? arm_check_start(&arm_default_safety, q, effort, &arm_default_gains, mismatch) : ARM_OK;
+  for (int i = 0; i < ARM_JOINTS && checked == ARM_LOAD_MISMATCH; ++i)
+    if (std::fabs(mismatch[i]) > arm_default_safety.start_mismatch[i])
+      RCLCPP_ERROR(get_node()->get_logger(), "joint %s is held by %g more than its model says: wrong mounting or tool?",
+                   joints_[static_cast<std::size_t>(i)].c_str(), mismatch[i]);
+  if (checked != ARM_OK) {
+    RCLCPP_ERROR(get_node()->get_logger(), "refused to start: the efforts that hold the arm have status %d", checked);
+    return CallbackReturn::ERROR;
+  }
+  arm_start(&state_, q, ARM_COMMANDS_TORQUE && effort_states_ && !held ? effort : nullptr);
   if (held) arm_hold(&state_, q, nullptr);
   arm_reference_at(q, &reference_);
   std::copy_n(reference_.value, ARM_REFERENCE, target_.value.begin());

@@ -2,7 +2,7 @@
  *
  * Read it from top to bottom: constants; numbers; chart and dynamics; inverse map; then the supervised law: its modes as
  * a table, its boundary, its sensors, its references, its modes in code, the catcher, memory, one tick; and references
- * of programs. R1 to R30 are requirements; docs/reference/runtime.md says which tests check which.
+ * of programs. R1 to R31 are requirements; docs/reference/runtime.md says which tests check which.
  *
  * C99, no global variables, no heap, no input, no output. Every array has the size that orthocas_runtime.h says; local
  * arrays are places in `work`, which a caller owns.
@@ -43,25 +43,9 @@ static const struct {
 } rules = {
   .halvings = 20,
 #ifndef ORTHOCAS_CHART_ONLY
-  .turn = 6.283185307179586,
-  .longest = 1e6,
-  .implausible = 30.0,
-  .jitter = 0.01,
-  .alike = 0.2,
-  .stirring = 1e-3,
-  .standing = 0.1,
-  .room = 0.05,
-  .nearly = 0.2,
-  .slow = 1.0 / 3.0,
-  .settling = 0.5,
-  .giving = 0.02,
-  .learning = 2.0,
-  .lifted = 0.5,
-  .far_off = 0.1,
-  .deep = 0.5,
-  .forever = 1000000,
-  .bisections = 10,
-  .sweeps = 6,
+  .turn = 6.283185307179586, .longest = 1e6, .implausible = 30.0, .jitter = 0.01, .alike = 0.2, .stirring = 1e-3,
+  .standing = 0.1, .room = 0.05, .nearly = 0.2, .slow = 1.0 / 3.0, .settling = 0.5, .giving = 0.02, .learning = 2.0,
+  .lifted = 0.5, .far_off = 0.1, .deep = 0.5, .forever = 1000000, .bisections = 10, .sweeps = 6,
 #endif
 };
 
@@ -579,6 +563,7 @@ ORTHOCAS_API int orthocas_check_settings(const orthocas_arm *arm, const orthocas
         is_positive(arm, safety->brake_stiffness)))
     return 0;
   return all_from(-any, safety->lower, n, any) && all_from(-any, safety->upper, n, any) &&
+         all_from(0.0, safety->start_mismatch, n, any) &&
          all_from(0.0, safety->command_rate, n, any) && all_from(0.0, safety->speed_limit, n, any) &&
          all_from(0.0, safety->rest_speed, n, finite) && all_from(0.0, safety->stuck_speed, n, any) &&
          all_from(0.0, safety->reference_speed, n, any) && all_from(0.0, safety->reference_acceleration, n, any) &&
@@ -1192,6 +1177,28 @@ static void remember(const orthocas_arm *arm, orthocas_state *state, const ortho
 }
 
 /* ---- begin, resume, brakes ---- */
+
+/* R31: before anything moves, the torque that holds the arm at rest is the model's, within start_mismatch; else the
+ * mounting or the tool is another one. The fallback at the gains holds the arm; that of velocity laws is none, so gravity
+ * counts. */
+ORTHOCAS_API int orthocas_check_start(const orthocas_arm *arm, const orthocas_safety *safety, const double *q,
+                                      const double *torque, const void *gains, double *mismatch, double *work) {
+  const int n = arm->n;
+  double *holding = take(&work, n), *still = take(&work, n), *M = take(&work, n * n), *bias = take(&work, n);
+  int i, status = ORTHOCAS_OK;
+  set_zero(mismatch, n);
+  set_zero(still, n);
+  if (!orthocas_check_settings(arm, safety)) return ORTHOCAS_BAD_INPUT;
+  if (!all_within(q, n, arm->numbers.farthest) || !all_finite(arm, torque, n)) return ORTHOCAS_NOT_FINITE;
+  if (arm->torque) arm->kernels.fallback(q, gains, holding);
+  else arm->kernels.dynamics(q, still, M, bias, holding);
+  if (!all_finite(arm, holding, n)) return ORTHOCAS_NOT_FINITE;
+  for (i = 0; i < n; ++i) {
+    mismatch[i] = torque[i] - holding[i];
+    if (!(fabs(mismatch[i]) <= safety->start_mismatch[i])) status = ORTHOCAS_LOAD_MISMATCH;
+  }
+  return status;
+}
 
 static void begin(const orthocas_arm *arm, orthocas_state *state, const double *q, const double *command, double *work) {
   const int n = arm->n, is_position = all_within(q, n, arm->numbers.farthest);

@@ -28,7 +28,8 @@ enum {
   ORTHOCAS_TOO_FAST = 9,
   ORTHOCAS_LATE = 10,
   ORTHOCAS_HELD = 11,
-  ORTHOCAS_STOPPED_EARLY = 12
+  ORTHOCAS_STOPPED_EARLY = 12,
+  ORTHOCAS_LOAD_MISMATCH = 13
 };
 enum { ORTHOCAS_LAW = 0, ORTHOCAS_CATCHER = 1, ORTHOCAS_RETURN = 2, ORTHOCAS_HOLD = 3 };
 
@@ -138,7 +139,7 @@ typedef struct {
 /* Settings, as in NAME_safety, which says what they mean. */
 typedef struct {
   const double *command_rate, *speed_limit, *rest_speed, *stuck_speed;            /* (n,) */
-  const double *reference_speed, *reference_acceleration;                         /* (n,) */
+  const double *reference_speed, *reference_acceleration, *start_mismatch;        /* (n,) */
   const double *lower, *upper, *stop_stiffness;                                   /* (n,) */
   const double *observer_rate, *stop_zone, *stop_damping, *brake_yield;           /* (n,), null for velocity laws */
   const double *error_limit, *offset_rate, *integral_rate, *integral_limit;       /* (k,) */
@@ -197,8 +198,10 @@ ORTHOCAS_API double orthocas_difference(const orthocas_arm *arm, const double *f
 ORTHOCAS_API int orthocas_control(const orthocas_arm *arm, const double *q, const double *dq,
                                   const orthocas_reference *reference, const void *gains, double *command, double *work);
 
-/* The supervised law: see NAME_start to NAME_step. A state begins as zeros with the default settings. */
+/* The supervised law: see NAME_check_start to NAME_step. A state begins as zeros with the default settings. */
 ORTHOCAS_API int orthocas_check_settings(const orthocas_arm *arm, const orthocas_safety *safety);
+ORTHOCAS_API int orthocas_check_start(const orthocas_arm *arm, const orthocas_safety *safety, const double *q,
+                                      const double *torque, const void *gains, double *mismatch, double *work);
 ORTHOCAS_API void orthocas_start(const orthocas_arm *arm, orthocas_state *state, const double *q, const double *command,
                                  double *work);
 ORTHOCAS_API void orthocas_take_over(const orthocas_arm *arm, orthocas_state *state, const double *q,

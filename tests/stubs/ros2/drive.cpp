@@ -83,6 +83,11 @@ int main() {
   std::printf("first command %s\n", controller.command_interface_configuration().names.front().c_str());
   std::printf("last state %s\n", controller.state_interface_configuration().names.back().c_str());
   controller.assign_interfaces(std::move(commands), std::move(states));
+  for (const double wrong : {100.0, std::numeric_limits<double>::quiet_NaN()}) {
+    felt[1] = wrong;
+    std::printf("held by %.0f %d\n", wrong, controller.on_activate({}) == controller_interface::CallbackReturn::ERROR);
+  }
+  felt[1] = 0.0;
   if (controller.on_activate({}) != controller_interface::CallbackReturn::SUCCESS) return 1;
   std::printf("held %d\n", run(controller, 500));
 
