@@ -336,7 +336,7 @@ def _measure_union(solids: Sequence[Shape | Capsule], count: int = RULES.points)
         )
         # a point in k solids counts one k-th in each of them; those whose boxes are apart share none
         shared = np.ones(len(inside))
-        for other in np.flatnonzero(((low < high[k]) & (high > low[k])).all(axis=1)):
+        for other in np.flatnonzero(((low < high[k]) & (high > low[k])).all(axis=1)).tolist():
             if other != k:
                 parts = np.array_split(inside, max(1, len(inside) // RULES.chunk))
                 shared = shared + np.concatenate([solids[other].contains(part) for part in parts])
