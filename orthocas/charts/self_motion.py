@@ -290,13 +290,18 @@ class LevelCurve:
         """Points (K, n) and tangents up to what ends the curve between them, and what that is; None if nothing does."""
         doubtful = ~self._chart.domain.contains(q[1:])
         if signs is not None:
-            doubtful |= signs(q[1:], t[1:]) < 0
+            doubtful |= ~(signs(q[1:], t[1:]) >= 0)
         k = 0
         while k < len(q) - 1:
             # A step that may pass through a contact is halved.
             if self.walls.may_touch(q[k], t[k], q[k + 1], t[k + 1]):
                 ahead = q[k] + ((q[k + 1] - q[k]) @ t[k]) / 2 * t[k]
                 middle, onward = self._settle(target, ahead, t[k])
+                # Where the halves are no shorter, nothing tells what lies between.
+                if not max(np.linalg.norm(middle - q[k]), np.linalg.norm(q[k + 1] - middle)) < np.linalg.norm(
+                    q[k + 1] - q[k]
+                ):
+                    return q[: k + 1], t[: k + 1], Stop(StopKind.SINGULAR)
                 q, t = np.insert(q, k + 1, middle, axis=0), np.insert(t, k + 1, onward, axis=0)
                 doubtful = np.insert(doubtful, k, True)
                 continue
@@ -307,9 +312,10 @@ class LevelCurve:
         return None
 
     def _margin(self, q: Array, t: Array, signs: Signs | None) -> float:
-        """Positive before the end of the curve, negative beyond it."""
+        """Positive before the end of the curve, negative beyond it, and where nothing is finite."""
         fold = np.inf if signs is None else float(signs(q[None], t[None])[0])
-        return float(min(self.walls.values(q).min(), fold))
+        margin = float(np.append(self.walls.values(q), fold).min())
+        return -1.0 if np.isnan(margin) else margin
 
     def _end(self, target: Array, q: Array, t: Array, signs: Signs | None) -> tuple[Array, Array, Stop]:
         """The last point between two points (2, n) that is in the domain and before a fold, and what it meets.

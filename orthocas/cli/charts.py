@@ -157,19 +157,9 @@ def certify(
                 print_rows({"check": line, **loaded.certificate.facts()})
             raise typer.Exit(0 if holds and loaded.certificate.proved else _NOT_PROVED)
         # Prove, from where the file's certificate stopped; Ctrl-C keeps what is proved so far.
-        # the certificate in the file if there is more to prove, it is about the same bound, and it can be resumed
         saved = loaded.certificate
-        if (
-            saved is None
-            or saved.method not in METHODS
-            or not saved.digest
-            or saved.proved
-            or saved.fold
-            or (bound is not None and bound != saved.bound)
-        ):
-            resume = None
-        else:
-            resume = saved
+        resumable = saved is not None and saved.method in METHODS and saved.digest and not (saved.proved or saved.fold)
+        resume = saved if resumable and saved and bound in (None, saved.bound) else None
         try:
             certificate = certificates.certify(
                 loaded,
