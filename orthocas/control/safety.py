@@ -48,6 +48,9 @@ class SafetyRules:
     friction: float = 2.0  #: that may hold a joint at a start beside its torque [N m] or [N]
     most_friction: float = 12.5  #: and most that may hold it against the law, later [N m] or [N]
     stiction: float = 0.125  #: likewise, as a share of the effort limit: Coulomb friction of 10 %, a quarter more at rest
+    fine_step: float = 2 * np.pi / 2**13  #: of an encoder [rad]
+    observer: float = 60.0  #: poles of the observer of velocities for that step, at most twice that for finer ones [1/s]
+    turn_per_metre: float = 40 * np.pi  #: encoders of sliding joints turn once in 5 cm [rad/m]
     error: float = 0.02  #: of models and torque sensors, as a share of the effort limit; without one, of gravity
 
 
@@ -89,7 +92,9 @@ class Safety:
     ]
     stuck_speed: Annotated[Array, "speed that an arm which measures the same may get [rad/s]; velocity laws: way [rad]"]
     longest_period: Annotated[float, "between two ticks; later ones call the catcher [s]"]
-    observer_rate: Annotated[Array, "poles of an observer of velocities, for coarse encoders [1/s]; 0: as measured"]
+    observer_rate: Annotated[
+        Array, "poles of an observer of velocities, for coarse encoders [1/s]; 0: as measured; default by encoder_step"
+    ]
     encoder_step: Annotated[Array, "what an encoder rounds to, which that observer does not take for motion [rad] or [m]"]
     friction: Annotated[Array, "dry friction that may hold a joint, whose sensors then measure the same [N m]"]
     lower: Annotated[Array, "joint limits [rad] or [m]"]
@@ -206,6 +211,11 @@ class Safety:
         if unknown:
             raise InvalidValueError("setting", repr(unknown[0]), f"one of {', '.join(settings)}")
         spread = {name: _spread(name, value, settings[name]) for name, value in changes.items()}
+        # Coarse encoders need an observer of velocities, and the coarser they are, a slower one.
+        if "encoder_step" in spread and "observer_rate" not in spread:
+            fine = np.where(robot.tree.prismatic, RULES.fine_step / RULES.turn_per_metre, RULES.fine_step)
+            coarseness = np.asarray(spread["encoder_step"]) / fine
+            spread["observer_rate"] = np.where(coarseness > 0, RULES.observer * np.maximum(coarseness, 0.25) ** -0.5, 0)
         rate = float(np.asarray(spread.get("integral_rate", 0.0), dtype=float).max(initial=0.0))
         if rate > 0 and rate > (bound := getattr(controller, "integral_bound", np.inf)):
             raise InvalidValueError("integral_rate", rate, f"at most {bound:.3g}/s, which the slowest mode bears")
