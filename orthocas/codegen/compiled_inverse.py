@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike
 from orthocas.charts.chart import Chart
 from orthocas.charts.curve_tracer import RULES
 from orthocas.charts.curves import Nearest, SelfMotionCurves
-from orthocas.charts.inverse import Inverse, Solutions
-from orthocas.charts.methods import solve_with, targets_of_wish
+from orthocas.charts.inverse import Inverse, Solutions, build_phi_of_wish, solve_rows
 from orthocas.charts.newton import NEWTON, Attempt, Newton
 from orthocas.codegen.compiled import keep_library, load_library
 from orthocas.codegen.generate import generate_c
@@ -54,11 +53,11 @@ class CompiledInverse(Shown):
         self, phi: ArrayLike, q_start: ArrayLike | None = None, *, tolerance: float = 1e-9, inside: bool = False
     ) -> Solutions:
         """Solve like `Chart.solve`: the same status for each row and the same q to 1e-9, unless starts are far away."""
-        return solve_with(self._parts, self.chart, phi, q_start, tolerance, inside)
+        return solve_rows(self.chart, self._parts, phi, q_start, tolerance, inside)
 
     def nearest_xi(self, q_wish: ArrayLike, x: ArrayLike | None = None, *, tolerance: float = 1e-9) -> Solutions:
         """Solve like `Chart.nearest_xi`."""
-        phi, wishes = targets_of_wish(self.chart, q_wish, x)
+        phi, wishes = build_phi_of_wish(self.chart, q_wish, x)
         return self.solve(phi, wishes, tolerance=tolerance, inside=True)
 
     @cached_property
