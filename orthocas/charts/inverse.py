@@ -546,8 +546,8 @@ class Inverse:
         solved = np.flatnonzero(largest(attempt.residual) <= tolerance)
         status = np.full(len(attempt.q), int(InverseStatus.NOT_FOUND))
         status[solved] = InverseStatus.FOUND
-        outside = solved[~self.problem.domain.contains(attempt.q[solved])]
-        if outside.size:
+        doubtful = solved if attempt.inside is None else solved[~attempt.inside[solved]]
+        if doubtful.size and (outside := doubtful[~self.problem.domain.contains(attempt.q[doubtful])]).size:
             # within the joint limits, or beyond
             q, robot, slack = attempt.q[outside], self.problem.robot, RULES.slack * self.problem.domain.half_width
             allowed = ((q >= robot.lower - slack) & (q <= robot.upper + slack)).all(axis=1)
