@@ -19,6 +19,7 @@ from orthocas.charts.certificate import ELIMINATION, PROVED, Certificate, Subdiv
 from orthocas.charts.chart_file import fingerprint
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import CertifyError, ChartFileError
+from orthocas.tasks.corridor import Corridor
 
 
 def two_joints() -> oc.Robot:
@@ -129,7 +130,7 @@ def test_a_corridor_beyond_the_first_turn_is_not_proved_by_the_box() -> None:
     """Its path is at q1 = 7; in the box, q1 ends at pi, and all of it is far from the path."""
     known = problems.get("planar_3r_xy")
     box = oc.Box([0.0, 0.8, 0.8], [np.pi, 0.3, 0.3], [0])
-    corridor = oc.Corridor(box, [[7.0, 0.8, 0.8], [7.2, 0.8, 0.8]], [0.2, 0.2, 0.2])
+    corridor = Corridor(box, [[7.0, 0.8, 0.8], [7.2, 0.8, 0.8]], [0.2, 0.2, 0.2])
     assert corridor.contains([7.1, 0.8, 0.8])
     free = oc.fit(oc.Problem(known.robot, known.task, domain=box), oc.Linear()).chart
     chart = oc.Chart(oc.Problem(known.robot, known.task, domain=corridor), free.coordinates)

@@ -35,8 +35,9 @@ from orthocas.charts.regular_part import RegularPart
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.errors import CompileError
 from orthocas.fitting.loss import loss
-from orthocas.paths import corridor_problem
+from orthocas.paths import corridor_problem, read_joints
 from orthocas.robots.collisions import Collisions
+from orthocas.tasks.corridor import Corridor
 from orthocas.tasks.domains import default_box
 from orthocas.tasks.metric import Metric
 from orthocas.viewer.session import Session
@@ -245,7 +246,7 @@ def _makers() -> dict[str, Call]:
         "Robot.from_model": (oc.Robot.from_model, {"model": None, "tip": "tip", "locked": {}}),
         "Robot": (oc.Robot, {"tree": robot.tree, "homes": {"a": q}}),
         "Box": (oc.Box, {"centre": q, "half_width": 0.3, "unbounded": [0]}),
-        "Corridor": (oc.Corridor, {"box": oc.Box(q, 0.5), "postures": [q, q + 0.1], "radius": 0.2}),
+        "Corridor": (Corridor, {"box": oc.Box(q, 0.5), "postures": [q, q + 0.1], "radius": 0.2}),
         "corridor_problem": (
             corridor_problem,
             {"problem": planar(), "postures": [q, q + 0.1], "radius": 0.2, "margin_deg": 1.0},
@@ -469,7 +470,7 @@ def _methods() -> dict[str, Call]:
             oc.follow,
             {"chart": chart, "tool_path": chart.x([q, q + 0.05]), "xi": "objective", "velocity_limits": 1.0},
         ),
-        "read_joints": (oc.read_joints, {"path": "no.csv", "robot": robot, "topic": "/arm"}),
+        "read_joints": (read_joints, {"path": "no.csv", "robot": robot, "topic": "/arm"}),
         "motion.save_csv": (joint_motion().save_csv, {"path": "motion.csv"}),
         "Sphere": (oc.obstacles.Sphere, {"centre": q, "radius": 0.1}),
         "Capsule": (oc.obstacles.Capsule, {"start": q, "end": -q, "radius": 0.1}),
