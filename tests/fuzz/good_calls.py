@@ -28,7 +28,7 @@ from public_objects import (
 import orthocas as oc
 from orthocas import bases, control, learn, problems, simulation, solvers, viewer
 from orthocas.bases import cyclic_joints
-from orthocas.certificates import certified_box, check_certificate
+from orthocas.certificates import check_certificate
 from orthocas.charts.chart import GrownChart
 from orthocas.charts.figures import quality_figure, self_motion_figure
 from orthocas.charts.regular_part import RegularPart
@@ -343,7 +343,6 @@ def _functions() -> dict[str, Call]:
         ),
         "bounded fit": (oc.fit, {**box, "solver": None, "samples": 50, "max_mutual_deg": None}),
         "certify": (oc.certify, {"chart": chart, "bound": 0.0, "time_limit": 0.0, "executor": None, "resume": None}),
-        "certified_box": (certified_box, {"chart": chart, "bound": 0.0, "time_limit": 5.0, "executor": None}),
         "check_certificate": (check_certificate, {"chart": chart, "certificate": None, "executor": None}),
         "check": (oc.check, {"problem": problem, "samples": 50, "seed": 1}),
         "cyclic_joints": (cyclic_joints, {"problem": problem}),
