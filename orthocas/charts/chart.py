@@ -542,7 +542,7 @@ class Chart(Shown):
         """
         from orthocas.charts.figures import self_motion_figure  # with matplotlib, which takes long to import
 
-        return self_motion_figure(self, reach=None)
+        return self_motion_figure(self)
 
     def save(self, path: str | Path, force: bool = False, collisions: Collisions | None = None) -> None:
         """Write a self-contained chart file. It replaces a chart file of that name, and with `force` any other file.

@@ -59,16 +59,14 @@ class ChartParts:
     def _build_function(self, name: str) -> ca.Function:
         """A function of `FUNCTIONS` by name."""
         task = self.chart.problem.task
-        if name in ("task", "task_jacobian"):
-            return task.function if name == "task" else task.jacobian_function
+        if name == "task":
+            return task.function
+        if name == "task_jacobian":
+            return task.jacobian_function
+        if name == "manipulability":
+            return task.manipulability_function
         q, v, w = (ca.MX.sym(symbol, self.chart.n) for symbol in ("q", "v", "w"))
         inputs = {"q": q}
-        if name == "manipulability":
-            # sqrt(det(J J^T)) is the product of the diagonal of the Cholesky factor
-            J = task.frame_jacobian_function(q)
-            product = ca.SX.sym("P", J.shape[0], J.shape[0])
-            volume = ca.Function("volume", [product], [ca.det(ca.diag(ca.diag(ca.chol(product))))])
-            return ca.Function(name, [q], [volume(J @ J.T)], ["q"], [name])
         # task first, then coordinates
         own = self.chart.coordinates.functions
         if name == "inverse":

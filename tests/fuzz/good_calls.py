@@ -189,7 +189,7 @@ def _views() -> dict[str, Call]:
         "cyclic_motions": (viewer.cyclic_motions, {"chart": chart, "path": [x, x + 0.05, x], "cycles": 1}),
         "Session": (Session, {"chart": chart, "q": q}),
         "session.wish": (session.wish, {"values": {"xi1": 0.1}}),
-        "chart.plot": (lambda postures: self_motion_figure(chart, postures, None), {"postures": 3}),
+        "chart.plot": (lambda postures: self_motion_figure(chart, postures), {"postures": 3}),
     }
 
 
@@ -406,7 +406,7 @@ def _functions() -> dict[str, Call]:
         "to data": (bases.parametrisation_to_data, {"parametrisation": oc.Polynomial(2)}),
         "solvers.get": (solvers.get, {"name": "lbfgs"}),
         "problems.get": (problems.get, {"name": "planar_2r"}),
-        "self_motion_figure": (self_motion_figure, {"chart": chart, "postures": 2, "reach": 0.1}),
+        "self_motion_figure": (self_motion_figure, {"chart": chart, "postures": 2}),
         "quality_figure": (quality_figure, {"report": None}),
     }
 
