@@ -149,7 +149,7 @@ ARMS = {
         "Unitree G1, left arm",
         "g1_description/urdf/g1_29dof_rev_1_0.urdf",
         "--tip left_rubber_hand --lock waist_yaw_joint=0 --lock waist_roll_joint=0 --lock waist_pitch_joint=0",
-        f"{GITHUB}/unitreerobotics/unitree_ros",
+        f"{GITHUB}/unitreerobotics/unitree_ros/tree/master/robots/g1_description",
         BSD,
         "Unitree Robotics",
     ),

@@ -35,7 +35,7 @@ class FitRules:
 
     least_samples: int = 1000  #: of bases
     residuals: int = 140  #: per coefficient, for which samples are drawn beyond these
-    residuals_in_metric: int = 70  #: the same in another metric than the identity: half the time, leaks of the same size
+    residuals_in_metric: int = 70  #: the same in another metric than the identity: leaks are of the same size
     renewal_in_metric: float = 0.95  #: of the matrix of QuasiNewton there, where losses fall along long valleys
     tolerance_of_many: float = 1e-3  #: of the solver for many joints: half the time, and leaks are 2 % larger
     residuals_of_many: int = 100  #: the same for coordinates of many joints, and nothing beyond them
