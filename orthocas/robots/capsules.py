@@ -141,17 +141,17 @@ def build_rods(tree: KinematicTree, radius: ArrayLike) -> Collisions:
     ends: dict[tuple[int, int | str], Array] = {}
     for frame in (tree.tip, *map(tree.frame, tree.tips)):
         for start, end in pairwise(tree.carriers(frame.parent)):
-            if tree.joint_names[end] not in BASE_JOINTS:
+            if tree.body_joints[end] not in BASE_JOINTS:
                 ends[start, end] = np.asarray(tree.translations[end])
         ends[frame.parent, frame.name] = np.asarray(frame.translation)
     parts = []
     for (body, _), far in ends.items():
         if body < 0:
             continue
-        length, thick = float(np.linalg.norm(far)), float(radii[body])
+        length, thick = float(np.linalg.norm(far)), float(radii[tree.leaders[body]])
         solid: Geometry = BallGeometry(thick) if length < RULES.point else CapsuleGeometry(thick, length)
         turn = np.eye(3) if length < RULES.point else rotate_z_to(far / length)
-        parts.append(Part(f"link of {tree.joint_names[body]}", body, Shape(solid, turn, far / 2)))
+        parts.append(Part(f"link of {tree.body_joints[body]}", body, Shape(solid, turn, far / 2)))
     return Collisions(tree, parts, (), origin="rods")
 
 
