@@ -90,6 +90,7 @@ def render_distance(fitted: FittedCapsules, values: Mapping[str, Any], precision
         "n": tree.n,
         "ratio": f"{fitted.ratio:.2f}",
         "missing": clean_word(listed(model.missing)) if model.missing else "",
+        "dropped": clean_word(listed([f"{a} and {b}" for a, b in fitted.dropped])) if fitted.dropped else "",
         "pair_count": len(model.pairs),
         "names": [[_quote(name) for name in pair] for pair in model.pairs],
         "parents": tree.parents,

@@ -32,7 +32,7 @@ from orthocas.robots.pinocchio_model import (
     lock_off_chain,
     read_model_postures,
 )
-from orthocas.robots.tree import PRISMATIC_ROOM, KinematicTree
+from orthocas.robots.tree import KinematicTree
 from orthocas.robots.urdf import find_robot_file, read_srdf_postures, read_urdf
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import BuiltOnUse, cached_property
@@ -506,13 +506,7 @@ class Robot(Shown):
 
         Joints without limits take a whole turn, or half a metre.
         """
-        width = np.where(self.tree.prismatic, 2 * PRISMATIC_ROOM, 2 * np.pi)
-        low = np.where(
-            np.isfinite(self.lower), self.lower, np.where(np.isfinite(self.upper), self.upper - width, -width / 2)
-        )
-        high = np.where(np.isfinite(self.upper), self.upper, low + width)
-        rng = np.random.default_rng(require_count("seed", seed, least=0))
-        return np.asarray(rng.uniform(low, high, (require_count("count", count), self.n)))
+        return self.tree.draw_postures(require_count("count", count), require_count("seed", seed, least=0))
 
     def frame_position(self, q: Any, frame: str, relative_to: str | None = None) -> Any:
         """Position of a frame in the world, or in another frame, (3,) [m].

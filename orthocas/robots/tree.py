@@ -284,6 +284,14 @@ class KinematicTree:
         posture[limited] = (self.lower[limited] + self.upper[limited]) / 2
         return np.asarray(posture)
 
+    def draw_postures(self, count: int, seed: int) -> Array:
+        """Uniform postures between the limits, (count, n); joints without limits take a turn, or half a metre."""
+        width = np.where(self.prismatic, 2 * PRISMATIC_ROOM, 2 * np.pi)
+        upwards = np.where(np.isfinite(self.upper), self.upper - width, -width / 2)
+        low = np.where(np.isfinite(self.lower), self.lower, upwards)
+        high = np.where(np.isfinite(self.upper), self.upper, low + width)
+        return np.random.default_rng(seed).uniform(low, np.maximum(low, high), (count, self.n))
+
     @property
     def prismatic(self) -> tuple[bool, ...]:
         """Whether each joint is prismatic."""
