@@ -56,7 +56,7 @@ def write(folder: Path, robot: oc.Robot, fitted: FittedCapsules, **options: bool
 
 
 def compare(compiled: Compiled, model: Collisions, q: Array, tolerance: float) -> None:
-    """The same as coal's for the same solids, whose nearest points are good to some 1e-6 where axes are nearly parallel."""
+    """The same as coal's for the same solids, whose points are good to some 1e-6 where axes are nearly parallel."""
     wanted = model.distance(q)
     errors = []
     for k, posture in enumerate(q):
