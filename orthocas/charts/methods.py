@@ -383,6 +383,13 @@ def solve_with(
 def build_phi(chart: InverseMethods, phi: ArrayLike | None, x: Any, xi: ArrayLike | None) -> ArrayLike:
     """Target values of phi: those given, or [x; xi]."""
     if phi is not None and x is None and xi is None:
+        # What people hold is often a pose.
+        matrix = isinstance(phi, np.ndarray) and phi.shape[-2:] == (4, 4) and chart.n != 4
+        if matrix or hasattr(phi, "homogeneous"):
+            instead = (
+                f"{chart.n} numbers; solve(x=pose, xi=...) takes a pose with xi, and nearest_xi(q, pose) one alone"
+            )
+            raise InvalidValueError("phi", "a pose", instead)
         return phi
     if phi is not None or x is None or xi is None:
         given = listed(name for name, value in (("phi", phi), ("x", x), ("xi", xi)) if value is not None)

@@ -33,7 +33,7 @@ from orthocas.robots.pinocchio_model import (
     read_model_postures,
 )
 from orthocas.robots.tree import KinematicTree
-from orthocas.robots.urdf import find_robot_file, read_srdf_postures, read_urdf
+from orthocas.robots.urdf import find_robot_file, list_robot_files, read_srdf_postures, read_urdf
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import BuiltOnUse, cached_property
 from orthocas.tools.checks import (
@@ -167,6 +167,8 @@ class Robot(Shown):
     ) -> Self:
         """Build the joints that move the tips from a URDF file; see `from_file`."""
         file, names = as_path("path", path), _check_tips(tip, tips)
+        if not file.suffix and not file.exists() and file.name in list_robot_files():
+            raise RobotError(f"cannot read URDF file {file}: no such file; Robot.from_name('{file}') knows this name")
         robot = cls._from_chain(*read_urdf(file), names, locked, tool, base, gravity)
         source = CollisionSource(file.absolute(), None, dict(locked or {}))
         return cls(robot.tree, read_srdf_postures(file, robot.joint_names), source)

@@ -80,10 +80,8 @@ class Problem(Shown):
         least_singular_value: float | None = None,
     ) -> None:
         # Robot and task belong together, and the task leaves some freedom.
-        if not isinstance(task, Task) or not isinstance(robot, Robot):
-            raise InvalidValueError(
-                "robot and task", f"{type(robot).__name__} and {type(task).__name__}", "Robot and Task"
-            )
+        require_kind("robot", robot, Robot)
+        require_kind("task", task, Task)
         if task.robot is not robot:
             raise InvalidValueError("task", f"a task of another robot ({task.name})", "a task built on the same robot")
         if task.m >= robot.n - len(robot.tree.floating):
