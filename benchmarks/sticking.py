@@ -32,16 +32,16 @@ from orthocas.errors import OrthocasError
 from orthocas.simulation import Friction, StickingPlant
 from orthocas.tools.checks import Array
 
-READY = ("panda", "xarm7", "iiwa7", "baxter-left", "tiago-pro-left")
+READY = ("panda", "xarm7", "iiwa7", "tiago-pro-left")
 FITTED = ("sawyer", "gen3")
 CHARTS = (
     *(f"{name}-{kind}" for name in READY for kind in ("wide", "pose")),
-    *("pr2-left-wide", "sawyer-wide", "gen3-wide"),
+    *("baxter-left-wide", "pr2-left-wide", "sawyer-wide", "gen3-wide"),
 )
 TICK, BEFORE, SECONDS, LONG, STILL = 1e-3, 0.3, 5.0, 60.0, 1.0  # [s]
 NEAR = 0.5, 0.02  # [mm], of xi
 STANDS, SLOW, TIMESTEP = 1e-4, 1e-6, 5e-4  # [rad/s]; change of the correction in a tick [N m]; of the plant [s]
-WAY, BREAKING, HELD, DRAWS = 0.3, 1.25, 0.7, 20_000
+WAY, BREAKING, HELD, ROOM, DRAWS = 0.3, 1.25, 0.7, 0.8, 20_000
 HEADER = "| chart | case | x off [mm] | xi off | there after [s] |\n| --- | --- | --- | --- | --- |"
 LOST = np.inf, np.inf, np.nan
 
@@ -114,7 +114,9 @@ def find_start(chart: oc.Chart) -> Array:
     for q in draws[(np.abs(robot.gravity(draws)) < HELD * robot.effort_limits).all(axis=1)]:
         phi, place, steps = chart.phi(q), q, 10
         for step in range(steps + 1):
-            if not domain.contains(place) or (np.abs(robot.gravity(place)) > HELD * robot.effort_limits).any():
+            # With room to the boundary, where arms that jump off friction are caught.
+            roomy = domain.contains(domain.centre + (place - domain.centre) / ROOM)
+            if not roomy or (np.abs(robot.gravity(place)) > HELD * robot.effort_limits).any():
                 break
             if step == steps:
                 return np.asarray(q)
