@@ -302,7 +302,7 @@ def keep_clear(names: list[str], ticks: int, found: dict[str, float]) -> Iterato
             problem = oc.Problem(robot, oc.Task.position(robot, "x"), domain=oc.Box(middle, 0.1))
             chart, goals = oc.fit(problem, oc.Linear(), samples=300).chart, robot.sample(ticks // LEG, 5)
         fitted = oc.fit_capsules(own)
-        free = goals[fitted.collisions.distance(goals).distance > 2 * MARGIN]
+        free = goals[fitted.collisions.distance(goals).distance > 1.5 * MARGIN]
         around, scene = put_post(own, chart.robot, free[0])
         if scene is not None:
             fitted = replace(fitted, collisions=fitted.collisions.with_scene(scene))
