@@ -34,7 +34,9 @@ from orthocas.tools.checks import Array
 
 READY = ("panda", "xarm7", "iiwa7", "baxter-left", "tiago-pro-left", "pr2-left")
 FITTED = ("sawyer", "gen3")
-CHARTS = tuple(f"{name}-{kind}" for name in READY for kind in ("wide", "pose")) + tuple(f"{name}-wide" for name in FITTED)
+CHARTS = tuple(f"{name}-{kind}" for name in READY for kind in ("wide", "pose")) + tuple(
+    f"{name}-wide" for name in FITTED
+)
 TICK, BEFORE, SECONDS, LONG, STILL = 1e-3, 0.3, 5.0, 60.0, 1.0  # [s]
 REST, STANDS, SLOW = 5e-2, 1e-4, 1e-6  # [rad/s], twice; change of the correction in a tick [N m]
 WAY, BREAKING, HELD, DRAWS = 0.3, 1.25, 0.7, 20_000
@@ -122,7 +124,9 @@ def find_start(chart: oc.Chart) -> Array:
     raise OrthocasError(f"no start in {DRAWS} draws")
 
 
-def lead(law: PDPlus, supervisor: Supervisor, plant: StickingPlant, q: Array, seconds: float) -> tuple[float, float, float]:
+def lead(
+    law: PDPlus, supervisor: Supervisor, plant: StickingPlant, q: Array, seconds: float
+) -> tuple[float, float, float]:
     """Errors of x [mm] and of xi after some seconds, infinite if the arm is lost, and when it rests (NaN: never)."""
     chart, robot = law.chart, law.problem.robot
     start, label = chart.phi(q), chart.labels[chart.m]
