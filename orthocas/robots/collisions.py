@@ -22,6 +22,7 @@ from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
     Array,
+    Flags,
     Indices,
     as_float_array,
     as_number,
@@ -347,7 +348,7 @@ class Collisions(Shown):
             ]
         return Collisions(self.tree, (*self.parts, *parts), pairs, self.missing, self.origin)
 
-    def scan_near(self, points: Array, least: float, asked: Array) -> Iterator[tuple[int, float]]:
+    def scan_near(self, points: Array, least: float, asked: Flags) -> Iterator[tuple[int, float]]:
         """Pairs that are nearer than some distance, with their distances, at postures (N, n).
 
         Args:
