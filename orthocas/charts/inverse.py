@@ -197,6 +197,13 @@ def solve_rows(
 def build_phi(chart: Chart, phi: ArrayLike | None, x: Any, xi: ArrayLike | None) -> ArrayLike:
     """Target values of phi: those given, or [x; xi]."""
     if phi is not None and x is None and xi is None:
+        # What people hold is often a pose.
+        matrix = isinstance(phi, np.ndarray) and phi.shape[-2:] == (4, 4) and chart.n != 4
+        if matrix or hasattr(phi, "homogeneous"):
+            instead = (
+                f"{chart.n} numbers; solve(x=pose, xi=...) takes a pose with xi, and nearest_xi(q, pose) one alone"
+            )
+            raise InvalidValueError("phi", "a pose", instead)
         return phi
     if phi is not None or x is None or xi is None:
         given = listed(name for name, value in (("phi", phi), ("x", x), ("xi", xi)) if value is not None)
@@ -335,11 +342,11 @@ def beyond_reach(task: Task, x: Array) -> NDArray[np.bool_]:
     if not task.of_tip or not columns:
         return np.zeros(len(x), dtype=bool)
     # place of the first joint that moves the tip, (3,), and the largest distance of the tip from it [m]
-    chain = task.robot.tree.carriers(task.robot.tree.tip_parent)
-    offsets = [*task.robot.tree.translations[chain], task.robot.tree.tip_translation]
-    strokes = np.maximum(np.abs(task.robot.tree.lower[chain]), np.abs(task.robot.tree.upper[chain]))[
-        np.array(task.robot.tree.prismatic)[chain]
-    ]
+    tree = task.robot.tree
+    chain = tree.carriers(tree.tip_parent)
+    offsets = [*tree.translations[chain], tree.tip_translation]
+    slides = [i for i in chain if tree.body_kinds[i] == "prismatic"]
+    strokes = np.maximum(np.abs(tree.expand(tree.lower)), np.abs(tree.expand(tree.upper)))[slides]
     origin, length = offsets[0], float(sum(np.linalg.norm(offset) for offset in offsets[1:]) + strokes.sum())
     away = x[:, columns] - origin[["xyz".index(task.labels[k]) for k in columns]]
     return np.asarray(np.linalg.norm(away, axis=1) > (1 + RULES.rounding) * length)

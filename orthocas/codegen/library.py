@@ -337,7 +337,7 @@ def _build_state(
     counts = ("mode", "cause", "asked", "bad_ticks", "fresh", "stale_ticks", "same_ticks")
     names = ("q", "dq", "seen_q", "seen_dq", "command", "led", "impulse", "impulse_from", "law", "anchor", "safe")
     layout: dict[str, Any] = dict.fromkeys(counts, ctypes.c_int)
-    layout |= dict.fromkeys(("weight", "brake", "unseen"), number)
+    layout |= dict.fromkeys(("weight", "brake", "unseen", "hasty"), number)
     layout |= dict.fromkeys(names, joints) | dict.fromkeys(("offset", "integral"), quantities)
     if has_spring:
         layout |= dict.fromkeys(("load", "drive", "speed"), joints) | {"inertia": number * n**2}

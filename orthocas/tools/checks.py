@@ -210,7 +210,18 @@ def require_kind(name: str, value: object, kind: type) -> None:
     if not isinstance(value, kind):
         plain = isinstance(value, str | int | float | None)
         received = repr(value)[:80] if plain else f"a {type(value).__name__}"
-        raise InvalidValueError(name, received, f"a {kind.__name__}{suggest_attribute(value, kind)}")
+        hint = suggest_attribute(value, kind) or _MAKERS.get(kind.__name__, "")
+        raise InvalidValueError(name, received, f"a {kind.__name__}{hint}")
+
+
+#: by class: how to make one, for the end of a message
+_MAKERS = {
+    "Task": ", such as oc.Task.pose(robot)",
+    "Problem": ", such as oc.Problem(robot, task), or oc.problems.get(name)",
+    "Robot": ", such as oc.Robot.from_name(name), or oc.Robot.from_urdf(path)",
+    "KinematicTree": ": oc.Robot.from_name(name) and oc.Robot.from_urdf(path) build a robot",
+    "Chart": ", such as oc.load(path), or oc.fit(problem).chart",
+}
 
 
 def suggest_attribute(value: object, kind: type) -> str:
