@@ -40,7 +40,6 @@ class SearchRules:
     most: int = 32  #: iterations from a cell
     patience: int = 3  #: of these, within which the error must halve
     cell_rows: int = 1024  #: whose starts in cells are held in memory
-    same: float = 1e-6  #: half-widths up to which two solutions count as one
 
 
 RULES = SearchRules()
@@ -281,21 +280,15 @@ class InDomain:
             u[rows], error[rows] = self._searched(targets[rows], tolerance)
         return self.boxed.points(u), np.asarray(error <= tolerance)
 
-    def all_solutions(self, target: Array, tolerance: float) -> Array:
-        """Different solutions for a target (n,), that nearest to the centre first, (k, n)."""
+    def find_all(self, target: Array, near: Array, tolerance: float) -> Array:
+        """Solutions inside for a target (n,), some several times, (k, n); also from positions (S, n) near solutions."""
         places = self.cells.places(target[None])
         # starts: the place in each cell that may hold a solution, and samples around it
         likely = np.flatnonzero(places.overshoot[0] <= RULES.margin)
         more = self.cells.samples(np.broadcast_to(target, (len(likely), len(target))), likely, RULES.all)
-        starts = np.vstack([places.start[0, likely], more.reshape(-1, len(target))])
+        starts = np.vstack([self.boxed.of_points(near), places.start[0, likely], more.reshape(-1, len(target))])
         u, error = self._solved(np.broadcast_to(target, starts.shape), starts, tolerance)
-        u = u[error <= tolerance]
-        different: list[Array] = []
-        # solutions that differ, the nearest to the centre first
-        for row in u[np.argsort(np.linalg.norm(u, axis=1))]:
-            if all(np.abs(row - other).max() > RULES.same for other in different):
-                different.append(row)
-        return self.boxed.points(np.array(different).reshape(-1, len(target)))
+        return self.boxed.points(u[error <= tolerance])
 
     def _searched(self, targets: Array, tolerance: float) -> tuple[Array, Array]:
         """The best points u (N, n), and their errors (N,)."""

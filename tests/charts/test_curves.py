@@ -33,6 +33,20 @@ def test_no_random_start_leads_to_a_nearer_xi(name: str) -> None:
     assert known > 20 * len(x)
 
 
+@pytest.mark.parametrize("name", ["panda-wide", "iiwa7-pose"])
+def test_all_solutions_on_curves_are_those_of_a_search_in_cells(name: str) -> None:
+    """The other search of the domain, with 17 starts in each of up to 1,024 cells."""
+    chart = oc.charts.load(name)
+    in_domain = chart.parts.inverse.in_domain
+    assert in_domain is not None
+    for q in sample_uniform(chart.problem.domain, 5, 8):
+        found, others = chart.solutions(chart.phi(q)), in_domain.find_all(chart.phi(q), q[None], 1e-9)
+        assert len(others) > 0
+        assert all(np.abs(found - other).max(axis=1).min() < 1e-6 for other in others)
+        assert all(np.abs(others - own).max(axis=1).min() < 1e-6 for own in found)
+        np.testing.assert_allclose(chart.phi(found), np.tile(chart.phi(q), (len(found), 1)), atol=1e-8)
+
+
 @pytest.mark.slow
 def test_few_random_starts_lead_to_a_nearer_xi_where_curves_fill_surfaces() -> None:
     """With r = 2, slices show most of the self-motions: of 800 wishes, 4,000 starts led nearer in one of a hundred."""
