@@ -46,7 +46,7 @@ class ChartKernelRules:
     rounds: int = 12  #: of a descent, at most
     far_rounds: int = 4  #: of them, those with an error above `near`
     gain: float = 1e-9  #: relative decrease of the squared error below which it is a minimum
-    near: float = 1e-3  #: error of x below which the last posture with a chart does not count
+    near: float = 3e-4  #: error of x below which the last posture with a chart does not count
     decrease: float = 1e-4  #: of the cost, relative to what a step promises
     enough: float = 1e-2  #: relative decrease of the cost below which a far arm leaves the rest to the next call
     falls: float = 0.9  #: of an error at the end of a window, relative to that at its begin, where the arm is not stuck
@@ -57,6 +57,8 @@ class ChartKernelRules:
     flattest: float = 2.0  #: least curvature that counts, in errors: less would amplify the tremor of a hand
     calms: float = 0.8  #: factor of it for each call since the target moved
     saddle: float = 0.02  #: slope of the error, relative to its curvature, below which a posture is next to a saddle
+    onward: float = 0.3  #: step across a saddle of the last call, in the largest steps of joints, that goes on
+    unstable: float = 0.1  #: curvature along which a saddle falls, in errors, that any side is better than none
     astride: float = 0.05  #: step to a side of a saddle
     largest: float = 0.7  #: norm of a step of Newton's method
     in_chart: int = 10  #: rounds of it at a tick in the chart
