@@ -1,14 +1,10 @@
 """A million joint positions: time per row of phi, xi and the Jacobian of a chart, and of the modules it exports.
 
-The C is that of `generate_c(..., rows=True)`, compiled for this processor.
-
 Rows of PyTorch and JAX appear where they are installed. Every figure is the best of three runs. `--quick` takes 1,000
 rows.
 """
 
-import ctypes
 import importlib.util
-import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +17,6 @@ from benchmark import run, table
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.codegen.library import find_compilers
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
 
@@ -63,21 +58,7 @@ def functions(chart: oc.Chart, points: Array, folder: Path) -> dict[str, dict[st
         found |= of_torch(exported(chart, "torch", folder), points)
     if importlib.util.find_spec("jax"):
         found["JAX, jit, float64"] = of_jax(exported(chart, "jax", folder), points)
-    return found | of_c(chart, points, folder)
-
-
-def of_c(chart: oc.Chart, points: Array, folder: Path) -> dict[str, dict[str, Callable[[], Any]]]:
-    """Rows of phi in generated C, in one thread."""
-    generated, library = oc.generate_c(chart, folder / "c", name="arm", rows=True), folder / "c" / "rows.so"
-    sources = [str(generated.folder / file) for file in ("arm.c", "arm_rows.c")]
-    flags = ["-O3", "-march=native", "-fPIC", "-shared"]
-    subprocess.run([find_compilers()[0], *flags, "-o", str(library), *sources, "-lm"], check=True)
-    run, arrays = ctypes.CDLL(str(library)).arm_phi_rows, (points, np.empty_like(points))
-
-    def phi() -> None:
-        run(ctypes.c_long(len(points)), *(ctypes.c_void_p(array.ctypes.data) for array in arrays))
-
-    return {"C, one thread": {"phi": phi}}
+    return found
 
 
 def of_torch(arm: ModuleType, points: Array) -> dict[str, dict[str, Callable[[], Any]]]:

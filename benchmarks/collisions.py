@@ -290,9 +290,6 @@ def stream(names: list[str], ticks: int, found: dict[str, float]) -> Iterator[st
 def keep_clear(names: list[str], ticks: int, found: dict[str, float]) -> Iterator[str]:
     """Rows of hostile streams of postures through NAME_keep_clear in C, checked against the hulls."""
     for name in [*names, *(["baxter, both arms"] if "baxter" in names else [])]:
-        # Capsules of tiago's wrist touch those of its hand in all postures.
-        if name == "tiago_pro":
-            continue
         if name in CHARTS:
             chart, own = load(name)
             goals = chart.domain.sample(ticks // LEG, 5)

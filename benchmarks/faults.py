@@ -26,7 +26,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from benchmark import run, table
@@ -42,7 +42,7 @@ ARMS = ("iiwa7-position", "panda-position", "xarm7-position", "tiago-pro-left-po
 RUNS, TICK, SETTLED = 5, 1e-3, 400
 LOOK = 200  # ticks after sensors stand still
 REST = 0.05  # [rad/s]
-OBSERVED = {12: 40.0, 13: 60.0, 14: 80.0}  # bits of encoders, and poles of the observer of velocities [1/s]
+OBSERVED = 12, 13, 14  # bits of encoders
 TRAVEL = 0.05  # of a sliding joint in a turn of its encoder [m]
 PUSH = 50.0, 500, 600  # [N], from and to a tick
 HEADER = (
@@ -99,17 +99,21 @@ class Arm:
         self.before = None
         return supervisor, plant
 
-    def with_encoders(self, bits: int, poles: float) -> "Arm":
-        """The same arm with encoders, and poles of the observer [1/s]; 0: none."""
-        rates = np.full(self.chart.n, poles)
-        return replace(self, safety=replace(self.safety, observer_rate=rates), rng=np.random.default_rng(7), bits=bits)
+    def with_encoders(self, bits: int, observed: bool = True) -> "Arm":
+        """The same arm with encoders, and the observer for their step, or none."""
+        self = replace(self, rng=np.random.default_rng(7), bits=bits)
+        return replace(self, safety=Safety.of(self.law, encoder_step=self.count)) if observed else self
+
+    @property
+    def count(self) -> Array:
+        """What the encoders count in, (n,) [rad] or [m]."""
+        return np.where(self.robot.tree.prismatic, TRAVEL, 2 * np.pi) / 2**self.bits
 
     def seen(self, plant: MuJoCoPlant) -> tuple[Array, Array]:
         """Measured positions and velocities (n,), the differences of what encoders count."""
         if self.bits == 0:
             return plant.q, plant.dq
-        count = np.where(self.robot.tree.prismatic, TRAVEL, 2 * np.pi) / 2**self.bits
-        q = count * np.round(plant.q / count)
+        q = self.count * np.round(plant.q / self.count)
         dq = 0 * q if self.before is None else (q - self.before) / TICK
         self.before = q
         return q, dq
@@ -128,10 +132,10 @@ def main(quick: bool = False) -> dict[str, int]:
 
 
 @contextmanager
-def arm_of(name: str) -> Iterator[Arm]:
+def arm_of(name: str, memory: Literal["none", "friction"] = "none") -> Iterator[Arm]:
     """An arm with its law in C."""
     chart = oc.charts.load(name)
-    law = PDPlus.on_chart(chart)
+    law = PDPlus.on_chart(chart, memory=memory)
     with TemporaryDirectory() as folder:
         path = compile_shared(oc.generate_c(chart, Path(folder), law, "arm"), Path(folder), ("-O1",))
         yield Arm(chart, law, CompiledLibrary(path, "arm", chart.n), Safety.of(law), np.random.default_rng(7))
@@ -142,7 +146,10 @@ def rows(arms: tuple[str, ...], runs: int) -> Iterator[str]:
     for name in arms:
         with arm_of(name) as arm:
             yield row(arm, name, runs)
-            yield row(arm.with_encoders(13, OBSERVED[13]), f"{name}, encoders", runs)
+            yield row(arm.with_encoders(13), f"{name}, encoders", runs)
+        with arm_of(name, "friction") as arm:
+            yield row(arm, f"{name}, `FrictionObserver`", runs)
+            yield row(arm.with_encoders(13), f"{name}, `FrictionObserver`, encoders", runs)
 
 
 def row(arm: Arm, label: str, runs: int) -> str:
@@ -163,14 +170,14 @@ def observed_rows(arms: tuple[str, ...], runs: int) -> Iterator[str]:
     """A row for each arm and encoder: all runs without and with the observer, and with what else goes wrong."""
     for name in arms:
         with arm_of(name) as arm:
-            for bits, rate in OBSERVED.items():
+            for bits in OBSERVED:
                 before, after, wrong, pushed = (
-                    motions(arm.with_encoders(bits, poles), runs, **case)
-                    for poles, case in (
-                        (0.0, {}),
-                        (rate, {}),
-                        (rate, {"scale": 1.2, "delay": 5}),
-                        (rate, {"push": PUSH[0]}),
+                    motions(arm.with_encoders(bits, observed), runs, **case)
+                    for observed, case in (
+                        (False, {}),
+                        (True, {}),
+                        (True, {"scale": 1.2, "delay": 5}),
+                        (True, {"push": PUSH[0]}),
                     )
                 )
                 words = [f"{mean:{form}} -> {new:{form}}" for mean, new, form in compared(before, after)]

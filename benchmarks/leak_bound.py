@@ -16,6 +16,7 @@ from benchmark import run
 from redundancy.arms import Arm
 
 import orthocas as oc
+from orthocas.tasks.corridor import Corridor
 from orthocas.tools.checks import Array
 
 ARMS, TASKS, RADII = ("iiwa", "panda"), ("position", "pose"), (0.05, 0.1, 0.2, 0.4)
@@ -84,7 +85,7 @@ def row(name: str, kind: str, radius: float, found: dict[str, float]) -> str:
     arm = Arm(name)
     centre, n = arm.home, arm.n
     task = oc.Task.named(arm.robot, kind, centre)
-    domain = oc.Corridor(oc.Box(centre, radius), [centre], radius)
+    domain = Corridor(oc.Box(centre, radius), [centre], radius)
     problem = oc.Problem(arm.robot, task, domain=domain)
     chart = oc.fit(problem, oc.Polynomial(4)).chart
     basis = np.linalg.svd(projectors(problem, centre[None])[0])[0][:, : chart.r].T

@@ -14,7 +14,7 @@ import numpy as np
 import orthocas as oc
 from orthocas.certificates.one_to_one import choose_one_to_one_check
 from orthocas.certificates.rows import build_chart_rows
-from orthocas.certificates.search import Limits, Search, rank_by_volume
+from orthocas.certificates.search import Limits, Search
 from orthocas.charts.certificate import Subdivision
 from orthocas.errors import OrthocasError
 
@@ -44,7 +44,7 @@ def proved_box(chart: oc.Chart) -> Subdivision | None:
         judge = choose_one_to_one_check(chart, rows, box)
         if judge is None:
             return None
-        search = Search(judge, box, Limits(boxes=_BOXES), rank_by_volume(box))
+        search = Search(judge, box, Limits(boxes=_BOXES))
         search.run(lambda _: None)
         if search.finished:
             return box

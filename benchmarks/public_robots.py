@@ -49,7 +49,8 @@ def find_distance(path: Path, robot: oc.Robot) -> float | None:
         if joint.nq == 1:
             low, high = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
             full[joint.idx_q] = np.clip(0.0, low, high)
-    for name, value in zip(robot.joint_names, q, strict=True):
+    tree = robot.tree
+    for name, value in zip(tree.body_joints, tree.expand(q), strict=True):
         joint = model.joints[model.getJointId(name)]
         full[joint.idx_q : joint.idx_q + joint.nq] = [np.cos(value), np.sin(value)] if joint.nq == 2 else value
     data = model.createData()

@@ -1,4 +1,6 @@
-"""Make the ready charts of `oc.charts`: fit, proof, card and picture of each (about 8 min; robot files: extra [test]).
+"""Make the ready charts of `oc.charts`: fit, proof, card and picture of each (about 12 min).
+
+Robot files come with the extra [test], and that of Kinova's Gen3 with `pip install --no-deps robosuite==1.5.2`.
 
 Each chart is made by the commands on its card. Charts whose commands have not changed are kept, so the script goes on
 where it was stopped. `python examples/ready_charts.py NAME ...` makes some again.
@@ -33,7 +35,7 @@ WIDTH, HEIGHT, POSTURES = 420, 420, 61  #: of the pictures
 
 @dataclass(frozen=True)
 class Arm:
-    """An arm: where its file lies in example-robot-data (empty: the arm of a named problem), and whose it is."""
+    """An arm: where its file lies in a package (a word: the arm of a named problem), and whose it is."""
 
     robot: str
     file: str
@@ -41,16 +43,17 @@ class Arm:
     upstream: str
     licence: str
     holder: str
+    package: str = "example-robot-data"
 
     @property
     def path(self) -> Path | None:
         """The robot file; None for a named problem."""
-        return robot_file(self.file) if self.file.endswith(".urdf") else None
+        return robot_file(self.file, self.package) if Path(self.file).suffix else None
 
     @property
     def model(self) -> Model:
         """What the cards say of the robot."""
-        package = "orthocas" if self.path is None else f"example-robot-data {metadata.version('example-robot-data')}"
+        package = "orthocas" if self.path is None else f"{self.package} {metadata.version(self.package)}"
         file = "iiwa7_r800.urdf" if self.path is None else Path(self.file).name
         return Model(self.robot, file, package, self.upstream, self.licence, self.holder)
 
@@ -133,6 +136,39 @@ ARMS = {
         BSD,
         "Willow Garage, Inc.",
     ),
+    "gen3": Arm(
+        "Kinova Gen3",
+        "robots/kinova3/robot.xml",
+        "--tip right_hand",
+        f"{GITHUB}/ARISE-Initiative/robosuite",
+        "MIT",
+        "Stanford Vision and Learning Lab and UT Robot Perception and Learning Lab",
+        "robosuite",
+    ),
+    "g1-left": Arm(
+        "Unitree G1, left arm",
+        "g1_description/urdf/g1_29dof_rev_1_0.urdf",
+        "--tip left_rubber_hand --lock waist_yaw_joint=0 --lock waist_roll_joint=0 --lock waist_pitch_joint=0",
+        f"{GITHUB}/unitreerobotics/unitree_ros/tree/master/robots/g1_description",
+        BSD,
+        "Unitree Robotics",
+    ),
+    "romeo-left": Arm(
+        "Aldebaran Romeo, left arm",
+        "romeo_description/urdf/romeo.urdf",
+        "--tip l_gripper --lock TrunkYaw=0",
+        f"{GITHUB}/ros-aldebaran/romeo_robot",
+        BSD,
+        "Aldebaran Robotics",
+    ),
+    "centauro-left": Arm(
+        "IIT Centauro, torso and arm 1",
+        "centauro_description/urdf/centauro.urdf",
+        "--tip arm1_8",
+        f"{GITHUB}/ADVRHumanoids/iit-centauro-ros-pkg",
+        APACHE,
+        "Istituto Italiano di Tecnologia",
+    ),
 }
 WIDEST = "--domain auto --param polynomial:4:cyclic"  #: a leak of at most 8 deg, a conditioning of at least 0.2
 TIGHT = f"{WIDEST} --leak-deg 5 --conditioning 0.4"
@@ -163,11 +199,18 @@ RECIPES = {  #: arm and options of `orthocas fit`
     "baxter-left-wide": ("baxter-left", BRANCH),
     "pr2-left-wide": ("pr2-left", BRANCH),
     "tiago-pro-left-wide": ("tiago-pro-left", BRANCH),
+    "gen3-wide": ("gen3", BRANCH),
+    "g1-left-wide": ("g1-left", BRANCH),
+    "romeo-left-wide": ("romeo-left", BRANCH),
+    "centauro-left-wide": ("centauro-left", BRANCH),
     "iiwa7-wide-inertia": ("iiwa7", CONTROL),
     "panda-wide-inertia": ("panda", f"--home default {CONTROL}"),
     "xarm7-wide-inertia": ("xarm7", CONTROL),
     "baxter-left-wide-inertia": ("baxter-left", CONTROL),
     "pr2-left-wide-inertia": ("pr2-left", CONTROL),
+    "gen3-wide-inertia": ("gen3", CONTROL),
+    "g1-left-wide-inertia": ("g1-left", CONTROL),
+    "romeo-left-wide-inertia": ("romeo-left", CONTROL),
 }
 
 
@@ -196,7 +239,7 @@ def draw(name: str, data: Path, path: Path) -> None:
     """Draw the arm along the coordinate that moves it farthest."""
     chart, file = oc.load(data / f"{name}.orthocas"), ARMS[RECIPES[name][0]].path
     robot, centre = chart.problem.robot, chart.problem.domain.centre
-    look = None if file is None else read_urdf_look(file, robot.tree).look
+    look = read_urdf_look(file, robot.tree).look if file is not None and file.suffix == ".urdf" else None
     curve = fan_along(chart, centre, widest_coordinate(chart, centre)).spread(POSTURES)
     save_trimmed(fan_picture(robot, centre, curve, WIDTH, HEIGHT, look), path)
 

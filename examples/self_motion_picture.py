@@ -46,12 +46,12 @@ def main(out: Path, quick: bool = False) -> dict[str, float]:
     }
 
 
-def robot_file(path: str) -> Path:
-    """A robot file of the package example-robot-data."""
-    for entry in files("example-robot-data") or []:
-        if str(entry).endswith(f"robots/{path}"):
+def robot_file(path: str, package: str = "example-robot-data") -> Path:
+    """A robot file of a package."""
+    for entry in files(package) or []:
+        if str(entry).endswith(f"/{path}"):
             return Path(str(entry.locate())).resolve()
-    raise FileNotFoundError(f"{path} of example-robot-data (pip install orthocas[test])")
+    raise FileNotFoundError(f"{path} of {package} (pip install orthocas[test])")
 
 
 def save_trimmed(picture: Picture, path: Path) -> None:

@@ -7,7 +7,6 @@ from orthocas import errors as errors
 from orthocas import problems as problems
 from orthocas import simulation as simulation
 from orthocas import solvers as solvers
-from orthocas import viewer as viewer
 from orthocas.arms.arm import Arm as Arm
 from orthocas.bases.circle import Circle as Circle
 from orthocas.bases.cyclic import Mobile as Mobile
@@ -30,7 +29,6 @@ from orthocas.codegen.generate import generate_c as generate_c
 from orthocas.exact.involutivity import involutivity as involutivity
 from orthocas.fitting.compare import compare as compare
 from orthocas.fitting.distil import distil as distil
-from orthocas.fitting.fit import Fit as Fit
 from orthocas.fitting.fit import fit as fit
 from orthocas.fitting.suggest_domain import suggest_domain as suggest_domain
 from orthocas.fitting.terms import Weights as Weights
@@ -38,7 +36,6 @@ from orthocas.fitting.terms import register_loss_term as register_loss_term
 from orthocas.fitting.wide import fit_wide as fit_wide
 from orthocas.paths.chart_along import chart_along as chart_along
 from orthocas.paths.follow import follow as follow
-from orthocas.paths.recordings import read_joints as read_joints
 from orthocas.robots import obstacles as obstacles
 from orthocas.robots.capsules import fit_capsules as fit_capsules
 from orthocas.robots.robot import Robot as Robot
@@ -47,7 +44,6 @@ from orthocas.simulation.run import simulate as simulate
 from orthocas.simulation.run import simulate_many as simulate_many
 from orthocas.tasks.branches import branches as branches
 from orthocas.tasks.clear_box import ClearBox as ClearBox
-from orthocas.tasks.corridor import Corridor as Corridor
 from orthocas.tasks.domains import Box as Box
 from orthocas.tasks.domains import Domain as Domain
 from orthocas.tasks.domains import Torus as Torus

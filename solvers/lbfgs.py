@@ -79,12 +79,13 @@ class QuasiNewton(LBFGS):
     theta = theta_k + L^-T z with L L^T = H(theta_k) + 0.003 diag H; of many coefficients, H has only its diagonal
     blocks. A matrix of K coefficients and N samples takes
     N K^2 operations, a gradient N K. So one matrix and many gradients cost less than a few Gauss-Newton steps, and
-    L-BFGS learns what the matrix misses. It starts again, with a new matrix, where the loss has fallen by a fifth.
+    L-BFGS learns what the matrix misses. It starts again, with a new matrix, once the loss has fallen enough.
 
     Args:
         max_iterations: largest number of iterations.
         tolerance: stop when two iterations in a row reduce the loss by less than this fraction each.
         memory: number of stored correction pairs.
+        renewal: fraction of the loss at the last matrix below which a new one is worth its time.
 
     Source:
         ours; L-BFGS as in [NW2006] Alg. 7.5.
@@ -93,6 +94,7 @@ class QuasiNewton(LBFGS):
     max_iterations: int = 200
     tolerance: float = 3e-4
     memory: int = 20
+    renewal: float = 0.8
     name: str = "quasi_newton"
 
     def coarser(self) -> "QuasiNewton":
@@ -146,7 +148,7 @@ class QuasiNewton(LBFGS):
             little = before - value <= self.tolerance * before
             gained_little, converged = little, little and gained_little
             best.next_iteration(self.max_iterations)
-            if converged or value < RULES.renewal * height:
+            if converged or value < self.renewal * height:
                 raise StopIteration
 
         left = self.max_iterations - best.iterations
@@ -155,7 +157,7 @@ class QuasiNewton(LBFGS):
             return Status.CONVERGED
         if best.iterations == self.max_iterations:
             return Status.ITERATION_LIMIT
-        return None if value < RULES.renewal * height else status
+        return None if value < self.renewal * height else status
 
 
 class _Finite:

@@ -24,7 +24,6 @@ class SolverRules:
     part: int = 2**14  #: parameters that Adam moves at a time, which stay in the cache
     most_rejections: int = 16  #: of a Gauss-Newton step: the damping may grow from its least to 400
     damping: float = 3e-3  #: of the matrix of QuasiNewton, relative to its diagonal
-    renewal: float = 0.8  #: fraction of the loss at the last matrix below which a new one is worth its time
     exact_hessian: int = 1500  #: largest number of parameters for exact, dense Hessians in Ipopt
     barrier: float = 1e-4  #: of Ipopt: starts are good, a stronger one would push away from them into worse minima
     feasible: float = 1e-6  #: constraint violations up to this size count as zero

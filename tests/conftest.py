@@ -91,7 +91,7 @@ def robot_data(relative: str) -> Path:
 def arm(name: str) -> tuple[pin.Model, str]:
     """Model and tip of one of ROBOTS, without the joints off the chain."""
     file, tip = ROBOTS[name]
-    full = urdf.read_urdf(robot_data(file))
+    full = urdf.read_urdf(robot_data(file))[0]
     return full if "both arms" in name else pinocchio_model.lock_off_chain(full, tip), tip
 
 

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.arms.kernel import RULES as CURVES
-from orthocas.arms.kernel import build_curvature, pointer, write_curves
+from orthocas.arms.kernel import build_curvature, write_curves
 from orthocas.arms.maps import ArmMaps
 from orthocas.charts.chart import Chart
 from orthocas.codegen.compiled import keep_library, load_library
 from orthocas.codegen.kernels import generate_kernels
+from orthocas.codegen.library import pointer
 from orthocas.codegen.rendering import render
 from orthocas.tasks.regular_box import find_joint_range
 from orthocas.tools.batch import dense_function, run_in_threads
@@ -62,7 +63,7 @@ class ChartKernelRules:
     calms: float = 0.8  #: factor of it for each call since the target moved
     saddle: float = 0.02  #: slope of the error, relative to its curvature, below which a posture is next to a saddle
     onward: float = 0.3  #: step across a saddle of the last call, in the largest steps of joints, that goes on
-    unstable: float = 0.1  #: curvature along which a saddle falls, in errors, that any side is better than none
+    unstable: float = 0.2  #: curvature along which a saddle falls, in errors, that any side is better than none
     astride: float = 0.05  #: step to a side of a saddle
     largest: float = 0.7  #: norm of a step of Newton's method
     in_chart: int = 10  #: rounds of it at a tick in the chart

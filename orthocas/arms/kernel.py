@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from orthocas.arms.stored import StoredPostures
 from orthocas.codegen.compiled import keep_library, load_library
 from orthocas.codegen.kernels import generate_kernels
+from orthocas.codegen.library import pointer
 from orthocas.codegen.rendering import get_source, render
 from orthocas.tasks.task import Frames, Task
 from orthocas.tools.batch import dense_function
@@ -178,12 +179,6 @@ def write_curves(equations: ca.Function, lower: Array, upper: Array, turning: ND
     }
     included = {name: get_source(name) for name in ("self_motion.c", "curve_math.c")}
     return {"task_curves.c": render("task_curves.c", values), **included}
-
-
-def pointer(array: NDArray[Any]) -> ctypes.c_void_p:
-    """The place of an array that somebody else keeps until the call ends, contiguous."""
-    assert array.flags.c_contiguous
-    return ctypes.c_void_p(array.__array_interface__["data"][0])
 
 
 def split_curves(

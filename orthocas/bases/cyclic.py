@@ -176,6 +176,9 @@ def keeps_self_motions(problem: Problem, joint: int) -> bool:
     # in the tree are prismatic and, if it is revolute, exactly along its axis.
     tree, metric, task = problem.robot.tree, problem.metric, problem.task
     below, q = tree.carriers(tree.parents[joint]), ca.SX.sym("q", tree.n)
+    if tree.mimic_names:
+        # A mimic joint may move with the joint, or carry it.
+        return False
     along = tree.prismatic[joint] or all(_is_axis(_fit_rotation(tree, joint, i)[:, 2], 2) for i in below)
     at_rest = along and all(tree.prismatic[i] for i in below)
     rigid = metric.recipe["kind"] == "inertia" and at_rest
@@ -196,8 +199,9 @@ def turns_tool(task: Task, joint: int) -> bool:
 
     Then neither ker J_x nor the regularity of coordinates without this joint depends on its position.
     """
-    turn = TipTurn.from_kind(task.recipe["kind"])
-    return task.of_tip and turn is not None and turn.whole and joint == task.robot.tree.tip_parent
+    turn, tree = TipTurn.from_kind(task.recipe["kind"]), task.robot.tree
+    whole = task.of_tip and turn is not None and turn.whole
+    return whole and joint == tree.tip_parent and joint not in tree.mimic_leaders
 
 
 def _is_turn_of_components(tree: KinematicTree, joint: int, kind: str) -> bool:

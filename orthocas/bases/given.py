@@ -187,6 +187,7 @@ def sew_angle(robot: Robot, kind: str) -> ca.Function:
     require_known("SEW angle", kind, SEW_KINDS)
     # A chain of seven revolute joints.
     tree = robot.tree
+    tree.require_no_mimics("a shoulder-elbow-wrist angle")
     if tree.n != 7:
         raise RobotError(f"the robot has {tree.n} joints, expected 7 for a shoulder-elbow-wrist angle")
     for i, name in enumerate(tree.joint_names):

@@ -6,6 +6,6 @@
 - `taylor` and `graph` are the arithmetic: Taylor models with remainders that cover rounding.
 """
 
-from orthocas.certificates.certify import certified_box, certify, check_certificate
+from orthocas.certificates.certify import certify, check_certificate
 
-__all__ = ["certified_box", "certify", "check_certificate"]
+__all__ = ["certify", "check_certificate"]

@@ -12,15 +12,15 @@ import numpy as np
 
 from orthocas.certificates.box_checks import BoxCheck, BoxResults
 from orthocas.certificates.one_to_one import choose_one_to_one_check
-from orthocas.certificates.outside import choose_check, choose_inside_check
+from orthocas.certificates.outside import choose_check
 from orthocas.certificates.rows import ChartRows, build_chart_rows
-from orthocas.certificates.search import Limits, Look, Search, measure_distances, rank_by_volume
+from orthocas.certificates.search import Limits, Look, Search
 from orthocas.charts.certificate import COFACTORS, ELIMINATION, METHODS, OPEN, PROVED, Certificate, Subdivision
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
 from orthocas.errors import CertifyError, Interrupted, InvalidValueError
 from orthocas.robots.tree import require_driven
-from orthocas.tasks.domains import Box, Domain
+from orthocas.tasks.domains import Domain
 from orthocas.tasks.samples import sample_boundary_weighted
 from orthocas.tools.checks import Array, as_number, require_at_least, require_executor, require_kind
 from orthocas.tools.display import percent
@@ -120,7 +120,7 @@ def certify(
     # Near the boundary of a domain that keeps folds out, there is always something left to prove.
     if guarded:
         limits = replace(limits, boxes=RULES.guarded_boxes)
-    search = Search(check, base, limits, rank_by_volume(base), executor)
+    search = Search(check, base, limits, executor)
     injective: Subdivision | None = None
 
     def build_so_far() -> Certificate:
@@ -137,53 +137,6 @@ def certify(
     except KeyboardInterrupt:
         raise Interrupted(build_so_far()) from None
     return build_so_far()
-
-
-def certified_box(
-    chart: Chart,
-    bound: float = 0.0,
-    *,
-    time_limit: float | None = None,
-    executor: Executor | None = None,
-    monitor: Monitor = silent,
-) -> Box:
-    """The largest box around the domain's centre, with its proportions, on which the chart is proved not to fold.
-
-    Largest up to what the bounds resolve: parts are halved down to 1/64 of the domain's widths.
-
-    Args:
-        chart: a fitted chart; it may fold elsewhere.
-        bound: bound of the conditioning, see `certify`.
-        time_limit: seconds after which the box proved so far is returned.
-        executor: shares the work, see `certify`.
-        monitor: called with progress.
-
-    Raises:
-        CertifyError: as `certify`, and if nothing is proved around the centre.
-
-    Example:
-        >>> import orthocas as oc
-        >>> from orthocas import problems
-        >>> from orthocas.certificates import certified_box
-        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
-        >>> bool((certified_box(chart).half_width == chart.problem.domain.half_width).all())
-        True
-    """
-    # Boxes near the centre come first, and a box without a proof ends the search: those behind it do not matter.
-    seconds = check_options(chart, time_limit, executor)
-    limits = Limits(seconds, smallest=2.0**-6, first_failure=True, folds=False)
-    check = choose_inside_check(chart, build_chart_rows(chart), check_bound(chart, bound))
-    base = cover_domain(chart.problem.domain)
-    search = Search(check, base, limits, partial(measure_distances, base), executor)
-    search.run(_report_search(monitor, "largest box"))
-    # The largest copy of the domain about its centre that no open part reaches into, rounded down.
-    parts = search.build_subdivision()
-    low, high = parts.leaves(OPEN)
-    scale = float(measure_distances(parts, low, high).min()) if len(low) else 1.0
-    if scale == 0:
-        raise CertifyError("nothing is proved around the centre of the domain, expected a chart that is regular there")
-    domain = chart.problem.domain
-    return Box(domain.centre, domain.half_width * (scale if scale == 1 else scale * (1 - 1e-9)))
 
 
 def check_certificate(
@@ -357,7 +310,7 @@ def _find_one_to_one_box(
         if not own(point, point).proved.all():
             return False
         left = Limits(max(end - time.monotonic(), 0.0), boxes=most, hopeless=most // 4)
-        search = Search(own, part, left, rank_by_volume(part), executor)
+        search = Search(own, part, left, executor)
         search.run(_report_search(monitor, "one-to-one"))
         if search.finished:
             best = search.build_subdivision()

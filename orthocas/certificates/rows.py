@@ -249,10 +249,10 @@ class TipRows:
 
     @classmethod
     def build(cls, task: Task) -> "TipRows | None":
-        """Build for a task; None for tasks of other kinds or frames, and for a tip that does not move."""
+        """Build for a task; None for tasks of other kinds or frames, a tip that does not move, and mimic joints."""
         # The task's recipe says what it compares.
-        kind = task.recipe["kind"]
-        if task.robot.tree.tip_parent < 0 or not task.of_tip:
+        kind, tree = task.recipe["kind"], task.robot.tree
+        if tree.tip_parent < 0 or not task.of_tip or tree.mimic_names:
             return None
         # Rows of a position, or of some of its components.
         if kind == "polar":

@@ -31,7 +31,6 @@ class SearchRules:
 RULES = SearchRules()
 
 _log = logging.getLogger(__name__)
-Priority = Callable[[Array, Array], Array]  #: corners (boxes, n) -> numbers, smallest first
 Look = Callable[["Search"], None]  #: called after each batch
 
 
@@ -42,8 +41,6 @@ class Limits:
     seconds: float = np.inf
     boxes: int = MOST_BOXES // 4
     smallest: float = 2.0**-12  #: fraction of the width of the whole below which a joint's interval is not halved
-    first_failure: bool = False  #: whether boxes that rank behind one that is too small to halve do not matter
-    folds: bool = True  #: whether a fold ends the search
     hopeless: int = MOST_BOXES  #: boxes after which the search ends if the rest would take more than `boxes`
 
 
@@ -54,13 +51,10 @@ class Search:
     check: BoxCheck
     base: Subdivision  #: its open parts are searched
     limits: Limits
-    priority: Priority
     executor: Executor | None = None
     evaluated: int = 0
     proved_volume: float = 0.0  #: fraction of the whole
     open_count: int = 0  #: number of boxes where nothing is proved so far
-    dead: int = 0  #: number of boxes too small to halve, or of no use to halve
-    failed: float = np.inf  #: least rank of these boxes
     conditioning: float = np.inf  #: least of the lower bounds on proved boxes
     signs: dict[int, Array] = field(default_factory=dict)  #: sign of det J -> a point with that sign
     _codes: list[int] = field(default_factory=list)
@@ -90,13 +84,9 @@ class Search:
         pending: dict[Future[BoxResults], list[tuple[float, int, Array, Array]]] = {}
         try:
             while self._waiting or pending:
-                # A fold may end the search, and so may a failure that ranks before all that is left.
-                behind = bool(self._waiting) and self._waiting[0][0] > self.failed
-                if (self.folded and self.limits.folds) or (behind and self.limits.first_failure):
-                    break
-                # It also ends at its limits, and if all would take too many boxes at the pace so far.
+                # A fold ends the search, a limit, and a pace at which all would take too many boxes.
                 hopeless = self.evaluated > max(self.limits.hopeless, self.proved_volume * self.limits.boxes)
-                if time.monotonic() > end or self.evaluated >= self.limits.boxes or hopeless:
+                if self.folded or time.monotonic() > end or self.evaluated >= self.limits.boxes or hopeless:
                     break
                 self._step(pending)
                 look(self)
@@ -162,7 +152,6 @@ class Search:
             given_up = [box for box in batch if self._deaths[box[1]] >= ATTEMPTS]
             self._return([box for box in batch if self._deaths[box[1]] < ATTEMPTS])
             if given_up:
-                self.failed = min(self.failed, *(rank for rank, _, _, _ in given_up))
                 _log.warning("%d boxes are left unproved: worker processes died over them", len(given_up))
 
     def _take(self) -> list[tuple[float, int, Array, Array]]:
@@ -190,7 +179,7 @@ class Search:
         if proved.any():
             self.conditioning = min(self.conditioning, float(results.conditioning[proved].min()))
             self.proved_volume += float(_measure_volumes(self.base, low[proved], high[proved]).sum())
-        for k, (rank, place, a, b) in enumerate(batch):
+        for k, (_, place, a, b) in enumerate(batch):
             if proved[k]:
                 self._codes[place] = PROVED
                 self.open_count -= 1
@@ -200,9 +189,8 @@ class Search:
             # Where bounds are infinite, halve the relatively widest joint: a choice that stays the same may never help.
             if joint == UNKNOWN:
                 joint = max(self.check.joints, key=lambda i: float(widths[i]))
+            # Boxes too small to halve, or of no use to halve, stay open.
             if joint == NEVER or widths[joint] <= self.limits.smallest:
-                self.dead += 1
-                self.failed = min(self.failed, rank)
                 continue
             # The halves take the place of the box.
             top, bottom = b.copy(), a.copy()
@@ -212,25 +200,12 @@ class Search:
             self._add(np.array([a, bottom]), np.array([top, b]))
 
     def _add(self, low: Array, high: Array) -> None:
-        # New boxes are open, and wait by their rank.
+        # New boxes are open, and wait, the largest first.
         self.open_count += len(low)
-        for rank, a, b in zip(self.priority(low, high).tolist(), low, high, strict=True):
-            heapq.heappush(self._waiting, (rank, len(self._codes), a, b))
+        for volume, a, b in zip(_measure_volumes(self.base, low, high).tolist(), low, high, strict=True):
+            heapq.heappush(self._waiting, (-volume, len(self._codes), a, b))
             self._codes.append(OPEN)
             self._children.append(0)
-
-
-def rank_by_volume(base: Subdivision) -> Priority:
-    """Boxes of the largest volume first."""
-    return lambda low, high: -_measure_volumes(base, low, high)
-
-
-def measure_distances(base: Subdivision, low: Array, high: Array) -> Array:
-    """The scale s at which a copy of the whole about its centre first touches each box, (boxes,)."""
-    # Gaps between the centre and a box, in half-widths of the whole.
-    centre, half = (base.low + base.high) / 2, (base.high - base.low) / 2
-    gaps: Array = np.maximum(np.maximum(low - centre, centre - high), 0) / half
-    return np.asarray(gaps.max(axis=1))
 
 
 def _measure_volumes(base: Subdivision, low: Array, high: Array) -> Array:

@@ -10,7 +10,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from orthocas.charts.self_motion import fan_along
 from orthocas.errors import InvalidValueError
-from orthocas.tools.checks import Array, require_at_least, require_count
+from orthocas.tools.checks import require_count
 from orthocas.tools.picture import Picture, equal_axes
 
 if TYPE_CHECKING:
@@ -41,26 +41,21 @@ def quality_figure(report: "Report") -> Figure:
     return figure
 
 
-def self_motion_figure(chart: "Chart", postures: int = 9, reach: float | None = 0.4) -> Figure:
-    """The self-motions of the arm: each panel sweeps one coordinate and holds the task and the others.
+def self_motion_figure(chart: "Chart", postures: int = 9) -> Figure:
+    """The self-motions of the arm: each panel sweeps one coordinate as far as it reaches, and holds all else.
 
     Args:
-        chart: the chart; the sweep starts at the centre of its domain.
+        chart: the chart; the sweep starts at the home of its domain.
         postures: number of postures per panel.
-        reach: largest value of the swept coordinate. None: as far as it reaches on either side.
-
-    Raises:
-        InverseError: if a posture of the sweep cannot be reached.
     """
     _require("chart", chart, "xi_range", "a Chart")
     require_count("postures", postures, most=_MOST_POSTURES)
-    if reach is not None:
-        require_at_least("reach", reach, 0)
     columns = min(chart.r, _PANELS)
     rows = -(-chart.r // columns)
     figure = Picture(figsize=(4.5 * columns, 3.9 * rows), layout=ConstrainedLayoutEngine(h_pad=0.15, w_pad=0.1))
     # all panels have the same axes
-    sweeps = [_sweep(chart, j, postures, reach) for j in range(chart.r)]
+    fans = [fan_along(chart, chart.problem.domain.home, j) for j in range(chart.r)]
+    sweeps = [fan.q[np.abs(fan.arc_length[:, None] - fan.places(postures)).argmin(axis=0)] for fan in fans]
     everything = chart.problem.robot.joint_points(np.concatenate(sweeps)).reshape(-1, 3)
     colours = mpl.colormaps["viridis"](np.linspace(0.1, 0.9, postures))
     for j, sweep in enumerate(sweeps):
@@ -88,28 +83,6 @@ def _draw_angles(axes: Axes, angles: "AngleStatistics", colour: str, label: str)
     axes.set_xlabel(f"{label} [deg]")
     axes.set_title(f"mean {angles.mean:.2f}°, std {angles.std:.2f}°", fontsize=10)
     axes.grid(alpha=0.3)
-
-
-def _sweep(chart: "Chart", j: int, postures: int, reach: float | None) -> Array:
-    """Joint positions along xi_j with all else held. Each is solved from its neighbour, from the middle outwards."""
-    centre = chart.problem.domain.home
-    base = chart.phi(centre)
-    if reach is None:
-        fan = fan_along(chart, centre, j)
-        shown: Array = fan.q[np.abs(fan.arc_length[:, None] - fan.places(postures)).argmin(axis=0)]
-        return shown
-    values = np.linspace(-float(reach), float(reach), postures)
-    found = np.empty((len(values), chart.n))
-    middle = int(np.argmin(np.abs(values)))
-    for order in (range(middle, len(values)), range(middle - 1, -1, -1)):
-        q = centre
-        for k in order:
-            target = base.copy()
-            target[chart.m + j] = values[k]
-            # as far as was asked
-            q = chart.inverse(target, q, outside=True)
-            found[k] = q
-    return found
 
 
 def _bound(length: float) -> str:

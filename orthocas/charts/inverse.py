@@ -1,25 +1,39 @@
-"""The inverse map q(x, xi): its searches in order, how each row ended, and their results."""
+"""The inverse map q(x, xi): targets, the searches in order, how each row ended, and the results."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from orthocas.charts.coordinates import InvertibleMap
 from orthocas.charts.curves import CurveSearch
 from orthocas.charts.inside import Inside
 from orthocas.charts.newton import Attempt, Continuation, LocalSolver
 from orthocas.charts.phi import PhiMap, largest
 from orthocas.charts.search import InDomain, Starts
-from orthocas.errors import InverseError
+from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, units_hint
+from orthocas.robots.collisions import Collisions
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.task import Task
-from orthocas.tools.checks import Array, Indices
+from orthocas.tools.cached import cached_property
+from orthocas.tools.checks import (
+    Array,
+    Indices,
+    as_float_array,
+    as_rows,
+    require_at_least,
+    require_kind,
+    require_shape,
+)
 from orthocas.tools.display import Shown, listed
+
+if TYPE_CHECKING:
+    from orthocas.charts.chart import Chart
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +173,146 @@ class Solutions(Shown):
         return f"rows {rows[: RULES.named].tolist()}" if len(self) > 1 else "phi"
 
 
+def solve_rows(
+    chart: Chart, search: Inverse, phi: ArrayLike, q_start: ArrayLike | None, tolerance: float, inside: bool
+) -> Solutions:
+    """`Chart.solve` for targets of phi, by a search of one's own."""
+    require_at_least("tolerance", tolerance, 0)
+    targets = as_rows("phi", phi, chart.n)[0]
+    # one start serves all rows; grown coordinates begin at the centre
+    starts = None if q_start is None else as_rows("q_start", q_start, chart.n)[0]
+    if starts is None and isinstance(chart.coordinates, InvertibleMap):
+        starts = chart.problem.domain.home[None]
+    if starts is not None:
+        if len(starts) not in (1, len(targets)):
+            raise ShapeError("q_start", starts.shape, targets.shape)
+        starts = np.broadcast_to(starts, targets.shape)
+    require_kind("inside", inside, bool)
+    if inside:
+        require_expression(chart, "inside=True")
+    return search.solve(targets, starts, float(tolerance), inside)
+
+
+def build_phi(chart: Chart, phi: ArrayLike | None, x: Any, xi: ArrayLike | None) -> ArrayLike:
+    """Target values of phi: those given, or [x; xi]."""
+    if phi is not None and x is None and xi is None:
+        # What people hold is often a pose.
+        matrix = isinstance(phi, np.ndarray) and phi.shape[-2:] == (4, 4) and chart.n != 4
+        if matrix or hasattr(phi, "homogeneous"):
+            instead = (
+                f"{chart.n} numbers; solve(x=pose, xi=...) takes a pose with xi, and nearest_xi(q, pose) one alone"
+            )
+            raise InvalidValueError("phi", "a pose", instead)
+        return phi
+    if phi is not None or x is None or xi is None:
+        given = listed(name for name, value in (("phi", phi), ("x", x), ("xi", xi)) if value is not None)
+        raise InvalidValueError("target", given or "nothing", "phi, or x and xi; `nearest_xi` takes x and a posture")
+    # x in any form that tasks take, and xi; one may serve many of the other
+    first, second = chart.task.target(x), as_float_array("xi", xi)
+    if second.ndim == 0 and chart.r == 1:
+        second = second[None]
+    for name, part, size in (("x", first, chart.m), ("xi", second, chart.r)):
+        require_shape(name, part.shape, (size,) if part.ndim == 1 else (None, size))
+    if first.ndim == second.ndim == 2 and len(first) != len(second) and 1 not in (len(first), len(second)):
+        raise ShapeError("xi", second.shape, (len(first), chart.r))
+    # both side by side, row by row
+    rows = np.broadcast_shapes(first.shape[:-1], second.shape[:-1])
+    return np.concatenate([np.broadcast_to(part, (*rows, part.shape[-1])) for part in (first, second)], axis=-1)
+
+
+def build_phi_of_wish(chart: Chart, q_wish: ArrayLike, x: Any) -> tuple[Array, Array]:
+    """Targets of phi for `nearest_xi`, and the wishes moved into the box of the domain, (N, n) each."""
+    wishes = np.clip(as_rows("q_wish", q_wish, chart.n)[0], *chart.problem.domain.bounds)
+    phi = np.array(chart.phi(wishes))
+    if x is not None:
+        values = chart.task.target(x)
+        if values.shape not in ((chart.m,), (len(phi), chart.m)):
+            raise ShapeError("x", values.shape, (len(phi), chart.m))
+        phi[:, : chart.m] = values
+    return phi, wishes
+
+
+def solve_all(chart: Chart, phi: Array, tolerance: float, collisions: Collisions | None) -> Solutions:
+    """All solutions for one target (n,) inside the domain that a search finds, free ones first."""
+    require_at_least("tolerance", tolerance, 0)
+    require_expression(chart, "a search for all solutions")
+    in_domain, phi_map = chart.parts.inverse.in_domain, chart.parts.phi_map
+    assert in_domain is not None
+    # free ones first, otherwise the nearest to the centre first
+    q = in_domain.all_solutions(phi, float(tolerance))
+    status = np.full(len(q), int(InverseStatus.FOUND))
+    if collisions is not None and len(q):
+        status[~collisions.check_free(q)] = InverseStatus.COLLIDING
+    order = np.argsort(status, kind="stable")
+    q, rows = q[order], np.broadcast_to(phi, q.shape)
+    # their errors, and what is left of xi
+    error = largest(phi_map.residual(rows, q)) if len(q) else np.zeros(0)
+    own = phi_map.difference(rows, np.asarray(chart.phi(q)))[:, chart.m :] if len(q) else q[:, chart.m :]
+    steps = np.zeros(len(q), dtype=np.int64)
+    return Solutions(q, status[order], steps, error, np.linalg.norm(own, axis=1), float(tolerance))
+
+
+def prefer_free(chart: Chart, phi: ArrayLike, found: Solutions, collisions: Collisions) -> Solutions:
+    """Solutions for phi with free ones in place of those that touch, where there are any."""
+    rows = np.flatnonzero(np.isin(found.status, (InverseStatus.FOUND, InverseStatus.NEAREST)))
+    rows = rows[~collisions.check_free(found.q[rows])] if rows.size else rows
+    if not rows.size:
+        return found
+    # rows whose solution touches something
+    status, targets = found.status.copy(), as_rows("phi", phi, chart.n)[0]
+    status[rows] = InverseStatus.COLLIDING
+    parts = [replace(found, status=status).row(k) for k in range(len(found))]
+    # of all solutions of such a row, the free one nearest to the first
+    for k in rows[found.status[rows] == InverseStatus.FOUND].tolist():
+        if not isinstance(chart.coordinates, InvertibleMap):
+            every = solve_all(chart, targets[k], found.tolerance, collisions)
+            free = np.flatnonzero(every.found)
+            if free.size:
+                parts[k] = every.row(free[np.argmin(np.linalg.norm(every.q[free] - found.q[k], axis=1))])
+    return join_solutions(parts)
+
+
+def require_solutions(
+    chart: Chart, targets: Array, q_start: ArrayLike | None, found: Solutions, outside: bool, single: bool
+) -> None:
+    """Raise InverseError where targets (N, n) have no solution, or, unless `outside`, none inside the domain."""
+    # a row without any solution is an error, whatever `outside` says
+    try:
+        found.require(inside=False)
+    except InverseError as error:
+        hint = units_hint(chart.problem.task.units, np.abs(targets[:, : chart.m]).max(axis=0).tolist())
+        raise InverseError(f"{error}{hint}") from None
+    beyond = np.flatnonzero(~found.found)
+    if outside or not beyond.size:
+        return
+    # the nearest inside, for those who catch the error
+    nearest = None
+    if not isinstance(chart.coordinates, InvertibleMap):
+        nearest = found.q.copy()
+        if q_start is not None:
+            q_start = np.broadcast_to(as_rows("q_start", q_start, chart.n)[0], targets.shape)[beyond]
+        nearest[beyond] = chart.solve(targets[beyond], q_start, tolerance=found.tolerance, inside=True).q
+    # the joint of the first row that is farthest outside
+    q, domain = found.q[beyond[0]], chart.problem.domain
+    low, high = domain.bounds
+    j = int(np.argmax(np.maximum(low - q, q - high) / domain.half_width))
+    name = chart.problem.robot.joint_names[j]
+    reason = f"joint '{name}' at {q[j]:.4g}, expected within [{low[j]:.4g}, {high[j]:.4g}]"
+    if not domain.is_box and low[j] <= q[j] <= high[j]:
+        reason = domain.explain(q)
+    raise InverseError(
+        f"q with phi(q) = phi lies outside the domain for {found.named(beyond)}: {reason}. "
+        "`error.nearest` has joint positions inside; outside=True accepts those outside",
+        None if nearest is None else nearest[0] if single else nearest,
+    )
+
+
+def require_expression(chart: Chart, what: str) -> None:
+    """Raise NoExpressionError if the coordinates are grown."""
+    if isinstance(chart.coordinates, InvertibleMap):
+        raise NoExpressionError(f"{what} needs coordinates with a CasADi expression; received grown coordinates")
+
+
 def join_solutions(parts: Sequence[Solutions]) -> Solutions:
     """All rows, in this order."""
     names = ("q", "status", "iterations", "error", "distance")
@@ -175,11 +329,11 @@ def beyond_reach(task: Task, x: Array) -> NDArray[np.bool_]:
     if not task.of_tip or not columns:
         return np.zeros(len(x), dtype=bool)
     # place of the first joint that moves the tip, (3,), and the largest distance of the tip from it [m]
-    chain = task.robot.tree.carriers(task.robot.tree.tip_parent)
-    offsets = [*task.robot.tree.translations[chain], task.robot.tree.tip_translation]
-    strokes = np.maximum(np.abs(task.robot.tree.lower[chain]), np.abs(task.robot.tree.upper[chain]))[
-        np.array(task.robot.tree.prismatic)[chain]
-    ]
+    tree = task.robot.tree
+    chain = tree.carriers(tree.tip_parent)
+    offsets = [*tree.translations[chain], tree.tip_translation]
+    slides = [i for i in chain if tree.body_kinds[i] == "prismatic"]
+    strokes = np.maximum(np.abs(tree.expand(tree.lower)), np.abs(tree.expand(tree.upper)))[slides]
     origin, length = offsets[0], float(sum(np.linalg.norm(offset) for offset in offsets[1:]) + strokes.sum())
     away = x[:, columns] - origin[["xyz".index(task.labels[k]) for k in columns]]
     return np.asarray(np.linalg.norm(away, axis=1) > (1 + RULES.rounding) * length)
@@ -194,14 +348,23 @@ class Found:
     iterations: Indices  #: (N,)
     status: Indices  #: (N,)
 
+    @classmethod
+    def none(cls, targets: Array) -> Found:
+        """Nothing, as for rows that are not finite."""
+        q, bad = np.full(targets.shape, np.nan), np.full(len(targets), int(InverseStatus.BAD_INPUT))
+        return cls(q, q.copy(), np.zeros_like(bad), bad)
+
+    def put(self, rows: Indices, other: Found) -> None:
+        """Take over what a search found in some rows."""
+        for name, values in vars(other).items():
+            getattr(self, name)[rows] = values
+
     def improve(self, rows: Indices, other: Found) -> None:
         """Take over what another search found in some rows, where it is better."""
         better = other.status < self.status[rows]
         same = other.status == self.status[rows]
         better |= same & (other.status == InverseStatus.NOT_FOUND) & (other.error < self.error[rows])
-        into = rows[better]
-        for name in ("q", "residual", "iterations", "status"):
-            getattr(self, name)[into] = getattr(other, name)[better]
+        self.put(rows[better], Found(*(values[better] for values in vars(other).values())))
 
     @property
     def error(self) -> Array:
@@ -225,30 +388,36 @@ class Inverse:
 
     def solve(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Solutions:
         """Solutions for targets (N, n), from starts (N, n) or our own. Rows that are not finite fail."""
-        good = np.isfinite(targets).all(axis=1)
+        good = np.asarray(np.isfinite(targets).all(axis=1))
         if starts is not None:
             good &= np.isfinite(starts).all(axis=1)
-        q = np.full(targets.shape, np.nan)
-        error, distance = np.full((2, len(q)), np.nan)
-        status, iterations = np.full(len(q), int(InverseStatus.BAD_INPUT)), np.zeros(len(q), dtype=np.int64)
-        for rows in np.array_split(np.flatnonzero(good), -(-int(good.sum()) // RULES.rows) or 1):
-            if rows.size:
-                found = self._searched(targets[rows], None if starts is None else starts[rows], tolerance, inside)
-                q[rows], status[rows], iterations[rows] = found.q, found.status, found.iterations
-                error[rows] = found.error
-                # |xi(q) - xi|: infinite where xi(q) is undefined
-                of_xi = (found.residual * self.phi_map.scale(targets[rows]))[:, self.problem.m :]
-                apart = np.sqrt((of_xi**2).sum(axis=1))
-                distance[rows] = np.where(np.isfinite(apart), apart, np.inf)
-                kept = np.isin(found.status, _KEPT) if inside else np.zeros(len(rows), dtype=bool)
-                error[rows[kept]] = largest(found.residual[kept, : self.problem.m])
-        return Solutions(q, status, iterations, error, distance, tolerance)
+        if good.all() and 0 < len(good) <= RULES.rows:
+            found = self._search(targets, starts, tolerance, inside)
+        else:
+            found, rows = Found.none(targets), np.flatnonzero(good)
+            for first in range(0, len(rows), RULES.rows):
+                some = rows[first : first + RULES.rows]
+                found.put(
+                    some, self._search(targets[some], None if starts is None else starts[some], tolerance, inside)
+                )
+        # |xi(q) - xi|: infinite where xi(q) is undefined
+        error, of_xi = found.error, (found.residual * self.phi_map.scale(targets))[:, self.problem.m :]
+        distance = np.sqrt((of_xi**2).sum(axis=1))
+        distance[~np.isfinite(distance)] = np.inf
+        error[~good] = distance[~good] = np.nan
+        if inside:
+            kept = np.isin(found.status, _KEPT)
+            error[kept] = largest(found.residual[kept, : self.problem.m])
+        return Solutions(found.q, found.status, found.iterations, error, distance, tolerance)
 
-    def _searched(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Found:
+    def _search(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Found:
         """What the search finds from given starts, or from the rough inverse and, where that fails, in the domain."""
         follows = inside or (self.curves is not None and starts is None)
         first = self.local if self.brief is None or not follows else self.brief
         best = self._attempt(targets, self.starts.guess(targets) if starts is None else starts, tolerance, first)
+        # most rows end here
+        if not best.status.any():
+            return best
         # rows without a solution, because the arm is too short
         rows = np.flatnonzero(best.status == InverseStatus.NOT_FOUND)
         beyond = beyond_reach(self.problem.task, targets[rows, : self.problem.m])
@@ -267,7 +436,7 @@ class Inverse:
             self._restart(targets, best, rows, RULES.restarts, InverseStatus.SINGULAR, tolerance)
         elif self.along is not None:
             rows = self._open(best)
-            best.improve(rows, self._judged(self.along(targets[rows], starts[rows]), tolerance))
+            best.improve(rows, self._evaluate(self.along(targets[rows], starts[rows]), tolerance))
         return best
 
     def _open(self, best: Found) -> Indices:
@@ -280,7 +449,9 @@ class Inverse:
         if rows.size and self.curves is not None:
             near = self.curves.search(targets[rows], best.q[rows], tolerance)
             found = near.distance == 0
-            best.improve(rows[found], self._found(targets[rows[found]], near.q[found]))
+            rows, q = rows[found], near.q[found]
+            solved = np.full(len(q), int(InverseStatus.FOUND))
+            best.improve(rows, Found(q, self.phi_map.residual(targets[rows], q), np.zeros_like(solved), solved))
             return
         if not rows.size or self.in_domain is None or self.inside is None:
             return
@@ -290,13 +461,16 @@ class Inverse:
             q = self.inside.nearest(targets[rows], best.q[rows])[0]
         # other coordinates: the best point of the cells, or near stored ones
         attempt = Attempt(q, self.phi_map.residual(targets[rows], q), best.iterations[rows], np.ones(len(q), bool))
-        best.improve(rows, self._judged(attempt, tolerance))
+        best.improve(rows, self._evaluate(attempt, tolerance))
 
     def _restart(
         self, targets: Array, best: Found, rows: Indices, count: int, worst: InverseStatus, tolerance: float
     ) -> None:
         """Search some rows again from points of the table and the centre, until their status is `worst` or better."""
-        for start in self._other_starts(targets[rows], count):
+        if not rows.size:
+            return
+        near = self.starts.nearest(targets[rows], count, self.problem.n)
+        for start in (*near, np.broadcast_to(self.problem.domain.home, near.shape[1:])):
             left = best.status[rows] > worst
             if not left.any():
                 break
@@ -359,50 +533,38 @@ class Inverse:
         within = np.where(whole, InverseStatus.FOUND, InverseStatus.NEAREST)
         best.status[rows] = np.where(kept, np.where(inside, within, InverseStatus.OUTSIDE_DOMAIN), missed)
 
-    def _other_starts(self, targets: Array, count: int) -> Iterator[Array]:
-        """Points of the table near the targets, nearest first, and the centre of the domain, (N, n) each."""
-        if len(targets):
-            yield from self.starts.nearest(targets, count, self.problem.n)
-            yield np.broadcast_to(self.problem.domain.home, targets.shape)
-
     def _attempt(self, targets: Array, starts: Array, tolerance: float, local: LocalSolver | None = None) -> Found:
-        """One search from starts (N, n), judged."""
+        """One search from starts (N, n), with a status."""
         attempt = (local or self.local)(targets, starts)
-        return self._judged(self._snapped(targets, attempt, tolerance), tolerance)
+        # joints that miss the boundary by rounding are moved onto it, where the point is a solution still
+        low, high = self._bounds
+        moved = np.clip(attempt.q, low, high)
+        off = np.abs(moved - attempt.q)
+        if off.any():
+            near = (off <= RULES.snap * self.problem.domain.half_width).all(axis=1)
+            rows = np.flatnonzero(off.any(axis=1) & near)
+            residual = self.phi_map.residual(targets[rows], moved[rows])
+            good = largest(residual) <= tolerance
+            attempt.q[rows[good]], attempt.residual[rows[good]] = moved[rows[good]], residual[good]
+        return self._evaluate(attempt, tolerance)
 
-    def _judged(self, attempt: Attempt, tolerance: float) -> Found:
+    def _evaluate(self, attempt: Attempt, tolerance: float) -> Found:
         """Where a search ended, with a status."""
-        solved = largest(attempt.residual) <= tolerance
+        solved = np.flatnonzero(largest(attempt.residual) <= tolerance)
         status = np.full(len(attempt.q), int(InverseStatus.NOT_FOUND))
-        status[solved] = self._status(attempt.q[solved])
-        doubtful = np.flatnonzero(solved & attempt.suspicious)
+        status[solved] = InverseStatus.FOUND
+        doubtful = solved if attempt.inside is None else solved[~attempt.inside[solved]]
+        if doubtful.size and (outside := doubtful[~self.problem.domain.contains(attempt.q[doubtful])]).size:
+            # within the joint limits, or beyond
+            q, robot, slack = attempt.q[outside], self.problem.robot, RULES.slack * self.problem.domain.half_width
+            allowed = ((q >= robot.lower - slack) & (q <= robot.upper + slack)).all(axis=1)
+            status[outside] = np.where(allowed, InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT)
+        doubtful = solved[attempt.suspicious[solved]]
         if doubtful.size:
             status[doubtful[self.phi_map.is_singular(attempt.q[doubtful])]] = InverseStatus.SINGULAR
         return Found(attempt.q, attempt.residual, attempt.iterations, status)
 
-    def _found(self, targets: Array, q: Array) -> Found:
-        """Solutions inside the domain (N, n)."""
-        status = np.full(len(q), int(InverseStatus.FOUND))
-        return Found(q, self.phi_map.residual(targets, q), np.zeros(len(q), dtype=np.int64), status)
-
-    def _status(self, q: Array) -> Indices:
-        """Where solutions (N, n) lie."""
-        robot, domain = self.problem.robot, self.problem.domain
-        slack = RULES.slack * domain.half_width
-        allowed = ((q >= robot.lower - slack) & (q <= robot.upper + slack)).all(axis=1)
-        beyond = np.where(allowed, InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT)
-        return np.where(domain.contains(q), InverseStatus.FOUND, beyond).astype(np.int64)
-
-    def _snapped(self, targets: Array, attempt: Attempt, tolerance: float) -> Attempt:
-        """The same points, but on the boundary where they are solutions that miss it by rounding."""
-        low, high = self.problem.domain.bounds
-        moved = np.clip(attempt.q, low, high)
-        off = np.abs(moved - attempt.q)
-        # only points that are as good on the boundary as before
-        rows = np.flatnonzero((off > 0).any(axis=1) & (off <= RULES.snap * self.problem.domain.half_width).all(axis=1))
-        if not rows.size:
-            return attempt
-        residual = self.phi_map.residual(targets[rows], moved[rows])
-        good = largest(residual) <= tolerance
-        attempt.q[rows[good]], attempt.residual[rows[good]] = moved[rows[good]], residual[good]
-        return attempt
+    @cached_property
+    def _bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest joint positions of the domain, (n,) each."""
+        return self.problem.domain.bounds

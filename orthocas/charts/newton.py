@@ -54,6 +54,7 @@ class Attempt:
     residual: Array  #: (phi - phi(q)) / scale, (N, n)
     iterations: Indices  #: (N,)
     suspicious: NDArray[np.bool_]  #: whether J may be singular there, (N,)
+    inside: NDArray[np.bool_] | None = None  #: which rows lie inside the domain for certain, (N,); None: not looked at
 
     @classmethod
     def empty(cls, N: int, n: int) -> "Attempt":
@@ -394,6 +395,7 @@ class FewRows:
 
     def __init__(self, phi_map: PhiMap, functions: PointFunctions, other: LocalSolver) -> None:
         self._map, self._functions, self._other = phi_map, functions, other
+        self._spare: list[PointSolver] = []  # that nobody uses now
 
     def __call__(self, targets: Array, starts: Array) -> Attempt:
         """Search from starts (N, n)."""
@@ -402,11 +404,16 @@ class FewRows:
         attempt = Attempt.empty(*targets.shape)
         # otherwise CasADi turns Ctrl-C into a RuntimeError, or swallows it
         with deferred():
-            solver, done = PointSolver(self._functions), np.zeros(len(targets), dtype=bool)
+            try:
+                solver = self._spare.pop()
+            except IndexError:
+                solver = PointSolver(self._functions)
+            done = np.zeros(len(targets), dtype=bool)
             for k in range(len(targets)):
                 solver.q[:], solver.target[:] = starts[k], targets[k]
                 done[k] = solver.solve()
                 attempt.q[k], attempt.residual[k], attempt.iterations[k] = solver.q, solver.phi, solver.iterations
+            self._spare.append(solver)
         attempt.residual[:] = self._map.difference(targets, attempt.residual) / self._map.scale(targets)
         failed = np.flatnonzero(~done)
         if failed.size:

@@ -89,17 +89,12 @@ def _judged(problem: Problem, coordinates: CoordinateMap, points: Array) -> dict
     found = judge(samples, J)
     ends = measure_half_turn_distance(problem, samples.points) < WORST.near_the_end
     if ends.any():
-        for name, values in zip(
-            ("leak_sines", "conditioning", "signs"), _by_frame(problem, samples[ends], J[ends]), strict=True
-        ):
-            found[name][ends] = values
+        # there the rows of the frame Jacobian, which span the same, keep the rank that J_x loses
+        rows = problem.task.batched_frame_jacobian(samples.points[ends])[0].reshape(-1, problem.m, problem.n)
+        values = in_the_metric(replace(samples[ends], task_jacobian=rows), J[ends])
+        for name, part in zip(("leak_sines", "conditioning", "signs"), values, strict=True):
+            found[name][ends] = part
     return {"kept": kept, "points": samples.points, "jacobian": J, **found}
-
-
-def _by_frame(problem: Problem, samples: Samples, J: Array) -> tuple[Array, Array, Array]:
-    """`in_the_metric` by the frame Jacobian, whose rows span the same and keep their rank where J_x loses it."""
-    rows = problem.task.batched_frame_jacobian(samples.points)[0].reshape(samples.task_jacobian.shape)
-    return in_the_metric(replace(samples, task_jacobian=rows), J)
 
 
 def judge(samples: Samples, J: Array) -> dict[str, Array]:

@@ -459,6 +459,9 @@ def _report(
     floating = {chart.problem.robot.joint_names[k] for k in chart.problem.robot.tree.floating}
     angles, without_idle = Angles.of(judged, [range(chart.r), others])
     short, long = np.quantile(_lengths(judged.jacobian), [0.01, 0.99], axis=0)
+    # how fast joints move with xi held, at some of the points
+    some = slice(RULES.held)
+    speeds = measure_held_speeds(chart.problem, judged.points[some], judged.jacobian[some], seed or 0)
     # the point of least conditioning, (n,)
     k = int(np.argmin(judged.conditioning))
     point: Array = judged.points[k]
@@ -479,20 +482,13 @@ def _report(
         ),
         worst=worst,
         singular_samples=len(points) - len(judged.points),
-        held_speed=_held_speed(chart, judged, seed or 0),
+        held_speed=float(np.quantile(speeds, RULES.mostly)),
         length_ratio=float((long / short).max()),
         folded_samples=int(min((judged.signs > 0).sum(), (judged.signs <= 0).sum())),
         idle_joints=tuple(name for name in idle.values() if name not in floating),
         without_idle=without_idle if idle and others else None,
         contacts=contacts,
     )
-
-
-def _held_speed(chart: Chart, judged: Judged, seed: int) -> float:
-    """The speed with xi held at some of the points, for nine in ten of them."""
-    some = slice(RULES.held)
-    speeds = measure_held_speeds(chart.problem, judged.points[some], judged.jacobian[some], seed)
-    return float(np.quantile(speeds, RULES.mostly))
 
 
 def _functions_of(joint: int, J: Array) -> NDArray[np.int_]:

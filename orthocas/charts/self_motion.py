@@ -550,7 +550,9 @@ def filled(chart: Chart, q: Array, alone: XiRange, samples: int, collisions: Col
     about `samples` points result. The fill goes from point to neighbour, so that all points can be reached from q.
     """
     cells = max(2, round(samples ** (1 / chart.r)))
-    spacing = _spans(alone) / cells
+    # a full turn of coordinates without ends
+    span = alone.high - alone.low
+    spacing = np.where(np.isfinite(span) & (span > 0), span, 2 * np.pi) / cells
     known: dict[tuple[int, ...], Array] = {(0,) * chart.r: q}
     front, tried = list(known), set(known)
     start, sign = chart.phi(q), np.sign(np.linalg.det(chart.parts.batched_rates(q[None])[0]))
@@ -566,12 +568,6 @@ def filled(chart: Chart, q: Array, alone: XiRange, samples: int, collisions: Col
         front = [pairs[row][1] for row in good]
         known.update(zip(front, found[good], strict=True))
     return np.array(list(known.values()))
-
-
-def _spans(alone: XiRange) -> Array:
-    """The widths of the ranges; a full turn for endless coordinates."""
-    span = alone.high - alone.low
-    return np.where(np.isfinite(span) & (span > 0), span, 2 * np.pi)
 
 
 def _neighbours(

@@ -181,7 +181,7 @@ def fit_demo(out: Path, quick: bool = False, force: bool = False) -> tuple[Fit, 
     with open_output_folder("--out", out) as folder, publish(folder, listed=True, force=force) as drafts:
         fit.chart.save(drafts / "iiwa.orthocas")
         quality_figure(report).savefig(drafts / "iiwa_quality.png", dpi=150)
-        self_motion_figure(fit.chart, reach=None).savefig(drafts / "iiwa_self_motion.png", dpi=150)
+        self_motion_figure(fit.chart).savefig(drafts / "iiwa_self_motion.png", dpi=150)
     return fit, {
         "task_std_deg": report.task_angle.std,
         "mutual_std_deg": report.mutual_angle.std,

@@ -106,6 +106,7 @@ def _describe_robot(robot: Robot) -> dict[str, Any]:
     return {
         "joints": list(robot.joint_names),
         "kinds": list(robot.tree.joint_kinds),
+        **({"mimics": list(robot.mimics)} if robot.mimics else {}),
         "lower": clean(robot.lower),
         "upper": clean(robot.upper),
         "effort_limits": clean(robot.effort_limits),

@@ -154,7 +154,7 @@ FORMER = {
     "--plane": "use --obstacle plane:NORMAL,POINT, with three numbers each",
     "--gravity": "the gravity of a robot is an option of fit; whether a law compensates gravity: "
     "codegen --gravity-compensation law or robot",
-    "--cycles": "a comparison has three cycles; oc.viewer.cyclic_motions takes their number",
+    "--cycles": "a comparison has three cycles; orthocas.viewer.cyclic_motions takes their number",
 }
 
 

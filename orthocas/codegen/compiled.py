@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 
 from orthocas.codegen.kernels import generate_kernels
-from orthocas.codegen.library import find_compilers
+from orthocas.codegen.library import find_compilers, pointer
 from orthocas.codegen.rendering import render
 from orthocas.errors import CompileError, SimulationError
 from orthocas.tools.cached import cached_property
@@ -285,7 +285,7 @@ class Integrator:
         return result
 
     def _run(self, name: str, *arguments: Any) -> None:
-        pointers = [ctypes.c_void_p(a.ctypes.data) if isinstance(a, np.ndarray) else a for a in arguments]
+        pointers = [pointer(a) if isinstance(a, np.ndarray) else a for a in arguments]
         with deferred():
             failed = get_runner(name)(ctypes.byref(self._state), *pointers)
         if failed:

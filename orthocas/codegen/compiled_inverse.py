@@ -16,12 +16,12 @@ from numpy.typing import ArrayLike
 from orthocas.charts.chart import Chart
 from orthocas.charts.curve_tracer import RULES
 from orthocas.charts.curves import Nearest, SelfMotionCurves
-from orthocas.charts.inverse import Inverse, Solutions
-from orthocas.charts.methods import solve_with, targets_of_wish
+from orthocas.charts.inverse import Inverse, Solutions, build_phi_of_wish, solve_rows
 from orthocas.charts.newton import NEWTON, Attempt, Newton
 from orthocas.codegen.compiled import keep_library, load_library
 from orthocas.codegen.generate import generate_c
 from orthocas.codegen.kernels import generate_kernels
+from orthocas.codegen.library import pointer
 from orthocas.codegen.rendering import get_source, render
 from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.cached import cached_property
@@ -54,11 +54,11 @@ class CompiledInverse(Shown):
         self, phi: ArrayLike, q_start: ArrayLike | None = None, *, tolerance: float = 1e-9, inside: bool = False
     ) -> Solutions:
         """Solve like `Chart.solve`: the same status for each row and the same q to 1e-9, unless starts are far away."""
-        return solve_with(self._parts, self.chart, phi, q_start, tolerance, inside)
+        return solve_rows(self.chart, self._parts, phi, q_start, tolerance, inside)
 
     def nearest_xi(self, q_wish: ArrayLike, x: ArrayLike | None = None, *, tolerance: float = 1e-9) -> Solutions:
         """Solve like `Chart.nearest_xi`."""
-        phi, wishes = targets_of_wish(self.chart, q_wish, x)
+        phi, wishes = build_phi_of_wish(self.chart, q_wish, x)
         return self.solve(phi, wishes, tolerance=tolerance, inside=True)
 
     @cached_property
@@ -73,30 +73,21 @@ class CompiledInverse(Shown):
 
     def _search(self, iterations: int, targets: Array, starts: Array) -> Attempt:
         """Search from starts (N, n) in C."""
-        attempt, condition = Attempt.empty(*targets.shape), np.empty(len(targets))
-        inputs, rows_in_c = (np.ascontiguousarray(targets), np.ascontiguousarray(starts)), self._c.arm_inverse_rows
-        rows_in_c.restype = None
+        N, phi_map = len(targets), self.chart.parts.phi_map
+        q, residual, condition, inside = starts.copy(), np.empty_like(targets), np.empty(N), np.empty(N, dtype=np.bool_)
+        arrays = np.ascontiguousarray(targets), q, residual, condition, inside
 
         def solve_piece(first: int) -> None:
             rows = slice(first, first + _PIECE)
-            phi, q_start, q, reached = (array[rows] for array in (*inputs, attempt.q, attempt.residual))
-            arrays = (phi, q_start, self.chart.parts.phi_sizes, q, reached, condition[rows])
-            rows_in_c(
-                ctypes.c_long(len(phi)),
-                ctypes.c_int(iterations),
-                *(ctypes.c_void_p(array.ctypes.data) for array in arrays),
-            )
+            places = (pointer(array[rows]) for array in arrays)
+            self._c.arm_inverse_rows(ctypes.c_long(min(_PIECE, N - first)), iterations, *places)
 
-        run_in_threads(solve_piece, range(0, len(targets), _PIECE))
-        # C returns phi in place of the residual, and a negative condition where it finds nothing.
-        phi_map = self.chart.parts.phi_map
-        attempt.residual[:] = phi_map.difference(targets, attempt.residual) / phi_map.scale(targets)
-        attempt.iterations[:], attempt.suspicious[:] = 1, ~(condition < NEWTON.suspicious)
+        run_in_threads(solve_piece, range(0, N, _PIECE))
+        attempt = Attempt(q, residual, np.ones(N, dtype=np.int64), ~(condition < NEWTON.suspicious), inside)
         # Where C finds nothing, NumPy finds how near one can get; rows for which another search follows stay there.
         failed = np.flatnonzero(condition < 0)
-        if iterations == _FEW_ITERATIONS:
-            attempt.q[failed] = starts[failed]
-            attempt.residual[failed] = phi_map.residual(targets[failed], starts[failed])
+        if failed.size and iterations == _FEW_ITERATIONS:
+            residual[failed] = phi_map.residual(targets[failed], starts[failed])
         elif failed.size:
             attempt.replace(failed, Newton(phi_map)(targets[failed], starts[failed]))
         return attempt

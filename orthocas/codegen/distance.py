@@ -65,6 +65,7 @@ def render_distance(fitted: FittedCapsules, values: Mapping[str, Any], precision
         low, high = (f([p + s * r for p, r in zip(rows, radii, strict=True)], axis=(0, 1)) for f, s in _BOX)
         centre = (low + high) / 2
         far = [np.linalg.norm(p - centre, axis=1).max() + r for p, r in zip(rows, radii, strict=True)]
+        tree.require_no_mimics("distances in C")
         carried = np.zeros(tree.n, dtype=int)
         carried[tree.carriers(parts[0].body)] = 1
         ball = {"centre": centre, "radius": float(max(far)) * (1 + RULES.grown)}
@@ -89,6 +90,7 @@ def render_distance(fitted: FittedCapsules, values: Mapping[str, Any], precision
         "n": tree.n,
         "ratio": f"{fitted.ratio:.2f}",
         "missing": clean_word(listed(model.missing)) if model.missing else "",
+        "dropped": clean_word(listed([f"{a} and {b}" for a, b in fitted.dropped])) if fitted.dropped else "",
         "pair_count": len(model.pairs),
         "names": [[_quote(name) for name in pair] for pair in model.pairs],
         "parents": tree.parents,
@@ -154,7 +156,7 @@ def build_distance_form(fitted: FittedCapsules) -> Form:
         "plane_normals": np.repeat(np.reshape(normals, (-1, 4)), most_planes, axis=0)[:, :, None],
         "plane_radii": radii[flat][:, None],
     }
-    bodies = [part.body if part.body >= 0 else tree.n for part in parts]
+    bodies = [part.body if part.body >= 0 else tree.bodies for part in parts]
     indices = {
         "capsule_bodies": [*bodies, *bodies],
         "first": numbers[:, 0].tolist(),
@@ -164,7 +166,7 @@ def build_distance_form(fitted: FittedCapsules) -> Form:
     }
     values = {
         "pairs": ascii(model.pairs),
-        "bodies": tree.n + 1,
+        "bodies": tree.bodies + 1,
         "capsules": len(parts),
         "count": len(pairs),
         "most": most,

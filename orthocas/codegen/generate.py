@@ -26,7 +26,6 @@ from orthocas.codegen.rendering import (
     is_generated,
     render,
 )
-from orthocas.codegen.rows import render_rows
 from orthocas.codegen.supervision import build_supervision_kernels, describe_law, describe_supervision, find_condition
 from orthocas.control.controller import Controller, require_controller
 from orthocas.control.memory import find_memory
@@ -78,7 +77,6 @@ def generate_c(
     force: bool = False,
     safety: Safety | None = None,
     single_precision: bool = False,
-    rows: bool = False,
     capsules: FittedCapsules | None = None,
 ) -> GeneratedC:
     """Write C99 for a chart, the robot's dynamics, the inverse map, and a controller.
@@ -96,15 +94,13 @@ def generate_c(
         safety: settings of the supervised law; default `Safety.of(controller)`.
         single_precision: whether numbers are `float` instead of `double`, for processors that compute in single
             precision only.
-        rows: also write NAME_rows.c and NAME_rows.h with NAME_phi_rows, phi of many joint positions, for vector
-            instructions. Not for large networks.
         capsules: of `oc.fit_capsules(robot.collisions)`: also write NAME_distance.c and NAME_distance.h with
             NAME_distance, the least distance of the links and its gradient.
 
     Raises:
         NoExpressionError: if the chart is grown; `orthocas.distil` turns it into a chart with a closed expression.
-        InvalidValueError: if the name is not a C identifier, the controller belongs to another chart, the chart has
-            too many operations for rows, or the folder has a file of the same name that was not generated.
+        InvalidValueError: if the name is not a C identifier, the controller belongs to another chart, or the
+            folder has a file of the same name that was not generated.
         ArchiveError: if the folder is not writable, or a file there is a symbolic link.
         CompileError: if this version of CasADi generates C of an unexpected form.
 
@@ -134,7 +130,7 @@ def generate_c(
     precision = SINGLE if single_precision else DOUBLE
     kernels = generate_kernels(_build_functions(chart, controller, precision), f"{name}_kernel")
     stack_bytes = _bound_stack(kernels, chart, controller, precision.size)
-    values = _describe_library(chart, controller, name, rows, precision, kernels) | {"stack_bytes": stack_bytes}
+    values = _describe_library(chart, controller, name, precision, kernels) | {"stack_bytes": stack_bytes}
     values["distances"] = capsules is not None
     values |= _describe_chart(chart, precision) | {"check": _compute_check(chart, controller, precision)}
     if controller is not None and safety is not None:
@@ -147,8 +143,6 @@ def generate_c(
         "README.md": render("README.md", values),
         **{f"{precision.runtime}.{end}": get_runtime(precision, end) for end in ("h", "c")},
     }
-    if rows:
-        contents |= render_rows(chart, values, precision)
     if capsules is not None:
         contents |= render_distance(capsules, values, precision)
 
@@ -231,7 +225,7 @@ def _bound_stack(kernels: Kernels, chart: Chart, controller: Controller | None, 
 
 
 def _describe_library(
-    chart: Chart, controller: Controller | None, name: str, rows: bool, precision: Precision, kernels: Kernels
+    chart: Chart, controller: Controller | None, name: str, precision: Precision, kernels: Kernels
 ) -> dict[str, Any]:
     """Values of the templates about names, versions, number type and kernels; no law yet."""
     # The law comes later, from `describe_law`.
@@ -244,7 +238,6 @@ def _describe_library(
         "title": clean_word(title),
         "version": VERSION,
         "casadi_version": ca.CasadiMeta.version(),
-        "rows": rows,
         "max_evaluations": RULES.evaluations,
         "runtime": precision.runtime,
         **precision.describe(),

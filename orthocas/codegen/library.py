@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from orthocas.charts.chart import Chart
 from orthocas.codegen.generate import GeneratedC, generate_c
@@ -28,7 +28,6 @@ from orthocas.tools.processes import run_program
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
 NO_DOUBLE = ("-Wdouble-promotion", "-Wfloat-conversion")  #: for code in single precision
-_POINTER = ctypes.c_void_p
 # As in runtime/ticks.c.
 _STATES = 64
 # To spend on one measurement.
@@ -172,7 +171,7 @@ class CompiledLibrary:
         # C would read beyond the end of a short array; the first two have a number for each joint.
         for array in arrays[:2]:
             require_shape(f"an argument of {function}", array.shape[:1], (self.n,))
-        places, results = ([array.ctypes.data_as(_POINTER) for array in some] for some in (arrays, outputs))
+        places, results = ([array.ctypes.data_as(ctypes.c_void_p) for array in some] for some in (arrays, outputs))
         return int(self.function(function)(*places, *numbers, *results))
 
 
@@ -199,11 +198,14 @@ class Supervisor:
             name: library.function(name)
             for name in ("check_start", "start", "take_over", "resume", "hold", "release", "step")
         }
-        self._functions["check_start"].argtypes = [_POINTER] * 5
-        self._functions["step"].argtypes = [*[_POINTER] * 6, library.precision.c_type, _POINTER]
+        self._functions["check_start"].argtypes = [ctypes.c_void_p] * 5
+        self._functions["step"].argtypes = [*[ctypes.c_void_p] * 6, library.precision.c_type, ctypes.c_void_p]
         stream, pace = (library.function(f"reference_{name}") for name in ("stream", "pace"))
-        stream.argtypes = [*[_POINTER] * 3, *[library.precision.c_type] * 2]
-        pace.argtypes, pace.restype = [_POINTER, _POINTER, library.precision.c_type], library.precision.c_type
+        stream.argtypes = [*[ctypes.c_void_p] * 3, *[library.precision.c_type] * 2]
+        pace.argtypes, pace.restype = (
+            [ctypes.c_void_p, ctypes.c_void_p, library.precision.c_type],
+            library.precision.c_type,
+        )
         self._functions |= {"stream": stream, "pace": pace}
         if safety is not None:
             require_kind("safety", safety, Safety)
@@ -238,7 +240,7 @@ class Supervisor:
         mismatch = self._library.numbers(np.zeros(self._n))
         inputs = [self._numbers(name, value, self._n) for name, value in (("q", q), ("torque", torque))]
         inputs += [self._library.numbers(self.gains), mismatch]
-        status = self._functions["check_start"](self._safety, *map(_pointer, inputs))
+        status = self._functions["check_start"](self._safety, *map(pointer, inputs))
         return mismatch, ControlStatus(status)
 
     def start(self, q: ArrayLike, command: ArrayLike | None = None) -> None:
@@ -248,7 +250,7 @@ class Supervisor:
     def take_over(self, q: ArrayLike, command: ArrayLike) -> None:
         """Take over from another controller while the arm moves."""
         points = self._point("q", q), self._point("command", command)
-        self._functions["take_over"](self._here, *map(_pointer, points))
+        self._functions["take_over"](self._here, *map(pointer, points))
 
     def resume(self) -> None:
         """Ask for the law again."""
@@ -273,8 +275,8 @@ class Supervisor:
         """
         inputs = [self._numbers(name, value, self._n) for name, value in (("q", q), ("dq", dq))]
         inputs += [self._reference(reference), self._library.numbers(self.gains)]
-        time, command = as_number("period", period), _pointer(self._command)
-        status = self._functions["step"](self._here, self._safety, *map(_pointer, inputs), time, command)
+        time, command = as_number("period", period), pointer(self._command)
+        status = self._functions["step"](self._here, self._safety, *map(pointer, inputs), time, command)
         return self._command.copy(), ControlStatus(status)
 
     def stream(self, reference: Array, target: ArrayLike, omega: float, period: float = 1e-3) -> ControlStatus:
@@ -286,14 +288,14 @@ class Supervisor:
         goal = self._numbers("target", target, self._k)
         speed = as_number("omega", omega)
         time = as_number("period", period)
-        status = self._functions["stream"](self._here, _pointer(numbers), _pointer(goal), speed, time)
+        status = self._functions["stream"](self._here, pointer(numbers), pointer(goal), speed, time)
         reference[:] = numbers
         return ControlStatus(status)
 
     def pace(self, reference: Array, period: float = 1e-3) -> float:
         """Scale the derivatives of a reference to what joints can follow; the pace at which time goes on, 0 to 1."""
         numbers = self._reference(reference)
-        pace = float(self._functions["pace"](self._here, _pointer(numbers), as_number("period", period)))
+        pace = float(self._functions["pace"](self._here, pointer(numbers), as_number("period", period)))
         reference[:] = numbers
         return pace
 
@@ -311,7 +313,7 @@ class Supervisor:
 
     def _begin(self, name: str, q: ArrayLike, command: ArrayLike | None) -> None:
         point, given = self._point("q", q), None if command is None else self._point("command", command)
-        self._functions[name](self._here, _pointer(point), None if given is None else _pointer(given))
+        self._functions[name](self._here, pointer(point), None if given is None else pointer(given))
 
     def _numbers(self, name: str, values: ArrayLike, size: int) -> Array:
         """Numbers of the library's type, which may be NaN or infinite."""
@@ -338,7 +340,7 @@ def _build_state(
     counts = ("mode", "cause", "asked", "bad_ticks", "fresh", "stale_ticks", "same_ticks")
     names = ("q", "dq", "seen_q", "seen_dq", "command", "led", "impulse", "impulse_from", "law", "anchor", "safe")
     layout: dict[str, Any] = dict.fromkeys(counts, ctypes.c_int)
-    layout |= dict.fromkeys(("weight", "brake", "unseen"), number)
+    layout |= dict.fromkeys(("weight", "brake", "unseen", "hasty"), number)
     layout |= dict.fromkeys(names, joints) | dict.fromkeys(("offset", "integral"), quantities)
     if has_spring:
         layout |= dict.fromkeys(("load", "drive", "speed"), joints) | {"inertia": number * n**2}
@@ -355,9 +357,10 @@ def _build_struct(name: str, layout: dict[str, Any]) -> type[ctypes.Structure]:
     return type(name, (ctypes.Structure,), {"_fields_": list(layout.items())})
 
 
-def _pointer(array: Array) -> Any:
-    """The address of an array, which must live until C has read it. `data_as` would keep it, and takes microseconds."""
-    return _POINTER(array.ctypes.data)
+def pointer(array: NDArray[Any]) -> ctypes.c_void_p:
+    """The place of an array, contiguous, that somebody else keeps until the call ends. `data_as` takes microseconds."""
+    assert array.flags.c_contiguous
+    return ctypes.c_void_p(array.__array_interface__["data"][0])
 
 
 @dataclass(frozen=True)

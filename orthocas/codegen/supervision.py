@@ -161,6 +161,7 @@ def describe_supervision(controller: Controller, safety: Safety) -> dict[str, An
     path, relative = domain.path_bound, Relative(problem.task)
     return {
         "settings": [_describe_setting(name, value) for name, value in safety.in_c(controller.command).items()],
+        "integral_bound": write_number(float(getattr(controller, "integral_bound", np.inf))),
         "unused_settings": () if controller.command == "torque" else TORQUE_ONLY,
         "turning": np.isinf(robot.lower) & np.isinf(robot.upper) & ~np.array(robot.tree.prismatic),
         "bounded": np.isfinite(lower) & np.isfinite(upper) & (controller.chart is not None),

@@ -19,10 +19,12 @@ from orthocas.tools.interrupts import deferred
 
 UNBOUNDED = (  #: settings that may be infinite
     *("command_rate", "speed_limit", "stuck_speed", "lower", "upper", "error_limit"),
-    *("reference_speed", "reference_acceleration", "start_mismatch"),
+    *("reference_speed", "reference_acceleration", "start_mismatch", "friction"),
 )
 SIGNED = ("lower", "upper")  #: settings that may be negative
-TORQUE_ONLY = ("observer_rate", "stop_zone", "stop_damping", "brake_stiffness", "brake_yield")  #: not of velocity laws
+TORQUE_ONLY = (  #: not of velocity laws
+    *("observer_rate", "encoder_step", "friction", "stop_zone", "stop_damping", "brake_stiffness", "brake_yield"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +46,11 @@ class SafetyRules:
     stuck_speed: float = 0.15  #: that commands must have given to an arm that measures the same [rad/s]
     stuck_way: float = 0.03  #: likewise of velocity laws [rad]
     friction: float = 2.0  #: that may hold a joint at a start beside its torque [N m] or [N]
+    most_friction: float = 12.5  #: and most that may hold it against the law, later [N m] or [N]
+    stiction: float = 0.125  #: likewise, as a share of the effort limit: Coulomb friction of 10 %, a quarter more at rest
+    fine_step: float = 2 * np.pi / 2**13  #: of an encoder [rad]
+    observer: float = 60.0  #: poles of the observer of velocities for that step, at most twice that for finer ones [1/s]
+    turn_per_metre: float = 40 * np.pi  #: encoders of sliding joints turn once in 5 cm [rad/m]
     error: float = 0.02  #: of models and torque sensors, as a share of the effort limit; without one, of gravity
 
 
@@ -85,7 +92,11 @@ class Safety:
     ]
     stuck_speed: Annotated[Array, "speed that an arm which measures the same may get [rad/s]; velocity laws: way [rad]"]
     longest_period: Annotated[float, "between two ticks; later ones call the catcher [s]"]
-    observer_rate: Annotated[Array, "poles of an observer of velocities, for coarse encoders [1/s]; 0: as measured"]
+    observer_rate: Annotated[
+        Array, "poles of an observer of velocities, for coarse encoders [1/s]; 0: as measured; default by encoder_step"
+    ]
+    encoder_step: Annotated[Array, "what an encoder rounds to, which that observer does not take for motion [rad] or [m]"]
+    friction: Annotated[Array, "dry friction that may hold a joint, whose sensors then measure the same [N m]"]
     lower: Annotated[Array, "joint limits [rad] or [m]"]
     upper: Annotated[Array, "joint limits [rad] or [m]"]
     stop_zone: Annotated[Array, "where springs and dampers near the joint limits begin [rad] or [m]"]
@@ -184,6 +195,8 @@ class Safety:
             "stuck_speed": np.full(n, RULES.stuck_speed if torque else RULES.stuck_way),
             "longest_period": 0.02,
             "observer_rate": np.zeros(n),
+            "encoder_step": np.zeros(n),
+            "friction": np.minimum(RULES.most_friction, RULES.stiction * efforts),
             "lower": robot.lower,
             "upper": robot.upper,
             "stop_zone": np.fmin(RULES.zone, RULES.zone * (robot.upper - robot.lower)),
@@ -198,6 +211,11 @@ class Safety:
         if unknown:
             raise InvalidValueError("setting", repr(unknown[0]), f"one of {', '.join(settings)}")
         spread = {name: _spread(name, value, settings[name]) for name, value in changes.items()}
+        # Coarse encoders need an observer of velocities, and the coarser they are, a slower one.
+        if "encoder_step" in spread and "observer_rate" not in spread:
+            fine = np.where(robot.tree.prismatic, RULES.fine_step / RULES.turn_per_metre, RULES.fine_step)
+            coarseness = np.asarray(spread["encoder_step"]) / fine
+            spread["observer_rate"] = np.where(coarseness > 0, RULES.observer * np.maximum(coarseness, 0.25) ** -0.5, 0)
         rate = float(np.asarray(spread.get("integral_rate", 0.0), dtype=float).max(initial=0.0))
         if rate > 0 and rate > (bound := getattr(controller, "integral_bound", np.inf)):
             raise InvalidValueError("integral_rate", rate, f"at most {bound:.3g}/s, which the slowest mode bears")

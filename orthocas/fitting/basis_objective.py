@@ -43,6 +43,7 @@ class ObjectiveRules:
     hinges: int = 1000  #: samples that estimate the Gauss-Newton matrix of a hinge, about
     coupled: int = 1500  #: coefficients up to which an estimate holds what couples coordinates
     rough: int = 12  #: residuals per coefficient in a rough estimate
+    rough_in_metric: int = 6  #: the same in another metric than the identity, where more estimates are needed
 
     orienting: int = 200  #: samples that determine the orientation of a network's start
     piece: int = 2**18  #: entries of the largest array of a piece of samples; larger ones leave the cache
@@ -169,8 +170,9 @@ class BasisObjective:
         """
         # as few samples as leave enough residuals for each coefficient
         residuals = self.N * (self._loss.hinge_rows.start or 1)
+        rough = RULES.rough if self._loss.sizes.identity_metric else RULES.rough_in_metric
         stride = RULES.stride
-        while 2 * stride <= RULES.most_stride and residuals >= 2 * stride * RULES.rough * theta.size:
+        while 2 * stride <= RULES.most_stride and residuals >= 2 * stride * rough * theta.size:
             stride *= 2
         return [self._build_matrix(theta, stride)] if theta.size <= RULES.coupled else self._build_blocks(theta, stride)
 

@@ -35,6 +35,8 @@ class FitRules:
 
     least_samples: int = 1000  #: of bases
     residuals: int = 140  #: per coefficient, for which samples are drawn beyond these
+    residuals_in_metric: int = 70  #: the same in another metric than the identity: leaks are of the same size
+    renewal_in_metric: float = 0.95  #: of the matrix of QuasiNewton there, where losses fall along long valleys
     tolerance_of_many: float = 1e-3  #: of the solver for many joints: half the time, and leaks are 2 % larger
     residuals_of_many: int = 100  #: the same for coordinates of many joints, and nothing beyond them
     network_samples: int = 2000  #: of families that are not linear in their parameters
@@ -157,7 +159,9 @@ def choose_solver(parametrisation: Parametrisation, problem: Problem) -> Solver:
     terms = parametrisation.term_count(problem.n) if isinstance(parametrisation, GradedParametrisation) else 0
     if terms and problem.n > RULES.many_joints:
         return QuasiNewton(tolerance=RULES.tolerance_of_many)
-    return QuasiNewton() if terms > RULES.many_terms else GaussNewton()
+    if terms <= RULES.many_terms:
+        return GaussNewton()
+    return QuasiNewton() if problem.metric.is_identity else QuasiNewton(renewal=RULES.renewal_in_metric)
 
 
 def _check_bound(parametrisation: Parametrisation, max_mutual_deg: float) -> float:

@@ -127,9 +127,11 @@ class Continuation:
     def _solve(self, step: Parametrisation, label: str, final: bool) -> None:
         """Run a stage, and search the worst points of its result."""
         runner, degree = self._runner, step.degree if isinstance(step, GradedParametrisation) else 0
-        # the family on the active joints, from the last result; only the last degree is solved exactly
-        family = runner.family(step, self._r)
-        solver = runner.settings.solver if final else runner.settings.solver.coarser()
+        # The family on the active joints, from the last result. Only the last degree is solved exactly, but in another
+        # metric than the identity: the loss has long valleys there, and steps of low degrees cost little.
+        family, solver = runner.family(step, self._r), runner.settings.solver
+        if not final and runner.problem.metric.is_identity:
+            solver = solver.coarser()
         stage = runner.run(Plan(label, family, self._start(family), solver, degree, final))
         self._stages.append(stage)
         self._reached = step, family
@@ -464,7 +466,8 @@ class StageRunner:
         rows = self.problem.m + r - 1
         if self.problem.n > RULES.many_joints:
             return self.settings.samples or ceil(RULES.residuals_of_many * terms / rows)
-        return self.settings.samples or RULES.least_samples + ceil(RULES.residuals * terms / rows)
+        residuals = RULES.residuals if self.problem.metric.is_identity else RULES.residuals_in_metric
+        return self.settings.samples or RULES.least_samples + ceil(residuals * terms / rows)
 
     def _sample(self, count: int, tag: int) -> Samples:
         points = sample_evenly(self.problem.domain, count, (self.settings.seed, tag))

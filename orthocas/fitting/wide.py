@@ -107,8 +107,9 @@ def fit_wide(
        to prove, and hold at any turn of these joints. They ask that self-motions turn base and tool in one direction.
     3. If these leave out much of the branch, polynomials in all joints are tried, and a network,
        MLP((64, 64, 64), raw=True), where both leave out much, or the first ones very much, as on arms whose axes pass
-       each other at a distance. A network begins at random and descends with Adam on some of the samples at a time. It
-       takes several times as long to evaluate, and is not tried with `like` or with slides without limits.
+       each other at a distance. A network begins at random, or with the result of A = I in another metric with r = 1,
+       and descends with Adam on some of the samples at a time. It takes several times as long to evaluate, and is not
+       tried with `like` or with slides without limits.
     4. The best ones go on: as long as they are not regular enough at other samples, and get better, the worst of many
        fresh samples join. Once they are, and with r = 1, leaks weigh more in a last descent, kept if coordinates stay
        regular enough.

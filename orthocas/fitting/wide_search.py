@@ -209,7 +209,15 @@ class Search:
             self._descend(name, "volume", self.solver)
         else:
             self._samples = [sample_frames(self.problem, np.vstack([points, self._sample_near_centre()]))]
-            self._last = self._start_at_random()
+            problem = self.problem
+            if problem.metric.is_identity or problem.r > 1 or self.left_out:
+                self._last = self._start_at_random()
+            else:
+                # networks of all joints are led by those of A = I: from a random start, some would stay folded
+                plain = Problem(problem.robot, problem.task, "euclidean", problem.domain, problem.name)
+                leader = Search(plain, self.parametrisation, self.settings)
+                leader.begin(f"{name}, A = I")
+                self._last, self.stages = leader._last, leader.stages
             self._descend(name, "volume with the worst", self.solver)
 
     def go_on(self) -> None:

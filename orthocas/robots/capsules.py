@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,7 +12,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError
-from orthocas.robots.collisions import Collisions, Part
+from orthocas.robots.collisions import Collisions, Pair, Part
 from orthocas.robots.shapes import BallGeometry, CapsuleGeometry, CloudGeometry, Geometry, Shape
 from orthocas.robots.spatial import rotate_z_to
 from orthocas.robots.tree import BASE_JOINTS, KinematicTree
@@ -36,11 +37,12 @@ class CapsuleRules:
     first: float = 0.2  #: its first steps
     room: float = 1e-9  #: [m] between a corner and the surface; rounding takes a thousandth of it
     points: int = 20_000  #: by which volumes are measured
-    few: int = 2000  #: of them, to choose a cut
+    few: int = 10_000  #: by which cuts are chosen
     chunk: int = 1000  #: of these points, at once
     thickest: float = 1e6  #: [m], of rods
     point: float = 1e-9  #: [m]: shorter rods are balls
-    seed: int = 0  #: of these points
+    seed: int = 0  #: of these points, and of postures
+    postures: int = 1000  #: in which pairs touch that are left out
 
 
 RULES = CapsuleRules()
@@ -54,6 +56,7 @@ class FittedCapsules(Shown):
     ratios: Mapping[str, float]  #: volume of the capsules over that of the solids, by link
     ratio: float  #: the same of all links together
     pieces: tuple[tuple[str, Array, Part], ...]  #: links, corners (K, 3) of their pieces, and the capsules of these
+    dropped: tuple[Pair, ...] = ()  #: pairs whose capsules touch in all postures, and are not checked
 
     def facts(self) -> dict[str, str]:
         """How many there are, and how much larger than the links."""
@@ -62,6 +65,7 @@ class FittedCapsules(Shown):
             "capsules": f"{len(self.pieces)} around {len(self.ratios)} links",
             "volume": f"{self.ratio:.3g} of that of the links, at most {self.ratios[worst]:.3g} ({worst})",
             "links": listed(self.ratios),
+            **({"unchecked": listed([f"{a} and {b}" for a, b in self.dropped])} if self.dropped else {}),
         }
 
 
@@ -75,6 +79,9 @@ def fit_capsules(collisions: Collisions) -> FittedCapsules:
 
     Every corner of a piece lies within its capsule, by 1e-9 m or more. A capsule is convex, so it contains the piece;
     the pieces of a hull are all of it. So distances of capsules are never larger than those of the hulls.
+
+    Pairs of links whose capsules touch in all of 1,000 seeded postures would never report anything else. They are left
+    out and named in `dropped`; the hulls of `collisions` still check them.
 
     Args:
         collisions: such as `robot.collisions`. Half-spaces of a scene stay what they are.
@@ -115,14 +122,22 @@ def fit_capsules(collisions: Collisions) -> FittedCapsules:
             pieces.append((name, hull, Part(name, parts[0].body, capsule.shape)))
         ratios[name] = found[1] / volume
         volumes += [found[1], volume]
-    model = Collisions(
-        collisions.tree,
-        [*kept, *(part for _, _, part in pieces)],
-        collisions.pairs,
-        collisions.missing,
-        f"capsules around those {collisions.origin}",
-    )
-    return FittedCapsules(model, ratios, float(volumes[0] / volumes[1]) if volumes[1] else 1.0, tuple(pieces))
+    parts, origin = [*kept, *(part for _, _, part in pieces)], f"capsules around those {collisions.origin}"
+    model = Collisions(collisions.tree, parts, collisions.pairs, collisions.missing, origin)
+    # Pairs that always touch, of links that are not solid in the world: scenes are for the user to correct.
+    touching = model.pair_distances(collisions.tree.centre_posture) <= 0
+    for q in collisions.tree.draw_postures(RULES.postures, RULES.seed):
+        if not touching.any():
+            break
+        touched = [owner for owner, _ in model.scan_near(q[None], 0.0, touching)]
+        touching &= np.isin(np.arange(len(touching)), touched)
+    fixed = {part.name for part in parts if part.body < 0}
+    dropped = [pair for pair, always in zip(model.pairs, touching, strict=True) if always and not fixed & set(pair)]
+    if dropped:
+        left = [pair for pair in model.pairs if pair not in dropped]
+        model = Collisions(collisions.tree, parts, left, collisions.missing, origin)
+    ratio = float(volumes[0] / volumes[1]) if volumes[1] else 1.0
+    return FittedCapsules(model, ratios, ratio, tuple(pieces), tuple(dropped))
 
 
 def build_rods(tree: KinematicTree, radius: ArrayLike) -> Collisions:
@@ -141,17 +156,17 @@ def build_rods(tree: KinematicTree, radius: ArrayLike) -> Collisions:
     ends: dict[tuple[int, int | str], Array] = {}
     for frame in (tree.tip, *map(tree.frame, tree.tips)):
         for start, end in pairwise(tree.carriers(frame.parent)):
-            if tree.joint_names[end] not in BASE_JOINTS:
+            if tree.body_joints[end] not in BASE_JOINTS:
                 ends[start, end] = np.asarray(tree.translations[end])
         ends[frame.parent, frame.name] = np.asarray(frame.translation)
     parts = []
     for (body, _), far in ends.items():
         if body < 0:
             continue
-        length, thick = float(np.linalg.norm(far)), float(radii[body])
+        length, thick = float(np.linalg.norm(far)), float(radii[tree.leaders[body]])
         solid: Geometry = BallGeometry(thick) if length < RULES.point else CapsuleGeometry(thick, length)
         turn = np.eye(3) if length < RULES.point else rotate_z_to(far / length)
-        parts.append(Part(f"link of {tree.joint_names[body]}", body, Shape(solid, turn, far / 2)))
+        parts.append(Part(f"link of {tree.body_joints[body]}", body, Shape(solid, turn, far / 2)))
     return Collisions(tree, parts, (), origin="rods")
 
 
@@ -185,10 +200,12 @@ class Capsule:
 
     def measure_rooms(self, points: Array) -> Array:
         """Distances of points (N, 3) from the surface, (N,), positive inside."""
-        along = self.end - self.start
-        squared = float(along @ along)
-        s = np.clip((points - self.start) @ along / squared, 0.0, 1.0) if squared > 0 else np.zeros(len(points))
-        return np.asarray(self.radius - np.linalg.norm(points - self.start - s[:, None] * along, axis=1))
+        along, offsets = self.end - self.start, points - self.start
+        squared, ahead = float(along @ along), offsets @ along
+        s = np.clip(ahead / squared, 0.0, 1.0) if squared > 0 else np.zeros(len(points))
+        # |o - s a|^2, with the nearest point of the segment at s
+        away = np.einsum("ij,ij->i", offsets, offsets) + s * (s * squared - 2 * ahead)
+        return np.asarray(self.radius - np.sqrt(np.maximum(away, 0.0)))
 
 
 def _cover(
@@ -203,32 +220,36 @@ def _cover(
         most: number of pieces.
     """
     found = []
+    first = [(hull, _fit_capsule(hull, rounding)) for hull in hulls]
+    # Unions are compared by the same points in a box, of which each capsule is asked once.
+    low, high = (np.array(corners) for corners in zip(*(capsule.list_box() for _, capsule in first), strict=True))
+    low, high = low.min(axis=0), high.max(axis=0)
+    points = np.random.default_rng(RULES.seed).uniform(low, high, (RULES.few, 3))
+    each = float(np.prod(high - low)) / RULES.few
     for overlaps in (True, False):
-        pieces = [(hull, _fit_capsule(hull, rounding)) for hull in hulls]
-        whole = _measure_union([capsule for _, capsule in pieces])
+        pieces, held = list(first), [capsule.contains(points) for _, capsule in first]
+        whole = each * np.any(held, axis=0).sum()
         while whole > RULES.ratio * volume and len(pieces) < most:
             # The piece whose capsule has most to lose, and its best cut.
             order = np.argsort([_measure_hull(hull) - capsule.volume for hull, capsule in pieces])
             k, cuts = next(((int(k), cuts) for k in order if (cuts := _list_cuts(pieces[k][0]))), (0, []))
             if not cuts:
                 break
-            others = [capsule for row, (_, capsule) in enumerate(pieces) if row != k]
             parts = [[(side, _fit_capsule(side, rounding, quick=True)) for side in cut] for cut in cuts]
-            values = [
-                _measure_union([*others, *(capsule for _, capsule in cut)], RULES.few)
-                if overlaps
-                else sum(capsule.volume for _, capsule in cut)
-                for cut in parts
-            ]
-            pieces[k : k + 1] = parts[int(np.argmin(values))]
-            whole = _measure_union([capsule for _, capsule in pieces], RULES.few)
-        if len(pieces) > len(hulls):
-            pieces = [(hull, _fit_capsule(hull, rounding)) for hull, _ in pieces]
-            whole = _measure_union([capsule for _, capsule in pieces])
+            within = [[capsule.contains(points) for _, capsule in cut] for cut in parts]
+            others = np.logical_or.reduce([mask for row, mask in enumerate(held) if row != k], axis=0, initial=False)
+            unions = [(others | one | other).sum() for one, other in within]
+            values = unions if overlaps else [sum(capsule.volume for _, capsule in cut) for cut in parts]
+            best = int(np.argmin(values))
+            pieces[k : k + 1], held[k : k + 1] = parts[best], within[best]
+            whole = each * unions[best]
         found.append((pieces, whole))
         if whole <= RULES.ratio * volume:
             break
-    return min(found, key=lambda cover: cover[1])
+    # The capsules of cuts were quick ones.
+    pieces = min(found, key=lambda cover: cover[1])[0]
+    pieces = [(hull, _fit_capsule(hull, rounding)) for hull, _ in pieces] if len(pieces) > len(hulls) else pieces
+    return pieces, _measure_union([capsule for _, capsule in pieces])
 
 
 def _fit_capsule(corners: Array, rounding: float, quick: bool = False) -> Capsule:
@@ -259,9 +280,10 @@ def _shorten(corners: Array, place: Array, axis: Array, more: float) -> Capsule:
     """The capsule about a line with the radius that its points need, and more, and the shortest segment on it."""
     offsets = corners - place
     along = offsets @ axis
-    away = np.linalg.norm(offsets - np.outer(along, axis), axis=1)
-    radius = float(away.max()) + more
-    depth = np.sqrt(np.maximum(radius**2 - away**2, 0.0))
+    # squares of the distances from the line
+    away = np.maximum(np.einsum("ij,ij->i", offsets, offsets) - along**2, 0.0)
+    radius = math.sqrt(float(away.max())) + more
+    depth = np.sqrt(np.maximum(radius**2 - away, 0.0))
     low, high = float((along + depth).min()), float((along - depth).max())
     low, high = (low, high) if low < high else ((low + high) / 2, (low + high) / 2)
     return Capsule(place + low * axis, place + high * axis, radius)

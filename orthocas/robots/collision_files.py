@@ -26,7 +26,7 @@ from orthocas.robots.shapes import (
     HullGeometry,
     Shape,
 )
-from orthocas.robots.tree import PRISMATIC_ROOM, KinematicTree
+from orthocas.robots.tree import KinematicTree
 from orthocas.robots.urdf import find_srdf, read_urdf_xml, read_xml
 from orthocas.tools.checks import Array
 
@@ -212,7 +212,7 @@ def _find_pairs_file(urdf: Path, name: str) -> Path | None:
 
 def find_pairs(collisions: Collisions) -> list[Pair]:
     """The pairs of `collisions` that neither touch by their make nor stay apart, in seeded postures between limits."""
-    postures = _draw_postures(collisions.tree, RULES.postures)
+    postures = collisions.tree.draw_postures(RULES.postures, RULES.seed)
     count = len(collisions.pairs)
     touching, near = np.zeros(count), np.zeros(count, dtype=bool)
     # How often pairs touch, of the first postures.
@@ -226,15 +226,6 @@ def find_pairs(collisions: Collisions) -> list[Pair]:
         for owner, _ in collisions.scan_near(postures[start : start + RULES.first], RULES.near, ~near):
             near[owner] = True
     return [pair for pair, ever, made in zip(collisions.pairs, near, always, strict=True) if ever and not made]
-
-
-def _draw_postures(tree: KinematicTree, count: int) -> Array:
-    """Uniform postures between the limits, (count, n); a full turn, or a part of a rail, where there are none."""
-    room = np.where(tree.prismatic, PRISMATIC_ROOM, np.pi)
-    low = np.where(np.isfinite(tree.lower), tree.lower, -room)
-    high = np.where(np.isfinite(tree.upper), tree.upper, np.maximum(room, low + room))
-    low = np.minimum(low, high - 1e-9)
-    return np.random.default_rng(RULES.seed).uniform(low, high, (count, tree.n))
 
 
 def _find_neighbours(root: ElementTree.Element, solid: set[str]) -> set[frozenset[str]]:

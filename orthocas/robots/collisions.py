@@ -145,7 +145,7 @@ class Collisions(Shown):
         require_kind("parts", parts, Sequence)
         for part in parts:
             require_kind("entry of parts", part, Part)
-            require_count("body of a part", part.body + 1, least=0, most=tree.n)
+            require_count("body of a part", part.body + 1, least=0, most=tree.bodies)
         require_kind("missing", missing, Sequence)
         self.tree = tree
         self.parts = tuple(parts)
@@ -194,7 +194,7 @@ class Collisions(Shown):
         values = np.full((len(points), len(self.pairs)), np.inf)
         scratch = self._scratch
         for row, position in zip(values, points, strict=True):
-            pin.updateGeometryPlacements(scratch.model, scratch.data, scratch.geometry, scratch.placed, position)
+            scratch.place(position)
             for k, owner in enumerate(self._owners.tolist()):
                 found = pin.computeDistance(scratch.geometry, scratch.placed, k).min_distance
                 row[owner] = min(row[owner], found)
@@ -209,7 +209,7 @@ class Collisions(Shown):
             some = points[start : start + RULES.piece]
             bounds = self._bound_distances(some, 0.0)
             for i in np.flatnonzero((bounds <= 0).any(axis=1)).tolist():
-                pin.updateGeometryPlacements(scratch.model, scratch.data, scratch.geometry, scratch.placed, some[i])
+                scratch.place(some[i])
                 near = np.flatnonzero(bounds[i] <= 0)
                 for k in near[np.argsort(bounds[i][near])].tolist():
                     if pin.computeDistance(scratch.geometry, scratch.placed, k).min_distance <= 0:
@@ -359,7 +359,7 @@ class Collisions(Shown):
         bounds = self._bound_distances(points, least)
         bounds[:, np.flatnonzero(asked[self._owners] == 0)] = np.inf
         for i in np.flatnonzero((bounds < least).any(axis=1)).tolist():
-            pin.updateGeometryPlacements(scratch.model, scratch.data, scratch.geometry, scratch.placed, points[i])
+            scratch.place(points[i])
             distances: dict[int, float] = {}
             for k in np.flatnonzero(bounds[i] < least).tolist():
                 found = pin.computeDistance(scratch.geometry, scratch.placed, k).min_distance
@@ -393,7 +393,7 @@ class Collisions(Shown):
     def measure_parts(self, q: Array, index: Indices) -> tuple[Array, Array, Array]:
         """Distances (P,), gradients (P, n) and nearest points (P, 2, 3) of numbered pairs of parts (P,) at q (n,)."""
         scratch = self._scratch
-        pin.updateGeometryPlacements(scratch.model, scratch.data, scratch.geometry, scratch.placed, q)
+        scratch.place(q)
         values, ends, normals = np.empty(len(index)), np.empty((len(index), 2, 3)), np.empty((len(index), 3))
         for row, k in enumerate(index.tolist()):
             result = pin.computeDistance(scratch.geometry, scratch.placed, k)
@@ -424,7 +424,9 @@ class Collisions(Shown):
         distance from that axis, over all postures between the limits.
         """
         tree, parts = self.tree, self.parts
-        reach = np.zeros((len(parts), tree.n))
+        reach = np.zeros((len(parts), tree.bodies))
+        # How far the joints of slides go, those of mimic joints too.
+        strokes = np.maximum(*(np.abs(tree.expand(end)) for end in (tree.lower, tree.upper)))
         for k, part in enumerate(parts):
             start, end, radius = part.shape.bound()
             # From the farthest point of the part inwards, along the joints that carry it.
@@ -432,15 +434,15 @@ class Collisions(Shown):
             across = max(float(np.hypot(*start[:2])), float(np.hypot(*end[:2]))) + radius
             body = part.body
             while body >= 0:
-                slides = tree.prismatic[body]
+                slides = tree.body_kinds[body] == "prismatic"
                 reach[k, body] = 1.0 if slides else across
-                ends = np.abs([tree.lower[body], tree.upper[body]]).max() if slides else 0.0
+                ends = strokes[body] if slides else 0.0
                 length += float(np.linalg.norm(tree.translations[body])) + ends
                 across, body = length, tree.parents[body]
         first, second = self._pair_parts.T
         # A joint that carries both moves neither against the other.
         moves = (reach[first] > 0) != (reach[second] > 0)
-        return np.where(moves, reach[first] + reach[second], 0.0)
+        return np.where(moves, reach[first] + reach[second], 0.0) @ np.abs(tree.coupling)
 
     def _halve(self, a: Array, b: Array, suspects: Indices, gap: float, extra: Array) -> Contact | None:
         """The first contact on the straight way from a to b (n,), of some pairs; None if it is free."""
@@ -452,7 +454,7 @@ class Collisions(Shown):
             """Distances at a fraction of the way, NaN for pairs that are not asked for."""
             values = known.setdefault(s, np.full(len(self._owners), np.nan))
             scratch = self._scratch
-            pin.updateGeometryPlacements(scratch.model, scratch.data, scratch.geometry, scratch.placed, a + s * (b - a))
+            scratch.place(a + s * (b - a))
             for k in pairs[np.isnan(values[pairs])].tolist():
                 values[k] = pin.computeDistance(scratch.geometry, scratch.placed, k).min_distance
             return values[pairs]
@@ -508,10 +510,10 @@ class Collisions(Shown):
         """Evaluate pairs at R of the points (N, n), in orders (R, k), until bounds (R, K) are above what is found."""
         values, index, ends, normals = found
         scratch = self._scratch
-        model, data, geometry, placed = scratch.model, scratch.data, scratch.geometry, scratch.placed
+        geometry, placed = scratch.geometry, scratch.placed
         sorted_bounds = np.take_along_axis(bounds, orders, axis=1).tolist()
         for row, order, own in zip(rows.tolist(), orders.tolist(), sorted_bounds, strict=True):
-            pin.updateGeometryPlacements(model, data, geometry, placed, points[row])
+            scratch.place(points[row])
             least, nearest = values[row], -1
             for bound, k in zip(own, order, strict=True):
                 if bound >= least:
@@ -526,7 +528,7 @@ class Collisions(Shown):
 
     def _build_gradients(self, points: Array, index: Indices, ends: Array, normals: Array) -> Array:
         """u^T (J_p2 - J_p1), (N, n), for nearest points (N, 2, 3) and unit normals u (N, 3)."""
-        N, n = len(points), self.tree.n
+        N, n = len(points), self.tree.bodies
         gradients = np.zeros((N, n))
         if not self._owners.size or not N:
             return gradients
@@ -538,7 +540,8 @@ class Collisions(Shown):
             wrenches = np.concatenate([_cross(ends[:, side], normals), -normals], axis=1)
             rates = wrenches @ twists[0].T if same else np.einsum("nij,nj->ni", twists, wrenches)
             gradients += carried * rates
-        return gradients
+        # Mimic joints move with their leaders.
+        return gradients @ self.tree.coupling if self.tree.mimic_names else gradients
 
     def _bound_distances(self, points: Array, within: float | Array = np.inf) -> Array:
         """Lower bounds of the distances of pairs of parts, (N, K): where they may be within a distance, by capsules."""
@@ -614,7 +617,7 @@ class Collisions(Shown):
     @cached_property
     def _carried(self) -> Array:
         """Whether a joint carries a part, (parts, n)."""
-        carried = np.zeros((len(self.parts), self.tree.n))
+        carried = np.zeros((len(self.parts), self.tree.bodies))
         for row, part in zip(carried, self.parts, strict=True):
             row[self.tree.carriers(part.body)] = 1.0
         return carried
@@ -642,25 +645,28 @@ class Collisions(Shown):
 
     @cached_property
     def _twists(self) -> Batched:
-        """q -> of every joint a and a x o, with its axis a through o in the world; 0 and -a of slides, (6 n, 1)."""
+        """q -> of every joint a and a x o, with its axis a through o in the world; 0 and -a of slides, (6 N, 1)."""
         q = ca.SX.sym("q", self.tree.n)
         rows = []
-        for slides, (rotation, translation) in zip(self.tree.prismatic, build_body_poses(self.tree, q), strict=True):
+        for kind, (rotation, translation) in zip(self.tree.body_kinds, build_body_poses(self.tree, q), strict=True):
             axis = rotation[:, 2]
-            rows += [ca.SX.zeros(3), -axis] if slides else [axis, ca.cross(axis, translation)]
+            rows += [ca.SX.zeros(3), -axis] if kind == "prismatic" else [axis, ca.cross(axis, translation)]
         return Batched(dense_function("twists", [q], [ca.vertcat(*rows)]))
 
     @cached_property
     def _models(self) -> tuple[pin.Model, pin.GeometryModel]:
         """The robot and its solids for Pinocchio."""
         tree, model, geometry = self.tree, pin.Model(), pin.GeometryModel()
-        for i, name in enumerate(tree.joint_names):
-            joint = pin.JointModelPZ() if tree.prismatic[i] else pin.JointModelRZ()
-            model.addJoint(tree.parents[i] + 1, joint, pin.SE3(tree.rotations[i], tree.translations[i]), name)
+        # All joints are independent ones, parents first; `place` gives them their positions.
+        ids = {-1: 0}
+        for i in tree.order:
+            joint = pin.JointModelPZ() if tree.body_kinds[i] == "prismatic" else pin.JointModelRZ()
+            pose = pin.SE3(tree.rotations[i], tree.translations[i])
+            ids[i] = model.addJoint(ids[tree.parents[i]], joint, pose, tree.body_joints[i])
         for k, part in enumerate(self.parts):
             pose = pin.SE3(part.shape.rotation, part.shape.translation)
             solid = part.shape.geometry.build()
-            geometry.addGeometryObject(pin.GeometryObject(f"{k} {part.name}", part.body + 1, pose, solid))
+            geometry.addGeometryObject(pin.GeometryObject(f"{k} {part.name}", ids[part.body], pose, solid))
         for first, second in self._pair_parts.tolist():
             geometry.addCollisionPair(pin.CollisionPair(first, second))
         return model, geometry
@@ -674,7 +680,7 @@ class Collisions(Shown):
         """The models, with the memory of one thread."""
         mine = self._threads
         if not hasattr(mine, "scratch"):
-            mine.scratch = _Scratch(*self._models)
+            mine.scratch = _Scratch(self.tree, *self._models)
         scratch: _Scratch = mine.scratch
         return scratch
 
@@ -682,11 +688,17 @@ class Collisions(Shown):
 class _Scratch:
     """Models of Pinocchio, and the data of one thread."""
 
-    def __init__(self, model: pin.Model, geometry: pin.GeometryModel) -> None:
+    def __init__(self, tree: KinematicTree, model: pin.Model, geometry: pin.GeometryModel) -> None:
         self.model, self.geometry = model, geometry
         self.data, self.placed = model.createData(), geometry.createData()
         for request in self.placed.distanceRequests:
             request.gjk_tolerance, request.gjk_max_iterations = RULES.tolerance, RULES.iterations
+        self._tree, self._order = tree, list(tree.order)
+
+    def place(self, q: Array) -> None:
+        """Place all solids at joint positions (n,)."""
+        positions = self._tree.expand(q)[self._order] if self._tree.mimic_names else q
+        pin.updateGeometryPlacements(self.model, self.data, self.geometry, self.placed, positions)
 
 
 def _cross(a: Array, b: Array) -> Array:

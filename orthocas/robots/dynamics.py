@@ -45,11 +45,12 @@ def build_mass_matrix(
     """
     joints = _build_transforms(tree, q)
     bodies = _build_bodies(tree, payload, inertials)
+    kinds, N = tree.body_kinds, tree.bodies
     mass, moment, inertia = ([getattr(body, name) for body in bodies] for name in ("mass", "moment", "inertia"))
-    M = ca.SX.zeros(tree.n, tree.n)
-    for i in reversed(range(tree.n)):
+    M = ca.SX.zeros(N, N)
+    for i in reversed(tree.order):
         # Force, and torque about the origin, that give the body unit acceleration along its joint.
-        if tree.joint_kinds[i] == "prismatic":
+        if kinds[i] == "prismatic":
             force, torque = mass[i] * _Z, ca.cross(moment[i], _Z)
         else:
             force, torque = ca.cross(_Z, moment[i]), inertia[i][:, 2]
@@ -67,7 +68,9 @@ def build_mass_matrix(
                 moment[parent] + mc,
                 inertia[parent] + inert,
             )
-    return M
+    # S^T M S of all joints, with the velocities S dq of mimic joints.
+    S = ca.sparsify(ca.DM(tree.coupling))
+    return S.T @ M @ S if tree.mimic_names else M
 
 
 def build_inverse_dynamics(
@@ -82,26 +85,29 @@ def build_inverse_dynamics(
     """tau = M ddq + C dq + g, (n, 1) [N m] or [N], for a gravity acceleration (3,) in the world."""
     joints = _build_transforms(tree, q)
     bodies = _build_bodies(tree, payload, inertials)
+    # Mimic joints have the velocities S dq, and S^T of the torques of all joints acts on q.
+    S = ca.sparsify(ca.DM(tree.coupling))
+    dq, ddq = (S @ dq, S @ ddq) if tree.mimic_names else (dq, ddq)
     #: angular velocity, angular acceleration matrix, linear acceleration
-    states: list[tuple[ca.SX, ca.SX, ca.SX]] = []
-    accelerations: list[ca.SX] = []
+    states: dict[int, tuple[ca.SX, ca.SX, ca.SX]] = {}
+    accelerations: dict[int, ca.SX] = {}
     at_rest = (ca.SX(3, 1), ca.SX(3, 3), constant(-gravity))
-    for i, parent in enumerate(tree.parents):
+    for i in tree.order:
         # The parent's motion in the axes of the body, then what the joint adds.
-        omega_p, U_p, a_p = states[parent] if parent >= 0 else at_rest
-        alpha_p = accelerations[parent] if parent >= 0 else ca.SX(3, 1)
+        omega_p, U_p, a_p = states.get(tree.parents[i], at_rest)
+        alpha_p = accelerations.get(tree.parents[i], ca.SX(3, 1))
         to_child = joints[i].to_child
         omega, alpha, a = to_child(omega_p), to_child(alpha_p), to_child(a_p + U_p @ joints[i].offset)
-        if tree.joint_kinds[i] == "prismatic":
+        if tree.body_kinds[i] == "prismatic":
             a += 2 * ca.cross(omega, _Z) * dq[i] + _Z * ddq[i]
         else:
             alpha += ca.cross(omega, _Z) * dq[i] + _Z * ddq[i]
             omega += _Z * dq[i]
         # U v = alpha x v + omega x (omega x v): one matrix for all vectors fixed in the body.
         U = skew(alpha) + omega @ omega.T - ca.SX.eye(3) * ca.dot(omega, omega)
-        states.append((omega, U, a))
-        accelerations.append(alpha)
-    return _sum_wrenches(tree, joints, bodies, states, accelerations) + ca.SX(ca.DM(tree.armatures)) * ddq
+        states[i], accelerations[i] = (omega, U, a), alpha
+    tau = _sum_wrenches(tree, joints, bodies, states, accelerations) + ca.SX(ca.DM(tree.armatures)) * ddq
+    return S.T @ tau if tree.mimic_names else tau
 
 
 def build_forward_dynamics(
@@ -177,13 +183,13 @@ class _JointTransform:
 
 
 def _build_transforms(tree: KinematicTree, q: ca.SX) -> list[_JointTransform]:
-    transforms = []
-    for i in range(tree.n):
+    transforms, positions = [], tree.expand(q)
+    for i, kind in enumerate(tree.body_kinds):
         rotation, offset = constant(tree.rotations[i]), constant(tree.translations[i])
-        if tree.joint_kinds[i] == "prismatic":
-            transforms.append(_JointTransform(rotation, ca.SX.eye(3), offset + rotation[:, 2] * q[i]))
+        if kind == "prismatic":
+            transforms.append(_JointTransform(rotation, ca.SX.eye(3), offset + rotation[:, 2] * positions[i]))
         else:
-            transforms.append(_JointTransform(rotation, turn(q[i]), offset))
+            transforms.append(_JointTransform(rotation, turn(positions[i]), offset))
     return transforms
 
 
@@ -191,14 +197,14 @@ def _sum_wrenches(
     tree: KinematicTree,
     joints: list[_JointTransform],
     bodies: list[_Body],
-    states: list[tuple[ca.SX, ca.SX, ca.SX]],
-    accelerations: list[ca.SX],
+    states: dict[int, tuple[ca.SX, ca.SX, ca.SX]],
+    accelerations: dict[int, ca.SX],
 ) -> ca.SX:
     """Backward pass: sum body wrenches towards the base, and project them on the joint axes."""
-    forces = [ca.SX(3, 1)] * tree.n
-    torques = [ca.SX(3, 1)] * tree.n
-    tau = ca.SX.zeros(tree.n)
-    for i in reversed(range(tree.n)):
+    forces = [ca.SX(3, 1)] * tree.bodies
+    torques = [ca.SX(3, 1)] * tree.bodies
+    tau = ca.SX.zeros(tree.bodies)
+    for i in reversed(tree.order):
         # The wrench of the body itself, and those of the bodies that it carries.
         omega, U, a = states[i]
         moment, inertia = bodies[i].moment, bodies[i].inertia
@@ -213,13 +219,13 @@ def _sum_wrenches(
 
 
 def _project_on_joint(tree: KinematicTree, i: int, force: ca.SX, torque: ca.SX) -> ca.SX:
-    return force[2] if tree.joint_kinds[i] == "prismatic" else torque[2]
+    return force[2] if tree.body_kinds[i] == "prismatic" else torque[2]
 
 
 def collect_inertials(tree: KinematicTree) -> Array:
     """The inertial parameters on which the dynamics depend, (k,): 7 of each revolute joint's body, 10 of others."""
     numbers = []
-    for kind, body in zip(tree.joint_kinds, _regroup(tree), strict=True):
+    for kind, body in zip(tree.body_kinds, _regroup(tree), strict=True):
         all_ten = np.concatenate([[body.mass], body.moment, body.inertia[np.triu_indices(3)]])
         numbers.append(all_ten[_OF_BODY[kind]])
     return np.concatenate(numbers)
@@ -233,7 +239,7 @@ def find_first_moments(tree: KinematicTree) -> tuple[list[int], tuple[int, ...]]
     places: list[int] = []
     joints: list[int] = []
     start = 0
-    for joint, kind in enumerate(tree.joint_kinds):
+    for joint, kind in zip(tree.leaders, tree.body_kinds, strict=True):
         moments = (0,) if kind == "prismatic" else (1, 2)
         new = [start + i for i, place in enumerate(_OF_BODY[kind]) if place in moments]
         places, joints, start = places + new, joints + [joint] * len(new), start + len(_OF_BODY[kind])
@@ -243,7 +249,7 @@ def find_first_moments(tree: KinematicTree) -> tuple[list[int], tuple[int, ...]]
 def _unpack_inertials(tree: KinematicTree, inertials: ca.SX) -> list[_Body]:
     """Bodies with the numbers of `collect_inertials`."""
     bodies, start = [], 0
-    for kind in tree.joint_kinds:
+    for kind in tree.body_kinds:
         ten = ca.SX(10, 1)
         for place in _OF_BODY[kind]:
             ten[place], start = inertials[start], start + 1
@@ -283,8 +289,8 @@ def _regroup(tree: KinematicTree) -> list[_Body]:
         _Body(mass, mass * centre, inertia + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre)))
         for mass, centre, inertia in zip(tree.masses, tree.centres, tree.inertias, strict=True)
     ]
-    for i in reversed(range(tree.n)):
-        if tree.joint_kinds[i] == "prismatic":
+    for i in reversed(tree.order):
+        if tree.body_kinds[i] == "prismatic":
             continue
         body = bodies[i]
         rod = _Body(body.mass, np.array([0, 0, body.moment[2]]), np.diag([body.inertia[1, 1]] * 2 + [0.0]))

@@ -44,19 +44,20 @@ TOOL_SUFFIX = " + tool"  #: of the name of a tip at the end of a tool
 
 def build_body_poses(tree: KinematicTree, q: ca.SX) -> list[Pose]:
     """Rotation and position of every body frame in the world, for q (n, 1)."""
-    poses: list[Pose] = []
-    for i, parent in enumerate(tree.parents):
-        poses.append(_move_to_child(tree, q, i, poses[parent] if parent >= 0 else (ca.SX.eye(3), ca.SX.zeros(3))))
-    return poses
+    positions, poses = tree.expand(q), dict[int, Pose]()
+    for i in tree.order:
+        parent = poses.get(tree.parents[i], (ca.SX.eye(3), ca.SX.zeros(3)))
+        poses[i] = _move_to_child(tree, positions, i, parent)
+    return [poses[i] for i in range(tree.bodies)]
 
 
-def _move_to_child(tree: KinematicTree, q: ca.SX, i: int, pose: Pose) -> Pose:
-    """Pose of body i, from that of its parent."""
+def _move_to_child(tree: KinematicTree, positions: ca.SX, i: int, pose: Pose) -> Pose:
+    """Pose of body i, from that of its parent, for the positions of all joints (N, 1)."""
     R, p = pose
     R_joint, p_joint = R @ constant(tree.rotations[i]), p + R @ constant(tree.translations[i])
-    if tree.joint_kinds[i] == "prismatic":
-        return R_joint, p_joint + R_joint[:, 2] * q[i]
-    return R_joint @ turn(q[i]), p_joint
+    if tree.body_kinds[i] == "prismatic":
+        return R_joint, p_joint + R_joint[:, 2] * positions[i]
+    return R_joint @ turn(positions[i]), p_joint
 
 
 def build_frame_pose(tree: KinematicTree, q: ca.SX, frame: Frame, base: Frame | None = None) -> Pose:
@@ -103,22 +104,23 @@ def _find_shared(tree: KinematicTree, frame: Frame, base: Frame | None) -> list[
 def _place_frame(tree: KinematicTree, q: ca.SX, frame: Frame, shared: list[int]) -> Pose:
     """Pose of a frame in the last of the shared bodies that carry it, or in the world."""
     R, p = ca.SX.eye(3), ca.SX.zeros(3)
+    positions = tree.expand(q)
     for body in tree.carriers(frame.parent)[len(shared) :]:
-        R, p = _move_to_child(tree, q, body, (R, p))
+        R, p = _move_to_child(tree, positions, body, (R, p))
     return R @ constant(frame.rotation), p + R @ constant(frame.translation)
 
 
 def _build_jacobian(tree: KinematicTree, q: ca.SX, carrier: int, point: ca.SX, shared: list[int]) -> ca.SX:
     """Jacobian (6, n) of a point and of the frames of a body, by the joints between it and the shared bodies."""
-    J, pose = ca.SX(6, tree.n), (ca.SX.eye(3), ca.SX.zeros(3))
+    J, pose, positions = ca.SX(6, tree.bodies), (ca.SX.eye(3), ca.SX.zeros(3)), tree.expand(q)
     for i in tree.carriers(carrier)[len(shared) :]:
-        pose = _move_to_child(tree, q, i, pose)
+        pose = _move_to_child(tree, positions, i, pose)
         axis = pose[0][:, 2]
-        if tree.joint_kinds[i] == "prismatic":
+        if tree.body_kinds[i] == "prismatic":
             J[:3, i] = axis
         else:
             J[:3, i], J[3:, i] = ca.cross(axis, point - pose[1]), axis
-    return J
+    return J @ ca.sparsify(ca.DM(tree.coupling)) if tree.mimic_names else J
 
 
 def build_tip_pose(tree: KinematicTree, q: ca.SX) -> Pose:

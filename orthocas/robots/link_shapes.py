@@ -13,7 +13,6 @@ import numpy as np
 import pinocchio as pin
 
 from orthocas.errors import RobotError
-from orthocas.robots.kinematics import TOOL_SUFFIX
 from orthocas.robots.mjcf import read_mjcf
 from orthocas.robots.pinocchio_model import find_axis, find_frame, lock_joints, lock_others
 from orthocas.robots.spatial import rotate_z_to
@@ -50,35 +49,26 @@ def place_links(
     Raises:
         RobotError: if the file cannot be read, or its joints are not those of the robot.
     """
-    # Joints, not tips: the tip may be that of a tool, which the file does not have.
-    tips = [name.removesuffix(TOOL_SUFFIX) for name in (tree.tip_name, *tree.tips)]
-    whole = read_mjcf(path) if path.suffix.lower() == MJCF else read_urdf(path, tips, locked)
-    model = lock_joints(whole, locked or {})
-    if lost := [name for name in tree.joint_names if name not in (*model.names, *BASE_JOINTS)]:
+    whole, mimics = (read_mjcf(path), {}) if path.suffix.lower() == MJCF else read_urdf(path)
+    model = lock_joints(whole, locked or {}, mimics)
+    if lost := [name for name in tree.body_joints if name not in (*model.names, *BASE_JOINTS)]:
         raise RobotError(f"{path} has the joints {listed(list(model.names)[1:])}, expected {listed(lost)} among them")
-    model = lock_others(model, [i for i in range(1, model.njoints) if model.names[i] in tree.joint_names])
-    base = sum(name in BASE_JOINTS for name in tree.joint_names)
-    _require_same(path, model, tree, base)
+    model = lock_others(model, [i for i in range(1, model.njoints) if model.names[i] in tree.body_joints], mimics)
+    # Bodies that the model's joints move; the world is the base.
+    carried = [-1, *(tree.body_joints.index(name) for name in list(model.names)[1:])]
+    lengths = np.array([np.linalg.norm(place.translation) for place in list(model.jointPlacements)[1:]])
+    apart = np.abs(lengths - np.linalg.norm(tree.translations[carried[1:]], axis=1))
+    if apart.max(initial=0.0) > SAME_PLACE:
+        joint = model.names[1 + int(np.argmax(apart))]
+        raise RobotError(f"{path} places joint '{joint}' elsewhere, expected the robot file that the chart was made of")
     # Frames of our tree have the joint's axis as z; Pinocchio's have those of the file.
     turns = [np.eye(3), *(rotate_z_to(find_axis(model, i)[1]) for i in range(1, model.njoints))]
     places = []
     for name in names:
         frame = model.frames[find_frame(model, name)]
         turn = pin.SE3(turns[frame.parentJoint].T, np.zeros(3))
-        places.append(LinkPlace(frame.parentJoint - 1 + base, turn * frame.placement))
+        places.append(LinkPlace(carried[frame.parentJoint], turn * frame.placement))
     return places
-
-
-def _require_same(path: Path, model: pin.Model, tree: KinematicTree, base: int) -> None:
-    """Raise RobotError unless a model has the joints of a tree, after those of its base, at the same places."""
-    names, wanted = tuple(model.names)[1:], tree.joint_names[base:]
-    if names != wanted:
-        raise RobotError(f"{path} has the joints {', '.join(names)}, expected {', '.join(wanted)}")
-    lengths = np.array([np.linalg.norm(model.jointPlacements[i + 1].translation) for i in range(len(names))])
-    apart = np.abs(lengths - np.linalg.norm(tree.translations[base:], axis=1))
-    if apart.max() > SAME_PLACE:
-        joint = names[int(np.argmax(apart))]
-        raise RobotError(f"{path} places joint '{joint}' elsewhere, expected the robot file that the chart was made of")
 
 
 def load_mesh(path: Path, shape: ElementTree.Element) -> tuple[Array, Indices]:

@@ -1,8 +1,10 @@
 """`pin.Model`: its joints and frames as a `KinematicTree`, locked joints, default tips, postures, and planar arms."""
 
+import logging
 import re
 import warnings
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -11,6 +13,8 @@ from orthocas.errors import InvalidValueError, RobotError, TipWarning, degrees_h
 from orthocas.robots.spatial import rotate_z_to, snap
 from orthocas.robots.tree import BASE_JOINTS, JointKind, KinematicTree, place_on_base
 from orthocas.tools.checks import Array, freeze_array, require_known
+
+_log = logging.getLogger(__name__)
 
 LINKS = (pin.FrameType.BODY, pin.FrameType.OP_FRAME)  #: links of URDF, bodies and sites of MJCF
 _UNLIMITED = 1e10  #: numbers above it are no limits: Pinocchio uses the largest double
@@ -24,8 +28,21 @@ TIP = "tip"
 GRAVITY = 9.81  #: [m/s^2]
 
 
-def build_tree(model: pin.Model, *tips: str, base: str | None = None) -> KinematicTree:
+class Mimic(NamedTuple):
+    """How a joint follows an independent one: its position is factor x position of the leader + offset."""
+
+    leader: str
+    factor: float
+    offset: float  #: [rad] or [m]
+
+
+Mimics = Mapping[str, Mimic]  #: by the name of the joint that follows
+
+
+def build_tree(model: pin.Model, *tips: str, base: str | None = None, mimics: Mimics | None = None) -> KinematicTree:
     """Read joints, bodies, limits, tips and links from a Pinocchio model, whose base may move; see `place_on_base`.
+
+    Joints of `mimics` follow their leaders; the limits of a leader keep them within their own.
 
     Raises:
         UnknownNameError: if there is no frame with the name of a tip.
@@ -38,15 +55,21 @@ def build_tree(model: pin.Model, *tips: str, base: str | None = None) -> Kinemat
     axes = [find_axis(model, i) for i in range(1, model.njoints)]
     # Each body frame is turned so that the joint's axis is its z axis.
     turns = [np.eye(3)] + [rotate_z_to(axis) for _, axis in axes]
-    bodies = range(1, model.njoints)
+    # Joints that move by themselves come first, then those that follow them.
+    follow = {model.getJointId(name): mimic for name, mimic in (mimics or {}).items() if model.existJointName(name)}
+    leaders = [i for i in range(1, model.njoints) if i not in follow]
+    followers = [i for i in range(1, model.njoints) if i in follow]
+    bodies = [*leaders, *followers]
+    place_of = {0: -1} | {i: place for place, i in enumerate(bodies)}
+    led = [place_of[model.getJointId(follow[i].leader)] for i in followers]
+    lower, upper, velocities = _find_limits(model, bodies, [follow[i] for i in followers], led)
     placed = [(turns[frame.parentJoint].T, frame.placement) for frame in (tip, *further)]
     rotations = [snap(across @ place.rotation) for across, place in placed]
     translations = [across @ place.translation for across, place in placed]
-    continuous = [model.joints[i].nq == 2 for i in bodies]
     tree = KinematicTree(
-        joint_names=tuple(model.names[i] for i in bodies),
-        joint_kinds=tuple(kind for kind, _ in axes),
-        parents=tuple(model.parents[i] - 1 for i in bodies),
+        joint_names=tuple(model.names[i] for i in leaders),
+        joint_kinds=tuple(axes[i - 1][0] for i in leaders),
+        parents=tuple(place_of[model.parents[i]] for i in bodies),
         rotations=np.array(
             [snap(turns[model.parents[i]].T @ model.jointPlacements[i].rotation @ turns[i]) for i in bodies]
         ),
@@ -55,20 +78,25 @@ def build_tree(model: pin.Model, *tips: str, base: str | None = None) -> Kinemat
         centres=np.array([turns[i].T @ model.inertias[i].lever for i in bodies]),
         inertias=np.array([turns[i].T @ model.inertias[i].inertia @ turns[i] for i in bodies]),
         armatures=np.array([model.armature[model.joints[i].idx_v] for i in bodies]),
-        lower=_read_limits(model, model.lowerPositionLimit, continuous, -np.inf),
-        upper=_read_limits(model, model.upperPositionLimit, continuous, np.inf),
-        effort_limits=_read_largest(model, "effort", model.effortLimit),
-        velocity_limits=_read_largest(model, "velocity", model.velocityLimit),
+        lower=lower,
+        upper=upper,
+        effort_limits=_read_largest(model, leaders, "effort", model.effortLimit),
+        velocity_limits=velocities,
         tip_name=tip.name,
-        tip_parent=tip.parentJoint - 1,
+        tip_parent=place_of[tip.parentJoint],
         tip_rotation=rotations[0],
         tip_translation=translations[0],
         gravity=np.array(model.gravity.linear),
         tips=tuple(tips[1:]),
         frame_names=tuple(frame.name for frame in further),
-        frame_parents=tuple(frame.parentJoint - 1 for frame in further),
+        frame_parents=tuple(place_of[frame.parentJoint] for frame in further),
         frame_rotations=np.array(rotations[1:]).reshape(-1, 3, 3),
         frame_translations=np.array(translations[1:]).reshape(-1, 3),
+        mimic_names=tuple(model.names[i] for i in followers),
+        mimic_kinds=tuple(axes[i - 1][0] for i in followers),
+        mimic_leaders=tuple(led),
+        mimic_factors=np.array([follow[i].factor for i in followers]),
+        mimic_offsets=np.array([follow[i].offset for i in followers]),
     )
     # What a moving base carries are the links that no joint of the file moves.
     own = model.inertias[0]
@@ -96,7 +124,8 @@ def find_axis(model: pin.Model, i: int) -> tuple[JointKind, Array]:
     joint, name = model.joints[i], model.names[i]
     if i in set(model.mimicking_joints):
         leader = model.names[find_leader(model, i)]
-        raise RobotError(f"joint '{name}' is a mimic joint, expected independent joints: {suggest_lock(leader)}")
+        hint = f"{suggest_lock(leader)}, or read the file with Robot.from_urdf"
+        raise RobotError(f"joint '{name}' of the model is a mimic joint, expected independent joints: {hint}")
     if joint.nv != 1:
         raise RobotError(
             f"joint '{name}' is of type {joint.shortname()} with {joint.nv} degrees of freedom, "
@@ -126,26 +155,51 @@ def suggest_lock(joint: str) -> str:
     return f"lock it with locked={{'{joint}': 0.0}} or --lock {joint}=0"
 
 
-def _read_limits(model: pin.Model, limits: Array, continuous: list[bool], unlimited: float) -> Array:
-    """Position limits, one per joint. A continuous joint has none."""
-    values = [unlimited if free else limits[model.joints[i + 1].idx_q] for i, free in enumerate(continuous)]
-    return np.array([unlimited if abs(value) > _UNLIMITED else value for value in values])
+def _find_limits(
+    model: pin.Model, bodies: list[int], follow: list[Mimic], led: list[int]
+) -> tuple[Array, Array, Array]:
+    """Lower and upper positions and largest speeds of n independent joints, (n,), that keep mimic joints in their own.
+
+    With q_f = a q + b in [l, u], q is between (l - b) / a and (u - b) / a, and |dq| at most the speed over |a|. Limits
+    of a mimic joint that would leave its leader no way at all are ignored, as ROS ignores them, and logged.
+    """
+    n = len(bodies) - len(follow)
+    ends: tuple[list[float], list[float]] = ([], [])
+    for i in bodies:
+        joint = model.joints[i]
+        for side, limits, endless in ((0, model.lowerPositionLimit, -np.inf), (1, model.upperPositionLimit, np.inf)):
+            # A continuous joint has no limits.
+            value = endless if joint.nq == 2 else limits[joint.idx_q]
+            ends[side].append(endless if abs(value) > _UNLIMITED else value)
+    lower, upper = (np.array(values) for values in ends)
+    speeds = _read_largest(model, bodies, "velocity", model.velocityLimit)
+    for j, (mimic, leader) in enumerate(zip(follow, led, strict=True)):
+        speeds[leader] = min(speeds[leader], speeds[n + j] / abs(mimic.factor))
+        low, high = sorted((end[n + j] - mimic.offset) / mimic.factor for end in (lower, upper))
+        low, high = max(float(lower[leader]), low), min(float(upper[leader]), high)
+        if low < high:
+            lower[leader], upper[leader] = low, high
+        else:
+            name = model.names[bodies[n + j]]
+            _log.warning("limits of joint '%s' leave '%s', which it mimics, no way: ignored", name, mimic.leader)
+    return lower[:n], upper[:n], speeds[:n]
 
 
-def _read_largest(model: pin.Model, what: str, limits: Array) -> Array:
-    """Limits of effort or velocity, one per joint. 0 means no limit: many files use it as a placeholder.
+def _read_largest(model: pin.Model, ids: list[int], what: str, limits: Array) -> Array:
+    """Limits of effort or velocity of joints. 0 means no limit: many files use it as a placeholder.
 
     Raises:
         RobotError: if a limit is negative or NaN. The message names the joint.
     """
-    values = np.array([limits[joint.idx_v] for joint in model.joints[1:]])
-    for name, value in zip(list(model.names)[1:], values, strict=True):
+    values = np.array([limits[model.joints[i].idx_v] for i in ids])
+    for i, value in zip(ids, values, strict=True):
         if not value >= 0:
-            raise RobotError(f"joint '{name}' has the {what} limit {value:g}, expected a number >= 0 (0: unlimited)")
+            joint = f"joint '{model.names[i]}'"
+            raise RobotError(f"{joint} has the {what} limit {value:g}, expected a number >= 0 (0: unlimited)")
     return np.where((values > 0) & (values < _UNLIMITED), values, np.inf)
 
 
-def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
+def lock_joints(model: pin.Model, locked: Mapping[str, float], mimics: Mimics | None = None) -> pin.Model:
     """Lock joints at the given positions [rad] or [m]. Joints that mimic a locked joint follow it.
 
     A joint with several degrees of freedom (floating, spherical, planar) is locked at its neutral position, given as 0.
@@ -163,26 +217,41 @@ def lock_joints(model: pin.Model, locked: Mapping[str, float]) -> pin.Model:
     ids = []
     for name, value in locked.items():
         require_known("joint", name, names)
+        if mimics and name in mimics:
+            raise _refuse_lock(name, mimics[name].leader)
         if not isinstance(value, int | float | np.number) or not np.isfinite(value):
             raise InvalidValueError(f"locked position of joint '{name}'", repr(value), "a finite number")
         ids.append(model.getJointId(name))
         set_position(model, ids[-1], float(value), position)
     ids += [i for i in model.mimicking_joints if find_leader(model, i) in ids]
+    for name, mimic in (mimics or {}).items():
+        if mimic.leader in locked and name in names:
+            ids.append(model.getJointId(name))
+            set_position(model, ids[-1], mimic.factor * locked[mimic.leader] + mimic.offset, position)
     return fix_joints(model, ids, position) if ids else model
 
 
-def lock_off_chain(model: pin.Model, *tips: str) -> pin.Model:
+def lock_off_chain(model: pin.Model, *tips: str, mimics: Mimics | None = None) -> pin.Model:
     """Lock every joint that moves no tip, of any type, at neutral or at the limit closest to zero.
+
+    Leaders of mimic joints that move a tip are kept, and so are all joints that follow them.
 
     Raises:
         UnknownNameError: if there is no frame with the name of a tip.
-        RobotError: as in `lock_others`.
+        RobotError: as in `lock_others`; if the leader of a mimic joint is none of the model.
     """
+    follow = {name: mimic for name, mimic in (mimics or {}).items() if model.existJointName(name)}
     chains = [model.supports[model.frames[find_frame(model, tip)].parentJoint] for tip in tips]
-    return lock_others(model, sorted({i for supports in chains for i in supports if i > 0}))
+    moving = {model.names[i] for supports in chains for i in supports if i > 0}
+    for name in sorted(moving & follow.keys()):
+        if not model.existJointName(leader := follow[name].leader):
+            raise RobotError(f"joint '{name}' mimics joint '{leader}', which the file does not have")
+        moving.add(leader)
+    moving |= {name for name, mimic in follow.items() if mimic.leader in moving}
+    return lock_others(model, [i for i in range(1, model.njoints) if model.names[i] in moving], follow)
 
 
-def lock_others(model: pin.Model, chain: list[int]) -> pin.Model:
+def lock_others(model: pin.Model, chain: list[int], mimics: Mimics | None = None) -> pin.Model:
     """Lock every joint that is not in a chain, of any type, at neutral or at the limit closest to zero.
 
     Raises:
@@ -192,12 +261,19 @@ def lock_others(model: pin.Model, chain: list[int]) -> pin.Model:
         find_axis(model, i)
     # all others stand at neutral, moved into their limits
     ids = [i for i in range(1, model.njoints) if i not in chain]
-    position, mimics = pin.neutral(model), set(model.mimicking_joints)
+    position, following = pin.neutral(model), set(model.mimicking_joints)
     for i in ids:
         joint = model.joints[i]
-        if joint.nq == joint.nv == 1 and i not in mimics:
+        if joint.nq == joint.nv == 1 and i not in following:
             limits = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
             position[joint.idx_q] = np.clip(0.0, *limits)
+    # mimic joints stand where their leaders take them
+    for i in ids:
+        if mimic := (mimics or {}).get(model.names[i]):
+            k = model.getJointId(mimic.leader)
+            leads = k < model.njoints and model.joints[k].nq == model.joints[k].nv == 1
+            at = float(position[model.joints[k].idx_q]) if leads else 0.0
+            set_position(model, i, mimic.factor * at + mimic.offset, position)
     return fix_joints(model, ids, position) if ids else model
 
 
@@ -230,10 +306,7 @@ def set_position(model: pin.Model, i: int, value: float, position: Array) -> Non
     """Write a joint position into a configuration. Pinocchio stores cos and sin of a continuous joint."""
     joint, name = model.joints[i], model.names[i]
     if i in set(model.mimicking_joints):
-        leader = model.names[find_leader(model, i)]
-        raise RobotError(
-            f"joint '{name}' mimics joint '{leader}', expected an independent joint: {suggest_lock(leader)}"
-        )
+        raise _refuse_lock(name, model.names[find_leader(model, i)])
     if joint.nv != 1:
         if value != 0:
             raise RobotError(
@@ -246,6 +319,10 @@ def set_position(model: pin.Model, i: int, value: float, position: Array) -> Non
     if turns and (hint := degrees_hint(value)):
         raise InvalidValueError(f"locked position of joint '{name}'", f"{value:g}", f"an angle in radians{hint}")
     position[joint.idx_q : joint.idx_q + joint.nq] = (np.cos(value), np.sin(value)) if joint.nq == 2 else value
+
+
+def _refuse_lock(name: str, leader: str) -> RobotError:
+    return RobotError(f"joint '{name}' mimics joint '{leader}', expected an independent joint: {suggest_lock(leader)}")
 
 
 def find_default_tip(model: pin.Model) -> str:

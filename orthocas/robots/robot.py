@@ -23,6 +23,7 @@ from orthocas.robots.kinematics import add_tool
 from orthocas.robots.mjcf import read_mjcf
 from orthocas.robots.pinocchio_model import (
     TIP,
+    Mimics,
     build_planar,
     build_tree,
     find_default_tip,
@@ -31,8 +32,8 @@ from orthocas.robots.pinocchio_model import (
     lock_off_chain,
     read_model_postures,
 )
-from orthocas.robots.tree import PRISMATIC_ROOM, KinematicTree
-from orthocas.robots.urdf import find_robot_file, read_srdf_postures, read_urdf
+from orthocas.robots.tree import KinematicTree
+from orthocas.robots.urdf import find_robot_file, list_robot_files, read_srdf_postures, read_urdf
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import BuiltOnUse, cached_property
 from orthocas.tools.checks import (
@@ -166,8 +167,9 @@ class Robot(Shown):
     ) -> Self:
         """Build the joints that move the tips from a URDF file; see `from_file`."""
         file, names = as_path("path", path), _check_tips(tip, tips)
-        model = read_urdf(file, names, locked)
-        robot = cls._from_chain(model, names, locked, tool, base, gravity)
+        if not file.suffix and not file.exists() and file.name in list_robot_files():
+            raise RobotError(f"cannot read URDF file {file}: no such file; Robot.from_name('{file}') knows this name")
+        robot = cls._from_chain(*read_urdf(file), names, locked, tool, base, gravity)
         source = CollisionSource(file.absolute(), None, dict(locked or {}))
         return cls(robot.tree, read_srdf_postures(file, robot.joint_names), source)
 
@@ -187,7 +189,7 @@ class Robot(Shown):
 
         Needs the extra `orthocas[mujoco]`, because MuJoCo's compiler reads the file.
         """
-        robot = cls._from_chain(read_mjcf(path), _check_tips(tip, tips), locked, tool, base, gravity)
+        robot = cls._from_chain(read_mjcf(path), {}, _check_tips(tip, tips), locked, tool, base, gravity)
         if not isinstance(path, str | PathLike):
             return robot
         source = CollisionSource(as_path("path", path).absolute(), None, dict(locked or {}))
@@ -197,6 +199,7 @@ class Robot(Shown):
     def _from_chain(
         cls,
         model: pin.Model,
+        mimics: Mimics,
         tips: tuple[str, ...],
         locked: Locked,
         tool: Tool,
@@ -205,8 +208,10 @@ class Robot(Shown):
     ) -> Self:
         """The robot of the joints that move the tips, without those that the user locks."""
         tips = tips or (find_default_tip(model),)
-        chain = lock_off_chain(lock_joints(model, locked or {}), *tips)
-        robot = cls.from_model(chain, tips=tips, base=base, gravity=gravity)
+        chain = lock_off_chain(lock_joints(model, locked or {}, mimics), *tips, mimics=mimics)
+        tree = build_tree(chain, *tips, base=base, mimics=mimics)
+        robot = cls(tree, read_model_postures(chain, tree.joint_names))
+        robot = robot if gravity is None else robot.with_gravity(gravity)
         return robot if tool is None else robot.with_tool(tool)
 
     @classmethod
@@ -250,6 +255,8 @@ class Robot(Shown):
     def with_scaled_masses(self, factor: ArrayLike) -> Self:
         """The same robot with scaled masses: mass and inertia of each body times a factor, (n,) or one number > 0.
 
+        The body of a mimic joint takes the factor of its leader.
+
         Raises:
             ShapeError, InvalidValueError: if the factors are invalid.
         """
@@ -257,6 +264,7 @@ class Robot(Shown):
         factors = freeze_array("factor", np.full(self.n, values) if values.ndim == 0 else values, (self.n,))
         if factors.min() <= 0:
             raise InvalidValueError("factor", factors.min(), "numbers > 0")
+        factors = factors[list(self.tree.leaders)]
         masses, inertias = self.tree.masses * factors, self.tree.inertias * factors[:, None, None]
         return type(self)(replace(self.tree, masses=masses, inertias=inertias), self.homes, self.solids)
 
@@ -379,6 +387,14 @@ class Robot(Shown):
         return self.tree.joint_names
 
     @property
+    def mimics(self) -> tuple[str, ...]:
+        """Joints that follow others, as equations: "finger2 = -1 finger1 + 0.02". They have no part in q."""
+        tree = self.tree
+        leaders = (tree.joint_names[leader] for leader in tree.mimic_leaders)
+        rows = zip(tree.mimic_names, leaders, tree.mimic_factors, tree.mimic_offsets, strict=True)
+        return tuple(f"{name} = {a:g} {leader}{f' {b:+g}' if b else ''}" for name, leader, a, b in rows)
+
+    @property
     def lower(self) -> Array:
         """Lower joint limits (n,) [rad] or [m], -inf where unlimited."""
         return self.tree.lower
@@ -407,6 +423,7 @@ class Robot(Shown):
             "robot": f"{self.n} joints, {tips}, {tree.masses.sum():.4g} kg",
             "joints": listed(tree.joint_names),
             **({"prismatic": listed(sliding)} if sliding else {}),
+            **({"mimic": listed(self.mimics)} if tree.mimic_names else {}),
             "lower": number_list(self.lower),
             "upper": number_list(self.upper),
             **({"effort": number_list(self.effort_limits)} if np.isfinite(self.effort_limits).any() else {}),
@@ -491,13 +508,7 @@ class Robot(Shown):
 
         Joints without limits take a whole turn, or half a metre.
         """
-        width = np.where(self.tree.prismatic, 2 * PRISMATIC_ROOM, 2 * np.pi)
-        low = np.where(
-            np.isfinite(self.lower), self.lower, np.where(np.isfinite(self.upper), self.upper - width, -width / 2)
-        )
-        high = np.where(np.isfinite(self.upper), self.upper, low + width)
-        rng = np.random.default_rng(require_count("seed", seed, least=0))
-        return np.asarray(rng.uniform(low, high, (require_count("count", count), self.n)))
+        return self.tree.draw_postures(require_count("count", count), require_count("seed", seed, least=0))
 
     def frame_position(self, q: Any, frame: str, relative_to: str | None = None) -> Any:
         """Position of a frame in the world, or in another frame, (3,) [m].

@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
+import casadi as ca
 import numpy as np
 
 from orthocas.errors import InvalidValueError, RobotError
@@ -46,11 +47,15 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class KinematicTree:
-    """Joints, bodies, tip frames and further frames by name. Joint i moves body i, and parents come before children.
+    """Joints, bodies, tip frames and further frames by name. Joint i of n moves body i.
 
     Body frames are rotated so that every joint axis is the body's z axis. Joint i places its body at
     `rotations[i] Rz(q_i), translations[i]` (revolute) or `rotations[i], translations[i] + q_i rotations[i] z`
     (prismatic) in the parent body's frame.
+
+    Mimic joints come after the n joints and have no coordinate of their own. Joint n + j moves body n + j, at
+    `mimic_factors[j] q_l + mimic_offsets[j]` with its leader l = `mimic_leaders[j]`, so the positions of all N joints
+    are S q + s_0. Without mimic joints N = n, and parents come before children.
 
     Raises:
         ShapeError, InvalidValueError, UnknownNameError, RobotError: for numbers and names that no robot has.
@@ -58,13 +63,13 @@ class KinematicTree:
 
     joint_names: tuple[str, ...]
     joint_kinds: tuple[JointKind, ...]
-    parents: tuple[int, ...]  #: index of the parent body, -1 for the base
-    rotations: Array  #: (n, 3, 3) joint frames in the parent's frame
-    translations: Array  #: (n, 3) [m]
-    masses: Array  #: (n,) [kg]
-    centres: Array  #: (n, 3) centre of mass in the body frame [m]
-    inertias: Array  #: (n, 3, 3) about the centre of mass, in the body frame [kg m^2]
-    armatures: Array  #: (n,) rotor inertia seen at the joint [kg m^2] or [kg]
+    parents: tuple[int, ...]  #: (N,) index of the parent body, -1 for the base
+    rotations: Array  #: (N, 3, 3) joint frames in the parent's frame
+    translations: Array  #: (N, 3) [m]
+    masses: Array  #: (N,) [kg]
+    centres: Array  #: (N, 3) centre of mass in the body frame [m]
+    inertias: Array  #: (N, 3, 3) about the centre of mass, in the body frame [kg m^2]
+    armatures: Array  #: (N,) rotor inertia seen at the joint [kg m^2] or [kg]
     lower: Array  #: (n,) joint limits [rad] or [m], -inf where unlimited
     upper: Array  #: (n,)
     effort_limits: Array  #: (n,) largest torque [N m] or force [N], inf where unknown
@@ -79,20 +84,27 @@ class KinematicTree:
     frame_parents: tuple[int, ...] = ()  #: bodies that carry them, -1 for the base
     frame_rotations: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))  #: (k, 3, 3) in the body's frame
     frame_translations: Array = field(default_factory=lambda: np.zeros((0, 3)))  #: (k, 3) [m]
+    mimic_names: tuple[str, ...] = ()  #: of N - n joints that follow others
+    mimic_kinds: tuple[JointKind, ...] = ()
+    mimic_leaders: tuple[int, ...] = ()  #: the joints of the n that they follow
+    mimic_factors: Array = field(default_factory=lambda: np.zeros(0))  #: (N - n,)
+    mimic_offsets: Array = field(default_factory=lambda: np.zeros(0))  #: (N - n,) [rad] or [m]
 
     def __post_init__(self) -> None:
-        n = self.n
+        n, bodies = self.n, self.bodies
         if n == 0:
             raise RobotError("the robot has no movable joint, expected at least one")
         if n > RULES.joints:
             raise RobotError(f"the robot has {n} movable joints, expected at most {RULES.joints}")
         shapes: dict[str, tuple[int, ...]] = {
-            "rotations": (n, 3, 3),
-            "translations": (n, 3),
-            "masses": (n,),
-            "centres": (n, 3),
-            "inertias": (n, 3, 3),
-            "armatures": (n,),
+            "rotations": (bodies, 3, 3),
+            "translations": (bodies, 3),
+            "masses": (bodies,),
+            "centres": (bodies, 3),
+            "inertias": (bodies, 3, 3),
+            "armatures": (bodies,),
+            "mimic_factors": (bodies - n,),
+            "mimic_offsets": (bodies - n,),
             "tip_rotation": (3, 3),
             "tip_translation": (3,),
             "gravity": (3,),
@@ -105,7 +117,7 @@ class KinematicTree:
             # Products of larger numbers would overflow.
             if array.size and np.abs(array).max() > RULES.largest:
                 row = int(np.unravel_index(np.abs(array).argmax(), array.shape)[0])
-                place = f" at joint '{self.joint_names[row]}'" if name in _OF_JOINTS else ""
+                place = f" at joint '{self.body_joints[row]}'" if name in _OF_JOINTS else ""
                 largest = f"{float(np.abs(array).max()):g}"
                 raise InvalidValueError(f"largest entry of {name}{place}", largest, f"at most {RULES.largest:g}")
         # Limits may be infinite.
@@ -114,22 +126,29 @@ class KinematicTree:
             require_shape(name, limits.shape, (n,))
             limits.setflags(write=False)
             object.__setattr__(self, name, limits)
+        self._check_mimics()
         self._check_joints()
         self._check_frames()
 
     def _check_joints(self) -> None:
-        """Check names, kinds, limits, the order of bodies, rotations and inertias."""
+        """Check names, kinds, limits, the order of bodies and rotations."""
+        names = self.body_joints
         require_shape("joint_kinds", (len(self.joint_kinds),), (self.n,))
-        require_shape("parents", (len(self.parents),), (self.n,))
-        for i, name in enumerate(self.joint_names):
+        require_shape("parents", (len(self.parents),), (self.bodies,))
+        for i, name in enumerate(names):
             require_text(f"joint_names[{i}]", name)
-        if len(set(self.joint_names)) < self.n:
-            twice = next(name for i, name in enumerate(self.joint_names) if name in self.joint_names[:i])
+        if len(set(names)) < self.bodies:
+            twice = next(name for i, name in enumerate(names) if name in names[:i])
             raise RobotError(f"two joints are called '{twice}', expected different names")
         require_text("tip_name", self.tip_name)
+        for i, kind in enumerate(self.body_kinds):
+            require_known("joint kind", kind, JOINT_KINDS)
+            # A mimic joint may carry joints that come before it.
+            _require_index(f"parents[{i}]", self.parents[i], self.bodies - 1 if self.mimic_names else i - 1)
+            _require_rotation(f"rotations[{i}]", self.rotations[i])
+        if len(self.order) < self.bodies:
+            raise RobotError("the joints hang on each other in a loop, expected a tree")
         for i, name in enumerate(self.joint_names):
-            require_known("joint kind", self.joint_kinds[i], JOINT_KINDS)
-            _require_index(f"parents[{i}]", self.parents[i], i - 1)
             # A joint can be somewhere, and move.
             lower, upper = self.lower[i], self.upper[i]
             if not lower <= upper or lower == np.inf or upper == -np.inf:
@@ -137,24 +156,33 @@ class KinematicTree:
             for what, limit in (("effort", self.effort_limits[i]), ("velocity", self.velocity_limits[i])):
                 if not limit > 0:
                     raise RobotError(f"joint '{name}' has the {what} limit {limit:g}, expected a number > 0")
-            _require_rotation(f"rotations[{i}]", self.rotations[i])
+
+    def _check_mimics(self) -> None:
+        """Check that each mimic joint follows one of the n joints."""
+        followers = len(self.mimic_names)
+        require_shape("mimic_kinds", (len(self.mimic_kinds),), (followers,))
+        require_shape("mimic_leaders", (len(self.mimic_leaders),), (followers,))
+        for j, leader in enumerate(self.mimic_leaders):
+            _require_index(f"mimic_leaders[{j}]", leader, self.n - 1, least=0)
+            if self.mimic_factors[j] == 0:
+                raise InvalidValueError(f"mimic_factors[{j}]", 0, "a factor other than 0")
 
     def _check_frames(self) -> None:
         """Check the tip, further frames, and the bodies that carry them."""
-        _require_index("tip_parent", self.tip_parent, self.n - 1)
+        _require_index("tip_parent", self.tip_parent, self.bodies - 1)
         _require_rotation("tip_rotation", self.tip_rotation)
         require_shape("frame_parents", (len(self.frame_parents),), (len(self.frame_names),))
         if len(self.frame_names) > RULES.frames:
             raise RobotError(f"the robot has {len(self.frame_names)} frames, expected at most {RULES.frames}")
         for k, name in enumerate(self.frame_names):
             require_text(f"frame_names[{k}]", name)
-            _require_index(f"frame_parents[{k}]", self.frame_parents[k], self.n - 1)
+            _require_index(f"frame_parents[{k}]", self.frame_parents[k], self.bodies - 1)
             _require_rotation(f"frame_rotations[{k}]", self.frame_rotations[k])
         for tip in self.tips:
             require_known("tip", tip, self.frame_names)
         # The links of each body name it in errors.
         frames = list(zip((self.tip_name, *self.frame_names), (self.tip_parent, *self.frame_parents), strict=True))
-        for i, name in enumerate(self.joint_names):
+        for i, name in enumerate(self.body_joints):
             links = [frame for frame, parent in frames if parent == i]
             require_body(name, self.masses[i], self.inertias[i], self.armatures[i], links)
 
@@ -176,7 +204,7 @@ class KinematicTree:
         return Frame(name, self.frame_parents[k], self.frame_rotations[k], self.frame_translations[k])
 
     def carriers(self, body: int) -> list[int]:
-        """A body and those that carry it, from the base on; none for -1."""
+        """A body and those that carry it, from the base on; none for -1. Bodies from n on are those of mimic joints."""
         chain = []
         while body >= 0:
             chain.append(body)
@@ -185,8 +213,63 @@ class KinematicTree:
 
     @property
     def n(self) -> int:
-        """Number of joints."""
+        """Number of joints that move by themselves."""
         return len(self.joint_names)
+
+    @property
+    def bodies(self) -> int:
+        """Number N of joints with mimic joints, and of the bodies that they move."""
+        return len(self.joint_names) + len(self.mimic_names)
+
+    @property
+    def body_joints(self) -> tuple[str, ...]:
+        """Names of the joints that move the bodies, (N,)."""
+        return (*self.joint_names, *self.mimic_names)
+
+    @property
+    def body_kinds(self) -> tuple[JointKind, ...]:
+        """Kinds of the joints that move the bodies, (N,)."""
+        return (*self.joint_kinds, *self.mimic_kinds)
+
+    @property
+    def leaders(self) -> tuple[int, ...]:
+        """The joint by whose coordinate each body moves, (N,)."""
+        return (*range(self.n), *self.mimic_leaders)
+
+    @property
+    def coupling(self) -> Array:
+        """S (N, n): the positions of all joints are S q + s_0, and their velocities S dq."""
+        S = np.zeros((self.bodies, self.n))
+        S[range(self.bodies), self.leaders] = (*np.ones(self.n), *self.mimic_factors)
+        return S
+
+    @property
+    def order(self) -> tuple[int, ...]:
+        """The bodies that hang on the base, parents before children."""
+        if not self.mimic_names:
+            return tuple(range(self.n))
+        placed: list[int] = []
+        waiting = list(range(self.bodies))
+        while ready := [i for i in waiting if self.parents[i] < 0 or self.parents[i] in placed]:
+            placed.append(ready[0])
+            waiting.remove(ready[0])
+        return tuple(placed)
+
+    def expand(self, q: Any) -> Any:
+        """S q + s_0, the positions of all joints: of SX or MX (n, 1), or of arrays (n,) or (K, n)."""
+        if not self.mimic_names:
+            return q
+        leaders, offsets = list(self.leaders), np.concatenate([np.zeros(self.n), self.mimic_offsets])
+        factors = np.concatenate([np.ones(self.n), self.mimic_factors])
+        if isinstance(q, ca.SX | ca.MX):
+            return q[leaders, 0] * ca.DM(factors) + ca.DM(offsets)
+        return q[..., leaders] * factors + offsets
+
+    def require_no_mimics(self, what: str) -> None:
+        """Raise RobotError if a joint mimics another one, for what is not possible with such joints."""
+        if self.mimic_names:
+            joint, leader = self.mimic_names[0], self.joint_names[self.mimic_leaders[0]]
+            raise RobotError(f"{what}: not possible with mimic joints, and '{joint}' mimics '{leader}'")
 
     @property
     def centre_posture(self) -> Array:
@@ -200,6 +283,14 @@ class KinematicTree:
         limited = np.isfinite(self.lower) & np.isfinite(self.upper)
         posture[limited] = (self.lower[limited] + self.upper[limited]) / 2
         return np.asarray(posture)
+
+    def draw_postures(self, count: int, seed: int) -> Array:
+        """Uniform postures between the limits, (count, n); joints without limits take a turn, or half a metre."""
+        width = np.where(self.prismatic, 2 * PRISMATIC_ROOM, 2 * np.pi)
+        upwards = np.where(np.isfinite(self.upper), self.upper - width, -width / 2)
+        low = np.where(np.isfinite(self.lower), self.lower, upwards)
+        high = np.where(np.isfinite(self.upper), self.upper, low + width)
+        return np.random.default_rng(seed).uniform(low, np.maximum(low, high), (count, self.n))
 
     @property
     def prismatic(self) -> tuple[bool, ...]:
@@ -215,11 +306,11 @@ class KinematicTree:
         return ()
 
 
-def _require_index(name: str, value: int, largest: int) -> None:
+def _require_index(name: str, value: int, largest: int, least: int = -1) -> None:
     """Raise InvalidValueError unless the value is the index of a body, or -1 for the base."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not whole or not -1 <= value <= largest:
-        raise InvalidValueError(name, repr(value)[:80], f"an index from -1 to {largest}")
+    if not whole or not least <= value <= largest:
+        raise InvalidValueError(name, repr(value)[:80], f"an index from {least} to {largest}")
 
 
 def _require_rotation(name: str, matrix: Array) -> None:
@@ -343,4 +434,5 @@ def place_on_base(tree: KinematicTree, base: str, mass: float, centre: Array, in
         frame_parents=tuple(map(shift, tree.frame_parents)),
         frame_rotations=frames,
         frame_translations=places,
+        mimic_leaders=tuple(map(shift, tree.mimic_leaders)),
     )

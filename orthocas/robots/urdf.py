@@ -19,14 +19,7 @@ import numpy as np
 import pinocchio as pin
 
 from orthocas.errors import RobotError, UnknownNameError, one_line
-from orthocas.robots.pinocchio_model import (
-    collect_postures,
-    find_default_tip,
-    find_frame,
-    fix_joints,
-    set_position,
-    suggest_lock,
-)
+from orthocas.robots.pinocchio_model import Mimic, collect_postures, fix_joints, set_position
 from orthocas.tools.checks import Array
 from orthocas.tools.display import listed
 
@@ -57,24 +50,17 @@ _USED = {"link": ("inertial",), "joint": ("origin", "parent", "child", "axis", "
 _CONTEXT = "joint xml is not initialized correctly"
 
 
-def read_urdf(path: str | Path, tips: Sequence[str] = (), locked: Mapping[str, float] | None = None) -> pin.Model:
-    """Read a URDF file. Mimic joints are kept, so that they can be refused or locked later.
+def read_urdf(path: str | Path) -> tuple[pin.Model, dict[str, Mimic]]:
+    """Read a URDF file: all joints as independent ones, and which of them follow others.
 
     Only what kinematics and dynamics use is read: links, their inertias, and joints. Faults elsewhere, such as in
     shapes and colours, are logged. So are missing limits of effort and velocity, which count as unlimited.
 
-    Pinocchio cannot keep joints that mimic a fixed joint, another mimic joint, or a joint which comes later in its
-    order. In files with such joints, all mimic joints are locked where their leaders are, at 0, at the limit closest to
-    0, or as `locked` says.
-
-    Args:
-        path: the file.
-        tips: names of the frames that the robot moves; default: the last frame of a robot with a single chain.
-        locked: positions of joints [rad] or [m] that are going to be locked.
+    Joints that mimic a fixed joint, or with the multiplier 0, are locked at their offset.
 
     Raises:
-        RobotError: if the file is missing or not a URDF model, or a joint has a zero axis; if a mimic joint that had to
-            be locked moves the tip and its leader is not in `locked`.
+        RobotError: if the file is missing or not a URDF model, a joint has a zero axis, or joints mimic each other in a
+            loop.
     """
     root = read_urdf_xml(path)
     _check_macros(path, root)
@@ -99,12 +85,10 @@ def read_urdf(path: str | Path, tips: Sequence[str] = (), locked: Mapping[str, f
             part.extend(child for child in element if child.tag in _USED[element.tag])
     _check_urdf(path, used)
     text = ElementTree.tostring(used, "unicode")
-    model, fault = _parse_urdf(text, mimic=True)
-    if fault and used.find("joint/mimic") is not None:
-        model, fault = _parse_urdf(text, mimic=False)
-        model = model if fault else _lock_mimics(model, used, tips, locked or {})
+    model, fault = _parse_urdf(text)
     if fault:
         raise RobotError(f"{path} is not a usable URDF model: {fault}")
+    model, mimics = _read_mimics(model, used)
 
     if unlimited:
         _log.warning(
@@ -113,10 +97,10 @@ def read_urdf(path: str | Path, tips: Sequence[str] = (), locked: Mapping[str, f
             listed(unlimited),
         )
     _note_impossible_inertias(path, used)
-    _, beside = _parse_urdf(ElementTree.tostring(root, "unicode"), mimic=False)
+    _, beside = _parse_urdf(ElementTree.tostring(root, "unicode"))
     if beside:
         _log.warning("%s: what kinematics does not use is left out: %s", path, beside)
-    return model
+    return model, mimics
 
 
 def read_urdf_xml(path: str | Path) -> ElementTree.Element:
@@ -284,7 +268,7 @@ def _check_numbers(path: str | Path, joint: ElementTree.Element) -> None:
         if _is_negative(text):
             label = f"<limit> of joint '{name}'"
             raise RobotError(f"{path}: {what} of {label} is '{text[:80]}', expected a number >= 0 (0: unlimited)")
-    # It reads mimic elements only where the leader comes first.
+    # It does not read mimic elements here.
     for mimic in joint.findall("mimic"):
         for what in ("multiplier", "offset"):
             text = mimic.get(what, "0").strip()
@@ -367,7 +351,7 @@ def _check_loops(
             )
 
 
-def _parse_urdf(text: str, mimic: bool) -> tuple[pin.Model, str]:
+def _parse_urdf(text: str) -> tuple[pin.Model, str]:
     """The model that Pinocchio reads from a text, and what is wrong with it: "" if nothing.
 
     The parser goes on after many errors and skips what it cannot read, for example a mass. It writes them to standard
@@ -377,7 +361,7 @@ def _parse_urdf(text: str, mimic: bool) -> tuple[pin.Model, str]:
     with tempfile.TemporaryFile() as notes:
         os.dup2(notes.fileno(), 2)
         try:
-            model = pin.buildModelFromXML(text, mimic=mimic)
+            model = pin.buildModelFromXML(text, mimic=False)
         except (ValueError, RuntimeError) as error:
             # Without its place in the C++ source.
             words = one_line(str(error).rpartition("message:")[2])
@@ -392,51 +376,35 @@ def _parse_urdf(text: str, mimic: bool) -> tuple[pin.Model, str]:
     return model, words
 
 
-def _lock_mimics(
-    model: pin.Model, root: ElementTree.Element, tips: Sequence[str], locked: Mapping[str, float]
-) -> pin.Model:
-    """The model with every mimic joint locked at multiplier x position of its leader + offset."""
-    mimics = {joint.get("name", ""): mimic for joint in root.findall("joint") for mimic in joint.findall("mimic")}
-    joints = {joint.get("name", "") for joint in root.findall("joint")}
-    carriers = [model.frames[find_frame(model, tip)].parentJoint for tip in tips or (find_default_tip(model),)]
-    chain = {i for carrier in carriers for i in model.supports[carrier]}
-    position, ids = pin.neutral(model), []
-    for name in mimics:
-        leader, factor, offset = _find_leader(name, mimics)
-        i = model.getJointId(name)
-        # Fixed joints are no joints of the model.
-        if i >= model.njoints:
-            continue
-        if i in chain and leader not in joints:
-            raise RobotError(f"joint '{name}' mimics joint '{leader}', which the file does not have")
-        if i in chain and leader not in locked:
-            raise RobotError(f"joint '{name}' is a mimic joint, expected independent joints: {suggest_lock(leader)}")
-        if name in locked:
-            hint = suggest_lock(leader)
-            raise RobotError(f"joint '{name}' mimics joint '{leader}', expected an independent joint: {hint}")
-        # The leader is going to be locked at the given position, at 0, or at the limit closest to 0.
-        at, k = float(locked.get(leader, 0.0)), model.getJointId(leader)
-        if leader not in locked and k < model.njoints:
-            k = model.joints[k].idx_q
-            at = float(np.clip(0.0, model.lowerPositionLimit[k], model.upperPositionLimit[k]))
-        set_position(model, i, offset + factor * at, position)
-        ids.append(i)
-    return fix_joints(model, ids, position)
+def _read_mimics(model: pin.Model, root: ElementTree.Element) -> tuple[pin.Model, dict[str, Mimic]]:
+    """The joints of a model that follow others, with the independent leader of each: leaders may follow others.
 
+    Joints that follow a fixed joint, or with the factor 0, are locked in the model that is returned.
 
-def _find_leader(name: str, mimics: Mapping[str, ElementTree.Element]) -> tuple[str, float, float]:
-    """The independent joint that a joint follows, along all leaders; the multiplier and the offset."""
-    factor, offset, passed = 1.0, 0.0, set()
-    # leaders may follow others: factors multiply, offsets add up
-    while name in mimics:
-        if name in passed:
-            raise RobotError(f"joint '{name}' mimics itself")
-        passed.add(name)
-        mimic = mimics[name]
-        offset += factor * float(mimic.get("offset", 0))
-        factor *= float(mimic.get("multiplier", 1))
-        name = mimic.get("joint", "")
-    return name, factor, offset
+    Raises:
+        RobotError: if joints follow each other in a loop.
+    """
+    elements = {joint.get("name", ""): mimic for joint in root.findall("joint") for mimic in joint.findall("mimic")}
+    mimics = {}
+    for name in filter(model.existJointName, elements):
+        leader, factor, offset, passed = name, 1.0, 0.0, set[str]()
+        # Factors multiply, offsets add up.
+        while leader in elements:
+            if leader in passed:
+                raise RobotError(f"joint '{name}' mimics itself")
+            passed.add(leader)
+            mimic = elements[leader]
+            offset += factor * float(mimic.get("offset", 0))
+            factor *= float(mimic.get("multiplier", 1))
+            leader = mimic.get("joint", "")
+        mimics[name] = Mimic(leader, factor, offset)
+    # those that never move
+    fixed = {joint.get("name", "") for joint in root.findall("joint") if joint.get("type") == "fixed"}
+    still = [name for name, mimic in mimics.items() if mimic.leader in fixed or not mimic.factor]
+    position, ids = pin.neutral(model), [model.getJointId(name) for name in still]
+    for name, i in zip(still, ids, strict=True):
+        set_position(model, i, mimics.pop(name).offset, position)
+    return fix_joints(model, ids, position) if ids else model, mimics
 
 
 def read_srdf_postures(urdf: Path, joint_names: Sequence[str]) -> dict[str, Array]:

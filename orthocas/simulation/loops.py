@@ -101,10 +101,12 @@ class ClosedLoop:
             return (self.n,)
         tree = self.plant.tree
         arrays = [tree.rotations, tree.translations, tree.armatures, tree.gravity]
+        arrays += [tree.mimic_factors, tree.mimic_offsets]
         if self.stops is not None:
             arrays += [np.asarray(self.stops.stiffness), np.asarray(self.stops.damping), tree.lower, tree.upper]
         numbers = tuple(array.tobytes() for array in arrays)
-        return (tree.joint_kinds, tree.parents, numbers, self.loads.places, self.rubs, self.stops is None)
+        joints = (tree.body_kinds, tree.parents, tree.mimic_leaders)
+        return (joints, numbers, self.loads.places, self.rubs, self.stops is None)
 
     @property
     def rubs(self) -> bool:

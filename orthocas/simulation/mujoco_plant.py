@@ -210,6 +210,7 @@ def mujoco_model(tree: KinematicTree, scene: MuJoCo, viscous: Array, coulomb: Ar
         RobotError: if MuJoCo refuses the model.
     """
     mj = mujoco()
+    tree.require_no_mimics("MuJoCo's plant")
     spec = mj.MjSpec()
     spec.compiler.degree = False
     spec.option.gravity = tree.gravity

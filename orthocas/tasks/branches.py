@@ -251,7 +251,9 @@ class _Arm:
             moved = np.asarray(_evaluate_jacobians(task.with_reference_at(whole.centre), points[:20]).any(axis=(0, 1)))
         arms = []
         for tip in robot.tips:
-            joints = robot.tree.carriers(robot.tree.frame(tip).parent)[-RULES.arm :]
+            # Joints that move the tip, those that mimic joints follow too, each once.
+            bodies = robot.tree.carriers(robot.tree.frame(tip).parent)
+            joints = list(dict.fromkeys(robot.tree.leaders[body] for body in bodies))[-RULES.arm :]
             if joints and moved[joints].any():
                 arms.append(cls._build(robot, Task.pose(robot, frame=tip), whole, joints, points))
         return arms

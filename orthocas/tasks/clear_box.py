@@ -207,8 +207,9 @@ class ClearBox(Box):
     def contains(self, q: ArrayLike) -> Any:
         """Whether points (n,) or (N, n) lie in the box and are clear of singular positions: a bool, or (N,)."""
         points, single = as_point_set("q", q, len(self.centre))
-        inside = np.array(super().contains(points))
-        inside[inside] = self.is_clear(points[inside])
+        inside = np.asarray((np.abs(points - self.centre) <= self.reach).all(axis=1))
+        if inside.any():
+            inside[inside] = self.is_clear(points[inside])
         return inside[0] if single else inside
 
     def is_clear(self, points: Array) -> NDArray[np.bool_]:

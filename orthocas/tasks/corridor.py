@@ -47,7 +47,8 @@ class Corridor(Box):
 
     Example:
         >>> import orthocas as oc
-        >>> corridor = oc.Corridor(oc.Box([0.5, 0.5], 0.7), [[0.0, 0.0], [1.0, 1.0]], 0.2)
+        >>> from orthocas.tasks.corridor import Corridor
+        >>> corridor = Corridor(oc.Box([0.5, 0.5], 0.7), [[0.0, 0.0], [1.0, 1.0]], 0.2)
         >>> corridor.contains([[0.5, 0.6], [0.9, 0.1]]).tolist()
         [True, False]
     """

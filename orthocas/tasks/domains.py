@@ -16,6 +16,7 @@ from orthocas.errors import DomainError, InvalidValueError, ShapeError, degrees_
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM
 from orthocas.tools import json
+from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
     Array,
     as_float_array,
@@ -108,7 +109,7 @@ class Domain(ABC):
         """What the boundaries give for rounding, (n,)."""
         return np.asarray(1e-12 * self.half_width + 4 * np.finfo(float).eps * np.abs(self.centre))
 
-    @property
+    @cached_property
     def reach(self) -> Array:
         """Largest distance from the centre that counts as inside, (n,), with slack for rounding at the boundaries."""
         lower, upper = self.bounds

@@ -28,7 +28,9 @@ from orthocas.tools.json import get_part
 NEAR_SINGULAR = 0.01  #: smallest relative singular value of the task below which a sample counts as singular
 NEAR_HALF_A_TURN = 0.01  #: cos(angle / 2) of turns that count as half a turn: those above 178.9 deg
 _RANK_LOST = 1e-9
+#: fields of trees with frames, and of those with mimic joints, which other files do not have
 _OF_FRAMES = {"tips", "frame_names", "frame_parents", "frame_rotations", "frame_translations"}
+_OF_MIMICS = {"mimic_names", "mimic_kinds", "mimic_leaders", "mimic_factors", "mimic_offsets"}
 #: what reading a header that may be anything raises, beside errors of our own
 FOREIGN = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, MemoryError)
 
@@ -78,10 +80,8 @@ class Problem(Shown):
         least_singular_value: float | None = None,
     ) -> None:
         # Robot and task belong together, and the task leaves some freedom.
-        if not isinstance(task, Task) or not isinstance(robot, Robot):
-            raise InvalidValueError(
-                "robot and task", f"{type(robot).__name__} and {type(task).__name__}", "Robot and Task"
-            )
+        require_kind("robot", robot, Robot)
+        require_kind("task", task, Task)
         if task.robot is not robot:
             raise InvalidValueError("task", f"a task of another robot ({task.name})", "a task built on the same robot")
         if task.m >= robot.n - len(robot.tree.floating):
@@ -277,9 +277,9 @@ def write_problem(problem: Problem) -> tuple[dict[str, Any], dict[str, Stored]]:
     """Parts 'robot' and 'problem' of a header, and arrays whose names begin with robot_ and domain_."""
     tree = problem.robot.tree
     numbers = {f.name: getattr(tree, f.name) for f in fields(tree)}
-    # Without frames, files are as before there were any.
-    if not tree.frame_names:
-        numbers = {name: value for name, value in numbers.items() if name not in _OF_FRAMES}
+    # Without frames or mimic joints, files are as before there were any.
+    unused = (set() if tree.frame_names else _OF_FRAMES) | (set() if tree.mimic_names else _OF_MIMICS)
+    numbers = {name: value for name, value in numbers.items() if name not in unused}
     arrays = {f"robot_{name}": value for name, value in numbers.items() if isinstance(value, np.ndarray)}
     domain = problem.domain
     arrays |= {"domain_centre": domain.centre, "domain_half_width": domain.half_width}
@@ -332,12 +332,12 @@ def _read_tree(data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Kinemat
         numbers.setdefault(name, np.full(len(names), np.inf))
     texts: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in data.items()}
     expected, received = {field.name for field in fields(KinematicTree)}, {*texts, *numbers}
-    if not received & _OF_FRAMES:
-        expected -= _OF_FRAMES
+    for optional in (_OF_FRAMES, _OF_MIMICS):
+        expected -= set() if received & optional else optional
     if expected != received:
         odd = f"with {sorted(received - expected)} and without {sorted(expected - received)}"
         raise InvalidValueError("robot", odd, "the fields of a KinematicTree")
-    for name in ("joint_kinds", "parents", *sorted(_OF_FRAMES & {*data})):
+    for name in ("joint_kinds", "parents", *sorted((_OF_FRAMES | _OF_MIMICS) & {*data})):
         get_part(data, name, list)
     return KinematicTree(**texts | numbers)
 

@@ -602,14 +602,11 @@ class Task(Shown, HoldsFunctions):
             [Y1985]
         """
         points, single = as_point_set("q", q, self.robot.n)
-        J = self.batched_frame_jacobian(points)[0].reshape(len(points), -1, self.robot.n)
-        w = np.prod(np.linalg.svd(J, compute_uv=False), axis=-1)
+        w = self._batched_manipulability[0](points)[0][:, 0]
         return np.asarray(w[0] if single else w)
 
     def manipulability_gradient(self, q: ArrayLike) -> Array:
         """dw/dq (n,) of the manipulability at q (n,), or (N, n) at each row of (N, n); NaN at singular positions.
-
-        dw/dq_i = w tr(J^+ dJ/dq_i).
 
         Raises:
             ShapeError, InvalidValueError: as in `manipulability`.
@@ -618,22 +615,31 @@ class Task(Shown, HoldsFunctions):
             The formula: [Y1985], differentiated.
         """
         points, single = as_point_set("q", q, self.robot.n)
-        count, n = points.shape
-        J = self.batched_frame_jacobian(points)[0].reshape(count, -1, n)
-        change = self._batched_frame_change(points)[0].reshape(count, n, -1, n)
-        U, sizes, V = np.linalg.svd(J, full_matrices=False)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inverse = np.moveaxis(V, 1, 2) @ (np.moveaxis(U, 1, 2) / sizes[:, :, None])
-            dw = np.prod(sizes, axis=1)[:, None] * np.einsum("kam,kima->ki", inverse, change)
+        dw = self._batched_manipulability[1](points)[0]
         return np.asarray(dw[0] if single else dw)
 
     @cached_property
-    def _batched_frame_change(self) -> Batched:
-        """Evaluates dJ/dq_i of `frame_jacobian_function`, for one joint after another."""
+    def manipulability_function(self) -> ca.Function:
+        """q (n, 1) -> w (1, 1): the volume that the rows of `frame_jacobian_function` span."""
         q = ca.SX.sym("q", self.robot.n)
-        J = self.frame_jacobian_function(q)
-        changes = [ca.jacobian(ca.vec(J.T), q)[:, i] for i in range(self.robot.n)]
-        return Batched(dense_function("frame_change", [q], [ca.cse(ca.vertcat(*changes))]))
+        J, volume, units = self.frame_jacobian_function(q), ca.SX(1), list[ca.SX]()
+        # the product of the lengths that rows have across those before them; a length of 0 has no direction
+        for k in range(J.shape[0]):
+            across = J[k, :].T
+            for unit in units:
+                across -= ca.dot(unit, across) * unit
+            length = ca.norm_2(across)
+            units.append(across / ca.fmax(length, np.finfo(float).tiny))
+            volume *= length
+        return ca.Function("manipulability", [q], [ca.cse(volume)], ["q"], ["manipulability"])
+
+    @cached_property
+    def _batched_manipulability(self) -> tuple[Batched, Batched]:
+        """w at many points, and its gradient."""
+        q = ca.SX.sym("q", self.robot.n)
+        w = self.manipulability_function(q)
+        gradient = dense_function("manipulability_gradient", [q], [ca.cse(ca.gradient(w, q))])
+        return Batched(self.manipulability_function), Batched(gradient)
 
     def evaluate_jacobian(self, points: Array, results: Array | None = None) -> Array:
         """J_x at points (N, n), as an array (N, m, n): a new one, or `results`.

@@ -156,14 +156,13 @@ def require_finite(name: str, array: Array) -> None:
         raise InvalidValueError(f"{name}{list(place) if place else ''}", array[place], "a finite number")
 
 
-def as_point_set(name: str, value: ArrayLike, n: int) -> tuple[Array, bool]:
-    """Convert one point or a set of points to a set (N, n), and whether it was one point.
+def as_rows(name: str, value: ArrayLike, n: int) -> tuple[Array, bool]:
+    """Convert one point or a set of points, finite or not, to a set (N, n), and whether it was one point.
 
     A point is (n,), or a column (n, 1), such as a `casadi.DM`; for n = 1 a column is a set.
 
     Raises:
         ShapeError: if the last axis does not have n entries.
-        InvalidValueError: if an entry is not finite.
     """
     array = as_float_array(name, value)
     # columns, as CasADi returns them, are one point
@@ -173,6 +172,17 @@ def as_point_set(name: str, value: ArrayLike, n: int) -> tuple[Array, bool]:
     points = array[None, :] if single else array
     if points.ndim != 2 or points.shape[1] != n:
         raise ShapeError(name, array.shape, (n,) if single else (None, n))
+    return points, single
+
+
+def as_point_set(name: str, value: ArrayLike, n: int) -> tuple[Array, bool]:
+    """Convert one point or a set of points as `as_rows` does.
+
+    Raises:
+        ShapeError: if the last axis does not have n entries.
+        InvalidValueError: if an entry is not finite.
+    """
+    points, single = as_rows(name, value, n)
     require_finite(name, points[0] if single else points)
     return points, single
 
@@ -200,7 +210,18 @@ def require_kind(name: str, value: object, kind: type) -> None:
     if not isinstance(value, kind):
         plain = isinstance(value, str | int | float | None)
         received = repr(value)[:80] if plain else f"a {type(value).__name__}"
-        raise InvalidValueError(name, received, f"a {kind.__name__}{suggest_attribute(value, kind)}")
+        hint = suggest_attribute(value, kind) or _MAKERS.get(kind.__name__, "")
+        raise InvalidValueError(name, received, f"a {kind.__name__}{hint}")
+
+
+#: by class: how to make one, for the end of a message
+_MAKERS = {
+    "Task": ", such as oc.Task.pose(robot)",
+    "Problem": ", such as oc.Problem(robot, task), or oc.problems.get(name)",
+    "Robot": ", such as oc.Robot.from_name(name), or oc.Robot.from_urdf(path)",
+    "KinematicTree": ": oc.Robot.from_name(name) and oc.Robot.from_urdf(path) build a robot",
+    "Chart": ", such as oc.load(path), or oc.fit(problem).chart",
+}
 
 
 def suggest_attribute(value: object, kind: type) -> str:

@@ -210,16 +210,16 @@ def _decimate(solid: Solid, count: int) -> Solid:
 
 def build_stick_arm(tree: KinematicTree, thickness: float = 1.0, facets: int = RULES.facets) -> Look:
     """Drums about the joint axes and tapered rods between the frames, thinner or thicker than usual by a factor."""
-    look: Look = [[] for _ in range(tree.n + 2)]
-    # Radii of the rods that begin at the base and at each body, (n + 1,).
-    total, run = compute_chain_length(tree), np.zeros(tree.n + 1)
-    for i, parent in enumerate(tree.parents):
-        run[i + 1] = run[parent + 1] + np.linalg.norm(tree.translations[i])
+    look: Look = [[] for _ in range(tree.bodies + 2)]
+    # Radii of the rods that begin at the base and at each body, (N + 1,).
+    total, run = compute_chain_length(tree), np.zeros(tree.bodies + 1)
+    for i in tree.order:
+        run[i + 1] = run[tree.parents[i] + 1] + np.linalg.norm(tree.translations[i])
     radii = thickness * RULES.rod * total * (1 - RULES.taper * np.clip(run / total, 0.0, 1.0))
     for i, parent in enumerate(tree.parents):
         r = radii[i + 1]
         # A drum about the axis of a revolute joint, or a slim rail along that of a prismatic one.
-        size = (0.8 * r, 2.2 * r) if tree.prismatic[i] else (1.18 * r, 1.3 * r)
+        size = (0.8 * r, 2.2 * r) if tree.body_kinds[i] == "prismatic" else (1.18 * r, 1.3 * r)
         look[i + 1].append(build_drum(*size, RULES.joint, facets))
         _add_rod(look[parent + 1], tree.translations[i], (radii[parent + 1], r), facets)
     r = radii[tree.tip_parent + 1]
@@ -278,7 +278,7 @@ def read_urdf_look(path: Path, tree: KinematicTree, locked: Mapping[str, float] 
         for material in root.iter("material")
         if (colour := _read_colour(material)) is not None and material.get("name")
     }
-    look: Look = [[] for _ in range(tree.n + 2)]
+    look: Look = [[] for _ in range(tree.bodies + 2)]
     missing: list[str] = []
     for link, carrier in zip(links, places, strict=True):
         for visual in link.findall("visual"):
@@ -339,7 +339,7 @@ def _load_mesh(path: Path, shape: ElementTree.Element, colour: Colour, missing: 
 
 
 class BodyPoses:
-    """Poses of the base, of each body and of the tip frame in the world: n + 2 frames in this order."""
+    """Poses of the base, of each body and of the tip frame in the world: N + 2 frames in this order."""
 
     def __init__(self, tree: KinematicTree) -> None:
         q = ca.SX.sym("q", tree.n)
@@ -348,9 +348,9 @@ class BodyPoses:
         self._batched = Batched(dense_function("poses", [q], [ca.horzcat(*(ca.horzcat(R, p) for R, p in poses))]))
 
     def __call__(self, q: Array) -> tuple[Array, Array]:
-        """Positions (N, n + 2, 3) [m] and unit quaternions w, x, y, z (N, n + 2, 4) at joint positions (N, n)."""
+        """Positions (K, N + 2, 3) [m] and unit quaternions w, x, y, z (K, N + 2, 4) at joint positions (K, n)."""
         flat = self._batched(q)[0]
-        frames = flat.reshape(len(q), 3, -1, 4).transpose(0, 2, 1, 3)  # (N, n + 2, 3, 4)
+        frames = flat.reshape(len(q), 3, -1, 4).transpose(0, 2, 1, 3)  # (K, N + 2, 3, 4)
         turns = scipy.spatial.transform.Rotation.from_matrix(frames[..., :3].reshape(-1, 3, 3))
         quaternions = turns.as_quat(scalar_first=True).reshape(len(q), -1, 4)
         return np.ascontiguousarray(frames[..., 3]), quaternions

@@ -197,6 +197,7 @@ static orthocas_arm plain(void) {
   arm.kernels.fallback = fallback_of;
   arm.kernels.gap = gap_between;
   arm.torque = 1;
+  arm.integral_bound = 5.0;
   arm.shared = 1;
   arm.memory_torque = -1;
   arm.bounded = bounded;
@@ -251,7 +252,7 @@ static const orthocas_arm *arm;
 static orthocas_state state;
 static orthocas_safety safety;
 static orthocas_reference reference, given;
-static double numbers[40 * N + 2 * N * N], settings[18][N], values[6][K], work[WORK];
+static double numbers[40 * N + 2 * N * N], settings[20][N], values[6][K], work[WORK];
 static double q[N], dq[N], command[N], limit[N], used[2 * N];
 static const double anything[N] = {INFINITY, INFINITY, INFINITY};
 
@@ -262,14 +263,15 @@ static void set(double *x, double a, double b, double c) {
 }
 
 static void fill_settings(void) {
-  const double defaults[18] = {1e4, 6, 0.5, 0.15, 4, 20, -3, 3, 900, 0, 0.05, 60, 30, 0.6, 0.5, 0.0, 0.2, 2};
-  const double **places[18] = {&safety.command_rate, &safety.speed_limit, &safety.rest_speed, &safety.stuck_speed,
+  const double defaults[20] = {1e4, 6, 0.5, 0.15, 4, 20, -3, 3, 900, 0, 0.05, 60, 30, 0.6, 0.5, 0.0, 0.2, 2, 0, 0};
+  const double **places[20] = {&safety.command_rate, &safety.speed_limit, &safety.rest_speed, &safety.stuck_speed,
                                &safety.reference_speed, &safety.reference_acceleration, &safety.lower, &safety.upper,
                                &safety.stop_stiffness, &safety.observer_rate, &safety.stop_zone, &safety.stop_damping,
                                &safety.brake_yield, &safety.error_limit, &safety.offset_rate, &safety.integral_rate,
-                               &safety.integral_limit, &safety.start_mismatch};
+                               &safety.integral_limit, &safety.start_mismatch, &safety.friction,
+                               &safety.encoder_step};
   int i;
-  for (i = 0; i < 18; ++i) {
+  for (i = 0; i < 20; ++i) {
     set(settings[i], defaults[i], defaults[i], defaults[i]);
     *places[i] = settings[i];
   }
@@ -453,8 +455,9 @@ static void test_settings(void) {
   const double bad[] = {NAN, -1.0, 0.0, INFINITY};
   size_t i, b;
   start_law(arm);
-  for (i = 0; i < 18; ++i) {
-    const int any = i < 2 || (i > 2 && i < 8) || i == 13 || i == 17, only_torque = i > 8 && i < 13;
+  for (i = 0; i < 20; ++i) {
+    const int any = i < 2 || (i > 2 && i < 8) || i == 13 || i == 17 || i == 18;
+    const int only_torque = (i > 8 && i < 13) || i > 17;
     fill_settings();
     CHECK(orthocas_check_settings(arm, &safety));
     settings[i][1] = NAN;
@@ -575,18 +578,22 @@ static void test_sensors(void) {
   CHECK(step(-1.0) == ORTHOCAS_BAD_INPUT);
   CHECK(step(1e7) == ORTHOCAS_BAD_INPUT);
   /* Sensors that stand still while they claim a speed, or while commands must have moved the arm. */
-  for (k = 0; k < 3; ++k) {
+  for (k = 0; k < 4; ++k) { /* friction may hold it */
     int tick, seen = 0;
     start_law(arm);
     (void)steps(2);
     if (k == 0) set(dq, 0.1, 0, 0);
     if (k == 1) fault.law = 20.0;
     if (k == 2) fault.singular = 1; /* its inertia is not known */
+    if (k == 3) {
+      fault.law = 20.0;
+      set(settings[18], 25.0, 25.0, 25.0);
+    }
     for (tick = 0; tick < 60; ++tick) {
       wiggle = 1;
       seen |= step(1e-3) == ORTHOCAS_BAD_INPUT;
     }
-    CHECK(k == 2 || seen);
+    CHECK(k == 2 || seen == (k < 2 || !arm->torque));
   }
   start_law(arm);
   (void)steps(2);
@@ -648,7 +655,8 @@ static void test_modes(void) {
   dq[0] = 0.3;
   fault.status = ORTHOCAS_OK;
   CHECK(step(1e-3) == ORTHOCAS_RETURNING); /* inside, but not at rest yet */
-  dq[0] = 6.5;
+  dq[0] = 6.5; /* for a moment, a light joint may */
+  CHECK(steps(5) == ORTHOCAS_RETURNING);
   CHECK(step(1e-3) == ORTHOCAS_CAUGHT);
   CHECK(state.cause == ORTHOCAS_TOO_FAST);
   orthocas_resume(&state);
@@ -665,7 +673,7 @@ static void test_modes(void) {
   start_law(arm);
   (void)steps(2);
   dq[0] = -6.1;
-  CHECK(step(1e-3) == ORTHOCAS_CAUGHT);
+  CHECK(steps(6) == ORTHOCAS_CAUGHT);
   CHECK(state.cause == ORTHOCAS_TOO_FAST || state.cause == ORTHOCAS_OUTSIDE_DOMAIN);
   start_law(arm);
   (void)steps(2);
@@ -804,6 +812,15 @@ static void test_reference(void) {
   reference.value[0] += 0.01;
   (void)steps(60);
   CHECK(fabs(state.integral[0]) > 0.0);
+  /* No faster than the slowest mode bears, which the status says. */
+  start_law(arm);
+  set(settings[15], 50.0, 1.0, 1.0);
+  reference.value[0] += 0.01;
+  CHECK(step(1e-3) == ORTHOCAS_BAD_INPUT);
+  state.integral[0] = 0.0;
+  state.weight = 1.0;
+  (void)step(1e-3);
+  CHECK(fabs(state.integral[0]) > 0.0 && fabs(state.integral[0]) < 1.01 * 5.0 * 0.6 * 1e-3);
 }
 
 /* ---- R23: the observer ---- */
@@ -813,6 +830,11 @@ static void test_observer(void) {
   start_law(arm);
   set(settings[9], 60.0, 0.0, 60.0);
   CHECK(steps(20) == ORTHOCAS_OK);
+  settings[19][0] = 2e-3; /* within the step of its encoder, nothing is seen */
+  q[0] = state.q[0] + 0.9e-3;
+  state.dq[0] = state.expected[0] = 0.0;
+  (void)step(1e-3);
+  CHECK(fabs(state.dq[0]) <= 0.0);
   q[0] += 0.11; /* far off: it begins anew */
   (void)steps(30);
   for (k = 0; k < 3; ++k) {

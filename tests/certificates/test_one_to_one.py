@@ -16,7 +16,7 @@ from orthocas.certificates import check_certificate
 from orthocas.certificates.jets import Jets
 from orthocas.certificates.one_to_one import OneToOneCheck, choose_one_to_one_check
 from orthocas.certificates.rows import build_chart_rows
-from orthocas.certificates.search import Limits, Search, rank_by_volume
+from orthocas.certificates.search import Limits, Search
 from orthocas.charts.certificate import PROVED, Subdivision
 
 certifying = importlib.import_module("orthocas.certificates.certify")  # a function has the name of the module
@@ -30,7 +30,7 @@ def judge_on(known: oc.Chart, half: np.ndarray) -> tuple[OneToOneCheck, Subdivis
 
 def proved(known: oc.Chart, half: np.ndarray, boxes: int) -> bool:
     judge, box = judge_on(known, half)
-    search = Search(judge, box, Limits(boxes=boxes), rank_by_volume(box))
+    search = Search(judge, box, Limits(boxes=boxes))
     search.run(lambda _: None)
     return search.finished
 

@@ -8,7 +8,7 @@ import pytest
 import orthocas as oc
 from orthocas.certificates.outside import OutsideCheck, choose_check
 from orthocas.certificates.rows import build_chart_rows
-from orthocas.certificates.search import Limits, Search, rank_by_volume
+from orthocas.certificates.search import Limits, Search
 
 certifying = importlib.import_module("orthocas.certificates.certify")  # a function has the name of the module
 BOUND = 0.1
@@ -65,7 +65,7 @@ def test_boxes_without_a_proof_of_their_own_hold_no_clear_position(chart: oc.Cha
 @pytest.mark.slow
 def test_a_chart_next_to_singular_positions_needs_few_boxes(chart: oc.Chart) -> None:
     base = certifying.cover_domain(chart.problem.domain)
-    search = Search(choose_check(chart, build_chart_rows(chart), 0.0), base, Limits(), rank_by_volume(base))
+    search = Search(choose_check(chart, build_chart_rows(chart), 0.0), base, Limits())
     search.run(lambda _: None)
     assert search.finished
     assert search.evaluated < 400  # 165; with singular vectors that stay and boxes halved by linear terms alone 2,421

@@ -6,7 +6,7 @@ import numpy as np
 
 import orthocas as oc
 from orthocas.certificates.box_checks import UNKNOWN, BoxResults
-from orthocas.certificates.search import Limits, Search, rank_by_volume
+from orthocas.certificates.search import Limits, Search
 from orthocas.charts.certificate import Subdivision
 
 
@@ -26,7 +26,7 @@ class SmallBoxes:
 
 def searched(judge: SmallBoxes, **limits: float) -> Search:
     base = Subdivision.whole(np.zeros(3), np.array([1.0, 8.0, 1.0]))
-    search = Search(judge, base, Limits(**limits), rank_by_volume(base))
+    search = Search(judge, base, Limits(**limits))
     search.run(lambda _: None)
     return search
 
@@ -38,11 +38,12 @@ def test_joints_are_halved_in_turn_where_bounds_are_infinite() -> None:
     assert search.build_subdivision().proved_count == 16 * 16  # both down to a 16th; joint 3 is never halved
 
 
-def test_search_that_gives_up_counts_its_dead_boxes() -> None:
+def test_boxes_too_small_to_halve_stay_open() -> None:
     search = searched(SmallBoxes((0, 1), 0.5, choice=0), smallest=2.0**-3)
     assert not search.finished
-    assert search.dead == 8  # joint 1 was halved three times, and then not any more
-    assert search.build_subdivision().open_count == search.open_count == 8
+    assert (
+        search.build_subdivision().open_count == search.open_count == 8
+    )  # joint 1 was halved three times, then no more
 
 
 def test_search_that_is_too_slow_ends_early() -> None:

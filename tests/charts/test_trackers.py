@@ -17,6 +17,7 @@ from orthocas.charts.trackers import TrackerStatus
 from orthocas.codegen.library import CompiledLibrary, compile_shared
 from orthocas.errors import DomainError, InvalidValueError, NoExpressionError, ShapeError
 from orthocas.fitting.fit import Fit
+from orthocas.tasks.corridor import Corridor
 from orthocas.tasks.domains import Domain
 
 
@@ -199,7 +200,7 @@ def corridor() -> oc.Chart:
     """A chart near a line of postures."""
     known = oc.problems.get("planar_3r_xy")
     path = known.domain.centre + np.linspace(-0.2, 0.2, 5)[:, None] * np.ones(3)
-    problem = oc.Problem(known.robot, known.task, domain=oc.Corridor(known.domain, path, 0.2))
+    problem = oc.Problem(known.robot, known.task, domain=Corridor(known.domain, path, 0.2))
     return oc.fit(problem, oc.Polynomial(2), samples=300).chart
 
 

@@ -20,6 +20,7 @@ from orthocas.errors import (
     UnknownNameError,
     UnreachableReferenceError,
 )
+from orthocas.fitting.fit import Fit
 from orthocas.tasks.task import TASK_KINDS
 from orthocas.tools.progress import Progress
 
@@ -60,7 +61,7 @@ def test_locked_angles_tools_and_targets_in_other_units_get_a_hint(iiwa: oc.Prob
         assert f"are these {hint}" in str(caught.value) or hint is None
 
 
-def test_fits_in_place_of_charts_are_told_apart(planar_fit: oc.Fit) -> None:
+def test_fits_in_place_of_charts_are_told_apart(planar_fit: Fit) -> None:
     calls = (oc.evaluate, oc.certify, oc.view, lambda fit: oc.generate_c(fit, "nowhere"), lambda fit: PDPlus(fit, 1.0))
     for call in calls:
         with pytest.raises(InvalidValueError, match="is a Fit, expected .*: use its attribute 'chart'$"):

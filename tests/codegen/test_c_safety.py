@@ -17,6 +17,7 @@ from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_share
 from orthocas.codegen.library import STRICT, find_compilers
 from orthocas.control import Controller, ControlStatus, PDPlus
 from orthocas.errors import CompileError
+from orthocas.tasks.corridor import Corridor
 
 pytestmark = [needs_c, pytest.mark.slow]
 
@@ -73,7 +74,7 @@ def clang(tmp_path_factory: pytest.TempPathFactory, tmp_path: Path, monkeypatch:
 def random_ticks(case: Generated, ticks: int, out: Path, *flags: str) -> Path:
     generated, law = case
     limit, domain = law.gains["limit"].max(), law.problem.domain
-    if isinstance(domain, oc.Corridor):
+    if isinstance(domain, Corridor):
         flags = (*flags, *path_flags(domain))
     return built(generated, "random_ticks.c", out, f"-DTICKS={ticks}L", f"-DLIMIT={limit}", "-DSINGULAR=0,0,0", *flags)
 

@@ -16,7 +16,8 @@ from orthocas.codegen import GeneratedC
 from orthocas.codegen.library import NO_DOUBLE, STRICT, find_compilers
 from orthocas.errors import InvalidValueError
 from orthocas.robots.capsules import FittedCapsules
-from orthocas.robots.collisions import Collisions
+from orthocas.robots.collisions import Collisions, Part
+from orthocas.robots.shapes import BallGeometry, BoxGeometry, Shape
 from orthocas.tools.checks import Array
 
 pytestmark = needs_c
@@ -55,7 +56,7 @@ def write(folder: Path, robot: oc.Robot, fitted: FittedCapsules, **options: bool
 
 
 def compare(compiled: Compiled, model: Collisions, q: Array, tolerance: float) -> None:
-    """The same as coal's for the same solids, whose directions are good to 1e-6."""
+    """The same as coal's for the same solids, whose points are good to some 1e-6 where axes are nearly parallel."""
     wanted = model.distance(q)
     errors = []
     for k, posture in enumerate(q):
@@ -66,7 +67,7 @@ def compare(compiled: Compiled, model: Collisions, q: Array, tolerance: float) -
         errors.append((not same, np.abs(points - wanted.points[k]).max(), np.abs(gradient - wanted.gradient[k]).max()))
     # Points of parallel axes are those of one choice, which rounding makes in single precision.
     certain = 0.9 if compiled.kind is np.float32 else 1.0
-    assert (np.quantile(errors, certain, axis=0) <= [0, max(1e-6, 10 * tolerance), max(1e-5, 100 * tolerance)]).all()
+    assert (np.quantile(errors, certain, axis=0) <= [0, max(5e-6, 10 * tolerance), max(5e-5, 100 * tolerance)]).all()
 
 
 @pytest.fixture(scope="module")
@@ -255,3 +256,22 @@ def test_steps_in_c_keep_clear_between_postures_too(arm: tuple[oc.Robot, FittedC
     for bad in ((np.nan, 0.02), (0.0, 0.0), (0.0, -1.0), (0.0, np.nan)):
         result, distance, status = keep_clear(q + bad[0], q, bad[1])
         assert (status, distance, result.any()) == (3, 0.0, False)
+
+
+def test_pairs_whose_capsules_always_touch_are_left_out_and_named(tmp_path: Path) -> None:
+    """Plates above each other at a joint: no posture brings them together, and all have their capsules touching."""
+    robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])
+    plate, turn = BoxGeometry(np.array([0.6, 0.6, 0.01])), np.eye(3)
+    parts = [
+        Part("lower plate", 0, Shape(plate, turn, np.array([1.0, 0.0, 0.0]))),
+        Part("upper plate", 1, Shape(plate, turn, np.array([0.0, 0.0, 0.015]))),
+        Part("ball", 1, Shape(BallGeometry(0.1), turn, np.array([1.0, 0.0, 0.0]))),
+    ]
+    own = Collisions(robot.tree, parts, [("lower plate", "upper plate"), ("lower plate", "ball")])
+    assert own.check_free(robot.sample(50))[:, None].all()
+    fitted = oc.fit_capsules(own)
+    assert fitted.dropped == (("lower plate", "upper plate"),)
+    assert fitted.collisions.pairs == (("lower plate", "ball"),)
+    assert fitted.facts()["unchecked"] == "lower plate and upper plate"
+    write(tmp_path, robot, fitted)
+    assert "touch in all postures: lower plate and upper plate" in (tmp_path / "arm_distance.h").read_text()

@@ -17,6 +17,7 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.charts.inverse import InverseStatus
 from orthocas.codegen.export import LIBRARIES
+from orthocas.tasks.corridor import Corridor
 from orthocas.tasks.domains import Domain
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
@@ -28,7 +29,7 @@ FOUND, OUTSIDE, LIMIT, NOT_FOUND, BAD_INPUT = 0, 2, 3, 5, 6
 def in_corridor() -> oc.Chart:
     known = problems.get("planar_3r_xy")
     postures = known.domain.centre + np.linspace(-0.3, 0.3, 5)[:, None] * [1.0, -0.5, 0.5]
-    domain = oc.Corridor(oc.Box(known.domain.centre, known.domain.half_width), postures, 0.2)
+    domain = Corridor(oc.Box(known.domain.centre, known.domain.half_width), postures, 0.2)
     return oc.fit(oc.Problem(known.robot, known.task, domain=domain), oc.Polynomial(2), samples=300).chart
 
 

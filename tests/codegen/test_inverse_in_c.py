@@ -14,7 +14,7 @@ from public_objects import circle, clear, exact, wide
 
 import orthocas as oc
 from orthocas.codegen import compiled
-from orthocas.errors import CompileError, InvalidValueError, NoExpressionError
+from orthocas.errors import CompileError, NoExpressionError
 from orthocas.fitting.fit import Fit
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.expressions import wrap_shortest
@@ -87,8 +87,6 @@ def test_damaged_libraries_are_compiled_again_and_grown_charts_refused(planar_ar
     assert oc.compile_inverse(planar_arm, tmp_path).solve(phi).found.all()
     with pytest.raises(NoExpressionError):
         oc.compile_inverse(circle(), tmp_path)
-    with pytest.raises(InvalidValueError, match="local"):
-        planar_arm.solve(planar_arm.phi(planar_arm.problem.domain.centre), local=3)  # type: ignore[arg-type]
 
 
 @needs_c

@@ -71,11 +71,12 @@ def test_every_reader_belongs_to_a_campaign() -> None:
 def functions_called(name: str, wanted: set[str], monkeypatch: pytest.MonkeyPatch) -> set[str]:
     """Which of some functions of orthocas a campaign calls while it judges its first mutants, here in this process."""
     places = {(part.rpartition(".")[0].replace(".", "/"), part.rpartition(".")[2]): part for part in wanted}
-    root, found = Path(inspect.getfile(oc)).parent, set()
+    root, found, names = Path(inspect.getfile(oc)).parent, set(), {name for _, name in places}
 
     def note(frame: FrameType, event: str, _: object) -> None:
         code = frame.f_code
-        if event == "call" and code.co_filename.startswith(f"{root}/"):
+        # the name first: this runs at every call of every package
+        if event == "call" and code.co_name in names and code.co_filename.startswith(f"{root}/"):
             place = code.co_filename.removeprefix(f"{root}/").removesuffix(".py")
             found.update({places[place, code.co_name]} if (place, code.co_name) in places else ())
 

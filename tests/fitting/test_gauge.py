@@ -9,7 +9,7 @@ from programs import nightly
 import orthocas as oc
 from orthocas.bases import JointSpace
 from orthocas.errors import InvalidValueError
-from orthocas.fitting.fit import align, fix_gauge
+from orthocas.fitting.fit import Fit, align, fix_gauge
 from orthocas.tasks.samples import sample_problem
 from orthocas.tools.checks import Array
 
@@ -35,7 +35,7 @@ def test_seeds_lead_to_the_same_coordinates_in_the_same_order_and_sign(
         assert np.diag(parallel(first, other)).min() > least
 
 
-def test_order_and_sign_follow_the_gradients_at_the_centre(iiwa_fit: oc.Fit, iiwa: oc.Problem) -> None:
+def test_order_and_sign_follow_the_gradients_at_the_centre(iiwa_fit: Fit, iiwa: oc.Problem) -> None:
     g = iiwa_fit.chart.coordinates.jacobian(iiwa.domain.centre[None])[0][:3]  # the fourth is the idle joint
     moved = (g**2 @ np.arange(7)) / (g**2).sum(axis=1)
     assert (np.diff(moved) > -1e-6).all()  # coordinates that change places in the mirror have the same mean

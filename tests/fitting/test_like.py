@@ -8,6 +8,7 @@ from programs import Run
 import orthocas as oc
 from orthocas import problems
 from orthocas.errors import InvalidValueError, OrthocasError
+from orthocas.fitting.fit import Fit
 from orthocas.fitting.like import Like
 from orthocas.fitting.terms import Sizes
 from orthocas.tasks.samples import sample_problem, sample_uniform
@@ -26,14 +27,14 @@ def angle_deg(v: Array, w: Array, B: Array) -> float:
 
 
 @pytest.fixture(scope="module", params=["euclidean", "inertia"])
-def fit(request: pytest.FixtureRequest) -> oc.Fit:
+def fit(request: pytest.FixtureRequest) -> Fit:
     known = problems.get("iiwa")
     problem = oc.Problem(known.robot, known.task, request.param, oc.Box(known.domain.centre, 0.25))
     return oc.fit(problem, oc.Polynomial(2), like="A3", samples=1500)
 
 
 @pytest.mark.slow
-def test_first_coordinate_follows_a_joint(fit: oc.Fit) -> None:
+def test_first_coordinate_follows_a_joint(fit: Fit) -> None:
     """The reported angle is that to the projected gradient; a fit without a meaning is farther from it."""
     chart, angles, B = fit.chart, [], np.eye(7)
     problem = chart.problem
@@ -52,7 +53,7 @@ def test_first_coordinate_follows_a_joint(fit: oc.Fit) -> None:
 
 
 @pytest.mark.slow
-def test_coordinates_stay_orthogonal_to_the_task(fit: oc.Fit) -> None:
+def test_coordinates_stay_orthogonal_to_the_task(fit: Fit) -> None:
     plain = oc.fit(fit.chart.problem, oc.Polynomial(2), samples=1500).chart
     leaks = [oc.evaluate(chart, samples=4000).leak.rms for chart in (fit.chart, plain)]
     assert leaks[0] < 1.3 * leaks[1]

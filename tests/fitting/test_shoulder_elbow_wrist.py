@@ -21,11 +21,13 @@ Z = np.array([0.0, 0.0, 1.0])
 
 def iiwa_model() -> pin.Model:
     with urdf_path() as path:
-        return urdf.read_urdf(path)
+        return urdf.read_urdf(path)[0]
 
 
 def panda_model() -> pin.Model:
-    return pinocchio_model.lock_off_chain(urdf.read_urdf(robot_data("panda_description/urdf/panda.urdf")), "panda_hand")
+    return pinocchio_model.lock_off_chain(
+        urdf.read_urdf(robot_data("panda_description/urdf/panda.urdf"))[0], "panda_hand"
+    )
 
 
 def changed(robot: oc.Robot, **changes: Any) -> oc.Robot:
@@ -202,7 +204,7 @@ def foot(line: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarra
 @pytest.mark.parametrize("kind", SEW_KINDS)
 def test_points_of_axes_that_pass_each_other_are_ends_of_common_normals(kind: str) -> None:
     """A Baxter: axes 1 and 2 pass at 69 mm, and so do 5 and 6, at 10 mm."""
-    full = urdf.read_urdf(robot_data("baxter_description/urdf/baxter.urdf"))
+    full = urdf.read_urdf(robot_data("baxter_description/urdf/baxter.urdf"))[0]
     model = pinocchio_model.lock_off_chain(full, "left_gripper")
     psi = sew_angle(oc.Robot.from_model(model, "left_gripper"), kind)
     for q in np.random.default_rng(7).uniform(-1.5, 1.5, (20, 7)):

@@ -28,15 +28,16 @@ from public_objects import (
 import orthocas as oc
 from orthocas import bases, control, learn, problems, simulation, solvers, viewer
 from orthocas.bases import cyclic_joints
-from orthocas.certificates import certified_box, check_certificate
+from orthocas.certificates import check_certificate
 from orthocas.charts.chart import GrownChart
 from orthocas.charts.figures import quality_figure, self_motion_figure
 from orthocas.charts.regular_part import RegularPart
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.errors import CompileError
 from orthocas.fitting.loss import loss
-from orthocas.paths import corridor_problem
+from orthocas.paths import corridor_problem, read_joints
 from orthocas.robots.collisions import Collisions
+from orthocas.tasks.corridor import Corridor
 from orthocas.tasks.domains import default_box
 from orthocas.tasks.metric import Metric
 from orthocas.viewer.session import Session
@@ -188,7 +189,7 @@ def _views() -> dict[str, Call]:
         "cyclic_motions": (viewer.cyclic_motions, {"chart": chart, "path": [x, x + 0.05, x], "cycles": 1}),
         "Session": (Session, {"chart": chart, "q": q}),
         "session.wish": (session.wish, {"values": {"xi1": 0.1}}),
-        "chart.plot": (lambda postures: self_motion_figure(chart, postures, None), {"postures": 3}),
+        "chart.plot": (lambda postures: self_motion_figure(chart, postures), {"postures": 3}),
     }
 
 
@@ -245,7 +246,7 @@ def _makers() -> dict[str, Call]:
         "Robot.from_model": (oc.Robot.from_model, {"model": None, "tip": "tip", "locked": {}}),
         "Robot": (oc.Robot, {"tree": robot.tree, "homes": {"a": q}}),
         "Box": (oc.Box, {"centre": q, "half_width": 0.3, "unbounded": [0]}),
-        "Corridor": (oc.Corridor, {"box": oc.Box(q, 0.5), "postures": [q, q + 0.1], "radius": 0.2}),
+        "Corridor": (Corridor, {"box": oc.Box(q, 0.5), "postures": [q, q + 0.1], "radius": 0.2}),
         "corridor_problem": (
             corridor_problem,
             {"problem": planar(), "postures": [q, q + 0.1], "radius": 0.2, "margin_deg": 1.0},
@@ -342,7 +343,6 @@ def _functions() -> dict[str, Call]:
         ),
         "bounded fit": (oc.fit, {**box, "solver": None, "samples": 50, "max_mutual_deg": None}),
         "certify": (oc.certify, {"chart": chart, "bound": 0.0, "time_limit": 0.0, "executor": None, "resume": None}),
-        "certified_box": (certified_box, {"chart": chart, "bound": 0.0, "time_limit": 5.0, "executor": None}),
         "check_certificate": (check_certificate, {"chart": chart, "certificate": None, "executor": None}),
         "check": (oc.check, {"problem": problem, "samples": 50, "seed": 1}),
         "cyclic_joints": (cyclic_joints, {"problem": problem}),
@@ -406,7 +406,7 @@ def _functions() -> dict[str, Call]:
         "to data": (bases.parametrisation_to_data, {"parametrisation": oc.Polynomial(2)}),
         "solvers.get": (solvers.get, {"name": "lbfgs"}),
         "problems.get": (problems.get, {"name": "planar_2r"}),
-        "self_motion_figure": (self_motion_figure, {"chart": chart, "postures": 2, "reach": 0.1}),
+        "self_motion_figure": (self_motion_figure, {"chart": chart, "postures": 2}),
         "quality_figure": (quality_figure, {"report": None}),
     }
 
@@ -469,7 +469,7 @@ def _methods() -> dict[str, Call]:
             oc.follow,
             {"chart": chart, "tool_path": chart.x([q, q + 0.05]), "xi": "objective", "velocity_limits": 1.0},
         ),
-        "read_joints": (oc.read_joints, {"path": "no.csv", "robot": robot, "topic": "/arm"}),
+        "read_joints": (read_joints, {"path": "no.csv", "robot": robot, "topic": "/arm"}),
         "motion.save_csv": (joint_motion().save_csv, {"path": "motion.csv"}),
         "Sphere": (oc.obstacles.Sphere, {"centre": q, "radius": 0.1}),
         "Capsule": (oc.obstacles.Capsule, {"start": q, "end": -q, "radius": 0.1}),

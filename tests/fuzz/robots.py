@@ -101,7 +101,7 @@ def write(rng: Rng, folder: Path) -> Path:
     path.write_bytes(text_of(rng, root))
     if mjcf:
         (folder / "part.xml").write_bytes(text_of(rng, mjcf_chain(rng, 1)))
-    elif rng.random() < 0.4:
+    elif rng.random() < 0.6:
         (folder / "m.stl").write_text(_MESH[: int(rng.integers(len(_MESH) // 2, 2 * len(_MESH)))])
         path.with_suffix(".srdf").write_bytes(text_of(rng, srdf(rng)))
     return path
@@ -143,7 +143,7 @@ def urdf_chain(rng: Rng, joints: int) -> Element:
         if rng.random() < 0.8:
             collision = SubElement(link, "collision")
             SubElement(collision, "origin", xyz="0 0 0.1", rpy="0 0 0.2")
-            kind = pick(rng, ("box", "sphere", "cylinder", "capsule", "mesh"))
+            kind = pick(rng, ("box", "sphere", "cylinder", "capsule", "mesh", "mesh", "mesh"))
             sizes = (
                 {"size": "0.1 0.1 0.3"} if kind == "box" else {"radius": "0.1", "length": "0.2", "filename": "m.stl"}
             )
@@ -184,7 +184,7 @@ def srdf(rng: Rng) -> Element:
     state = SubElement(root, "group_state", name=pick(rng, NAMES), group="arm")
     for i in range(int(rng.integers(5))):
         SubElement(state, "joint", name=pick(rng, (f"j{i + 1}", *NAMES[:4])), value=pick(rng, ("0.1", *NUMBERS)))
-    if rng.random() < 0.5:
+    if rng.random() < 0.8:
         SubElement(root, "disable_collisions", link1="l1", link2=pick(rng, ("l2", *NAMES[:3])))
     if rng.random() < 0.3:
         _drop_attribute(rng, root)

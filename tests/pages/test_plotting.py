@@ -7,7 +7,6 @@ import pytest
 
 import orthocas as oc
 from orthocas.charts.figures import quality_figure, self_motion_figure
-from orthocas.errors import InverseError
 from orthocas.fitting.fit import Fit
 
 
@@ -30,13 +29,8 @@ def test_quality_figure_without_mutual_angles(planar_xy: oc.Problem, tmp_path: P
 
 @pytest.mark.slow
 def test_self_motion_figure_has_a_panel_per_coordinate_and_a_line_per_posture(iiwa_fit: Fit) -> None:
-    figure = self_motion_figure(iiwa_fit.chart, postures=3, reach=0.2)
+    figure = self_motion_figure(iiwa_fit.chart, postures=3)
     assert len(figure.axes) == 4
     assert all(len(panel.lines) == 3 for panel in figure.axes)
     tips = [line.get_data_3d()[0][-1] for line in figure.axes[0].lines]  # type: ignore[attr-defined]
     np.testing.assert_allclose(tips, tips[0], atol=1e-8)  # the flange stays
-
-
-def test_sweep_out_of_reach_is_an_error(planar_fit: Fit) -> None:
-    with pytest.raises(InverseError):
-        self_motion_figure(planar_fit.chart, postures=3, reach=50.0)

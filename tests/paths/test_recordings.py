@@ -9,6 +9,7 @@ import pytest
 
 import orthocas as oc
 from orthocas.errors import MissingExtraError, PathFileError
+from orthocas.paths import read_joints
 from orthocas.tools import checks
 from orthocas.viewer.motion import read_joint_motion
 
@@ -66,7 +67,7 @@ def bag(tmp_path: Path) -> Callable[..., Path]:
 def test_csv_files_name_joints_in_several_ways(header: str, tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     path.write_text(f"other,{header}\nx,1700000000.0,0.1,0.2\nx,1700000000.5,0.3,0.4\n")
-    times, q = oc.read_joints(path, ROBOT)
+    times, q = read_joints(path, ROBOT)
     np.testing.assert_allclose(times, [0, 0.5])
     np.testing.assert_array_equal(q, [[0.1, 0.2], [0.3, 0.4]])
 
@@ -86,7 +87,7 @@ def test_faults_of_csv_files_are_named(text: str, wrong: str, tmp_path: Path) ->
     path = tmp_path / "log.csv"
     path.write_text(text)
     with pytest.raises(PathFileError, match=wrong):
-        oc.read_joints(path, ROBOT)
+        read_joints(path, ROBOT)
 
 
 def test_joints_of_a_bag_come_in_several_messages_and_any_order(bag: Callable[..., Path]) -> None:
@@ -97,19 +98,19 @@ def test_joints_of_a_bag_come_in_several_messages_and_any_order(bag: Callable[..
         ("/arm", message(5.3, q2=0.4)),
         ("/other", message(6.0, q1=9.0, q2=9.0)),
     )
-    times, q = oc.read_joints(path, ROBOT, "/arm")
+    times, q = read_joints(path, ROBOT, "/arm")
     np.testing.assert_allclose(times, [0, 0.2], atol=1e-9)
     np.testing.assert_array_equal(q, [[0.1, 0.2], [0.1, 0.4]])
-    assert len(oc.read_joints(path, ROBOT)[0]) == 3
+    assert len(read_joints(path, ROBOT)[0]) == 3
 
 
 def test_bags_without_the_joints_and_damaged_ones_are_named(bag: Callable[..., Path]) -> None:
     path = bag(("/arm", message(5.0, q1=0.2)))
     with pytest.raises(PathFileError, match="no JointState messages with all of the joints q1, q2"):
-        oc.read_joints(path, ROBOT)
+        read_joints(path, ROBOT)
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(PathFileError, match="damaged"):
-        oc.read_joints(path, ROBOT)
+        read_joints(path, ROBOT)
 
 
 def test_without_the_library_the_extra_is_named(bag: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,7 +120,7 @@ def test_without_the_library_the_extra_is_named(bag: Callable[..., Path], monkey
     path = bag(("/arm", message(5.0, q1=0.2, q2=0.1)))
     monkeypatch.setattr(checks, "import_module", fail)
     with pytest.raises(MissingExtraError, match=r"orthocas\[recordings\]"):
-        oc.read_joints(path, ROBOT)
+        read_joints(path, ROBOT)
 
 
 def test_the_viewer_plays_a_bag(bag: Callable[..., Path]) -> None:

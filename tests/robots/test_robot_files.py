@@ -207,7 +207,7 @@ def test_joints_of_any_type_off_the_chain_are_locked_unless_a_model_is_taken_who
     path.write_text(path.read_text().replace("</robot>", floating))
     assert oc.Robot.from_urdf(path, "a").joint_names == ("j",)
     with pytest.raises(RobotError, match="'free' .*--lock free=0"):
-        oc.Robot.from_model(urdf.read_urdf(path), "a")
+        oc.Robot.from_model(urdf.read_urdf(path)[0], "a")
 
 
 def test_locked_must_be_a_mapping_to_numbers() -> None:

@@ -169,11 +169,9 @@ def test_ranges_of_mjcf_slides_are_metres(tmp_path: Path, angle: str, hinge: flo
     np.testing.assert_allclose(robot.upper, [2, np.pi / 2])
 
 
-def test_mimic_joint_on_the_way_names_the_joint_to_lock() -> None:
+def test_mimic_joint_that_is_to_be_locked_names_the_joint_to_lock() -> None:
     path = robot_data("panda_description/urdf/panda.urdf")
     suggest_lock = r"locked=\{'panda_finger_joint1': 0.0\} or --lock panda_finger_joint1=0"
-    with pytest.raises(RobotError, match=f"panda_finger_joint2.*mimic.*{suggest_lock}"):
-        oc.Robot.from_urdf(path, "panda_rightfinger")
     with pytest.raises(RobotError, match=f"'panda_finger_joint2' mimics joint 'panda_finger_joint1'.*{suggest_lock}"):
         oc.Robot.from_urdf(path, "panda_rightfinger", {"panda_finger_joint2": 0.0})
     finger = oc.Robot.from_urdf(path, "panda_rightfinger", {"panda_finger_joint1": 0.03})
@@ -187,7 +185,8 @@ def test_mimic_joint_on_the_way_names_the_joint_to_lock() -> None:
 def test_joints_off_the_way_are_locked_next_to_zero_and_those_of_the_user_where_asked() -> None:
     path = robot_data("panda_description/urdf/panda.urdf")
     q = np.full(7, 0.3)
-    model = pinocchio_model.lock_joints(urdf.read_urdf(path), {"panda_finger_joint1": 0.0})
+    model, mimics = urdf.read_urdf(path)
+    model = pinocchio_model.lock_joints(model, {"panda_finger_joint1": 0.0}, mimics)
     want = oc.Robot.from_model(model, "panda_hand").mass_matrix(q)
     np.testing.assert_allclose(oc.Robot.from_urdf(path, "panda_hand").mass_matrix(q), want, atol=1e-12)
     opened = oc.Robot.from_urdf(path, "panda_hand", {"panda_finger_joint1": 0.04}).mass_matrix(q)
@@ -288,7 +287,7 @@ TURNS = '<axis xyz="0 1 0"/><limit lower="0.2" upper="1" effort="9" velocity="3"
 
 
 def test_joints_that_mimic_a_later_joint_are_locked_where_it_is(tmp_path: Path) -> None:
-    """Pinocchio refuses such files. The same arm with fixed fingers is the reference."""
+    """Pinocchio refuses to keep such mimic joints. The same arm with fixed fingers is the reference."""
     path = tmp_path / "arm.urdf"
 
     def written(*fingers: tuple[str, str, float, str]) -> Path:
@@ -308,8 +307,7 @@ def test_joints_that_mimic_a_later_joint_are_locked_where_it_is(tmp_path: Path) 
         assert robot.joint_names == ("shoulder",)
         np.testing.assert_allclose(robot.mass_matrix([0.3]), fixed.mass_matrix([0.3]), rtol=1e-12)
         np.testing.assert_allclose(robot.gravity([0.3]), fixed.gravity([0.3]), rtol=1e-12)
-    with pytest.raises(RobotError, match="'a_joint' is a mimic joint, .*lock it with locked={'z_joint': 0.0}"):
-        oc.Robot.from_urdf(written(*hand), "a")
+    assert oc.Robot.from_urdf(written(*hand), "a").mimics == ("a_joint = 4 z_joint -0.1", "b_joint = -2 z_joint +0.1")
     with pytest.raises(RobotError, match="joint 'a_joint' mimics itself"):
         oc.Robot.from_urdf(written(("a", "revolute", 0.0, mimic("b")), ("b", "revolute", 0.0, mimic("a"))), "arm")
 
@@ -322,7 +320,7 @@ def test_joints_that_mimic_a_later_joint_are_locked_where_it_is(tmp_path: Path) 
     ],
 )
 def test_humanoids_with_late_leaders_have_the_dynamics_of_pinocchio(file: str, tip: str, n: int) -> None:
-    """Arms in front of hands of mimic joints: M and g are those of the file read without mimics, fingers locked."""
+    """Arms in front of hands of mimic joints: M is S^T M S of the file read without mimics, other joints locked."""
     path = robot_data(file)
     robot = oc.Robot.from_urdf(path, tip)
     model = pin.buildModelFromUrdf(str(path))
@@ -333,13 +331,18 @@ def test_humanoids_with_late_leaders_have_the_dynamics_of_pinocchio(file: str, t
     placed = data.oMf[model.getFrameId(tip)]
     assert robot.n == n
     np.testing.assert_allclose(robot.tip_position(np.linspace(0.1, 0.5, n)), placed.translation, atol=1e-12)
-    rows = [model.joints[model.getJointId(name)].idx_v for name in robot.joint_names]
-    for i in range(1, model.njoints):  # the limit closest to zero, or what a finger mimics
-        if model.names[i] not in robot.joint_names:
-            k = model.joints[i].idx_q
-            q[k] = np.clip(0.0, model.lowerPositionLimit[k], model.upperPositionLimit[k])
+    rows = {name: model.joints[model.getJointId(name)].idx_v for name in list(model.names)[1:]}
+    S = np.zeros((model.nv, robot.n))
+    S[[rows[name] for name in robot.joint_names], range(robot.n)] = 1.0
+    mimics = urdf.read_urdf(path)[1]
+    # Others stand at the limit closest to zero, or where they follow their leader.
+    for name in [*(name for name in rows if name not in (*robot.joint_names, *mimics)), *mimics]:
+        k = model.joints[model.getJointId(name)].idx_q
+        q[k] = np.clip(0.0, model.lowerPositionLimit[k], model.upperPositionLimit[k])
+        if name in mimics:
+            leader, factor, offset = mimics[name]
+            q[k] = factor * q[model.joints[model.getJointId(leader)].idx_q] + offset
+            S[rows[name]] = factor * S[rows[leader]]
     whole = pin.crba(model, data, q)
     whole = np.triu(whole) + np.triu(whole, 1).T
-    np.testing.assert_allclose(
-        robot.mass_matrix(np.linspace(0.1, 0.5, n)), whole[np.ix_(rows, rows)], rtol=1e-3, atol=1e-4
-    )
+    np.testing.assert_allclose(robot.mass_matrix(np.linspace(0.1, 0.5, n)), S.T @ whole @ S, rtol=1e-9, atol=1e-12)

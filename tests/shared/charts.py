@@ -6,6 +6,7 @@ import numpy as np
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.tasks.corridor import Corridor
 from orthocas.tasks.samples import sample_uniform
 
 
@@ -44,5 +45,5 @@ def in_a_corridor() -> oc.Chart:
     known = problems.get("planar_3r_x")
     centre, width = known.domain.centre, known.domain.half_width
     path = centre + width * np.array([[0.0, -0.6, -0.6], [0.0, 0.0, -0.4], [0.0, 0.5, 0.5]])
-    domain = oc.Corridor(known.domain, path, [np.inf, *(0.4 * width[1:])])
+    domain = Corridor(known.domain, path, [np.inf, *(0.4 * width[1:])])
     return oc.fit(oc.Problem(known.robot, known.task, "inertia", domain), oc.Polynomial(3), samples=500).chart

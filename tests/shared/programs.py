@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-import orthocas as oc
 from orthocas.codegen import GeneratedC
 from orthocas.codegen.library import find_compilers
+from orthocas.tasks.corridor import Corridor
 
 PROGRAMS = Path(__file__).parents[1] / "c"
 
@@ -51,7 +51,7 @@ def printed_here(code: str, folder: Path) -> str:
     return out.getvalue()
 
 
-def path_flags(corridor: oc.Corridor) -> tuple[str, str]:
+def path_flags(corridor: Corridor) -> tuple[str, str]:
     """What random_ticks.c is told about a corridor."""
     radius = ("INFINITY" if np.isinf(size) else repr(float(size)) for size in corridor.radius)
     return f"-DPATH={','.join(map(repr, corridor.postures.ravel().tolist()))}", f"-DRADIUS={','.join(radius)}"

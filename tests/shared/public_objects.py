@@ -42,6 +42,7 @@ from orthocas.simulation import (
     simulate,
 )
 from orthocas.tasks.branches import Branches
+from orthocas.tasks.corridor import Corridor
 from orthocas.tasks.metric import Metric
 from orthocas.tasks.samples import sample_problem, sample_uniform
 from orthocas.tools.batch import Batched
@@ -303,7 +304,7 @@ OBJECTS: dict[str, Callable[[], Any]] = {
     "wide fit of an exact quantity": exact,
     "branches": branches,
     "branch": lambda: branches()[0],
-    "corridor": lambda: oc.Corridor(oc.Box([0.0, 0.9], 0.8), [[0.0, 0.5], [0.3, 1.2]], [np.inf, 0.2]),
+    "corridor": lambda: Corridor(oc.Box([0.0, 0.9], 0.8), [[0.0, 0.5], [0.3, 1.2]], [np.inf, 0.2]),
     "clear part of a domain": lambda: ClearPart(0.1, 0.95),
     "torus": lambda: oc.Torus(3),
     "suggestion of a domain": suggestion,

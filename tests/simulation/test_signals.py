@@ -21,7 +21,7 @@ from programs import Run, nightly, python
 
 import orthocas as oc
 from orthocas.certificates.box_checks import BoxResults
-from orthocas.certificates.search import Limits, Search, rank_by_volume
+from orthocas.certificates.search import Limits, Search
 from orthocas.certificates.taylor import Variables
 from orthocas.charts.certificate import Subdivision
 from orthocas.cli import entry
@@ -157,7 +157,7 @@ def test_a_search_ends_soon_after_a_signal_that_a_library_swallowed(name: str) -
     of_this_process = signal.signal(number, handler)
     box = Subdivision.whole(-np.ones(2), np.ones(2))
     judge = Disturbed(number)
-    search = Search(judge, box, Limits(boxes=1000), rank_by_volume(box))
+    search = Search(judge, box, Limits(boxes=1000))
     try:
         with ended_in_order(), remembered(), pytest.raises((KeyboardInterrupt, SystemExit)):
             search.run(lambda _: None)

@@ -17,6 +17,7 @@ from orthocas.certificates.rows import build_chart_rows
 from orthocas.control import ControlStatus
 from orthocas.errors import DomainError, InvalidValueError, ShapeError, UnreachableReferenceError
 from orthocas.paths import corridor_problem
+from orthocas.tasks.corridor import Corridor
 from orthocas.tasks.samples import sample_boundary_weighted, sample_uniform
 from orthocas.tools.checks import Array
 
@@ -24,9 +25,9 @@ PATH = np.array([[0.0, 0.6, 0.8], [0.7, 0.9, 1.2], [0.9, 1.7, 1.2]])
 RADIUS = 0.3
 
 
-def corridor(radius: Any = RADIUS) -> oc.Corridor:
+def corridor(radius: Any = RADIUS) -> Corridor:
     low, high = PATH.min(axis=0) - 0.3, PATH.max(axis=0) + 0.25
-    return oc.Corridor(oc.Box.from_limits(low, high), PATH, radius)
+    return Corridor(oc.Box.from_limits(low, high), PATH, radius)
 
 
 def circle(problem: oc.Problem, q: Array, size: float, steps: int = 60) -> Array:
@@ -151,7 +152,7 @@ def test_file_holds_the_corridor(chart: oc.Chart, tmp_path: Path) -> None:
     again = oc.load(tmp_path / "arm.orthocas")
     q = sample_uniform(chart.problem.domain, 50, 3)
     domain = again.problem.domain
-    assert isinstance(domain, oc.Corridor)
+    assert isinstance(domain, Corridor)
     assert domain.contains(q).all()
     assert not domain.contains(q[0] + [0.0, 0.8, 0.0])
     assert np.array_equal(again.xi(q), chart.xi(q))
@@ -160,7 +161,7 @@ def test_file_holds_the_corridor(chart: oc.Chart, tmp_path: Path) -> None:
 def test_cyclic_and_idle_joints_take_all_positions() -> None:
     iiwa = problems.get("iiwa")
     found = corridor_problem(iiwa, iiwa.domain.centre[None], 0.2).domain
-    assert isinstance(found, oc.Corridor)
+    assert isinstance(found, Corridor)
     assert np.isinf(found.radius).tolist() == [True, False, False, False, False, False, True]
     assert found.half_width[[0, 6]].min() > 2.9
 
@@ -178,7 +179,7 @@ def test_wrong_corridors_are_refused() -> None:
         *(([[0.0, 0.0], [0.0, far]], 0.1, InvalidValueError) for far in (1e7, 1e160, -1e300)),
     ):
         with pytest.raises(error):
-            oc.Corridor(box, postures, radius)
+            Corridor(box, postures, radius)
     known = problems.get("planar_3r_xy")
     with pytest.raises(InvalidValueError, match="least_singular_value"):
         oc.Problem(known.robot, known.task, domain=corridor(), least_singular_value=0.1)
@@ -195,7 +196,7 @@ def test_command_line_fits_along_postures(run: Run) -> None:
     assert (code, err) == (0, "")
     assert json.loads(out)["parametrisation"] == "polynomial:3:cyclic=q1"
     domain = oc.load("a.orthocas").problem.domain
-    assert isinstance(domain, oc.Corridor)
+    assert isinstance(domain, Corridor)
     assert domain.radius.tolist() == [np.inf, 0.25, 0.25]
     assert domain.contains(PATH).all()
     for others, word in (

@@ -12,6 +12,7 @@ from orthocas import problems
 from orthocas.charts.self_motion import Interval, Stop
 from orthocas.charts.trackers import RULES, TrackerStatus
 from orthocas.errors import DomainError
+from orthocas.tasks.corridor import Corridor
 from orthocas.tasks.domains import StopKind
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.checks import Array
@@ -54,9 +55,9 @@ class Ball(Round):
         return ca.Function("pivots", [q], [self.radius**2 - ca.sumsqr(q - self.centre)])
 
 
-def corridor() -> oc.Corridor:
+def corridor() -> Corridor:
     path = CENTRE + np.array([[-0.3, -0.2, 0.2], [0.0, 0.0, 0.0], [0.3, 0.2, -0.2]])
-    return oc.Corridor(oc.Box(CENTRE, 0.6), path, 0.15)
+    return Corridor(oc.Box(CENTRE, 0.6), path, 0.15)
 
 
 DOMAINS: dict[str, Callable[[oc.Task], oc.Domain]] = {

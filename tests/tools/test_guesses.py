@@ -1,5 +1,6 @@
 """What a new user types first: it works, or the error names what serves."""
 
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +12,8 @@ import pytest
 from programs import output_of
 
 import orthocas as oc
-from orthocas.errors import InvalidValueError
+from orthocas.errors import InvalidValueError, OrthocasError
+from orthocas.robots.collisions import Collisions
 from orthocas.tools.display import GUESSES
 
 
@@ -167,18 +169,57 @@ def test_guesses_of_objects(chart: oc.Chart, kind: str, name: str) -> None:
 
 
 def test_what_is_suggested_exists(chart: oc.Chart) -> None:
-    import re
-
-    owners = {"oc": oc, "chart": chart, "robot": chart.robot}
+    owners = {"oc": oc, "chart": chart, "robot": chart.robot, "law": oc.control.PDPlus(chart)}
     for table in GUESSES.values():
         for words in table.values():
             for owner, path in re.findall(r"\b(oc|chart|robot)\.([\w.]+)", words):
                 value: Any = owners[owner]
                 for part in path.rstrip(".").split("."):
-                    value = getattr(value, part)
+                    # a robot of a chart file may have no solids
+                    value = Collisions if part == "collisions" else getattr(value, part)
 
 
 @pytest.mark.parametrize("words", [("evaluate", "--samples", "200"), ("info",)])
 def test_commands_take_names_of_ready_charts(words: tuple[str, ...], tmp_path: Path) -> None:
     command = Path(sys.executable).with_name("orthocas")
     assert "xi1" in output_of(command, words[0], "panda-wide", *words[1:], folder=tmp_path)
+
+
+#: first lines of users of roboticstoolbox, Pinocchio, pink, mink, ikpy, pybotics and MATLAB, written before looking
+FIRST_CALLS = """
+oc.Robot("panda") oc.Robot.from_urdf("panda") oc.load("panda") oc.load_robot_description("panda_description")
+oc.models oc.Manipulator oc.RobotWrapper oc.buildModelFromUrdf("panda.urdf") oc.Configuration(robot,q)
+oc.Solver(robot) oc.IK(robot) oc.solve_ik(chart,[],0.01) oc.PostureTask() oc.ComTask() oc.NullspaceTask()
+oc.DampingTask() oc.limits oc.barriers oc.integrate(q,q,0.1) oc.self_motion(chart,q) oc.xi_range(chart,q)
+oc.animate(chart) oc.export_c(chart) oc.save(chart) oc.Sphere([0,0,0],1) oc.Obstacle oc.Trajectory() oc.fit("panda")
+oc.fit(robot) oc.fit(robot,"pose") oc.fit_wide(robot,"pose") robot.fkine(q) robot.forward(q)
+robot.frame_pose(q,"hand") robot.get_transform("hand") robot.jacobe(q) robot.hessian0(q)
+robot.computeJointJacobians(q) robot.ikine_LM(q) robot.ik_LM(q) robot.solve(q) robot.gravload(q) robot.inertia_x(q)
+robot.links robot.link_names robot.ee_links robot.tip robot.base robot.tool robot.qr robot.qz robot.vellim
+robot.teach() robot.plot(q) robot.kinetic_energy(q,q) robot.self_collision(q) robot.in_collision(q) robot.distance(q)
+robot.model robot.name chart.solve(T) chart.solve(T,q) chart.solve(T,0.1) chart.solve(T,xi=0.1) chart.solutions(T)
+chart.ik_all(T) chart.solve_all(T) chart.nullspace_basis(q) chart.projector(q) chart.redundancy chart.arm_angle(q)
+chart.swivel(q) chart.elbow(q) chart.xi_limits(q) chart.bounds chart.names chart.dof chart.pose(q) chart.jac(q)
+chart.jacobian_xi(q) chart.velocity(q,q) chart.rates(q,q) chart.to_casadi() chart.to_c("x") chart.to_torch()
+chart.plan(q,q) chart.path(q,q) chart.step(T) chart.controller() chart.info() chart.summary() chart.report()
+chart.is_valid(q) chart.contains(q) chart.branch(q) law.step(q,q) law.torque(q,q) law.compute(q,q) law.update(q,q)
+law.simulate() law.codegen()
+"""
+
+
+@pytest.mark.parametrize("call", FIRST_CALLS.split())
+def test_first_calls_of_users_of_other_packages(chart: oc.Chart, q: Any, call: str) -> None:
+    """They work, or the message names what serves: something of the package, the chart, the robot or the law."""
+    known = {
+        "oc": oc,
+        "chart": chart,
+        "robot": chart.robot,
+        "q": q,
+        "T": chart.robot.pose(q),
+        "law": oc.control.Kinematic(chart),
+    }
+    try:
+        eval(call, known)
+    except (AttributeError, OrthocasError) as error:
+        words = str(error)
+        assert re.search(r"\b(oc|chart|robot|law|Robot)\.\w|solve\(x=|nearest_xi|known: |q \+ dq|print\(|dq @", words)

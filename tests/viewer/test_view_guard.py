@@ -19,7 +19,7 @@ from fuzz.views import views
 
 import orthocas as oc
 from orthocas.errors import ViewError
-from orthocas.viewer import window
+from orthocas.viewer import View, window
 from orthocas.viewer.window import Guard
 
 needs_viser = pytest.mark.skipif(find_spec("viser") is None, reason="no viser: pip install 'orthocas[view]'")
@@ -101,7 +101,7 @@ def test_tokens_differ_and_cannot_be_guessed() -> None:
 
 
 @pytest.fixture(scope="module")
-def view() -> Iterator[oc.viewer.View]:
+def view() -> Iterator[View]:
     with oc.view(oc.Robot.planar([1.0, 1.0], [1.0, 1.0]), port=0) as shown:
         yield shown
 
@@ -142,7 +142,7 @@ def connected(url: str, path: str, origin: str | None, host: str | None = None) 
 
 
 @needs_viser
-def test_pages_are_served_to_those_with_the_address_only(view: oc.viewer.View) -> None:
+def test_pages_are_served_to_those_with_the_address_only(view: View) -> None:
     parts = urlsplit(view.url)
     assert status(view.url, parts.path) == 200
     for packed in ("identity", "gzip"):
@@ -157,7 +157,7 @@ def test_pages_are_served_to_those_with_the_address_only(view: oc.viewer.View) -
 
 
 @needs_viser
-def test_websockets_are_opened_to_own_pages_only(view: oc.viewer.View) -> None:
+def test_websockets_are_opened_to_own_pages_only(view: View) -> None:
     refused = import_module("websockets.exceptions").InvalidStatus
     parts = urlsplit(view.url)
     for origin in (None, f"http://{parts.netloc}"):
@@ -175,7 +175,7 @@ def test_websockets_are_opened_to_own_pages_only(view: oc.viewer.View) -> None:
 
 
 @needs_viser
-def test_huge_messages_end_the_connection(view: oc.viewer.View) -> None:
+def test_huge_messages_end_the_connection(view: View) -> None:
     closed = import_module("websockets.exceptions").ConnectionClosedError
     with connected(view.url, urlsplit(view.url).path, None) as socket_:
         socket_.send(bytes(2**20 + 1))
@@ -207,7 +207,7 @@ ATTACK = """new Promise(done => {
 
 @needs_viser
 @pytest.mark.slow
-def test_pages_of_others_in_a_real_browser_get_no_websocket(view: oc.viewer.View, tmp_path: Path) -> None:
+def test_pages_of_others_in_a_real_browser_get_no_websocket(view: View, tmp_path: Path) -> None:
     """Even with the whole address: an origin of another port, a file, and a sandboxed frame, whose origin is null."""
     if PROGRAM is None:
         pytest.skip("no chromium: apt-get install chromium")

@@ -48,7 +48,7 @@ def test_meshes_are_where_pinocchio_places_them() -> None:
     assert found.missing == ()
     q = np.array([0.3, -0.4, 0.5, -1.2, 0.2, 1.0, -0.7])
     positions, quaternions = BodyPoses(robot.tree)(q[None])
-    model = lock_off_chain(read_urdf(path), "panda_hand")
+    model = lock_off_chain(read_urdf(path)[0], "panda_hand")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Pinocchio imports what it deprecates itself
         geometry = pin.buildGeomFromUrdf(model, str(path), pin.GeometryType.VISUAL, str(path.parents[4]))
@@ -97,7 +97,7 @@ def test_all_tips_are_drawn() -> None:
     for i, solids in enumerate(build_stick_arm(robot.tree)):
         turn = pin.Quaternion(*quaternions[0, i]).matrix()
         balls += [(s.vertices @ turn.T + positions[0, i]).mean(axis=0) for s in solids if s.colour == RULES.tool]
-    model = lock_off_chain(read_urdf(path), *tips)
+    model = lock_off_chain(read_urdf(path)[0], *tips)
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
     places = [data.oMf[model.getFrameId(tip)].translation for tip in tips]

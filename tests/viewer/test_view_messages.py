@@ -18,6 +18,7 @@ from test_view_guard import connected
 from test_view_pages import wait
 
 import orthocas as oc
+from orthocas.viewer import View
 from orthocas.viewer.player import RobotPage
 from orthocas.viewer.window import _CAMERA_NUMBERS
 
@@ -31,13 +32,13 @@ def encoded(message: object) -> bytes:
 
 
 @pytest.fixture
-def view() -> Iterator[oc.viewer.View]:
+def view() -> Iterator[View]:
     with oc.view(oc.Robot.planar([1.0, 1.0], [1.0, 1.0]), port=0) as shown:
         yield shown
 
 
 @pytest.fixture
-def link(view: oc.viewer.View) -> Iterator[Any]:
+def link(view: View) -> Iterator[Any]:
     """The websocket of a browser that shows the page."""
     with connected(view.url, urlsplit(view.url).path, None) as socket:
         socket.send(encoded(CAMERA))
@@ -45,7 +46,7 @@ def link(view: oc.viewer.View) -> Iterator[Any]:
         yield socket
 
 
-def moved(view: oc.viewer.View, link: Any, value: float) -> None:
+def moved(view: View, link: Any, value: float) -> None:
     """Check that a slider still moves the arm."""
     slider = view._page._sliders[0]
     link.send(encoded({"type": "GuiUpdateMessage", "uuid": slider._impl.uuid, "updates": {"value": value}}))
@@ -71,7 +72,7 @@ HOSTILE: tuple[tuple[object, str], ...] = (
 
 @pytest.mark.slow
 def test_hostile_messages_are_dropped_with_one_line_each_and_the_page_goes_on(
-    view: oc.viewer.View, link: Any, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+    view: View, link: Any, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
     uuid = view._page._sliders[0]._impl.uuid
     callbacks = list(view._page._sliders[0]._impl.update_cb)
@@ -95,7 +96,7 @@ def test_hostile_messages_are_dropped_with_one_line_each_and_the_page_goes_on(
 
 
 @pytest.mark.slow
-def test_uploads_stay_out_of_memory(view: oc.viewer.View, link: Any) -> None:
+def test_uploads_stay_out_of_memory(view: View, link: Any) -> None:
     """viser keeps what the parts of a file hold until all have come."""
     for k in range(100):
         part = {"type": "FileTransferPart", "source_component_uuid": None, "transfer_uuid": "a", "part": k}
@@ -117,7 +118,7 @@ def test_messages_that_are_let_through_harm_nothing() -> None:
 
 @pytest.mark.slow
 def test_garbage_in_place_of_a_request_leaves_one_line(
-    view: oc.viewer.View, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+    view: View, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
     socket = import_module("socket")
     parts = urlsplit(view.url)
@@ -133,7 +134,7 @@ def test_garbage_in_place_of_a_request_leaves_one_line(
     assert "Traceback" not in capfd.readouterr().err
 
 
-def slide(view: oc.viewer.View, slider: Any, value: float) -> None:
+def slide(view: View, slider: Any, value: float) -> None:
     """What viser would do if a value came from a browser in spite of all."""
     slider._impl.value = value
     asyncio.run(slider._impl.update_cb[0](SimpleNamespace(client=object(), target=slider)))
@@ -148,7 +149,7 @@ def told(page: Any) -> list[Exception]:
 
 
 @pytest.mark.slow
-def test_a_robot_page_shows_the_error_of_a_nan_and_goes_on(view: oc.viewer.View) -> None:
+def test_a_robot_page_shows_the_error_of_a_nan_and_goes_on(view: View) -> None:
     page: RobotPage = view._page
     errors = told(page)
     slide(view, page._sliders[0], 0.5)

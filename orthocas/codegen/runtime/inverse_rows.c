@@ -1,14 +1,7 @@
-/* Rows of the inverse map in one call. Compile with -DN=joints, next to a generated library named arm.
- *
- * For each row, after at most so many evaluations of phi: q and, unless `condition` is NULL, phi there, and |J| |J^-1|
- * of J with rows divided by the sizes, or -1 where there is no solution. */
-#include "arm.h"
+/* Rows of the inverse map in one call: the library of a chart, named arm, with its static functions. */
+#include "arm.c"
 
-#include <math.h>
 #include <string.h>
-
-void arm_inverse_rows(long rows, int iterations, const double *phi, const double *q_start, const double *sizes, double *q, double *reached,
-                      double *condition);
 
 /* Product of the Frobenius norms of A and its inverse, by Gauss-Jordan elimination with pivoting; overwrites A. */
 static double condition_of(double *A) {
@@ -48,19 +41,20 @@ static double condition_of(double *A) {
   return sqrt(before) * sqrt(after);
 }
 
-void arm_inverse_rows(long rows, int iterations, const double *phi, const double *q_start, const double *sizes, double *q, double *reached,
-                      double *condition) {
-  double jacobian[N * N];
+/* For each row, after at most so many evaluations of phi: q, in place of its start; (phi - phi(q)) / scale; |J| |J^-1| of
+ * J / scale, or -1 where there is no solution, and q is the start; and whether q lies inside the domain. */
+void arm_inverse_rows(long rows, int iterations, const double *phi, double *q, double *residual, double *condition, char *within);
+
+void arm_inverse_rows(long rows, int iterations, const double *phi, double *q, double *residual, double *condition, char *within) {
+  double start[N], jacobian[N * N], work[ORTHOCAS_INVERSE_WORK(N)];
   long k;
-  int i, j;
-  for (k = 0; k < rows; ++k) {
-    arm_status status = arm_inverse(phi + k * N, q_start + k * N, iterations, q + k * N);
-    if (condition == NULL) continue;
+  for (k = 0; k < rows; ++k, phi += N, q += N, residual += N) {
+    int status;
+    memcpy(start, q, sizeof start);
+    status = orthocas_inverse(&arm, phi, start, iterations, q, work);
     condition[k] = -1.0;
-    if (status != ARM_OK && status != ARM_OUTSIDE_DOMAIN) continue;
-    status = arm_chart(q + k * N, reached + k * N, jacobian);
-    for (i = 0; i < N; ++i)
-      for (j = 0; j < N; ++j) jacobian[i * N + j] /= sizes[i];
-    if (status == ARM_OK || status == ARM_OUTSIDE_DOMAIN) condition[k] = condition_of(jacobian);
+    within[k] = (char)(status == ORTHOCAS_OK);
+    if (status != ORTHOCAS_OK && status != ORTHOCAS_OUTSIDE_DOMAIN) memcpy(q, start, sizeof start);
+    else if (residual_at(&arm, phi, q, residual, jacobian, work) >= 0.0) condition[k] = condition_of(jacobian);
   }
 }

@@ -36,6 +36,7 @@ static const struct {
   double lifted;      /* largest load, in limits of the command: the other half is for motion */
   double far_off;     /* from what the observer of velocities expects: it begins anew [rad] or [m] */
   double deep;        /* so near to the path of a corridor is near enough, as it may run along a limit of the box [radii] */
+  double hasty;       /* time for which a joint may exceed its speed limit: light ones do as they break away [s] */
   int forever;        /* ticks; a counter stops there, before it overflows */
   int bisections;     /* of the way of a stream to the boundary: 1e-3 of it */
   int sweeps;         /* of rotations for an eigenvalue; they converge quadratically */
@@ -45,7 +46,7 @@ static const struct {
 #ifndef ORTHOCAS_CHART_ONLY
   .turn = 6.283185307179586, .longest = 1e6, .implausible = 30.0, .jitter = 0.01, .alike = 0.2, .stirring = 1e-3,
   .standing = 0.1, .room = 0.05, .nearly = 0.2, .slow = 1.0 / 3.0, .settling = 0.5, .giving = 0.02, .learning = 2.0,
-  .lifted = 0.5, .far_off = 0.1, .deep = 0.5, .forever = 1000000, .bisections = 10, .sweeps = 6,
+  .lifted = 0.5, .far_off = 0.1, .deep = 0.5, .hasty = 5e-3, .forever = 1000000, .bisections = 10, .sweeps = 6,
 #endif
 };
 
@@ -560,22 +561,22 @@ ORTHOCAS_API int orthocas_check_settings(const orthocas_arm *arm, const orthocas
   if (arm->torque &&
       !(all_from(0.0, safety->observer_rate, n, finite) && all_from(0.0, safety->stop_zone, n, finite) &&
         all_from(0.0, safety->stop_damping, n, finite) && all_from(0.0, safety->brake_yield, n, finite) &&
+        all_from(0.0, safety->encoder_step, n, finite) && all_from(0.0, safety->friction, n, any) &&
         is_positive(arm, safety->brake_stiffness)))
     return 0;
   return all_from(-any, safety->lower, n, any) && all_from(-any, safety->upper, n, any) &&
-         all_from(0.0, safety->start_mismatch, n, any) &&
-         all_from(0.0, safety->command_rate, n, any) && all_from(0.0, safety->speed_limit, n, any) &&
-         all_from(0.0, safety->rest_speed, n, finite) && all_from(0.0, safety->stuck_speed, n, any) &&
+         all_from(0.0, safety->start_mismatch, n, any) && all_from(0.0, safety->command_rate, n, any) &&
+         all_from(0.0, safety->speed_limit, n, any) && all_from(0.0, safety->stuck_speed, n, any) &&
          all_from(0.0, safety->reference_speed, n, any) && all_from(0.0, safety->reference_acceleration, n, any) &&
-         all_from(0.0, safety->stop_stiffness, n, finite) && all_from(0.0, safety->error_limit, k, any) &&
-         all_from(0.0, safety->offset_rate, k, finite) && all_from(0.0, safety->integral_rate, k, finite) &&
-         all_from(0.0, safety->integral_limit, k, finite) && is_positive(arm, safety->near_margin) &&
-         is_positive(arm, safety->catch_margin) && is_positive(arm, safety->return_margin) &&
-         is_positive(arm, safety->fade_in) && is_positive(arm, safety->fade_out) &&
-         is_positive(arm, safety->return_speed) && is_positive(arm, safety->longest_period) &&
-         is_positive(arm, safety->damping) && safety->hold_ticks >= 0 && safety->stale_ticks >= 0 &&
-         safety->catch_margin < safety->near_margin && safety->near_margin < safety->return_margin &&
-         safety->return_margin < 1.0;
+         all_from(0.0, safety->rest_speed, n, finite) && all_from(0.0, safety->stop_stiffness, n, finite) &&
+         all_from(0.0, safety->error_limit, k, any) && all_from(0.0, safety->offset_rate, k, finite) &&
+         all_from(0.0, safety->integral_rate, k, finite) && all_from(0.0, safety->integral_limit, k, finite) &&
+         is_positive(arm, safety->near_margin) && is_positive(arm, safety->catch_margin) &&
+         is_positive(arm, safety->return_margin) && is_positive(arm, safety->fade_in) &&
+         is_positive(arm, safety->fade_out) && is_positive(arm, safety->return_speed) &&
+         is_positive(arm, safety->longest_period) && is_positive(arm, safety->damping) && safety->hold_ticks >= 0 &&
+         safety->stale_ticks >= 0 && safety->catch_margin < safety->near_margin &&
+         safety->near_margin < safety->return_margin && safety->return_margin < 1.0;
 }
 
 /* ---- the boundary of the domain ---- */
@@ -683,10 +684,9 @@ static double unturned(const orthocas_arm *arm, const orthocas_state *state, int
 }
 
 static int faster_than(const orthocas_arm *arm, const double *dq, const double *speed, double share) {
-  int i;
-  for (i = 0; i < arm->n; ++i)
-    if (fabs(dq[i]) > share * speed[i]) return 1;
-  return 0;
+  int i, fast = 0;
+  for (i = 0; i < arm->n; ++i) fast = fast || fabs(dq[i]) > share * speed[i];
+  return fast;
 }
 
 static int is_measurement(const orthocas_arm *arm, const double *q, const double *dq) {
@@ -708,8 +708,7 @@ static int plausible(const orthocas_arm *arm, const orthocas_state *state, const
                      double period) {
   const orthocas_safety *safety = state->safety;
   const double since = period * (1.0 + (double)state->bad_ticks);
-  int i, odd;
-  odd = faster_than(arm, dq, safety->speed_limit, rules.implausible);
+  int i, odd = faster_than(arm, dq, safety->speed_limit, rules.implausible);
   for (i = 0; i < arm->n; ++i)
     if (state->bad_ticks < safety->hold_ticks &&
         fabs(between(arm, i, unturned(arm, state, i, q[i]) - state->q[i])) >
@@ -740,8 +739,7 @@ static int look(const orthocas_arm *arm, orthocas_state *state, const double *q,
   int i, same = 1, good;
   if (!is_measurement(arm, q, dq)) return 0;
   good = plausible(arm, state, q, dq, period);
-  for (i = 0; i < n; ++i)
-    if (fabs(q[i] - state->seen_q[i]) > 0.0 || fabs(dq[i] - state->seen_dq[i]) > 0.0) same = 0;
+  for (i = 0; i < n; ++i) same = same && fabs(q[i] - state->seen_q[i]) <= 0.0 && fabs(dq[i] - state->seen_dq[i]) <= 0.0;
   copy(state->seen_q, q, n);
   copy(state->seen_dq, dq, n);
   state->unseen = 0.0;
@@ -754,16 +752,17 @@ static int look(const orthocas_arm *arm, orthocas_state *state, const double *q,
   return good && !frozen(arm, state, dq, work);
 }
 
-/* Add up the momentum that an arm must have got since its measurements changed last, at a command that may have balanced
- * it, as well as the fallback may; of velocity laws, how far it must have moved. Brakes hold against any torque. */
+/* Add up the momentum that an arm must have got since its measurements changed: the command then, or the fallback, may have
+ * balanced it, and friction hold it beside that. Of velocity laws: how far it must have moved. Brakes hold anything. */
 static void watch_sensors(const orthocas_arm *arm, orthocas_state *state, const double *fallback, const double *command,
                           double period) {
   double *from = state->impulse_from;
   int i;
   if (arm->torque && (state->same_ticks == 0 || state->mode == ORTHOCAS_HOLD)) copy(from, command, arm->n);
   for (i = 0; i < arm->n; ++i) {
-    const double balanced = fmin(fmax(command[i], fmin(from[i], fallback[i])), fmax(from[i], fallback[i]));
-    state->impulse[i] += (command[i] - balanced) * period;
+    const double held = arm->torque ? state->safety->friction[i] : 0.0;
+    const double least = fmin(from[i], fallback[i]) - held, most = fmax(from[i], fallback[i]) + held;
+    state->impulse[i] += (command[i] - fmin(fmax(command[i], least), most)) * period;
   }
 }
 
@@ -808,8 +807,9 @@ static int works(int law) { return law == ORTHOCAS_OK || law == ORTHOCAS_SATURAT
 static void choose_mode(const orthocas_arm *arm, orthocas_state *state, int law, const double *q, const double *dq,
                         double clear, double room, const double *error, double period, int late, double *work) {
   const orthocas_safety *safety = state->safety;
-  const int fast = faster_than(arm, dq, safety->speed_limit, 1.0);
+  const int hurries = faster_than(arm, dq, safety->speed_limit, 1.0), fast = hurries && state->hasty >= rules.hasty;
   const int ready = works(law) && room >= safety->return_margin;
+  state->hasty = hurries ? fmin(state->hasty + period, rules.hasty) : 0.0;
   switch (state->mode) {
   case ORTHOCAS_LAW:
     if (!works(law)) catch_arm(arm, state, law, q);
@@ -971,7 +971,7 @@ static void fade_offset(const orthocas_arm *arm, orthocas_state *state, const do
   for (i = 0; i < arm->k; ++i) state->offset[i] *= fmax(0.0, 1.0 - period / needed);
 }
 
-/* Fade weights and offset. R17: integrate the error, unless the command is cut or the law does not command. */
+/* Fade weights and offset. R17: integrate the error, as fast as the slowest mode bears, while the law commands, uncut. */
 static void advance(const orthocas_arm *arm, orthocas_state *state, const double *shared, const double *error, int cut,
                     double clear, double room, double period, double *work) {
   const orthocas_safety *safety = state->safety;
@@ -984,8 +984,8 @@ static void advance(const orthocas_arm *arm, orthocas_state *state, const double
   }
   for (i = 0; i < arm->k && state->mode == ORTHOCAS_LAW && !cut; ++i) {
     const double e = clipped(error[i] + state->offset[i], safety->error_limit[i]);
-    state->integral[i] = clipped(state->integral[i] + safety->integral_rate[i] * e * period * state->weight,
-                                 safety->integral_limit[i]);
+    const double rate = fmin(safety->integral_rate[i], arm->integral_bound) * state->weight;
+    state->integral[i] = clipped(state->integral[i] + rate * e * period, safety->integral_limit[i]);
   }
   fade_offset(arm, state, shared, clear, room, period, work);
 }
@@ -1116,20 +1116,21 @@ static void foresee(const orthocas_arm *arm, orthocas_state *state, double perio
     }
 }
 
-/* It corrects that by a measurement, with three poles at observer_rate for position, velocity and the acceleration that
- * torques do not explain. Where it knows nothing, or is far off, it begins anew with what is measured. */
+/* It corrects that by what a measurement has beyond the step of its encoder, with three poles at observer_rate: position,
+ * velocity, acceleration that torques do not explain. Where it knows nothing, or is far off, it begins anew. */
 static void observe(const orthocas_arm *arm, orthocas_state *state, double *q, double *dq, double period) {
   int i;
   for (i = 0; i < arm->n; ++i) {
-    const double rate = state->safety->observer_rate[i], error = between(arm, i, q[i] - state->q[i]);
+    const double rate = state->safety->observer_rate[i], gap = between(arm, i, q[i] - state->q[i]);
+    const double error = gap - clipped(gap, 0.5 * state->safety->encoder_step[i]);
     double left, taken;
-    if (!observes(state) || !(rate > 0.0) || !(fabs(error) <= rules.far_off)) {
+    if (!observes(state) || !(rate > 0.0) || !(fabs(gap) <= rules.far_off)) {
       state->unexplained[i] = 0.0;
       continue;
     }
     left = exp(-rate * period);
     taken = 1.0 - left;
-    q[i] -= left * left * left * error;
+    q[i] -= gap - (1.0 - left * left * left) * error;
     dq[i] = state->dq[i] + 1.5 * taken * taken * (1.0 + left) / period * error;
     state->unexplained[i] += taken * taken * taken / (period * period) * error;
   }
@@ -1140,9 +1141,8 @@ static void expect(const orthocas_arm *arm, orthocas_state *state, const double 
                    double *M, const double *bias, const double *gravity) {
   int i, known = 0;
   for (i = 0; i < arm->n; ++i) state->drive[i] = command[i] - fallback[i] - (bias[i] - gravity[i]);
-  for (i = 0; i < arm->n; ++i)
-    if (state->safety->observer_rate[i] > 0.0) known = state->mode != ORTHOCAS_HOLD;
-  if (!known) return;
+  for (i = 0; i < arm->n; ++i) known = known || state->safety->observer_rate[i] > 0.0;
+  if (!known || state->mode == ORTHOCAS_HOLD) return;
   copy(state->expected, state->drive, arm->n);
   known = solve(arm, M, state->expected, arm->n, 1) && all_finite(arm, state->expected, arm->n);
   for (i = 0; i < arm->n; ++i) state->expected[i] = (known ? state->expected[i] : 0.0) + state->unexplained[i];
@@ -1307,8 +1307,8 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   int i, good, cut, known, status, limited = 1;
 
   /* A limit that is not > 0 is not used; the last one holds (R5). */
-  for (i = 0; i < n; ++i)
-    if (!(gains->given_limit[i] > 0.0)) limited = 0;
+  for (i = 0; i < n; ++i) limited = limited && gains->given_limit[i] > 0.0;
+  for (i = 0; i < k; ++i) set = set && safety->integral_rate[i] <= arm->integral_bound; /* R17 */
   if (limited) copy(state->limit, gains->given_limit, n);
   copy(gains->limit, state->limit, n);
 

@@ -124,6 +124,7 @@ typedef struct {
   orthocas_kernels kernels;
 
   int torque;                            /* whether commands are torques, not velocities */
+  double integral_bound;                 /* of the rate of integral action that the slowest mode bears [1/s] */
   int shared, memory;                    /* numbers of `shared`, and of NAME_memory */
   int memory_torque;                     /* where NAME_memory has a torque (n,) that the first command shows; or -1 */
   int turned_first, turned_end;          /* components of x that are an orientation; equal: none */
@@ -140,6 +141,7 @@ typedef struct {
 typedef struct {
   const double *command_rate, *speed_limit, *rest_speed, *stuck_speed;            /* (n,) */
   const double *reference_speed, *reference_acceleration, *start_mismatch;        /* (n,) */
+  const double *friction, *encoder_step;                                          /* (n,), null for velocity laws */
   const double *lower, *upper, *stop_stiffness;                                   /* (n,) */
   const double *observer_rate, *stop_zone, *stop_damping, *brake_yield;           /* (n,), null for velocity laws */
   const double *error_limit, *offset_rate, *integral_rate, *integral_limit;       /* (k,) */
@@ -152,7 +154,7 @@ typedef struct {
 typedef struct {
   int mode, cause;
   int asked, bad_ticks, fresh, stale_ticks, same_ticks;
-  double weight, brake, unseen;
+  double weight, brake, unseen, hasty;
   double *q, *dq, *seen_q, *seen_dq, *command, *led, *impulse, *impulse_from, *law, *anchor, *safe, *limit; /* (n,) */
   double *offset, *integral;                                                                                /* (k,) */
   double *load, *drive, *speed, *expected, *unexplained;                     /* (n,), null for velocity laws */

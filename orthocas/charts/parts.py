@@ -1,0 +1,217 @@
+"""What solvers, laws and generated code use of a chart: its functions, its differences, and its searches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from orthocas.charts.coordinates import Coordinates, InvertibleMap
+from orthocas.charts.curve_tracer import CurveTracer
+from orthocas.charts.curves import SelfMotionCurves
+from orthocas.charts.descent import RULES, BoxedPhi
+from orthocas.charts.inside import Inside
+from orthocas.charts.inverse import Inverse
+from orthocas.charts.newton import (
+    NEWTON,
+    Continuation,
+    FewRows,
+    Newton,
+    OwnInverse,
+    PointFunctions,
+    inverse_function,
+)
+from orthocas.charts.phi import Differences, PhiMap, fill_coordinates, leave_over
+from orthocas.charts.search import Cells, InDomain, Starts
+from orthocas.charts.trackers import near_function
+from orthocas.tasks.problem import measure_task_sizes
+from orthocas.tasks.relative import Relative
+from orthocas.tasks.samples import sample_uniform
+from orthocas.tools.cached import BuiltOnUse, cached_property
+from orthocas.tools.checks import Array, as_point, require_shape
+from orthocas.tools.expressions import choose_form
+
+if TYPE_CHECKING:
+    from orthocas.charts.chart import Chart
+
+FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobian", "manipulability", "inverse")
+
+
+@dataclass(frozen=True, eq=False)
+class ChartParts:
+    """What solvers, laws and generated code use of a chart; no interface for users."""
+
+    chart: Chart
+
+    @cached_property
+    def functions(self) -> BuiltOnUse[str, ca.Function]:
+        """The functions of `Chart.function`."""
+        return BuiltOnUse(self._build_function)
+
+    def express(self, name: str, q: Any) -> Any:
+        """A function at a CasADi column (n, 1)."""
+        require_shape("q", q.shape, (self.chart.n, 1))
+        return self.functions[name](q)
+
+    def _build_function(self, name: str) -> ca.Function:
+        """A function of `FUNCTIONS` by name."""
+        task = self.chart.problem.task
+        if name == "task":
+            return task.function
+        if name == "task_jacobian":
+            return task.jacobian_function
+        if name == "manipulability":
+            return task.manipulability_function
+        q, v, w = (ca.MX.sym(symbol, self.chart.n) for symbol in ("q", "v", "w"))
+        inputs = {"q": q}
+        # task first, then coordinates
+        own = self.chart.coordinates.functions
+        if name == "inverse":
+            return inverse_function(self.functions["phi"], self.phi_sizes, self.phi_map.difference)
+        if name == "xi":
+            value = own["xi"](q)
+        elif name == "phi":
+            value = ca.vertcat(task.function(q), own["xi"](q))
+        elif name == "jacobian":
+            value = ca.vertcat(task.jacobian_function(q), own["jacobian"](q))
+        else:
+            # d^2 phi [v, w] is linear in both, so that C calls it with any two directions
+            value = ca.vertcat(task.second_derivative_function(q, v, w), own["second_derivative"](q, v, w))
+            inputs |= {"v": v, "w": w}
+        return ca.Function(name, list(inputs.values()), [ca.densify(value)], list(inputs), [name])
+
+    @cached_property
+    def phi_sizes(self) -> Array:
+        """Sizes of the components of phi, (n,): how far task components move over the domain, and 1 for xi."""
+        return np.concatenate([measure_task_sizes(self.chart.problem), np.ones(self.chart.r)])
+
+    @property
+    def turns(self) -> Array:
+        """Periods of the components of phi, (n,): 2 pi for circle-valued coordinates, 0 where there is none."""
+        own, chart = self.chart.coordinates, self.chart
+        periods = own.turns if isinstance(own, Coordinates) else np.full(chart.r, getattr(own, "turn", 0.0))
+        return np.concatenate([np.zeros(chart.m), periods])
+
+    @property
+    def named_coordinates(self) -> tuple[str, ...]:
+        """Labels of the coordinates, with what the first ones are, or are like: 'xi1: like swivel [rad]'."""
+        labels, notes = self.chart.labels[self.chart.m :], self.chart.notes
+        meaning, exact = notes.get("meaning"), "exact" in notes
+        named = meaning.split("; ") if isinstance(meaning, str) else []
+        # older charts only name what they are like
+        named = [name if exact or name.startswith("like ") else f"like {name}" for name in named]
+        return (*(f"{label}: {name}" for label, name in zip(labels, named, strict=False)), *labels[len(named) :])
+
+    def runnable(self, graph: ca.Function) -> ca.Function:
+        """The fast form of a graph of this chart's functions: scalar code, or the graph itself for networks.
+
+        It is also the graph itself for robots with more than 10 joints.
+        """
+        own = self.chart.coordinates
+        return graph if isinstance(own, Coordinates) and own.as_matrices else choose_form(graph, self.chart.n)
+
+    def left_over(self, q_start: ArrayLike, q: ArrayLike, tolerance: float = 1e-9) -> Array | None:
+        """What a loop in (x, xi) leaves over in the joints: q - q_start (n,), less full turns of endless joints.
+
+        phi is one-to-one near each point only, so x and xi may come back while the joints do not. A loop that can be
+        shrunk to a point, while its joints stay in the domain, leaves nothing over. A loop around a full turn of the
+        tool or the base cannot be shrunk, and closes only if xi does not change with the joint that turns.
+
+        Args:
+            q_start: where the loop began, (n,).
+            q: where it ended, (n,).
+            tolerance: of phi, relative to `phi_sizes`.
+
+        Returns:
+            (n,) [rad] or [m]; None if x or xi differ, so that the path is open.
+        """
+        start, end = as_point("q_start", q_start, self.chart.n), as_point("q", q, self.chart.n)
+        apart = self.phi_map.difference(self.chart.phi(end), self.chart.phi(start)) / self.phi_sizes
+        return leave_over(float(np.abs(apart).max()), tolerance, end - start, self.chart.problem.turning)
+
+    @cached_property
+    def relative(self) -> Relative:
+        """Task values relative to wanted ones."""
+        return Relative(self.chart.problem.task)
+
+    @cached_property
+    def rates(self) -> ca.Function:
+        """q (n, 1) -> J (n, n) with the rows of `Relative.rates` for the task: for solvers and laws."""
+        chart = self.chart
+        if not self.relative.turned:
+            return chart.function("jacobian")
+        q = ca.MX.sym("q", chart.n)
+        rows = ca.vertcat(self.relative.rates(q), chart.coordinates.functions["jacobian"](q))
+        return ca.Function("rates", [q], [ca.densify(rows)], ["q"], ["rates"])
+
+    def batched_rates(self, points: Array) -> Array:
+        """The rows of `rates` at points (N, n), (N, n, n); NaN where the task has no finite Jacobian."""
+        chart = self.chart
+        J = np.empty((len(points), chart.n, chart.n))
+        J[:, : chart.m] = self.relative.batched_rates(points)[0].reshape(-1, chart.m, chart.n)
+        fill_coordinates(chart.coordinates, "jacobian", J[:, chart.m :], points)
+        return J
+
+    @cached_property
+    def phi_map(self) -> PhiMap:
+        """phi and J for solvers of phi(q) = phi."""
+        chart = self.chart
+        return PhiMap(chart.phi, self.batched_rates, self.phi_sizes, Differences(self.turns, self.relative))
+
+    @cached_property
+    def boxed(self) -> BoxedPhi:
+        """phi in the box of the domain."""
+        return BoxedPhi(self.chart.problem.task, self.chart.problem.domain, self.phi_map, self.chart.xi)
+
+    @cached_property
+    def tracer(self) -> CurveTracer:
+        """Traces self-motion curves, r = 1."""
+        return CurveTracer(self.boxed)
+
+    @cached_property
+    def turn_shifts(self) -> dict[str, Array]:
+        """What a full turn of a joint that turns without end adds to xi everywhere, (r,) by the joint's name.
+
+        One posture then has many values of xi, these apart. Joints whose turns do not change xi are missing, and so are
+        those whose turns change it by different amounts in different postures.
+        """
+        chart, shifts = self.chart, {}
+        q = sample_uniform(chart.problem.domain, 8, 0)
+        for k in chart.problem.turning:
+            turned = chart.phi(q + 2 * np.pi * np.eye(chart.n)[k])
+            shift = self.phi_map.difference(turned, chart.phi(q))[:, chart.m :]
+            if np.abs(shift[0]).max() > RULES.same and np.ptp(shift, axis=0).max() < RULES.same:
+                shifts[chart.problem.robot.joint_names[k]] = np.asarray(shift[0])
+        return shifts
+
+    @cached_property
+    def inverse(self) -> Inverse:
+        """The search of `Chart.solve`."""
+        chart, phi_map, domain = self.chart, self.phi_map, self.chart.problem.domain
+        # grown coordinates bring their own inverse
+        starts = Starts(phi_map, domain)
+        if isinstance(chart.coordinates, InvertibleMap):
+            return Inverse(chart.problem, phi_map, OwnInverse(chart.coordinates, phi_map), starts)
+        boxed = self.boxed
+        local, brief = (
+            FewRows(phi_map, self.point_functions, Newton(phi_map, k)) for k in (NEWTON.halvings, NEWTON.brief)
+        )
+        in_domain, inside = InDomain(boxed, Cells(boxed)), Inside(boxed, starts)
+        curves = SelfMotionCurves(boxed, starts, self.tracer) if chart.r == 1 else None
+        return Inverse(chart.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves, brief)
+
+    @cached_property
+    def point_functions(self) -> PointFunctions:
+        """The functions that trackers and `solve` call for one row."""
+        phi_map = self.phi_map
+        phi = self.chart.function("phi")
+        return PointFunctions.of(phi, self.rates, phi_map.sizes, phi_map.difference, self.chart.problem.turning)
+
+    @cached_property
+    def reaching(self) -> ca.Function:
+        """The function of `ReachingTracker`: see `near_function`."""
+        chart = self.chart
+        return near_function(chart.function("phi"), self.rates, chart.m, self.phi_map, chart.problem.domain)
