@@ -151,7 +151,7 @@ class NumpyTracker:
         return self._q.copy()
 
     def _watch_error(self) -> None:
-        """Look for a detour where the error of x has not fallen for a while."""
+        """Start a search for a detour if the error of x has not fallen for a while."""
         e, _ = self._look(self._q)
         error = float(np.linalg.norm(e))
         if self._ticks % self._patience == 0:

@@ -282,7 +282,7 @@ class InDomain:
         return self.boxed.points(u), np.asarray(error <= tolerance)
 
     def all_solutions(self, target: Array, tolerance: float) -> Array:
-        """Different solutions for a target (n,), that nearest to the centre first, (k, n)."""
+        """The different solutions for a target (n,), the nearest to the centre first, (k, n)."""
         places = self.cells.places(target[None])
         # starts: the place in each cell that may hold a solution, and samples around it
         likely = np.flatnonzero(places.overshoot[0] <= RULES.margin)
@@ -314,7 +314,7 @@ class InDomain:
         return best.u, best.error
 
     def _search_again(self, targets: Array, places: Places, best: "_Best", tolerance: float) -> None:
-        """Search from other starts in the likeliest cells."""
+        """Search again for rows without a solution, from other starts in the likeliest cells."""
         row, cell = np.nonzero((places.overshoot <= RULES.core) & (best.error > tolerance)[:, None])
         starts = self.cells.samples(targets[row], cell, RULES.again).reshape(-1, targets.shape[1])
         row = np.repeat(row, RULES.again)

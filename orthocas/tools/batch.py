@@ -205,7 +205,7 @@ class _BlasHold:
         self._limits: Any = None
 
     def begin(self) -> None:
-        """One more wants it."""
+        """Limit BLAS to one thread, if no other caller has."""
         with self._lock:
             if not self._count:
                 # New modules may have brought libraries.
