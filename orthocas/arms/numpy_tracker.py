@@ -203,7 +203,7 @@ class NumpyTracker:
         return True
 
     def _step_anywhere(self, asked: bool) -> TrackStatus:
-        """A step with x first."""
+        """A step that puts x before xi."""
         if self._goal is not None and (status := self._step_to_goal()) is not None:
             return status
         low, high = self._bounds()

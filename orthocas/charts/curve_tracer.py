@@ -224,8 +224,8 @@ class CurveTracer:
     def _step(self) -> BlockedFunction:
         """One step: a column (q, t, bend, h, q0, t0) and x -> the new q and t, and four numbers.
 
-        The numbers are the length of the correction, the cosine between the tangents, and the distance of q from q0 up to full
-        turns, also along t0.
+        The numbers are the length of the correction, the cosine between the tangents, and the distance of q from q0 up
+        to full turns, also along t0.
         """
         q, x = self._symbols[:2]
         n = q.shape[0]

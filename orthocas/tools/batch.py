@@ -195,7 +195,7 @@ if hasattr(os, "register_at_fork"):
 
 
 class _BlasHold:
-    """BLAS held to one thread while anyone wants it so."""
+    """Holds BLAS to one thread while any caller asks for it."""
 
     def __init__(self) -> None:
         self._lock, self._count = Lock(), 0
