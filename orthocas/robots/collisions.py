@@ -388,7 +388,7 @@ class Collisions(Shown):
         return np.array([row[0] for row in measured]), np.array([row[1] for row in measured])
 
     def list_near_parts(self, q: Array, within: float | Array) -> Indices:
-        """Numbers of pairs of parts whose bounds at q (n,) are nearer than a distance, or each than its own (K,)."""
+        """Indices of pairs of parts whose lower bounds at q (n,) are below a distance, one for all or each, (K,)."""
         return np.flatnonzero(self._bound_distances(q[None], within)[0] < within)
 
     def measure_parts(self, q: Array, index: Indices) -> tuple[Array, Array, Array]:

@@ -403,12 +403,14 @@ def test_collisions_travel(tmp_path: Path) -> None:
 
 
 TWO_ARMS = """<robot name="two"><link name="base"/>{parts}</robot>"""
-ARM_LINK = """<link name="{side}{k}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>
-</inertial><collision><origin xyz="0.25 0 0"/><geometry><box size="0.3 0.05 0.05"/></geometry></collision></link>
+ARM_LINK = """<link name="{side}{k}"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><origin xyz="0.25 0 0"/><geometry><box size="0.3 0.05 0.05"/></geometry></collision></link>
 <joint name="{side}q{k}" type="revolute"><origin xyz="{at} 0"/><parent link="{parent}"/><child link="{side}{k}"/>
 <axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>"""
 HAND = """<link name="{side}hand"><collision><geometry><sphere radius="0.05"/></geometry></collision></link>
-<joint name="{side}fix" type="fixed"><origin xyz="0.5 0 0"/><parent link="{side}3"/><child link="{side}hand"/></joint>"""
+<joint name="{side}fix" type="fixed"><origin xyz="0.5 0 0"/><parent link="{side}3"/><child link="{side}hand"/>
+</joint>"""
 
 
 def test_a_box_in_both_hands_moves_with_them_and_hits_what_is_around(tmp_path: Path) -> None:
