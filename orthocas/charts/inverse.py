@@ -31,6 +31,7 @@ from orthocas.tools.checks import (
     require_shape,
 )
 from orthocas.tools.display import Shown, listed
+from orthocas.tools.expressions import wrap_shortest
 
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
@@ -245,11 +246,13 @@ def solve_all(chart: Chart, phi: Array, tolerance: float, collisions: Collisions
     near = (search.brief or search.local)(np.broadcast_to(phi, starts.shape), starts)
     solved = near.q[largest(near.residual) <= tolerance]
     every = np.concatenate([solved[domain.contains(solved)], whole.find_all(phi, near.q, float(tolerance))])
-    # of all that are found, those that differ, the nearest to the centre first
-    u = (every - domain.centre) / domain.half_width
+    # of all that are found, those that differ by more than full turns, the nearest to the centre first
+    turns = np.zeros(chart.n)
+    turns[list(chart.problem.turning)] = 2 * np.pi
     kept: list[int] = []
-    for k in np.argsort(np.linalg.norm(u, axis=1)):
-        if all(np.abs(u[k] - u[other]).max() > RULES.same for other in kept):
+    for k in np.argsort(np.linalg.norm((every - domain.centre) / domain.half_width, axis=1)):
+        apart = np.abs(wrap_shortest(every[k] - every[kept], turns)) / domain.half_width
+        if (apart.max(axis=1) > RULES.same).all():
             kept.append(int(k))
     # free ones come first
     q = every[kept]
