@@ -43,7 +43,10 @@ def find_compilers() -> tuple[str, ...]:
     result = [path for name in ("gcc", "clang") if (path := shutil.which(name)) is not None]
     result = result or [path for path in (shutil.which("cc"),) if path is not None]
     if not result:
-        raise CompileError("no C compiler found, expected gcc, clang or cc on the PATH")
+        raise CompileError(
+            "no C compiler found, expected gcc, clang or cc on the PATH: apt install gcc, xcode-select --install, or "
+            "pip install ziglang, which suffices for all that is compiled while Python runs"
+        )
     return tuple(result)
 
 
