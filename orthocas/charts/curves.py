@@ -162,7 +162,7 @@ class SelfMotionCurves:
         return q.reshape(N, S, n), ~arrived.reshape(N, S)
 
     def _steps(self, traces: Traces, own: Array) -> "Steps":
-        """The steps of curves in and around the box of the domain, after all full turns that bring them there."""
+        """The steps of all curves in and around the box of the domain, moved there by full turns."""
         curve, shift = self._sheets(traces, own)
         low, high = self.boxed.domain.bounds
         # steps of which one end is near the box
@@ -260,7 +260,7 @@ class SelfMotionCurves:
         return np.asarray(around & ~(none & ~changes))
 
     def _sheets(self, traces: Traces, own: Array) -> tuple[Indices, Array]:
-        """Which curves (of K) pass the box of the domain after which full turns: curve (L,), and shifts (L, n).
+        """Full turns that bring curves (of K) into the box of the domain: indices of curves (L,), shifts (L, n).
 
         Joints without boundaries turn to within half a turn of the caller's starts (K, n), or one and a half where
         turns change xi.
@@ -327,7 +327,7 @@ class SelfMotionCurves:
         return q[solved], solved
 
     def _take_points(self, targets: Array, arcs: "Arcs", best: Nearest) -> "Ends":
-        """Points of arcs that lie in the domain; returns the ends that may be nearer."""
+        """Take points of arcs that lie in the domain, and return the ends that may be nearer."""
         # points inside are candidates for the nearest xi
         inside = arcs.inside & (best.distance > 0)[arcs.row][:, None]
         arc, place = np.nonzero(inside)
@@ -436,7 +436,7 @@ class Steps:
     follows: NDArray[np.bool_]  #: whether a step begins where the one before it ends, (S,)
 
     def part(self, which: NDArray[np.bool_]) -> "Steps":
-        """Some of the steps (S,)."""
+        """The steps that `which` (S,) selects."""
         row, q, tangent, follows = (array[which] for array in vars(self).values())
         follows[1:] &= np.diff(np.flatnonzero(which)) == 1
         follows[:1] = False

@@ -371,7 +371,7 @@ class Found:
         return cls(q, q.copy(), np.zeros_like(bad), bad)
 
     def put(self, rows: Indices, other: Found) -> None:
-        """Take over what a search found in some rows."""
+        """Replace some rows by the results of another search."""
         for name, values in vars(other).items():
             getattr(self, name)[rows] = values
 

@@ -225,7 +225,7 @@ def xi_along(chart: Chart, points: Array) -> Array:
 
 
 def too_far(chart: Chart, q: Array, wanted: Array) -> str:
-    """The coordinate that is wanted (r,) farthest outside its range at q (n,), in words; empty if there is none."""
+    """Name the coordinate whose target (r,) is farthest outside its range at q (n,); empty if none is outside."""
     if chart.parts.turns.any():
         return ""
     # how far outside each coordinate is, and what stops the farthest
