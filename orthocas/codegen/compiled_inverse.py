@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from orthocas.charts.chart import Chart
 from orthocas.charts.curve_tracer import RULES
 from orthocas.charts.curves import Nearest, SelfMotionCurves
-from orthocas.charts.inverse import Inverse, Solutions, build_phi_of_wish, solve_rows
+from orthocas.charts.inverse import Inverse, Solutions, build_phi, build_phi_of_wish, solve_rows
 from orthocas.charts.newton import NEWTON, Attempt, Newton
 from orthocas.codegen.compiled import keep_library, load_library
 from orthocas.codegen.generate import generate_c
@@ -51,12 +51,19 @@ class CompiledInverse(Shown):
         return {"inverse": f"compiled, of the chart of {self.chart.problem.name}", "library": str(self.library)}
 
     def solve(
-        self, phi: ArrayLike, q_start: ArrayLike | None = None, *, tolerance: float = 1e-9, inside: bool = False
+        self,
+        phi: ArrayLike | None = None,
+        q_start: ArrayLike | None = None,
+        *,
+        x: Any = None,
+        xi: ArrayLike | None = None,
+        tolerance: float = 1e-9,
+        inside: bool = False,
     ) -> Solutions:
         """Solve like `Chart.solve`: the same status for each row and the same q to 1e-9, unless starts are far away."""
-        return solve_rows(self.chart, self._parts, phi, q_start, tolerance, inside)
+        return solve_rows(self.chart, self._parts, build_phi(self.chart, phi, x, xi), q_start, tolerance, inside)
 
-    def nearest_xi(self, q_wish: ArrayLike, x: ArrayLike | None = None, *, tolerance: float = 1e-9) -> Solutions:
+    def nearest_xi(self, q_wish: ArrayLike, x: Any = None, *, tolerance: float = 1e-9) -> Solutions:
         """Solve like `Chart.nearest_xi`."""
         phi, wishes = build_phi_of_wish(self.chart, q_wish, x)
         return self.solve(phi, wishes, tolerance=tolerance, inside=True)
