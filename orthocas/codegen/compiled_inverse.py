@@ -39,6 +39,84 @@ _PIECE, _CURVE_PIECE = 512, 64
 _STARTS = 1 + RULES.near_phi + RULES.near_x + RULES.more
 
 
+def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledInverse:
+    """Compile the inverse map of a chart, or find it compiled earlier; for large batches.
+
+    The first call for a chart generates and compiles C, which takes some seconds. Later calls, also in other processes,
+    find the library in the folder: its name is a digest of the C code, the compiler and its options.
+
+    Args:
+        chart: a chart with a closed expression.
+        folder: where compiled libraries are kept; default `orthocas/libraries` in $XDG_CACHE_HOME
+            or ~/.cache. Only the user and root may be able to write there.
+
+    Raises:
+        CompileError: if there is no C compiler, or others may write to the folder.
+        NoExpressionError: if the chart is grown.
+        InvalidValueError: if the folder cannot be written.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> with TemporaryDirectory() as folder:  # or without a folder, to keep the library
+        ...     compiled = oc.compile_inverse(chart, folder)
+        ...     solutions = compiled.solve(chart.phi([[0.7, 0.9, 0.6], [0.6, 0.8, 0.8]]))
+        >>> solutions.found.tolist()
+        [True, True]
+    """
+    require_kind("chart", chart, Chart)
+    # the library of the chart, then what takes many rows, then what follows curves
+    with open_draft_folder() as drafts:
+        generate_c(chart, drafts, name="arm")
+        sources = {path.name: path.read_text(encoding="utf-8") for path in sorted(drafts.glob("*.[hc]"))}
+    sources[_ROWS] = get_source(_ROWS)
+    curves = chart.parts.inverse.curves
+    if curves is not None:
+        sources |= {name: get_source(name) for name in ("curve_rows.c", "curve_math.c")}
+        sources["curves.c"] = write_curve_source(chart, curves)
+    return CompiledInverse(chart, keep_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder))
+
+
+def write_curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
+    """C of the search along self-motion curves: kernels and tables of a chart, then runtime/curve_rows.c.
+
+    Raises:
+        DomainError: if the domain has a condition, but no expression of it.
+    """
+    q, domain = ca.MX.sym("q", chart.n), chart.problem.domain
+    x, own = ca.MX.sym("x", chart.m), chart.coordinates.functions
+    # Errors and gradients of the task, xi with its gradient, and the condition of the domain.
+    functions = [
+        dense_function("curve_task", [q, x], curves.tracer.equations.call([q, x])),
+        dense_function("curve_xi", [q], [chart.parts.runnable(own["xi"])(q)]),
+        dense_function("curve_gradient", [q], [chart.parts.runnable(own["jacobian"])(q)]),
+    ]
+    if domain.condition is not None:
+        functions.append(dense_function("curve_pivots", [q], [domain.condition.pivots(q)]))
+    kernels, (low, high) = generate_kernels(functions, "kernel"), domain.bounds
+    values = {
+        "kernels": kernels.code,
+        "arrays": kernels.declare_arrays,
+        "call": kernels.write_call,
+        "m": chart.m,
+        "starts": _STARTS,
+        "rules": asdict(RULES),
+        "xi_size": float(chart.parts.phi_sizes[chart.m]),
+        "period": float(chart.parts.turns[chart.m]),
+        "low": low,
+        "high": high,
+        "centre": domain.centre,
+        "half_width": domain.half_width,
+        "turning": curves.tracer.turning,
+        "bounded": np.isfinite(low),
+        "winding": curves.boxed.winding,
+        "pivots": kernels.numbers.get("curve_pivots", 0),
+    }
+    return render("curves.c", values)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class CompiledInverse(Shown):
     """`Chart.solve` and `Chart.nearest_xi` in compiled C; `orthocas.compile_inverse` makes it."""
@@ -104,46 +182,6 @@ class CompiledInverse(Shown):
         return load_library(self.library)
 
 
-def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledInverse:
-    """Compile the inverse map of a chart, or find it compiled earlier; for large batches.
-
-    The first call for a chart generates and compiles C, which takes some seconds. Later calls, also in other processes,
-    find the library in the folder: its name is a digest of the C code, the compiler and its options.
-
-    Args:
-        chart: a chart with a closed expression.
-        folder: where compiled libraries are kept; default `orthocas/libraries` in $XDG_CACHE_HOME
-            or ~/.cache. Only the user and root may be able to write there.
-
-    Raises:
-        CompileError: if there is no C compiler, or others may write to the folder.
-        NoExpressionError: if the chart is grown.
-        InvalidValueError: if the folder cannot be written.
-
-    Example:
-        >>> from tempfile import TemporaryDirectory
-        >>> import orthocas as oc
-        >>> from orthocas import problems
-        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
-        >>> with TemporaryDirectory() as folder:  # or without a folder, to keep the library
-        ...     compiled = oc.compile_inverse(chart, folder)
-        ...     solutions = compiled.solve(chart.phi([[0.7, 0.9, 0.6], [0.6, 0.8, 0.8]]))
-        >>> solutions.found.tolist()
-        [True, True]
-    """
-    require_kind("chart", chart, Chart)
-    # the library of the chart, then what takes many rows, then what follows curves
-    with open_draft_folder() as drafts:
-        generate_c(chart, drafts, name="arm")
-        sources = {path.name: path.read_text(encoding="utf-8") for path in sorted(drafts.glob("*.[hc]"))}
-    sources[_ROWS] = get_source(_ROWS)
-    curves = chart.parts.inverse.curves
-    if curves is not None:
-        sources |= {name: get_source(name) for name in ("curve_rows.c", "curve_math.c")}
-        sources["curves.c"] = write_curve_source(chart, curves)
-    return CompiledInverse(chart, keep_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder))
-
-
 @dataclass(frozen=True, eq=False)
 class CompiledCurves(SelfMotionCurves):
     """Self-motion curves with their search in compiled C."""
@@ -171,41 +209,3 @@ class CompiledCurves(SelfMotionCurves):
         run_in_threads(search_piece, range(0, len(own), _CURVE_PIECE))
         best.between[:] = between
         return best
-
-
-def write_curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
-    """C of the search along self-motion curves: kernels and tables of a chart, then runtime/curve_rows.c.
-
-    Raises:
-        DomainError: if the domain has a condition, but no expression of it.
-    """
-    q, domain = ca.MX.sym("q", chart.n), chart.problem.domain
-    x, own = ca.MX.sym("x", chart.m), chart.coordinates.functions
-    # Errors and gradients of the task, xi with its gradient, and the condition of the domain.
-    functions = [
-        dense_function("curve_task", [q, x], curves.tracer.equations.call([q, x])),
-        dense_function("curve_xi", [q], [chart.parts.runnable(own["xi"])(q)]),
-        dense_function("curve_gradient", [q], [chart.parts.runnable(own["jacobian"])(q)]),
-    ]
-    if domain.condition is not None:
-        functions.append(dense_function("curve_pivots", [q], [domain.condition.pivots(q)]))
-    kernels, (low, high) = generate_kernels(functions, "kernel"), domain.bounds
-    values = {
-        "kernels": kernels.code,
-        "arrays": kernels.declare_arrays,
-        "call": kernels.write_call,
-        "m": chart.m,
-        "starts": _STARTS,
-        "rules": asdict(RULES),
-        "xi_size": float(chart.parts.phi_sizes[chart.m]),
-        "period": float(chart.parts.turns[chart.m]),
-        "low": low,
-        "high": high,
-        "centre": domain.centre,
-        "half_width": domain.half_width,
-        "turning": curves.tracer.turning,
-        "bounded": np.isfinite(low),
-        "winding": curves.boxed.winding,
-        "pivots": kernels.numbers.get("curve_pivots", 0),
-    }
-    return render("curves.c", values)
