@@ -38,7 +38,7 @@ class ChartKernelRules:
     xi_found: float = 1e-9  #: error of xi of a posture that has it
     xi_weight: float = 1e-3  #: of errors of xi, relative to those of x
     posture_weight: float = 1e-4  #: of the way back to the last posture with a chart, where there is none
-    push_weight: float = 0.3  #: of pairs that come nearer than `avoid`, relative to x
+    push_weight: float = 1.0  #: of pairs that come nearer than `avoid`, relative to x
     pushes: int = 8  #: of these pairs, the nearest ones
     turns: int = 4  #: of a call, until no more pairs come nearer
     kept: float = 1e-5  #: [m] that these may be nearer than `avoid`

@@ -49,7 +49,7 @@ class ArmTracker(Shown):
     while; so it does where it is stuck without x. `detours=False` forbids both.
 
     With a collision model it brakes as `orthocas.charts.trackers.Tracker` does, on detours too, whatever the limits of
-    acceleration. With `avoid`, pairs that a step would bring nearer join the program above with a weight of 0.3, as
+    acceleration. With `avoid`, pairs that a step would bring nearer join the program above with the weight of x, as
     rows that keep them at that distance, and the step is made again: xi yields.
 
     A call is one call of compiled C, and of a few with `avoid`; each takes a bounded time.
