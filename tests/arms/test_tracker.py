@@ -262,7 +262,7 @@ def test_a_copied_tracker_goes_on_where_the_first_one_is() -> None:
 
 
 def test_a_fold_is_passed_in_the_direction_of_the_motion() -> None:
-    """The poses of a straight joint motion lead to a posture where J nearly loses rank, and joints to its other side."""
+    """The poses of a straight joint motion lead to a posture where J nearly loses rank, and joints beyond it."""
     arm = oc.Arm(panda().task)
     begin = np.array([-0.5968, -0.1594, -1.3922, -3.0717, 0.3344, 2.8393, 0.4327])
     end = np.array([-1.3968, 0.2521, -0.6078, -2.8718, 0.5942, 2.3023, -0.1178])
