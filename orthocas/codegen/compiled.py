@@ -125,7 +125,7 @@ def _require_own(place: Path) -> None:
 
 
 def _is_whole(library: Path) -> bool:
-    """Whether a library is there as it was compiled: the system ends processes that load half of one."""
+    """Whether a library is complete: the system ends processes that load half of one."""
     try:
         return library.with_name(f"{library.name}.sha256").read_text() == compute_digest(library)
     except (OSError, ValueError):
