@@ -38,6 +38,7 @@ from orthocas.tools.checks import (
     as_float_array,
     as_number,
     as_path,
+    as_point,
     as_point_set,
     require_count,
     require_kind,
@@ -112,7 +113,7 @@ class Arm(Shown):
 
     Where a chart ends at a boundary of its domain, an arm goes on: it knows the postures of a task value x within the
     joint limits. Without limits they are a few closed curves, which are traced from stored postures and then cut at
-    the limits: `self_motion`, `nearest`, `solve` and `solutions`. Charts give postures a number xi on each branch.
+    the limits: `self_motion` and `solve`. Charts give postures a number xi on each branch.
     `tracker` follows a stream of x and xi through borders of charts, singular positions and out of reach. Arms with
     several joints more than the task needs, such as those on mobile bases, have trackers only.
 
@@ -276,49 +277,6 @@ class Arm(Shown):
         self.require_one_free()
         return find_motions(self.maps, self._read_one(x))
 
-    def solutions(
-        self, x: Any, xi: float | None = None, collisions: Collisions | None = None
-    ) -> tuple[Arc, ...] | Postures:
-        """All postures with a task value, on all branches.
-
-        Args:
-            x: one task value.
-            xi: that postures are to have in the chart of their branch; None for any.
-            collisions: of the robot, for postures with xi: those without a contact come first, the others are
-                COLLIDING.
-
-        Returns:
-            Without xi the arcs, the components of `self_motion`; with xi the postures where a chart has it.
-
-        Raises:
-            InvalidValueError: if x is no task value, xi is given to an arm without charts, or collisions without xi.
-        """
-        self._check_collisions(collisions)
-        if collisions is not None and xi is None:
-            raise InvalidValueError("collisions", "given without xi", "xi with it; `solve` takes it without xi")
-        motions = self.self_motion(x)
-        if xi is None:
-            return motions.components
-        self._require_charts()
-        value = as_number("xi", xi)
-        found = [(q, name) for k, name in enumerate(self.branch_names) for q in self._find_xi(motions, k, value)]
-        q = np.array([q for q, _ in found]).reshape(-1, self.robot.n)
-        names = tuple(name for _, name in found)
-        status = np.full(len(q), int(InverseStatus.FOUND))
-        if collisions is not None and len(q):
-            status[~collisions.check_free(q)] = InverseStatus.COLLIDING
-        order = np.argsort(status, kind="stable")
-        return Postures(q[order], status[order], tuple(names[k] for k in order), np.full(len(q), value))
-
-    def nearest(self, x: Any, q_wish: ArrayLike) -> Postures:
-        """The posture within the joint limits with a task value that is nearest to another one, |q - q_wish| least.
-
-        Args:
-            x: one task value, or N of them.
-            q_wish: (n,), or one for each (N, n).
-        """
-        return self.solve(x, start=q_wish)
-
     def solve(
         self,
         x: Any,
@@ -326,8 +284,10 @@ class Arm(Shown):
         start: ArrayLike | None = None,
         branch: str = ANY,
         collisions: Collisions | None = None,
+        *,
+        all: bool = False,  # noqa: A002
     ) -> Postures:
-        """A posture within the joint limits for each task value.
+        """A posture within the joint limits for each task value, or all with one x and xi.
 
         With xi, charts are asked in turn: that of the start's branch first, or else the largest. Newton's method goes
         to (x, xi) from the start, or from the nearest of stored postures; the first chart in which it arrives gives the
@@ -346,19 +306,25 @@ class Arm(Shown):
                 the same x and xi takes its place; else, of free postures 0.05 rad apart on the arcs, that with the
                 nearest xi (NEAREST), or without xi that nearest to the start, or farthest from limits. Where none is
                 free, the status is COLLIDING.
+            all: return all postures with one task value in which the chart of their branch has one xi, those without a
+                contact first, the others COLLIDING. Without xi, they are the arcs of `self_motion`.
 
         Raises:
-            InvalidValueError, ShapeError: for arguments that do not fit, or an xi or branch without charts.
+            InvalidValueError, ShapeError: for arguments that do not fit, an xi or branch without charts, or all without
+                xi.
         """
         self.require_one_free()
+        require_kind("all", all, bool)
         self._check_collisions(collisions)
+        require_kind("branch", branch, str)
+        if branch != ANY:
+            require_known("branch", branch, self.branch_names)
+        if all:
+            return self._solve_all(x, xi, start, branch, collisions)
         # What was asked: targets, starts, charts that may answer, and xi.
         targets, single = self._read(x)
         N, n = len(targets), self.robot.n
         starts = None if start is None else _repeat_rows("start", as_point_set("start", start, n)[0], N)
-        require_kind("branch", branch, str)
-        if branch != ANY:
-            require_known("branch", branch, self.branch_names)
         chosen = [k for k, name in enumerate(self.branch_names) if branch in (ANY, name)]
         values = None
         good = np.asarray(np.isfinite(targets).all(axis=1))
@@ -401,6 +367,24 @@ class Arm(Shown):
         if single:
             return Postures(q[0], InverseStatus(int(status[0])), names[0], own[0])
         return Postures(q, status, names, own)
+
+    def _solve_all(
+        self, x: Any, xi: ArrayLike | None, start: ArrayLike | None, branch: str, collisions: Collisions | None
+    ) -> Postures:
+        """All postures with x and xi, those without a contact first, and then those nearest to a start."""
+        self._require_charts()
+        if xi is None:
+            raise InvalidValueError("all", True, "an xi with it; without one, they are the arcs of `self_motion(x)`")
+        motions, value = self.self_motion(x), as_number("xi", xi)
+        chosen = [(k, name) for k, name in enumerate(self.branch_names) if branch in (ANY, name)]
+        found = [(q, name) for k, name in chosen for q in self._find_xi(motions, k, value)]
+        q = np.array([q for q, _ in found]).reshape(-1, self.robot.n)
+        status = np.full(len(q), int(InverseStatus.FOUND))
+        if collisions is not None and len(q):
+            status[~collisions.check_free(q)] = InverseStatus.COLLIDING
+        away = np.zeros(len(q)) if start is None else np.linalg.norm(q - as_point("start", start, self.robot.n), axis=1)
+        order = np.lexsort((away, status))
+        return Postures(q[order], status[order], tuple(found[k][1] for k in order), np.full(len(q), value))
 
     def tracker(
         self,

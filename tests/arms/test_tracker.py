@@ -142,7 +142,7 @@ def test_xi_on_another_arc_is_reached_again() -> None:
     arm, chart = panda(), panda().charts[0]
     q = np.array([0.3, -0.9, 1.2, -1.9, 0.6, 2.0, 0.2])
     x, xi = arm.x(q), float(chart.xi(q)[0])
-    arcs, own = arm.solutions(x), arm.self_motion(x).nearest(q).component
+    arcs, own = arm.self_motion(x), arm.self_motion(x).nearest(q).component
     others = [arc.at(arc.length / 2) for k, arc in enumerate(arcs) if k != own]
     other = min(others, key=lambda posture: float(np.abs(posture - q).max()))
     for detours, end in ((True, TrackStatus.OK), (False, TrackStatus.YIELDING)):
