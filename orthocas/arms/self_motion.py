@@ -332,7 +332,7 @@ class SelfMotions(Shown):
         return Gap(value, *best)
 
     def merge(self, a: int, b: int) -> Merge:
-        """A way from one component to another that leaves x little.
+        """A way from one component to another on which x deviates little.
 
         From the straight way across their gap, postures go down to smaller errors of x, across the way, which is kept
         at equal distances. It is one way, not the best of all: its error is an upper bound of the least.

@@ -50,7 +50,7 @@ class TargetReader:
         return targets
 
     def vector(self, targets: Array) -> Array:
-        """Values of x as vectors (N, m), of targets (N, k); NaN where these are."""
+        """Targets (N, k) as vectors of x (N, m); NaN where a target is NaN."""
         turn = self.task.turn
         if turn is None or not turn.whole:
             return targets

@@ -267,7 +267,7 @@ def require_same(chart: Chart, certificate: Certificate) -> None:
 
 
 def _sample_suspects(chart: Chart) -> Array:
-    """The home, and the sample with the least sign(det J(home)) det J: uniform, near faces, and near corners."""
+    """Two suspects: the home, and the sample with the least sign(det J(home)) det J, of three kinds of samples."""
     domain = chart.problem.domain
     # Powers of uniform samples lie near faces and corners.
     rng = np.random.default_rng(0)

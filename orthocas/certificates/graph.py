@@ -94,7 +94,7 @@ def _build_one() -> TaylorModel:
 
 
 def _apply_step(name: str, of: Sequence[_Jet]) -> _Jet:
-    """A step of any kind."""
+    """Apply one step of a tape to jets."""
     a, slopes = of[0], Slopes()
     # f^k has the derivative k f^(k - 1) f'.
     if name in POWERS:

@@ -119,7 +119,7 @@ def list_multi_indices(n: int, order: int) -> tuple[Monomial, ...]:
 
 @cache
 def find_neighbours(n: int, order: int) -> NDArray[np.intp]:
-    """Where the multi-index m + e_i of an order stands among those of that order, (n, multi-indices m)."""
+    """Positions of the multi-indices m + e_i in the list of their order, (n, multi-indices m)."""
     index = {m: k for k, m in enumerate(list_multi_indices(n, order))}
     return np.array([[index[tuple(sorted((*m, i)))] for m in list_multi_indices(n, order - 1)] for i in range(n)])
 

@@ -72,7 +72,7 @@ class CurveTracer:
     held: tuple[int, ...] = ()  #: r - 1 joints
 
     def reach(self, x: Array, starts: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Where damped least squares lead from starts (M, n), whatever the limits, and whether near x (M, m), (M,)."""
+        """Where damped least squares end from starts (M, n), without limits; whether x (M, m) is met, (M,)."""
         q, arrived, left = starts.copy(), np.zeros(len(starts), dtype=bool), np.arange(len(starts))
         # rows drop out when they arrive, or where the step has no value
         for _ in range(RULES.reach):
@@ -222,10 +222,10 @@ class CurveTracer:
 
     @cached_property
     def _step(self) -> BlockedFunction:
-        """A step along a curve: q, t, bend, h, q0, t0 in one column, and x -> new q and t, and four numbers.
+        """One step: a column (q, t, bend, h, q0, t0) and x -> the new q and t, and four numbers.
 
-        They are the length of the correction, the cosine between the tangents, and the distance of q from q0 up to full
-        turns, also along t0.
+        The numbers are the length of the correction, the cosine between the tangents, and the distance of q from q0 up
+        to full turns, also along t0.
         """
         q, x = self._symbols[:2]
         n = q.shape[0]

@@ -199,7 +199,7 @@ def solve_programs(programs: Programs, at: NDArray[np.int8]) -> tuple[Array, NDA
 
 
 def _solve_held(programs: Programs, held: NDArray[np.int8]) -> tuple[Array, NDArray[np.int8]]:
-    """d (N, n) where the bounds that are held, (N, n), are equations, and those that hold next by d."""
+    """Solve for d (N, n) with the held bounds (N, n) as equations; returns d and the bounds to hold next."""
     K, joint = programs.H.copy(), held != 0
     # joints at a bound get the equation d = bound
     here, j = np.nonzero(joint)

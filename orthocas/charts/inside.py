@@ -335,7 +335,7 @@ class Slices:
 
 @dataclass(frozen=True, eq=False)
 class Slide:
-    """Where N rows ended."""
+    """The points at which the searches of N rows ended."""
 
     u: Array  #: points of the box, (N, n)
     error: Array  #: largest error of x, (N,)

@@ -31,7 +31,7 @@ def leave_over(apart: float, tolerance: float, change: Array, turning: tuple[int
 
 
 def counted_on(rows: Array, turns: Array) -> Array:
-    """Rows (N, k) of values along a curve; periodic ones go on by the shorter way from row to row."""
+    """Values along a curve (N, k), continuous: periodic ones are continued by the shorter way from row to row."""
     if not turns.any():
         return rows
     steps = wrap_shortest(np.diff(rows, axis=0), turns)

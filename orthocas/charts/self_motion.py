@@ -443,7 +443,7 @@ def xi_range(chart: Chart, q: ArrayLike, collisions: Collisions | None = None) -
 
 
 def too_far(chart: Chart, q: Array, wanted: Array) -> str:
-    """The coordinate that is wanted (r,) farthest outside its range at q (n,), in words; empty if there is none."""
+    """Name the coordinate whose target (r,) is farthest outside its range at q (n,); empty if none is outside."""
     if chart.parts.turns.any():
         return ""
     reach = xi_range(chart, q)

@@ -99,7 +99,7 @@ class _Notes(logging.Handler):
     """Prints what the library logs, as warnings."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """One line."""
+        """Print a record of the log as one line."""
         _show_warning(record.getMessage())
 
 

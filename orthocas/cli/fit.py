@@ -18,12 +18,14 @@ from orthocas.cli.options import (
     DOMAIN,
     WEIGHTS_TEXT,
     AsJson,
+    DisabledPairs,
     Force,
     LikeNames,
     ProblemName,
     ProblemOptions,
     SampleCount,
     add_problem_options,
+    add_solids,
     is_robot_file,
     parse_likeness,
     parse_number,
@@ -152,6 +154,15 @@ def fit(
             help="Bound on the rms deviation of the mutual angles from 90 deg; Ipopt minimises the task angle.",
         ),
     ] = None,
+    collisions: Annotated[
+        str | None,
+        typer.Option(
+            "--collisions",
+            metavar="FILE.urdf|NAME",
+            help="With --domain branch: be regular where the robot does not hit itself, by the solids of this file.",
+        ),
+    ] = None,
+    srdf: DisabledPairs = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="Chart file; default: PROBLEM.orthocas in the current folder.")
     ] = None,
@@ -163,10 +174,12 @@ def fit(
     if domain == _ALL:
         own = {"param": param, "solver": solver, "like": like, "exact": exact or None, "corridor": corridor, **bounds}
         own |= {"samples": samples, "angles": angles, "max-mutual-deg": max_mutual_deg}
+        own |= {"collisions": collisions, "srdf": srdf}
         own |= {"weights": None if weights == WEIGHTS_TEXT else weights}
         _fit_arm(problem, words, own, seed, out, force, json)
         return
-    kind, branch = _check_domain(domain, corridor, bounds)
+    solids = (collisions, srdf)
+    kind, branch = _check_domain(domain, corridor, bounds, solids)
     if exact and (kind != _BRANCH or like is None):
         raise OptionError("--exact requires --domain branch and --like")
     if kind == _BRANCH:
@@ -199,6 +212,7 @@ def fit(
                     problem,
                     words,
                     branch,
+                    solids,
                     quantities,
                     exact or None,
                     parametrisation,
@@ -263,7 +277,12 @@ def _fit_arm(
     )
 
 
-def _check_domain(domain: str | None, corridor: Path | None, bounds: Mapping[str, float | None]) -> tuple[str, str]:
+def _check_domain(
+    domain: str | None,
+    corridor: Path | None,
+    bounds: Mapping[str, float | None],
+    solids: tuple[str | None, Path | None],
+) -> tuple[str, str]:
     """The kind of a domain, and the name of its branch; raises OptionError for options of another kind."""
     kind, _, branch = (domain or "").partition(":")
     if domain is not None and corridor is not None:
@@ -278,6 +297,8 @@ def _check_domain(domain: str | None, corridor: Path | None, bounds: Mapping[str
             repr(domain),
             "auto, branch, branch:NAME, all, or --centre and --half-width for a box of your own",
         )
+    if kind != _BRANCH and solids != (None, None):
+        raise OptionError("--collisions requires --domain branch")
     return kind, branch.strip()
 
 
@@ -328,6 +349,7 @@ def _fit_wide(
     name: str,
     words: ProblemOptions,
     branch: str,
+    solids: tuple[str | None, Path | None],
     like: str | list[str] | None,
     exact: bool | None,
     parametrisation: Parametrisation | None,
@@ -340,6 +362,11 @@ def _fit_wide(
     words.require_none(("centre", "half_width"), "--domain branch is a domain")
     base = None if is_robot_file(name) else replace(words, least_singular_value=None).build_problem(name)
     robot, task, metric = _build_parts(name, words, base)
+    free = solids != (None, None)
+    if free:
+        # The task is one of the same joints.
+        robot = add_solids(robot, *solids)
+        task = Task.from_recipe(robot, task.recipe)
     centre = None if base is None or branch else base.domain.home
     with warnings.catch_warnings():
         # commands print a note instead
@@ -351,6 +378,7 @@ def _fit_wide(
             metric,
             clearance=CLEARANCE if words.least_singular_value is None else words.least_singular_value,
             parametrisation=parametrisation,
+            collisions=free,
             home=words.home if base is None else centre,
             like=like,
             exact=exact,

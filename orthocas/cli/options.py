@@ -255,21 +255,24 @@ class ProblemOptions:
 
 
 def read_solids(robot: Robot, urdf: str | None, srdf: Path | None) -> Collisions | None:
-    """The collision model that --collisions and --srdf name; None without them.
+    """The collision model that --collisions and --srdf name; None without them. Errors as in `add_solids`."""
+    return None if urdf is None and srdf is None else add_solids(robot, urdf, srdf).collisions
+
+
+def add_solids(robot: Robot, urdf: str | None, srdf: Path | None) -> Robot:
+    """The robot with the solids that --collisions and --srdf name.
 
     Raises:
         OptionError: for --srdf alone.
         RobotError: if a file cannot be read, or is that of another robot.
     """
     if urdf is None:
-        if srdf is not None:
-            raise OptionError("--srdf requires --collisions FILE.urdf, which has the solids")
-        return None
+        raise OptionError("--srdf requires --collisions FILE.urdf, which has the solids")
     path = find_robot_file(urdf) if is_robot_name(urdf) else Path(urdf)
-    found = robot.with_solids(path, srdf).collisions
-    if found.missing:
-        note(f"nothing is known of {listed(found.missing)}: no mesh in {path}, so contacts with it go unseen")
-    return found
+    solid = robot.with_solids(path, srdf)
+    if missing := solid.collisions.missing:
+        note(f"nothing is known of {listed(missing)}: no mesh in {path}, so contacts with it go unseen")
+    return solid
 
 
 def is_robot_file(name: str) -> bool:

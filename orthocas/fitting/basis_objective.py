@@ -259,7 +259,7 @@ class BasisObjective:
 
     @property
     def _parts(self) -> list[slice]:
-        """The blocks of samples in parts."""
+        """Slices of at most `RULES.blocks` samples."""
         return [slice(start, start + RULES.blocks) for start in range(0, len(self.X), RULES.blocks)]
 
     def _evaluate_jacobians(self, theta: Array) -> Array:

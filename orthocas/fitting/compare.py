@@ -506,7 +506,7 @@ class Comparison(Shown):
         return any(result.solver == WIDE for result in self.results)
 
     def summaries(self) -> list[Summary]:
-        """One per parametrisation, solver and weights, best task angle (wide: leak) first, failed ones last."""
+        """One for each parametrisation, solver and weights: best task angle (wide: leak) first, failures last."""
         groups: dict[tuple[str, str, str], list[CellResult]] = {}
         for result in self.results:
             groups.setdefault((result.parametrisation, result.solver, result.weights), []).append(result)

@@ -245,7 +245,7 @@ class _Distance:
         self._data[2] = self._data[2].reshape(N, r * n)
 
     def value(self, theta: Array) -> float:
-        """Distance at theta."""
+        """The distance to the grown coordinates for parameters theta."""
         return float(self._run(self._value, theta)[0][0, 0])
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:

@@ -467,7 +467,7 @@ class MeaningError:
 
     @property
     def explained(self) -> str:
-        """The error in words."""
+        """How far the coordinate is from its quantity, in words."""
         rates = f"moves it by {self.slow:.2g} to {self.fast:.2g} (5 to 95 %) for each unit"
         off = f"{self.rms:.2g} off (rms), {self.undetermined:.2g} after the best monotone map"
         against = f"against it on {percent(self.against, fault=True)} of the domain, where it turns back"

@@ -291,7 +291,7 @@ class _Block:
 
     @classmethod
     def filled(cls, graph: _LossGraph, points: Array, data: Array, total: int) -> "_Block":
-        """Samples with weight 1 / total each. Unused columns repeat samples with weight 0."""
+        """Samples in blocks, with the weight 1 / total each. Unused columns repeat samples with the weight 0."""
         kept = np.arange(graph.columns) % len(points)
         share = np.where(np.arange(graph.columns) < len(points), 1 / total, 0.0)
         return cls(graph, np.ascontiguousarray(points[kept]), np.ascontiguousarray(data[kept].T), share)

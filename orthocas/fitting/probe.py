@@ -108,7 +108,7 @@ class Quality:
         return dict(sorted(ratios.items(), key=lambda pair: -pair[1]))
 
     def keeps(self, bounds: Bounds | None) -> bool:
-        """Whether no bound is missed; False without bounds."""
+        """Whether all bounds are met; False without bounds."""
         return bounds is not None and max(self.excess(bounds).values()) <= 1
 
     def explained(self, miss: Miss, bounds: Bounds) -> str:

@@ -142,7 +142,7 @@ class Mirror:
         return np.concatenate(coordinates_of(list(rows), self.exchanged))
 
     def components(self, theta: Array) -> Array:
-        """Coefficients of the components, (r K,), from those of the coordinates."""
+        """Coefficients of the symmetric components, (r K,), from those of the coordinates."""
         rows = theta.reshape(len(self.parities), -1)
         back = tuple((j, i) for i, j in self.exchanged)
         return np.concatenate(coordinates_of(list(rows), back))
@@ -166,7 +166,7 @@ class Mirror:
 
     @cached_property
     def _kept(self) -> dict[LinearFamily, NDArray[np.bool_] | None]:
-        """Results of `kept` so far."""
+        """Results of `kept` by family, filled on use."""
         return {}
 
 

@@ -461,7 +461,7 @@ def _name_coordinates(
 
 
 def _describe_left_out(problem: Problem, branch: Branch, counted: Array, share: float) -> str:
-    """What a chart leaves out of a branch, of which some positions (N, n) are clear; empty for little."""
+    """Describe what a chart leaves out of a branch, judged by its clear positions (N, n); empty if that is little."""
     domain, reasons = problem.domain, []
     if share < RULES.divided and not np.array_equal(domain.home, domain.centre):
         reason = "its middle is not clear, and coordinates have one direction on a part of it only"

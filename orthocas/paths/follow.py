@@ -320,7 +320,7 @@ class MotionLimits:
         return f"; just before, the coordinates reach {ranges} one at a time"
 
     def measure_margins(self, q: Array, dq: Array, ddq: Array) -> Margins:
-        """What a motion leaves, at its time stamps."""
+        """Room that a motion leaves at its time stamps: to limits, singular positions and contacts."""
         # Room to the boundary, relative to the half-widths.
         low, high = self.chart.problem.domain.bounds
         room = np.minimum(q - low, high - q) / self.chart.problem.domain.half_width

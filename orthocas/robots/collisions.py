@@ -22,6 +22,7 @@ from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
     Array,
+    Flags,
     Indices,
     as_float_array,
     as_number,
@@ -347,7 +348,7 @@ class Collisions(Shown):
             ]
         return Collisions(self.tree, (*self.parts, *parts), pairs, self.missing, self.origin)
 
-    def scan_near(self, points: Array, least: float, asked: Array) -> Iterator[tuple[int, float]]:
+    def scan_near(self, points: Array, least: float, asked: Flags) -> Iterator[tuple[int, float]]:
         """Pairs that are nearer than some distance, with their distances, at postures (N, n).
 
         Args:
@@ -387,7 +388,7 @@ class Collisions(Shown):
         return np.array([row[0] for row in measured]), np.array([row[1] for row in measured])
 
     def list_near_parts(self, q: Array, within: float | Array) -> Indices:
-        """Numbers of pairs of parts whose bounds at q (n,) are nearer than a distance, or each than its own (K,)."""
+        """Indices of pairs of parts whose lower bounds at q (n,) are below a distance, one for all or each, (K,)."""
         return np.flatnonzero(self._bound_distances(q[None], within)[0] < within)
 
     def measure_parts(self, q: Array, index: Indices) -> tuple[Array, Array, Array]:

@@ -232,7 +232,7 @@ def collect_inertials(tree: KinematicTree) -> Array:
 
 
 def find_first_moments(tree: KinematicTree) -> tuple[list[int], tuple[int, ...]]:
-    """Places among `collect_inertials` of what gravity acts on, and the joint that carries each.
+    """Indices in `collect_inertials` of the numbers on which gravity depends, and the joint that carries each.
 
     These are mass times centre across the axis for revolute joints, and the mass for prismatic ones.
     """

@@ -223,7 +223,7 @@ class CompiledLoop:
         return partial(self._build_integrator(step, tolerance).continuous, outputs)
 
     def ticks(self, period: float, tolerance: float) -> Callable[..., tuple[Array, Array, Array]]:
-        """What `run_ticks` calls, for one thread, for ticks of a length [s]."""
+        """The function that `run_ticks` calls in one thread, for ticks of the length `period` [s]."""
         return partial(self._build_integrator(period, tolerance).ticks, period)
 
     def rows(self, name: str, *arguments: Array) -> list[Array]:

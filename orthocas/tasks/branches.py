@@ -342,7 +342,7 @@ def _find_sliver_cut(
 
 
 def sample_nonsingular(robot: Robot, task: Task, box: Box, samples: int, seed: int | tuple[int, ...]) -> Array:
-    """Uniform positions of a box at which a task is clear, as `branches` counts them, (N, n).
+    """Uniform clear positions of a box, (N, n); `branches` counts the same positions as clear.
 
     Args:
         robot: the robot.

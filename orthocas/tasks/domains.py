@@ -154,7 +154,7 @@ class Domain(ABC):
 
     @property
     def fold_bound(self) -> FoldBound | None:
-        """What `room_to_fold` is made of, for code that evaluates it in other libraries."""
+        """The parts of `room_to_fold`, for exports that evaluate it with other libraries."""
         return None
 
     @property

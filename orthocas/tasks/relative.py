@@ -1,4 +1,4 @@
-"""Task values relative to target ones: where x holds a whole orientation, nothing happens half a turn from anywhere."""
+"""Task values relative to a target, so that whole orientations have no end half a turn from a reference."""
 
 from typing import Any
 

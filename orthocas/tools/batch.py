@@ -195,7 +195,7 @@ if hasattr(os, "register_at_fork"):
 
 
 class _BlasHold:
-    """BLAS held to one thread while anyone wants it so."""
+    """Holds BLAS to one thread while any caller asks for it."""
 
     def __init__(self) -> None:
         self._lock, self._count = Lock(), 0
@@ -205,7 +205,7 @@ class _BlasHold:
         self._limits: Any = None
 
     def begin(self) -> None:
-        """One more wants it."""
+        """Limit BLAS to one thread, if no other caller has."""
         with self._lock:
             if not self._count:
                 # New modules may have brought libraries.

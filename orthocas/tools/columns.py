@@ -186,7 +186,7 @@ def fill(results: NDArray[Any], points: Array, make: Callable[[], BlockFunction]
 
 
 def fill_blocks(results: NDArray[Any], function: BlockFunction, columns: int, *arguments: Array) -> None:
-    """`fill` by one function, of blocks of so many columns, in this thread."""
+    """Fill the results in this thread, by calls of one function on blocks of `columns` columns."""
     for first in range(0, len(results), columns):
         count = min(columns, len(results) - first)
         values = function(*(_fill_columns(array[first : first + columns], columns) for array in arguments))

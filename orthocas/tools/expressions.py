@@ -47,7 +47,7 @@ Value = TypeVar("Value")
 
 
 class HoldsFunctions:
-    """Base of objects with CasADi functions among their fields: pickles say which CasADi wrote them."""
+    """Base of objects with CasADi functions among their fields; pickles record the version of CasADi."""
 
     def __getstate__(self) -> dict[str, Any]:
         """The fields, with functions as text."""

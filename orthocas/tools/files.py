@@ -234,7 +234,7 @@ def _name_full_disk(folder: Path, drafts: Path) -> Iterator[None]:
 
 
 def require_replaceable_files(folder: Path, names: Iterable[str], force: bool) -> None:
-    """Check early, before long work, that no file with one of these names is there that orthocas did not write.
+    """Check before long work that these names are free, or belong to files that orthocas wrote.
 
     Raises:
         ArchiveError: if there is one, or a symbolic link.

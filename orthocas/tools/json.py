@@ -165,7 +165,7 @@ class Reader:
         return data
 
     def items(self, data: object, where: str) -> list[Any]:
-        """A list."""
+        """Return the data if it is a list; raise otherwise."""
         if not isinstance(data, list):
             raise self.wrong(where, data, "a list")
         return data

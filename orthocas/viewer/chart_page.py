@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from html import escape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.self_motion import Fan, fan_along
+from orthocas.paths.tool_path import read_path
 from orthocas.robots.collisions import Collisions
 from orthocas.tasks.branches import branches
 from orthocas.tools.checks import Array
 from orthocas.viewer.contacts import Contacts
-from orthocas.viewer.looks import RULES, Arm, Ghosts, Look, compute_chain_length
+from orthocas.viewer.looks import RULES, Arm, Ghosts, Look, build_shape, compute_chain_length
 from orthocas.viewer.motion import join_waypoints, write_joints
 from orthocas.viewer.panel import ChartPanel
 from orthocas.viewer.session import Session, describe_stop
@@ -37,7 +39,8 @@ class ChartPage:
         self._panel = ChartPanel(session.chart, session.place)
         self._loop = Loop(self._settle, self._show_failure)
         self._gesture = self._dragging = self._sweeping = False
-        self._play: Any = None  # the button of a path
+        self._path: Array | None = None  # waypoints to play
+        self._line: Any = None  # that shows them
         self._recorded: list[tuple[float, Array]] | None = None  # times [s] and joints (n,), while it records
         # The scene, with room for all that the coordinates reach, then what the user moves, then what it shows first.
         robot = session.chart.problem.robot
@@ -49,8 +52,8 @@ class ChartPage:
         self._readings = place_panels(server)
         self._sliders = self._add_sliders()
         self._add_buttons()
-        if path is not None:
-            self._add_path(path)
+        self._add_files()
+        self._set_path(path)
         self._show()
         self._settle()
         self._loop.start()
@@ -139,20 +142,54 @@ class ChartPage:
             if not branching.mirrors:
                 self._server.gui.add_markdown("No mirror image of this arm has the same pose of its tip.")
 
-    def _add_path(self, path: Array) -> None:
-        """A button that plays a path, whose waypoints are drawn where the task has a whole position."""
-        labels = self._chart.labels[: path.shape[1]]
-        kept = "the coordinates stay" if len(labels) == self._chart.m else "with its coordinates"
-        with self._server.gui.add_folder(f"Path: {kept}"):
-            self._play = self._add_button("Play", "player-play", partial(self._toggle_path, path))
-        if labels[:3] == ("x", "y", "z") and self._chart.problem.task.of_tip:
+    def _add_files(self) -> None:
+        """Lists of the paths and robot files in the folder where the view began, and a button that plays a path.
+
+        The page offers names and gets no others: what a browser sends never becomes a path of its own.
+        """
+        gui = self._server.gui
+        with gui.add_folder("Path"):
+            for suffix, what, load in ((".csv", "file", self._load_path), (".urdf", "links", self._load_look)):
+                names = sorted(place.name for place in Path.cwd().glob(f"*{suffix}"))[: RULES.most_files]
+                if names:
+                    chosen = gui.add_dropdown(what, (_NONE, *names), initial_value=_NONE)
+                    chosen.on_update(self._loop.build_handler(what, partial(load, chosen)))
+            self._play = self._add_button("Play", "player-play", self._toggle_path)
+
+    def _load_path(self, chosen: Any) -> None:
+        """Take the waypoints of the chosen file."""
+        self._rest()
+        x, xi = (None, None) if chosen.value == _NONE else read_path(Path.cwd() / chosen.value, self._chart)
+        self._set_path(x if x is None or xi is None else np.hstack([x, xi]))
+
+    def _load_look(self, chosen: Any) -> None:
+        """Draw the links as the chosen robot file shows them, or as drums and rods."""
+        robot = self._chart.robot
+        shape = build_shape(robot, None if chosen.value == _NONE else Path.cwd() / chosen.value, None)
+        with self._server.atomic():
+            self._arm.remove()
+            self._arm = Arm(self._server.scene, "/arm", robot, shape.look)
+        self._show_arm(self.session.q)
+
+    def _set_path(self, path: Array | None) -> None:
+        """Take waypoints to play, and draw them where the task has a whole position."""
+        self._path, self._play.disabled = path, path is None
+        if self._line is not None:
+            self._line.remove()
+            self._line = None
+        labels = self._chart.labels[:3]
+        if path is not None and labels == ("x", "y", "z") and self._chart.problem.task.of_tip:
             thickness = RULES.trace * compute_chain_length(self._chart.problem.robot.tree)
             ends = np.stack([path[:-1, :3], path[1:, :3]], axis=1)
-            self._server.scene.add_line_segments("/path", ends, RULES.path_colours[0], thickness=thickness)
+            self._line = self._server.scene.add_line_segments("/path", ends, RULES.path_colours[0], thickness=thickness)
 
-    def _toggle_path(self, path: Array) -> None:
-        """Move to the first waypoint and along the others, until something else is wished for or stops it; or end."""
-        if self._play.label == "Stop":
+    def _toggle_path(self) -> None:
+        """Move to the first waypoint and along the others, until something else is wished for or stops it; or end.
+
+        The coordinates stay, or follow the path if it has them.
+        """
+        path = self._path
+        if self._play.label == "Stop" or path is None:
             self._rest()
             return
         self._rest()
@@ -286,8 +323,7 @@ class ChartPage:
         """End a sweep, and a path."""
         self._loop.animate(None)
         self._sweeping, self._sweep.label = False, "Sweep"
-        if self._play is not None:
-            self._play.label = "Play"
+        self._play.label = "Play"
 
     def _show(self, moved: Any = ()) -> None:
         """Draw the arm and the readings, and move the sliders that the user does not hold."""

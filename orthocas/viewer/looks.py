@@ -19,7 +19,7 @@ from orthocas.robots.spatial import rotate_z_to
 from orthocas.robots.tree import KinematicTree
 from orthocas.robots.urdf import read_urdf_xml
 from orthocas.tools.batch import Batched, dense_function
-from orthocas.tools.checks import Array, Indices
+from orthocas.tools.checks import Array, Indices, as_path
 
 Colour = tuple[int, int, int]  #: red, green, blue, 0 to 255
 
@@ -97,6 +97,7 @@ class ViewRules:
     tick: float = 1 / 30  #: of animations; browsers without a graphics card fall behind more [s]
     quiet: float = 0.25  #: without jobs, after which the page settles [s]
     silence: float = 1.0  #: of a connection that asks for nothing, before it is dropped [s]
+    most_files: int = 50  #: of a folder, that a page offers
     largest_message: int = 2**20  #: from a browser; sliders and cameras need hundreds [bytes]
     message_length: int = 80  #: of a report [characters]
 
@@ -250,14 +251,25 @@ def _add_rod(solids: list[Solid], end: Array, radii: tuple[float, float], facets
 
 
 @dataclass(frozen=True)
-class UrdfLook:
-    """What a URDF file shows."""
+class RobotLook:
+    """How a robot looks."""
 
-    look: Look  #: empty where the file has nothing to show, or its mesh is missing
-    missing: tuple[str, ...]  #: mesh files that cannot be found or read
+    look: Look  #: empty for bodies without anything to show
+    missing: tuple[str, ...] = ()  #: mesh files that cannot be found or read
 
 
-def read_urdf_look(path: Path, tree: KinematicTree, locked: Mapping[str, float] | None = None) -> UrdfLook:
+def build_shape(robot: Robot, robot_file: str | Path | None, locked: Mapping[str, float] | None) -> RobotLook:
+    """How a robot looks: as its file says, or drums and rods where that shows nothing."""
+    sticks = build_stick_arm(robot.tree)
+    if robot_file is None:
+        return RobotLook(sticks)
+    read = read_urdf_look(as_path("robot_file", robot_file), robot.tree, locked)
+    bare = bool(read.missing) or not any(read.look)
+    look = [part or (sticks[i] if bare else []) for i, part in enumerate(read.look)]
+    return RobotLook(decimate([*look[:-1], sticks[-1]]), read.missing)
+
+
+def read_urdf_look(path: Path, tree: KinematicTree, locked: Mapping[str, float] | None = None) -> RobotLook:
     """Solids of all links of a URDF file, carried by the bodies of a robot that was built from it.
 
     Joints off the chain to the tip are locked as in `Robot.from_urdf`, so their links are shown too.
@@ -289,7 +301,7 @@ def read_urdf_look(path: Path, tree: KinematicTree, locked: Mapping[str, float] 
     triangles = sum(len(solid.faces) for solids in look for solid in solids)
     if triangles > RULES.most_triangles:
         raise RobotError(f"{path} shows {triangles:,} triangles, expected at most {RULES.most_triangles:,}")
-    return UrdfLook(look, tuple(missing))
+    return RobotLook(look, tuple(missing))
 
 
 def _read_colour(material: ElementTree.Element) -> Colour | None:
@@ -372,7 +384,7 @@ class Arm:
     def __init__(self, scene: Any, name: str, robot: Robot, look: Look, shift: Array | None = None) -> None:
         self._poses = BodyPoses(robot.tree)
         self.shift = np.zeros(3) if shift is None else shift
-        scene.add_frame(name, show_axes=False, position=tuple(self.shift))
+        self._nodes = [scene.add_frame(name, show_axes=False, position=tuple(self.shift))]
         # A mesh for each colour; bones are bodies, and move with them.
         self._bones: list[tuple[int, Any]] = []
         colours = dict.fromkeys(solid.colour for solids in look for solid in solids)
@@ -386,7 +398,13 @@ class Arm:
                 bone_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)), bone_positions=np.zeros((count, 3)),
                 cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
+            self._nodes.insert(0, handle)
             self._bones += zip(solids, handle.bones, strict=True)
+
+    def remove(self) -> None:
+        """Take it out of the scene."""
+        for node in self._nodes:
+            node.remove()
 
     def show(self, q: Array) -> None:
         """Move to a joint position (n,)."""

@@ -59,7 +59,7 @@ class Session:
 
     @property
     def place(self) -> str:
-        """The branch of a mirrored arm."""
+        """The branch of the arm while it is mirrored, for the panel; empty otherwise."""
         if not (self.branches and self.flips):
             return ""
         branch = self.branches.of(self.mirror(self.q[None])[0])

@@ -21,7 +21,7 @@ from orthocas.simulation.trajectory import Trajectory
 from orthocas.tools.checks import as_path, as_point_set, require_kind, suggest_attribute
 from orthocas.tools.files import publish, require_replaceable, require_writable
 from orthocas.viewer.chart_page import ChartPage
-from orthocas.viewer.looks import Look, build_stick_arm, decimate, read_urdf_look
+from orthocas.viewer.looks import RobotLook, build_shape
 from orthocas.viewer.motion import Motion, require_joints
 from orthocas.viewer.panel import name_robot
 from orthocas.viewer.player import PlayerPage, RobotPage, Scene, record_scene, show_chart, show_motions, show_robot
@@ -30,14 +30,6 @@ from orthocas.viewer.window import LOCAL, close_window, open_window
 
 PORT = 8080
 _OURS = b"<!-- written by orthocas -->"
-
-
-@dataclass(frozen=True)
-class Shape:
-    """How a robot looks."""
-
-    look: Look
-    missing: tuple[str, ...] = ()  #: mesh files that were not found; rods stand for their links
 
 
 @dataclass(eq=False)
@@ -149,7 +141,7 @@ def export_page(
     robot_file: str | Path | None = None,
     locked: Mapping[str, float] | None = None,
     force: bool = False,
-) -> Shape:
+) -> RobotLook:
     """Write one self-contained HTML file that shows the same without a server, and works offline.
 
     A chart moves each coordinate to its ends and back. Sliders need `view`.
@@ -219,14 +211,3 @@ def read_subject(shown: Any, robot: Robot | Chart | None) -> tuple[Robot, Sequen
     if isinstance(shown, Trajectory | JointMotion):
         require_joints(shown.joint_names, arm, "the motion")
     return arm, motions
-
-
-def build_shape(robot: Robot, robot_file: str | Path | None, locked: Mapping[str, float] | None) -> Shape:
-    """How a robot looks: as its file says, or drums and rods where that shows nothing."""
-    sticks = build_stick_arm(robot.tree)
-    if robot_file is None:
-        return Shape(sticks)
-    read = read_urdf_look(as_path("robot_file", robot_file), robot.tree, locked)
-    bare = bool(read.missing) or not any(read.look)
-    look = [part or (sticks[i] if bare else []) for i, part in enumerate(read.look)]
-    return Shape(decimate([*look[:-1], sticks[-1]]), read.missing)

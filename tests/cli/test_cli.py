@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from conftest import robot_data
 from programs import Run, nightly, output_of
+from solid_arms import BALL, build_arm
 
 import orthocas as oc
 from orthocas import problems
@@ -230,7 +231,6 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
             ["fit", PANDA, "--tip", "panda_hand", "--lock", "panda_joint=0"],
             "unknown joint 'panda_joint', known: panda_joint",
         ),
-        (["info", PANDA, "--tip", "panda_rightfinger"], "or --lock panda_finger_joint1=0"),
         (
             ["info", PANDA, "--tip", "panda_hand", "--tool", "0,1"],
             "shape of tool is (2,), expected (3,), (6,) or (4, 4)",
@@ -353,6 +353,20 @@ def test_compare_writes_tables_pictures_and_charts(run: Run, tmp_path: Path) -> 
     code, out, err = run(words[0], chart, *words[2:], "--jobs", "1", "--json")
     assert (code, err) == (0, "")
     assert json.loads(out)["summaries"][0]["solver"] == "closed form"
+
+
+def test_wide_fits_leave_postures_in_self_collision_aside(run: Run, tmp_path: Path) -> None:
+    """A planar arm whose last links fold back: regular on the free part, which the facts name."""
+    build_arm(tmp_path, [BALL, '<box size="0.6 0.2 0.1"/>', '<box size="0.6 0.2 0.1"/>', BALL])
+    words = ("fit", "arm.urdf", "--task", "position:xy", "--domain", "branch", "--param", "polynomial:3")
+    code, _, err = run(*words, "--samples", "800", "--collisions", "arm.urdf", "--out", "free.orthocas")
+    assert code == 0, err
+    notes = oc.load(tmp_path / "free.orthocas").notes
+    assert any("found in 10,000 postures" in str(value) for value in notes.values())
+    assert run("fit", "arm.urdf", "--collisions", "arm.urdf")[::2] == (
+        2,
+        "orthocas: --collisions requires --domain branch\n",
+    )
 
 
 @pytest.mark.slow

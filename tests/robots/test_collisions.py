@@ -400,3 +400,56 @@ def test_collisions_travel(tmp_path: Path) -> None:
     assert pickle.loads(pickle.dumps(robot)).collisions.pairs == robot.collisions.pairs
     tool = robot.with_tool([0.1, 0.0, 0.0]).with_payload(0.2)
     assert tool.collisions.pairs == robot.collisions.pairs
+
+
+TWO_ARMS = """<robot name="two"><link name="base"/>{parts}</robot>"""
+ARM_LINK = """<link name="{side}{k}"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><origin xyz="0.25 0 0"/><geometry><box size="0.3 0.05 0.05"/></geometry></collision></link>
+<joint name="{side}q{k}" type="revolute"><origin xyz="{at} 0"/><parent link="{parent}"/><child link="{side}{k}"/>
+<axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>"""
+HAND = """<link name="{side}hand"><collision><geometry><sphere radius="0.05"/></geometry></collision></link>
+<joint name="{side}fix" type="fixed"><origin xyz="0.5 0 0"/><parent link="{side}3"/><child link="{side}hand"/>
+</joint>"""
+
+
+def test_a_box_in_both_hands_moves_with_them_and_hits_what_is_around(tmp_path: Path) -> None:
+    """The left hand carries it, the right hand may touch it; coordinates of both arms keep it between the hands."""
+    parts = []
+    for side, x in (("l", -0.3), ("r", 0.3)):
+        for k in (1, 2, 3):
+            at = f"{x} 0" if k == 1 else "0.5 0"
+            parts.append(ARM_LINK.format(side=side, k=k, at=at, parent="base" if k == 1 else f"{side}{k - 1}"))
+        parts.append(HAND.format(side=side))
+    path = tmp_path / "two.urdf"
+    path.write_text(TWO_ARMS.format(parts="".join(parts)))
+    robot = oc.Robot.from_urdf(path, tips=["lhand", "rhand"])
+    q = np.array([2.2, -1.2, -1.0, 0.9416, 1.2, 1.0])
+    across = robot.frame_position(q, "rhand", "lhand")
+    carton = {"carton": oc.obstacles.Sphere(across / 2, np.linalg.norm(across) / 2 - 0.05)}
+    # both hands touch the carton, and no pair with them is checked
+    held = robot.collisions.with_attached("lhand", carton, allowed=[("carton", "rhand")])
+    assert ("rhand", "carton") not in held.pairs
+    assert ("r1", "carton") in held.pairs
+    free = robot.collisions.with_attached("lhand", carton)
+    gap = free.pairs.index(("rhand", "carton"))
+    assert free.pair_distances(q)[gap] == pytest.approx(0.0, abs=1e-9)
+    # coordinates that keep the right hand where it is in the left one carry the carton, and it stays between them
+    task = oc.Task.relative_position(robot, "lhand", "rhand", "xy")
+    chart = oc.fit(oc.Problem(robot, task, domain=oc.Box(q, 0.25)), oc.Polynomial(3)).chart
+    goal = chart.phi(q) + np.array([0.0, 0.0, 0.05, -0.05, 0.04, 0.03])
+    moved = chart.inverse(goal, q)
+    centre = (robot.frame_position(moved, "lhand") + robot.frame_position(moved, "rhand")) / 2
+    assert np.linalg.norm(centre - (robot.frame_position(q, "lhand") + robot.frame_position(q, "rhand")) / 2) > 0.01
+    assert free.pair_distances(moved)[gap] == pytest.approx(0.0, abs=1e-7)
+    # the carton reaches a wall at the end of its way, by 2 mm
+    before = (robot.frame_position(q, "lhand") + robot.frame_position(q, "rhand")) / 2
+    way = (centre - before) / np.linalg.norm(centre - before)
+    reach = np.linalg.norm(across) / 2 - 0.05
+    point = centre + (reach - 0.002) * way
+    wall = oc.Scene({"wall": oc.obstacles.Sphere(point + 0.2 * way, 0.2)})
+    around = held.with_scene(wall)
+    assert ("carton", "wall") in around.pairs
+    contact = Collisions(around.tree, around.parts, [("carton", "wall")]).find_contact(np.linspace(q, moved, 20))
+    assert contact is not None
+    assert contact.segment > 15

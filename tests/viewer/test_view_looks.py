@@ -22,11 +22,11 @@ from orthocas.viewer.looks import (
     build_block,
     build_capsule,
     build_drum,
+    build_shape,
     build_stick_arm,
     decimate,
     read_urdf_look,
 )
-from orthocas.viewer.view import build_shape
 
 
 def test_body_poses_are_those_of_pinocchio() -> None:

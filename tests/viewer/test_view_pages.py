@@ -89,6 +89,38 @@ def test_rings_turn_the_tool_of_a_pose_task() -> None:
         np.testing.assert_allclose(chart.xi(session.q), chart.xi(home), atol=1e-9)
 
 
+def test_pages_offer_paths_and_robot_files_of_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is chosen is played and drawn; a file that is none leaves a message, and the page goes on."""
+    chart = fitted().chart
+    monkeypatch.chdir(tmp_path)
+    x = chart.x(chart.problem.domain.home)
+    rows = "\n".join(",".join(map(str, point)) for point in (x + 0.02, x - 0.03))
+    Path("way.csv").write_text(f"{','.join(chart.labels[: chart.m])}\n{rows}\n")
+    Path("other.csv").write_text("a,b\n1,2\n")
+    Path("arm.urdf").write_text("no robot")
+    with oc.view(chart, port=0) as view:
+        page = view._page
+        assert page._play.disabled
+        chosen = {handle.label: handle for handle in view._server.gui._gui_input_handle_from_uuid.values()
+                  if getattr(handle, "label", "") in ("file", "links")}  # fmt: skip
+        assert chosen["file"].options == ("none", "other.csv", "way.csv")
+        assert chosen["links"].options == ("none", "arm.urdf")
+        chosen["file"].value = "way.csv"
+        wait(lambda: not page._play.disabled)
+        np.testing.assert_allclose(page._path, [x + 0.02, x - 0.03])
+        chosen["file"].value = "none"
+        wait(lambda: page._play.disabled)
+        before = page._arm
+        for what, name in (("links", "arm.urdf"), ("file", "other.csv")):
+            chosen[what].value = name
+            page._loop.ask("after", lambda: None)
+            time.sleep(0.3)
+            assert page._arm is before
+            assert page._play.disabled
+        chosen["links"].value = "none"
+        wait(lambda: page._arm is not before)
+
+
 def test_a_path_plays_and_its_recording_can_be_viewed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chart = fitted().chart
     monkeypatch.setattr(chart_page, "RULES", replace(chart_page.RULES, cycle=0.5))
