@@ -14,8 +14,7 @@ import numpy as np
 from benchmark import run
 
 import orthocas as oc
-from orthocas.arms.kernel import Curve, build_equations
-from orthocas.arms.numpy_kernel import NumpyKernel
+from orthocas.arms.kernel import Curve, evaluate_cubic
 from orthocas.arms.self_motion import SelfMotions, cut_curve, find_motions
 from orthocas.robots.tree import KinematicTree
 from orthocas.tools.checks import Array
@@ -23,6 +22,7 @@ from orthocas.tools.checks import Array
 READY = ("panda-wide", "iiwa7-wide", "xarm7-wide", "baxter-left-wide")
 SEEDS = (1, 2, 3)  # of random arms
 POSES, NEWTON_POSES, DENSE, STARTS = 100, 20, 20_000, 1000
+NEAR = 0.015  # [rad] between points of curves: they are one
 SAME = 1e-6  # [rad] from an arc: the posture is on it
 
 
@@ -83,17 +83,22 @@ def look(arm: oc.Arm, q: Array, pool: Array) -> Pose:
     ended = time.perf_counter()
     dense = maps.kernel.find_curves(target, np.vstack([q, pool]), len(pool) + 1)
     lengths = np.array([sum(arc.length for arc in cut_curve(maps, target, curve)) for curve in dense])
-    known = np.array([any(is_same(arm, target, other, curve) for other in mine) for curve in dense])
+    known = np.array([any(is_same(other, curve) for other in mine) for curve in dense])
     gap = found.nearest(q).value if found.components else np.inf
     return Pose(middle - began, ended - middle, found.curves, float(lengths[known].sum() / lengths.sum()), gap)
 
 
-def is_same(arm: oc.Arm, target: Array, curve: Curve, other: Curve) -> bool:
-    """Whether points of another curve are on a curve."""
-    maps = arm.maps
-    kernel = NumpyKernel(build_equations(arm.task, maps.scale), arm.robot.lower, arm.robot.upper, maps.turning)
-    rows = (0, len(other.q) // 3, len(other.q) // 2)
-    return all(kernel.lies_on(target, curve, other.q[row], other.tangent[row]) for row in rows)
+def is_same(curve: Curve, other: Curve) -> bool:
+    """Whether points of another curve are on a curve, up to full turns: near points of it at most 0.02 rad apart."""
+    parts = (curve.q[:-1], curve.q[1:], curve.tangent[:-1], curve.tangent[1:], curve.length[:-1, None])
+    points, along = evaluate_cubic(*(part[:, None] for part in parts), np.linspace(0, 1, 21)[None, :, None])
+    for row in (0, len(other.q) // 3, len(other.q) // 2):
+        away = points - other.q[row]
+        away = np.linalg.norm(away - 2 * np.pi * np.rint(away / (2 * np.pi)), axis=2)
+        k = np.unravel_index(np.argmin(away), away.shape)
+        if not (away[k] < NEAR and along[k] @ other.tangent[row] > 0):
+            return False
+    return True
 
 
 def newton(arm: oc.Arm, target: Array, q: Array) -> Array:

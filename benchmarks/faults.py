@@ -101,8 +101,8 @@ class Arm:
 
     def with_encoders(self, bits: int, observed: bool = True) -> "Arm":
         """The same arm with encoders, and the observer for their step, or none."""
-        self = replace(self, rng=np.random.default_rng(7), bits=bits)
-        return replace(self, safety=Safety.of(self.law, encoder_step=self.count)) if observed else self
+        arm = replace(self, rng=np.random.default_rng(7), bits=bits)
+        return replace(arm, safety=Safety.of(self.law, encoder_step=arm.count)) if observed else arm
 
     @property
     def count(self) -> Array:

@@ -8,6 +8,7 @@ import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import ModuleType
@@ -127,8 +128,7 @@ def case(scenario: Scenario, arm: Arm, build: Any, seed: int, quick: bool) -> di
     try:
         if isinstance(build, Unsuited):
             raise build
-        rng = np.random.default_rng([seed, *scenario.name.encode(), *arm.name.encode()])
-        streams = scenario.streams(arm, rng, quick)
+        streams = built_streams(scenario.name, arm, seed, quick)
         before = time.process_time()
         runs = [followed(arm, build, stream) for stream in streams]
         ticks = sum(len(run.q) for run in runs)
@@ -142,6 +142,12 @@ def case(scenario: Scenario, arm: Arm, build: Any, seed: int, quick: bool) -> di
         logging.getLogger(__name__).warning("%s, %s, %s", scenario.name, arm.name, build, exc_info=error)
         found |= {"why": f"failed: {type(error).__name__}"}
     return found
+
+
+@cache
+def built_streams(name: str, arm: Arm, seed: int, quick: bool) -> list[Stream]:
+    """The streams of a scenario, the same for all methods."""
+    return scenarios()[name].streams(arm, np.random.default_rng([seed, *name.encode(), *arm.name.encode()]), quick)
 
 
 def _number(value: float) -> float | None:

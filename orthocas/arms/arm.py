@@ -15,15 +15,14 @@ from numpy.typing import ArrayLike
 from orthocas.arms.arm_file import read_charts, write_charts
 from orthocas.arms.chart_kernel import ChartKernel, write_tracker
 from orthocas.arms.maps import ArmMaps
-from orthocas.arms.numpy_tracker import TrackStatus
 from orthocas.arms.self_motion import Arc, SelfMotions, find_motions
-from orthocas.arms.tracker import ArmTracker
+from orthocas.arms.tracker import ArmTracker, TrackStatus
 from orthocas.charts.chart import Chart
 from orthocas.charts.clearance import Clearance
 from orthocas.charts.inverse import InverseStatus
 from orthocas.charts.ready import load, names
 from orthocas.codegen.generate import require_free_folder, require_name
-from orthocas.errors import BranchWarning, CompileError, DomainError, InvalidValueError, NotRedundantError, ShapeError
+from orthocas.errors import BranchWarning, DomainError, InvalidValueError, NotRedundantError, ShapeError
 from orthocas.fitting.wide import fit_wide
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.robot import Robot
@@ -117,8 +116,9 @@ class Arm(Shown):
     `tracker` follows a stream of x and xi through borders of charts, singular positions and out of reach. Arms with
     several joints more than the task needs, such as those on mobile bases, have trackers only.
 
-    The curves are traced in C that is compiled on first use and kept; without a compiler, NumPy does the same, a
-    hundred times slower. `Arm(task)` has no charts: it is ready at once, and knows no xi.
+    Curves, postures with xi and trackers are C that is compiled on first use and kept. Without a C compiler these
+    methods raise CompileError, which says how to get one. `Arm(task)` has no charts: it is ready at once, and knows no
+    xi.
 
     A task value x is the task's vector (m,). For tasks of a whole orientation it is also a 4 x 4 matrix, a pair of
     position and rotation (3, 3) or quaternion (w, x, y, z), or a `pinocchio.SE3`. Methods that take several, take rows
@@ -297,7 +297,7 @@ class Arm(Shown):
             return motions.components
         self._require_charts()
         value = as_number("xi", xi)
-        found = [(q, name) for k, name in enumerate(self.branch_names) for q in self._find_xi(motions, k, value)[0]]
+        found = [(q, name) for k, name in enumerate(self.branch_names) for q in self._find_xi(motions, k, value)]
         q = np.array([q for q, _ in found]).reshape(-1, self.robot.n)
         names = tuple(name for _, name in found)
         status = np.full(len(q), int(InverseStatus.FOUND))
@@ -365,9 +365,17 @@ class Arm(Shown):
         owners = np.full(N, -1)
         status[~good] = InverseStatus.BAD_INPUT
         rows, near = np.flatnonzero(good), None if starts is None else starts[good]
-        solve_rows = self._solve_rows if xi is None or self.chart_kernel is None else self._solve_rows_in_c
-        wishes = None if values is None else values[rows]
-        q[rows], status[rows], owners[rows] = solve_rows(targets[rows], wishes, near, chosen, branch == ANY)
+        if values is None:
+            q[rows], status[rows] = self._solve_on_arcs(targets[rows], near, chosen, branch == ANY)
+            found = rows[np.isfinite(q[rows]).all(axis=1)]
+            owners[found] = self.find_branches(q[found])
+        else:
+            q[rows], status[rows], owners[rows] = self.chart_kernel.solve_rows(
+                targets[rows], values[rows], near, chosen
+            )
+            if branch != ANY:
+                beyond = status == InverseStatus.OUTSIDE_DOMAIN
+                q[beyond], status[beyond] = np.nan, InverseStatus.NOT_FOUND
         if collisions is not None:
             known = np.flatnonzero(np.isfinite(q).all(axis=1))
             for row in known[~collisions.check_free(q[known])].tolist():
@@ -415,7 +423,7 @@ class Arm(Shown):
         """
         clearance = Clearance.build(collisions, self.robot.tree, margin, avoid)
         rules = velocity_limits, acceleration_limits, weights, detours, clearance
-        return ArmTracker(self.maps, self.charts, self.chart_kernel, q, period, *rules)
+        return ArmTracker(self.chart_kernel, q, period, *rules)
 
     def follow(
         self,
@@ -520,16 +528,9 @@ class Arm(Shown):
         return ArmMaps(self.task)
 
     @cached_property
-    def chart_kernel(self) -> ChartKernel | None:
-        """Searches in compiled C, with the charts; None without a compiler. For other files of this package."""
-        if not self.maps.compiled:
-            return None
-        kernel = ChartKernel(self.maps, self.charts)
-        try:
-            kernel.load()
-        except (CompileError, DomainError, InvalidValueError):  # no compiler, no folder, or no expression of a domain
-            return None
-        return kernel
+    def chart_kernel(self) -> ChartKernel:
+        """Searches with the charts, and trackers, in C. For other files of this package."""
+        return ChartKernel(self.maps, self.charts)
 
     def _require_charts(self) -> None:
         if not self.charts:
@@ -549,7 +550,7 @@ class Arm(Shown):
         """As `TargetReader.read`, in C where x is an array of vectors."""
         m = self.task.m
         plain = type(x) is np.ndarray and x.dtype == np.float64 and (x.shape == (m,) or x.shape[1:] == (m,) != (4,))
-        if not (plain and self.charts) or self.chart_kernel is None:
+        if not (plain and self.charts):
             return self.maps.targets.read(x)
         return self.chart_kernel.build_targets(np.ascontiguousarray(x).reshape(-1, m)), x.ndim == 1
 
@@ -561,97 +562,35 @@ class Arm(Shown):
             )
         return np.asarray(targets[0])
 
-    def _solve_rows_in_c(
-        self, targets: Array, values: Any, starts: Array | None, chosen: Sequence[int], anywhere: bool
-    ) -> tuple[Array, Indices, Indices]:
-        """Postures of targets and xi, numbers of their status and charts."""
-        assert self.chart_kernel is not None
-        q, status, owners = self.chart_kernel.solve_rows(targets, values, starts, chosen)
-        if not anywhere:
-            beyond = status == InverseStatus.OUTSIDE_DOMAIN
-            q[beyond], status[beyond] = np.nan, InverseStatus.NOT_FOUND
-        return q, status, owners
-
-    def _solve_rows(
-        self, targets: Array, values: Array | None, starts: Array | None, chosen: Sequence[int], anywhere: bool
-    ) -> tuple[Array, Indices, Indices]:
-        """The same by charts, and arcs where they have none; without xi by arcs alone."""
-        N = len(targets)
-        q, status = np.full((N, self.robot.n), np.nan), np.full(N, int(InverseStatus.NOT_FOUND))
-        if values is not None:
-            self._solve_by_charts(targets, values, starts, chosen, q, status)
+    def _solve_on_arcs(
+        self, targets: Array, starts: Array | None, chosen: Sequence[int], anywhere: bool
+    ) -> tuple[Array, Indices]:
+        """Postures of targets (N, k) on their arcs, nearest to starts or far from limits, and how they ended."""
+        q = np.full((len(targets), self.robot.n), np.nan)
+        status = np.full(len(targets), int(InverseStatus.NOT_FOUND))
+        domains = [self.charts[k].problem.domain for k in chosen]
 
         def solve_row(row: int) -> None:
-            wish = None if starts is None else starts[row]
-            value = None if values is None else float(values[row])
-            q[row], status[row] = self._solve_on_arcs(targets[row], value, wish, chosen, anywhere)
+            start = None if starts is None else starts[row]
+            motions = find_motions(self.maps, targets[row], *(() if start is None else (start[None],)))
+            if not motions.components:
+                return
+            if anywhere:
+                q[row] = (motions.best(self._measure_room) if start is None else motions.nearest(start)).q
+            else:
+                q[row] = self._choose_inside(motions, domains, start)
+            status[row] = InverseStatus.FOUND if np.isfinite(q[row, 0]) else InverseStatus.NOT_FOUND
 
-        run_in_threads(solve_row, np.flatnonzero(status != InverseStatus.FOUND).tolist())
-        owners, there = np.full(N, -1), np.flatnonzero(np.isfinite(q).all(axis=1))
-        owners[there] = self.find_branches(q[there])
-        return q, status, owners
+        run_in_threads(solve_row, range(len(targets)))
+        return q, status
 
-    def _solve_by_charts(
-        self,
-        targets: Array,
-        values: Array,
-        starts: Array | None,
-        chosen: Sequence[int],
-        q: Array,
-        status: Indices,
-    ) -> None:
-        """Ask charts in turn for (x, xi); q and status of those that are found are filled in."""
-        vectors = self.maps.targets.vector(targets)
-        first = np.full(len(targets), -1) if starts is None else self.find_branches(starts)
-        for own in (True, False):
-            for k in chosen:
-                rows = np.flatnonzero((status != InverseStatus.FOUND) & ((first == k) == own))
-                if not rows.size or (own and starts is None):
-                    continue
-                near = starts[rows] if own and starts is not None else None
-                found = self.charts[k].solve(np.column_stack([vectors[rows], values[rows]]), near)
-                done = found.found
-                q[rows[done]], status[rows[done]] = found.q[done], int(InverseStatus.FOUND)
-
-    def _solve_on_arcs(
-        self, target: Array, xi: float | None, start: Array | None, chosen: Sequence[int], anywhere: bool
-    ) -> tuple[Array, int]:
-        """The posture of one target, by its arcs."""
-        motions = find_motions(self.maps, target, *(() if start is None else (start[None],)))
-        found: tuple[Array, InverseStatus] | None = None
-        if motions.components and xi is not None:
-            found = self._choose_xi(motions, xi, start, chosen)
-        elif motions.components and not anywhere:
-            found = self._choose_inside(motions, [self.charts[k].problem.domain for k in chosen], start)
-        if found is None and motions.components and anywhere:
-            place = motions.best(self._measure_room) if start is None else motions.nearest(start)
-            found = place.q, InverseStatus.FOUND if xi is None else InverseStatus.OUTSIDE_DOMAIN
-        q, status = found or (np.full(self.robot.n, np.nan), InverseStatus.NOT_FOUND)
-        return q, int(status)
-
-    def _choose_xi(
-        self, motions: SelfMotions, xi: float, start: Array | None, chosen: Sequence[int]
-    ) -> tuple[Array, InverseStatus] | None:
-        """The posture with an xi that is nearest to the start; without any, that with the nearest xi."""
-        parts = [self._find_xi(motions, k, xi) for k in chosen]
-        exact = [q for postures, _ in parts for q in postures]
-        if exact:
-            wish = exact[0] if start is None else start
-            return min(exact, key=lambda q: float(np.linalg.norm(q - wish))), InverseStatus.FOUND
-        nearest = min((near for _, near in parts if near is not None), key=lambda item: item[1], default=None)
-        return None if nearest is None else (nearest[0], InverseStatus.NEAREST)
-
-    def _choose_inside(
-        self, motions: SelfMotions, domains: Sequence[Any], start: Array | None
-    ) -> tuple[Array, InverseStatus] | None:
-        """The posture in one of the domains that is nearest to the start, of those 0.05 rad apart on the arcs."""
+    def _choose_inside(self, motions: SelfMotions, domains: Sequence[Any], start: Array | None) -> Array:
+        """A posture in one of the domains, of those 0.05 rad apart on the arcs; NaN where there is none."""
         q = np.vstack([arc.at(self._list_places(arc)) for arc in motions])
-        inside = np.any([np.asarray(domain.contains(q)) for domain in domains], axis=0)
-        if not inside.any():
-            return None
-        q = q[inside]
-        k = np.argmax(self._measure_room(q)) if start is None else np.argmin(np.linalg.norm(q - start, axis=1))
-        return q[k], InverseStatus.FOUND
+        q = q[np.any([np.asarray(domain.contains(q)) for domain in domains], axis=0)]
+        if not len(q):
+            return np.full(self.robot.n, np.nan)
+        return np.asarray(q[self._choose(q, start)])
 
     def _find_free(
         self,
@@ -665,11 +604,12 @@ class Arm(Shown):
         """A posture of one target without a contact, of those with xi or of many on its arcs; None if there is none."""
         motions = find_motions(self.maps, target, *(() if start is None else (start[None],)))
         if xi is not None:
-            exact = np.array([q for k in chosen for q in self._find_xi(motions, k, xi)[0]]).reshape(-1, self.robot.n)
+            exact = np.array([q for k in chosen for q in self._find_xi(motions, k, xi)]).reshape(-1, self.robot.n)
             exact = exact[collisions.check_free(exact)] if len(exact) else exact
             if len(exact):
-                away = np.linalg.norm(exact - (exact[0] if start is None else start), axis=1)
-                return exact[np.argmin(away)], InverseStatus.FOUND
+                return exact[
+                    0 if start is None else np.linalg.norm(exact - start, axis=1).argmin()
+                ], InverseStatus.FOUND
         q = np.vstack([np.empty((0, self.robot.n)), *(arc.at(self._list_places(arc)) for arc in motions)])
         q = q[collisions.check_free(q)] if len(q) else q
         if xi is None and anywhere:
@@ -687,14 +627,19 @@ class Arm(Shown):
             periods = np.array([self.charts[k].parts.turns[self.charts[k].m] for k in owners])
             away = np.abs(wrap_shortest(self._evaluate_xi(q, owners) - xi, periods))
             return q[np.argmin(away)], InverseStatus.NEAREST
-        k = np.argmax(self._measure_room(q)) if start is None else np.argmin(np.linalg.norm(q - start, axis=1))
-        return q[k], InverseStatus.FOUND
+        return q[self._choose(q, start)], InverseStatus.FOUND
 
     def _check_collisions(self, collisions: Collisions | None) -> None:
         """Raise InvalidValueError for what is no collision model of the robot."""
         if collisions is not None:
             require_kind("collisions", collisions, Collisions)
             collisions.require_for(self.robot.tree)
+
+    def _choose(self, q: Array, start: Array | None) -> int:
+        """The number of the posture nearest to a start, or without one, farthest from the limits."""
+        if start is None:
+            return int(np.argmax(self._measure_room(q)))
+        return int(np.argmin(np.linalg.norm(q - start, axis=1)))
 
     def _measure_room(self, q: Array) -> Array:
         """Distances from the limits (N,), in half-widths of the joints' ranges."""
@@ -703,13 +648,12 @@ class Arm(Shown):
         room = np.minimum(q - low, high - q)[:, bounded] / (high - low)[bounded]
         return np.asarray(2 * room.min(axis=1, initial=1.0))
 
-    def _find_xi(self, motions: SelfMotions, k: int, xi: float) -> tuple[list[Array], tuple[Array, float] | None]:
-        """Postures on the arcs where chart k has an xi, and the one whose xi is nearest, with its distance."""
+    def _find_xi(self, motions: SelfMotions, k: int, xi: float) -> list[Array]:
+        """Postures on the arcs where chart k has an xi."""
         chart = self.charts[k]
         domain, (low, high) = chart.problem.domain, chart.problem.domain.bounds
         period = float(chart.parts.turns[chart.m])
         found: list[Array] = []
-        best: tuple[Array, float] | None = None
 
         def miss(q: Array) -> Array:
             left = chart.xi(q)[:, 0] - xi
@@ -722,10 +666,6 @@ class Arm(Shown):
             inside, left = np.zeros(len(q), dtype=bool), np.full(len(q), np.nan)
             if near.size:
                 inside[near], left[near] = np.asarray(domain.contains(q[near])), miss(q[near])
-            if inside.any():
-                row = np.flatnonzero(inside)[np.argmin(np.abs(left[inside]))]
-                if best is None or abs(left[row]) < best[1]:
-                    best = q[row], float(abs(left[row]))
             crosses = (left[:-1] * left[1:] <= 0) & (inside[:-1] | inside[1:])
             if period:
                 crosses &= np.abs(left[1:] - left[:-1]) < period / 2
@@ -734,7 +674,7 @@ class Arm(Shown):
                 known = any(np.abs(posture - other).max() < RULES.same for other in found)
                 if abs(error) < RULES.tolerance and not known and bool(domain.contains(posture)):
                     found.append(posture)
-        return found, best
+        return found
 
     def _list_places(self, arc: Arc) -> Array:
         """Places on an arc, at most `RULES.spacing` apart, (P,)."""

@@ -27,7 +27,7 @@ _FLAGS = ("-O3",)
 
 @dataclass(frozen=True, slots=True)
 class ChartKernelRules:
-    """Numbers of the search for postures with x and xi in C, and of the tracker in C and NumPy.
+    """Numbers of the search for postures with x and xi, and of the tracker.
 
     Errors of x are in radians, or as long as a radian moves the tip; joint positions in [rad] or [m].
     """
@@ -38,7 +38,11 @@ class ChartKernelRules:
     xi_found: float = 1e-9  #: error of xi of a posture that has it
     xi_weight: float = 1e-3  #: of errors of xi, relative to those of x
     posture_weight: float = 1e-4  #: of the way back to the last posture with a chart, where there is none
-    avoid_weight: float = 1e-2  #: of pairs nearer than `avoid`, relative to x
+    push_weight: float = 0.3  #: of pairs that come nearer than `avoid`, relative to x
+    pushes: int = 8  #: of these pairs, the nearest ones
+    turns: int = 4  #: of a call, until no more pairs come nearer
+    kept: float = 1e-5  #: [m] that these may be nearer than `avoid`
+    aligned: float = 0.9  #: cosine between the rows of two pairs, or of one at two postures, above which one counts
     way_weight: float = 1e-2  #: of the way to a posture with x and xi that was found
     step_damping: float = 1e-8  #: of squared joint steps
     error_damping: float = 0.3  #: of squared joint steps, times the squared error of x
@@ -47,7 +51,7 @@ class ChartKernelRules:
     rounds: int = 12  #: of a descent, at most
     far_rounds: int = 4  #: of them, those with an error above `near`
     gain: float = 1e-9  #: relative decrease of the squared error below which it is a minimum
-    near: float = 1e-3  #: error of x below which the last posture with a chart does not count
+    near: float = 3e-4  #: error of x below which the last posture with a chart does not count
     decrease: float = 1e-4  #: of the cost, relative to what a step promises
     enough: float = 1e-2  #: relative decrease of the cost below which a far arm leaves the rest to the next call
     falls: float = 0.9  #: of an error at the end of a window, relative to that at its begin, where the arm is not stuck
@@ -58,6 +62,8 @@ class ChartKernelRules:
     flattest: float = 2.0  #: least curvature that counts, in errors: less would amplify the tremor of a hand
     calms: float = 0.8  #: factor of it for each call since the target moved
     saddle: float = 0.02  #: slope of the error, relative to its curvature, below which a posture is next to a saddle
+    onward: float = 0.3  #: step across a saddle of the last call, in the largest steps of joints, that goes on
+    unstable: float = 0.2  #: curvature along which a saddle falls, in errors, that any side is better than none
     astride: float = 0.05  #: step to a side of a saddle
     largest: float = 0.7  #: norm of a step of Newton's method
     in_chart: int = 10  #: rounds of it at a tick in the chart
@@ -107,6 +113,7 @@ def tracker_type(n: int, r: int, target: int) -> np.dtype[Any]:
     rows = ("q", "most", "change", "weight", "near", "moved", "last", "goal")
     fields: list[Any] = [(name, "f8", (n,)) for name in rows]
     fields += [("wish", "f8", (r,)), ("target", "f8", (target,)), ("far", "f8"), ("best", "f8")]
+    fields += [("push", "f8", (RULES.pushes, n)), ("room", "f8", (RULES.pushes,)), ("pushes", "i4")]
     numbers = ("detours", "patience", "chart", "inside", "status", "mode", "ticks", "pause", "rested", "next", "listed")
     fields += [(name, "i4") for name in numbers]
     return np.dtype([*fields, ("list", "i4", (RULES.searched,))], align=True)
@@ -151,11 +158,11 @@ class ChartKernel:
 
     `solve_rows` asks charts in turn, that of the start first: Newton's method on x and xi from the start, or from the
     stored postures that are nearest in x and xi. Where none arrives, all curves of x are traced and xi is looked at
-    along them, as `Arm` does it without a compiler.
+    along them.
 
     Raises:
-        CompileError, InvalidValueError: if there is no C compiler, or no folder to keep the library.
-        DomainError: if a domain has a condition, but no expression of it.
+        CompileError, InvalidValueError: at the first call, if there is no C compiler, or no folder to keep the library.
+        DomainError: at the first call, if a domain has a condition, but no expression of it.
     """
 
     maps: ArmMaps
@@ -219,10 +226,6 @@ class ChartKernel:
     def hold(self) -> Any:
         """`arm_track_hold` of the library."""
         return self._c.arm_track_hold
-
-    def load(self) -> None:
-        """Compile now, or find what was compiled earlier."""
-        assert self._c is not None
 
     @cached_property
     def _c(self) -> Any:

@@ -2,7 +2,7 @@
 
 import ctypes
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -23,7 +23,7 @@ _FLAGS = ("-O3",)
 
 @dataclass(frozen=True, slots=True)
 class CurveRules:
-    """Numbers of the search for curves, in C and NumPy. Chosen on panda and xarm7, held on others (benchmarks/arm.py).
+    """Numbers of the search for curves. Chosen on panda and xarm7, held on others (benchmarks/arm.py).
 
     Errors of x are in radians, or as long as a radian moves the tip. Joint positions are in [rad] or [m].
     """
@@ -100,25 +100,6 @@ def evaluate_cubic(
     return q, slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-300)
 
 
-class Kernel(Protocol):
-    """What finds curves and corrects points on them."""
-
-    def find_curves(self, target: Array, starts: Array, patience: int = RULES.patience) -> list[Curve]:
-        """All curves of a target that starts (S, n) lead to, with their crossings of limits.
-
-        The search ends after `patience` starts in turn that find no new curve.
-        """
-        ...
-
-    def choose_starts(self, stored: StoredPostures, place: Array) -> Array:
-        """Stored postures near a place of x, in turn from each branch, (S, n)."""
-        ...
-
-    def correct(self, target: Array, q: Array, tangent: Array) -> NDArray[np.bool_]:
-        """Bring points q (K, n) to their curve across tangents (K, n), both in place; where that succeeds, (K,)."""
-        ...
-
-
 def crossing_type(n: int) -> np.dtype[Any]:
     """A record of a crossing: a joint, less full turns, is at its lowest (side 0) or highest (1) position."""
     fields: list[Any] = [("place", "f8"), ("q", "f8", (n,))]
@@ -126,11 +107,11 @@ def crossing_type(n: int) -> np.dtype[Any]:
 
 
 @dataclass(frozen=True, eq=False)
-class CompiledKernel:
-    """`Kernel` in compiled C: runtime/self_motion.c. Threads may share it.
+class CurveKernel:
+    """Finds curves and corrects points on them, in compiled C: runtime/self_motion.c. Threads may share it.
 
     Raises:
-        CompileError: if there is no C compiler.
+        CompileError, InvalidValueError: at the first call, if there is no C compiler, or no folder to keep the library.
     """
 
     equations: ca.Function
@@ -139,7 +120,10 @@ class CompiledKernel:
     turning: NDArray[np.bool_]
 
     def find_curves(self, target: Array, starts: Array, patience: int = RULES.patience) -> list[Curve]:
-        """As `Kernel.find_curves`."""
+        """All curves of a target that starts (S, n) lead to, with their crossings of limits.
+
+        The search ends after `patience` starts in turn that find no new curve.
+        """
         n = len(self.lower)
         nodes = np.empty((RULES.nodes, 2 * n + 1))
         ends, closed = np.zeros(RULES.curves, dtype=np.intc), np.zeros(RULES.curves, dtype=np.intc)
@@ -157,7 +141,7 @@ class CompiledKernel:
         return split_curves(nodes[: ends[count - 1]].copy(), ends[:count], closed, found[:size].copy())
 
     def choose_starts(self, stored: StoredPostures, place: Array) -> Array:
-        """As `Kernel.choose_starts`."""
+        """Stored postures near a place of x, in turn from each branch, (S, n)."""
         count, branches = len(stored.q), len(stored.begins) - 1
         distance, single = np.empty(count, dtype=np.float32), place.astype(np.float32)
         chosen = np.empty(RULES.starts + branches, dtype=np.intc)
@@ -169,14 +153,10 @@ class CompiledKernel:
         return stored.q[chosen[:total]]
 
     def correct(self, target: Array, q: Array, tangent: Array) -> NDArray[np.bool_]:
-        """As `Kernel.correct`."""
+        """Bring points q (K, n) to their curve across tangents (K, n), both in place; where that succeeds, (K,)."""
         good = np.empty(len(q), dtype=np.bool_)
         self._c.correct_rows(pointer(target), len(q), pointer(q), pointer(tangent), pointer(good))
         return good
-
-    def load(self) -> None:
-        """Compile now, or find what was compiled earlier."""
-        assert self._c is not None
 
     @cached_property
     def _c(self) -> Any:

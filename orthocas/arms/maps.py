@@ -6,12 +6,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.arms.kernel import CompiledKernel, Curve, Kernel, build_equations
-from orthocas.arms.numpy_kernel import NumpyKernel
+from orthocas.arms.kernel import Curve, CurveKernel, build_equations
 from orthocas.arms.stored import PlaceReader, StoredPostures
 from orthocas.arms.targets import TargetReader
 from orthocas.charts.self_motion import Stop
-from orthocas.errors import CompileError, InvalidValueError
 from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import branches
 from orthocas.tasks.domains import Box, StopKind
@@ -30,7 +28,6 @@ class ArmMaps:
     """Kernel, readers and stored postures of a task with r = 1. Threads may share it; pickles hold the task only."""
 
     task: Task
-    compiled: bool = True  #: whether to compile C if there is a compiler
 
     @property
     def robot(self) -> Robot:
@@ -76,17 +73,9 @@ class ArmMaps:
         return np.asarray(self.places.of_targets(probe.copy()) / probe)
 
     @cached_property
-    def kernel(self) -> Kernel:
-        """The search for curves: compiled, or in NumPy without a compiler."""
-        parts = self.equations, self.robot.lower, self.robot.upper, self.turning
-        if self.compiled:
-            kernel = CompiledKernel(*parts)
-            try:
-                kernel.load()
-            except (CompileError, InvalidValueError):  # no compiler, or no folder to keep the library
-                return NumpyKernel(*parts)
-            return kernel
-        return NumpyKernel(*parts)
+    def kernel(self) -> CurveKernel:
+        """The search for curves."""
+        return CurveKernel(self.equations, self.robot.lower, self.robot.upper, self.turning)
 
     @cached_property
     def stored(self) -> StoredPostures:

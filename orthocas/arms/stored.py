@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from orthocas.tasks.branches import Branches
 from orthocas.tasks.regular_box import find_joint_range
 from orthocas.tasks.task import Frames, Task
-from orthocas.tools.checks import Array, Indices
+from orthocas.tools.checks import Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,16 +61,6 @@ class StoredPostures:
         places = np.ascontiguousarray(reader.of_postures(q).T, dtype=np.float32)
         begins = np.flatnonzero(np.diff(own, prepend=-1, append=len(branches) + 1))
         return cls(q, places, weights.astype(np.float32), begins.astype(np.intc))
-
-    def near(self, place: Array, count: int) -> Array:
-        """The postures nearest to a place, in turn from each branch, (about count, n)."""
-        distance = ((self.places - place[:, None].astype(np.float32)) ** 2).sum(axis=0) * self.weights
-        each = -(-count // (len(self.begins) - 1))
-        ranked: list[Indices] = []
-        for begin, end in zip(self.begins[:-1], self.begins[1:], strict=True):
-            ranked.append(begin + np.argsort(distance[begin:end], kind="stable")[:each])
-        rows = [rank[i] for i in range(each) for rank in ranked if i < len(rank)]
-        return self.q[rows]
 
 
 @dataclass(frozen=True, eq=False)

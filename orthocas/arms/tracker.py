@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from orthocas.arms.chart_kernel import RULES, ChartKernel, tracker_type
-from orthocas.arms.maps import ArmMaps
-from orthocas.arms.numpy_tracker import NumpyTracker, TrackStatus
-from orthocas.charts.chart import Chart
 from orthocas.charts.clearance import Clearance
 from orthocas.codegen.library import pointer
-from orthocas.errors import CompileError, InvalidValueError, degrees_hint
+from orthocas.errors import InvalidValueError, degrees_hint
 from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind, require_shape
 from orthocas.tools.display import Shown, number_list
+
+
+class TrackStatus(IntEnum):
+    """How the last call of an arm's tracker ended."""
+
+    OK = 0  #: x is met, and xi if one was given
+    YIELDING = 1  #: x is met; xi is another one: a limit, a border of the chart or the speed of joints is in its way
+    BEHIND = 2  #: x is not met: the arm moves towards it as fast as its joints may, or goes another way to it
+    NEAREST = 3  #: x is out of reach from here: a local minimum of its error within the limits, at rest
+    BAD_INPUT = 4  #: a number of x or xi is not finite; the arm stays
+    BRAKED = 5  #: a part of the way, or none: all of it would come nearer to a contact than `margin` allows
 
 
 class ArmTracker(Shown):
@@ -41,10 +49,10 @@ class ArmTracker(Shown):
     while; so it does where it is stuck without x. `detours=False` forbids both.
 
     With a collision model it brakes as `orthocas.charts.trackers.Tracker` does, on detours too, whatever the limits of
-    acceleration; with `avoid` it gives way, in NumPy.
+    acceleration. With `avoid`, pairs that a step would bring nearer join the program above with a weight of 0.3, as
+    rows that keep them at that distance, and the step is made again: xi yields.
 
-    With a C compiler, a call is one call of C that takes a bounded time. Without one, NumPy does the same, slower,
-    without limits of acceleration, with one joint more than the task needs, and does not look for xi elsewhere.
+    A call is one call of compiled C, and of a few with `avoid`; each takes a bounded time.
 
     Source:
         Levenberg and Marquardt's method with an active set on a box; ours.
@@ -52,9 +60,7 @@ class ArmTracker(Shown):
 
     def __init__(
         self,
-        maps: ArmMaps,
-        charts: Sequence[Chart],
-        kernel: ChartKernel | None,
+        kernel: ChartKernel,
         q: ArrayLike,
         period: float,
         velocity_limits: ArrayLike | None = None,
@@ -63,66 +69,68 @@ class ArmTracker(Shown):
         detours: bool = True,
         clearance: Clearance | None = None,
     ) -> None:
-        robot, span = maps.robot, as_number("period", period)
+        robot, m, span = kernel.maps.robot, kernel.maps.task.m, as_number("period", period)
         if not 1e-5 <= span <= 10:
             raise InvalidValueError("period", period, "a time from 1e-5 to 10 s")
         require_kind("detours", detours, bool)
         speed = _read_limits("velocity_limits", velocity_limits, robot.velocity_limits)
         speed = np.where(np.isfinite(speed), speed, RULES.speed)
-        self._rules: dict[str, Any] = {
-            "period": span,
-            "velocity_limits": speed,
-            "acceleration_limits": _read_limits("acceleration_limits", acceleration_limits, np.full(robot.n, np.inf)),
-            "weights": _read_limits("weights", weights, np.ones(robot.n)),  # only their ratios count
-            "detours": detours,
-        }
-        self._maps, self._charts, self._kernel, self._clearance = maps, tuple(charts), kernel, clearance
-        self._r = robot.n - maps.task.m
-        point = self._read_posture(q)
-        self._engine: NumpyTracker | _Compiled
-        gives_way = clearance is not None and clearance.avoid is not None
-        if kernel is not None and not gives_way:
-            self._engine = _Compiled(kernel, self._rules, clearance)
-            self._engine.reset(point)
-        elif self._r > 1 or acceleration_limits is not None:
-            what = "limits of acceleration, and more than one joint too many,"
-            raise CompileError(f"{what} need a C compiler, and a tracker without `avoid`")
-        else:
-            self._engine = NumpyTracker(maps, self._charts, point, span, speed, detours, clearance)
+        change = _read_limits("acceleration_limits", acceleration_limits, np.full(robot.n, np.inf))
+        weight = _read_limits("weights", weights, np.ones(robot.n))
+        self._kernel, self._clearance, self._r = kernel, clearance, robot.n - m
+        # What the tracker knows between calls is one record of C: `NAME_tracker` of templates/arm_track.h.jinja.
+        self._state = np.zeros(1, tracker_type(robot.n, self._r, kernel.target_size))
+        self._state["most"], self._state["change"] = speed * span, change * span**2
+        self._state["weight"] = weight / weight.max()
+        self._state["detours"], self._state["patience"] = detours, max(2, int(RULES.window / span))
+        self._connect()
+        self.reset(q)
+
+    def _connect(self) -> None:
+        """Places of the state and of what a call is given, for C."""
+        self._x, self._target = np.empty(self._kernel.maps.task.m), np.empty(self._kernel.target_size)
+        self._wish: Array = np.empty(self._r)
+        places = (pointer(part) for part in (self._state, self._x, self._target, self._wish))
+        self._at, self._x_at, self._target_at, self._wish_at = places
+        self._postures_at = ctypes.byref(self._kernel.postures.in_c)
+        self._q: Array = self._state["q"][0]
 
     def __getstate__(self) -> dict[str, Any]:
         """Without scratch memory."""
-        parts = {"maps": self._maps, "charts": self._charts, "kernel": self._kernel, "q": self.q}
-        return {**parts, "rules": {**self._rules, "clearance": self._clearance}, "memory": self._engine.memory}
+        return {"kernel": self._kernel, "memory": self._state.tobytes(), "clearance": self._clearance, "r": self._r}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        rules = dict(state["rules"])
-        if not np.isfinite(rules["acceleration_limits"]).any():
-            rules["acceleration_limits"] = None
-        self.__init__(state["maps"], state["charts"], state["kernel"], state["q"], **rules)  # type: ignore[misc]
-        self._engine.memory = state["memory"]
+        self._kernel, self._clearance, self._r = state["kernel"], state["clearance"], state["r"]
+        kind = tracker_type(self._kernel.maps.robot.n, self._r, self._kernel.target_size)
+        self._state = np.frombuffer(state["memory"], kind).copy()
+        self._connect()
+        if self._clearance is not None:
+            self._clearance.start(self.q)
 
     @property
     def q(self) -> Array:
         """The last posture, (n,)."""
-        return self._engine.q
+        return np.array(self._q)
 
     @property
     def status(self) -> TrackStatus:
         """How the last call ended."""
-        return self._engine.status
+        return TrackStatus(int(self._state["status"][0]))
 
     @property
     def xi(self) -> Any:
         """xi of the last posture, a number, or (r,) of several; NaN outside the domain of the tracker's chart."""
-        return self._engine.xi
+        if not self._state["inside"][0]:
+            return float("nan") if self._r == 1 else np.full(self._r, np.nan)
+        value = np.asarray(self._kernel.charts[int(self._state["chart"][0])].xi(self.q))
+        return float(value[0]) if self._r == 1 else value
 
     @property
     def branch(self) -> str:
         """Name of the branch whose chart gives xi; "" before there is one."""
-        if self._engine.chart < 0:
+        if self._state["chart"][0] < 0:
             return ""
-        chart = self._charts[self._engine.chart]
+        chart = self._kernel.charts[int(self._state["chart"][0])]
         return str(chart.notes.get("branch", chart.problem.name))
 
     def facts(self) -> dict[str, str]:
@@ -139,7 +147,14 @@ class ArmTracker(Shown):
         Raises:
             InvalidValueError: if it is not within them, or a pair touches there.
         """
-        self._engine.reset(self._read_posture(q))
+        robot = self._kernel.maps.robot
+        point = as_point("q", q, robot.n)
+        if not ((point >= robot.lower) & (point <= robot.upper)).all():
+            hint = degrees_hint(*point[np.isfinite(robot.lower)])
+            raise InvalidValueError("q", point.tolist(), f"a posture within the joint limits{hint}")
+        if self._clearance is not None:
+            self._clearance.start(point)
+        self._kernel.reset(self._at, pointer(np.ascontiguousarray(point)))
 
     def step(self, x: Any, xi: ArrayLike | None = None, posture: ArrayLike | None = None) -> Array:
         """The next posture (n,); see `status`.
@@ -154,126 +169,95 @@ class ArmTracker(Shown):
         Raises:
             InvalidValueError: if x is no task value of this task, or xi and a posture are given.
         """
-        wish = None if xi is None else self._read_wish(xi)
+        maps, wished = self._kernel.maps, xi is not None
+        if wished:
+            self._read_wish(xi)
         if posture is not None:
-            if xi is not None:
+            if wished:
                 raise InvalidValueError("posture", "given with xi", "one of the two")
             near = as_float_array("posture", posture)
-            require_shape("posture", near.shape, (self._maps.robot.n,))
+            require_shape("posture", near.shape, (maps.robot.n,))
             if np.isfinite(near).all():
-                self._engine.stay_near(near)
+                self._state["near"] = near
             else:
-                wish = np.nan  # BAD_INPUT
-        if type(x) is np.ndarray and x.dtype == np.float64 and x.shape == (self._maps.task.m,):
-            return self._engine.step(x, None, wish)
-        targets, single = self._maps.targets.read(x)
+                self._wish[:], wished = np.nan, True  # BAD_INPUT
+        # A plain vector is read in C, which is most of the time of a call.
+        if type(x) is np.ndarray and x.dtype == np.float64 and x.shape == (maps.task.m,):
+            self._x[:] = x
+            return self._move(self._kernel.track_value, self._x_at, wished)
+        targets, single = maps.targets.read(x)
         if not single:
             raise InvalidValueError("x", f"{len(targets)} values", "one task value")
-        return self._engine.step(None, targets[0], wish)
+        self._target[:] = targets[0]
+        return self._move(self._kernel.track, self._target_at, wished)
 
     def step_to(self, target: Array, xi: ArrayLike | None) -> Array:
         """As `step`, for x as `orthocas.arms.kernel.build_equations` takes it."""
-        return self._engine.step(None, target, None if xi is None else self._read_wish(xi))
+        if xi is not None:
+            self._read_wish(xi)
+        self._target[:] = target
+        return self._move(self._kernel.track, self._target_at, xi is not None)
 
-    def _read_wish(self, xi: ArrayLike) -> Any:
-        if not self._charts:
+    def _read_wish(self, xi: ArrayLike | None) -> None:
+        if not self._kernel.charts:
             raise InvalidValueError("xi", xi, "None, for an arm without charts")
         if self._r == 1:
-            return as_number("xi", xi)
+            self._wish[0] = as_number("xi", xi)
+            return
         values = as_float_array("xi", xi)
         require_shape("xi", values.shape, (self._r,))
-        return values
+        self._wish[:] = values
 
-    def _read_posture(self, q: ArrayLike) -> Array:
-        robot = self._maps.robot
-        point = as_point("q", q, robot.n)
-        if not ((point >= robot.lower) & (point <= robot.upper)).all():
-            hint = degrees_hint(*point[np.isfinite(robot.lower)])
-            raise InvalidValueError("q", point.tolist(), f"a posture within the joint limits{hint}")
-        return point
+    def _move(self, track: Any, at: Any, wished: bool) -> Array:
+        """One call of C, and what contacts ask of it."""
+        wish = self._wish_at if wished else None
+        if self._clearance is None:
+            track(self._at, self._postures_at, at, wish)
+            return self.q
+        before, memory = self.q, self._state.copy()
+        track(self._at, self._postures_at, at, wish)
+        for _ in range(RULES.turns if self._clearance.avoid is not None else 0):
+            if not self._push(self._clearance, memory):
+                break
+            track(self._at, self._postures_at, at, wish)
+        self._state["pushes"] = 0
+        q, fraction = self._clearance.limit(before, self.q)
+        if fraction < 1:
+            self._kernel.hold(self._at, pointer(np.ascontiguousarray(q)), int(TrackStatus.BRAKED))
+        return self.q
 
+    def _push(self, clearance: Clearance, memory: NDArray[np.void]) -> bool:
+        """Go back to where the call began, with a row for each pair that it brought nearer than `avoid`, if any.
 
-class _Compiled:
-    """The tracker in C: templates/arm_track.c.jinja, and its state."""
-
-    def __init__(self, kernel: ChartKernel, rules: dict[str, Any], clearance: Clearance | None) -> None:
-        robot, m = kernel.maps.robot, kernel.maps.task.m
-        period, self._r = rules["period"], robot.n - m
-        self._kernel, self._clearance = kernel, clearance
-        self._state = np.zeros(1, tracker_type(robot.n, self._r, kernel.target_size))
-        self._state["most"], self._state["weight"] = (
-            rules["velocity_limits"] * period,
-            rules["weights"] / rules["weights"].max(),
-        )
-        self._state["change"] = rules["acceleration_limits"] * period**2
-        self._state["detours"], self._state["patience"] = rules["detours"], max(2, int(RULES.window / period))
-        self._x, self._target, self._wish = np.empty(m), np.empty(kernel.target_size), np.empty(self._r)
-        self._q: Array = self._state["q"][0]
-        self._status = self._state["status"]
-        places = (pointer(part) for part in (self._state, self._x, self._target, self._wish))
-        self._at, self._x_at, self._target_at, self._wish_at = places
-        self._postures = kernel.postures
-        self._postures_at = ctypes.byref(self._postures.in_c)
-        self._track, self._track_value = kernel.track, kernel.track_value
-
-    def step(self, vector: Array | None, target: Array | None, xi: Any) -> Array:
-        """The next posture for x as the task's vector or as a target."""
-        before = None if self._clearance is None else self.q
-        wish = None
-        if xi is not None:
-            self._wish[:] = xi
-            wish = self._wish_at
-        if vector is not None:
-            self._x[:] = vector
-            self._track_value(self._at, self._postures_at, self._x_at, wish)
-        else:
-            self._target[:] = target
-            self._track(self._at, self._postures_at, self._target_at, wish)
-        if self._clearance is not None and before is not None:
-            q, fraction = self._clearance.limit(before, self.q)
-            if fraction < 1:
-                self._kernel.hold(self._at, pointer(np.ascontiguousarray(q)), int(TrackStatus.BRAKED))
-        return np.array(self._q)
-
-    def stay_near(self, posture: Array) -> None:
-        """Instead of holding xi."""
-        self._state["near"] = posture
-
-    def reset(self, q: Array) -> None:
-        """Continue from another posture (n,)."""
-        point = np.array(q, dtype=float)
-        if self._clearance is not None:
-            self._clearance.start(point)
-        self._kernel.reset(self._at, pointer(point))
+        grad d . (q + step - q_1) + d_1 = avoid, with the distance d_1 where the call ended, at q_1.
+        """
+        assert clearance.avoid is not None
+        end = self.q
+        near = clearance.collisions.find_near(end, clearance.avoid - RULES.kept)
+        if not len(near.distance):
+            return False
+        known = [(self._state["push"][0, k].copy(), float(self._state["room"][0, k])) for k in range(self._pushes)]
+        self._state[:] = memory
+        rows = [
+            (slope, clearance.avoid - distance + float(slope @ (end - memory["q"][0])))
+            for distance, slope in zip(near.distance.tolist(), near.gradient, strict=True)
+        ]
+        # Pairs of an earlier turn stay, unless this one knows them better.
+        rows = (rows + [(slope, room) for slope, room in known if not _is_known(slope, rows)])[: RULES.pushes]
+        for k, (slope, room) in enumerate(rows):
+            self._state["push"][0, k], self._state["room"][0, k] = slope, room
+        self._state["pushes"] = len(rows)
+        return True
 
     @property
-    def q(self) -> Array:
-        return np.array(self._q)
+    def _pushes(self) -> int:
+        return int(self._state["pushes"][0])
 
-    @property
-    def status(self) -> TrackStatus:
-        return TrackStatus(int(self._status[0]))
 
-    @property
-    def chart(self) -> int:
-        return int(self._state["chart"][0])
-
-    @property
-    def xi(self) -> Any:
-        if not self._state["inside"][0]:
-            return float("nan") if self._r == 1 else np.full(self._r, np.nan)
-        value = np.asarray(self._kernel.charts[self.chart].xi(self.q))
-        return float(value[0]) if self._r == 1 else value
-
-    @property
-    def memory(self) -> bytes:
-        return self._state.tobytes()
-
-    @memory.setter
-    def memory(self, memory: bytes) -> None:
-        self._state[:] = np.frombuffer(memory, self._state.dtype)
-        if self._clearance is not None:
-            self._clearance.start(self.q)
+def _is_known(slope: Array, rows: list[tuple[Array, float]]) -> bool:
+    """Whether a row has nearly the direction of one of others."""
+    size = float(np.linalg.norm(slope))
+    return any(float(slope @ other) > RULES.aligned * size * float(np.linalg.norm(other)) for other, _ in rows)
 
 
 def _read_limits(name: str, limits: ArrayLike | None, default: Array) -> Array:

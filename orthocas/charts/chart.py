@@ -242,8 +242,8 @@ class Chart(Shown):
         from phi(q_start) to phi, so that every xi within `xi_range(q_start)` is found. Without a start, Newton's method
         starts at a rough inverse of phi, a polynomial fitted to points of the domain, then at stored points of the
         domain whose phi is nearest. Rows that still have no solution inside are searched for along the self-motion
-        curves of x (r = 1, or some of them in wide charts), or in all cells of the domain that may hold one. q is the
-        first solution inside that is found; `solutions` looks for all.
+        curves of x (r = 1, or some of them in wide charts), or from more stored points. q is the first solution inside
+        that is found; `solutions` looks for all.
 
         Args:
             phi: target values, (n,) or (N, n). Rows that are not finite get the status BAD_INPUT.
@@ -313,8 +313,9 @@ class Chart(Shown):
         """All q inside the domain with phi(q) = phi that a search of the whole domain finds.
 
         A chart without a fold may have several: det J != 0 makes phi one-to-one near each point only. On the box of a
-        certificate's proof "one-to-one", there is at most one. The search starts in all cells of the domain that may
-        hold a solution. It is no proof that there are no others; docs/explanation/inverse.md has what it misses.
+        certificate's proof "one-to-one", there is at most one. With r = 1 the search follows all self-motion curves of
+        x, with more coordinates it descends from stored positions. It is no proof that there are no others;
+        docs/explanation/inverse.md has what it misses.
 
         Args:
             phi: target values, (n,).
@@ -322,7 +323,8 @@ class Chart(Shown):
             collisions: of the chart's robot: solutions without a contact come first. `solve` with `all` says which.
 
         Returns:
-            Different solutions, the one nearest to the centre of the domain first, (k, n).
+            Solutions that differ by more than full turns of joints without boundaries, the one nearest to the centre of
+            the domain first, (k, n).
 
         Raises:
             NoExpressionError: if the coordinates are grown.

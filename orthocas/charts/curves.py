@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from itertools import product
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,14 +39,6 @@ class Nearest:
         self.between[rows[better]] = between
 
 
-class CurveSearch(Protocol):
-    """A search along self-motion curves."""
-
-    def search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
-        """The nearest points for targets (N, n) of phi, from stored starts and one of the caller's (N, n)."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class SelfMotionCurves:
     """Finds q in the domain with h(q) = x and the nearest xi, along all self-motion curves of x that it finds.
@@ -72,6 +63,34 @@ class SelfMotionCurves:
         found = [self._search(targets[rows], own[rows], tolerance) for rows in pieces]
         parts = zip(*(vars(part).values() for part in (Nearest.empty(own[:0]), *found)), strict=True)
         return Nearest(*(np.concatenate(arrays) for arrays in parts))
+
+    def find_all(self, target: Array, near: Array, tolerance: float) -> Array:
+        """Solutions inside for a target (n,) of phi on all curves of x that are found, some several times, (k, n).
+
+        Curves are sought from positions (S, n) near solutions as well.
+        """
+        targets, own = target[None], self.boxed.domain.home[None]
+        with np.errstate(all="ignore"):
+            q, known = self._reach(targets, np.concatenate([near[:, None], *self.stages(targets, own)]))
+            away, found = self.tracer.away(q)[0], [np.empty((0, len(target)))]
+            while not known.all():
+                # the next curve, through the start nearest to the domain that lies on none so far
+                start = np.argmin(np.where(known[0], np.inf, away))
+                traces = self.tracer.trace(targets[:, : self.boxed.m], q[:, start], np.zeros(1, dtype=np.int64))
+                known[0, start] = True
+                known |= self.tracer.on_curves(q, traces)
+                # where xi passes its target between points close to one another
+                points = self._steps(traces, own).divided()[0]
+                flat = points.reshape(-1, len(target))
+                left = self._xi_left(np.broadcast_to(targets, flat.shape), flat).reshape(points.shape[:2])
+                # points from which the next one may lie beyond a root, or between two
+                change = np.abs(np.diff(left, axis=1))
+                change = np.where(change > self._period / 2, np.inf, change)
+                close = np.zeros(left.shape, dtype=bool)
+                close[:, 1:], close[:, :-1] = np.abs(left[:, 1:]) <= change, np.abs(left[:, :-1]) <= change
+                guess = points[close]
+                found.append(self._solve(targets, np.zeros(len(guess), dtype=np.int64), guess, tolerance)[0])
+        return np.concatenate(found)
 
     def _search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
         best, ends, traced = Nearest.empty(own), Ends.empty(own.shape[1]), list[Traces]()
@@ -100,7 +119,7 @@ class SelfMotionCurves:
         best: Nearest,
     ) -> "Ends":
         """Search some rows from starts (S, rows, n), and add to the curves that are traced; returns ends of arcs."""
-        q, known = self._reached(targets[rows], starts)
+        q, known = self._reach(targets[rows], starts)
         place, ends = np.full(len(targets), -1), Ends.empty(q.shape[2])
         place[rows] = np.arange(len(rows))
         # starts on curves that are known already need no search
@@ -135,7 +154,7 @@ class SelfMotionCurves:
             traced.append(traces)
         return ends
 
-    def _reached(self, targets: Array, starts: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def _reach(self, targets: Array, starts: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Positions (N, S, n) near the task values of targets, and which starts (S, N, n) led to none, (N, S)."""
         S, N, n = starts.shape
         x = np.repeat(targets[:, : self.boxed.m], S, axis=0)
@@ -286,10 +305,15 @@ class SelfMotionCurves:
 
     def _take_solutions(self, targets: Array, rows: Indices, q: Array, tolerance: float, best: Nearest) -> None:
         """Solutions of phi(q) = phi inside to which Newton's steps lead from points q (K, n) of some rows."""
+        q, solved = self._solve(targets, rows, q, tolerance)
+        best.take(rows[solved], q, np.zeros(len(q)))
+
+    def _solve(self, targets: Array, rows: Indices, q: Array, tolerance: float) -> tuple[Array, NDArray[np.bool_]]:
+        """The solutions (S, n), and which of the points led to them, (K,)."""
         if not rows.size:
-            return
+            return q, np.zeros(0, dtype=bool)
         phi_map = self.boxed.phi_map
-        for _ in range(4):
+        for _ in range(8):
             J = phi_map.jacobian(q) / phi_map.sizes[:, None]
             left_over = phi_map.difference(targets[rows], phi_map.phi(q)) / phi_map.sizes
             q = q + solutions_of(J, left_over[:, :, None])[:, :, 0]
@@ -297,9 +321,10 @@ class SelfMotionCurves:
         moved = np.clip(q, *self.boxed.domain.bounds)
         near = np.abs(moved - q) <= 1e-9 * self.boxed.domain.half_width
         q = np.where(near.all(axis=1, keepdims=True), moved, q)
-        q = np.where(np.isfinite(q), q, best.q[rows])
-        solved = (largest(phi_map.residual(targets[rows], q)) <= tolerance) & self.boxed.domain.contains(q)
-        best.take(rows[solved], q[solved], np.zeros(int(solved.sum())))
+        solved = np.asarray(np.isfinite(q).all(axis=1))
+        solved[solved] = largest(phi_map.residual(targets[rows[solved]], q[solved])) <= tolerance
+        solved[solved] = self.boxed.domain.contains(q[solved])
+        return q[solved], solved
 
     def _take_points(self, targets: Array, arcs: "Arcs", best: Nearest) -> "Ends":
         """Take points of arcs that lie in the domain, and return the ends that may be nearer."""

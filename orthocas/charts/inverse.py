@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocas.charts.coordinates import InvertibleMap
-from orthocas.charts.curves import CurveSearch
+from orthocas.charts.curves import SelfMotionCurves
 from orthocas.charts.inside import Inside
 from orthocas.charts.newton import Attempt, Continuation, LocalSolver
 from orthocas.charts.phi import PhiMap, largest
@@ -31,6 +31,7 @@ from orthocas.tools.checks import (
     require_shape,
 )
 from orthocas.tools.display import Shown, listed
+from orthocas.tools.expressions import wrap_shortest
 
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
@@ -46,6 +47,7 @@ class InverseRules:
     restarts: int = 8  #: from points of the table, where nothing leads to any solution
     snap: float = 1e-9  #: half-widths: solutions so close to the boundary are moved onto it
     slack: float = 1e-9  #: half-widths: joint limits are decimal numbers, see `require_within_limits`
+    same: float = 1e-6  #: half-widths up to which two solutions count as one
     named: int = 5  #: rows that a message names
 
 
@@ -236,10 +238,24 @@ def solve_all(chart: Chart, phi: Array, tolerance: float, collisions: Collisions
     """All solutions for one target (n,) inside the domain that a search finds, free ones first."""
     require_at_least("tolerance", tolerance, 0)
     require_expression(chart, "a search for all solutions")
-    in_domain, phi_map = chart.parts.inverse.in_domain, chart.parts.phi_map
-    assert in_domain is not None
-    # free ones first, otherwise the nearest to the centre first
-    q = in_domain.all_solutions(phi, float(tolerance))
+    search, phi_map, domain = chart.parts.inverse, chart.parts.phi_map, chart.problem.domain
+    whole = search.in_domain if search.curves is None else search.curves
+    assert whole is not None
+    # what Newton's method finds from stored points, then all of the domain
+    starts = search.starts.nearest(phi[None], RULES.first, chart.n)[:, 0]
+    near = (search.brief or search.local)(np.broadcast_to(phi, starts.shape), starts)
+    solved = near.q[largest(near.residual) <= tolerance]
+    every = np.concatenate([solved[domain.contains(solved)], whole.find_all(phi, near.q, float(tolerance))])
+    # of all that are found, those that differ by more than full turns, the nearest to the centre first
+    turns = np.zeros(chart.n)
+    turns[list(chart.problem.turning)] = 2 * np.pi
+    kept: list[int] = []
+    for k in np.argsort(np.linalg.norm((every - domain.centre) / domain.half_width, axis=1)):
+        apart = np.abs(wrap_shortest(every[k] - every[kept], turns)) / domain.half_width
+        if (apart.max(axis=1) > RULES.same).all():
+            kept.append(int(k))
+    # free ones come first
+    q = every[kept]
     status = np.full(len(q), int(InverseStatus.FOUND))
     if collisions is not None and len(q):
         status[~collisions.check_free(q)] = InverseStatus.COLLIDING
@@ -383,7 +399,7 @@ class Inverse:
     along: Continuation | None = None  #: follows lines of values from given starts; for fitted coordinates
     in_domain: InDomain | None = None  #: searches all of the domain; for fitted coordinates with r > 1
     inside: Inside | None = None  #: finds points inside that keep the task; for fitted coordinates
-    curves: CurveSearch | None = None  #: finds the nearest xi at a task value; for fitted coordinates with r = 1
+    curves: SelfMotionCurves | None = None  #: finds the nearest xi at a task value; for fitted coordinates with r = 1
     brief: LocalSolver | None = None  #: in place of `local` where curves are searched anyway; it may give up early
 
     def solve(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Solutions:
@@ -477,7 +493,7 @@ class Inverse:
             best.improve(rows[left], self._attempt(targets[rows[left]], start[left], tolerance))
 
     def _search_curves(
-        self, curves: CurveSearch, inside: Inside, targets: Array, best: Found, own: Array, tolerance: float
+        self, curves: SelfMotionCurves, inside: Inside, targets: Array, best: Found, own: Array, tolerance: float
     ) -> None:
         """Replace what is not found by other solutions, or the nearest xi, on self-motion curves inside the domain."""
         rows = np.flatnonzero(best.status != InverseStatus.FOUND)
@@ -490,7 +506,7 @@ class Inverse:
 
     def _take_nearest(
         self,
-        curves: CurveSearch,
+        curves: SelfMotionCurves,
         inside: Inside,
         targets: Array,
         best: Found,

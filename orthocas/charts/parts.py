@@ -25,7 +25,7 @@ from orthocas.charts.newton import (
     inverse_function,
 )
 from orthocas.charts.phi import Differences, PhiMap, fill_coordinates, leave_over
-from orthocas.charts.search import Cells, InDomain, Starts
+from orthocas.charts.search import InDomain, Starts
 from orthocas.charts.trackers import near_function
 from orthocas.tasks.problem import measure_task_sizes
 from orthocas.tasks.relative import Relative
@@ -199,7 +199,7 @@ class ChartParts:
         local, brief = (
             FewRows(phi_map, self.point_functions, Newton(phi_map, k)) for k in (NEWTON.halvings, NEWTON.brief)
         )
-        in_domain, inside = InDomain(boxed, Cells(boxed)), Inside(boxed, starts)
+        in_domain, inside = InDomain(boxed, starts), Inside(boxed, starts)
         curves = SelfMotionCurves(boxed, starts, self.tracer) if chart.r == 1 else None
         return Inverse(chart.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves, brief)
 

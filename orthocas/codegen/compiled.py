@@ -2,8 +2,10 @@
 
 import ctypes
 import hashlib
+import importlib.util
 import os
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -47,7 +49,7 @@ def keep_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], fo
         CompileError: if there is no C compiler, or it fails, or the folder is not the user's own.
         InvalidValueError: if the folder cannot be written.
     """
-    compiler, options = find_compilers()[0], ("-std=c99", "-fPIC", "-shared", *flags)
+    compiler, options = _choose_compiler(), ("-std=c99", "-fPIC", "-shared", *flags)
     content = [*(text.encode() for text in sources.values()), repr((compiler, options)).encode()]
     name = f"{kind}-{hashlib.sha256(b'/'.join(content)).hexdigest()[:32]}.so"
     place = _find_cache() if folder is None else as_path("folder", folder)
@@ -61,9 +63,23 @@ def keep_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], fo
             # Files that others include are a part of those.
             included = {name for text in sources.values() for name in _INCLUDED.findall(text)}
             code = [str(place / file) for file in sources if file.endswith(".c") and file not in included]
-            run_program([compiler, *options, "-o", str(drafts / name), *code, "-lm"])
+            run_program([*compiler, *options, "-o", str(drafts / name), *code, "-lm"])
             (drafts / f"{name}.sha256").write_text(compute_digest(drafts / name))
     return library
+
+
+def _choose_compiler() -> tuple[str, ...]:
+    """The command that compiles C: a compiler on the PATH, or that of the package ziglang, which pip installs anywhere.
+
+    Raises:
+        CompileError: if there is neither.
+    """
+    try:
+        return (find_compilers()[0],)
+    except CompileError:
+        if importlib.util.find_spec("ziglang") is None:
+            raise
+        return (sys.executable, "-m", "ziglang", "cc")
 
 
 def _find_cache() -> Path:

@@ -66,8 +66,8 @@ class CompiledInverse(Shown):
         """The parts of the chart, with compiled searches in their places."""
         parts = self.chart.parts.inverse
         curves = parts.curves
-        if isinstance(curves, SelfMotionCurves):
-            curves = CompiledCurves(curves, lambda: self._c)
+        if curves is not None:
+            curves = CompiledCurves(curves.boxed, curves.starts, curves.tracer, lambda: self._c)
         local, brief = partial(self._search, _ITERATIONS), partial(self._search, _FEW_ITERATIONS)
         return replace(parts, local=local, brief=brief, curves=curves)
 
@@ -131,17 +131,16 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
         sources = {path.name: path.read_text(encoding="utf-8") for path in sorted(drafts.glob("*.[hc]"))}
     sources[_ROWS] = get_source(_ROWS)
     curves = chart.parts.inverse.curves
-    if isinstance(curves, SelfMotionCurves):
+    if curves is not None:
         sources |= {name: get_source(name) for name in ("curve_rows.c", "curve_math.c")}
         sources["curves.c"] = write_curve_source(chart, curves)
     return CompiledInverse(chart, keep_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder))
 
 
 @dataclass(frozen=True, eq=False)
-class CompiledCurves:
-    """`SelfMotionCurves.search` in compiled C."""
+class CompiledCurves(SelfMotionCurves):
+    """Self-motion curves with their search in compiled C."""
 
-    curves: SelfMotionCurves
     library: Callable[[], Any]  #: the library with the code of `write_curve_source`
 
     def search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
@@ -154,7 +153,7 @@ class CompiledCurves:
         # Later stages of starts serve only rows that the earlier ones leave without a solution.
         def search_piece(first: int) -> None:
             rows = slice(first, first + _CURVE_PIECE)
-            stages = self.curves.stages(targets[rows], own[rows])
+            stages = self.stages(targets[rows], own[rows])
             starts = np.concatenate(stages).transpose(1, 0, 2)
             inputs = (np.ascontiguousarray(array) for array in (targets[rows], starts))
             arrays = (*inputs, np.empty(room, dtype=np.uint8), best.q[rows], best.distance[rows], between[rows])

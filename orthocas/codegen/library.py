@@ -43,7 +43,10 @@ def find_compilers() -> tuple[str, ...]:
     result = [path for name in ("gcc", "clang") if (path := shutil.which(name)) is not None]
     result = result or [path for path in (shutil.which("cc"),) if path is not None]
     if not result:
-        raise CompileError("no C compiler found, expected gcc, clang or cc on the PATH")
+        raise CompileError(
+            "no C compiler found, expected gcc, clang or cc on the PATH: apt install gcc, xcode-select --install, or "
+            "pip install ziglang, which suffices for all that is compiled while Python runs"
+        )
     return tuple(result)
 
 
@@ -108,6 +111,16 @@ class CompiledLibrary:
         """M (n, n), bias (n,), gravity (n,), status."""
         M, bias, gravity = self._zeros(self.n, self.n), self._zeros(self.n), self._zeros(self.n)
         return M, bias, gravity, self._call("dynamics", [q, dq], [M, bias, gravity])
+
+    def link_positions(self, motor_q: Array, stiffness: Array, torque: Array | None = None) -> tuple[Array, int]:
+        """q (n,) with stiffness (motor_q - q) = torque, which is gravity at q if it is not given, status."""
+        q, arrays = self._zeros(self.n), [motor_q, stiffness, *([] if torque is None else [torque])]
+        for array in arrays:
+            require_shape("an argument of link_positions", np.shape(array), (self.n,))
+        places = [None if array is None else self.numbers(array) for array in (motor_q, stiffness, torque)]
+        run = self.function("link_positions")
+        run.argtypes = [ctypes.c_void_p] * 4
+        return q, int(run(*(None if place is None else pointer(place) for place in places), pointer(q)))
 
     def control(self, q: Array, dq: Array, reference: Array, gains: Array) -> tuple[Array, int]:
         """Command (n,), status. Reference (3 k,) and gains hold the numbers of the C structs in order."""
@@ -189,7 +202,7 @@ class Supervisor:
     def __init__(self, library: CompiledLibrary, controller: Controller, safety: Safety | None = None) -> None:
         require_kind("library", library, CompiledLibrary)
         require_controller(controller)
-        self._n, self._k, self._library = library.n, len(controller.labels), library
+        self._n, self._k, self.library = library.n, len(controller.labels), library
         # Functions of the supervised law; those that take numbers beside pointers state their types.
         self._functions = {
             name: library.function(name)
@@ -234,9 +247,9 @@ class Supervisor:
             q: joint positions (n,).
             torque: measured or commanded, in terms of the command: without what the robot adds itself (n,).
         """
-        mismatch = self._library.numbers(np.zeros(self._n))
+        mismatch = self.library.numbers(np.zeros(self._n))
         inputs = [self._numbers(name, value, self._n) for name, value in (("q", q), ("torque", torque))]
-        inputs += [self._library.numbers(self.gains), mismatch]
+        inputs += [self.library.numbers(self.gains), mismatch]
         status = self._functions["check_start"](self._safety, *map(pointer, inputs))
         return mismatch, ControlStatus(status)
 
@@ -271,7 +284,7 @@ class Supervisor:
             period: time since the last call [s].
         """
         inputs = [self._numbers(name, value, self._n) for name, value in (("q", q), ("dq", dq))]
-        inputs += [self._reference(reference), self._library.numbers(self.gains)]
+        inputs += [self._reference(reference), self.library.numbers(self.gains)]
         time, command = as_number("period", period), pointer(self._command)
         status = self._functions["step"](self._here, self._safety, *map(pointer, inputs), time, command)
         return self._command.copy(), ControlStatus(status)
@@ -317,10 +330,10 @@ class Supervisor:
         array = as_float_array(name, values)
         # C would read beyond the end of a short array.
         require_shape(name, array.shape, (size,))
-        return self._library.numbers(array)
+        return self.library.numbers(array)
 
     def _point(self, name: str, values: ArrayLike) -> Array:
-        return self._library.numbers(as_point(name, values, self._n))
+        return self.library.numbers(as_point(name, values, self._n))
 
     @property
     def _here(self) -> Any:

@@ -111,9 +111,10 @@ class _OperationalSpace(LawOfChart):
             stiffness.
         compliance: c >= 0 of each joint, in series with the springs, (n,) or one number [rad/(N m)]; used with a finite
             `fastest`. Default: 0, but that of `tracking_gains` for PD+ without a stiffness.
-        remembers: integral action against a wrong model: `FrictionObserver()`, `MomentumObserver()`, `Adaptation()`.
-            It needs the input `extra_torque`, which it adds to `model`, and ticks: a `control_rate` in simulations, the
-            supervised law in C, `Remembering` in programs of your own. Default: none.
+        remembers: integral action against a wrong model: `FrictionObserver()`, `MomentumObserver()`, `Adaptation()`, or
+            their names "friction", "momentum", "adaptive". Arms that stick need the first. It needs the input
+            `extra_torque`, which it adds to `model`, and ticks: a `control_rate` in simulations, the supervised law in
+            C, `Remembering` in programs of your own. Default: none.
 
     Raises:
         ShapeError, InvalidValueError, UnknownNameError: for settings of the wrong shape, value or name.
@@ -175,7 +176,7 @@ class _OperationalSpace(LawOfChart):
         limit: ArrayLike | None = None,
         damping_stiffness: ArrayLike | None = None,
         model: RunTimeModel | None = None,
-        remembers: Remembers | None = None,
+        remembers: Remembers | Literal["momentum", "adaptive", "friction"] | None = None,
         *,
         fastest: float | None = None,
         compliance: ArrayLike | None = None,
@@ -187,6 +188,9 @@ class _OperationalSpace(LawOfChart):
         require_driven(f"the law {self.name}", chart.problem.robot.tree)
         model = RunTimeModel() if model is None else model
         require_kind("model", model, RunTimeModel)
+        if isinstance(remembers, str):
+            require_known("remembers", remembers, MEMORIES)
+            remembers = MEMORIES[remembers]()
         if remembers is not None and not callable(getattr(remembers, "of", None)):
             raise InvalidValueError(
                 "remembers", repr(remembers)[:80], "what makes a memory, such as MomentumObserver()"
@@ -284,7 +288,7 @@ class _OperationalSpace(LawOfChart):
         """
         # Words become the objects that they name.
         require_known("memory", memory, ("none", *MEMORIES))
-        remembers = None if memory == "none" else MEMORIES[memory]()
+        remembers = None if memory == "none" else memory
         zeros: dict[str, ArrayLike] = {"payload": 0.0, "wrench": np.zeros(6), "extra_torque": 0.0}
         names = inputs.split(",") if inputs else []
         for name in names:

@@ -47,13 +47,9 @@ class SafetyRules:
     stuck_way: float = 0.03  #: likewise of velocity laws [rad]
     friction: float = 2.0  #: that may hold a joint at a start beside its torque [N m] or [N]
     most_friction: float = 12.5  #: and most that may hold it against the law, later [N m] or [N]
-    stiction: float = (
-        0.125  #: likewise, as a share of the effort limit: Coulomb friction of 10 %, a quarter more at rest
-    )
+    stiction: float = 0.125  #: the same as a share of the effort limit: Coulomb friction of 10 %, a quarter more
     fine_step: float = 2 * np.pi / 2**13  #: of an encoder [rad]
-    observer: float = (
-        60.0  #: poles of the observer of velocities for that step, at most twice that for finer ones [1/s]
-    )
+    observer: float = 60.0  #: poles of the observer for that step, at most twice that for finer ones [1/s]
     turn_per_metre: float = 40 * np.pi  #: encoders of sliding joints turn once in 5 cm [rad/m]
     error: float = 0.02  #: of models and torque sensors, as a share of the effort limit; without one, of gravity
 
@@ -99,9 +95,7 @@ class Safety:
     observer_rate: Annotated[
         Array, "poles of an observer of velocities, for coarse encoders [1/s]; 0: as measured; default by encoder_step"
     ]
-    encoder_step: Annotated[
-        Array, "what an encoder rounds to, which that observer does not take for motion [rad] or [m]"
-    ]
+    encoder_step: Annotated[Array, "what an encoder rounds to; that observer does not take it for motion [rad] or [m]"]
     friction: Annotated[Array, "dry friction that may hold a joint, whose sensors then measure the same [N m]"]
     lower: Annotated[Array, "joint limits [rad] or [m]"]
     upper: Annotated[Array, "joint limits [rad] or [m]"]

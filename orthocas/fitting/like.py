@@ -1,4 +1,6 @@
-"""Coordinates that are like given quantities: gradients as near to theirs as they can be across the task."""
+"""Coordinates that are given quantities, or like them: gradients as near to theirs as they can be across the task."""
+
+from __future__ import annotations
 
 import hashlib
 import json
@@ -10,21 +12,22 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from orthocas.bases.family import LinearFamily
+from orthocas.bases.family import JointSpace, LinearFamily, Parametrisation, require_parametrisation
 from orthocas.bases.given import Given, find_periods, sew_angle
 from orthocas.charts.coordinates import Coordinates
-from orthocas.errors import InvalidValueError, RobotError
+from orthocas.charts.regular_part import RegularPart
+from orthocas.errors import DomainError, InvalidValueError, RobotError
 from orthocas.fitting.basis_objective import BasisGradients
-from orthocas.fitting.terms import Data, Sizes, metric_lengths
+from orthocas.fitting.terms import Data, Sizes, find_least_volume, metric_lengths
 from orthocas.robots.robot import Robot
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import Samples, sample_problem
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, require_known, require_shape
+from orthocas.tools.checks import Array, require_kind, require_known, require_shape
 from orthocas.tools.columns import BlockedFunction
-from orthocas.tools.display import percent
+from orthocas.tools.display import listed, percent
 from orthocas.tools.expressions import build_expression, replay, wrap_shortest, write_tape
 
 Quantity = Callable[[ca.SX], ca.SX]  #: a function of an SX column q
@@ -43,12 +46,83 @@ class LikeRules:
     still: float = 1e-9  #: of the largest projected gradient
     still_motion: float = 1e-3  #: least change of a quantity for a unit self-motion, over the length of its gradient
     scaled_against: float = 0.1  #: share of positions against the swivel up to which it gives a scale
+    enough_itself: float = 0.995  #: share of nonsingular positions on which a quantity is regular, to be xi itself
     held_out: int = 2000  #: samples of the distances
     held_out_of_meaning: int = 10_000  #: samples of the domain for errors of a meaning
     quantiles: tuple[float, float] = (0.05, 0.95)  #: of rates of a meaning
 
 
 RULES = LikeRules()
+
+
+def choose_quantities(
+    problem: Problem, like: Likeness | None, exact: bool | None, parametrisation: Parametrisation | None
+) -> tuple[Like | None, bool | None]:
+    """The quantities of `like`, or those that a parametrisation without parameters is; and whether xi is to be these.
+
+    Raises:
+        InvalidValueError: if arguments contradict each other, or there are more quantities than coordinates.
+    """
+    if exact is not None:
+        require_kind("exact", exact, bool)
+    if parametrisation is not None:
+        require_parametrisation(parametrisation)
+        if parametrisation.closed_form is not None and isinstance(given := parametrisation.for_problem(problem), Given):
+            if like is not None or exact is False:
+                name = "exact" if like is None else "like"
+                raise InvalidValueError(name, f"given with {given.label}", "this left out: xi is what is given")
+            given.family(JointSpace.of(problem), problem.r)  # of the right shape
+            return Like.of_given(given), True
+    if like is None:
+        if exact is not None:
+            raise InvalidValueError("exact", "given without like", "a quantity, such as like='swivel'")
+        return None, None
+    if exact and parametrisation is not None:
+        raise InvalidValueError("exact", "given with a parametrisation to fit", "one of them")
+    quantities = Like.of(problem, like)
+    quantities.require_at_most(problem.r)
+    return quantities, exact if parametrisation is None else False
+
+
+def take_exactly(problem: Problem, quantities: Like, exact: bool | None, counted: Array) -> Coordinates | None:
+    """Quantities as coordinates, xi = y(q), if they are to be that.
+
+    Coordinates of r quantities are regular where the volume of `RegularPart`, with r = 1 the cosine between gradient
+    and self-motion, is above the least one of wide charts, with the sign of the centre of the domain.
+
+    Args:
+        problem: the problem, on the clear part of a branch.
+        quantities: at most r quantities.
+        exact: True to take them on however small a part, False never, None where they are regular nearly everywhere.
+        counted: nonsingular positions of the branch, (N, n).
+
+    Returns:
+        The coordinates; None if coordinates are to be fitted to the quantities.
+
+    Raises:
+        InvalidValueError: with `exact`, if there are fewer quantities than coordinates, or they are not independent.
+        DomainError: with `exact`, if they are not regular at the centre.
+    """
+    count = len(quantities.names)
+    if exact is False or (count < problem.r and not exact):
+        return None
+    if count < problem.r:
+        what = f"given with {count} {'quantity' if count == 1 else 'quantities'}"
+        raise InvalidValueError("exact", what, f"{problem.r} of them, one for each coordinate; or leave it out")
+    # the quantities themselves: not shifted, and not scaled
+    domain, space, r = problem.domain, JointSpace.of(problem), problem.r
+    coordinates = Coordinates(quantities.given, space, (), np.zeros(0), np.zeros(r), np.ones(r))
+    inside = counted[domain.contains(counted)]
+    try:
+        regular = RegularPart(domain, coordinates, find_least_volume(problem))
+    except DomainError:
+        if not exact:
+            return None
+        # that they are nowhere regular is worse
+        quantities.project(sample_problem(problem, RULES.held_out, RULES.held_out))
+        turning = f"in the middle of branch '{problem.name}', self-motions do not change {listed(quantities.names)}"
+        raise DomainError(f"{turning}: give a smaller box as branch, another branch, or another quantity") from None
+    return coordinates if exact or np.mean(regular.contains(inside)) >= RULES.enough_itself else None
 
 
 def build_quantity(robot: Robot, like: Quantity | str) -> tuple[str, ca.Function]:
@@ -92,7 +166,7 @@ class Like:
     function: ca.Function  #: q (n, 1) -> y (k, 1)
 
     @classmethod
-    def of(cls, problem: Problem, like: Likeness) -> "Like":
+    def of(cls, problem: Problem, like: Likeness) -> Like:
         """Build from a task of lower priority, a quantity, or of several.
 
         A missing reference orientation of the task is taken at the centre of the domain.
@@ -116,7 +190,7 @@ class Like:
         return cls(tuple(name for name, _ in quantities), _require_arms(robot, q, values))
 
     @classmethod
-    def of_given(cls, given: Given) -> "Like":
+    def of_given(cls, given: Given) -> Like:
         """Build from coordinates in closed form; angles have the unit rad."""
         q = ca.SX.sym("q", given.n)
         values = ca.vertcat(*replay(given.tape, ca.vertsplit(q)))
@@ -126,7 +200,7 @@ class Like:
         return cls(names, dense_function("like", [q], [values]))
 
     @classmethod
-    def by_default(cls, problem: Problem) -> "Like | None":
+    def by_default(cls, problem: Problem) -> Like | None:
         """The angle of the elbow, if the arm has shoulder, elbow and wrist, and r = 1."""
         try:
             return cls.of(problem, SWIVEL) if problem.r == 1 else None
@@ -163,7 +237,7 @@ class Like:
         q = ca.SX.sym("q", self.function.numel_in(0))
         return BlockedFunction(dense_function("slopes", [q], [ca.jacobian(self.function(q), q)]))
 
-    def build_term(self, problem: Problem, active: list[int]) -> "LikeTerm":
+    def build_term(self, problem: Problem, active: list[int]) -> LikeTerm:
         """The term of the loss for coordinates of the active joints; the others stay at the centre of the domain.
 
         Raises:
@@ -209,7 +283,7 @@ class Like:
         Q, R = np.linalg.qr(np.vstack([self.differentiate(centre.points)[0] @ across.T, np.eye(len(across))]).T)
         return np.asarray((Q * np.where(R.diagonal() < 0, -1.0, 1.0)).T @ across)
 
-    def hold(self, samples: Samples, along: Callable[[Array], Array]) -> "list[QuadraticTerm]":
+    def hold(self, samples: Samples, along: Callable[[Array], Array]) -> list[QuadraticTerm]:
         """Weighted means of squared distances of gradients from those g_k of quantities, above all along self-motions.
 
         They are those of |Z^T d_k|^2 + 0.1 |N^T d_k|^2 with the distance d_k = dxi_k/dq - g_k and orthonormal bases Z
@@ -269,7 +343,7 @@ class Like:
             scale=coordinates.scale * scale,
         )
 
-    def measure_error(self, problem: Problem, coordinates: Coordinates, seed: int) -> "MeaningError":
+    def measure_error(self, problem: Problem, coordinates: Coordinates, seed: int) -> MeaningError:
         """What the first coordinate misses of the first quantity at samples of the domain, where it has a value."""
         samples = sample_problem(problem, RULES.held_out_of_meaning, (seed, RULES.held_out_of_meaning))
         value = Batched(self.function)(samples.points)[0].reshape(len(samples), -1)[:, 0]

@@ -29,9 +29,8 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import worst_points
 from orthocas.charts.regular_part import RegularPart
 from orthocas.errors import BranchWarning, DomainError, Interrupted, InvalidValueError
-from orthocas.fitting.exact_quantity import choose_quantities, take_exactly
 from orthocas.fitting.fit import Fit, fix_gauge, normalise
-from orthocas.fitting.like import Like, Likeness, MeaningError
+from orthocas.fitting.like import Like, Likeness, MeaningError, choose_quantities, take_exactly
 from orthocas.fitting.terms import Weights, find_least_volume, find_term
 from orthocas.fitting.wide_search import (
     RULES,
@@ -111,8 +110,7 @@ def fit_wide(
        and descends with Adam on some of the samples at a time. It takes several times as long to evaluate, and is not
        tried with `like` or with slides without limits.
     4. The best ones go on: as long as they are not regular enough at other samples, and get better, the worst of many
-       fresh samples join. Once they are, and with r = 1, leaks weigh more in a last descent, kept if coordinates stay
-       regular enough.
+       fresh samples join. Once they are, leaks weigh more in a last descent, kept if coordinates stay regular enough.
 
     The best result is kept: regular at the centre, with the fewest bad positions, then with the largest 1 % quantile of
     the volume. The domain of the chart is the part of the branch where coordinates are regular with a margin in the

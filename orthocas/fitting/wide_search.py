@@ -43,6 +43,7 @@ class WideRules:
     alignment: float = 0.3  #: weight of the mean sin^2 of the leaks
     alignment_in_metric: float = 1.0  #: the same in another metric than the identity
     closer: float = 4.0  #: factor of this weight in a last descent, once coordinates are regular enough
+    closer_of_several: float = 2.0  #: the same with r > 1
     mutual: float = 0.15  #: weight of the mean cos^2 between gradients of different coordinates
     evenness: float = 0.03  #: weight of the mean squared logarithm of the lengths of gradients
     uniform: float = 0.5  #: fraction of samples that are uniform; the others are boundary-weighted
@@ -240,8 +241,8 @@ class Search:
         # The gradient comes nearer to self-motions, if it stays regular enough. A user's balance of terms is kept.
         balanced = self.settings.weights or self.settings.quantities
         finished = self._done if self.linear else self.left_out and self.is_enough(RULES.enough)
-        if finished and self._last is self.best and self.problem.r == 1 and not balanced:
-            self._alignment *= RULES.closer
+        if finished and self._last is self.best and not balanced:
+            self._alignment *= RULES.closer if self.problem.r == 1 else RULES.closer_of_several
             first = self.linear and len(self._samples) == 1
             solver = LBFGS(RULES.further, RULES.tolerance) if self.linear else _SLOWER_OF_SMALL
             rank = self._descend("smaller leaks", "volume" if first else "volume with the worst", solver)

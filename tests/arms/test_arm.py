@@ -61,23 +61,6 @@ def test_batches_of_x_and_xi_are_solved_within_the_limits() -> None:
     assert ((found.q >= arm.robot.lower) & (found.q <= arm.robot.upper)).all()
 
 
-def test_compiled_rows_end_as_those_without_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At random poses, with and without starts: the same statuses, x and xi met, and no xi that is farther."""
-    arm, postures = panda(), panda().robot.sample(60, seed=3)
-    x = arm.x(postures)
-    assert arm.chart_kernel is not None
-    compiled = [arm.solve(x, 0.2, start) for start in (None, postures)]
-    monkeypatch.setattr(oc.Arm, "chart_kernel", None)
-    for found, other in zip(compiled, [arm.solve(x, 0.2, start) for start in (None, postures)], strict=True):
-        assert (found.status == other.status).all()
-        assert found.branch == other.branch
-        assert np.abs(arm.x(found.q) - x).max() < 1e-8
-        nearest = found.status == InverseStatus.NEAREST
-        assert nearest.any()
-        assert (np.abs(found.xi - 0.2) <= np.abs(other.xi - 0.2) + 5e-3)[nearest].all()  # xi may turn between points
-        assert found.xi[found.found] == pytest.approx(arm.charts[0].xi(found.q[found.found])[:, 0], abs=1e-8)
-
-
 def test_arrays_and_lists_of_task_values_are_one() -> None:
     arm, q = panda(), inside(panda(), 3, 8)
     x, xi = arm.x(q), arm.charts[0].xi(q)[:, 0]

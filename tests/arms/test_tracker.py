@@ -8,8 +8,7 @@ import pytest
 
 import orthocas as oc
 from orthocas.arms import ArmTracker, TrackStatus
-from orthocas.arms.numpy_tracker import _solve_by_steps, solve_in_box
-from orthocas.errors import CompileError, InvalidValueError
+from orthocas.errors import InvalidValueError
 from orthocas.tools.checks import Array
 
 PERIOD = 0.01
@@ -57,13 +56,8 @@ def test_inside_a_chart_x_and_xi_are_met() -> None:
     assert tracker.branch == arm.branch_names[0]
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_near_a_posture_the_free_motion_of_the_joints_leads_no_nearer(
-    compiled: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_near_a_posture_the_free_motion_of_the_joints_leads_no_nearer() -> None:
     """With x met, the self-motion is at right angles to the way to the posture; the way plays no part."""
-    if not compiled:
-        monkeypatch.setattr(oc.Arm, "chart_kernel", None)
     arm, wish = panda(), centre() + np.array([0.3, -0.2, 0.2, 0.1, -0.3, 0.2, -0.1])
     tracker, x, rng = arm.tracker(centre(), period=PERIOD), arm.x(centre()), np.random.default_rng(4)
     answers = []
@@ -211,21 +205,6 @@ def test_on_a_moving_base_x_is_followed_and_the_posture_comes_back() -> None:
         arm.self_motion(arm.x(q))
 
 
-def test_without_a_compiler_numpy_tracks(monkeypatch: pytest.MonkeyPatch) -> None:
-    arm, x, q = panda(), panda().x(centre()), centre()
-    path = along(x, np.array([0.5, 0.1, -0.1]), 120)
-    compiled = [arm.follow(path, q=q)]
-    monkeypatch.setattr(oc.Arm, "chart_kernel", None)
-    other, statuses = arm.follow(path, q=q)
-    inside = np.flatnonzero([status is TrackStatus.OK for status in statuses])
-    assert len(inside) > 50
-    assert compiled[0][0][inside[:50]] == pytest.approx(other[inside[:50]], abs=1e-7)
-    tracker = arm.tracker(q)
-    assert pickle.loads(pickle.dumps(tracker)).step(path[3]) == pytest.approx(tracker.step(path[3]), abs=1e-9)
-    with pytest.raises(CompileError, match="acceleration"):
-        arm.tracker(q, acceleration_limits=1.0)
-
-
 def test_without_detours_the_error_of_a_target_at_rest_never_rises() -> None:
     arm = panda()
     for q in np.random.default_rng(2).uniform(arm.robot.lower, arm.robot.upper, (4, 7)):
@@ -282,18 +261,32 @@ def test_a_copied_tracker_goes_on_where_the_first_one_is() -> None:
         assert other.step(target) == pytest.approx(tracker.step(target), abs=1e-9)
 
 
-def test_the_program_on_a_box_is_solved_by_both_active_sets() -> None:
-    """Its solution meets the conditions of Karush, Kuhn and Tucker."""
-    rng = np.random.default_rng(3)
-    for _ in range(200):
-        n = int(rng.integers(1, 8))
-        A, g = rng.normal(size=(n, n)), 3 * rng.normal(size=n)
-        H, low, high = A.T @ A + 1e-3 * np.eye(n), -rng.uniform(0, 1, n), rng.uniform(0, 1, n)
-        for solve in (solve_in_box, _solve_by_steps):
-            d = solve(H, g, low, high)
-            slope = g + H @ d
-            assert ((d >= low) & (d <= high)).all()
-            inner = (d > low + 1e-12) & (d < high - 1e-12)
-            assert np.abs(slope[inner]).max(initial=0.0) < 1e-8
-            assert (slope[d <= low + 1e-12] >= -1e-8).all()
-            assert (slope[d >= high - 1e-12] <= 1e-8).all()
+def test_a_fold_is_passed_in_the_direction_of_the_motion() -> None:
+    """A straight joint motion through a posture at which J loses rank: Franka's elbow goes on to the other side."""
+    arm = oc.Arm(panda().task)
+    q, way = np.array([0.0, 0.3, 0.0, -1.2, 0.0, 0.0, 0.4]), np.array([0.1, 0.1, 0.1, 0.2, -0.1, 0.4, 0.1])
+    J = arm.robot.jacobian(q)
+    assert np.linalg.svd(J, compute_uv=False)[-1] < 1e-6
+    begin, end = q - 0.01 * way, q + way
+    tracker = arm.tracker(begin, period=PERIOD, detours=False)
+    for share in (1 - np.cos(np.linspace(0, np.pi, 150))) / 2:
+        x = arm.x(begin + share * (end - begin))
+        tracker.step(x)
+        assert np.abs(arm.x(tracker.q) - x).max() < 2e-3
+    assert np.abs(arm.x(tracker.q) - x).max() < 1e-8
+
+
+def test_from_a_symmetric_posture_a_turn_leaves_the_plane() -> None:
+    """The iiwa in its vertical plane turns its tool until the wrist is at its limit; the rest is beside the plane."""
+    arm = oc.Arm(oc.Task.pose(oc.problems.get("iiwa").robot))
+    home = np.array([0.0, 1.309, 0.0, 1.309, 0.0, -0.982, 0.0])
+    tracker, pose = arm.tracker(home, period=PERIOD, detours=False), np.array(arm.robot.pose(home))
+    for angle in 0.97 * np.pi * (1 - np.cos(np.linspace(0, np.pi, 300))) / 2:
+        turned = pose.copy()
+        turned[:3, :3] = pose[:3, :3] @ np.array(
+            [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
+        )
+        q = tracker.step(turned)
+    assert tracker.status in (TrackStatus.OK, TrackStatus.YIELDING)
+    assert np.array(arm.robot.pose(q)) == pytest.approx(turned, abs=1e-8)
+    assert abs(q[2]) > 0.1

@@ -571,9 +571,12 @@ static void test_sensors(void) {
   CHECK(step(1e-3) == ORTHOCAS_BAD_INPUT);
   q[0] -= 0.9;
   CHECK(step(1e-3) == ORTHOCAS_OK);
-  dq[0] = 400; /* a true one, as q moves alike */
-  q[0] += 0.2;
-  CHECK(step(1e-3) == ORTHOCAS_CAUGHT);
+  dq[0] = 400; /* a true one, as q moves alike; a light joint may be fast for a moment */
+  for (k = 0; k < 6 && state.mode == ORTHOCAS_LAW; ++k) {
+    q[0] += k == 0 ? 0.2 : 0.4;
+    CHECK(step(1e-3) != ORTHOCAS_BAD_INPUT);
+  }
+  CHECK(state.mode == ORTHOCAS_CATCHER);
   CHECK(step(NAN) == ORTHOCAS_BAD_INPUT);
   CHECK(step(-1.0) == ORTHOCAS_BAD_INPUT);
   CHECK(step(1e7) == ORTHOCAS_BAD_INPUT);

@@ -33,6 +33,20 @@ def test_no_random_start_leads_to_a_nearer_xi(name: str) -> None:
     assert known > 20 * len(x)
 
 
+@pytest.mark.parametrize("name", ["panda-wide", "iiwa7-pose", "ur10-position", "panda-position"])
+def test_all_solutions_are_those_that_random_starts_find(name: str) -> None:
+    """Newton's method from 2,000 of them."""
+    chart = oc.charts.load(name)
+    starts = sample_uniform(chart.problem.domain, 2000, 9)
+    for q in sample_uniform(chart.problem.domain, 4, 8):
+        every = chart.solve(np.tile(chart.phi(q), (len(starts), 1)), starts)
+        found, others = chart.solutions(chart.phi(q)), np.unique(every.q[every.found].round(7), axis=0)
+        assert len(others) > 0
+        assert all(np.abs(found - other).max(axis=1).min() < 1e-6 for other in others)
+        assert all(np.abs(others - own).max(axis=1).min() < 1e-6 for own in found)
+        np.testing.assert_allclose(chart.phi(found), np.tile(chart.phi(q), (len(found), 1)), atol=1e-8)
+
+
 @pytest.mark.slow
 def test_few_random_starts_lead_to_a_nearer_xi_where_curves_fill_surfaces() -> None:
     """With r = 2, slices show most of the self-motions: of 800 wishes, 4,000 starts led nearer in one of a hundred."""

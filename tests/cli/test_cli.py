@@ -231,7 +231,6 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
             ["fit", PANDA, "--tip", "panda_hand", "--lock", "panda_joint=0"],
             "unknown joint 'panda_joint', known: panda_joint",
         ),
-        (["info", PANDA, "--tip", "panda_rightfinger"], "or --lock panda_finger_joint1=0"),
         (
             ["info", PANDA, "--tip", "panda_hand", "--tool", "0,1"],
             "shape of tool is (2,), expected (3,), (6,) or (4, 4)",

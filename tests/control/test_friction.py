@@ -7,7 +7,7 @@ import pytest
 
 import orthocas as oc
 from orthocas.control import FrictionObserver, PDPlus, Remembering
-from orthocas.errors import InvalidValueError, ShapeError
+from orthocas.errors import InvalidValueError, ShapeError, UnknownNameError
 from orthocas.simulation import Friction, StickingPlant
 from orthocas.tools.checks import Array
 
@@ -92,6 +92,12 @@ def test_a_joint_that_stands_is_pulled_ever_more_and_one_that_moves_is_let_go(ch
     assert np.abs(b[:-1]).max() < 0.02 * b[-1]
     ticks.tick(q, np.full(n, 1.0), wanted, TICK)
     np.testing.assert_allclose(ticks.fields["breakaway"][-1], b[-1] * np.exp(-1 / 3), rtol=1e-3)
+
+
+def test_memories_have_names(chart: oc.Chart) -> None:
+    assert PDPlus(chart, remembers="friction").remembers == FrictionObserver()
+    with pytest.raises(UnknownNameError, match="stiction"):
+        PDPlus(chart, remembers="stiction")
 
 
 def test_tolerances_that_no_chart_has_are_refused(chart: oc.Chart) -> None:

@@ -126,7 +126,7 @@ def test_coordinate_that_cannot_be_reached_is_named_with_its_range(planar_chart:
     q0 = planar_chart.problem.domain.centre
     start, reach = planar_chart.phi(q0), planar_chart.xi_range(q0)["xi1"]
     away = Reference.steps(planar_chart.labels, start, [(1.0, {"xi1": 0.6})], 4.0)
-    stopped = f"xi1 = 0.6 is asked for, at the last x it reaches [{reach.low:.3g}"
+    stopped = f"xi1 = 0.6 is asked for, at the last x it reaches [{reach.low:.4g}"
     with pytest.raises(UnreachableReferenceError, match=re.escape(stopped)) as caught:
         joint_path(planar_chart, away, q0)
     assert f"stopped by joint '{reach.high_stop.joint}' at {reach.high_stop.value:.4g}; " in str(caught.value)

@@ -279,7 +279,8 @@ def test_trackers_go_to_the_end_of_a_range_and_stay(kind: str, axes: str) -> Non
             np.testing.assert_array_equal(tracker.step(phi), last)
             if kind == "torus":
                 assert tracker.status is not TrackerStatus.OUTSIDE_DOMAIN
-            elif stop.kind is not StopKind.FOLD:
+            elif stop.kind is not StopKind.FOLD and newton(chart, phi, last) is not None:
+                # A fold may lie beyond the limit; where it does, no posture has these values.
                 assert tracker.status is TrackerStatus.OUTSIDE_DOMAIN
 
 

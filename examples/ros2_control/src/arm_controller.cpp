@@ -25,7 +25,7 @@ constexpr const char *COMMAND =
 CallbackReturn ArmController::on_init() {
   try {
     auto_declare<std::vector<std::string>>("joints", {});
-    auto_declare<double>("smoothness", 4.5);
+    auto_declare<double>("smoothness", 3.0);
     auto_declare<bool>("effort_states", false);
   } catch (const std::exception &error) {
     RCLCPP_ERROR(get_node()->get_logger(), "cannot declare parameters: %s", error.what());
@@ -57,7 +57,7 @@ CallbackReturn ArmController::on_configure(const rclcpp_lifecycle::State & /*pre
   for (auto &position : present_) position = std::numeric_limits<double>::quiet_NaN();
   if (joints_.size() != ARM_JOINTS || !(smoothness_ > 0.0)) {
     RCLCPP_ERROR(get_node()->get_logger(), "expected %d joints and smoothness > 0, received %zu joints and %g",
-                 ARM_JOINTS, joints_.size(), smoothness_);
+                 ARM_JOINTS, joints_.size(), smoothness_.load());
     return CallbackReturn::ERROR;
   }
   target_subscription_ = get_node()->create_subscription<std_msgs::msg::Float64MultiArray>(
@@ -79,8 +79,13 @@ CallbackReturn ArmController::on_configure(const rclcpp_lifecycle::State & /*pre
   resume_service_ = get_node()->create_service<std_srvs::srv::Trigger>(
       "~/resume", [this](const std::shared_ptr<std_srvs::srv::Trigger::Request> /*request*/,
                          std::shared_ptr<std_srvs::srv::Trigger::Response> response) {
-        resume_asked_ = true;
-        response->success = true;
+        const int last = status_;
+        response->success = active_ && last == ARM_CAUGHT && !brakes_closed_;
+        response->message = response->success ? "the arm goes on as soon as it is slow"
+                            : !active_        ? "refused: the controller is not active"
+                            : brakes_closed_  ? "refused: brakes hold the arm"
+                                              : "nothing to resume: the catcher does not hold the arm";
+        if (response->success) resume_asked_ = true;
       });
   brakes_service_ = get_node()->create_service<std_srvs::srv::SetBool>(
       "~/brakes", [this](const std::shared_ptr<std_srvs::srv::SetBool::Request> request,
@@ -88,6 +93,7 @@ CallbackReturn ArmController::on_configure(const rclcpp_lifecycle::State & /*pre
         brakes_closed_ = request->data;
         brakes_asked_ = request->data ? 1 : 0;
         response->success = true;
+        response->message = active_ ? "in the next tick" : "not active: kept until the controller is";
       });
   present_publisher_ = get_node()->create_publisher<std_msgs::msg::Float64MultiArray>("~/present", rclcpp::SystemDefaultsQoS());
   status_publisher_ = get_node()->create_publisher<std_msgs::msg::UInt8>("~/status", rclcpp::SystemDefaultsQoS());
@@ -96,6 +102,8 @@ CallbackReturn ArmController::on_configure(const rclcpp_lifecycle::State & /*pre
 }
 
 void ArmController::publish() {
+  const double smoothness = get_node()->get_parameter("smoothness").as_double();  // may change at run time
+  if (smoothness > 0.0 && std::isfinite(smoothness)) smoothness_ = smoothness;
   std_msgs::msg::UInt8 status;
   std_msgs::msg::Float64MultiArray present;
   arm_reference here;
@@ -140,10 +148,12 @@ CallbackReturn ArmController::on_activate(const rclcpp_lifecycle::State & /*prev
   resume_asked_ = false;
   brakes_asked_ = -1;
   status_ = ARM_OK;
+  active_ = true;
   return CallbackReturn::SUCCESS;
 }
 
 CallbackReturn ArmController::on_deactivate(const rclcpp_lifecycle::State & /*previous*/) {
+  active_ = false;
   return CallbackReturn::SUCCESS;  // the hardware decides what an arm without a controller does
 }
 

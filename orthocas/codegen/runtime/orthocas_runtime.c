@@ -803,24 +803,24 @@ static void move_anchor(const orthocas_arm *arm, orthocas_state *state, double p
 
 static int works(int law) { return law == ORTHOCAS_OK || law == ORTHOCAS_SATURATED; }
 
-/* R12: decide who commands, as the table of modes says. law: its status. */
+/* R12: decide who commands, as the table of modes says. law: its status. Speeds beyond the limit end soon, or are caught. */
 static void choose_mode(const orthocas_arm *arm, orthocas_state *state, int law, const double *q, const double *dq,
                         double clear, double room, const double *error, double period, int late, double *work) {
   const orthocas_safety *safety = state->safety;
   const int hurries = faster_than(arm, dq, safety->speed_limit, 1.0), fast = hurries && state->hasty >= rules.hasty;
   const int ready = works(law) && room >= safety->return_margin;
+  double *speed = take(&work, arm->n);
+  int i;
+  for (i = 0; i < arm->n; ++i) speed[i] = clipped(dq[i], safety->speed_limit[i]);
   state->hasty = hurries ? fmin(state->hasty + period, rules.hasty) : 0.0;
-  switch (state->mode) {
-  case ORTHOCAS_LAW:
+  if (state->mode == ORTHOCAS_LAW) {
     if (!works(law)) catch_arm(arm, state, law, q);
-    else if (distance(arm, q, dq, safety->fade_out, clear, work) < safety->catch_margin)
+    else if (distance(arm, q, speed, safety->fade_out, clear, work) < safety->catch_margin)
       catch_arm(arm, state, ORTHOCAS_OUTSIDE_DOMAIN, q);
     else if (fast) catch_arm(arm, state, ORTHOCAS_TOO_FAST, q);
     else if (late) catch_arm(arm, state, ORTHOCAS_LATE, q);
-    return;
-  case ORTHOCAS_HOLD: copy(state->anchor, q, arm->n); return;
-  default: break;
   }
+  if (state->mode == ORTHOCAS_HOLD) copy(state->anchor, q, arm->n);
   if (state->mode == ORTHOCAS_RETURN && fast) catch_arm(arm, state, ORTHOCAS_TOO_FAST, q);
   if (state->asked && !late && !faster_than(arm, dq, safety->rest_speed, 1.0)) {
     if (!ready) state->mode = ORTHOCAS_RETURN;

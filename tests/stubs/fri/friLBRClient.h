@@ -8,6 +8,7 @@ class LBRState {
  public:
   double getSampleTime() const;
   const double *getMeasuredJointPosition() const;
+  const double *getExternalTorque() const;
 };
 class LBRCommand {
  public:

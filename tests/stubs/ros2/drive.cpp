@@ -90,6 +90,12 @@ int main() {
   felt[1] = 0.0;
   if (controller.on_activate({}) != controller_interface::CallbackReturn::SUCCESS) return 1;
   std::printf("held %d\n", run(controller, 500));
+  const auto resume = [] {
+    auto response = std::make_shared<std_srvs::srv::Trigger::Response>();
+    made<rclcpp::Service<std_srvs::srv::Trigger>>->callback(std::make_shared<std_srvs::srv::Trigger::Request>(), response);
+    return response->success;
+  };
+  std::printf("nothing to resume %d\n", !resume());
 
   auto target = std::make_shared<std_msgs::msg::Float64MultiArray>();
   arm_reference reference;
@@ -113,14 +119,20 @@ int main() {
 
   std::printf("blind %d\n", run(controller, 50, true));
   std::printf("seeing again %d\n", run(controller, 500));
-  auto response = std::make_shared<std_srvs::srv::Trigger::Response>();
-  made<rclcpp::Service<std_srvs::srv::Trigger>>->callback(std::make_shared<std_srvs::srv::Trigger::Request>(), response);
+  if (controller.on_deactivate({}) != controller_interface::CallbackReturn::SUCCESS) return 1;
+  std::printf("refused without a controller %d\n", !resume());
+  if (controller.on_activate({}) != controller_interface::CallbackReturn::SUCCESS) return 1;
+  std::printf("held again %d\n", run(controller, 500));
+  std::printf("blind again %d\n", run(controller, 50, true));
+  std::printf("seeing once more %d\n", run(controller, 500));
+  std::printf("accepted %d\n", resume());
   std::printf("resumed %d\n", run(controller, 3000));
   auto closed = std::make_shared<std_srvs::srv::SetBool::Request>();
   auto answer = std::make_shared<std_srvs::srv::SetBool::Response>();
   closed->data = true;
   made<rclcpp::Service<std_srvs::srv::SetBool>>->callback(closed, answer);
   std::printf("brakes closed %d\n", run(controller, 100));
+  std::printf("refused under brakes %d\n", !resume());
   closed->data = false;
   made<rclcpp::Service<std_srvs::srv::SetBool>>->callback(closed, answer);
   std::printf("brakes open %d\n", run(controller, 100));

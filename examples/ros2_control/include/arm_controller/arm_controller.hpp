@@ -22,7 +22,8 @@ namespace arm_controller {
 
 // Topics and services: ~/target takes values for all controlled quantities, in the order of arm.h; ~/status publishes
 // the arm_status of the last tick and ~/present the quantities, 20 times a second; ~/resume asks for the law after the
-// catcher took over; ~/brakes is told true when brakes have closed, and false before they open.
+// catcher took over, and refuses when it did not; ~/brakes is told true when brakes have closed, and false before they
+// open, and keeps that for the next activation.
 class ArmController : public controller_interface::ControllerInterface {
  public:
   controller_interface::CallbackReturn on_init() override;
@@ -44,7 +45,8 @@ class ArmController : public controller_interface::ControllerInterface {
   void move_reference(const double *q, double period);
 
   std::vector<std::string> joints_;
-  double smoothness_ = 0.0;
+  std::atomic<double> smoothness_{0.0};
+  std::atomic<bool> active_{false};
   bool effort_states_ = false;
   std::atomic<std::uint64_t> received_{0};  // messages
   realtime_tools::RealtimeThreadSafeBox<Target> box_;

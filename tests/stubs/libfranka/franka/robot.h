@@ -17,7 +17,7 @@ class Torques : public Finishable {
 inline Torques MotionFinished(Torques command) noexcept { return command; }
 class Duration {};
 struct RobotState {
-  std::array<double, 7> tau_J_d{}, q{}, dq{};
+  std::array<double, 7> tau_J_d{}, tau_ext_hat_filtered{}, q{}, dq{};
 };
 constexpr double kDefaultCutoffFrequency = 100.0;
 enum class RealtimeConfig { kEnforce, kIgnore };
