@@ -1,4 +1,4 @@
-"""A benchmark of redundancy resolution, made of what users report: 14 scenarios, all methods, eight arms (35 min).
+"""A benchmark of redundancy resolution, made of what users report: 15 scenarios, all methods, eight arms (35 min).
 
 Writes `benchmarks/redundancy/results/SCENARIO.json`; `redundancy_page.py` makes tables and pictures of them. How to add
 a method: `benchmarks/redundancy/README.md`.

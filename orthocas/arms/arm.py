@@ -38,6 +38,7 @@ from orthocas.tools.checks import (
     as_float_array,
     as_number,
     as_path,
+    as_point,
     as_point_set,
     require_count,
     require_kind,
@@ -112,7 +113,7 @@ class Arm(Shown):
 
     Where a chart ends at a boundary of its domain, an arm goes on: it knows the postures of a task value x within the
     joint limits. Without limits they are a few closed curves, which are traced from stored postures and then cut at
-    the limits: `self_motion`, `nearest`, `solve` and `solutions`. Charts give postures a number xi on each branch.
+    the limits: `self_motion` and `solve`. Charts give postures a number xi on each branch.
     `tracker` follows a stream of x and xi through borders of charts, singular positions and out of reach. Arms with
     several joints more than the task needs, such as those on mobile bases, have trackers only.
 
@@ -152,12 +153,14 @@ class Arm(Shown):
         free = robot.n - len(robot.tree.floating)
         if self.task.m >= free:
             raise NotRedundantError(self.task.m, free)
+        # Turns of a joint are counted from a limit to the other one, so one limit alone is none.
         one = np.flatnonzero(np.isfinite(robot.lower) != np.isfinite(robot.upper))
         if any(not robot.tree.prismatic[k] for k in one):
             raise InvalidValueError("joint", f"'{robot.joint_names[one[0]]}' with one limit", "two limits, or none")
         object.__setattr__(self, "task", self.task.with_reference_at(find_joint_range(robot, 0).centre))
         if not isinstance(self.charts, tuple | list):
             raise InvalidValueError("charts", repr(self.charts)[:80], "a tuple of charts")
+        # All charts and the arm speak of the same x.
         for chart in self.charts:
             require_kind("charts", chart, Chart)
             same = chart.problem.task.recipe == self.task.recipe or _agree(chart, self.task)
@@ -191,6 +194,7 @@ class Arm(Shown):
         require_kind("robot", robot, Robot)
         bare = cls(Task.pose(robot) if task is None else task)
         bare.require_one_free()
+        # One chart for each branch; those that cannot be fitted are reported, not fatal.
         parts, found, reasons = branches(robot, bare.task), [], []
         for k, branch in enumerate(parts):
             own = f"branch {k + 1} of {len(parts)}, "
@@ -219,6 +223,7 @@ class Arm(Shown):
             UnknownNameError: for a word that is neither a file nor the name of a known arm.
             ChartFileError: if the file is missing, truncated, foreign, edited, or from a newer version.
         """
+        # A word without a folder or an ending is the name of a known arm.
         file = as_path("path", path)
         if not (file.exists() or file.suffix or len(file.parts) > 1):
             require_known("arm file or known arm", file.name, list_arms())
@@ -272,49 +277,6 @@ class Arm(Shown):
         self.require_one_free()
         return find_motions(self.maps, self._read_one(x))
 
-    def solutions(
-        self, x: Any, xi: float | None = None, collisions: Collisions | None = None
-    ) -> tuple[Arc, ...] | Postures:
-        """All postures with a task value, on all branches.
-
-        Args:
-            x: one task value.
-            xi: that postures are to have in the chart of their branch; None for any.
-            collisions: of the robot, for postures with xi: those without a contact come first, the others are
-                COLLIDING.
-
-        Returns:
-            Without xi the arcs, the components of `self_motion`; with xi the postures where a chart has it.
-
-        Raises:
-            InvalidValueError: if x is no task value, xi is given to an arm without charts, or collisions without xi.
-        """
-        self._check_collisions(collisions)
-        if collisions is not None and xi is None:
-            raise InvalidValueError("collisions", "given without xi", "xi with it; `solve` takes it without xi")
-        motions = self.self_motion(x)
-        if xi is None:
-            return motions.components
-        self._require_charts()
-        value = as_number("xi", xi)
-        found = [(q, name) for k, name in enumerate(self.branch_names) for q in self._find_xi(motions, k, value)]
-        q = np.array([q for q, _ in found]).reshape(-1, self.robot.n)
-        names = tuple(name for _, name in found)
-        status = np.full(len(q), int(InverseStatus.FOUND))
-        if collisions is not None and len(q):
-            status[~collisions.check_free(q)] = InverseStatus.COLLIDING
-        order = np.argsort(status, kind="stable")
-        return Postures(q[order], status[order], tuple(names[k] for k in order), np.full(len(q), value))
-
-    def nearest(self, x: Any, q_wish: ArrayLike) -> Postures:
-        """The posture within the joint limits with a task value that is nearest to another one, |q - q_wish| least.
-
-        Args:
-            x: one task value, or N of them.
-            q_wish: (n,), or one for each (N, n).
-        """
-        return self.solve(x, start=q_wish)
-
     def solve(
         self,
         x: Any,
@@ -322,8 +284,10 @@ class Arm(Shown):
         start: ArrayLike | None = None,
         branch: str = ANY,
         collisions: Collisions | None = None,
+        *,
+        all: bool = False,  # noqa: A002
     ) -> Postures:
-        """A posture within the joint limits for each task value.
+        """A posture within the joint limits for each task value, or all with one x and xi.
 
         With xi, charts are asked in turn: that of the start's branch first, or else the largest. Newton's method goes
         to (x, xi) from the start, or from the nearest of stored postures; the first chart in which it arrives gives the
@@ -342,18 +306,25 @@ class Arm(Shown):
                 the same x and xi takes its place; else, of free postures 0.05 rad apart on the arcs, that with the
                 nearest xi (NEAREST), or without xi that nearest to the start, or farthest from limits. Where none is
                 free, the status is COLLIDING.
+            all: return all postures with one task value in which the chart of their branch has one xi, those without a
+                contact first, the others COLLIDING. Without xi, they are the arcs of `self_motion`.
 
         Raises:
-            InvalidValueError, ShapeError: for arguments that do not fit, or an xi or branch without charts.
+            InvalidValueError, ShapeError: for arguments that do not fit, an xi or branch without charts, or all without
+                xi.
         """
         self.require_one_free()
+        require_kind("all", all, bool)
         self._check_collisions(collisions)
-        targets, single = self._read(x)
-        N, n = len(targets), self.robot.n
-        starts = None if start is None else _repeat_rows("start", as_point_set("start", start, n)[0], N)
         require_kind("branch", branch, str)
         if branch != ANY:
             require_known("branch", branch, self.branch_names)
+        if all:
+            return self._solve_all(x, xi, start, branch, collisions)
+        # What was asked: targets, starts, charts that may answer, and xi.
+        targets, single = self._read(x)
+        N, n = len(targets), self.robot.n
+        starts = None if start is None else _repeat_rows("start", as_point_set("start", start, n)[0], N)
         chosen = [k for k, name in enumerate(self.branch_names) if branch in (ANY, name)]
         values = None
         good = np.asarray(np.isfinite(targets).all(axis=1))
@@ -361,10 +332,12 @@ class Arm(Shown):
             self._require_charts()
             values = _repeat_rows("xi", as_float_array("xi", xi).reshape(-1, 1), N)[:, 0]
             good = good & np.isfinite(values)
+        # Rows with numbers that are not finite have their answer already.
         q, status = np.full((N, n), np.nan), np.full(N, int(InverseStatus.NOT_FOUND))
         owners = np.full(N, -1)
         status[~good] = InverseStatus.BAD_INPUT
         rows, near = np.flatnonzero(good), None if starts is None else starts[good]
+        # Without xi, the arcs of x are searched; with xi, charts first, and then the arcs, in C.
         if values is None:
             q[rows], status[rows] = self._solve_on_arcs(targets[rows], near, chosen, branch == ANY)
             found = rows[np.isfinite(q[rows]).all(axis=1)]
@@ -376,6 +349,7 @@ class Arm(Shown):
             if branch != ANY:
                 beyond = status == InverseStatus.OUTSIDE_DOMAIN
                 q[beyond], status[beyond] = np.nan, InverseStatus.NOT_FOUND
+        # Where the answer touches something, a free posture takes its place.
         if collisions is not None:
             known = np.flatnonzero(np.isfinite(q).all(axis=1))
             for row in known[~collisions.check_free(q[known])].tolist():
@@ -384,6 +358,7 @@ class Arm(Shown):
                 free = self._find_free(targets[row], value, wish, chosen, branch == ANY, collisions)
                 q[row], status[row] = free or (q[row], InverseStatus.COLLIDING)
                 owners[row] = self.find_branches(q[row : row + 1])[0]
+        # Names and xi of the branches that hold the answers.
         names = tuple(self.branch_names[k] if k >= 0 else "" for k in owners.tolist())
         own = np.full(N, np.nan) if values is None else np.where(status == InverseStatus.FOUND, values, np.nan)
         unknown = np.flatnonzero(np.isnan(own) & (owners >= 0))
@@ -392,6 +367,24 @@ class Arm(Shown):
         if single:
             return Postures(q[0], InverseStatus(int(status[0])), names[0], own[0])
         return Postures(q, status, names, own)
+
+    def _solve_all(
+        self, x: Any, xi: ArrayLike | None, start: ArrayLike | None, branch: str, collisions: Collisions | None
+    ) -> Postures:
+        """All postures with x and xi, those without a contact first, and then those nearest to a start."""
+        self._require_charts()
+        if xi is None:
+            raise InvalidValueError("all", True, "an xi with it; without one, they are the arcs of `self_motion(x)`")
+        motions, value = self.self_motion(x), as_number("xi", xi)
+        chosen = [(k, name) for k, name in enumerate(self.branch_names) if branch in (ANY, name)]
+        found = [(q, name) for k, name in chosen for q in self._find_xi(motions, k, value)]
+        q = np.array([q for q, _ in found]).reshape(-1, self.robot.n)
+        status = np.full(len(q), int(InverseStatus.FOUND))
+        if collisions is not None and len(q):
+            status[~collisions.check_free(q)] = InverseStatus.COLLIDING
+        away = np.zeros(len(q)) if start is None else np.linalg.norm(q - as_point("start", start, self.robot.n), axis=1)
+        order = np.lexsort((away, status))
+        return Postures(q[order], status[order], tuple(found[k][1] for k in order), np.full(len(q), value))
 
     def tracker(
         self,
@@ -452,6 +445,7 @@ class Arm(Shown):
         Returns:
             q (N, n), and how each call ended.
         """
+        # One call of a tracker for each task value.
         targets, _ = self.maps.targets.read(path)
         tracker = self.tracker(
             q, period=period, velocity_limits=velocity_limits, collisions=collisions, margin=margin, avoid=avoid
@@ -493,6 +487,7 @@ class Arm(Shown):
         require_count("postures", postures, least=1, most=RULES.postures)
         names = f"{name}_track.h", f"{name}_track.c"
         require_free_folder(out, name, names, force)
+        # All files appear together, or none.
         header = f"/* Generated by orthocas {VERSION}. Do not edit; generate it again instead. */"
         sources = write_tracker(self.maps, self.charts, name, "arm_track.c", header, postures)
         with publish(make_folder("folder", out)) as drafts:
@@ -603,6 +598,7 @@ class Arm(Shown):
     ) -> tuple[Array, InverseStatus] | None:
         """A posture of one target without a contact, of those with xi or of many on its arcs; None if there is none."""
         motions = find_motions(self.maps, target, *(() if start is None else (start[None],)))
+        # With xi: those that have it exactly, and are free.
         if xi is not None:
             exact = np.array([q for k in chosen for q in self._find_xi(motions, k, xi)]).reshape(-1, self.robot.n)
             exact = exact[collisions.check_free(exact)] if len(exact) else exact
@@ -610,6 +606,7 @@ class Arm(Shown):
                 return exact[
                     0 if start is None else np.linalg.norm(exact - start, axis=1).argmin()
                 ], InverseStatus.FOUND
+        # Otherwise, of free postures on the arcs ...
         q = np.vstack([np.empty((0, self.robot.n)), *(arc.at(self._list_places(arc)) for arc in motions)])
         q = q[collisions.check_free(q)] if len(q) else q
         if xi is None and anywhere:
@@ -623,6 +620,7 @@ class Arm(Shown):
             q, owners = q[owners >= 0], owners[owners >= 0]
         if not len(q):
             return None
+        # ... that with the nearest xi, or without xi, that nearest to the start.
         if xi is not None:
             periods = np.array([self.charts[k].parts.turns[self.charts[k].m] for k in owners])
             away = np.abs(wrap_shortest(self._evaluate_xi(q, owners) - xi, periods))
@@ -660,12 +658,14 @@ class Arm(Shown):
             return np.asarray(left - period * np.round(left / period) if period else left)
 
         for arc in motions:
+            # xi at even places of the arc, where the domain may hold them.
             places = self._list_places(arc)
             q = arc.at(places)
             near = np.flatnonzero(((q >= low - RULES.spacing) & (q <= high + RULES.spacing)).all(axis=1))
             inside, left = np.zeros(len(q), dtype=bool), np.full(len(q), np.nan)
             if near.size:
                 inside[near], left[near] = np.asarray(domain.contains(q[near])), miss(q[near])
+            # A change of sign between two places has a posture with this xi, unless xi jumps by its period there.
             crosses = (left[:-1] * left[1:] <= 0) & (inside[:-1] | inside[1:])
             if period:
                 crosses &= np.abs(left[1:] - left[:-1]) < period / 2
@@ -709,6 +709,7 @@ def _find_root(arc: Arc, f: Callable[[Array], Array], low: float, high: float) -
 
     By regula falsi, with every third step a bisection.
     """
+    # The end with the smaller value is the answer where no step is better.
     values = [float(f(arc.at(place)[None])[0]) for place in (low, high)]
     q, value = arc.at(low if abs(values[0]) <= abs(values[1]) else high), min(values, key=abs)
     for k in range(RULES.steps):
@@ -717,6 +718,7 @@ def _find_root(arc: Arc, f: Callable[[Array], Array], low: float, high: float) -
         place = low + (high - low) * (values[0] / (values[0] - values[1]) if k % 3 < 2 else 0.5)
         q = arc.at(place)
         value = float(f(q[None])[0])
+        # The root stays between both ends.
         if (value > 0) == (values[0] > 0):
             low, values[0] = place, value
         else:

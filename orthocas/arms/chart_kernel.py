@@ -38,7 +38,7 @@ class ChartKernelRules:
     xi_found: float = 1e-9  #: error of xi of a posture that has it
     xi_weight: float = 1e-3  #: of errors of xi, relative to those of x
     posture_weight: float = 1e-4  #: of the way back to the last posture with a chart, where there is none
-    push_weight: float = 0.3  #: of pairs that come nearer than `avoid`, relative to x
+    push_weight: float = 1.0  #: of pairs that come nearer than `avoid`, relative to x
     pushes: int = 8  #: of these pairs, the nearest ones
     turns: int = 4  #: of a call, until no more pairs come nearer
     kept: float = 1e-5  #: [m] that these may be nearer than `avoid`
@@ -133,6 +133,7 @@ class ChartPostures:
         """So many for each chart."""
         robot, r = maps.robot, maps.robot.n - maps.task.m
         whole = find_joint_range(robot, 0)
+        # Those of charts give starts with x and xi; those of all of the range, starts with x alone.
         own = [np.asarray(chart.problem.domain.sample(count, RULES.seed)) for chart in charts]
         rng = np.random.default_rng(RULES.seed)
         free = rng.uniform(whole.centre - whole.half_width, whole.centre + whole.half_width, (count, robot.n))
@@ -175,9 +176,12 @@ class ChartKernel:
         count, n = len(targets), self.maps.robot.n
         q = np.empty((count, n))
         status, owner = (np.empty(count, dtype=np.intc) for _ in range(2))
+        # Which charts may answer.
         flags = np.zeros(len(self.charts), dtype=np.int8)
         flags[list(allowed)] = 1
-        solve, stored, whole, room_size = self._c.solve_rows, self.postures.in_c, self._range, self._room_size
+        solve, stored, whole = self._c.solve_rows, self.postures.in_c, self._range
+        # Room for the points of all curves of a target, and for distances (float) of the stored postures.
+        room_size = CURVES.nodes * (2 * n + 1) + (len(self.maps.stored.q) + 1) // 2
         inputs = [np.ascontiguousarray(part) for part in (targets, xi)]
         first = None if starts is None else np.ascontiguousarray(starts)
 
@@ -190,6 +194,7 @@ class ChartKernel:
                 *(pointer(part[rows]) for part in (q, status, owner)),
             )
 
+        # A call of few rows costs no threads.
         if count <= RULES.piece:
             solve_piece(0)
         else:
@@ -253,10 +258,6 @@ class ChartKernel:
         """Numbers of a target."""
         return int(self.maps.equations.size1_in(1))
 
-    @cached_property
-    def _room_size(self) -> int:
-        return CURVES.nodes * (2 * self.maps.robot.n + 1) + (len(self.maps.stored.q) + 1) // 2
-
 
 def write_tracker(
     maps: ArmMaps, charts: Sequence[Chart], name: str, template: str, header: str = "", postures: int = 0
@@ -275,6 +276,7 @@ def write_tracker(
     equations = maps.equations
     functions = [equations, build_curvature(equations), maps.target_function]
     parts = []
+    # Of each chart: xi and its gradient, and what its domain asks for besides the box.
     for k, chart in enumerate(charts):
         q, own, domain = ca.MX.sym("q", n), chart.coordinates.functions, chart.problem.domain
         rows = [chart.parts.runnable(own[word])(q) for word in ("xi", "jacobian")]
@@ -290,6 +292,7 @@ def write_tracker(
         )
     kernels = generate_kernels(functions, f"{name}_kernel")
     size = equations.size1_in(1)
+    # How the header describes a target.
     words = f"its vector ({size})"
     if maps.places.turned:
         words = "the rotation (3, 3) of the frame by columns"
@@ -315,6 +318,7 @@ def write_tracker(
         "slides": ~maps.turning,
         "include": f'#include "{name}_track.h"',
     }
+    # The exported tracker brings its own postures; the library in Python shares them between trackers.
     speed = np.where(np.isfinite(robot.velocity_limits), robot.velocity_limits, RULES.speed)
     values |= {"stored": ChartPostures.build(maps, charts, postures) if postures else None, "speed": speed}
     values |= {"window": RULES.window}

@@ -86,6 +86,7 @@ class Curve:
         q, t = evaluate_cubic(
             self.q[k], self.q[k + 1], self.tangent[k], self.tangent[k + 1], h, (place - self.places[k]) / h
         )
+        # At a crossing, the exact posture takes the place of that on the cubic.
         at = np.flatnonzero(self.crossings["place"] == place)
         return (self.crossings["q"][at[0]] if at.size else q), t
 
@@ -128,6 +129,7 @@ class CurveKernel:
         nodes = np.empty((RULES.nodes, 2 * n + 1))
         ends, closed = np.zeros(RULES.curves, dtype=np.intc), np.zeros(RULES.curves, dtype=np.intc)
         used = ctypes.c_int()
+        # Points of all curves lie one after the other, with their ends.
         count = self._c.find_curves(
             *(pointer(target), pointer(starts), len(starts), patience, pointer(nodes), RULES.nodes),
             *(pointer(ends), pointer(closed), ctypes.byref(used)),
@@ -186,6 +188,7 @@ def split_curves(
 ) -> list[Curve]:
     """Curves from the points of all of them, (P, 2n + 1), and from all crossings, which come curve by curve."""
     n, curves, begin = (nodes.shape[1] - 1) // 2, [], 0
+    # Crossings come curve by curve; within one, in the order of places.
     parts = np.searchsorted(crossings["curve"], np.arange(len(ends) + 1)).tolist()
     for k, end in enumerate(ends.tolist()):
         own = crossings[parts[k] : parts[k + 1]]
@@ -213,6 +216,7 @@ def build_equations(task: Task, scale: Array) -> ca.Function:
         p, R, J = (frames.build_function(robot, name)(q) for name in ("position", "rotation", "jacobian"))
         first = 3 if turn.with_position else 0
         target = ca.SX.sym("target", first + 9)
+        # The rotation vector of R_d R^T: its axis times atan2(sine, cosine) / sine.
         across = ca.reshape(target[first:], 3, 3) @ R.T
         axis = ca.vertcat(across[2, 1] - across[1, 2], across[0, 2] - across[2, 0], across[1, 0] - across[0, 1]) / 2
         sine = ca.sqrt(ca.sumsqr(axis) + 1e-32)  # never zero, so that derivatives are finite
@@ -226,5 +230,8 @@ def build_curvature(equations: ca.Function) -> ca.Function:
     """q (n, 1), target -> the second derivative of |e|^2 / 2, (n, n): that of J and e of `build_equations`."""
     q, target = (ca.SX.sym(name, equations.size1_in(i)) for i, name in enumerate(("q", "target")))
     e, J = equations(q, target)
+    # The gradient of
+    # e
+    # ^2 / 2 is -J^T e.
     H = ca.jacobian(-J.T @ e, q)
     return dense_function("curvature", [q, target], [ca.cse((H + H.T) / 2)], ["q", "target"])

@@ -37,6 +37,7 @@ class ArmMaps:
     @cached_property
     def scale(self) -> Array:
         """What components of errors are divided by, (m,): 1 for angles, else how far a joint moves them, per radian."""
+        # Lengths of the rows of J for revolute joints, at even postures; one for each unit, such as all positions.
         whole = find_joint_range(self.robot, 0)
         q = sample_evenly(Box(whole.centre, whole.half_width), _SCALED, 0)
         J = Batched(build_equations(self.task, np.ones(self.task.m)))(q, np.tile(self._some_target, (len(q), 1)))[1]
@@ -60,6 +61,7 @@ class ArmMaps:
         task, x = self.task, ca.SX.sym("x", self.task.m)
         if not self.places.turned:
             return dense_function("target", [x], [x], ["x"])
+        # R(x) by Rodrigues' formula, R = 1 + 2 w [v] + 2 [v]^2, on the task's reference.
         w, *axis = ca.vertsplit(task.quaternion_function(x))
         cross = ca.skew(ca.vertcat(*axis))
         R = ca.SX(ca.DM(task.reference)) @ (ca.SX.eye(3) + 2 * (w * cross + cross @ cross))
@@ -129,6 +131,7 @@ class ArmMaps:
         places = self.places
         if not places.turned:
             return np.ascontiguousarray(self.task.batched(q)[0])
+        # Places are targets times `place_scale`, so back again.
         targets = places.of_postures(q) * np.sqrt(2)
         if targets.shape[1] > 9:
             targets[:, :3] *= self.scale[:3] / np.sqrt(2)

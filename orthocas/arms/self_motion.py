@@ -155,6 +155,7 @@ class Arc(Shown):
         require_count("n", n, least=2, most=RULES.most)
         known = metric if isinstance(metric, Metric) else Metric.from_spec(self.maps.robot, metric)
         places = np.linspace(0.0, self.length, n, endpoint=not self.closed)
+        # Lengths in a metric are sums over short chords.
         if not known.is_identity:
             dense = np.linspace(0.0, self.length, max(8, int(self.length / RULES.metric_spacing)) + 1)
             steps = np.diff(self._guess(dense)[0], axis=0)
@@ -183,6 +184,7 @@ class Arc(Shown):
         curve, parts, before = self.curve, [], 0.0
         along = curve.places
         for piece in self.pieces:
+            # Points of the curve between both ends of the piece, which are exact at limits.
             inner = np.flatnonzero((along > piece.begin + 1e-12) & (along < piece.end - 1e-12))
             (first, t_first), (last, t_last) = (curve.point(place) for place in (piece.begin, piece.end))
             shift = _TURN * np.array(piece.turns)
@@ -243,6 +245,7 @@ class SelfMotions(Shown):
         wish = as_point("q", q, self.maps.robot.n)
         self._require_components()
         arcs = self.components
+        # Distances of points on all arcs, some on each of their steps.
         shares = np.arange(RULES.parts) / RULES.parts
         nodes = [arc._nodes for arc in arcs]
         places = [np.concatenate([(at[:-1] + np.diff(at) * u) for u in shares] + [at[-1:]]) for _, _, at in nodes]
@@ -250,6 +253,7 @@ class SelfMotions(Shown):
         guesses = np.vstack([arc._guess(part)[0] for arc, part in zip(arcs, places, strict=True)])
         distances = (self.measure_away(guesses, wish) ** 2).sum(axis=1)
         along = np.concatenate(places)
+        # The squared distance may have several minima: some of the nearest points, apart from one another, are refined.
         order, chosen = np.argsort(distances), list[int]()
         for row in order[: RULES.parts * RULES.candidates].tolist():
             apart = [owners[row] != owners[other] or abs(along[row] - along[other]) > RULES.largest for other in chosen]
@@ -282,6 +286,7 @@ class SelfMotions(Shown):
                 raise InvalidValueError("what f returns", f"shape {values.shape}", f"({len(q)},)")
             return np.where(np.isnan(values), -np.inf, values)
 
+        # First at even places on all arcs.
         counts = [max(2, int(arc.length / RULES.spacing) + 2) for arc in self.components]
         places = [np.linspace(0.0, arc.length, count) for arc, count in zip(self.components, counts, strict=True)]
         q = np.vstack([arc.at(part) for arc, part in zip(self.components, places, strict=True)])
@@ -289,6 +294,7 @@ class SelfMotions(Shown):
         row, owners = int(np.argmax(values)), np.repeat(np.arange(len(counts)), counts)
         k = int(owners[row])
         arc, at, step = self.components[k], float(np.concatenate(places)[row]), self.components[k].length / counts[k]
+        # Then by golden section around the best of them, on its arc.
         low, high = max(0.0, at - 2 * step), min(arc.length, at + 2 * step)
         best = Place(q[row], float(values[row]), k, at)
         ratio = (np.sqrt(5) - 1) / 2
@@ -319,6 +325,7 @@ class SelfMotions(Shown):
         rows = [arc.at(places) for arc, places in zip((first, second), spaced, strict=True)]
         apart = [np.linalg.norm(self.measure_away(rows[1], q), axis=1) for q in rows[0]]
         i, j = np.unravel_index(int(np.argmin(apart)), (len(rows[0]), len(rows[1])))
+        # From the nearest pair of points, the nearest posture on one arc and on the other one in turn.
         near, at = rows[0][i], (float(spaced[0][i]), float(spaced[1][j]))
         best, value = None, np.inf
         for _ in range(MERGE.pairs):
@@ -348,6 +355,7 @@ class SelfMotions(Shown):
             The string method: E, Ren and Vanden-Eijnden, J. Chem. Phys. 126 (2007) 164103, with Gauss-Newton steps.
         """
         gap = self.gap(a, b)
+        # The straight way across the gap, in even images.
         end = gap.first.q + self.measure_away(gap.second.q[None], gap.first.q)[0]
         shares = np.linspace(0.0, 1.0, MERGE.images)[:, None]
         q, before = gap.first.q + shares * (end - gap.first.q), np.inf
@@ -359,6 +367,7 @@ class SelfMotions(Shown):
             if abs(before - most) < MERGE.settled * most:
                 break
             before = most
+            # Each image goes towards x, but not along the way.
             gram = J @ J.transpose(0, 2, 1)
             floor = MERGE.damping * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(e.shape[1])
             step = (J.transpose(0, 2, 1) @ np.linalg.solve(gram + floor, e[:, :, None]))[:, :, 0]
@@ -369,9 +378,11 @@ class SelfMotions(Shown):
                 MERGE.step, MERGE.longest / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-300)
             )
             q[1:-1] = np.clip(q + step, low, high)[1:-1]
+            # Images stay at equal distances.
             lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(q, axis=0), axis=1))])
             even = np.linspace(0.0, lengths[-1], MERGE.images)
             q = np.column_stack([np.interp(even, lengths, column) for column in q.T])
+        # The largest error is that of a pass between both sides, which Newton's method finds exactly.
         errors = np.linalg.norm(self.maps.evaluate(q, targets)[0], axis=1)
         k = int(np.argmax(errors))
         q[k] = self._find_pass(q[k], float(errors[k]))
@@ -390,6 +401,7 @@ class SelfMotions(Shown):
             at = at + min(1.0, RULES.largest / (size + 1e-300)) * step
             if size < MERGE.settled:
                 break
+        # Only a pass near the images is theirs.
         inside = ((at >= self.maps.robot.lower) & (at <= self.maps.robot.upper)).all()
         found = float(np.linalg.norm(self.maps.evaluate(at[None], target)[0]))
         good = inside and size < MERGE.settled and abs(found - error) < MERGE.near * error
@@ -400,6 +412,7 @@ class SelfMotions(Shown):
         from matplotlib.figure import Figure  # heavy, and few calls need it
 
         robot, figure = self.maps.robot, Figure(figsize=(8.0, 2.2 * max(1, len(self))), layout="constrained")
+        # A row of axes for each arc, with the outer tenth of the joints' ranges in grey.
         for k, arc in enumerate(self.components):
             axes = figure.add_subplot(len(self), 1, k + 1)
             places = np.linspace(0.0, arc.length, max(2, int(arc.length / RULES.spacing)))
@@ -459,6 +472,7 @@ class SelfMotions(Shown):
             q, t = arc.at(place), arc.direction(place)
             away = self.measure_away(q[None], wish)[0]
             gap, pull = float(np.linalg.norm(away)), float(away @ t)
+            # Where the way to the posture is at right angles to the arc, the distance is least.
             if gap < best.value:
                 best = Place(wish + away, gap, k, place)
             if number > 0 and place != before[0]:
@@ -489,6 +503,7 @@ def cut_curve(maps: ArmMaps, target: Array, curve: Curve) -> list[Arc]:
             present.append(set(range(lowest, highest + 1)))
         else:
             present.append({0} if low <= q <= high else set())
+    # What ends pieces that no limit ends: the seam of a closed curve is joined later.
     opened = Stop(StopKind.SINGULAR)
     seam = Stop(StopKind.ENDLESS) if curve.closed else opened
     active: dict[tuple[int, ...], tuple[float, Stop]] = dict.fromkeys(product(*present), (0.0, seam))
@@ -496,6 +511,7 @@ def cut_curve(maps: ArmMaps, target: Array, curve: Curve) -> list[Arc]:
     found, stops = curve.crossings, maps.stops
     columns = (found[name].tolist() for name in ("place", "joint", "side", "turns", "rises"))
     for place, i, side, turns, rises in zip(*columns, strict=True):
+        # A joint less k turns comes within its limits, or leaves them: pieces begin or end, for all turns of others.
         k, enters, stop = -turns, side != rises, stops[i][side]
         if enters and k not in present[i]:
             present[i].add(k)
@@ -519,6 +535,7 @@ def _join_at_seam(
     """Arcs of pieces of a closed curve that go on beyond its last point."""
     winding = np.where(np.isfinite(maps.robot.lower), np.rint((curve.q[-1] - curve.q[0]) / _TURN), 0.0)
     winding = np.where(maps.turning, winding, 0.0).astype(int)
+    # The piece that goes on after the last point has the full turns that the curve winds by added.
     begins = {piece.turns: k for k, (piece, began, _) in enumerate(pieces) if began is seam}
     follower: dict[int, int] = {}
     for k, (piece, _, ended) in enumerate(pieces):
@@ -526,6 +543,7 @@ def _join_at_seam(
             after = tuple((np.array(piece.turns) + winding).tolist())
             if after in begins:
                 follower[k] = begins[after]
+    # Chains of pieces: those that begin at a limit first, then closed ones.
     arcs, used = [], set[int]()
     heads = [k for k in range(len(pieces)) if k not in follower.values()]
     for head in [*heads, *range(len(pieces))]:

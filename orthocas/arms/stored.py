@@ -50,12 +50,14 @@ class StoredPostures:
         whole = find_joint_range(task.robot, 0)
         rng = np.random.default_rng(RULES.seed)
         q = rng.uniform(whole.centre - whole.half_width, whole.centre + whole.half_width, (RULES.count, task.robot.n))
+        # In the order of branches; postures of none come last.
         own = np.full(len(q), len(branches))
         for k, branch in enumerate(branches):
             own[np.asarray(branch.box.contains(q))] = k
         order = np.argsort(own, kind="stable")
         q, own = q[order], own[order]
         J = rates(q)
+        # Next to singular positions, x moves less for the same way of joints: distances there count more.
         volume = np.linalg.det(J @ J.transpose(0, 2, 1))
         weights = np.maximum(volume, RULES.least_volume) ** (-1 / task.m)
         places = np.ascontiguousarray(reader.of_postures(q).T, dtype=np.float32)
@@ -78,6 +80,9 @@ class PlaceReader:
         robot, frames, turn = task.robot, Frames.from_recipe(task.recipe), task.turn
         frame = robot.tree.tip_name if frames.frame is None else frames.frame
         R = np.asarray(robot.frame_rotation(q, frame, frames.relative_to)).reshape(-1, 3, 3)
+        #
+        # R - S
+        #  / sqrt(2) is the angle between both, for small ones.
         parts = [R.transpose(0, 2, 1).reshape(-1, 9) / np.sqrt(2)]
         if turn is not None and turn.with_position:
             p = np.asarray(robot.frame_position(q, frame, frames.relative_to)).reshape(-1, 3)

@@ -25,6 +25,7 @@ class TargetReader:
             ShapeError, InvalidValueError: if x is none of what the task can have.
         """
         m = self.task.m
+        # Poses with NaN, which a broken sensor sends, are a target that trackers answer with BAD_INPUT.
         try:
             values = self.task.target(x)
         except InvalidValueError:
@@ -40,6 +41,7 @@ class TargetReader:
         turn = self.task.turn
         if turn is None or not turn.whole:
             return np.ascontiguousarray(vectors)
+        # Rows that are not finite have no rotation; they stay NaN.
         good = np.asarray(np.isfinite(vectors).all(axis=1))
         targets = np.full((len(vectors), 12 if turn.with_position else 9), np.nan)
         if good.any():

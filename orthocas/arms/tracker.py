@@ -49,7 +49,7 @@ class ArmTracker(Shown):
     while; so it does where it is stuck without x. `detours=False` forbids both.
 
     With a collision model it brakes as `orthocas.charts.trackers.Tracker` does, on detours too, whatever the limits of
-    acceleration. With `avoid`, pairs that a step would bring nearer join the program above with a weight of 0.3, as
+    acceleration. With `avoid`, pairs that a step would bring nearer join the program above with the weight of x, as
     rows that keep them at that distance, and the step is made again: xi yields.
 
     A call is one call of compiled C, and of a few with `avoid`; each takes a bounded time.
@@ -70,6 +70,7 @@ class ArmTracker(Shown):
         clearance: Clearance | None = None,
     ) -> None:
         robot, m, span = kernel.maps.robot, kernel.maps.task.m, as_number("period", period)
+        # Limits are steps of one call in C.
         if not 1e-5 <= span <= 10:
             raise InvalidValueError("period", period, "a time from 1e-5 to 10 s")
         require_kind("detours", detours, bool)
@@ -120,6 +121,7 @@ class ArmTracker(Shown):
     @property
     def xi(self) -> Any:
         """xi of the last posture, a number, or (r,) of several; NaN outside the domain of the tracker's chart."""
+        # Beyond its chart, the arm has no xi.
         if not self._state["inside"][0]:
             return float("nan") if self._r == 1 else np.full(self._r, np.nan)
         value = np.asarray(self._kernel.charts[int(self._state["chart"][0])].xi(self.q))
@@ -221,6 +223,7 @@ class ArmTracker(Shown):
                 break
             track(self._at, self._postures_at, at, wish)
         self._state["pushes"] = 0
+        # What still comes nearer than the margin goes a part of the way.
         q, fraction = self._clearance.limit(before, self.q)
         if fraction < 1:
             self._kernel.hold(self._at, pointer(np.ascontiguousarray(q)), int(TrackStatus.BRAKED))
@@ -233,6 +236,7 @@ class ArmTracker(Shown):
         """
         assert clearance.avoid is not None
         end = self.q
+        # A motion that keeps its distance needs no rows.
         near = clearance.collisions.find_near(end, clearance.avoid - RULES.kept)
         if not len(near.distance):
             return False

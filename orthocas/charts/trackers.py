@@ -106,13 +106,14 @@ class Tracker(Shown):
 
     def __getstate__(self) -> dict[str, Any]:
         """Without scratch memory."""
-        parts = {"functions": self._functions, "domain": self._domain, "q": self.q, "limit": self._limit}
-        return {**parts, "m": self._m, "clearance": self._clearance, "start": self._start}
+        parts: dict[str, Any] = {"functions": self._functions, "domain": self._domain, "q": self.q}
+        parts |= {"limit": self._limit, "m": self._m, "clearance": self._clearance, "start": self._start}
+        return {**parts, "target": self._solver.target}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         names = ("functions", "domain", "q", "limit", "m", "clearance")
         self.__init__(*(state[name] for name in names))  # type: ignore[misc]
-        self._start = state["start"]
+        self._start, self._solver.target[:] = state["start"], state["target"]
 
     @property
     def q(self) -> Array:
@@ -162,21 +163,33 @@ class Tracker(Shown):
         if self._clearance is not None:
             self._clearance.start(point)
         self._start = self._solver.q.copy(), self._solver.phi.copy()
+        self._solver.target[:] = self._solver.phi
         self.status = TrackerStatus.OK  #: how the last call ended
 
-    def step(self, phi: ArrayLike) -> Array:
+    def step(self, phi: ArrayLike | None = None, *, x: ArrayLike | None = None, xi: ArrayLike | None = None) -> Array:
         """The q near the last one with phi(q) = phi, or the last one; see `status`.
 
         Args:
             phi: target values, (n,).
+            x: in place of phi, those of the task, (m,). Without it, x stays what the last call asked for.
+            xi: in place of phi, those of the coordinates, (r,) or a number. Without it, xi stays as well.
 
         Returns:
             q, (n,) [rad] or [m].
 
         Raises:
-            ShapeError: if phi has another number of entries.
+            InvalidValueError, ShapeError: if both phi and x or xi are given, or another number of entries.
         """
         solver = self._solver
+        if x is not None or xi is not None:
+            if phi is not None:
+                raise InvalidValueError("phi", "given with x or xi", "phi alone, or x and xi")
+            phi = np.where(np.isfinite(solver.target), solver.target, solver.phi)
+            for name, values, part in (("x", x, phi[: self._m]), ("xi", xi, phi[self._m :])):
+                if values is not None:
+                    own = np.atleast_1d(as_float_array(name, values))
+                    require_shape(name, own.shape, part.shape)
+                    part[:] = own
         if type(phi) is not np.ndarray or phi.shape != solver.target.shape:
             phi = as_float_array("phi", phi)
             require_shape("phi", phi.shape, solver.target.shape)
@@ -365,11 +378,11 @@ class ReachingTracker(Tracker):
     def __setstate__(self, state: dict[str, Any]) -> None:
         names = ("functions", "domain", "q", "limit", "m", "clearance", "near")
         self.__init__(*(state[name] for name in names))  # type: ignore[misc]
-        self._start = state["start"]
+        self._start, self._solver.target[:] = state["start"], state["target"]
 
-    def step(self, phi: ArrayLike) -> Array:
+    def step(self, phi: ArrayLike | None = None, *, x: ArrayLike | None = None, xi: ArrayLike | None = None) -> Array:
         """As `Tracker.step`; where that stays, the nearest q (n,) that a descent from the last one finds."""
-        q = super().step(phi)
+        q = super().step(phi, x=x, xi=xi)
         if self.status in (TrackerStatus.OK, TrackerStatus.YIELDING, TrackerStatus.BAD_INPUT):
             return q
         start = self._before.copy()

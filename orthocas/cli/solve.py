@@ -51,7 +51,7 @@ def solve(
         if every:
             if value is None:
                 raise OptionError("--all requires --xi")
-            postures: Any = arm.solutions(target, value)
+            postures: Any = arm.solve(target, value, near, ANY if branch is None else branch, all=True)
         else:
             postures = arm.solve(target, value, near, ANY if branch is None else branch)
         single = postures.q.ndim == 1

@@ -81,6 +81,7 @@ def _find_columns(names: Sequence[str], joints: Sequence[str]) -> list[int]:
 
 def _is_of_joint(name: str, joint: str) -> bool:
     """Whether a column has the positions of a joint."""
+    # Columns are called JOINT, TOPIC/JOINT, or .../JOINT/position, with dots or slashes.
     *_, last = parts = name.replace(".", "/").split("/")
     return joint in (name, last) or (last == "position" and parts[-2:-1] == [joint])
 

@@ -29,6 +29,7 @@ def search_xi(
     Source:
         ours; the recursion is Viterbi's.
     """
+    # At each station, the postures with x and one of the values of xi, where nothing touches.
     s, lattice = np.linspace(0.0, 1.0, RULES.stations), _list_values(chart)
     S, K = len(s), len(lattice)
     goals = np.hstack([np.repeat(path.x(s), K, axis=0), np.tile(lattice, S)[:, None]])
@@ -42,11 +43,13 @@ def search_xi(
     # least[i, j]: from value i at the first station to value j at this one.
     least, before = np.where(np.eye(K, dtype=bool), table[0], np.inf), list[Indices]()
     for k in range(1, S):
+        # Edges between stations cost the squared step of the joints; long ones are none.
         steps = q[k][None] - q[k - 1][:, None]
         edges = np.where(np.abs(steps).max(axis=2) < RULES.lattice_step, (steps**2).sum(axis=2) * S, np.inf) + table[k]
         totals = least[:, :, None] + edges[None]
         before.append(np.argmin(totals, axis=1))
         least = np.take_along_axis(totals, before[-1][:, None, :], axis=1)[:, 0]
+    # A closed path ends with the xi of its begin. From the best end, back along what led there.
     ends = np.where(np.eye(K, dtype=bool), least, np.inf) if path.closed else least
     first, last = np.unravel_index(int(np.argmin(ends)), ends.shape)
     if not np.isfinite(ends[first, last]):

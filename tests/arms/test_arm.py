@@ -45,7 +45,7 @@ def test_forms_of_a_task_value_are_one() -> None:
     turn = pin.Quaternion(np.asarray(R))
     wxyz = np.array([turn.w, turn.x, turn.y, turn.z])
     for x in (matrix, (p, R), (p, wxyz), (p, -wxyz), pin.SE3(np.asarray(R), np.asarray(p))):
-        assert arm.nearest(x, q).q == pytest.approx(q, abs=1e-9)
+        assert arm.solve(x, start=q).q == pytest.approx(q, abs=1e-9)
     several = arm.solve([pin.SE3(matrix), pin.SE3(matrix)], start=q)
     assert several.q == pytest.approx(np.array([q, q]), abs=1e-9)
 
@@ -76,7 +76,7 @@ def test_xi_that_no_posture_has_gives_the_nearest() -> None:
     found = arm.solve(arm.x(q), 50.0)
     assert found.status is InverseStatus.NEAREST
     assert arm.x(found.q) == pytest.approx(arm.x(q), abs=1e-9)
-    dense = np.vstack([arc.at(np.linspace(0, arc.length, 500)) for arc in arm.solutions(arm.x(q))])
+    dense = np.vstack([arc.at(np.linspace(0, arc.length, 500)) for arc in arm.self_motion(arm.x(q))])
     dense = dense[arm.charts[0].problem.domain.contains(dense)]
     assert found.xi >= arm.charts[0].xi(dense).max() - 0.05
 
@@ -94,14 +94,14 @@ def test_without_xi_the_posture_is_the_nearest_to_the_start() -> None:
     arm, q = panda(), inside(panda(), 5, 3)
     found = arm.solve(arm.x(q), start=q + 0.05)
     for posture, x, near in zip(found.q, arm.x(q), q + 0.05, strict=True):
-        dense = np.vstack([arc.at(np.linspace(0, arc.length, 500)) for arc in arm.solutions(x)])
+        dense = np.vstack([arc.at(np.linspace(0, arc.length, 500)) for arc in arm.self_motion(x)])
         assert np.linalg.norm(posture - near) <= np.linalg.norm(dense - near, axis=1).min() + 1e-9
 
 
 def test_without_a_start_the_posture_is_far_from_limits() -> None:
     arm, q = panda(), inside(panda(), 1, 4)[0]
     found, (low, high) = arm.solve(arm.x(q)), (arm.robot.lower, arm.robot.upper)
-    dense = np.vstack([arc.at(np.linspace(0, arc.length, 500)) for arc in arm.solutions(arm.x(q))])
+    dense = np.vstack([arc.at(np.linspace(0, arc.length, 500)) for arc in arm.self_motion(arm.x(q))])
     room = (np.minimum(dense - low, high - dense) / (high - low)).min(axis=1)
     assert (np.minimum(found.q - low, high - found.q) / (high - low)).min() >= room.max() - 1e-6
 
@@ -111,7 +111,7 @@ def test_solutions_with_xi_are_those_of_newtons_method() -> None:
     arm, chart = panda(), panda().charts[0]
     for q in inside(arm, 2, 5):
         phi = chart.phi(q)
-        found = arm.solutions(phi[:6], float(phi[6]))
+        found = arm.solve(phi[:6], float(phi[6]), all=True)
         assert isinstance(found, Postures)
         assert np.abs(chart.phi(found.q) - phi).max() < 1e-8
         again = chart.solve(np.tile(phi, (300, 1)), inside(arm, 300, 6))
@@ -210,7 +210,7 @@ def test_a_fit_has_a_chart_of_each_branch() -> None:
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: oc.Arm(oc.problems.get("iiwa").task).nearest([0.1, 0.2, 0.3], np.zeros(7)), "n - m = 4"),
+        (lambda: oc.Arm(oc.problems.get("iiwa").task).solve([0.1, 0.2, 0.3], start=np.zeros(7)), "n - m = 4"),
         (lambda: oc.Arm(3), "a Task"),  # type: ignore[arg-type]
         (lambda: oc.Arm(planar().task, (panda().charts[0],)), "charts"),
         (lambda: oc.Arm(panda().task).save("a.arm"), "without charts"),

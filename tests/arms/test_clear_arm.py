@@ -79,11 +79,11 @@ def test_free_postures_take_the_place_of_those_that_touch(arm: tuple[oc.Arm, Col
     assert near.status in (InverseStatus.FOUND, InverseStatus.NEAREST)
     assert around.check_free(near.q)
     np.testing.assert_allclose(whole.x(near.q), x, atol=1e-8)
-    every = whole.solutions(x, xi + 0.7, collisions=around)
+    every = whole.solve(x, xi + 0.7, collisions=around, all=True)
     assert isinstance(every.status, np.ndarray)
     assert InverseStatus.COLLIDING in every.status
     np.testing.assert_array_equal(around.check_free(every.q), every.status == InverseStatus.FOUND)
-    with pytest.raises(InvalidValueError, match="xi with it"):
-        whole.solutions(x, collisions=around)
+    with pytest.raises(InvalidValueError, match="an xi with it"):
+        whole.solve(x, collisions=around, all=True)
     with pytest.raises(InvalidValueError, match="those of the chart's robot"):
         whole.solve(x, collisions=Collisions(oc.Robot.planar([2.0, 1.0], [1.0, 1.0]).tree, around.parts[:1], ()))

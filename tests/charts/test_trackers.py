@@ -44,6 +44,22 @@ def test_a_tracker_follows_a_stream_and_comes_back(iiwa_fit: Fit) -> None:
     np.testing.assert_allclose(tracker.q, q[-1], atol=0)
 
 
+def test_x_and_xi_are_asked_for_by_name_and_what_is_not_asked_stays(planar_arm: oc.Chart) -> None:
+    home = np.array(planar_arm.domain.centre)
+    tracker, phi = planar_arm.tracker(home), planar_arm.phi(home)
+    away = phi + np.array([0.02, 0.0, 0.01])
+    tracker.step(x=away[:2])
+    assert planar_arm.phi(tracker.q) == pytest.approx([*away[:2], phi[2]], abs=1e-9)
+    tracker = pickle.loads(pickle.dumps(tracker))
+    tracker.step(np.full(3, np.nan))
+    tracker.step(xi=away[2])
+    assert planar_arm.phi(tracker.q) == pytest.approx(away, abs=1e-9)
+    with pytest.raises(InvalidValueError, match="phi alone"):
+        tracker.step(phi, xi=0.1)
+    with pytest.raises(ShapeError, match="x has shape"):
+        tracker.step(x=phi)
+
+
 def test_a_tracker_keeps_the_last_position_where_it_must_not_go(planar_arm: oc.Chart) -> None:
     """It says why, and goes on from there when the stream comes back."""
     domain = planar_arm.problem.domain

@@ -68,9 +68,7 @@ def _arms() -> dict[str, Call]:
         "arm.save": (whole.save, {"path": "new.arm", "force": False}),
         "arm.x": (whole.x, {"q": q}),
         "arm.self_motion": (whole.self_motion, {"x": x}),
-        "arm.solutions": (whole.solutions, {"x": x, "xi": 0.1}),
-        "arm.solve": (whole.solve, {"x": x, "xi": 0.1, "start": q, "branch": "any"}),
-        "arm.nearest": (whole.nearest, {"x": x, "q_wish": q}),
+        "arm.solve": (whole.solve, {"x": x, "xi": 0.1, "start": q, "branch": "any", "all": True}),
         "arm.tracker": (whole.tracker, {"q": q, "period": 0.01, "velocity_limits": 1.0, "detours": True}),
         "arm.follow": (
             whole.follow,

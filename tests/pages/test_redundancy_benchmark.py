@@ -46,7 +46,7 @@ def test_postures_of_the_self_motion_have_the_elbow_that_was_asked_for() -> None
 @pytest.mark.slow
 def test_all_scenarios_have_a_thread_and_streams_that_begin_at_home() -> None:
     known = runner.scenarios()
-    assert len(known) == 14
+    assert len(known) == 15
     for name, scenario in known.items():
         assert scenario.threads, name
         assert all(address.startswith("https://") for address in scenario.threads)

@@ -40,7 +40,7 @@ def judge(arm: Arm, runs: list[Run]) -> Score:
 SCENARIO = Scenario(
     "narrow",
     "Joints at their limits",
-    "motions not followed [%]",
+    "motions to joint limits not followed [%]",
     {
         "https://github.com/personalrobotics/ssik/issues/359": "reachable in-limits poses can return [] on tight-limit "
         "redundant 7R",

@@ -51,7 +51,7 @@ def judge(arm: Arm, runs: list[Run]) -> Score:
 SCENARIO = Scenario(
     "singular",
     "Through a singular posture",
-    "motions not followed [%]",
+    "motions through singular postures not followed [%]",
     {
         "https://github.com/moveit/moveit/issues/3069": "the robot often halts at singularities. This is especially "
         "problematic when rotating.",
