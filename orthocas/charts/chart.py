@@ -210,7 +210,7 @@ class Chart(Shown):
             >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
             >>> start = [0.6, 0.8, 0.8]
             >>> try:
-            ...     chart.inverse(chart.phi(start) + [0.0, 0.0, 2.0], start)
+            ...     chart.inverse(chart.phi(start) + [0.0, 0.0, 0.5], start)
             ... except oc.errors.InverseError as error:
             ...     bool(chart.problem.domain.contains(error.nearest))
             True
