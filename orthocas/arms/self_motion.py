@@ -189,6 +189,8 @@ class Arc(Shown):
             (first, t_first), (last, t_last) = (curve.point(place) for place in (piece.begin, piece.end))
             shift = _TURN * np.array(piece.turns)
             q = np.vstack([first, curve.q[inner], last]) + shift
+            # Where a piece goes on beyond the last point of a closed curve, endless joints keep their full turns.
+            q += _TURN * np.rint((parts[-1][0][-1] - q[0]) / _TURN) if parts else 0.0
             t = np.vstack([t_first, curve.tangent[inner], t_last])
             at = np.concatenate([[piece.begin], along[inner], [piece.end]]) - piece.begin + before
             parts.append((q, t, at))
