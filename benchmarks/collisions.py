@@ -302,12 +302,11 @@ def keep_clear(names: list[str], ticks: int, found: dict[str, float]) -> Iterato
             problem = oc.Problem(robot, oc.Task.position(robot, "x"), domain=oc.Box(middle, 0.1))
             chart, goals = oc.fit(problem, oc.Linear(), samples=300).chart, robot.sample(ticks // LEG, 5)
         fitted = oc.fit_capsules(own)
-        # Capsules of short wrists are near each other in all postures: then the margin is half of the most.
+        # Capsules of short wrists are near each other in all postures: then the margin is two thirds of the most.
         apart = fitted.collisions.distance(goals).distance
-        margin, start = (
-            min(MARGIN, float(apart.max()) / 2),
-            goals[int(np.argmax(apart >= min(1.5 * MARGIN, apart.max())))],
-        )
+        most = float(apart.max())
+        margin, far = min(MARGIN, most / 1.5), next(k for k in (2 * MARGIN, 1.5 * MARGIN, most) if k <= most)
+        start = goals[int(np.argmax(apart >= far))]
         around, scene = put_post(own, chart.robot, start)
         if scene is not None:
             fitted = replace(fitted, collisions=fitted.collisions.with_scene(scene))

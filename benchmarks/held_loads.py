@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from benchmark import run, table
-from faults import ARMS, OBSERVED, REST, SETTLED, TICK, Arm, arm_of
+from faults import ARMS, REST, SETTLED, TICK, Arm, arm_of
 
 from orthocas.control import ControlStatus
 from orthocas.simulation import MuJoCoPlant
@@ -32,7 +32,7 @@ def rows(arms: tuple[str, ...], runs: int) -> Iterator[str]:
     """Two rows for each arm, without and with encoders: the worst of all runs."""
     for name in arms:
         with arm_of(name) as arm:
-            for label, seen in ((name, arm), (f"{name}, encoders", arm.with_encoders(13, OBSERVED[13]))):
+            for label, seen in ((name, arm), (f"{name}, encoders", arm.with_encoders(13))):
                 found = np.array([[loaded(seen, before) for _ in range(runs)] for before in TAKEN])
                 away = ", ".join(f"{1e3 * way:.0f}" for way in found[..., 0].max(axis=1))
                 yield (

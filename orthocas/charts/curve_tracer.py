@@ -38,6 +38,8 @@ class CurveRules:
     halvings: int = 5  #: of chords that pass the box between points outside
     narrow: float = 1e-10  #: [rad] or [m]: brackets of an end of the domain
     narrowings: int = 100  #: halvings until then at most
+    newton: int = 8  #: steps to a solution; those near a fold need more than four
+    snap: float = 1e-9  #: half-widths: solutions so close to the boundary are moved onto it
     few: int = 16  #: rows up to which all starts are followed at once, though some lie on one curve
     prismatic: float = 1.0  #: half-widths that a sliding joint may leave its range by
 

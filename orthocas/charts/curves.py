@@ -313,13 +313,13 @@ class SelfMotionCurves:
         if not rows.size:
             return q, np.zeros(0, dtype=bool)
         phi_map = self.boxed.phi_map
-        for _ in range(8):
+        for _ in range(RULES.newton):
             J = phi_map.jacobian(q) / phi_map.sizes[:, None]
             left_over = phi_map.difference(targets[rows], phi_map.phi(q)) / phi_map.sizes
             q = q + solutions_of(J, left_over[:, :, None])[:, :, 0]
         # points that miss the boundary by rounding, on it
         moved = np.clip(q, *self.boxed.domain.bounds)
-        near = np.abs(moved - q) <= 1e-9 * self.boxed.domain.half_width
+        near = np.abs(moved - q) <= RULES.snap * self.boxed.domain.half_width
         q = np.where(near.all(axis=1, keepdims=True), moved, q)
         solved = np.asarray(np.isfinite(q).all(axis=1))
         solved[solved] = largest(phi_map.residual(targets[rows[solved]], q[solved])) <= tolerance

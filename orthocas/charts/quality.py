@@ -46,6 +46,149 @@ class ReportRules:
 RULES = ReportRules()
 
 
+def evaluate(
+    chart: Chart,
+    samples: int | None = None,
+    seed: int | None = None,
+    *,
+    points: ArrayLike | None = None,
+    collisions: Collisions | None = None,
+) -> Report:
+    """Measure the quality of a chart on uniform samples of its domain. Use another seed than that of the fit.
+
+    Uniform samples miss folds, so the least conditioning is searched near faces and corners too, and by descent.
+
+    The task and mutual angles are those of [AS2023] eq. (24): between each dxi_j and grad_A h_i, over all m r pairs,
+    and between the coordinates, over all r (r - 1) / 2 pairs. Their norms are Euclidean, so for A = M they hide how far
+    a coordinate leans into the task. The leak, the angle in the metric, shows it; see `LeakStatistics`. The
+    conditioning is computed in coordinates where A is the identity, so it does not depend on the task's own
+    conditioning or units.
+
+    Args:
+        chart: the chart.
+        samples: number of samples N. Default: 100,000.
+        seed: seed of the samples. Default: 1.
+        points: joint positions (N, n) or (n,) [rad] or [m] in place of samples, for example those of a path.
+        collisions: of the chart's robot, such as `robot.collisions`: the report says how many of up to 10,000 samples
+            touch. Charts of `fit_wide(collisions=True)` are evaluated so by default, and at free samples only.
+
+    Raises:
+        SingularTaskError: if a gradient vanishes, or a coordinate has no value, everywhere.
+        InvalidValueError, ShapeError: if an argument is invalid, or both points and samples or a seed are given.
+
+    Example:
+        >>> import orthocas as oc
+        >>> from orthocas import problems
+        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
+        >>> report = oc.evaluate(chart, samples=2000)
+        >>> 85 < report.task_angle.mean < 95, report.folded_samples
+        (True, 0)
+        >>> oc.evaluate(chart, points=[[0.6, 0.8, 0.8], [0.7, 0.8, 0.8]]).samples
+        2
+    """
+    require_kind("chart", chart, Chart)
+    if collisions is not None:
+        require_kind("collisions", collisions, Collisions)
+        collisions.require_for(chart.problem.robot.tree)
+    free = FREE in chart.notes
+    if free and collisions is None:
+        collisions = chart.problem.robot.collisions
+    # samples of one's own, and a search for the worst points, which samples miss
+    if points is None:
+        count = _count(chart, RULES.samples if samples is None else samples)
+        drawn = require_count("seed", RULES.seed if seed is None else seed, least=0)
+        searched = isinstance(chart.coordinates, Coordinates) and not chart.problem.domain.full_turns
+        problem, found = chart.problem, chart.coordinates
+        worst = worst_points(problem, found, drawn, thorough=True) if searched else None
+        return _report(chart, sample_uniform(chart.problem.domain, count, drawn), drawn, worst, collisions, free)
+    # or the points that were given, and nothing else
+    if samples is not None or seed is not None:
+        raise InvalidValueError("points", "given with samples or a seed", "points alone")
+    given = as_point_set("points", points, chart.n)[0]
+    _count(chart, len(given))
+    return _report(chart, given, None, None, collisions)
+
+
+def _count(chart: Chart, samples: int) -> int:
+    """The number of samples, if there is memory for them."""
+    count = require_count("samples", samples, most=RULES.most)
+    require_memory(f"evaluating {count} samples", 8.0 * count * chart.n * (2 * chart.n + 4))
+    return count
+
+
+def _report(
+    chart: Chart,
+    points: Array,
+    seed: int | None,
+    worst: WorstPoints | None,
+    collisions: Collisions | None,
+    free: bool = False,
+) -> Report:
+    contacts = None if collisions is None else ContactShare.of(collisions, points[: RULES.postures])
+    if collisions is not None and free:
+        points = points[collisions.check_free(points)]
+        if not len(points):
+            raise InvalidValueError("collisions", "a contact at all samples of the domain", "free postures")
+    # what is singular, or without a value, is left out and counted
+    judged = Judged.at(chart.problem, chart.coordinates, points)
+    if len(judged.points) == 0:
+        where = "given points" if seed is None else "samples of the domain"
+        raise SingularTaskError(f"a gradient vanishes, or a coordinate has no value, at all {len(points)} {where}")
+    # coordinates that are functions of one idle joint alone, with the names of these joints
+    first = evaluate_samples(chart.problem, sample_uniform(chart.problem.domain, RULES.telling, 0))
+    idle: dict[int, str] = {}
+    for joint in find_idle_joints(chart.problem, first):
+        likely = _functions_of(joint, judged.jacobian[: RULES.telling])
+        sure = likely[_functions_of(joint, judged.jacobian[:, likely])]
+        idle |= {int(j): chart.problem.robot.joint_names[joint] for j in sure}
+    others = [j for j in range(chart.r) if j not in idle]
+    floating = {chart.problem.robot.joint_names[k] for k in chart.problem.robot.tree.floating}
+    # all coordinates, and those that are no joints, whose exact ones would flatter the means
+    angles, without_idle = Angles.of(judged, [range(chart.r), others])
+    short, long = np.quantile(_lengths(judged.jacobian), [0.01, 0.99], axis=0)
+    # how fast joints move with xi held, at some of the points
+    some = slice(RULES.held)
+    speeds = measure_held_speeds(chart.problem, judged.points[some], judged.jacobian[some], seed or 0)
+    # the point of least conditioning, (n,)
+    k = int(np.argmin(judged.conditioning))
+    point: Array = judged.points[k]
+    return Report(
+        n=chart.n,
+        m=chart.m,
+        r=chart.r,
+        samples=len(points),
+        seed=seed,
+        metric=chart.problem.metric.name,
+        task_angle=angles.task_angle,
+        mutual_angle=angles.mutual_angle,
+        leak=angles.leak,
+        metric_mutual_angle=angles.metric_mutual_angle,
+        conditioning=Conditioning.of(judged.conditioning, worst),
+        worst_point=tuple(
+            (point if worst is None or worst.least > judged.conditioning[k] else worst.points[0]).tolist()
+        ),
+        worst=worst,
+        singular_samples=len(points) - len(judged.points),
+        held_speed=float(np.quantile(speeds, RULES.mostly)),
+        length_ratio=float((long / short).max()),
+        folded_samples=int(min((judged.signs > 0).sum(), (judged.signs <= 0).sum())),
+        idle_joints=tuple(name for name in idle.values() if name not in floating),
+        without_idle=without_idle if idle and others else None,
+        contacts=contacts,
+    )
+
+
+def _functions_of(joint: int, J: Array) -> NDArray[np.int_]:
+    """Coordinates whose gradients, rows of J (N, r, n), have entries for one joint only."""
+    others = np.abs(np.delete(J, joint, axis=2)).max(axis=2, initial=0.0) <= RULES.alone * _lengths(J)
+    return np.flatnonzero(others.all(axis=0))
+
+
+def _lengths(J: Array) -> Array:
+    """Norms of the rows of J (N, r, n), (N, r)."""
+    return np.asarray(np.sqrt(np.einsum("sij,sij->si", J, J)))
+
+
 @dataclass(frozen=True, eq=False)
 class _Sums:
     """Sums over the samples of some angles in degrees, each angle a column."""
@@ -359,144 +502,3 @@ class Report(Shown):
             **({} if self.contacts is None else {"contacts": self.contacts.as_dict()}),
         }
         return dict(clean(data))
-
-
-def evaluate(
-    chart: Chart,
-    samples: int | None = None,
-    seed: int | None = None,
-    *,
-    points: ArrayLike | None = None,
-    collisions: Collisions | None = None,
-) -> Report:
-    """Measure the quality of a chart on uniform samples of its domain. Use another seed than that of the fit.
-
-    Uniform samples miss folds, so the least conditioning is searched near faces and corners too, and by descent.
-
-    The task and mutual angles are those of [AS2023] eq. (24): between each dxi_j and grad_A h_i, over all m r pairs,
-    and between the coordinates, over all r (r - 1) / 2 pairs. Their norms are Euclidean, so for A = M they hide how far
-    a coordinate leans into the task. The leak, the angle in the metric, shows it; see `LeakStatistics`. The
-    conditioning is computed in coordinates where A is the identity, so it does not depend on the task's own
-    conditioning or units.
-
-    Args:
-        chart: the chart.
-        samples: number of samples N. Default: 100,000.
-        seed: seed of the samples. Default: 1.
-        points: joint positions (N, n) or (n,) [rad] or [m] in place of samples, for example those of a path.
-        collisions: of the chart's robot, such as `robot.collisions`: the report says how many of up to 10,000 samples
-            touch. Charts of `fit_wide(collisions=True)` are evaluated so by default, and at free samples only.
-
-    Raises:
-        SingularTaskError: if a gradient vanishes, or a coordinate has no value, everywhere.
-        InvalidValueError, ShapeError: if an argument is invalid, or both points and samples or a seed are given.
-
-    Example:
-        >>> import orthocas as oc
-        >>> from orthocas import problems
-        >>> chart = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(degree=2), samples=300).chart
-        >>> report = oc.evaluate(chart, samples=2000)
-        >>> 85 < report.task_angle.mean < 95, report.folded_samples
-        (True, 0)
-        >>> oc.evaluate(chart, points=[[0.6, 0.8, 0.8], [0.7, 0.8, 0.8]]).samples
-        2
-    """
-    require_kind("chart", chart, Chart)
-    if collisions is not None:
-        require_kind("collisions", collisions, Collisions)
-        collisions.require_for(chart.problem.robot.tree)
-    free = FREE in chart.notes
-    if free and collisions is None:
-        collisions = chart.problem.robot.collisions
-    # samples of one's own, and a search for the worst points, which samples miss
-    if points is None:
-        count = _count(chart, RULES.samples if samples is None else samples)
-        drawn = require_count("seed", RULES.seed if seed is None else seed, least=0)
-        searched = isinstance(chart.coordinates, Coordinates) and not chart.problem.domain.full_turns
-        problem, found = chart.problem, chart.coordinates
-        worst = worst_points(problem, found, drawn, thorough=True) if searched else None
-        return _report(chart, sample_uniform(chart.problem.domain, count, drawn), drawn, worst, collisions, free)
-    # or the points that were given, and nothing else
-    if samples is not None or seed is not None:
-        raise InvalidValueError("points", "given with samples or a seed", "points alone")
-    given = as_point_set("points", points, chart.n)[0]
-    _count(chart, len(given))
-    return _report(chart, given, None, None, collisions)
-
-
-def _count(chart: Chart, samples: int) -> int:
-    """The number of samples, if there is memory for them."""
-    count = require_count("samples", samples, most=RULES.most)
-    require_memory(f"evaluating {count} samples", 8.0 * count * chart.n * (2 * chart.n + 4))
-    return count
-
-
-def _report(
-    chart: Chart,
-    points: Array,
-    seed: int | None,
-    worst: WorstPoints | None,
-    collisions: Collisions | None,
-    free: bool = False,
-) -> Report:
-    contacts = None if collisions is None else ContactShare.of(collisions, points[: RULES.postures])
-    if collisions is not None and free:
-        points = points[collisions.check_free(points)]
-        if not len(points):
-            raise InvalidValueError("collisions", "a contact at all samples of the domain", "free postures")
-    judged = Judged.at(chart.problem, chart.coordinates, points)
-    if len(judged.points) == 0:
-        where = "given points" if seed is None else "samples of the domain"
-        raise SingularTaskError(f"a gradient vanishes, or a coordinate has no value, at all {len(points)} {where}")
-    # coordinates that are functions of one idle joint alone, with the names of these joints
-    first = evaluate_samples(chart.problem, sample_uniform(chart.problem.domain, RULES.telling, 0))
-    idle: dict[int, str] = {}
-    for joint in find_idle_joints(chart.problem, first):
-        likely = _functions_of(joint, judged.jacobian[: RULES.telling])
-        sure = likely[_functions_of(joint, judged.jacobian[:, likely])]
-        idle |= {int(j): chart.problem.robot.joint_names[joint] for j in sure}
-    others = [j for j in range(chart.r) if j not in idle]
-    floating = {chart.problem.robot.joint_names[k] for k in chart.problem.robot.tree.floating}
-    angles, without_idle = Angles.of(judged, [range(chart.r), others])
-    short, long = np.quantile(_lengths(judged.jacobian), [0.01, 0.99], axis=0)
-    # how fast joints move with xi held, at some of the points
-    some = slice(RULES.held)
-    speeds = measure_held_speeds(chart.problem, judged.points[some], judged.jacobian[some], seed or 0)
-    # the point of least conditioning, (n,)
-    k = int(np.argmin(judged.conditioning))
-    point: Array = judged.points[k]
-    return Report(
-        n=chart.n,
-        m=chart.m,
-        r=chart.r,
-        samples=len(points),
-        seed=seed,
-        metric=chart.problem.metric.name,
-        task_angle=angles.task_angle,
-        mutual_angle=angles.mutual_angle,
-        leak=angles.leak,
-        metric_mutual_angle=angles.metric_mutual_angle,
-        conditioning=Conditioning.of(judged.conditioning, worst),
-        worst_point=tuple(
-            (point if worst is None or worst.least > judged.conditioning[k] else worst.points[0]).tolist()
-        ),
-        worst=worst,
-        singular_samples=len(points) - len(judged.points),
-        held_speed=float(np.quantile(speeds, RULES.mostly)),
-        length_ratio=float((long / short).max()),
-        folded_samples=int(min((judged.signs > 0).sum(), (judged.signs <= 0).sum())),
-        idle_joints=tuple(name for name in idle.values() if name not in floating),
-        without_idle=without_idle if idle and others else None,
-        contacts=contacts,
-    )
-
-
-def _functions_of(joint: int, J: Array) -> NDArray[np.int_]:
-    """Coordinates whose gradients, rows of J (N, r, n), have entries for one joint only."""
-    others = np.abs(np.delete(J, joint, axis=2)).max(axis=2, initial=0.0) <= RULES.alone * _lengths(J)
-    return np.flatnonzero(others.all(axis=0))
-
-
-def _lengths(J: Array) -> Array:
-    """Norms of the rows of J (N, r, n), (N, r)."""
-    return np.asarray(np.sqrt(np.einsum("sij,sij->si", J, J)))

@@ -54,113 +54,203 @@ class SelfMotionRules:
 RULES = SelfMotionRules()
 
 
-@dataclass(frozen=True)
-class Stop:
-    """What ends a motion, and where."""
-
-    kind: StopKind
-    joint: str = ""  #: name of the joint, for JOINT
-    value: float = np.nan  #: position of that joint [rad] or [m], or what a condition of the domain bounds
-    is_limit: bool = False  #: whether the boundary of the domain is the limit of the joint
-    condition: str = ""  #: in one line, for conditions of the domain; the pair, for contacts
-
-    def __str__(self) -> str:
-        if self.kind is StopKind.JOINT:
-            return f"joint '{self.joint}' at {self.value:.4g}{', its limit' if self.is_limit else ''}"
-        if self.kind is StopKind.NEAR_SINGULAR:
-            return f"the task near singular, with a relative singular value of {self.value:.3g}"
-        if self.kind is StopKind.CONDITION:
-            return f"the boundary of the domain ({self.condition})"
-        if self.kind is StopKind.CONTACT:
-            return f"a contact of {self.condition}"
-        return {
-            StopKind.FOLD: "a fold of the chart",
-            StopKind.SINGULAR: "a singularity or the end of the chart",
-            StopKind.ENDLESS: "nothing",
-        }[self.kind]
-
-    @property
-    def brief(self) -> str:
-        """The same in a few words."""
-        if self.kind is StopKind.JOINT:
-            return f"{self.joint} at {'its limit ' if self.is_limit else ''}{self.value:.4g}"
-        return {
-            StopKind.NEAR_SINGULAR: "the task near singular",
-            StopKind.CONDITION: self.condition,
-            StopKind.CONTACT: f"a contact of {self.condition}",
-            StopKind.FOLD: "a fold",
-            StopKind.SINGULAR: "a singularity",
-            StopKind.ENDLESS: "no end",
-        }[self.kind]
+def xi_range(chart: Chart, q: ArrayLike, collisions: Collisions | None = None) -> XiRange:
+    """How far each coordinate reaches alone; see `Chart.xi_range`."""
+    start, intervals = start_inside(chart, q, collisions), []
+    for k in range(chart.r):
+        # the curve on which only this coordinate changes, both ways
+        down, up = (branch_along(chart, start, k, sign, collisions) for sign in (-1.0, 1.0))
+        low, high = (float(xi_along(chart, branch.q)[-1, k]) for branch in (down, up))
+        ends = -np.inf if down.endless else low, np.inf if up.endless else high
+        here = float(chart.xi(start)[k])
+        intervals.append(Interval(chart.labels[chart.m + k], here, *ends, down.stop, up.stop))
+    return XiRange(tuple(intervals), chart.parts.turn_shifts)
 
 
-class Walls:
-    """The boundaries of a problem's domain as functions that are positive inside.
+def self_motion(
+    chart: Chart, q: ArrayLike, step: float = 0.05, samples: int = 1000, collisions: Collisions | None = None
+) -> SelfMotion:
+    """The self-motion through a joint position; see `Chart.self_motion`."""
+    start = start_inside(chart, q, collisions)
+    longest = as_number("step", step)
+    if not 1e-4 <= longest <= 0.5:
+        raise InvalidValueError("step", step, "a length from 1e-4 to 0.5 [rad] or [m]")
+    require_count("samples", samples, least=2, most=10_000)
+    return _curve(chart, start, longest, collisions) if chart.r == 1 else _set(chart, start, samples, collisions)
 
-    They are (q_i - low_i) and (high_i - q_i), divided by the half-width of the domain, for every joint; then what the
-    domain itself names as its `walls`; then the distance to a contact, if there are solids to hit.
+
+def start_inside(chart: Chart, q: ArrayLike, collisions: Collisions | None = None) -> Array:
+    """One joint position (n,) inside the domain, where phi and J are finite and nothing touches.
+
+    Raises:
+        ShapeError, InvalidValueError: for anything else.
     """
-
-    def __init__(self, problem: Problem, collisions: Collisions | None = None) -> None:
-        domain = problem.domain
-        self._domain, self._robot, self._collisions = domain, problem.robot, collisions
-        self._low, self._high = domain.bounds
-        self.solid = collisions is not None  #: whether there is something to hit
-        self._curved = domain.walls
-        if collisions is not None:
-            require_kind("collisions", collisions, Collisions)
-            collisions.require_for(problem.robot.tree)
-            self._curved = (*domain.walls, Wall(StopKind.CONTACT, lambda q: float(collisions.distance(q).distance)))
-        endless = np.isinf(self._low) & ~np.array(problem.robot.tree.prismatic)
-        self.turning = endless  #: unbounded revolute joints, (n,): they are at the same place after a full turn
-
-    def values(self, q: Array) -> Array:
-        """All functions at one joint position (n,), positive inside; infinite for unbounded joints."""
-        width = self._domain.half_width
-        rooms = np.array([wall.room(q) for wall in self._curved])
-        parts = [(q - self._low) / width, (self._high - q) / width, np.where(np.isfinite(rooms), rooms, -1.0)]
-        return np.concatenate(parts)
-
-    def box_has(self, q: Array) -> bool:
-        """Whether q (n,) lies in the box of the domain."""
-        return bool(((q >= self._low) & (q <= self._high)).all())
-
-    def stop(self, k: int, q: Array) -> Stop:
-        """What the k-th function stands for, at q (n,)."""
-        n = len(q)
-        if k >= 2 * n:
-            wall = self._curved[k - 2 * n]
-            if wall.kind is StopKind.CONTACT and self._collisions is not None:
-                first, second = self._collisions.distance(q).pair
-                return Stop(wall.kind, condition=f"'{first}' and '{second}'")
-            value = np.nan if wall.value is None else float(wall.value(q))
-            return Stop(wall.kind, value=value, condition=wall.heading)
-        i = k % n
-        boundary, limit = (self._low, self._robot.lower) if k < n else (self._high, self._robot.upper)
-        at_limit = bool(abs(boundary[i] - limit[i]) <= RULES.at_limit * self._domain.half_width[i])
-        return Stop(StopKind.JOINT, self._robot.joint_names[i], float(boundary[i]), at_limit)
-
-    def may_touch(self, q: Array, t: Array, new: Array, onward: Array) -> bool:
-        """Whether a contact deeper than a tolerance may lie on an arc between joint positions (n,) with end tangents.
-
-        An arc whose tangent turns by an angle a is no farther from its chord c than (c / 2) tan(a / 2).
-        """
-        chord = float(np.linalg.norm(new - q))
-        if self._collisions is None or chord < RULES.grazing:
-            return False
-        bend = chord / 2 * float(np.tan(np.arccos(np.clip(t @ onward, 0.0, 1.0)) / 2))
-        return self._collisions.find_contact(np.array([q, new]), -RULES.depth, bend) is not None
-
-    def worst(self, q: Array) -> Stop:
-        """The boundary that q (n,) has crossed farthest, or is nearest to."""
-        return self.stop(int(np.argmin(self.values(q))), q)
-
-    def gap(self, q: Array, start: Array) -> Array:
-        """q - start (n,), up to full turns of unbounded revolute joints."""
-        return np.asarray(wrap_shortest(q - start, 2 * np.pi * self.turning))
+    point = as_point("q", q, chart.n)
+    given = point.round(4).tolist()
+    if not chart.problem.domain.contains(point):
+        stop = Walls(chart.problem).worst(point)
+        hint = degrees_hint(*point[~np.array(chart.problem.robot.tree.prismatic)])
+        raise InvalidValueError("q", given, f"a point of the domain, which ends at {stop}{hint}")
+    if not (np.isfinite(chart.phi(point)).all() and np.isfinite(chart.parts.batched_rates(point[None])).all()):
+        raise InvalidValueError("q", given, "a point at which the chart is finite")
+    # Inside the domain only a contact can be beyond its wall.
+    if collisions is not None and (walls := Walls(chart.problem, collisions)).values(point).min() <= 0:
+        stop = walls.worst(point)
+        if stop.kind is StopKind.CONTACT:
+            raise InvalidValueError("q", given, f"a posture without {stop}")
+    return point
 
 
-Signs = Callable[[Array, Array], Array]  #: q and tangents (N, n) -> numbers (N,) that turn negative at a fold
+def _curve(chart: Chart, q: Array, step: float, collisions: Collisions | None) -> SelfMotionCurve:
+    """Both directions of the curve; the coordinate rises at q."""
+    curve = LevelCurve(chart, np.arange(chart.m), step, collisions)
+    gradient = chart.parts.batched_rates(q[None])[0, chart.m]
+    # a curve that closes is found in one direction
+    up = curve.follow(q, gradient)
+    down = Branch(q[None], np.zeros(1), up.stop) if up.endless else curve.follow(q, -gradient)
+    points = np.concatenate([down.q[:0:-1], up.q])
+    # along the curve, xi may turn back, so its least and largest values need not be at the ends
+    xi = xi_along(chart, points)
+    rises = np.sign(np.diff(xi[:, 0]))
+    low, high = (down, up) if xi[0, 0] <= xi[-1, 0] else (up, down)
+    place = len(down.q) - 1
+    ends = Interval(chart.labels[-1], float(xi[place, 0]), xi.min(), xi.max(), low.stop, high.stop)
+    return SelfMotionCurve(
+        chart.x(q),
+        points,
+        xi,
+        place,
+        XiRange((ends,)),
+        np.concatenate([-down.arc_length[:0:-1], up.arc_length]),
+        up.endless,
+        int(np.count_nonzero(np.diff(rises[rises != 0]))),
+    )
+
+
+def _set(chart: Chart, q: Array, samples: int, collisions: Collisions | None) -> SelfMotion:
+    """Points on a lattice in xi, and the extent from its outermost points on."""
+    require_no_turns(chart.labels, chart.parts.turns, "a set of self-motions")
+    # the ranges at q size the lattice; its own outermost points may reach farther
+    alone = xi_range(chart, q, collisions)
+    points = filled(chart, q, alone, samples, collisions)
+    xi = chart.xi(points)
+    widest = tuple(_widest(chart, points, xi, alone[k], k, collisions) for k in range(chart.r))
+    return SelfMotion(chart.x(q), points, xi, 0, XiRange(widest))
+
+
+def _widest(chart: Chart, points: Array, xi: Array, alone: Interval, k: int, collisions: Collisions | None) -> Interval:
+    """The extent of one coordinate: from the outermost points of a set along the coordinate to what stops it."""
+    if not np.isfinite([alone.low, alone.high]).all():
+        return alone
+    down = branch_along(chart, points[np.argmin(xi[:, k])], k, -1.0, collisions)
+    up = branch_along(chart, points[np.argmax(xi[:, k])], k, 1.0, collisions)
+    low, high = (float(chart.xi(branch.q[-1])[k]) for branch in (down, up))
+    return Interval(alone.label, alone.here, low, high, down.stop, up.stop)
+
+
+def filled(chart: Chart, q: Array, alone: XiRange, samples: int, collisions: Collisions | None = None) -> Array:
+    """Joint positions (N, n) with the task value of q (n,), inside the domain and free, q first.
+
+    Their coordinates lie on a lattice around xi(q). Its spacing divides the range of each coordinate alone so that
+    about `samples` points result. The fill goes from point to neighbour, so that all points can be reached from q.
+    """
+    cells = max(2, round(samples ** (1 / chart.r)))
+    # a full turn of coordinates without ends
+    span = alone.high - alone.low
+    spacing = np.where(np.isfinite(span) & (span > 0), span, 2 * np.pi) / cells
+    known: dict[tuple[int, ...], Array] = {(0,) * chart.r: q}
+    front, tried = list(known), set(known)
+    start, sign = chart.phi(q), np.sign(np.linalg.det(chart.parts.batched_rates(q[None])[0]))
+    # the neighbours of all points of the last round, solved together
+    while front and len(known) < RULES.most * samples:
+        pairs = _neighbours(front, tried, cells)
+        if not pairs:
+            break
+        places = np.array([place for _, place in pairs])
+        targets = np.tile(start, (len(pairs), 1))
+        targets[:, chart.m :] += places * spacing
+        found, good = _solved(chart, np.array([known[origin] for origin, _ in pairs]), targets, float(sign))
+        good = good if collisions is None else good[collisions.check_free(found[good])]
+        # those that were found are the front of the next round
+        front = [pairs[row][1] for row in good]
+        known.update(zip(front, found[good], strict=True))
+    return np.array(list(known.values()))
+
+
+def _neighbours(
+    front: list[tuple[int, ...]], tried: set[tuple[int, ...]], cells: int
+) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+    """Pairs of a point and a neighbour of it that was not tried before."""
+    pairs = []
+    for origin, axis, move in product(front, range(len(front[0])), (-1, 1)):
+        place = (*origin[:axis], origin[axis] + move, *origin[axis + 1 :])
+        if place not in tried and abs(place[axis]) <= 2 * cells:
+            tried.add(place)
+            pairs.append((origin, place))
+    return pairs
+
+
+def _solved(chart: Chart, starts: Array, targets: Array, sign: float) -> tuple[Array, Indices]:
+    """Newton's method from all starts (N, n), and the rows where it found a point of the domain on the same sheet."""
+    phi_map = chart.parts.phi_map
+    found = Newton(phi_map)(targets, starts)
+    # far from its neighbour, a point is on another sheet
+    step = np.linalg.solve(phi_map.jacobian(starts), phi_map.difference(targets, phi_map.phi(starts))[..., None])[
+        ..., 0
+    ]
+    near = np.linalg.norm(found.q - starts, axis=1) <= RULES.farthest * np.linalg.norm(step, axis=1) + 1e-9
+    rows = np.flatnonzero(
+        (largest(found.residual) < RULES.phi_tolerance) & near & chart.problem.domain.contains(found.q)
+    )
+    same = np.sign(np.linalg.det(phi_map.jacobian(found.q[rows]))) == sign
+    return found.q, np.asarray(rows[same], dtype=np.int64)
+
+
+def branch_along(chart: Chart, q: Array, k: int, sign: float, collisions: Collisions | None = None) -> Branch:
+    """The curve from q (n,) on which x and all coordinates but the k-th stay, and that one rises (sign 1) or falls."""
+    row = chart.m + k
+    curve = LevelCurve(chart, np.delete(np.arange(chart.n), row), RULES.spacing, collisions)
+
+    def rising(points: Array, t: Array) -> Array:
+        gradient = chart.coordinates.jacobian(points)[:, k]
+        lengths = np.linalg.norm(gradient, axis=1)
+        return np.asarray(sign * (gradient * t).sum(axis=1) / np.where(lengths > 0, lengths, 1.0))
+
+    return curve.follow(q, sign * chart.parts.batched_rates(q[None])[0, row], rising)
+
+
+def xi_along(chart: Chart, points: Array) -> Array:
+    """Coordinates (N, r) along a curve from its first point on, without the jumps of circle-valued ones."""
+    return counted_on(chart.xi(points), chart.parts.turns[chart.m :])
+
+
+def too_far(chart: Chart, q: Array, wanted: Array) -> str:
+    """Name the coordinate whose target (r,) is farthest outside its range at q (n,); empty if none is outside."""
+    if chart.parts.turns.any():
+        return ""
+    # how far outside each coordinate is, and what stops the farthest
+    reach = xi_range(chart, q)
+    beyond = np.maximum(reach.low - wanted, wanted - reach.high)
+    k = int(np.argmax(beyond))
+    if beyond[k] <= 0:
+        return ""
+    interval = reach[k]
+    stop = interval.low_stop if wanted[k] < interval.low else interval.high_stop
+    told = f"at the last x it reaches [{interval.low:.4g}, {interval.high:.4g}], stopped by {stop}"
+    return f"; {interval.label} = {wanted[k]:.4g} is asked for, {told}"
+
+
+def fan_along(chart: Chart, q: Array, k: int) -> Fan:
+    """The fan of the k-th coordinate at a joint position (n,) inside the domain."""
+    down, up = branch_along(chart, q, k, -1.0), branch_along(chart, q, k, 1.0)
+    if down.endless:  # then one direction passes everything
+        down = Branch(q[None], np.zeros(1), down.stop)
+    points = np.concatenate([down.q[:0:-1], up.q])
+    arc_length = np.concatenate([-down.arc_length[:0:-1], up.arc_length])
+    xi = chart.xi(points)[:, k]
+    turn = getattr(chart.coordinates, "turn", 0.0)
+    xi = np.unwrap(xi, period=turn) if turn else xi
+    return Fan(chart.labels[chart.m + k], points, xi, arc_length, down.stop, up.stop)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,6 +265,9 @@ class Branch:
     def endless(self) -> bool:
         """Whether nothing stops it: the last point is the start, up to full turns, or the curve is very long."""
         return self.stop.kind is StopKind.ENDLESS
+
+
+Signs = Callable[[Array, Array], Array]  #: q and tangents (N, n) -> numbers (N,) that turn negative at a fold
 
 
 class LevelCurve:
@@ -207,12 +300,14 @@ class LevelCurve:
             signs: sign of det J, to notice folds; None: they do not end the curve.
         """
         target = self._chart.phi(q)
+        # the tangent on the side of the direction
         t = self._correct(target, q[None], direction[None])[1][0]
         if not np.isfinite(t).all():
             return Branch(q[None], np.zeros(1), Stop(StopKind.SINGULAR))
         points, tangents, steps, stop = [q[None]], [t[None]], [(q, t)], None
         for new, onward, ended in self._step_on(target, q, t):
             steps.append((new, onward))
+            # many long steps are divided and looked at together, as the box cannot be left before its faces
             if ended is None and len(steps) <= RULES.at_once and self.walls.box_has(new):
                 continue
             ahead, turned = self._divide(target, *(np.array(part) for part in zip(*steps, strict=True)))
@@ -231,6 +326,7 @@ class LevelCurve:
         start, bend, h, length, count, stop = (q, t), np.zeros(len(q)), RULES.step / 2, 0.0, 0, None
         while stop is None:
             found = self._correct_step(target, q, t, q + h * t + h**2 / 2 * bend)
+            # a step that misses the curve is halved
             if found is None:
                 h /= 2
                 if h < RULES.shortest:
@@ -240,6 +336,7 @@ class LevelCurve:
             new, onward = found
             if count > 2 and (closing := self._return_to_start(target, q, new, onward, *start)) is not None:
                 (new, onward), stop = closing, Stop(StopKind.ENDLESS)
+            # curvature and length for the next step
             length, count, turned = length + float(np.linalg.norm(new - q)), count + 1, float(onward @ t)
             bend = (onward - t) / h
             q, t, h = new, onward, min(1.6 * h, RULES.step) if turned > RULES.straight else h
@@ -272,6 +369,7 @@ class LevelCurve:
 
     def _divide(self, target: Array, q: Array, t: Array) -> tuple[Array, Array]:
         """Points close to one another on steps between points q (K, n), with tangents t (K, n): both for each."""
+        # u runs from 0 to 1 along each step, in as many parts as the spacing asks for
         chords = np.linalg.norm(np.diff(q, axis=0), axis=1)
         parts = np.maximum(1, np.ceil(chords / (RULES.divided * self._spacing)).astype(int))
         step = np.repeat(np.arange(len(parts)), parts)
@@ -281,6 +379,7 @@ class LevelCurve:
         points += h * ((u - 2 * u**2 + u**3) * t[step] + (u**3 - u**2) * t[step + 1])
         along = (1 - u) * t[step] + u * t[step + 1]
         points, along = np.concatenate([points, q[-1:]]), np.concatenate([along, t[-1:]])
+        # back to the curve, all at once
         for _ in range(2):
             change, along = self._correct(target, points, along)
             points = points + change
@@ -327,6 +426,7 @@ class LevelCurve:
         def margin(s: float) -> float:
             return self._margin(*self._settle(target, q[0] + s * t, t), signs)
 
+        # the end lies where the margin changes its sign, if not at one of both points
         s = h if margin(h) >= 0 else 0.0
         if s == 0 and margin(0.0) > 0:
             s = scipy.optimize.brentq(margin, 0.0, h, xtol=RULES.rounding)
@@ -436,80 +536,6 @@ class XiRange(Shown):
         }
 
 
-def xi_range(chart: Chart, q: ArrayLike, collisions: Collisions | None = None) -> XiRange:
-    """How far each coordinate reaches alone; see `Chart.xi_range`."""
-    start = start_inside(chart, q, collisions)
-    return XiRange(tuple(_interval(chart, start, k, collisions) for k in range(chart.r)), chart.parts.turn_shifts)
-
-
-def too_far(chart: Chart, q: Array, wanted: Array) -> str:
-    """Name the coordinate whose target (r,) is farthest outside its range at q (n,); empty if none is outside."""
-    if chart.parts.turns.any():
-        return ""
-    reach = xi_range(chart, q)
-    beyond = np.maximum(reach.low - wanted, wanted - reach.high)
-    k = int(np.argmax(beyond))
-    if beyond[k] <= 0:
-        return ""
-    interval = reach[k]
-    stop = interval.low_stop if wanted[k] < interval.low else interval.high_stop
-    told = f"at the last x it reaches [{interval.low:.4g}, {interval.high:.4g}], stopped by {stop}"
-    return f"; {interval.label} = {wanted[k]:.4g} is asked for, {told}"
-
-
-def start_inside(chart: Chart, q: ArrayLike, collisions: Collisions | None = None) -> Array:
-    """One joint position (n,) inside the domain, where phi and J are finite and nothing touches.
-
-    Raises:
-        ShapeError, InvalidValueError: for anything else.
-    """
-    point = as_point("q", q, chart.n)
-    given = point.round(4).tolist()
-    if not chart.problem.domain.contains(point):
-        stop = Walls(chart.problem).worst(point)
-        hint = degrees_hint(*point[~np.array(chart.problem.robot.tree.prismatic)])
-        raise InvalidValueError("q", given, f"a point of the domain, which ends at {stop}{hint}")
-    if not (np.isfinite(chart.phi(point)).all() and np.isfinite(chart.parts.batched_rates(point[None])).all()):
-        raise InvalidValueError("q", given, "a point at which the chart is finite")
-    # Inside the domain only a contact can be beyond its wall.
-    if collisions is not None and (walls := Walls(chart.problem, collisions)).values(point).min() <= 0:
-        stop = walls.worst(point)
-        if stop.kind is StopKind.CONTACT:
-            raise InvalidValueError("q", given, f"a posture without {stop}")
-    return point
-
-
-def branch_along(chart: Chart, q: Array, k: int, sign: float, collisions: Collisions | None = None) -> Branch:
-    """The curve from q (n,) on which x and all coordinates but the k-th stay, and that one rises (sign 1) or falls."""
-    row = chart.m + k
-    curve = LevelCurve(chart, np.delete(np.arange(chart.n), row), RULES.spacing, collisions)
-
-    def rising(points: Array, t: Array) -> Array:
-        gradient = chart.coordinates.jacobian(points)[:, k]
-        lengths = np.linalg.norm(gradient, axis=1)
-        return np.asarray(sign * (gradient * t).sum(axis=1) / np.where(lengths > 0, lengths, 1.0))
-
-    return curve.follow(q, sign * chart.parts.batched_rates(q[None])[0, row], rising)
-
-
-def xi_along(chart: Chart, points: Array) -> Array:
-    """Coordinates (N, r) along a curve from its first point on, without the jumps of circle-valued ones."""
-    return counted_on(chart.xi(points), chart.parts.turns[chart.m :])
-
-
-def _interval(chart: Chart, q: Array, k: int, collisions: Collisions | None) -> Interval:
-    down, up = (branch_along(chart, q, k, sign, collisions) for sign in (-1.0, 1.0))
-    low, high = (float(xi_along(chart, branch.q)[-1, k]) for branch in (down, up))
-    return Interval(
-        chart.labels[chart.m + k],
-        float(chart.xi(q)[k]),
-        -np.inf if down.endless else low,
-        np.inf if up.endless else high,
-        down.stop,
-        up.stop,
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class Fan:
     """The curve on which only one coordinate changes, from its lowest to its highest value."""
@@ -528,74 +554,6 @@ class Fan:
     def spread(self, count: int) -> Array:
         """Joint positions at even distances along the curve, (count, n), by interpolation between its points."""
         return np.column_stack([np.interp(self.places(count), self.arc_length, column) for column in self.q.T])
-
-
-def fan_along(chart: Chart, q: Array, k: int) -> Fan:
-    """The fan of the k-th coordinate at a joint position (n,) inside the domain."""
-    down, up = branch_along(chart, q, k, -1.0), branch_along(chart, q, k, 1.0)
-    if down.endless:  # then one direction passes everything
-        down = Branch(q[None], np.zeros(1), down.stop)
-    points = np.concatenate([down.q[:0:-1], up.q])
-    arc_length = np.concatenate([-down.arc_length[:0:-1], up.arc_length])
-    xi = chart.xi(points)[:, k]
-    turn = getattr(chart.coordinates, "turn", 0.0)
-    xi = np.unwrap(xi, period=turn) if turn else xi
-    return Fan(chart.labels[chart.m + k], points, xi, arc_length, down.stop, up.stop)
-
-
-def filled(chart: Chart, q: Array, alone: XiRange, samples: int, collisions: Collisions | None = None) -> Array:
-    """Joint positions (N, n) with the task value of q (n,), inside the domain and free, q first.
-
-    Their coordinates lie on a lattice around xi(q). Its spacing divides the range of each coordinate alone so that
-    about `samples` points result. The fill goes from point to neighbour, so that all points can be reached from q.
-    """
-    cells = max(2, round(samples ** (1 / chart.r)))
-    # a full turn of coordinates without ends
-    span = alone.high - alone.low
-    spacing = np.where(np.isfinite(span) & (span > 0), span, 2 * np.pi) / cells
-    known: dict[tuple[int, ...], Array] = {(0,) * chart.r: q}
-    front, tried = list(known), set(known)
-    start, sign = chart.phi(q), np.sign(np.linalg.det(chart.parts.batched_rates(q[None])[0]))
-    while front and len(known) < RULES.most * samples:
-        pairs = _neighbours(front, tried, cells)
-        if not pairs:
-            break
-        places = np.array([place for _, place in pairs])
-        targets = np.tile(start, (len(pairs), 1))
-        targets[:, chart.m :] += places * spacing
-        found, good = _solved(chart, np.array([known[origin] for origin, _ in pairs]), targets, float(sign))
-        good = good if collisions is None else good[collisions.check_free(found[good])]
-        front = [pairs[row][1] for row in good]
-        known.update(zip(front, found[good], strict=True))
-    return np.array(list(known.values()))
-
-
-def _neighbours(
-    front: list[tuple[int, ...]], tried: set[tuple[int, ...]], cells: int
-) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
-    """Pairs of a point and a neighbour of it that was not tried before."""
-    pairs = []
-    for origin, axis, move in product(front, range(len(front[0])), (-1, 1)):
-        place = (*origin[:axis], origin[axis] + move, *origin[axis + 1 :])
-        if place not in tried and abs(place[axis]) <= 2 * cells:
-            tried.add(place)
-            pairs.append((origin, place))
-    return pairs
-
-
-def _solved(chart: Chart, starts: Array, targets: Array, sign: float) -> tuple[Array, Indices]:
-    """Newton's method from all starts (N, n), and the rows where it found a point of the domain on the same sheet."""
-    phi_map = chart.parts.phi_map
-    found = Newton(phi_map)(targets, starts)
-    step = np.linalg.solve(phi_map.jacobian(starts), phi_map.difference(targets, phi_map.phi(starts))[..., None])[
-        ..., 0
-    ]
-    near = np.linalg.norm(found.q - starts, axis=1) <= RULES.farthest * np.linalg.norm(step, axis=1) + 1e-9
-    rows = np.flatnonzero(
-        (largest(found.residual) < RULES.phi_tolerance) & near & chart.problem.domain.contains(found.q)
-    )
-    same = np.sign(np.linalg.det(phi_map.jacobian(found.q[rows]))) == sign
-    return found.q, np.asarray(rows[same], dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -640,61 +598,111 @@ class SelfMotionCurve(SelfMotion):
         }
 
 
-def self_motion(
-    chart: Chart, q: ArrayLike, step: float = 0.05, samples: int = 1000, collisions: Collisions | None = None
-) -> SelfMotion:
-    """The self-motion through a joint position; see `Chart.self_motion`."""
-    start = start_inside(chart, q, collisions)
-    longest = as_number("step", step)
-    if not 1e-4 <= longest <= 0.5:
-        raise InvalidValueError("step", step, "a length from 1e-4 to 0.5 [rad] or [m]")
-    require_count("samples", samples, least=2, most=10_000)
-    return _curve(chart, start, longest, collisions) if chart.r == 1 else _set(chart, start, samples, collisions)
-
-
-def _curve(chart: Chart, q: Array, step: float, collisions: Collisions | None) -> SelfMotionCurve:
-    """Both directions of the curve; the coordinate rises at q."""
-    curve = LevelCurve(chart, np.arange(chart.m), step, collisions)
-    gradient = chart.parts.batched_rates(q[None])[0, chart.m]
-    up = curve.follow(q, gradient)
-    down = Branch(q[None], np.zeros(1), up.stop) if up.endless else curve.follow(q, -gradient)
-    points = np.concatenate([down.q[:0:-1], up.q])
-    xi = xi_along(chart, points)
-    rises = np.sign(np.diff(xi[:, 0]))
-    low, high = (down, up) if xi[0, 0] <= xi[-1, 0] else (up, down)
-    place = len(down.q) - 1
-    ends = Interval(chart.labels[-1], float(xi[place, 0]), xi.min(), xi.max(), low.stop, high.stop)
-    return SelfMotionCurve(
-        chart.x(q),
-        points,
-        xi,
-        place,
-        XiRange((ends,)),
-        np.concatenate([-down.arc_length[:0:-1], up.arc_length]),
-        up.endless,
-        int(np.count_nonzero(np.diff(rises[rises != 0]))),
-    )
-
-
-def _set(chart: Chart, q: Array, samples: int, collisions: Collisions | None) -> SelfMotion:
-    """Points on a lattice in xi, and the extent from its outermost points on."""
-    require_no_turns(chart.labels, chart.parts.turns, "a set of self-motions")
-    alone = xi_range(chart, q, collisions)
-    points = filled(chart, q, alone, samples, collisions)
-    xi = chart.xi(points)
-    widest = tuple(_widest(chart, points, xi, alone[k], k, collisions) for k in range(chart.r))
-    return SelfMotion(chart.x(q), points, xi, 0, XiRange(widest))
-
-
-def _widest(chart: Chart, points: Array, xi: Array, alone: Interval, k: int, collisions: Collisions | None) -> Interval:
-    """The extent of one coordinate: from the outermost points of a set along the coordinate to what stops it."""
-    if not np.isfinite([alone.low, alone.high]).all():
-        return alone
-    down = branch_along(chart, points[np.argmin(xi[:, k])], k, -1.0, collisions)
-    up = branch_along(chart, points[np.argmax(xi[:, k])], k, 1.0, collisions)
-    low, high = (float(chart.xi(branch.q[-1])[k]) for branch in (down, up))
-    return Interval(alone.label, alone.here, low, high, down.stop, up.stop)
-
-
 def _extents(extent: XiRange) -> dict[str, str]:
     return {name: text for name, text in extent.facts().items() if name != "reach"}
+
+
+@dataclass(frozen=True)
+class Stop:
+    """What ends a motion, and where."""
+
+    kind: StopKind
+    joint: str = ""  #: name of the joint, for JOINT
+    value: float = np.nan  #: position of that joint [rad] or [m], or what a condition of the domain bounds
+    is_limit: bool = False  #: whether the boundary of the domain is the limit of the joint
+    condition: str = ""  #: in one line, for conditions of the domain; the pair, for contacts
+
+    def __str__(self) -> str:
+        if self.kind is StopKind.JOINT:
+            return f"joint '{self.joint}' at {self.value:.4g}{', its limit' if self.is_limit else ''}"
+        if self.kind is StopKind.NEAR_SINGULAR:
+            return f"the task near singular, with a relative singular value of {self.value:.3g}"
+        if self.kind is StopKind.CONDITION:
+            return f"the boundary of the domain ({self.condition})"
+        if self.kind is StopKind.CONTACT:
+            return f"a contact of {self.condition}"
+        return {
+            StopKind.FOLD: "a fold of the chart",
+            StopKind.SINGULAR: "a singularity or the end of the chart",
+            StopKind.ENDLESS: "nothing",
+        }[self.kind]
+
+    @property
+    def brief(self) -> str:
+        """The same in a few words."""
+        if self.kind is StopKind.JOINT:
+            return f"{self.joint} at {'its limit ' if self.is_limit else ''}{self.value:.4g}"
+        return {
+            StopKind.NEAR_SINGULAR: "the task near singular",
+            StopKind.CONDITION: self.condition,
+            StopKind.CONTACT: f"a contact of {self.condition}",
+            StopKind.FOLD: "a fold",
+            StopKind.SINGULAR: "a singularity",
+            StopKind.ENDLESS: "no end",
+        }[self.kind]
+
+
+class Walls:
+    """The boundaries of a problem's domain as functions that are positive inside.
+
+    They are (q_i - low_i) and (high_i - q_i), divided by the half-width of the domain, for every joint; then what the
+    domain itself names as its `walls`; then the distance to a contact, if there are solids to hit.
+    """
+
+    def __init__(self, problem: Problem, collisions: Collisions | None = None) -> None:
+        domain = problem.domain
+        self._domain, self._robot, self._collisions = domain, problem.robot, collisions
+        self._low, self._high = domain.bounds
+        self.solid = collisions is not None  #: whether there is something to hit
+        self._curved = domain.walls
+        if collisions is not None:
+            require_kind("collisions", collisions, Collisions)
+            collisions.require_for(problem.robot.tree)
+            self._curved = (*domain.walls, Wall(StopKind.CONTACT, lambda q: float(collisions.distance(q).distance)))
+        endless = np.isinf(self._low) & ~np.array(problem.robot.tree.prismatic)
+        self.turning = endless  #: unbounded revolute joints, (n,): they are at the same place after a full turn
+
+    def values(self, q: Array) -> Array:
+        """All functions at one joint position (n,), positive inside; infinite for unbounded joints."""
+        width = self._domain.half_width
+        rooms = np.array([wall.room(q) for wall in self._curved])
+        parts = [(q - self._low) / width, (self._high - q) / width, np.where(np.isfinite(rooms), rooms, -1.0)]
+        return np.concatenate(parts)
+
+    def box_has(self, q: Array) -> bool:
+        """Whether q (n,) lies in the box of the domain."""
+        return bool(((q >= self._low) & (q <= self._high)).all())
+
+    def stop(self, k: int, q: Array) -> Stop:
+        """What the k-th function stands for, at q (n,)."""
+        n = len(q)
+        if k >= 2 * n:
+            wall = self._curved[k - 2 * n]
+            if wall.kind is StopKind.CONTACT and self._collisions is not None:
+                first, second = self._collisions.distance(q).pair
+                return Stop(wall.kind, condition=f"'{first}' and '{second}'")
+            value = np.nan if wall.value is None else float(wall.value(q))
+            return Stop(wall.kind, value=value, condition=wall.heading)
+        i = k % n
+        boundary, limit = (self._low, self._robot.lower) if k < n else (self._high, self._robot.upper)
+        at_limit = bool(abs(boundary[i] - limit[i]) <= RULES.at_limit * self._domain.half_width[i])
+        return Stop(StopKind.JOINT, self._robot.joint_names[i], float(boundary[i]), at_limit)
+
+    def may_touch(self, q: Array, t: Array, new: Array, onward: Array) -> bool:
+        """Whether a contact deeper than a tolerance may lie on an arc between joint positions (n,) with end tangents.
+
+        An arc whose tangent turns by an angle a is no farther from its chord c than (c / 2) tan(a / 2).
+        """
+        chord = float(np.linalg.norm(new - q))
+        if self._collisions is None or chord < RULES.grazing:
+            return False
+        bend = chord / 2 * float(np.tan(np.arccos(np.clip(t @ onward, 0.0, 1.0)) / 2))
+        return self._collisions.find_contact(np.array([q, new]), -RULES.depth, bend) is not None
+
+    def worst(self, q: Array) -> Stop:
+        """The boundary that q (n,) has crossed farthest, or is nearest to."""
+        return self.stop(int(np.argmin(self.values(q))), q)
+
+    def gap(self, q: Array, start: Array) -> Array:
+        """q - start (n,), up to full turns of unbounded revolute joints."""
+        return np.asarray(wrap_shortest(q - start, 2 * np.pi * self.turning))

@@ -28,6 +28,7 @@ from orthocas.codegen.generate import GeneratedC, generate_c
 from orthocas.control.controller import Controller, Setting, law_names, law_of
 from orthocas.errors import LawWarning, OptionError
 from orthocas.robots.capsules import fit_capsules
+from orthocas.tools.display import listed
 from orthocas.tools.interrupts import deferred
 
 CONTROLLERS = law_names()
@@ -91,6 +92,7 @@ def codegen(
             raise OptionError(f"--controller {_TRACK} takes --out, --name and --force")
         _write_tracker(chart, out, name, force, json)
         return
+    # Settings belong to a law.
     if controller != _NONE:
         require_settings(controller, settings)
     elif settings or limit is not None:
@@ -104,7 +106,11 @@ def codegen(
         solids = read_solids(loaded.problem.robot, collisions, srdf)
         capsules = None if solids is None else fit_capsules(solids)
         generated = generate_c(loaded, out, law, name, force, single_precision=single_precision, capsules=capsules)
-        remarks = [] if law is None else law.remarks()
+        remarks = [] if law is None else [*law.remarks()]
+    # Pairs that no distance in C will ever see are for the user to judge.
+    if capsules is not None and capsules.dropped:
+        pairs = listed([f"{first} and {second}" for first, second in capsules.dropped])
+        remarks.append(f"not checked in C, because their capsules touch in all postures: {pairs}")
     agreement = check_c(generated, loaded, law) if check else None
     report = _build_report(generated, agreement)
     if json:
@@ -120,6 +126,7 @@ def _write_tracker(file: Path, out: Path, name: str | None, force: bool, json: b
     from orthocas.arms.arm import Arm  # with all that arms need, which charts do not
     from orthocas.arms.arm_file import is_arm
 
+    # A chart is an arm with one chart.
     with deferred():
         if is_arm(file):
             arm = Arm.load(file)

@@ -256,6 +256,7 @@ def _fit_arm(
     if given := [option for option, value in others.items() if value is not None]:
         raise OptionError(f"--domain all chooses by itself: leave out --{given[0].replace('_', '-')}")
     words.require_none(("centre", "half_width", "home", "least_singular_value"), "--domain all is all there is")
+    # What can be refused is refused before anything takes time.
     target = out or Path(f"{Path(name).stem}.arm")
     require_free(target, ARM, force)
     base = None if is_robot_file(name) else words.build_problem(name)

@@ -88,6 +88,7 @@ def follow(
         loaded = load(chart)
         # Raises for grown charts.
         loaded.function("xi")
+    # What is to be followed, and what the arm may hit: its links, or rods in their place, and obstacles.
     waypoints, choice = _read_task(path, loaded, xi)
     solids = read_solids(loaded.problem.robot, collisions, srdf)
     if link_radius is not None and (solids is not None or not obstacle):
@@ -100,6 +101,7 @@ def follow(
             )
         robot = loaded.problem.robot if link_radius is None else loaded.problem.robot.with_rods(link_radius)
         solids = (robot.collisions if solids is None else solids).with_scene(scene)
+    # The motion on time stamps, within limits of velocity and acceleration.
     begin = time.perf_counter()
     motion = follow_path(
         loaded,
@@ -125,6 +127,7 @@ def follow(
 
 def _read_task(path: Path, chart: Chart, xi: str | None) -> tuple[Array, Any]:
     """The waypoints, and what to do with the coordinates: as asked for, or as the columns of the file suggest."""
+    # Columns of xi in the file are a schedule, which no other choice may contradict.
     waypoints, schedule = read_path(path, chart)
     choice = xi or (HOLD if schedule is None else SCHEDULE)
     require_known("choice of --xi", choice, _CHOICES)

@@ -101,6 +101,7 @@ def simulate(
     json: AsJson = False,
 ) -> None:
     """Run a controller in a chart's coordinates; write the run, pictures, an animation and a report."""
+    # What can be refused is refused before the chart is read.
     require_settings(controller, settings)
     _check_torques(controller, {"--mass-factor": mass_factor, "--friction": friction})
     _check_plant(plant, rate, supervised)
@@ -121,6 +122,7 @@ def simulate(
         "safety": Safety.of(law) if supervised else None,
         "compiled": compiled,
     }
+    # The run, its files and its pictures; Ctrl-C keeps what there is.
     begin = time.perf_counter()
     with terminal_monitor() as monitor:
         run = _run(law, plan, conditions, monitor)
@@ -134,6 +136,7 @@ def simulate(
             # The run is complete: keep it.
             report = finish()
             interrupted = True
+    # Numbers go to standard output, remarks to standard error.
     if json:
         print_json(report)
     else:
@@ -211,6 +214,7 @@ def _finish(
         run.save(drafts / "trajectory.npz")
         trajectory_figure(run, units_of(chart.problem)).savefig(drafts / "coordinates.png", dpi=130)
         (drafts / "report.json").write_text(write_json(report, indent=1) + "\n")
+    # An animation of an earlier run would show another motion.
     for old in (out / f"animation.{kind}" for kind in FORMATS):
         if is_listed(old):
             old.unlink()
@@ -234,6 +238,7 @@ def _print_notes(law: Controller, report: dict[str, Any], interrupted: bool) -> 
 
 def _find_contact(collisions: Collisions, run: Trajectory) -> str:
     """The first contact of a run in a sentence, between its time stamps too; or how near it came to one."""
+    # Rows without numbers are those after a run diverged.
     q = run.q[np.isfinite(run.q).all(axis=1)]
     contact = collisions.find_contact(q)
     if contact is not None:
@@ -347,6 +352,7 @@ def format_fallback(report: dict[str, Any]) -> str | None:
     fallback = report["fallback"]
     if fallback["since"] is None:
         return None
+    # A supervised law catches the arm, and may resume; others stay in their fallback.
     if report["catches"]:
         times = "once" if len(report["catches"]) == 1 else f"{len(report['catches'])} times"
         return (
@@ -386,6 +392,7 @@ def _evaluate_coupling(chart: Chart, reference: Reference, seen: Trajectory) -> 
 def _find_worst_couplings(index: dict[str, dict[str, float]], task: tuple[str, ...]) -> str:
     """The worst disturbance of the task by an extra coordinate, and the reverse."""
     pairs = [(value, to, by) for by, column in index.items() for to, value in column.items()]
+    # The largest index of each kind: task by extra coordinates, and the reverse.
     texts = []
     for name, of_task in (("task <- extra", True), ("extra <- task", False)):
         chosen = [pair for pair in pairs if (pair[1] in task) == of_task and (pair[2] in task) != of_task]

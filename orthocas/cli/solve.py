@@ -77,6 +77,7 @@ def solve(
 
 def _read_target(task: Task, text: str) -> Array:
     """The task's vector of the numbers of --x."""
+    # A matrix, a position with a quaternion, or the task's own numbers: told apart by how many there are.
     numbers = parse_numbers("--x", text)
     if len(numbers) == _MATRIX:
         return task.target(numbers.reshape(4, 4))
@@ -89,6 +90,7 @@ def _read_target(task: Task, text: str) -> Array:
 
 def _print(rows: list[tuple[Array, Array, Any, str]], json: bool) -> None:
     """One posture, or several; exit code 1 for none."""
+    # The same postures as data, then as text, with numbers that options take back.
     found = [
         {"q": clean(q), "xi": clean(xi), "status": InverseStatus(int(status)).name, "branch": branch}
         for q, xi, status, branch in rows
@@ -103,6 +105,7 @@ def _print(rows: list[tuple[Array, Array, Any, str]], json: bool) -> None:
         named = {f"branch{label}": branch} if branch else {}
         texts = {f"q{label}": _write(q), f"xi{label}": xi_text, **named}
         print_rows({f"status{label}": InverseStatus(int(status)).name, **texts})
+    # The exit code says whether there is a posture with x.
     if not any(np.isfinite(q).all() and status <= InverseStatus.OUTSIDE_DOMAIN for q, _, status, _ in rows):
         raise typer.Exit(1)
 

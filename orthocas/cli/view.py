@@ -88,6 +88,7 @@ def view(
     # CasADi may lose Ctrl-C while it builds functions.
     with deferred():
         scene = _read_scene(target, chart, robot, words)
+    # What is shown: a chart with a path to play, a motion, or a robot.
     if compare:
         # Motions along a closed path instead of a chart.
         if not isinstance(scene.shown, Chart):
@@ -98,6 +99,7 @@ def view(
         played = _read_played(scene, path, export)
     arm, meshes, locks = scene.robot, scene.meshes, scene.locked
     solids = _read_collisions(scene, collisions, srdf, export)
+    # A page that works offline, or one that is served until Ctrl-C.
     if export is not None:
         shape = export_page(scene.shown, export, robot=arm, robot_file=meshes, locked=locks, force=force)
         _note_missing(shape.missing)

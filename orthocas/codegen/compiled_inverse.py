@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from orthocas.charts.chart import Chart
 from orthocas.charts.curve_tracer import RULES
 from orthocas.charts.curves import Nearest, SelfMotionCurves
-from orthocas.charts.inverse import Inverse, Solutions, build_phi_of_wish, solve_rows
+from orthocas.charts.inverse import Inverse, Solutions, build_phi, build_phi_of_wish, solve_rows
 from orthocas.charts.newton import NEWTON, Attempt, Newton
 from orthocas.codegen.compiled import keep_library, load_library
 from orthocas.codegen.generate import generate_c
@@ -37,64 +37,6 @@ _ITERATIONS, _FEW_ITERATIONS = 100, 12
 # Rows that a thread takes at once; those along curves take longer.
 _PIECE, _CURVE_PIECE = 512, 64
 _STARTS = 1 + RULES.near_phi + RULES.near_x + RULES.more
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class CompiledInverse(Shown):
-    """`Chart.solve` and `Chart.nearest_xi` in compiled C; `orthocas.compile_inverse` makes it."""
-
-    chart: Chart
-    library: Path  #: the shared library
-
-    def facts(self) -> dict[str, str]:
-        """What `str` shows: the chart's problem and the file of the library."""
-        return {"inverse": f"compiled, of the chart of {self.chart.problem.name}", "library": str(self.library)}
-
-    def solve(
-        self, phi: ArrayLike, q_start: ArrayLike | None = None, *, tolerance: float = 1e-9, inside: bool = False
-    ) -> Solutions:
-        """Solve like `Chart.solve`: the same status for each row and the same q to 1e-9, unless starts are far away."""
-        return solve_rows(self.chart, self._parts, phi, q_start, tolerance, inside)
-
-    def nearest_xi(self, q_wish: ArrayLike, x: ArrayLike | None = None, *, tolerance: float = 1e-9) -> Solutions:
-        """Solve like `Chart.nearest_xi`."""
-        phi, wishes = build_phi_of_wish(self.chart, q_wish, x)
-        return self.solve(phi, wishes, tolerance=tolerance, inside=True)
-
-    @cached_property
-    def _parts(self) -> Inverse:
-        """The parts of the chart, with compiled searches in their places."""
-        parts = self.chart.parts.inverse
-        curves = parts.curves
-        if curves is not None:
-            curves = CompiledCurves(curves.boxed, curves.starts, curves.tracer, lambda: self._c)
-        local, brief = partial(self._search, _ITERATIONS), partial(self._search, _FEW_ITERATIONS)
-        return replace(parts, local=local, brief=brief, curves=curves)
-
-    def _search(self, iterations: int, targets: Array, starts: Array) -> Attempt:
-        """Search from starts (N, n) in C."""
-        N, phi_map = len(targets), self.chart.parts.phi_map
-        q, residual, condition, inside = starts.copy(), np.empty_like(targets), np.empty(N), np.empty(N, dtype=np.bool_)
-        arrays = np.ascontiguousarray(targets), q, residual, condition, inside
-
-        def solve_piece(first: int) -> None:
-            rows = slice(first, first + _PIECE)
-            places = (pointer(array[rows]) for array in arrays)
-            self._c.arm_inverse_rows(ctypes.c_long(min(_PIECE, N - first)), iterations, *places)
-
-        run_in_threads(solve_piece, range(0, N, _PIECE))
-        attempt = Attempt(q, residual, np.ones(N, dtype=np.int64), ~(condition < NEWTON.suspicious), inside)
-        # Where C finds nothing, NumPy finds how near one can get; rows for which another search follows stay there.
-        failed = np.flatnonzero(condition < 0)
-        if failed.size and iterations == _FEW_ITERATIONS:
-            residual[failed] = phi_map.residual(targets[failed], starts[failed])
-        elif failed.size:
-            attempt.replace(failed, Newton(phi_map)(targets[failed], starts[failed]))
-        return attempt
-
-    @cached_property
-    def _c(self) -> Any:
-        return load_library(self.library)
 
 
 def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledInverse:
@@ -137,35 +79,6 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
     return CompiledInverse(chart, keep_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder))
 
 
-@dataclass(frozen=True, eq=False)
-class CompiledCurves(SelfMotionCurves):
-    """Self-motion curves with their search in compiled C."""
-
-    library: Callable[[], Any]  #: the library with the code of `write_curve_source`
-
-    def search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
-        """The nearest points for targets (N, n) of phi, from stored starts and one of the caller's (N, n)."""
-        best, between = Nearest.empty(own), np.zeros(len(own), dtype=np.int8)
-        library = self.library()
-        library.curve_room.restype, library.curve_rows.restype = ctypes.c_ulong, None
-        room = library.curve_room()
-
-        # Later stages of starts serve only rows that the earlier ones leave without a solution.
-        def search_piece(first: int) -> None:
-            rows = slice(first, first + _CURVE_PIECE)
-            stages = self.stages(targets[rows], own[rows])
-            starts = np.concatenate(stages).transpose(1, 0, 2)
-            inputs = (np.ascontiguousarray(array) for array in (targets[rows], starts))
-            arrays = (*inputs, np.empty(room, dtype=np.uint8), best.q[rows], best.distance[rows], between[rows])
-            phi, q_start, *others = (ctypes.c_void_p(array.ctypes.data) for array in arrays)
-            counts = ctypes.c_long(len(stages[0])), ctypes.c_long(starts.shape[1])
-            library.curve_rows(ctypes.c_long(len(starts)), phi, q_start, *counts, ctypes.c_double(tolerance), *others)
-
-        run_in_threads(search_piece, range(0, len(own), _CURVE_PIECE))
-        best.between[:] = between
-        return best
-
-
 def write_curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
     """C of the search along self-motion curves: kernels and tables of a chart, then runtime/curve_rows.c.
 
@@ -202,3 +115,97 @@ def write_curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
         "pivots": kernels.numbers.get("curve_pivots", 0),
     }
     return render("curves.c", values)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CompiledInverse(Shown):
+    """`Chart.solve` and `Chart.nearest_xi` in compiled C; `orthocas.compile_inverse` makes it."""
+
+    chart: Chart
+    library: Path  #: the shared library
+
+    def facts(self) -> dict[str, str]:
+        """What `str` shows: the chart's problem and the file of the library."""
+        return {"inverse": f"compiled, of the chart of {self.chart.problem.name}", "library": str(self.library)}
+
+    def solve(
+        self,
+        phi: ArrayLike | None = None,
+        q_start: ArrayLike | None = None,
+        *,
+        x: Any = None,
+        xi: ArrayLike | None = None,
+        tolerance: float = 1e-9,
+        inside: bool = False,
+    ) -> Solutions:
+        """Solve like `Chart.solve`: the same status for each row and the same q to 1e-9, unless starts are far away."""
+        return solve_rows(self.chart, self._parts, build_phi(self.chart, phi, x, xi), q_start, tolerance, inside)
+
+    def nearest_xi(self, q_wish: ArrayLike, x: Any = None, *, tolerance: float = 1e-9) -> Solutions:
+        """Solve like `Chart.nearest_xi`."""
+        phi, wishes = build_phi_of_wish(self.chart, q_wish, x)
+        return self.solve(phi, wishes, tolerance=tolerance, inside=True)
+
+    @cached_property
+    def _parts(self) -> Inverse:
+        """The parts of the chart, with compiled searches in their places."""
+        parts = self.chart.parts.inverse
+        curves = parts.curves
+        if curves is not None:
+            curves = CompiledCurves(curves.boxed, curves.starts, curves.tracer, lambda: self._c)
+        local, brief = partial(self._search, _ITERATIONS), partial(self._search, _FEW_ITERATIONS)
+        return replace(parts, local=local, brief=brief, curves=curves)
+
+    def _search(self, iterations: int, targets: Array, starts: Array) -> Attempt:
+        """Search from starts (N, n) in C."""
+        N, phi_map = len(targets), self.chart.parts.phi_map
+        q, residual, condition, inside = starts.copy(), np.empty_like(targets), np.empty(N), np.empty(N, dtype=np.bool_)
+        arrays = np.ascontiguousarray(targets), q, residual, condition, inside
+
+        def solve_piece(first: int) -> None:
+            rows = slice(first, first + _PIECE)
+            places = (pointer(array[rows]) for array in arrays)
+            self._c.arm_inverse_rows(ctypes.c_long(min(_PIECE, N - first)), iterations, *places)
+
+        run_in_threads(solve_piece, range(0, N, _PIECE))
+        attempt = Attempt(q, residual, np.ones(N, dtype=np.int64), ~(condition < NEWTON.suspicious), inside)
+        # Where C finds nothing, NumPy finds how near one can get; rows for which another search follows stay there.
+        failed = np.flatnonzero(condition < 0)
+        if failed.size and iterations == _FEW_ITERATIONS:
+            residual[failed] = phi_map.residual(targets[failed], starts[failed])
+        elif failed.size:
+            attempt.replace(failed, Newton(phi_map)(targets[failed], starts[failed]))
+        return attempt
+
+    @cached_property
+    def _c(self) -> Any:
+        return load_library(self.library)
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledCurves(SelfMotionCurves):
+    """Self-motion curves with their search in compiled C."""
+
+    library: Callable[[], Any]  #: the library with the code of `write_curve_source`
+
+    def search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
+        """The nearest points for targets (N, n) of phi, from stored starts and one of the caller's (N, n)."""
+        best, between = Nearest.empty(own), np.zeros(len(own), dtype=np.int8)
+        library = self.library()
+        library.curve_room.restype, library.curve_rows.restype = ctypes.c_ulong, None
+        room = library.curve_room()
+
+        # Later stages of starts serve only rows that the earlier ones leave without a solution.
+        def search_piece(first: int) -> None:
+            rows = slice(first, first + _CURVE_PIECE)
+            stages = self.stages(targets[rows], own[rows])
+            starts = np.concatenate(stages).transpose(1, 0, 2)
+            inputs = (np.ascontiguousarray(array) for array in (targets[rows], starts))
+            arrays = (*inputs, np.empty(room, dtype=np.uint8), best.q[rows], best.distance[rows], between[rows])
+            phi, q_start, *others = (ctypes.c_void_p(array.ctypes.data) for array in arrays)
+            counts = ctypes.c_long(len(stages[0])), ctypes.c_long(starts.shape[1])
+            library.curve_rows(ctypes.c_long(len(starts)), phi, q_start, *counts, ctypes.c_double(tolerance), *others)
+
+        run_in_threads(search_piece, range(0, len(own), _CURVE_PIECE))
+        best.between[:] = between
+        return best

@@ -325,20 +325,15 @@ def build_guard(domain: Domain | None, n: int, numbers: int, keep_direction: boo
     status = ca.if_else(usable, status, float(ControlStatus.NOT_FINITE))
     # Only a command of the law can be saturated; a fallback is cut as well.
     from_law = status == float(ControlStatus.OK)
-    selected = _choose(from_law, command, fallback)
+    # Entry by entry, so that no NaN of the law gets through.
+    safe = [ca.if_else(_is_finite(entry), entry, 0) for entry in ca.vertsplit(fallback)]
+    selected = ca.vertcat(*(ca.if_else(from_law, a, b) for a, b in zip(ca.vertsplit(command), safe, strict=True)))
     cut = _limit(selected, limit, keep_direction)
     saturated = ca.logic_and(from_law, ca.logic_not(_all_hold(ca.fabs(selected) <= limit)))
     status = ca.if_else(saturated, float(ControlStatus.SATURATED), status)
     arguments = [command, fallback, limit, q, inputs, volume, smallest]
     names = ["command", "fallback", "limit", "q", "inputs", "volume", "smallest"]
     return ca.Function(GUARD, arguments, [cut, status], names, ["cut", "status"])
-
-
-def _choose(from_law: ca.SX, command: ca.SX, fallback: ca.SX) -> ca.SX:
-    # Entry by entry, so that no NaN of the law gets through.
-    rows = range(command.shape[0])
-    safe = [ca.if_else(_is_finite(fallback[i]), fallback[i], 0) for i in rows]
-    return ca.vertcat(*(ca.if_else(from_law, command[i], safe[i]) for i in rows))
 
 
 def _limit(command: ca.SX, limit: ca.SX, keep_direction: bool) -> ca.SX:

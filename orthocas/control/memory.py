@@ -59,6 +59,8 @@ class MemoryRules:
     travel: float = 3e-3  #: way on which a joint that broke away forgets that torque [rad] or [m]
     drop: float = 0.25  #: share of that torque by which friction may fall as a joint breaks away
     least: float = 0.2  #: share of its rates with which an observer of friction works if it does: nothing creeps
+    per_tick: float = 0.5  #: largest rate of an observer times a period: with 1, it forgets nothing, with 2 it is lost
+    instant: float = 1e-9  #: least period to divide by [s]
     unseen: float = 3.0  #: ticks until a law stops that: torque a tick late, held for one, seen in the next
 
 
@@ -237,6 +239,10 @@ class _Correcting:
         if self.bound is not None:
             as_float_array("bound", self.bound)
 
+    def _bound_rate(self, period: ca.MX) -> Any:
+        """The rate, or what a tick of that length bears."""
+        return ca.fmin(self.rate, RULES.per_tick / ca.fmax(period, RULES.instant))
+
 
 @dataclass(frozen=True)
 class MomentumObserver(_Correcting):
@@ -279,7 +285,7 @@ class MomentumObserver(_Correcting):
         expected = ca.if_else(ca.logic_and(period > 0, ca.fabs(later) <= LARGEST), later, anew)
 
         # r follows tau_ext; dp/dt = tau + C^T dq - g + r drives the momentum until the next tick.
-        r = self.rate * (p - expected)
+        r = self._bound_rate(period) * (p - expected)
         drive = inputs["command"] - model.feed_forward(law.problem.robot, inputs) + rate + r
         return _build_memory(fields, inputs, {"expected": expected, "drive": drive, "correction": _clip(-r, bound)})
 
@@ -407,7 +413,12 @@ class FrictionObserver(_Correcting):
                 limit, and laws whose model is given.
         """
         n, model = law.problem.n, law.model
-        bound, tolerance = _check_bound(self.bound, law), self._compute_tolerance(law)
+        bound = _check_bound(self.bound, law)
+        # Tolerances by the units of x and xi; the frequency of the law's fastest mode [rad/s].
+        units = [RULES.metres if unit == "m" else RULES.others for unit in law.problem.task.units]
+        default = np.array([*units, *[RULES.extra] * law.problem.r])
+        tolerance = default if self.tolerance is None else positive_gains("tolerance", self.tolerance, n)
+        fastest = law.fastest if law.is_limited else 2 * np.pi * float(law.modes().frequencies.max())
         fields = {name: np.zeros(n) for name in ("expected", "drive", "breakaway", "correction")}
         inputs = _name_inputs(law, fields)
         q, dq, period, b = (inputs[name] for name in ("q", "dq", "period", "breakaway"))
@@ -428,10 +439,10 @@ class FrictionObserver(_Correcting):
         # r, and the momentum that the last tick foresaw; none after a start.
         foreseen = inputs["expected"] + period * inputs["drive"]
         surprise = ca.if_else(ca.logic_and(period > 0, ca.fabs(foreseen) <= LARGEST), p - foreseen, 0)
-        r = _clip(b - inputs["correction"] + gate * self.rate * surprise, bound)
+        r = _clip(b - inputs["correction"] + gate * self._bound_rate(period) * surprise, bound)
 
         # b grows where a joint stands and is off, and is forgotten on its way.
-        firmness = 1 / (1 / (inertia * self._compute_fastest(law) ** 2) + ca.DM(law.compliance))
+        firmness = 1 / (1 / (inertia * fastest**2) + ca.DM(law.compliance))
         firmness = ca.fmax(firmness, RULES.firm * ca.DM(np.fmin(law.limit, LARGEST)))
         growth = period * RULES.breaking * gate * ca.exp(-((dq / RULES.sticking) ** 2))
         grown = b - growth * _clip(firmness * off, bound)
@@ -440,17 +451,6 @@ class FrictionObserver(_Correcting):
         correction = _clip(b - r, bound)
         values = {"expected": p, "drive": explained - correction, "breakaway": b, "correction": correction}
         return _build_memory(fields, inputs, {name: _replace_invalid(value) for name, value in values.items()})
-
-    def _compute_fastest(self, law: _OperationalSpace) -> float:
-        """Frequency of the law's fastest mode [rad/s]."""
-        return law.fastest if law.is_limited else 2 * np.pi * float(law.modes().frequencies.max())
-
-    def _compute_tolerance(self, law: _OperationalSpace) -> Array:
-        """Tolerances of phi (n,)."""
-        if self.tolerance is not None:
-            return positive_gains("tolerance", self.tolerance, law.problem.n)
-        task = [RULES.metres if unit == "m" else RULES.others for unit in law.problem.task.units]
-        return np.array([*task, *[RULES.extra] * law.problem.r])
 
 
 MEMORIES: Mapping[str, type[MomentumObserver] | type[Adaptation] | type[FrictionObserver]] = {

@@ -129,7 +129,7 @@ class ArrayObjective:
     def part(self, places: NDArray[np.int_]) -> Self:
         """The same loss on some of its samples, which may repeat."""
         other = copy(self)
-        other._divide(self._points[places], [array[places] for array in self._described])
+        other._divide(self._points[places], self._entries[places])
         return other
 
     def _round(self, theta: Array) -> Array:
@@ -137,16 +137,19 @@ class ArrayObjective:
         return theta.astype(np.float32 if self._single else np.float64)
 
     def _put(self, samples: Samples) -> None:
-        self._divide(samples.points, samples.collect_data(self._loss.data, self._orientation))
+        data = samples.collect_data(self._loss.data, self._orientation)
+        self._ends = np.cumsum([array[0].size for array in data], dtype=int)
+        self._divide(samples.points, _entries(data, len(samples)))
 
-    def _divide(self, points: Array, data: list[Array]) -> None:
+    def _divide(self, points: Array, entries: Array) -> None:
         """Use these samples, in pieces of nearly equal size."""
-        self._points, self._described = points, data
+        self._points, self._entries = points, entries
         N, most = len(points), max(RULES.least_piece, RULES.piece // (self.r * self._family.width))
         size = ceil(N / ceil(N / most))
         self._pieces = []
         for k in range(0, N, size):
-            blocks = [arrange_blocks(array[k : k + size]) for array in data]
+            # all data of a sample in one row, so that samples drawn at random are gathered at once
+            *blocks, _ = np.split(arrange_blocks(entries[k : k + size]), self._ends, axis=1)
             own = points[k : k + size]
             self._pieces.append(_Piece(own, blocks, build_weights(len(own)) * (len(own) / N)))
 

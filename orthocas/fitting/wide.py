@@ -124,7 +124,7 @@ def fit_wide(
     `regular_share` is of the branch: of all its positions that `branches` counts as clear, the fraction in the domain.
     If the chart leaves out the other side, or can only serve a smaller box, `left_out` and a BranchWarning say so.
 
-    Wide charts hold on most of what the arm reaches without passing a singular position, but their leaks are large, 15
+    Wide charts hold on most of what the arm reaches without passing a singular position, but their leaks are large, 8
     to 60 degrees on the arms that were measured. They serve inverse kinematics, closed loops, trackers and laws with
     the whole inertia, best with A = M; see `fit` for decoupled control. That det J keeps its sign does not mean that
     phi is one-to-one.

@@ -197,8 +197,8 @@ class Search:
         self._alignment = RULES.alignment if problem.metric.is_identity else RULES.alignment_in_metric
         self._objectives: list[BasisObjective] = []
         self._sign = 1.0  # of the volumes
-        # done: coordinates are as regular as they need to be
-        self._done = False
+        # done: coordinates are as regular as they need to be; finished: all rounds have been made
+        self._done = self._finished = False
 
     def begin(self, name: str) -> None:
         """Look for coordinates, in a stage of some name."""
@@ -223,6 +223,9 @@ class Search:
 
     def go_on(self) -> None:
         """Descend with the worst of fresh samples, as long as coordinates are not regular enough and get better."""
+        if self._finished:
+            return
+        self._finished = True
         of_networks = RULES.rounds_of_small_networks if self.left_out else RULES.rounds_of_networks
         for turn in range(1, 1 + (RULES.rounds if self.linear else of_networks)):
             few = turn > 1 and not self.linear and self.is_enough(RULES.enough)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.self_motion import Fan, fan_along
+from orthocas.errors import ViewError
 from orthocas.paths.tool_path import read_path
 from orthocas.robots.collisions import Collisions
 from orthocas.tasks.branches import branches
@@ -148,8 +149,8 @@ class ChartPage:
         The page offers names and gets no others: what a browser sends never becomes a path of its own.
         """
         gui = self._server.gui
-        with gui.add_folder("Path"):
-            for suffix, what, load in ((".csv", "file", self._load_path), (".urdf", "links", self._load_look)):
+        with gui.add_folder("Files"):
+            for suffix, what, load in ((".csv", "path", self._load_path), (".urdf", "links", self._load_look)):
                 names = sorted(place.name for place in Path.cwd().glob(f"*{suffix}"))[: RULES.most_files]
                 if names:
                     chosen = gui.add_dropdown(what, (_NONE, *names), initial_value=_NONE)
@@ -170,6 +171,9 @@ class ChartPage:
             self._arm.remove()
             self._arm = Arm(self._server.scene, "/arm", robot, shape.look)
         self._show_arm(self.session.q)
+        if shape.missing:
+            files = f"{len(shape.missing)} mesh files cannot be found or read, such as {shape.missing[0]}"
+            raise ViewError(f"{files}; rods stand for these links")
 
     def _set_path(self, path: Array | None) -> None:
         """Take waypoints to play, and draw them where the task has a whole position."""

@@ -60,3 +60,23 @@ def test_the_first_step_of_quasi_newton_is_the_gauss_newton_step() -> None:
     np.testing.assert_allclose(result.theta, start * (1 - 1 / 1.003), rtol=1e-9)
     assert solvers.QuasiNewton(tolerance=1e-12).minimise(Bowl(), start).iterations < 8
     assert solvers.LBFGS(tolerance=1e-12).minimise(Bowl(), start).iterations > 8
+
+
+def test_matrices_are_renewed_after_the_descent_that_is_asked_for() -> None:
+    """With 0.99, the 0.8 of the default would keep a matrix for longer."""
+
+    class Counting(Valley):
+        matrices = 0
+
+        def curvature_estimate(self, theta: np.ndarray) -> list[np.ndarray]:
+            self.matrices += 1
+            return super().curvature_estimate(theta)
+
+    counts = []
+    for renewal in (1e-9, 0.8, 0.99):
+        valley = Counting()
+        result = solvers.QuasiNewton(tolerance=1e-9, renewal=renewal).minimise(valley, START)
+        np.testing.assert_allclose(result.theta, 1.0, atol=1e-4)
+        counts.append(valley.matrices)
+    assert counts == sorted(counts)
+    assert counts[0] < counts[-1]

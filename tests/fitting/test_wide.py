@@ -896,6 +896,18 @@ def test_networks_are_regular_on_a_whole_box() -> None:
     assert 0.3 < stopped.value.result.regular_share <= 1
 
 
+@pytest.mark.slow
+def test_networks_in_another_metric_begin_with_those_of_the_identity() -> None:
+    known = oc.problems.get("planar_3r_xy")
+    network = oc.MLP((8,), raw=True)
+    fit = oc.fit_wide(known.robot, known.task, BENT, "inertia", parametrisation=network, samples=1000)
+    first, second = [stage.label for stage in fit.stages[:2]]
+    assert first == f"{second}, A = I"
+    plain = oc.fit_wide(known.robot, known.task, BENT, parametrisation=network, samples=1000)
+    assert np.array_equal(plain.stages[0].result.theta, fit.stages[0].result.theta)
+    assert fit.regular_share > 0.99
+
+
 @pytest.mark.parametrize(
     ("ranks", "begun", "kept"),
     [

@@ -102,16 +102,16 @@ def test_pages_offer_paths_and_robot_files_of_the_folder(tmp_path: Path, monkeyp
         page = view._page
         assert page._play.disabled
         chosen = {handle.label: handle for handle in view._server.gui._gui_input_handle_from_uuid.values()
-                  if getattr(handle, "label", "") in ("file", "links")}  # fmt: skip
-        assert chosen["file"].options == ("none", "other.csv", "way.csv")
+                  if getattr(handle, "label", "") in ("path", "links")}  # fmt: skip
+        assert chosen["path"].options == ("none", "other.csv", "way.csv")
         assert chosen["links"].options == ("none", "arm.urdf")
-        chosen["file"].value = "way.csv"
+        chosen["path"].value = "way.csv"
         wait(lambda: not page._play.disabled)
         np.testing.assert_allclose(page._path, [x + 0.02, x - 0.03])
-        chosen["file"].value = "none"
+        chosen["path"].value = "none"
         wait(lambda: page._play.disabled)
         before = page._arm
-        for what, name in (("links", "arm.urdf"), ("file", "other.csv")):
+        for what, name in (("links", "arm.urdf"), ("path", "other.csv")):
             chosen[what].value = name
             page._loop.ask("after", lambda: None)
             time.sleep(0.3)

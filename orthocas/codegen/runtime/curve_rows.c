@@ -182,11 +182,11 @@ static void take_solution(row_search *row, const double *start) {
   double q[N], e[M], J[M * N], A[N][N + 2], gradient[N] = {0}, left = 0.0, error;
   int round, i, j, near = 1;
   memcpy(q, start, sizeof q);
-  for (round = 0; round < 5; ++round) {
+  for (round = 0; round <= NEWTON; ++round) {
     error = task_at(q, row->target, e, J);
     left = xi_left(row->target, q);
     gradient_at(q, gradient);
-    if (round == 4 || fmax(error, fabs(left) / XI_SIZE) < 1e-14 || !isfinite(error) || !isfinite(left)) break;
+    if (round == NEWTON || fmax(error, fabs(left) / XI_SIZE) < 1e-14 || !isfinite(error) || !isfinite(left)) break;
     for (i = 0; i < M; ++i) {
       for (j = 0; j < N; ++j) A[i][j] = J[i + M * j];
       A[i][N] = e[i];
@@ -196,7 +196,7 @@ static void take_solution(row_search *row, const double *start) {
     if (eliminate(A, N, 1) == 0) return;
     for (i = 0; i < N; ++i) q[i] += A[i][N];
   }
-  for (i = 0; i < N; ++i) near = near && fabs(q[i] - fmin(fmax(q[i], low[i]), high[i])) <= 1e-9 * half_width[i];
+  for (i = 0; i < N; ++i) near = near && fabs(q[i] - fmin(fmax(q[i], low[i]), high[i])) <= SNAP * half_width[i];
   if (!near) return;
   for (i = 0; i < N; ++i) q[i] = fmin(fmax(q[i], low[i]), high[i]);
   error = fmax(task_at(q, row->target, e, J), fabs(xi_left(row->target, q)) / XI_SIZE);

@@ -1,0 +1,40 @@
+"""The supervised law in C on arms that stick, with encoders, and what its rates may be."""
+
+import numpy as np
+import pytest
+import sticking
+from programs import needs_c
+
+import orthocas as oc
+from orthocas.control import PDPlus, Safety
+from orthocas.simulation import Friction, StickingPlant
+
+pytestmark = needs_c
+
+
+@pytest.mark.slow
+def test_an_arm_that_sticks_reaches_x_and_xi_and_is_not_caught() -> None:
+    """A bare wrist jumps beyond its limit of speed as it breaks away, and the arm stands still under torques."""
+    chart = oc.load("iiwa7-pose")
+    law, robot, q = PDPlus(chart, remembers="friction"), chart.problem.robot, sticking.find_start(chart)
+    coulomb = np.minimum(5.0, 0.1 * robot.effort_limits)
+    plant = StickingPlant(robot, friction=Friction(0.0, coulomb, 1.25 * coulomb))
+    with sticking.supervised(law) as supervisor:
+        x, xi, _ = sticking.lead(law, supervisor, plant, q, 2.5)
+    assert x < 0.5
+    assert xi < 0.02
+
+
+def test_the_observer_of_velocities_is_slower_the_coarser_encoders_are() -> None:
+    law = PDPlus(oc.load("panda-position"))
+    assert not Safety.of(law).observer_rate.any()
+    for bits, rate in ((12, 42.4), (13, 60.0), (14, 84.9), (20, 120.0)):
+        safety = Safety.of(law, encoder_step=2 * np.pi / 2**bits)
+        np.testing.assert_allclose(safety.observer_rate, rate, rtol=1e-3)
+    assert Safety.of(law, encoder_step=1e-3, observer_rate=0.0).observer_rate.max() == 0
+
+
+def test_friction_that_may_hold_a_joint_is_a_share_of_its_effort_limit() -> None:
+    law = PDPlus(oc.load("panda-position"))
+    limits = law.chart.problem.robot.effort_limits
+    np.testing.assert_allclose(Safety.of(law).friction, np.minimum(12.5, 0.125 * limits))
