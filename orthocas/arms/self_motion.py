@@ -181,7 +181,8 @@ class Arc(Shown):
     @cached_property
     def _nodes(self) -> tuple[Array, Array, Array]:
         """Points (P, n), exact at the ends and nearly so between, tangents, and their places (P,)."""
-        curve, parts, before = self.curve, [], 0.0
+        curve, before = self.curve, 0.0
+        parts: list[tuple[Array, Array, Array]] = []
         along = curve.places
         for piece in self.pieces:
             # Points of the curve between both ends of the piece, which are exact at limits.
