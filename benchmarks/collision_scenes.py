@@ -1,8 +1,9 @@
 """Three scenes, lines of the hand past what the elbow would meet: our tracker, a barrier, a sphere cost (10 min).
 
-Scenes: a post beside the elbow of a panda; a slot of two plates around it, which it enters; baxter's left arm past its
-right one. In each, lines of 0.2 m along which an elbow at rest in xi has a contact, and which a search of all postures
-finds to be possible (elbow_lines.py). A line takes 200 ticks of 10 ms, and 50 more at its end.
+Lines of 0.2 m of the hand that a search of all postures finds to be possible (elbow_lines.py). Past a post beside the
+elbow of a panda, and past baxter's right arm, which reaches across the front, an elbow at rest in xi has a contact. In
+the third scene, two plates stand beside a free posture at the end of a line, and the elbow begins outside of the slot
+between them. A line takes 200 ticks of 10 ms, and 50 more at its end.
 
 - ours, planned: `oc.follow(..., "objective")` before the motion;
 - ours: `chart.tracker(..., nearest=True, margin=0.01, avoid=0.05)`, x of the line and xi of the start;
@@ -28,8 +29,10 @@ from elbow_lines import LENGTH, Line, Search, draw_lines, follow
 import orthocas as oc
 from orthocas.errors import PathError
 from orthocas.robots.capsules import FittedCapsules
+from orthocas.robots.collision_files import CollisionSource
 from orthocas.robots.collisions import Collisions, Part
 from orthocas.robots.shapes import BallGeometry, Shape
+from orthocas.robots.urdf import find_robot_file
 from orthocas.tools.checks import Array
 
 TICK, TICKS, REST, STEP = 0.01, 200, 50, 0.05  # [s]; of a line; at its end; largest of a joint in a tick [rad]
@@ -37,12 +40,14 @@ MARGIN, AVOID, PAIRS = 0.01, 0.05, 10  # [m]; [m]; of the barrier
 GAIN, DAMPING, PUSH = 0.5, 1e-3, 0.5  # of errors in a tick; of rates; of the cost's gradient
 APART, THICK, WIDE = 0.15, 0.02, 0.3  # [m] of a plate of the slot from the elbow; its thickness and width
 MOVED = 0.1  # [m] of the elbow, at least, on its way into the slot
+NEAR = 0.15  # [m] from the other arm at the start, at most
+RIGHT = {"right_s0": 1.2, "right_s1": -0.2, "right_e1": 0.6}  # the other arm, across the front [rad]
 
 Tick = Callable[[Array, Array], Array]  # posture and x -> the next posture
 
 
 def draw_slots(chart: oc.Chart, own: Collisions) -> Iterator[Line]:
-    """Lines that end with the elbow between two plates, and begin outside with another xi."""
+    """Lines at whose end a posture with the elbow between two plates is free; they begin outside, with another xi."""
     rng = np.random.default_rng(12)
     for end in chart.domain.sample(20_000, 12):
         side = rng.uniform(-np.pi, np.pi)
@@ -73,12 +78,13 @@ def draw_slots(chart: oc.Chart, own: Collisions) -> Iterator[Line]:
 def draw_crossings(chart: oc.Chart, own: Collisions) -> Iterator[Line]:
     """Lines of baxter's left hand along which its arm would meet the right one."""
     rng = np.random.default_rng(13)
-    for q in chart.domain.sample(20_000, 13):
+    postures = chart.domain.sample(20_000, 13)
+    found = own.distance(postures)
+    near = [any(name.startswith("right") for name in pair) for pair in found.pair]
+    for q in postures[np.array(near) & (found.distance > 0.02) & (found.distance < NEAR)]:
         direction = rng.normal(size=3)
         x = np.tile(chart.x(q), (31, 1))
         x[:, :3] += np.linspace(0.0, LENGTH, 31)[:, None] * direction / np.linalg.norm(direction)
-        if not own.distance(q).distance > 0.02:
-            continue
         try:
             held = oc.follow(chart, x, "hold", q_start=q).q
         except PathError:
@@ -182,7 +188,8 @@ def drive(chart: oc.Chart, line: Line, step: Tick) -> tuple[bool, bool, float, f
 def compare(count: int, found: dict[str, float]) -> Iterator[str]:
     """Rows: every scene by every method."""
     panda, own = load("panda")
-    baxter, pair = load("baxter")
+    baxter = oc.load("baxter-left-wide")
+    pair = oc.Robot(baxter.robot.tree, solids=CollisionSource(find_robot_file("baxter"), None, RIGHT)).collisions
     scenes = {
         "past a post": (panda, draw_lines(panda, own), own),
         "into a slot": (panda, draw_slots(panda, own), own),

@@ -79,15 +79,16 @@ class SelfMotionCurves:
                 traces = self.tracer.trace(targets[:, : self.boxed.m], q[:, start], np.zeros(1, dtype=np.int64))
                 known[0, start] = True
                 known |= self.tracer.on_curves(q, traces)
-                # where xi passes its target between points close to one another
+                # xi - xi(q) at points close to one another
                 points = self._steps(traces, own).divided()[0]
                 flat = points.reshape(-1, len(target))
                 left = self._xi_left(np.broadcast_to(targets, flat.shape), flat).reshape(points.shape[:2])
-                # points from which the next one may lie beyond a root, or between two
+                # a root may lie beside points where no more is left than changes to a neighbour
                 change = np.abs(np.diff(left, axis=1))
                 change = np.where(change > self._period / 2, np.inf, change)
                 close = np.zeros(left.shape, dtype=bool)
-                close[:, 1:], close[:, :-1] = np.abs(left[:, 1:]) <= change, np.abs(left[:, :-1]) <= change
+                close[:, 1:] |= np.abs(left[:, 1:]) <= change
+                close[:, :-1] |= np.abs(left[:, :-1]) <= change
                 guess = points[close]
                 found.append(self._solve(targets, np.zeros(len(guess), dtype=np.int64), guess, tolerance)[0])
         return np.concatenate(found)
