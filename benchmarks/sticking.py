@@ -32,11 +32,11 @@ from orthocas.errors import OrthocasError
 from orthocas.simulation import Friction, StickingPlant
 from orthocas.tools.checks import Array
 
-READY = ("panda", "xarm7", "iiwa7", "tiago-pro-left")
+READY = ("panda", "xarm7", "iiwa7")
 FITTED = ("sawyer", "gen3")
 CHARTS = (
     *(f"{name}-{kind}" for name in READY for kind in ("wide", "pose")),
-    *("baxter-left-wide", "pr2-left-wide", "sawyer-wide", "gen3-wide"),
+    *("sawyer-wide", "gen3-wide"),
 )
 TICK, BEFORE, SECONDS, LONG, STILL = 1e-3, 0.3, 5.0, 60.0, 1.0  # [s]
 NEAR = 0.5, 0.02  # [mm], of xi

@@ -204,7 +204,7 @@ def _describe_boundary(controller: Controller) -> dict[str, Any] | None:
         return None
     meaning = (
         "The bound on the relative singular value of the task is a part of the boundary; its\n"
-        " * distance counts in shares of that from the centre."
+        " * distance counts in shares of that from the domain's home."
     )
     fold_span = None
     if (room := domain.room_to_fold) is not None:
@@ -215,7 +215,8 @@ def _describe_boundary(controller: Controller) -> dict[str, Any] | None:
         "meaning": meaning,
         "path": None,
         "bound": bound.least_singular_value,
-        "span": float(bound.singular_values(bound.centre)) - bound.least_singular_value,
+        # Of the home: the centre itself may be singular.
+        "span": float(bound.singular_values(domain.home)) - bound.least_singular_value,
         "fold_span": fold_span,
     }
 

@@ -62,7 +62,7 @@ class Safety:
     """Settings of the supervised law; `Safety.of(controller)` gives the default ones.
 
     Margins are distances to the boundary in half-widths of the domain. On a `ClearBox`, the bound on the relative
-    singular value s is a boundary too, at the distance (s - bound) / (s at the centre - bound). In a `Corridor`, the
+    singular value s is a boundary too, at the distance (s - bound) / (s at the home - bound). In a `Corridor`, the
     path is 1 and the boundary 0, and the other boundaries of its joints count in radii as well. Lists hold one number
     per joint (n,), or per controlled quantity (k,) where that is said. The meanings are those of the generated header.
     """

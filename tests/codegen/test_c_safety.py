@@ -169,7 +169,7 @@ def test_object_holds_no_state_and_calls_only_mathematics(pd_plus: Generated, tm
     assert {kind for kind, _ in rows} <= {"T", "t", "R", "r", "U"}
     public = {name for kind, name in rows if kind in "TR"}
     functions, tables = (
-        ["chart", "chart_curvature", "check", "inverse", "nearest", "dynamics", "control"],
+        ["chart", "chart_curvature", "check", "inverse", "nearest", "dynamics", "link_positions", "control"],
         ["default_gains", "domain_lower", "domain_upper"],
     )
     functions += ["check_start", "start", "take_over", "resume", "step", "hold", "release"]

@@ -85,7 +85,7 @@ def test_velocity_laws_carry_no_settings_of_torques(planar_for_control: oc.Chart
         supervisor.take_over(q, np.zeros(3))
         for k in range(60):  # the catcher after speeds beyond the limit
             command, _ = supervisor.step(
-                q + 1e-4 * k, np.full(3, 20.0 * (k == 30)), at_rest(planar_for_control, q), TICK
+                q + 1e-4 * k, np.full(3, 20.0 * (30 <= k < 37)), at_rest(planar_for_control, q), TICK
             )
         assert supervisor.mode == 1  # the catcher
         commands.append(command)
