@@ -64,6 +64,7 @@ class ChartKernelRules:
     saddle: float = 0.02  #: slope of the error, relative to its curvature, below which a posture is next to a saddle
     onward: float = 0.3  #: step across a saddle of the last call, in the largest steps of joints, that goes on
     unstable: float = 0.2  #: curvature along which a saddle falls, in errors, that any side is better than none
+    even: float = 1e-7  #: slope of a saddle, relative to its curvature, below which both sides are alike
     astride: float = 0.05  #: step to a side of a saddle
     largest: float = 0.7  #: norm of a step of Newton's method
     in_chart: int = 10  #: rounds of it at a tick in the chart

@@ -181,7 +181,8 @@ class Arc(Shown):
     @cached_property
     def _nodes(self) -> tuple[Array, Array, Array]:
         """Points (P, n), exact at the ends and nearly so between, tangents, and their places (P,)."""
-        curve, parts, before = self.curve, [], 0.0
+        curve, before = self.curve, 0.0
+        parts: list[tuple[Array, Array, Array]] = []
         along = curve.places
         for piece in self.pieces:
             # Points of the curve between both ends of the piece, which are exact at limits.
@@ -189,6 +190,8 @@ class Arc(Shown):
             (first, t_first), (last, t_last) = (curve.point(place) for place in (piece.begin, piece.end))
             shift = _TURN * np.array(piece.turns)
             q = np.vstack([first, curve.q[inner], last]) + shift
+            # Where a piece goes on beyond the last point of a closed curve, endless joints keep their full turns.
+            q += _TURN * np.rint((parts[-1][0][-1] - q[0]) / _TURN) if parts else 0.0
             t = np.vstack([t_first, curve.tangent[inner], t_last])
             at = np.concatenate([[piece.begin], along[inner], [piece.end]]) - piece.begin + before
             parts.append((q, t, at))

@@ -42,6 +42,10 @@ class ArmTracker(Shown):
     Gauss-Newton steps within the same bounds bring the error of x to zero, or to a minimum, at which the arm rests. As
     damping grows where a step does not lower the error, the error of a target at rest never rises.
 
+    Next to a saddle of the error, where x alone does not say which way to take, a moving arm goes on as it moves, as
+    through a fold beside a singular posture; one at rest goes back to the side of its last posture with a chart, as an
+    elbow from the border of reach; and one that stands in a plane of symmetry leaves it.
+
     xi is that of the chart in whose domain the tracker began, or came to be first. When the arm comes back to the
     domain, xi goes from the value that it has there to what is asked as fast as the joints may. Where it does not come
     nearer for a quarter of a second, stored postures are tried, one a call, for one that has x and xi; the arm goes

@@ -211,6 +211,19 @@ def test_without_a_compiler_an_error_says_how_to_get_one(ask: str, monkeypatch: 
         calls[ask]()
 
 
+def test_arcs_beyond_the_seam_of_a_curve_keep_x_where_joints_have_no_end() -> None:
+    """Gen3's curves wind around its endless joints: pieces on both sides of the first point are full turns apart."""
+    arm = oc.Arm(oc.load("gen3-wide").task)
+    joined = 0
+    for x in arm.x(postures(arm, 12, 3)):
+        for arc in arm.self_motion(x):
+            joined += len(arc.pieces) > 1
+            q = arc.at(np.linspace(0.0, arc.length, 200))
+            assert np.abs(arm.maps.evaluate(q, np.tile(arc.target, (200, 1)))[0]).max() < 1e-8
+            assert np.abs(np.diff(q, axis=0)).max() < 0.5
+    assert joined > 3
+
+
 def test_out_of_reach_there_is_no_arc() -> None:
     motions = planar().self_motion([9.0, 0.0])
     assert (len(motions), motions.length, motions.sample(5).shape) == (0, 0.0, (0, 3))
