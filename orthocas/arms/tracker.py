@@ -32,7 +32,8 @@ class ArmTracker(Shown):
     """Follows a stream of x and xi from posture to posture; `Arm.tracker` makes it, and it belongs to one thread.
 
     A call moves no joint by more than its velocity limit times the period, and none beyond its position limit; with
-    limits of acceleration, the joints can always stop before their limits. In the domain of the chart that it began in,
+    limits of acceleration, the joints can always stop before their limits; after a jump, x swings about its target by
+    some per cent of it before it is met. In the domain of the chart that it began in,
     x and xi are met exactly, as by `Chart.tracker`. Where xi cannot be had, x has priority: the joint step d solves
 
         min |J d - e|^2 + w^2 |g d - e_xi|^2 + damping |d|^2,  with bounds of position and velocity,

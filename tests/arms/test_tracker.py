@@ -156,7 +156,7 @@ def test_xi_on_another_arc_is_reached_again() -> None:
 
 
 def test_joints_keep_limits_of_acceleration_and_stop_before_their_ends() -> None:
-    """Random jumps, out of reach as well, and NaN; a slow motion is followed exactly, and a jump without overshoot."""
+    """Random jumps, out of reach as well, and NaN; a slow motion is followed exactly, and a jump ends after it swings."""
     arm, rng, most = panda(), np.random.default_rng(5), 10.0 * PERIOD**2
     tracker, low, high = (
         arm.tracker(centre(), period=PERIOD, acceleration_limits=10.0),
@@ -183,7 +183,9 @@ def test_joints_keep_limits_of_acceleration_and_stop_before_their_ends() -> None
     for _ in range(300):
         errors.append(float(np.linalg.norm((arm.x(tracker.step(far)) - far)[:3])))
     assert tracker.status in (TrackStatus.OK, TrackStatus.YIELDING)
-    assert np.diff(errors)[100:].max() < 1.5e-3  # [m] of an error of 0.2
+    # within a second it swings about the target by some per cent of the jump, then it is there
+    assert max(errors[100:]) < 0.03 * errors[0]
+    assert max(errors[150:]) < 1e-9
 
 
 def test_on_a_moving_base_x_is_followed_and_the_posture_comes_back() -> None:
