@@ -159,7 +159,9 @@ class CompiledInverse(Shown):
     def _search(self, iterations: int, targets: Array, starts: Array) -> Attempt:
         """Search from starts (N, n) in C."""
         N, phi_map = len(targets), self.chart.parts.phi_map
-        q, residual, condition, inside = starts.copy(), np.empty_like(targets), np.empty(N), np.empty(N, dtype=np.bool_)
+        # C reads rows one after the other, whatever the order of the targets.
+        q, residual, condition = starts.copy(), np.empty(targets.shape), np.empty(N)
+        inside = np.empty(N, dtype=np.bool_)
         arrays = np.ascontiguousarray(targets), q, residual, condition, inside
 
         def solve_piece(first: int) -> None:
