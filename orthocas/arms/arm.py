@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import as_file, files
+from itertools import product
 from pathlib import Path
 from typing import Any, Self
 
@@ -27,6 +28,7 @@ from orthocas.fitting.wide import fit_wide
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import branches
+from orthocas.tasks.domains import Domain
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.regular_box import find_joint_range
 from orthocas.tasks.task import Task
@@ -579,13 +581,19 @@ class Arm(Shown):
         run_in_threads(solve_row, range(len(targets)))
         return q, status
 
-    def _choose_inside(self, motions: SelfMotions, domains: Sequence[Any], start: Array | None) -> Array:
+    def _choose_inside(self, motions: SelfMotions, domains: Sequence[Domain], start: Array | None) -> Array:
         """A posture in one of the domains, of those 0.05 rad apart on the arcs; NaN where there is none."""
         q = np.vstack([arc.at(self._list_places(arc)) for arc in motions])
-        q = q[np.any([np.asarray(domain.contains(q)) for domain in domains], axis=0)]
+        q = np.vstack([self._find_inside(q, domain) for domain in domains])
         if not len(q):
             return np.full(self.robot.n, np.nan)
         return np.asarray(q[self._choose(q, start)])
+
+    def _find_inside(self, q: Array, domain: Domain) -> Array:
+        """Those of postures (N, n) that a domain holds, after full turns of joints without limits into its box."""
+        bounded = np.isinf(self.robot.lower) & np.isfinite(domain.bounds[0]) & self.maps.turning
+        moved = domain.home + wrap_shortest(q - domain.home, 2 * np.pi * bounded)
+        return np.asarray(moved[np.asarray(domain.contains(moved))])
 
     def _find_free(
         self,
@@ -609,15 +617,10 @@ class Arm(Shown):
         # Otherwise, of free postures on the arcs ...
         q = np.vstack([np.empty((0, self.robot.n)), *(arc.at(self._list_places(arc)) for arc in motions)])
         q = q[collisions.check_free(q)] if len(q) else q
-        if xi is None and anywhere:
-            owners = np.zeros(len(q), dtype=np.int64)
-        else:
-            inside = [np.asarray(self.charts[k].problem.domain.contains(q)) for k in chosen] if len(q) else []
-            owners = np.array(
-                [next((k for k, part in zip(chosen, inside, strict=True) if part[row]), -1) for row in range(len(q))],
-                dtype=np.int64,
-            )
-            q, owners = q[owners >= 0], owners[owners >= 0]
+        owners = np.zeros(len(q), dtype=np.int64)
+        if not (xi is None and anywhere):
+            parts = [self._find_inside(q, self.charts[k].problem.domain) for k in chosen]
+            q, owners = np.vstack(parts), np.repeat(chosen, [len(part) for part in parts])
         if not len(q):
             return None
         # ... that with the nearest xi, or without xi, that nearest to the start.
@@ -657,23 +660,35 @@ class Arm(Shown):
             left = chart.xi(q)[:, 0] - xi
             return np.asarray(left - period * np.round(left / period) if period else left)
 
+        # Joints without limits may need full turns: into the box of the domain, or where turns change xi.
+        endless, winds = np.isinf(self.robot.lower) & self.maps.turning, chart.parts.boxed.winding
+        low, high = (np.where(winds, domain.home + k * 3 * np.pi, end) for k, end in ((-1, low), (1, high)))
+        counts = endless & np.isfinite(low)
         for arc in motions:
             # xi at even places of the arc, where the domain may hold them.
             places = self._list_places(arc)
-            q = arc.at(places)
-            near = np.flatnonzero(((q >= low - RULES.spacing) & (q <= high + RULES.spacing)).all(axis=1))
-            inside, left = np.zeros(len(q), dtype=bool), np.full(len(q), np.nan)
-            if near.size:
-                inside[near], left[near] = np.asarray(domain.contains(q[near])), miss(q[near])
-            # A change of sign between two places has a posture with this xi, unless xi jumps by its period there.
-            crosses = (left[:-1] * left[1:] <= 0) & (inside[:-1] | inside[1:])
-            if period:
-                crosses &= np.abs(left[1:] - left[:-1]) < period / 2
-            for row in np.flatnonzero(crosses):
-                posture, error = _find_root(arc, miss, *places[row : row + 2].tolist())
-                known = any(np.abs(posture - other).max() < RULES.same for other in found)
-                if abs(error) < RULES.tolerance and not known and bool(domain.contains(posture)):
-                    found.append(posture)
+            along = arc.at(places)
+            first = np.where(counts, np.ceil((low - along.max(axis=0)) / (2 * np.pi)), 0.0)
+            last = np.where(counts, np.floor((high - along.min(axis=0)) / (2 * np.pi)), 0.0)
+            for turns in product(*map(np.arange, first, last + 1)):
+                shift = 2 * np.pi * np.array(turns)
+                q = along + shift
+                near = np.flatnonzero(((q >= low - RULES.spacing) & (q <= high + RULES.spacing)).all(axis=1))
+                inside, left = np.zeros(len(q), dtype=bool), np.full(len(q), np.nan)
+                if near.size:
+                    inside[near], left[near] = np.asarray(domain.contains(q[near])), miss(q[near])
+                # A change of sign between two places has a posture with this xi, unless xi jumps by its period there.
+                crosses = (left[:-1] * left[1:] <= 0) & (inside[:-1] | inside[1:])
+                if period:
+                    crosses &= np.abs(left[1:] - left[:-1]) < period / 2
+                for row in np.flatnonzero(crosses):
+                    posture, error = _find_root(arc, shift, miss, *places[row : row + 2].tolist())
+                    known = any(
+                        np.abs(wrap_shortest(posture - other, 2 * np.pi * endless)).max() < RULES.same
+                        for other in found
+                    )
+                    if abs(error) < RULES.tolerance and not known and bool(domain.contains(posture)):
+                        found.append(posture)
         return found
 
     def _list_places(self, arc: Arc) -> Array:
@@ -704,19 +719,19 @@ def _agree(chart: Chart, task: Task) -> bool:
     return same and bool(np.allclose(chart.problem.task.batched(q)[0], task.batched(q)[0], rtol=0, atol=1e-9))
 
 
-def _find_root(arc: Arc, f: Callable[[Array], Array], low: float, high: float) -> tuple[Array, float]:
-    """The posture on an arc, between places where f has different signs, at which f is 0; and f there.
+def _find_root(arc: Arc, shift: Array, f: Callable[[Array], Array], low: float, high: float) -> tuple[Array, float]:
+    """The posture on an arc, shifted, between places where f has different signs, at which f is 0; and f there.
 
     By regula falsi, with every third step a bisection.
     """
     # The end with the smaller value is the answer where no step is better.
-    values = [float(f(arc.at(place)[None])[0]) for place in (low, high)]
-    q, value = arc.at(low if abs(values[0]) <= abs(values[1]) else high), min(values, key=abs)
+    values = [float(f((arc.at(place) + shift)[None])[0]) for place in (low, high)]
+    q, value = arc.at(low if abs(values[0]) <= abs(values[1]) else high) + shift, min(values, key=abs)
     for k in range(RULES.steps):
         if abs(value) < RULES.met or high - low < RULES.narrow:
             break
         place = low + (high - low) * (values[0] / (values[0] - values[1]) if k % 3 < 2 else 0.5)
-        q = arc.at(place)
+        q = arc.at(place) + shift
         value = float(f(q[None])[0])
         # The root stays between both ends.
         if (value > 0) == (values[0] > 0):

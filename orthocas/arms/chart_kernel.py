@@ -326,5 +326,14 @@ def write_tracker(
     values["rows"] = template != "arm_track.c"
     if values["rows"]:
         values["branches"] = len(maps.stored.begins) if charts and n - task.m == 1 else 0
+    if values.get("branches"):
+        # Where full turns count: within limits, or without these, in boxes of charts, or where they change xi.
+        lows, highs = (np.array([chart.problem.domain.bounds[k] for chart in charts]) for k in (0, 1))
+        winds = np.any([chart.parts.boxed.winding for chart in charts], axis=0)
+        home, endless = charts[0].problem.domain.home, np.isinf(robot.lower)
+        around = [home + np.where(winds, sign * 3 * np.pi, sign * np.inf) for sign in (-1, 1)]
+        values["lift_low"] = np.where(endless, np.maximum(lows.min(axis=0), around[0]), robot.lower)
+        values["lift_high"] = np.where(endless, np.minimum(highs.max(axis=0), around[1]), robot.upper)
+        values["winds"] = winds
     source = f"{name}_track.c" if template == "arm_track.c" else f"{name}.c"
     return {f"{name}_track.h": render("arm_track.h", values), source: render(template, values)}

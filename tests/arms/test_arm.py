@@ -14,6 +14,7 @@ from orthocas.arms import Postures
 from orthocas.charts.inverse import InverseStatus
 from orthocas.errors import ChartFileError, InvalidValueError, NotRedundantError, OrthocasError, UnknownNameError
 from orthocas.tools.checks import Array
+from orthocas.tools.expressions import wrap_shortest
 from orthocas.tools.progress import Progress
 
 
@@ -234,3 +235,39 @@ def test_an_arm_needs_one_joint_more_than_its_task() -> None:
         oc.Arm(oc.Task.position(robot, "xy"))
     with pytest.raises(InvalidValueError, match="n - m = 2"):
         oc.Arm.fit(oc.problems.get("planar_3r_xy").robot, oc.Task.position(oc.problems.get("planar_3r_xy").robot, "x"))
+
+
+def test_full_turns_of_endless_joints_bring_postures_into_a_box() -> None:
+    """Gen3's curves are traced on one sheet; a box about half a turn of its endless joints is met from both sides."""
+    known = oc.load("gen3-wide")
+    box = oc.Box([2.9, -1.0, 0.0, 1.4, -3.0, -1.0, 3.1], 0.5)
+    chart = oc.fit(oc.Problem(known.robot, known.task, domain=box), oc.Polynomial(degree=2), samples=400).chart
+    arm = oc.Arm(chart.task, (chart,))
+    q = inside(arm, 20, 1)
+    x, xi = chart.x(q), np.roll(chart.xi(q)[:, 0], 1)
+    found = arm.solve(x, xi)
+    assert found.status.tolist() == chart.solve(x=x, xi=xi[:, None], inside=True).status.tolist()
+    assert box.contains(found.q).all()
+    for k in range(5):
+        assert len(arm.solve(x[k], chart.xi(q[k])[0], all=True)) >= 1
+    # Without xi, in the chart's domain.
+    near = arm.solve(x, start=q, branch=arm.branch_names[0])
+    assert near.found.all()
+    assert np.linalg.norm(near.q - q, axis=1).max() < 0.05
+
+
+def test_where_full_turns_change_xi_an_arm_finds_as_many_as_its_chart() -> None:
+    """All solutions within one and a half turns, as the chart's own search has them."""
+    chart = oc.load("gen3-wide")
+    arm = oc.Arm(chart.task, (chart,))
+    q = inside(arm, 60, 21)
+    phi = chart.phi(q)
+    assert arm.solve(phi[:, :6], phi[:, 6]).found.all()
+    turns = 2 * np.pi * np.isinf(chart.robot.lower)
+    for row in phi[:3]:
+        own, theirs = arm.solve(row[:6], row[6], all=True).q, chart.solutions(row)
+        assert np.abs(chart.phi(own) - row).max() < 1e-8
+        theirs = theirs[(np.abs(theirs[:, turns > 0]) < 3 * np.pi).all(axis=1)]
+        apart = np.abs(wrap_shortest(theirs[:, None] - own, turns)).max(axis=2)
+        assert len(theirs) > 3
+        assert apart.min(axis=1).max() < 1e-4

@@ -44,6 +44,19 @@ def test_compiled_c_gives_the_same_solutions(iiwa_fit: Fit, tmp_path: Path) -> N
 
 @pytest.mark.slow
 @needs_c
+def test_targets_may_have_any_order_in_memory(planar_arm: oc.Chart, tmp_path: Path) -> None:
+    compiled = oc.compile_inverse(planar_arm, tmp_path / "cache")
+    phi = planar_arm.phi(sample_uniform(planar_arm.problem.domain, 20, 0))
+    x, xi = phi[:, : planar_arm.m], phi[:, planar_arm.m :]
+    rows = compiled.solve(phi)
+    for found in (compiled.solve(np.asfortranarray(phi)), compiled.solve(x=np.asfortranarray(x), xi=xi)):
+        np.testing.assert_array_equal(found.q, rows.q)
+    # one x, many xi
+    assert compiled.solve(x=x[0], xi=xi).found[0]
+
+
+@pytest.mark.slow
+@needs_c
 def test_a_library_is_compiled_once(planar_arm: oc.Chart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     first = oc.compile_inverse(planar_arm)
