@@ -252,9 +252,10 @@ class SelfMotionCurves:
         # where xi turns back between two steps
         bends = steps.follows.copy()
         bends[1:] &= ~(ahead[1:] * ahead[:-1] > 0) & both[1:] & both[:-1]
-        changes |= bends
-        # with their neighbours, which bound the root
+        # and, as a search may begin where it does, at both ends of a curve
         after = np.append(steps.follows[1:], False)
+        changes |= bends | (both & ~(steps.follows & after))
+        # with their neighbours, which bound the root
         around = changes.copy()
         around[1:] |= changes[:-1] & steps.follows[1:]
         around[:-1] |= changes[1:] & after[:-1]

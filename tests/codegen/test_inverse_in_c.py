@@ -178,3 +178,28 @@ def test_compiled_c_finds_what_random_starts_find(tmp_path: Path) -> None:
     for k in range(count):
         others = positions_at(chart, x[k], pool)
         assert near.distance[k] <= np.abs(chart.xi(others)[:, 0] - chart.xi(wishes[k])[0]).min() + 1e-6
+
+
+@needs_c
+def test_the_nearest_xi_may_lie_where_a_curve_begins(tmp_path: Path) -> None:
+    """Newton's method ends where xi turns back, from where a closed curve inside the domain is traced.
+
+    A planar arm's postures with x are two circles of q1: of 20,001 points on each, the nearest xi is nearer by less than 0.005.
+    """
+    robot = oc.Robot.planar(lengths=[1, 1, 1], masses=[3, 3, 3])
+    problem = oc.Problem(robot, oc.Task.position(robot, "xy"), domain=oc.Torus(3))
+    chart = oc.fit(problem, oc.Fourier(degree=2), samples=600).chart
+    phi = chart.phi(problem.domain.sample(80, 3))
+    phi[:, 2] = np.roll(phi[:, 2], 1)
+    q1 = np.linspace(-np.pi, np.pi, 20_001)
+    for found in (chart.solve(phi, inside=True), oc.compile_inverse(chart, tmp_path / "cache").solve(phi, inside=True)):
+        rows = np.flatnonzero(found.status == oc.InverseStatus.NEAREST)
+        assert len(rows) > 5
+        for row in rows:
+            away = phi[row, :2] - np.column_stack([np.cos(q1), np.sin(q1)])
+            cosine = ((away**2).sum(axis=1) - 2) / 2
+            reached = np.abs(cosine) <= 1
+            for q3 in (np.arccos(cosine[reached]), -np.arccos(cosine[reached])):
+                angle = np.arctan2(away[reached, 1], away[reached, 0]) - np.arctan2(np.sin(q3), 1 + np.cos(q3))
+                q = np.column_stack([q1[reached], angle - q1[reached], q3])
+                assert found.distance[row] < np.abs(chart.xi(q)[:, 0] - phi[row, 2]).min() + 5e-3

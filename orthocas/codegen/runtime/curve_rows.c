@@ -358,7 +358,9 @@ static void search_sheet(row_search *row, const curve_points *curve, const doubl
     if (inside[p] && inside[p + 1]) {
       ahead = left[p + 1] - left[p];
       if (isfinite(PERIOD)) ahead -= PERIOD * round(ahead / PERIOD);
-      matters[p] = (char)(crosses(left[p], left[p + 1]) || (p > 0 && inside[p - 1] && !(ahead * turned > 0)));
+      /* xi may turn back where a curve begins, as Newton's method ends at such points. */
+      matters[p] = (char)(crosses(left[p], left[p + 1]) || p == 0 || p + 2 == count ||
+                          (inside[p - 1] && !(ahead * turned > 0)));
       turned = ahead;
     } else {
       matters[p] = (char)(inside[p] || inside[p + 1] || shares_inside(q[p], q[p + 1], MISSED, &first, &last));
