@@ -377,7 +377,10 @@ class Arm(Shown):
         self._require_charts()
         if xi is None:
             raise InvalidValueError("all", True, "an xi with it; without one, they are the arcs of `self_motion(x)`")
-        motions, value = self.self_motion(x), as_number("xi", xi)
+        value = as_number("xi", xi)
+        if not np.isfinite(value):
+            raise InvalidValueError("xi", value, "a finite number")
+        motions = self.self_motion(x)
         chosen = [(k, name) for k, name in enumerate(self.branch_names) if branch in (ANY, name)]
         found = [(q, name) for k, name in chosen for q in self._find_xi(motions, k, value)]
         q = np.array([q for q, _ in found]).reshape(-1, self.robot.n)

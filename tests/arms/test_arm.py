@@ -219,6 +219,7 @@ def test_a_fit_has_a_chart_of_each_branch() -> None:
         (lambda: panda().self_motion([0.0, 1.0]), "shape"),
         (lambda: panda().self_motion(np.zeros((2, 6))), "one task value"),
         (lambda: panda().self_motion(np.full(6, np.nan)), "NaN"),
+        (lambda: panda().solve(np.zeros(6), np.nan, all=True), "xi"),
         (lambda: panda().solve(np.diag([2.0, 2.0, 2.0, 1.0])), "rotation"),
         (lambda: panda().tracker(np.full(7, 9.0)), "within the joint limits"),
     ],
