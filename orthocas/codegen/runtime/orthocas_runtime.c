@@ -812,7 +812,8 @@ static void choose_mode(const orthocas_arm *arm, orthocas_state *state, int law,
   double *speed = take(&work, arm->n);
   int i;
   for (i = 0; i < arm->n; ++i) speed[i] = clipped(dq[i], safety->speed_limit[i]);
-  state->hasty = hurries ? fmin(state->hasty + period, rules.hasty) : 0.0;
+  /* Half as fast back, so that swings are caught if they are too fast for a third of their time. */
+  state->hasty = hurries ? fmin(state->hasty + period, rules.hasty) : fmax(0.0, state->hasty - 0.5 * period);
   if (state->mode == ORTHOCAS_LAW) {
     if (!works(law)) catch_arm(arm, state, law, q);
     else if (distance(arm, q, speed, safety->fade_out, clear, work) < safety->catch_margin)
