@@ -9,7 +9,7 @@ import scipy
 
 from orthocas.errors import InvalidValueError, SolveError
 from orthocas.solvers.protocol import RULES, BestPoint, EstimatedObjective, Objective, SolveResult, Status
-from orthocas.tools.checks import Array, require_at_least, require_count
+from orthocas.tools.checks import Array, as_number, require_at_least, require_count
 from orthocas.tools.progress import UNWATCHED, Watch
 
 _STATUS = {0: Status.CONVERGED, 1: Status.ITERATION_LIMIT}  # of SciPy
@@ -96,6 +96,11 @@ class QuasiNewton(LBFGS):
     memory: int = 20
     renewal: float = 0.8
     name: str = "quasi_newton"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= as_number("renewal", self.renewal) < 1:
+            raise InvalidValueError("renewal", self.renewal, "a number from 0 to below 1")
 
     def coarser(self) -> "QuasiNewton":
         """The same solver with at most 15 iterations, which stops when two steps gain less than 0.5 % each."""

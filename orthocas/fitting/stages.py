@@ -462,7 +462,7 @@ class StageRunner:
         return count if kept is None or self.settings.samples else ceil(count / 2)
 
     def _count_for_basis(self, terms: int, r: int) -> int:
-        """Number of samples for a linear family, so that there are about 100 to 140 residuals per coefficient."""
+        """Number of samples for a linear family, so that there are 70 to 140 residuals per coefficient."""
         rows = self.problem.m + r - 1
         if self.problem.n > RULES.many_joints:
             return self.settings.samples or ceil(RULES.residuals_of_many * terms / rows)

@@ -161,7 +161,8 @@ def _find_limits(
     """Lower and upper positions and largest speeds of n independent joints, (n,), that keep mimic joints in their own.
 
     With q_f = a q + b in [l, u], q is between (l - b) / a and (u - b) / a, and |dq| at most the speed over |a|. Limits
-    of a mimic joint that would leave its leader no way at all are ignored, as ROS ignores them, and logged.
+    of a mimic joint that would leave its leader no way at all are ignored, as ROS ignores them, and logged. An endless
+    joint gets a turn from -pi to pi, where its next turns would bring a mimic joint elsewhere.
     """
     n = len(bodies) - len(follow)
     ends: tuple[list[float], list[float]] = ([], [])
@@ -177,6 +178,10 @@ def _find_limits(
         speeds[leader] = min(speeds[leader], speeds[n + j] / abs(mimic.factor))
         low, high = sorted((end[n + j] - mimic.offset) / mimic.factor for end in (lower, upper))
         low, high = max(float(lower[leader]), low), min(float(upper[leader]), high)
+        # Positions of joints without limits repeat after a turn everywhere else.
+        slides, leads = (find_axis(model, i)[0] == "prismatic" for i in (bodies[n + j], bodies[leader]))
+        if np.isinf([low, high]).all() and not leads and (slides or mimic.factor % 1):
+            low, high = -np.pi, np.pi
         if low < high:
             lower[leader], upper[leader] = low, high
         else:

@@ -484,12 +484,15 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
         ShapeError: if the domain has another number of joints.
         DomainError: if the domain leaves the joint limits, or is a torus and a joint is prismatic. The message names
             the joint.
+        RobotError: if the domain is a torus and a joint mimics another one: after a turn it may be elsewhere.
     """
     if len(domain.centre) != robot.n:
         raise ShapeError("domain", (len(domain.centre),), (robot.n,))
     if domain.full_turns and any(robot.tree.prismatic):
         name = robot.joint_names[robot.tree.prismatic.index(True)]
         raise DomainError(f"joint '{name}' is prismatic, expected a Box domain instead of a Torus")
+    if domain.full_turns:
+        robot.tree.require_no_mimics("a Torus domain")
     low, high = domain.centre - domain.half_width, domain.centre + domain.half_width
     if not domain.full_turns:
         low, high = domain.bounds

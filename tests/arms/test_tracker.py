@@ -156,7 +156,7 @@ def test_xi_on_another_arc_is_reached_again() -> None:
 
 
 def test_joints_keep_limits_of_acceleration_and_stop_before_their_ends() -> None:
-    """Random jumps, out of reach as well, and NaN; a slow motion is followed exactly, and a jump ends after it swings."""
+    """Random jumps, out of reach as well, and NaN; a slow motion is followed exactly, a jump after it swings."""
     arm, rng, most = panda(), np.random.default_rng(5), 10.0 * PERIOD**2
     tracker, low, high = (
         arm.tracker(centre(), period=PERIOD, acceleration_limits=10.0),

@@ -94,6 +94,7 @@ def test_bad_settings_of_solvers_are_refused() -> None:
         lambda: solvers.Adam(epochs=0),
         lambda: solvers.Adam(learning_rate=0.0),
         lambda: solvers.GradientFlow(accuracy=0.0),
+        lambda: solvers.QuasiNewton(renewal=1.0),
     ):
         with pytest.raises(InvalidValueError):
             build()

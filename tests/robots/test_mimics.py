@@ -94,6 +94,32 @@ def test_kinematics_and_dynamics_are_those_of_all_joints_free(arm_file: Path, ba
         np.testing.assert_allclose(robot.forward_dynamics(q, dq, tau), ddq, atol=1e-8)
 
 
+@pytest.mark.parametrize(
+    ("kind", "factor", "endless"), [("continuous", -2, True), ("continuous", 0.5, False), ("prismatic", 1, False)]
+)
+def test_endless_joints_have_one_turn_if_the_next_takes_a_mimic_joint_elsewhere(
+    kind: str, factor: float, endless: bool, tmp_path: Path
+) -> None:
+    """Charts, trackers and C take positions of joints without limits to repeat after a turn."""
+    joints = (
+        ("j1", "continuous", "base", "l1", ""),
+        ("j2", kind, "l1", "l2", f'<mimic joint="j1" multiplier="{factor}"/>'),
+        ("j3", "continuous", "l2", "l3", ""),
+    )
+    parts = [LINK.format(name=name, mass=1, half=0.08, length=0.16) for name in ("base", "l1", "l2", "l3")]
+    for name, of, parent, child, mimic in joints:
+        numbers = {"at": 0.2, "tilt": 0.3, "axis": "0 1 0", "low": -1e12, "high": 1e12, "speed": 2}
+        parts.append(JOINT.format(name=name, kind=of, parent=parent, child=child, mimic=mimic, **numbers))
+    (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{"".join(parts)}</robot>')
+    robot = oc.Robot.from_urdf(tmp_path / "arm.urdf", "l3")
+    end = np.inf if endless else np.pi
+    np.testing.assert_array_equal([robot.lower, robot.upper], [[-end, -np.inf], [end, np.inf]])
+    turned = np.abs(robot.pose([0.3 + 2 * np.pi, 0.1]) - robot.pose([0.3, 0.1])).max()
+    assert (turned < 1e-9) == endless
+    with pytest.raises(RobotError, match="a Torus domain: not possible with mimic joints"):
+        oc.Problem(robot, oc.Task.position(robot, "x"), domain=oc.Torus(2))
+
+
 def test_dynamics_are_those_of_mimic_joints_of_pinocchio(arm_file: Path, robot: oc.Robot) -> None:
     model = pin.buildModelFromUrdf(str(arm_file), mimic=True)
     data = model.createData()

@@ -76,6 +76,24 @@ def test_a_great_speed_that_positions_agree_with_goes_to_the_catcher(
     assert np.abs(arm.dq).max() < 0.5
 
 
+def test_a_joint_that_swings_faster_than_its_limit_is_caught_though_it_turns_back_in_between(
+    supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart
+) -> None:
+    """Up to 1.5 times the limit at 100 Hz: never faster than it for 5 ms without a break, but most of the time."""
+    chart, q = planar_for_control, planar_for_control.problem.domain.centre
+    slow = Safety.of(supervised_law, speed_limit=0.3)
+    for peak, wanted in ((0.32, 0), (0.45, 1)):
+        supervisor = Supervisor(supervised_library, supervised_law, slow)
+        supervisor.start(q)
+        for k in range(200):
+            phase = 2 * np.pi * 100 * k * TICK + 0.3
+            swing = peak * np.array([0.0, 0.0, 1.0])
+            place = q - swing * (np.cos(phase) - np.cos(0.3)) / (2 * np.pi * 100)
+            supervisor.step(place, swing * np.sin(phase), at_rest(chart, q), TICK)
+        assert supervisor.mode == wanted  # the law, the catcher
+        assert (supervisor.cause == ControlStatus.TOO_FAST) == bool(wanted)
+
+
 @pytest.mark.slow
 def test_a_spike_of_an_encoder_and_the_speed_made_from_it_are_bad_measurements(
     supervisor: Supervisor, planar_for_control: oc.Chart
