@@ -595,7 +595,7 @@ class Arm(Shown):
     def _find_inside(self, q: Array, domain: Domain) -> Array:
         """Those of postures (N, n) that a domain holds, after full turns of joints without limits into its box."""
         bounded = np.isinf(self.robot.lower) & np.isfinite(domain.bounds[0]) & self.maps.turning
-        moved = domain.home + wrap_shortest(q - domain.home, 2 * np.pi * bounded)
+        moved = domain.home + wrap_shortest(q - domain.home, np.where(bounded, 2 * np.pi, 0.0))
         return np.asarray(moved[np.asarray(domain.contains(moved))])
 
     def _find_free(
@@ -666,7 +666,7 @@ class Arm(Shown):
         # Joints without limits may need full turns: into the box of the domain, or where turns change xi.
         endless, winds = np.isinf(self.robot.lower) & self.maps.turning, chart.parts.boxed.winding
         low, high = (np.where(winds, domain.home + k * 3 * np.pi, end) for k, end in ((-1, low), (1, high)))
-        counts = endless & np.isfinite(low)
+        counts, periods = endless & np.isfinite(low), np.where(endless, 2 * np.pi, 0.0)
         for arc in motions:
             # xi at even places of the arc, where the domain may hold them.
             places = self._list_places(arc)
@@ -674,7 +674,7 @@ class Arm(Shown):
             first = np.where(counts, np.ceil((low - along.max(axis=0)) / (2 * np.pi)), 0.0)
             last = np.where(counts, np.floor((high - along.min(axis=0)) / (2 * np.pi)), 0.0)
             for turns in product(*map(np.arange, first, last + 1)):
-                shift = 2 * np.pi * np.array(turns)
+                shift: Array = 2 * np.pi * np.array(turns, dtype=float)
                 q = along + shift
                 near = np.flatnonzero(((q >= low - RULES.spacing) & (q <= high + RULES.spacing)).all(axis=1))
                 inside, left = np.zeros(len(q), dtype=bool), np.full(len(q), np.nan)
@@ -686,10 +686,7 @@ class Arm(Shown):
                     crosses &= np.abs(left[1:] - left[:-1]) < period / 2
                 for row in np.flatnonzero(crosses):
                     posture, error = _find_root(arc, shift, miss, *places[row : row + 2].tolist())
-                    known = any(
-                        np.abs(wrap_shortest(posture - other, 2 * np.pi * endless)).max() < RULES.same
-                        for other in found
-                    )
+                    known = any(np.abs(wrap_shortest(posture - other, periods)).max() < RULES.same for other in found)
                     if abs(error) < RULES.tolerance and not known and bool(domain.contains(posture)):
                         found.append(posture)
         return found

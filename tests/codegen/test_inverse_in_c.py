@@ -184,7 +184,7 @@ def test_compiled_c_finds_what_random_starts_find(tmp_path: Path) -> None:
 def test_the_nearest_xi_may_lie_where_a_curve_begins(tmp_path: Path) -> None:
     """Newton's method ends where xi turns back, from where a closed curve inside the domain is traced.
 
-    A planar arm's postures with x are two circles of q1: of 20,001 points on each, the nearest xi is nearer by less than 0.005.
+    A planar arm has two postures with x for each q1: of 20,001 values, none has an xi nearer by 0.005.
     """
     robot = oc.Robot.planar(lengths=[1, 1, 1], masses=[3, 3, 3])
     problem = oc.Problem(robot, oc.Task.position(robot, "xy"), domain=oc.Torus(3))
