@@ -297,6 +297,9 @@ class Arm(Shown):
         posture whose xi is nearest is NEAREST; where charts hold none, one with that x within the limits is
         OUTSIDE_DOMAIN. Without xi, it is the posture nearest to the start, or without one, far from limits.
 
+        Where full turns of joints without limits change xi, those within one and a half turns of the start count, or of
+        the centre of the domain.
+
         Rows are spread over the cores, in C that is compiled on first use.
 
         Args:
