@@ -485,7 +485,8 @@ class _OperationalSpace(LawOfChart):
             # Coordinates without a spring have no integral action.
             return np.asarray(np.where(modes.frequencies > 0, decays, np.inf).min(axis=1))
 
-        return float(find_slowest(least_in_domain(find_slowest, self.problem.domain)[None])[0])
+        # A mode without damping bears none; rounding may put it below zero.
+        return max(0.0, float(find_slowest(least_in_domain(find_slowest, self.problem.domain)[None])[0]))
 
     def compute_stiffness(self, points: Array) -> Array:
         """K(q) at points (N, n), (N, n, n): the diagonal of the stiffness, or what inertia and joints leave of it."""
