@@ -154,7 +154,7 @@ def rows(arms: tuple[str, ...], runs: int) -> Iterator[str]:
 
 def row(arm: Arm, label: str, runs: int) -> str:
     """The worst of all runs of each case."""
-    frozen = [max(stands_still(arm, case) for _ in range(runs)) for case in STANDING]
+    frozen = [max(stands_still(arm, case)[0] for _ in range(runs)) for case in STANDING]
     blown = np.array([blow(arm) for _ in range(runs)]).max(axis=0)
     asked = [max(led(arm, case) for _ in range(runs)) for case in ASKED]
     held = np.array([caught(arm, delay) for delay in DELAYS for _ in range(runs)])
@@ -249,8 +249,8 @@ DELAYS = 0, 1, 3, 5  # [ms]
 STANDING = ("moving", "way back", "reference", "integral")
 
 
-def stands_still(arm: Arm, case: str) -> float:
-    """The fastest joint within 200 ms after the sensors stood still [rad/s]."""
+def stands_still(arm: Arm, case: str) -> tuple[float, float]:
+    """The fastest joint within 200 ticks after the sensors stood still [rad/s], and in its own limit of speed."""
     wrong = case == "integral"
     q, domain = arm.posture(), arm.chart.problem.domain
     if case == "way back":
@@ -260,7 +260,7 @@ def stands_still(arm: Arm, case: str) -> float:
         arm.robot.with_scaled_masses(1.2) if wrong else None,
         integral_rate=np.full(arm.chart.n, 3.0 if wrong else 0.0),
     )
-    reference, signs, most = arm.resting(q), arm.rng.choice([-1.0, 1.0], arm.chart.n), 0.0
+    reference, signs, most = arm.resting(q), arm.rng.choice([-1.0, 1.0], arm.chart.n), np.zeros(arm.chart.n)
     for k in range(SETTLED + LOOK):
         if k <= SETTLED:
             q_seen, dq_seen = arm.seen(plant)
@@ -273,8 +273,9 @@ def stands_still(arm: Arm, case: str) -> float:
         if k >= SETTLED and case == "reference":
             reference[0] += 0.02 * TICK
         plant.step(supervisor.step(*seen, reference, TICK)[0], TICK)
-        most = max(most, float(np.abs(plant.dq).max())) if k >= SETTLED else 0.0
-    return most
+        if k >= SETTLED:
+            most = np.maximum(most, np.abs(plant.dq))
+    return float(most.max()), float((most / arm.limits).max())
 
 
 def motion(chart: oc.Chart, q: Array, dq: Array, ddq: ArrayLike = 0.0) -> Array:
