@@ -111,12 +111,17 @@ def inside(chart: oc.Chart, rows: int) -> dict[str, float]:
 def in_c(compiled: CompiledInverse, path: Any, q: Any) -> float:
     """Seconds of a call of NAME_inverse: means of 100 calls in one thread, the best of some."""
     run, seconds = ctypes.CDLL(str(compiled.library)).arm_inverse_rows, []
-    targets, starts = path[1:].copy(), q[:-1].copy()
-    results = np.empty_like(starts)
+    targets, starts = path[1:].copy(), q[:-1]
+    results, residual = np.empty_like(starts), np.empty_like(targets)
+    condition, within = np.empty(len(targets)), np.empty(len(targets), dtype=np.bool_)
     for first in [*range(0, len(targets) - TICKS + 1, TICKS)] * REPEATS:
-        arrays = [ctypes.c_void_p(array[first:].ctypes.data) for array in (targets, starts, results)]
+        # C puts solutions in the places of the starts.
+        results[first : first + TICKS] = starts[first : first + TICKS]
+        places = (
+            ctypes.c_void_p(array[first:].ctypes.data) for array in (targets, results, residual, condition, within)
+        )
         begin = time.perf_counter()
-        run(ctypes.c_long(TICKS), ctypes.c_int(ITERATIONS), *arrays[:2], None, arrays[2], None, None)
+        run(ctypes.c_long(TICKS), ctypes.c_int(ITERATIONS), *places)
         seconds.append((time.perf_counter() - begin) / TICKS)
     known = slice(len(targets) // TICKS * TICKS)
     np.testing.assert_allclose(results[known], q[1:][known], atol=1e-9)
