@@ -110,7 +110,7 @@ def codegen(
     # Pairs that no distance in C will ever see are for the user to judge.
     if capsules is not None and capsules.dropped:
         pairs = listed([f"{first} and {second}" for first, second in capsules.dropped])
-        remarks.append(f"not checked in C, because their capsules touch in all postures: {pairs}")
+        remarks.append(f"not checked in C, because their capsules touch in every posture tried: {pairs}")
     agreement = check_c(generated, loaded, law) if check else None
     report = _build_report(generated, agreement)
     if json:

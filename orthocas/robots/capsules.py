@@ -56,7 +56,7 @@ class FittedCapsules(Shown):
     ratios: Mapping[str, float]  #: volume of the capsules over that of the solids, by link
     ratio: float  #: the same of all links together
     pieces: tuple[tuple[str, Array, Part], ...]  #: links, corners (K, 3) of their pieces, and the capsules of these
-    dropped: tuple[Pair, ...] = ()  #: pairs whose capsules touch in all postures, and are not checked
+    dropped: tuple[Pair, ...] = ()  #: pairs whose capsules touch in all seeded postures, and are not checked
 
     def facts(self) -> dict[str, str]:
         """How many there are, and how much larger than the links."""

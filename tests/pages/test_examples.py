@@ -12,8 +12,10 @@ import certificates
 import clear_positions
 import collisions
 import compare_parametrisations
+import contact
 import distillation
 import domain_size
+import elastic_joints
 import elbow_angle
 import exported_inverse
 import exported_nearest
@@ -276,6 +278,18 @@ def test_benchmark_of_the_inverse_finds_every_row(capsys: pytest.CaptureFixture[
     assert {found[f"{solver}, none found"] for solver in ("NumPy", "compiled C")} == {1.0}
     assert {value for name, value in found.items() if name.endswith("wrong")} == {0}
     assert len(re.findall(r"\| (?:NumPy|compiled C) \|", capsys.readouterr().out)) == 8
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+@needs_c
+def test_benchmarks_of_contact_and_gears_lose_no_arm() -> None:
+    for benchmark in (contact, elastic_joints):
+        found = benchmark.main(quick=True)
+        assert found["runs"] >= 3
+        assert found["lost"] == 0
+    # without the springs' sag taken off, the tip is off by millimetres
+    assert found["gravity"] < 0.1 < found["motors"]
 
 
 @pytest.mark.nightly
