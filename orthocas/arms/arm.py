@@ -289,7 +289,7 @@ class Arm(Shown):
         *,
         all: bool = False,  # noqa: A002
     ) -> Postures:
-        """A posture within the joint limits for each task value, or all with one x and xi.
+        """A posture within the joint limits for each task value, or all that are found for one x and xi.
 
         With xi, charts are asked in turn: that of the start's branch first, or else the largest. Newton's method goes
         to (x, xi) from the start, or from the nearest of stored postures; the first chart in which it arrives gives the
@@ -311,8 +311,10 @@ class Arm(Shown):
                 the same x and xi takes its place; else, of free postures 0.05 rad apart on the arcs, that with the
                 nearest xi (NEAREST), or without xi that nearest to the start, or farthest from limits. Where none is
                 free, the status is COLLIDING.
-            all: return all postures with one task value in which the chart of their branch has one xi, those without a
-                contact first, the others COLLIDING. Without xi, they are the arcs of `self_motion`.
+            all: return the postures with one task value in which the chart of their branch has one xi, those without a
+                contact first, the others COLLIDING. They are sought between places 0.05 rad apart on the arcs, so
+                that some are missed where less of an arc lies in the domain, or where xi turns back in between. Without
+                xi, postures are the arcs of `self_motion`.
 
         Raises:
             InvalidValueError, ShapeError: for arguments that do not fit, an xi or branch without charts, or all without
