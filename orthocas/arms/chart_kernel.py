@@ -9,14 +9,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.arms.kernel import RULES as CURVES
 from orthocas.arms.kernel import build_curvature, write_curves
 from orthocas.arms.maps import ArmMaps
 from orthocas.charts.chart import Chart
-from orthocas.codegen.compiled import keep_library, load_library
-from orthocas.codegen.kernels import generate_kernels
-from orthocas.codegen.library import pointer
 from orthocas.codegen.rendering import render
+from orthocas.native.curves import RULES as CURVES
+from orthocas.native.kernels import generate_kernels
+from orthocas.native.libraries import keep_library, load_library, pointer
 from orthocas.tasks.regular_box import find_joint_range
 from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.cached import cached_property
