@@ -682,11 +682,12 @@ class Arm(Shown):
                 shift: Array = 2 * np.pi * np.array(turns, dtype=float)
                 q = along + shift
                 near = np.flatnonzero(((q >= low - RULES.spacing) & (q <= high + RULES.spacing)).all(axis=1))
-                inside, left = np.zeros(len(q), dtype=bool), np.full(len(q), np.nan)
+                left = np.full(len(q), np.nan)
                 if near.size:
-                    inside[near], left[near] = np.asarray(domain.contains(q[near])), miss(q[near])
+                    left[near] = miss(q[near])
                 # A change of sign between two places has a posture with this xi, unless xi jumps by its period there.
-                crosses = (left[:-1] * left[1:] <= 0) & (inside[:-1] | inside[1:])
+                # Only that posture need lie in the domain, of which the arc may pass a short part.
+                crosses = left[:-1] * left[1:] <= 0
                 if period:
                     crosses &= np.abs(left[1:] - left[:-1]) < period / 2
                 for row in np.flatnonzero(crosses):
