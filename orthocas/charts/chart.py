@@ -324,7 +324,7 @@ class Chart(Shown):
 
         Returns:
             Solutions that differ by more than full turns of joints without boundaries, the one nearest to the centre of
-            the domain first, (k, n).
+            the domain first, (k, n). Where full turns change xi, those within one and a half turns of the centre.
 
         Raises:
             NoExpressionError: if the coordinates are grown.
