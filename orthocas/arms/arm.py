@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -690,8 +691,17 @@ class Arm(Shown):
                 crosses = left[:-1] * left[1:] <= 0
                 if period:
                     crosses &= np.abs(left[1:] - left[:-1]) < period / 2
-                for row in np.flatnonzero(crosses):
-                    posture, error = _find_root(arc, shift, miss, *places[row : row + 2].tolist())
+                pairs = [places[row : row + 2].tolist() for row in np.flatnonzero(crosses)]
+                # Where xi turns back between two places, there may be one on both sides of the turn.
+                ahead, size = np.abs(np.diff(left)), np.abs(left)
+                dips = (left[:-2] * left[1:-1] > 0) & (left[2:] * left[1:-1] > 0) & (size[1:-1] <= size[:-2])
+                dips &= (size[1:-1] <= size[2:]) & (size[1:-1] <= np.maximum(ahead[:-1], ahead[1:]))
+                for row in np.flatnonzero(dips):
+                    begin, end = places[row], places[row + 2]
+                    turn = _find_turn(arc, shift, miss, begin, end, float(np.sign(left[row])))
+                    pairs += [] if turn is None else [[begin, turn], [turn, end]]
+                for begin, end in pairs:
+                    posture, error = _find_root(arc, shift, miss, begin, end)
                     known = any(np.abs(wrap_shortest(posture - other, periods)).max() < RULES.same for other in found)
                     if abs(error) < RULES.tolerance and not known and bool(domain.contains(posture)):
                         found.append(posture)
@@ -723,6 +733,23 @@ def _agree(chart: Chart, task: Task) -> bool:
     q = chart.problem.domain.home[None]
     same = chart.m == task.m and chart.n == task.robot.n
     return same and bool(np.allclose(chart.problem.task.batched(q)[0], task.batched(q)[0], rtol=0, atol=1e-9))
+
+
+def _find_turn(
+    arc: Arc, shift: Array, f: Callable[[Array], Array], low: float, high: float, sign: float
+) -> float | None:
+    """A place between two on an arc, shifted, where f has another sign than at both; None if there is none."""
+    ratio = (math.sqrt(5) - 1) / 2
+    for _ in range(RULES.steps):
+        pair = high - ratio * (high - low), low + ratio * (high - low)
+        first, second = (sign * f(arc.at(np.array(pair)) + shift)).tolist()
+        if min(first, second) < 0:
+            return pair[0] if first < second else pair[1]
+        low, high = (low, pair[1]) if first < second else (pair[0], high)
+        # What is left no longer falls.
+        if abs(first - second) < RULES.met:
+            break
+    return None
 
 
 def _find_root(arc: Arc, shift: Array, f: Callable[[Array], Array], low: float, high: float) -> tuple[Array, float]:

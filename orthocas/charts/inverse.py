@@ -252,8 +252,8 @@ def solve_all(chart: Chart, phi: Array, tolerance: float, collisions: Collisions
     away = np.where(chart.parts.boxed.winding, np.abs(every - domain.home), 0.0)
     every = every[np.asarray((away <= RULES.turned).all(axis=1))]
     # of all that are found, those that differ by more than full turns, the nearest to the centre first
-    turns = np.zeros(chart.n)
-    turns[list(chart.problem.turning)] = 2 * np.pi
+    endless = np.isinf(domain.bounds[0]) & ~np.array(chart.problem.robot.tree.prismatic)
+    turns = np.where(endless, 2 * np.pi, 0.0)
     kept: list[int] = []
     for k in np.argsort(np.linalg.norm((every - domain.centre) / domain.half_width, axis=1)):
         apart = np.abs(wrap_shortest(every[k] - every[kept], turns)) / domain.half_width
