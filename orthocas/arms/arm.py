@@ -313,9 +313,8 @@ class Arm(Shown):
                 nearest xi (NEAREST), or without xi that nearest to the start, or farthest from limits. Where none is
                 free, the status is COLLIDING.
             all: return the postures with one task value in which the chart of their branch has one xi, those without a
-                contact first, the others COLLIDING. They are sought between places 0.05 rad apart on the arcs, so
-                that some are missed where less of an arc lies in the domain, or where xi turns back in between. Without
-                xi, postures are the arcs of `self_motion`.
+                contact first, the others COLLIDING. They are sought between places 0.05 rad apart on the arcs, also
+                where xi turns back once in between. Without xi, postures are the arcs of `self_motion`.
 
         Raises:
             InvalidValueError, ShapeError: for arguments that do not fit, an xi or branch without charts, or all without

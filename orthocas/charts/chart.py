@@ -396,6 +396,9 @@ class Chart(Shown):
         until it leaves the domain or meets a fold. The ends are exact to 1e-9; the path between them is checked at
         steps of at most 0.1 rad or m.
 
+        With r = 1 and no collisions it is C, compiled at the first call for a chart (a second or two) and kept for
+        later ones; without a C compiler, Python finds the same in some ten times the time.
+
         Args:
             q: a joint position (n,) inside the domain.
             collisions: of the chart's robot, such as `robot.collisions`: a range ends where a pair touches, which its
