@@ -10,6 +10,7 @@ import casadi as ca
 import casadi_dynamics
 import certificates
 import clear_positions
+import collision_scenes
 import collisions
 import compare_parametrisations
 import contact
@@ -339,6 +340,14 @@ def test_benchmark_beyond_reach_finds_nothing_nearer() -> None:
     assert found["panda-wide, settled"] == 1
     assert found["panda-wide, left"] == 0
     assert found["panda-wide, way [m]"] > 0.05
+
+
+@pytest.mark.nightly
+def test_benchmark_of_scenes_moves_the_elbow_into_a_slot() -> None:
+    """Without pink, whose barrier then has no answer; contacts are looked for at all ticks and between them."""
+    found = collision_scenes.main(quick=True)
+    assert found["into a slot, planned, done"] == found["into a slot, ours, done"] == 1
+    assert found["into a slot, ours, contacts"] == 0
 
 
 @pytest.mark.nightly
