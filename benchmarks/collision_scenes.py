@@ -230,7 +230,8 @@ def main(quick: bool = False) -> dict[str, float]:
         warnings.simplefilter("ignore")
         head = "scene | method | lines | done | with a contact | hand off at most, median [mm] | time of a tick [ms]"
         print(f"| {head} |")
-        table("| --- " * (head.count("|") + 1) + "|", compare(("into a slot",) if quick else (), 1 if quick else 4, found))
+        asked = (("into a slot",), 1) if quick else ((), 4)
+        table("| --- " * (head.count("|") + 1) + "|", compare(*asked, found))
     return found
 
 

@@ -29,7 +29,7 @@ from simulate_command import SHORT
 import orthocas as oc
 from orthocas import problems
 from orthocas.arms import kernel as arm_kernel
-from orthocas.charts import quality
+from orthocas.charts import point_quality, quality
 from orthocas.cli import simulate
 from orthocas.cli.entry import main
 from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared, compiled, compiled_inverse
@@ -42,6 +42,8 @@ from orthocas.tools.checks import Array
 compile_shared.__defaults__ = (("-O0",), None)  # users' -O2 takes gcc three times as long, and computes the same
 compiled._FLAGS, compiled_inverse._FLAGS = ("-O1",), (*STRICT, "-O1")  # as their -O2 and -O3; here it runs for longer
 arm_kernel._FLAGS = (*STRICT, "-O2")
+# Descents as long as users', from a third of the candidates: laws look for their fastest and slowest modes with them.
+point_quality.WORST = replace(point_quality.WORST, candidates=2000, descents=100, kept=20)
 sys.dont_write_bytecode = False  # for the test files, which come after this one
 quality.RULES = replace(
     quality.RULES, samples=20_000

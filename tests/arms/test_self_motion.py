@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from conftest import arm as read_arm
-from programs import needs_c
+from programs import needs_c, nightly
 from random_arms import random_arm
 
 import orthocas as oc
@@ -73,7 +73,7 @@ def test_postures_of_newtons_method_are_on_the_arcs_of_random_positions(seed: in
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["iiwa7-wide", "xarm7-wide", "baxter-left-wide"])
+@pytest.mark.parametrize("name", ["xarm7-wide", *nightly("iiwa7-wide", "baxter-left-wide")])
 def test_postures_of_newtons_method_are_on_the_arcs_of_other_arms(name: str) -> None:
     require_all_found(oc.Arm(oc.Task.pose(oc.load(name).robot)), seed=2, poses=2, starts=100)
 

@@ -45,8 +45,8 @@ def test_joints_that_stick_leave_x_and_xi_within_half_a_millimetre_and_0_02(char
     robot = chart.problem.robot
     coulomb = np.minimum(5.0, 0.1 * robot.effort_limits)
     plant = StickingPlant(robot, friction=Friction(0.0, coulomb, 1.25 * coulomb))
-    bare, _ = led(chart, None, 4.0, plant)
-    errors, speeds = led(chart, FrictionObserver(), 8.0, plant)
+    bare, _ = led(chart, None, 2.0, plant)
+    errors, speeds = led(chart, FrictionObserver(), 6.0, plant)
     assert np.linalg.norm(bare[-1, :3]) > 0.5e-3
     assert np.linalg.norm(errors[3000:, :3], axis=1).max() < 0.5e-3
     assert np.abs(errors[3000:, chart.m :]).max() < 0.02

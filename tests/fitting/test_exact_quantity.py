@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from conftest import robot_data
 from numpy.typing import NDArray
-from programs import Run, needs_c
+from programs import Run, needs_c, nightly
 
 import orthocas as oc
 from orthocas import control
@@ -68,8 +68,13 @@ def wrapped(angles: Numbers) -> Numbers:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", SEW_KINDS)
-@pytest.mark.parametrize("name", list(ARMS))
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        *zip(ARMS, SEW_KINDS * 2, strict=True),
+        *nightly(*zip(ARMS, SEW_KINDS[::-1] * 2, strict=True)),
+    ],
+)
 def test_xi_is_the_swivel_and_moves_it_by_what_is_asked(name: str, kind: SEWKind) -> None:
     fit, robot = swivel_fit(name, kind), robot_of(name)
     chart, domain, least = fit.chart, fit.chart.problem.domain, ARMS[name][3][SEW_KINDS.index(kind)]

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from conftest import ROBOTS, robot_data
-from programs import Run
+from programs import Run, nightly
 from public_objects import suggestion
 
 import orthocas as oc
@@ -194,7 +194,7 @@ def test_progress_is_reported_and_ctrl_c_ends_the_search() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("joints", [6, 10])
+@pytest.mark.parametrize("joints", [6, *nightly(10)])
 def test_progress_rises_to_the_end_of_the_search_and_waits_nowhere(joints: int) -> None:
     seen: list[Progress] = []
     robot = oc.Robot.planar([3.0 / joints] * joints, [1.0] * joints)

@@ -434,7 +434,7 @@ def test_several_coordinates_are_regular_together() -> None:
 def test_coordinates_in_the_metric_of_the_inertia_are_regular_in_the_domain() -> None:
     """Orthogonal in M, four coordinates of the arm are nearly parallel otherwise, and the domain would be empty."""
     task, cubic = oc.Task.position(iiwa()), oc.Polynomial(3, ["A1"])
-    fit = oc.fit_wide(iiwa(), task, home_branch(), "inertia", parametrisation=cubic, samples=2500)
+    fit = oc.fit_wide(iiwa(), task, home_branch(), "inertia", parametrisation=cubic, samples=1500)
     assert fit.regular_share > 0.99
     q = sample_uniform(fit.chart.problem.domain, 2000, 6)
     J = np.concatenate([geometric_jacobians(iiwa(), q)[:, :3], fit.chart.coordinates.jacobian(q)], axis=1)
@@ -771,10 +771,10 @@ def test_command_fits_a_branch(run: Run) -> None:
         "--out",
         "a",
     )
-    code, out, err = run(*words, "--domain", "branch:shoulder+ elbow- wrist+", "--samples", "3000", "--json")
+    code, out, err = run(*words, "--domain", "branch:shoulder+ elbow- wrist+", "--samples", "1000", "--json")
     assert (code, err) == (0, "")
     assert json.loads(out)["branch"] == "shoulder+ elbow- wrist+"
-    code, out, _ = run(*words, "--domain", "branch:shoulder+ elbow- wrist+", "--samples", "3000", "--force")
+    code, out, _ = run(*words, "--domain", "branch:shoulder+ elbow- wrist+", "--samples", "1000", "--force")
     assert code == 0
     assert ": xi1: like swivel [rad]" in out
     message = "orthocas: --domain branch has a solver of its own: leave out --solver\n"
