@@ -9,12 +9,14 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # or every Python that tests st
 
 import gc
 import json
+import pickle
 import signal
 import sys
 import threading
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -37,13 +39,28 @@ from orthocas.codegen.library import STRICT
 from orthocas.control import PDPlus, Reference
 from orthocas.fitting.fit import Fit
 from orthocas.robots import pinocchio_model, urdf
+from orthocas.tasks import branches
 from orthocas.tools.checks import Array
 
 compile_shared.__defaults__ = (("-O0",), None)  # users' -O2 takes gcc three times as long, and computes the same
 compiled._FLAGS, compiled_inverse._FLAGS = ("-O1",), (*STRICT, "-O1")  # as their -O2 and -O3; here it runs for longer
 arm_kernel._FLAGS = (*STRICT, "-O2")
-# Descents as long as users', from a third of the candidates: laws look for their fastest and slowest modes with them.
-point_quality.WORST = replace(point_quality.WORST, candidates=2000, descents=100, kept=20)
+# Descents as long as users', from a sixth of the candidates: laws look for their fastest and slowest modes with them.
+point_quality.WORST = replace(point_quality.WORST, candidates=1000, descents=50, kept=10)
+
+_find_cuts = branches._Arm.find_cuts
+_CUTS: dict[Any, list[branches.Cut]] = {}
+
+
+def _remember_cuts(arm: branches._Arm, k: int) -> list[branches.Cut]:
+    """The cuts of a joint, found once for robots of the same content: many tests fit the same arms."""
+    key = pickle.dumps((arm.robot, arm.task.recipe, arm.joints, k)), branches._Arm._measure_slice
+    if key not in _CUTS:
+        _CUTS[key] = _find_cuts(arm, k)
+    return list(_CUTS[key])
+
+
+branches._Arm.find_cuts = _remember_cuts  # type: ignore[method-assign]
 sys.dont_write_bytecode = False  # for the test files, which come after this one
 quality.RULES = replace(
     quality.RULES, samples=20_000
@@ -256,6 +273,12 @@ def run_simulate(run: Run, planar_fit: Fit) -> Run:
 def unoptimised(monkeypatch: pytest.MonkeyPatch) -> None:
     """CMake builds in half the time, for tests of what hardly runs."""
     monkeypatch.setenv("CMAKE_BUILD_TYPE", "Debug")
+
+
+@pytest.fixture
+def whole_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Searches of worst points as users have them, for tests of what they find."""
+    monkeypatch.setattr(point_quality, "WORST", point_quality.WorstRules())
 
 
 @pytest.fixture

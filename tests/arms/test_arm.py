@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from programs import nightly
 
 import orthocas as oc
 from orthocas.arms import Postures
@@ -158,7 +159,7 @@ def test_known_arms_load_by_name() -> None:
         oc.Arm.load("iwa")
 
 
-@pytest.mark.parametrize(("name", "branches"), [("panda", 4), ("iiwa7", 8), ("xarm7", 8), ("baxter-left", 4)])
+@pytest.mark.parametrize(("name", "branches"), [("panda", 4), ("iiwa7", 8), ("baxter-left", 4), *nightly(("xarm7", 8))])
 def test_ready_arms_have_charts_of_all_branches(name: str, branches: int) -> None:
     """Held-out postures of each domain: xi rises along the self-motion, and x and xi lead back to the branch."""
     arm = oc.Arm.load(name)

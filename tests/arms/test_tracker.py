@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from programs import nightly
 
 import orthocas as oc
 from orthocas.arms import ArmTracker, TrackStatus
@@ -114,7 +115,7 @@ def test_jumps_are_followed_as_fast_as_joints_may() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["iiwa7-wide", "xarm7-wide", "baxter-left-wide"])
+@pytest.mark.parametrize("name", ["xarm7-wide", *nightly("iiwa7-wide", "baxter-left-wide")])
 def test_hostile_streams_neither_break_limits_nor_lose_the_arm(name: str) -> None:
     """Jumps, targets out of reach and behind the base, NaN: afterwards, x and xi of the begin are met again."""
     chart, rng = oc.load(name), np.random.default_rng(4)

@@ -404,7 +404,7 @@ def test_gradients_agree_with_pytorch() -> None:
     assert len(gradients.main(quick=True)) == 2  # it checks values and gradients before timing
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_elbow_angle_leans_farther_into_the_task_than_fitted_coordinates() -> None:
     """The benchmark takes leaks straight from Jacobians; `evaluate` has formulas of its own."""
     found = {name: numbers["leak rms [deg]"] for name, numbers in elbow_angle.main(quick=True).items()}
@@ -424,7 +424,7 @@ def test_the_elbow_angle_leans_farther_into_the_task_than_fitted_coordinates() -
         np.testing.assert_allclose(same.xi(points), own.xi(points), atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_benchmark_of_quantities_has_them_exactly_and_nearly() -> None:
     exact, near = quantities.main(quick=True)
     assert [row.split(" | ")[0] for row in (*exact, *near)] == [
