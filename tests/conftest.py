@@ -17,6 +17,7 @@ from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pinocchio as pin
@@ -36,7 +37,7 @@ from orthocas.cli import simulate
 from orthocas.cli.entry import main
 from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared, compiled, compiled_inverse
 from orthocas.codegen.library import STRICT
-from orthocas.control import PDPlus, Reference
+from orthocas.control import PDPlus, Reference, gains, operational_space
 from orthocas.fitting.fit import Fit
 from orthocas.robots import pinocchio_model, urdf
 from orthocas.tasks import branches
@@ -45,8 +46,16 @@ from orthocas.tools.checks import Array
 compile_shared.__defaults__ = (("-O0",), None)  # users' -O2 takes gcc three times as long, and computes the same
 compiled._FLAGS, compiled_inverse._FLAGS = ("-O1",), (*STRICT, "-O1")  # as their -O2 and -O3; here it runs for longer
 arm_kernel._FLAGS = (*STRICT, "-O2")
-# Descents as long as users', from a sixth of the candidates: laws look for their fastest and slowest modes with them.
-point_quality.WORST = replace(point_quality.WORST, candidates=1000, descents=50, kept=10)
+
+
+def _search_briefly(value: point_quality.Value, domain: oc.Domain, seed: int = 0) -> Array:
+    """As users' search for the fastest and slowest mode of a law, from a sixth of the candidates."""
+    fewer = replace(point_quality.WORST, candidates=1000, descents=50, kept=10)
+    with patch.object(point_quality, "WORST", fewer):
+        return point_quality.least_in_domain(value, domain, seed)
+
+
+operational_space.least_in_domain = gains.least_in_domain = _search_briefly  # type: ignore[attr-defined]
 
 _find_cuts = branches._Arm.find_cuts
 _CUTS: dict[Any, list[branches.Cut]] = {}
@@ -273,12 +282,6 @@ def run_simulate(run: Run, planar_fit: Fit) -> Run:
 def unoptimised(monkeypatch: pytest.MonkeyPatch) -> None:
     """CMake builds in half the time, for tests of what hardly runs."""
     monkeypatch.setenv("CMAKE_BUILD_TYPE", "Debug")
-
-
-@pytest.fixture
-def whole_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Searches of worst points as users have them, for tests of what they find."""
-    monkeypatch.setattr(point_quality, "WORST", point_quality.WorstRules())
 
 
 @pytest.fixture

@@ -361,7 +361,7 @@ class _OperationalSpace(LawOfChart):
         """Of an arm that the motors cannot hold; none if the robot compensates gravity itself."""
         if self.model.gravity == "robot":
             return []
-        return find_holding_doubts(self._robot, self.problem.domain, self.limit)
+        return find_holding_doubts(self.model.robot(self.problem), self.problem.domain, self.limit)
 
     @property
     def gains(self) -> dict[str, Array]:

@@ -157,7 +157,6 @@ def test_domains_that_force_folds_are_fitted_without_the_term(planar_xy: oc.Prob
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("whole_search")
 def test_thorough_descents_find_what_samples_and_short_ones_miss() -> None:
     """L-BFGS-B with differences, from 60 starts, found 0.298 on the PR2's chart, whose card said 0.336."""
     chart = oc.charts.load("pr2-left-position")
@@ -167,7 +166,6 @@ def test_thorough_descents_find_what_samples_and_short_ones_miss() -> None:
     assert oc.charts.card("pr2-left-position").quality["conditioning"]["min"] == pytest.approx(thorough, abs=1e-3)
 
 
-@pytest.mark.usefixtures("whole_search")
 def test_a_search_of_the_domain_ends_where_a_function_is_least() -> None:
     """A narrow valley to a corner, and a part without values where it would be less."""
     box = oc.Box([1.0, 2.0, 3.0], [0.5, 1.0, 2.0])

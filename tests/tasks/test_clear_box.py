@@ -240,7 +240,6 @@ def test_the_bound_takes_the_folds_out_of_a_box_with_singular_positions(problem:
     assert problem.domain.contains(report.worst.points).all()
 
 
-@pytest.mark.usefixtures("whole_search")
 def test_the_search_for_worst_points_stays_inside(problem: oc.Problem, chart: oc.Chart) -> None:
     found = worst_points(problem, chart.coordinates, seed=4)
     assert problem.domain.contains(found.points).all()
