@@ -45,6 +45,7 @@ def along(x: Array, way: Array, steps: int) -> Array:
     return targets
 
 
+@pytest.mark.slow
 def test_inside_a_chart_x_and_xi_are_met() -> None:
     arm, chart, q = panda(), panda().charts[0], centre()
     tracker, phi = arm.tracker(q, period=PERIOD), chart.phi(centre())
@@ -254,6 +255,7 @@ def test_following_a_path_is_a_call_for_each_of_its_values() -> None:
     assert np.abs(arm.x(q) - targets).max() < 1e-8
 
 
+@pytest.mark.slow
 def test_a_copied_tracker_goes_on_where_the_first_one_is() -> None:
     arm = panda()
     tracker, x = arm.tracker(centre()), arm.x(centre())

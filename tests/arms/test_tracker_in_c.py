@@ -17,6 +17,7 @@ from orthocas.errors import InvalidValueError
 WARNINGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["panda-wide", *nightly("iiwa7-wide")])
 def test_generated_ticks_are_those_of_python(name: str, tmp_path: Path) -> None:
     """On a motion in the chart, jumps, NaN, and the way back to x and xi."""

@@ -34,6 +34,7 @@ def test_no_random_start_leads_to_a_nearer_xi(name: str) -> None:
     assert known > 20 * len(x)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["panda-wide", "iiwa7-pose", "ur10-position", "panda-position"])
 def test_all_solutions_are_those_that_random_starts_find(name: str) -> None:
     """Newton's method from 1,000 of them."""
@@ -65,6 +66,7 @@ def test_few_random_starts_lead_to_a_nearer_xi_where_curves_fill_surfaces() -> N
     assert nearer <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inside", [False, True])
 @pytest.mark.parametrize("name", ["pr2-left-wide", "panda-position"])
 def test_where_nothing_leads_to_x_nothing_is_claimed(name: str, inside: bool) -> None:
@@ -76,6 +78,7 @@ def test_where_nothing_leads_to_x_nothing_is_claimed(name: str, inside: bool) ->
     assert np.isfinite(found.q).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inside", [False, True])
 def test_positions_near_boundaries_are_found_again(inside: bool) -> None:
     """Of 2,000, 12 were missed, and with `inside` said to lie nowhere in the domain."""

@@ -232,6 +232,7 @@ def test_kernels_compute_sines_of_joints_once(planar_chart: oc.Chart, tmp_path: 
     assert turns(once) == 2 * 3 < turns(graph)
 
 
+@pytest.mark.slow
 def test_statuses_of_the_header_are_those_of_python(supervised_c: GeneratedC) -> None:
     """One name and number each, also for `STOPPED_EARLY`, which no law returns."""
     header = (supervised_c.folder / "arm.h").read_text()

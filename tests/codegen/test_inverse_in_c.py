@@ -180,6 +180,7 @@ def test_compiled_c_finds_what_random_starts_find(tmp_path: Path) -> None:
         assert near.distance[k] <= np.abs(chart.xi(others)[:, 0] - chart.xi(wishes[k])[0]).min() + 1e-6
 
 
+@pytest.mark.slow
 @needs_c
 def test_the_nearest_xi_may_lie_where_a_curve_begins(tmp_path: Path) -> None:
     """Newton's method ends where xi turns back, from where a closed curve inside the domain is traced.

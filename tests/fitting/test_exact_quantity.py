@@ -187,6 +187,7 @@ def test_a_joint_that_is_regular_nearly_everywhere_is_the_coordinate_by_itself(t
     assert near.chart.parts.named_coordinates == ("xi1: like platform [rad]",)
 
 
+@pytest.mark.slow
 def test_coordinates_are_fitted_where_a_quantity_folds() -> None:
     """Joints of a planar arm: self-motions change the first one steadily, and turn the second one back."""
     known = oc.problems.get("planar_3r_xy")
@@ -228,6 +229,7 @@ def test_several_quantities_are_coordinates_if_there_are_enough_of_them() -> Non
         oc.fit_wide(robot, task, box, like=["q1", lambda q: 2 * q[0]], exact=True)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_exact_is_refused() -> None:
     known = oc.problems.get("planar_3r_xy")
     robot, task = known.robot, known.task

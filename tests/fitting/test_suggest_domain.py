@@ -37,6 +37,7 @@ def suggested(**asked: object) -> object:
     return oc.suggest_domain(*planar(), HOME, **{"parametrisation": oc.Polynomial(2, cyclic="auto"), **asked})
 
 
+@pytest.mark.slow
 def test_domains_are_suggested_for_linear_coordinates() -> None:
     """Trials are quadratic, which linear coordinates cannot begin from."""
     known = problems.get("planar_3r_x")
@@ -292,6 +293,7 @@ def test_contradictory_options_are_refused(run: Run, words: tuple[str, ...], com
     assert complaint in err
 
 
+@pytest.mark.slow
 def test_box_is_searched_with_the_weights_of_the_fit(planar_xy: oc.Problem) -> None:
     boxes = {}
     for angles in ("paper", "metric"):

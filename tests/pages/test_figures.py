@@ -12,6 +12,7 @@ CARDS = figures.Record("cards", "measured", tables=[["", *ready_charts.table()]]
 PAGES = figures.pages()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
 def test_every_measured_number_of_a_page_has_a_record(page: str) -> None:
     assert figures.unrecorded(PAGES[page], [*RECORDS.values(), CARDS]) == []

@@ -93,6 +93,7 @@ def test_torques_and_settings_that_cannot_be_used_are_refused(
     assert free.check_start(q, torque)[1] is ControlStatus.BAD_INPUT
 
 
+@pytest.mark.slow
 def test_limits_of_gains_and_velocity_laws_leave_gravity_as_it_is(
     supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart, tmp_path: Path
 ) -> None:
