@@ -59,8 +59,8 @@ def charts(
         if json:
             print_json({"charts": [ready.as_dict() for ready in cards]})
         else:
-            head = ("name", "robot", "n", "m", "r", "leak [deg]", "least conditioning", "licence")
-            print_table([head, *map(_format_card, cards)])
+            head = ("name", "robot", "n m r", "leak [deg]", "least conditioning", "licence")
+            print_table([head, *map(_format_card, cards)], f"orthocas view {cards[0].name}")
         return
     ready = card(name)
     if out is not None:
@@ -75,9 +75,9 @@ def charts(
 
 def _format_card(ready: Card) -> tuple[str, ...]:
     numbers = ready.quality
-    sizes = (str(numbers[name]) for name in "nmr")
+    sizes = " ".join(str(numbers[name]) for name in "nmr")
     leak, least = f"{numbers['leak_deg']['rms']:.2f}", f"{numbers['conditioning']['min']:.2f}"
-    return ready.name, ready.model.robot, *sizes, leak, least, ready.model.licence
+    return ready.name, ready.model.robot, sizes, leak, least, ready.model.licence
 
 
 def evaluate(

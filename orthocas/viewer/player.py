@@ -224,7 +224,7 @@ def record_scene(build: Scene) -> str:
         for t in np.linspace(0.0, duration, round(RULES.rate * duration) + 1)[: None if duration else 0]:
             show(float(t))
             serializer.insert_sleep(1 / RULES.rate)
-        return build_page(str(serializer.as_html()).encode()).decode()
+        return build_page(str(serializer.as_html()).encode(), "motion").decode()
     finally:
         close_window(server)
 

@@ -237,7 +237,7 @@ def test_pages_of_others_in_a_real_browser_get_no_websocket(view: View, tmp_path
         page.open(view.url)  # the same script in the page's own origin, and the page itself
         page.wait("!!document.querySelector('canvas')")
         assert page.value(code) == "in"
-        assert page.value("document.title") == "orthocas"
+        assert page.value("document.title").endswith(" - orthocas")
         page.open(page.value("location.href"))  # viser adds to the address; it stays one that can be opened
         page.wait("!!document.querySelector('canvas')")
         evil.shutdown()
