@@ -146,7 +146,7 @@ def test_pages_are_served_to_those_with_the_address_only(view: View) -> None:
     parts = urlsplit(view.url)
     assert status(view.url, parts.path) == 200
     for packed in ("identity", "gzip"):
-        assert title(view.url, packed) == "orthocas"
+        assert title(view.url, packed) == "tip - orthocas"
     assert status(view.url, f"{parts.path}/?fixedDpr=0.3", Origin=f"http://{parts.netloc}") == 200
     assert status(view.url, parts.path, Host=f"localhost:{parts.port}") == 200
     assert status(view.url, "/") == 403
