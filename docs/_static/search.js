@@ -10,17 +10,35 @@ var Scorer = {
   partialTerm: 2,
 
   score: ([page, , , , score, , kind]) => {
-    // An entry of the index that is the query itself has 100 and stays first.
+    // An entry of the index that is the query itself has 100 and stays first; `named` has scored what is like it.
     if (kind === "index") return score;
     const folders = {"how-to": 12, tutorials: 12, explanation: 6, reference: -4, measurements: -10, decisions: -30};
     const places = {changelog: -30, gallery: -10, policies: -5};
-    const asked = (new URLSearchParams(location.search).get("q") || "").toLowerCase().split(/\W+/);
-    const {docnames, indexentries} = Search._index, number = docnames.indexOf(page);
-    // Words of the query that the page names in the index, also with another ending.
-    const alike = (a, b) => a === b || (Math.min(a.length, b.length) > 3 && (a.startsWith(b) || b.startsWith(a)));
-    const named = Object.entries(indexentries).filter(([, spots]) => spots.some(([doc]) => doc === number));
-    const words = named.flatMap(([entry]) => entry.split(/\W+/));
-    const hits = asked.filter(word => word.length > 2 && words.some(other => alike(word, other))).length;
-    return score + (folders[page.split("/")[0]] ?? places[page] ?? 0) + 8 * hits;
+    return score + (folders[page.split("/")[0]] ?? places[page] ?? 0);
   },
 };
+
+// Sphinx defines `Search` below, in the same file, and asks it when the page is ready.
+queueMicrotask(() => {
+  const STOP = new Set("a an and are at can do does for from get has how i in is it me my of on or the to use what when where which why with".split(" "));
+  const split = text => text.toLowerCase().split(/[^\p{L}\d]+/u).filter(word => word && !STOP.has(word));
+  const alike = (a, b) => a === b || (Math.min(a.length, b.length) > 3 && (a.startsWith(b) || b.startsWith(a)));
+
+  // Pages whose title and entries of the index hold every word of the query, in any order and with other endings.
+  const named = query => {
+    const {docnames, filenames, titles, indexentries} = Search._index, asked = split(query);
+    const words = titles.map(split);
+    for (const [entry, spots] of Object.entries(indexentries))
+      for (const [number, , main] of spots) if (main) words[number].push(...split(entry));
+    const hit = number => asked.every(word => words[number].some(other => alike(word, other)));
+    const guide = number => /^(how-to|tutorials|explanation)\//.test(docnames[number]);
+    return asked.length === 0 ? [] : docnames.map((_, number) => number).filter(number => guide(number) && hit(number))
+      .map(number => [docnames[number], titles[number], "", null, 45, filenames[number], SearchResultKind.index]);
+  };
+
+  const terms = Search.performTermsSearch;
+  Search.performTermsSearch = (searched, excluded) => {
+    const query = new URLSearchParams(location.search).get("q") || "";
+    return [...terms(searched, excluded), ...named(query)];
+  };
+});
