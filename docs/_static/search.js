@@ -24,16 +24,26 @@ queueMicrotask(() => {
   const split = text => text.toLowerCase().split(/[^\p{L}\d]+/u).filter(word => word && !STOP.has(word));
   const alike = (a, b) => a === b || (Math.min(a.length, b.length) > 3 && (a.startsWith(b) || b.startsWith(a)));
 
-  // Pages whose title and entries of the index hold every word of the query, in any order and with other endings.
+  // Pages whose title and entries of the index hold the words of the query, in any order and with other endings. A word
+  // counts by how few pages have it; one that no page has does not count. A page that has most of them comes before text.
   const named = query => {
     const {docnames, filenames, titles, indexentries} = Search._index, asked = split(query);
-    const words = titles.map(split);
+    const guide = number => /^(how-to|tutorials|explanation|reference|policies)/.test(docnames[number]);
+    const entries = titles.map((title, number) => guide(number) ? [split(title)] : []);
     for (const [entry, spots] of Object.entries(indexentries))
-      for (const [number, , main] of spots) if (main) words[number].push(...split(entry));
-    const hit = number => asked.every(word => words[number].some(other => alike(word, other)));
-    const guide = number => /^(how-to|tutorials|explanation)\//.test(docnames[number]);
-    return asked.length === 0 ? [] : docnames.map((_, number) => number).filter(number => guide(number) && hit(number))
-      .map(number => [docnames[number], titles[number], "", null, 45, filenames[number], SearchResultKind.index]);
+      for (const [number, , main] of spots) if (main && guide(number)) entries[number].push(split(entry));
+    const has = (number, word) => entries[number].some(words => words.some(other => alike(word, other)));
+    const pages = docnames.map((_, number) => number).filter(guide);
+    const weights = asked.map(word => pages.filter(number => has(number, word)).length)
+      .map(count => count && Math.log(1 + pages.length / count));
+    const whole = weights.reduce((sum, weight) => sum + weight, 0);
+    return pages.map(number => {
+      const held = asked.reduce((sum, word, k) => sum + (has(number, word) ? weights[k] : 0), 0) / whole;
+      const closest = Math.max(0, ...entries[number].map(words =>
+        words.filter(word => asked.some(other => alike(word, other))).length / Math.max(words.length, asked.length)));
+      return [held, 45 * held + 15 * closest, number];
+    }).filter(([held]) => held > 0.6)
+      .map(([, score, k]) => [docnames[k], titles[k], "", null, Math.round(score), filenames[k], SearchResultKind.index]);
   };
 
   const terms = Search.performTermsSearch;
