@@ -31,6 +31,7 @@ def print_json(data: Mapping[str, Any]) -> None:
 
 def print_rows(rows: dict[str, str], then: str = "") -> None:
     """Print names and values in two columns; to people also what to do next, a command."""
+    # People get a table as wide as their terminal; files and pipes one line a row, which programs can read.
     if sys.stdout.isatty():
         _draw(list((rows | {"next": then} if then else rows).items()))
         return
@@ -47,6 +48,7 @@ def print_table(rows: Sequence[Sequence[str]], then: str = "") -> None:
         if then:
             print_rows({"next": then})
         return
+    # A long last cell, such as an explanation, does not widen its column for all rows.
     aligned = [row if len(row) == len(head) else row[:-1] for row in rows]
     widths = [max(len(row[k]) for row in aligned if k < len(row)) for k in range(len(head))]
     for row in rows:
@@ -79,6 +81,7 @@ def note(text: str) -> None:
 
 def format_report_rows(report: "Report", chart: "Chart") -> dict[str, str]:
     """The rows of a quality report, with what is normal for a wide chart, or advice on options for a tight one."""
+    # The standards of tight charts say nothing of wide ones, whose leaks are large by nature.
     rows = report.facts()
     if "branch" in chart.notes:
         rows["wide"] = (
@@ -139,6 +142,7 @@ def terminal_monitor() -> Iterator[Monitor]:
 @contextmanager
 def lines_of_progress(pause: float) -> Iterator[Monitor]:
     """A monitor whose last report is printed every `pause` seconds, also while one step takes longer than that."""
+    # A thread of its own speaks, because one step of a fit may take longer than the pause.
     begin, reports, ended = time.monotonic(), [""], threading.Event()
 
     def show(progress: Progress) -> None:

@@ -1,6 +1,7 @@
 """MJCF files and MuJoCo's compiled models as a `pin.Model` with the mass matrix and bias of MuJoCo."""
 
 import re
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from orthocas.tools.checks import Array, as_path, import_extra
 _WORDS = ("name", "class", "childclass", "joint", "body", "file", "mesh", "material")
 
 
-def read_mjcf(source: Any) -> tuple[pin.Model, dict[str, Mimic]]:
+def read_mjcf(source: Any, locked: Mapping[str, float] | None = None) -> tuple[pin.Model, dict[str, Mimic]]:
     """The kinematics, masses, armatures, limits of position and effort, gravity, and mimic joints of an MJCF file.
 
     MuJoCo's own compiler reads the file, with meshes, includes, default classes, attached and replicated bodies. The
@@ -32,6 +33,7 @@ def read_mjcf(source: Any) -> tuple[pin.Model, dict[str, Mimic]]:
 
     Args:
         source: the path of a file, or a `mujoco.MjModel`.
+        locked: joints that the caller locks: couplings in MuJoCo yield, so these follow no more.
 
     Raises:
         MissingExtraError: if MuJoCo is not installed.
@@ -43,7 +45,8 @@ def read_mjcf(source: Any) -> tuple[pin.Model, dict[str, Mimic]]:
         compiled, name = source, "the model"
     else:
         compiled, name = compile_mjcf(source), str(as_path("path", source))
-    return _convert(mujoco, compiled, name), _find_mimics(mujoco, compiled)
+    mimics = _find_mimics(mujoco, compiled)
+    return _convert(mujoco, compiled, name), {k: mimic for k, mimic in mimics.items() if k not in (locked or {})}
 
 
 def compile_mjcf(path: Any) -> Any:

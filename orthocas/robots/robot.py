@@ -189,10 +189,7 @@ class Robot(Shown):
 
         Needs the extra `orthocas[mujoco]`, because MuJoCo's compiler reads the file.
         """
-        model, coupled = read_mjcf(path)
-        # A coupling in MuJoCo yields, so a joint that is locked follows no more.
-        mimics = {name: mimic for name, mimic in coupled.items() if name not in (locked or {})}
-        robot = cls._from_chain(model, mimics, _check_tips(tip, tips), locked, tool, base, gravity)
+        robot = cls._from_chain(*read_mjcf(path, locked), _check_tips(tip, tips), locked, tool, base, gravity)
         if not isinstance(path, str | PathLike):
             return robot
         source = CollisionSource(as_path("path", path).absolute(), None, dict(locked or {}))
