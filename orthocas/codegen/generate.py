@@ -14,7 +14,6 @@ import numpy as np
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
 from orthocas.codegen.distance import render_distance
-from orthocas.codegen.kernels import Kernels, generate_kernels, share_calls, share_sines
 from orthocas.codegen.rendering import (
     DOUBLE,
     SINGLE,
@@ -31,6 +30,7 @@ from orthocas.control.controller import Controller, require_controller
 from orthocas.control.memory import find_memory
 from orthocas.control.safety import Safety
 from orthocas.errors import ArchiveError, InvalidValueError
+from orthocas.native.kernels import Kernels, generate_kernels, share_calls, share_sines
 from orthocas.robots.capsules import FittedCapsules
 from orthocas.robots.kinematics import TipTurn
 from orthocas.tools.checks import Array, as_path, require_kind, require_shape

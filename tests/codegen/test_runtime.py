@@ -13,8 +13,9 @@ from programs import PROGRAMS, needs_c, output_of
 
 import orthocas as oc
 from orthocas.codegen import GeneratedC
-from orthocas.codegen.library import STRICT, find_compilers
+from orthocas.codegen.library import STRICT
 from orthocas.control import PDPlus
+from orthocas.native.libraries import find_compilers
 
 pytestmark = needs_c
 
