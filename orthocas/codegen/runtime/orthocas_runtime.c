@@ -732,6 +732,11 @@ static int frozen(const orthocas_arm *arm, const orthocas_state *state, const do
   return faster_than(arm, dq, safety->rest_speed, rules.stirring) || faster_than(arm, speed, safety->stuck_speed, 1.0);
 }
 
+/* A count of ticks after one more, which counts its milliseconds if there are several: slower programs wait no longer. */
+static int later(int ticks, double period) {
+  return ticks < rules.forever ? ticks + (int)fmax(1.0, fmin(1e3 * period + 0.5, 1e3)) : ticks;
+}
+
 /* Look at a measurement. Returns whether it can be used. */
 static int look(const orthocas_arm *arm, orthocas_state *state, const double *q, const double *dq, double period,
                 double *work) {
@@ -746,8 +751,9 @@ static int look(const orthocas_arm *arm, orthocas_state *state, const double *q,
   if (!same && good) {
     state->same_ticks = 0;
     set_zero(state->impulse, n);
-  } else if (same && state->same_ticks < rules.forever) {
-    ++state->same_ticks;
+    if (arm->torque) set_zero(state->momentum, n);
+  } else if (same) {
+    state->same_ticks = later(state->same_ticks, period);
   }
   return good && !frozen(arm, state, dq, work);
 }
@@ -763,6 +769,7 @@ static void watch_sensors(const orthocas_arm *arm, orthocas_state *state, const 
     const double held = arm->torque ? state->safety->friction[i] : 0.0;
     const double least = fmin(from[i], fallback[i]) - held, most = fmax(from[i], fallback[i]) + held;
     state->impulse[i] += (command[i] - fmin(fmax(command[i], least), most)) * period;
+    if (arm->torque) state->momentum[i] += (command[i] - fmin(fmax(command[i], least + held), most - held)) * period;
   }
 }
 
@@ -1263,21 +1270,46 @@ ORTHOCAS_API void orthocas_stand(const orthocas_arm *arm, orthocas_state *state,
 
 /* ---- one tick ---- */
 
-/* R27: without a measurement, the command is held for hold_ticks; then it goes to the fallback, and the catcher is to
- * take over. */
+/* An arm that nobody sees is braked as the model foresees it: from its last speeds and the momentum that it got since, at
+ * the catcher's damping. What held it when it stood still holds it again. first: whether it was lost just now. */
+static void brake_unseen(const orthocas_arm *arm, orthocas_state *state, int first, const double *fallback, double period,
+                         double *command, double *work) {
+  const int n = arm->n;
+  double *M = take(&work, n * n), *bias = take(&work, n), *gravity = take(&work, n), *held = take(&work, n * n);
+  int i, j;
+  if (first && !faster_than(arm, state->dq, state->safety->rest_speed, rules.stirring))
+    for (i = 0; i < n; ++i) state->load[i] = state->impulse_from[i] - fallback[i];
+  (void)orthocas_dynamics(arm, state->q, state->dq, M, bias, gravity);
+  copy(held, M, n * n);
+  if (!solve(arm, held, state->momentum, n, 1)) set_zero(state->momentum, n);
+  for (i = 0; i < n; ++i) {
+    state->dq[i] += state->momentum[i];
+    state->q[i] += period * state->dq[i];
+  }
+  (void)orthocas_dynamics(arm, state->q, state->dq, M, bias, gravity);
+  for (i = 0; i < n; ++i) {
+    held[i] = command[i] = fallback[i] + state->load[i] + bias[i] - gravity[i];
+    for (j = 0; j < n; ++j) command[i] -= state->safety->damping * M[i * n + j] * state->dq[j];
+  }
+  (void)cut_command(arm, state, period, command);
+  for (i = 0; i < n; ++i) state->momentum[i] = (command[i] - held[i]) * period;
+}
+
+/* R27: without a measurement, the command is held for hold_ticks; then the catcher is to take over, and stops the arm. */
 static void tick_without_measurement(const orthocas_arm *arm, orthocas_state *state, const orthocas_gains *gains,
                                      double period, double *command, double *work) {
-  if (state->bad_ticks < state->safety->hold_ticks) {
-    ++state->bad_ticks;
-    copy(command, state->command, arm->n);
-  } else {
-    if (state->mode == ORTHOCAS_LAW || state->mode == ORTHOCAS_RETURN)
-      catch_arm(arm, state, ORTHOCAS_BAD_INPUT, state->q);
-    state->weight = 0.0;
-    fallback_at(arm, state->q, gains->used, command);
-    if (state->fresh == 2) learn_from_start(arm, state, gains, gains->used, work);
-    if (arm->torque) add_load(arm, state, 1.0, command);
-  }
+  const int hold = state->safety->hold_ticks, lost = state->bad_ticks >= hold;
+  const int first = state->bad_ticks < hold + later(0, period);
+  double *fallback = take(&work, arm->n);
+  fallback_at(arm, state->q, gains->used, fallback);
+  copy(command, lost ? fallback : state->command, arm->n);
+  if (lost && (state->mode == ORTHOCAS_LAW || state->mode == ORTHOCAS_RETURN))
+    catch_arm(arm, state, ORTHOCAS_BAD_INPUT, state->q);
+  if (lost) state->weight = 0.0;
+  if (lost && state->fresh == 2) learn_from_start(arm, state, gains, gains->used, work);
+  if (lost && arm->torque) brake_unseen(arm, state, first, fallback, period, command, work);
+  else watch_sensors(arm, state, fallback, command, period);
+  state->bad_ticks = later(state->bad_ticks, period);
   (void)cut_command(arm, state, period, command);
   copy(state->command, command, arm->n);
 }

@@ -157,7 +157,7 @@ typedef struct {
   double weight, brake, unseen, hasty;
   double *q, *dq, *seen_q, *seen_dq, *command, *led, *impulse, *impulse_from, *law, *anchor, *safe, *limit; /* (n,) */
   double *offset, *integral;                                                                                /* (k,) */
-  double *load, *drive, *speed, *expected, *unexplained;                     /* (n,), null for velocity laws */
+  double *load, *drive, *speed, *expected, *unexplained, *momentum;          /* (n,), null for velocity laws */
   double *inertia;                                                           /* (n, n), null for velocity laws */
   double *memory;                                                            /* (memory,) or null */
   orthocas_reference reference;
@@ -178,7 +178,7 @@ typedef struct {
 #define ORTHOCAS_NEAREST_WORK(n, rooms)                                                                               \
   (4 * (n) * (n) + 14 * (n) + 4 * (rooms) + 3 * (n) * (rooms) + (2 * (n) + (rooms)) * (2 * (n) + (rooms) + 1))
 #define ORTHOCAS_NEAREST_HELD(n, rooms) ((n) + (rooms))
-#define ORTHOCAS_LAW_WORK(n, k, shared, memory) (2 * (n) * (n) + 10 * (n) + 9 * (k) + (shared) + (memory))
+#define ORTHOCAS_LAW_WORK(n, k, shared, memory) (3 * (n) * (n) + 10 * (n) + 9 * (k) + (shared) + (memory))
 
 /* Of phi, in searches without a bound of the caller. */
 #define ORTHOCAS_EVALUATIONS 100
