@@ -810,16 +810,34 @@ static void move_anchor(const orthocas_arm *arm, orthocas_state *state, double p
 
 static int works(int law) { return law == ORTHOCAS_OK || law == ORTHOCAS_SATURATED; }
 
+/* Whether joints are faster than their limits, or would be before the torque that drives them can be taken back: it changes by
+ * no more than command_rate, so its momentum is a square. */
+static int hurries(const orthocas_arm *arm, const orthocas_state *state, const double *dq, double *work) {
+  const int n = arm->n;
+  double *M = take(&work, n * n), *speed = take(&work, n);
+  int i;
+  if (faster_than(arm, dq, state->safety->speed_limit, 1.0)) return 1;
+  if (!arm->torque || state->mode != ORTHOCAS_LAW) return 0;
+  for (i = 0; i < n; ++i) {
+    const double drive = state->drive[i] - state->load[i];
+    speed[i] = 0.5 * drive * fabs(drive) / fmax(state->safety->command_rate[i], arm->numbers.smallest);
+  }
+  copy(M, state->inertia, n * n);
+  if (!solve(arm, M, speed, n, 1)) return 0;
+  for (i = 0; i < n; ++i) speed[i] += dq[i];
+  return faster_than(arm, speed, state->safety->speed_limit, 1.0);
+}
+
 /* R12: who commands, by the table of modes. law: its status. Joints may be fast for 5 ms, which they get back in 10 ms. */
 static void choose_mode(const orthocas_arm *arm, orthocas_state *state, int law, const double *q, const double *dq,
                         double clear, double room, const double *error, double period, int late, double *work) {
   const orthocas_safety *safety = state->safety;
-  const int hurries = faster_than(arm, dq, safety->speed_limit, 1.0), fast = hurries && state->hasty >= rules.hasty;
+  const int hurry = hurries(arm, state, dq, work), fast = hurry && state->hasty >= rules.hasty;
   const int ready = works(law) && room >= safety->return_margin;
   double *speed = take(&work, arm->n);
   int i;
   for (i = 0; i < arm->n; ++i) speed[i] = clipped(dq[i], safety->speed_limit[i]);
-  state->hasty = hurries ? fmin(state->hasty + period, rules.hasty) : fmax(0.0, state->hasty - 0.5 * period);
+  state->hasty = hurry ? fmin(state->hasty + period, rules.hasty) : fmax(0.0, state->hasty - 0.5 * period);
   if (state->mode == ORTHOCAS_LAW) {
     if (!works(law)) catch_arm(arm, state, law, q);
     else if (distance(arm, q, speed, safety->fade_out, clear, work) < safety->catch_margin)
