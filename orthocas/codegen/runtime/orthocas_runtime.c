@@ -1393,10 +1393,13 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   if (state->fresh) settle(arm, state, here, room, work);
   status = arm->kernels.control(shared, here, speed, &shifted, gains->used, law);
   fallback_at(arm, here, gains->used, fallback);
-  for (i = 0; i < n && works(status); ++i) state->law[i] = law[i] - fallback[i];
-
   /* Who commands, and the command. */
   choose_mode(arm, state, status, here, speed, clear, room, error, since, late, work);
+  for (i = 0; i < n; ++i) { /* a law that gives way gets no more than it had */
+    const double had = state->command[i] - fallback[i];
+    if (works(status)) state->law[i] = law[i] - fallback[i];
+    if (state->mode != ORTHOCAS_LAW) state->law[i] = fmin(fmax(state->law[i], fmin(had, 0.0)), fmax(had, 0.0));
+  }
   if (works(status) && state->mode == ORTHOCAS_LAW && room >= safety->return_margin + rules.room)
     copy(state->safe, here, n); /* the law works here */
   if (arm->torque)
