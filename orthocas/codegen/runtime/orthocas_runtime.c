@@ -37,6 +37,7 @@ static const struct {
   double far_off;     /* from what the observer of velocities expects: it begins anew [rad] or [m] */
   double deep;        /* so near to the path of a corridor is near enough, as it may run along a limit of the box [radii] */
   double hasty;       /* time for which a joint may exceed its speed limit: light ones do as they break away [s] */
+  double stopping;    /* time constant with which a reference comes to rest that does not go on [s] */
   int forever;        /* ticks; a counter stops there, before it overflows */
   int bisections;     /* of the way of a stream to the boundary: 1e-3 of it */
   int sweeps;         /* of rotations for an eigenvalue; they converge quadratically */
@@ -46,7 +47,7 @@ static const struct {
 #ifndef ORTHOCAS_CHART_ONLY
   .turn = 6.283185307179586, .longest = 1e6, .implausible = 30.0, .jitter = 0.01, .alike = 0.2, .stirring = 1e-3,
   .standing = 0.1, .room = 0.05, .nearly = 0.2, .slow = 1.0 / 3.0, .settling = 0.5, .giving = 0.02, .learning = 2.0,
-  .lifted = 0.5, .far_off = 0.1, .deep = 0.5, .hasty = 5e-3, .forever = 1000000, .bisections = 10, .sweeps = 6,
+  .lifted = 0.5, .far_off = 0.1, .deep = 0.5, .hasty = 5e-3, .stopping = 0.1, .forever = 1000000, .bisections = 10, .sweeps = 6,
 #endif
 };
 
@@ -810,8 +811,8 @@ static void move_anchor(const orthocas_arm *arm, orthocas_state *state, double p
 
 static int works(int law) { return law == ORTHOCAS_OK || law == ORTHOCAS_SATURATED; }
 
-/* Whether joints are faster than their limits, or would be before the torque that drives them can be taken back: it changes by
- * no more than command_rate, so its momentum is a square. */
+/* Whether joints are faster than their limits, or are on the way there: before the torque that drives them can be taken back,
+ * by command_rate, it brings a momentum of half its square over that rate. Friction may take its share. */
 static int hurries(const orthocas_arm *arm, const orthocas_state *state, const double *dq, double *work) {
   const int n = arm->n;
   double *M = take(&work, n * n), *speed = take(&work, n);
@@ -819,7 +820,7 @@ static int hurries(const orthocas_arm *arm, const orthocas_state *state, const d
   if (faster_than(arm, dq, state->safety->speed_limit, 1.0)) return 1;
   if (!arm->torque || state->mode != ORTHOCAS_LAW) return 0;
   for (i = 0; i < n; ++i) {
-    const double drive = state->drive[i] - state->load[i];
+    const double felt = state->drive[i] - state->load[i], drive = felt - clipped(felt, state->safety->friction[i]);
     speed[i] = 0.5 * drive * fabs(drive) / fmax(state->safety->command_rate[i], arm->numbers.smallest);
   }
   copy(M, state->inertia, n * n);
@@ -858,7 +859,7 @@ static void choose_mode(const orthocas_arm *arm, orthocas_state *state, int law,
 /* ---- the reference of the law ---- */
 
 /* R13: take a reference if it can be followed: finite, and not standing still for long while it claims to move. If not,
- * the last value holds. measured, error: those of the value; change: its difference from the last one. Returns whether it
+ * the last one comes to rest, and its value holds. measured, error: those of the value; change: its difference from the last one. Returns whether it
  * is good. */
 static int take_reference(const orthocas_arm *arm, orthocas_state *state, const double *shared,
                           const orthocas_reference *reference, double period, double *measured, double *error,
@@ -877,8 +878,13 @@ static int take_reference(const orthocas_arm *arm, orthocas_state *state, const 
   }
   if (bad || !all_finite(arm, error, k) || !all_finite(arm, change, k)) {
     arm->kernels.deviation(shared, state->q, state->reference.value, measured, error);
-    set_zero(change, k);
-    stop_reference(arm, &state->reference);
+    arm->kernels.gap(&state->reference, state->reference.value, change, rate, bend);
+    for (i = 0; i < k; ++i) {
+      change[i] = fabs(rate[i]) <= arm->numbers.largest ? rate[i] * period : 0.0;
+      state->offset[i] += change[i];
+      state->reference.velocity[i] *= fmax(0.0, 1.0 - period / rules.stopping);
+      state->reference.acceleration[i] = -state->reference.velocity[i] / rules.stopping;
+    }
     return 0;
   }
   for (i = 0; i < k; ++i) {
