@@ -38,6 +38,7 @@ static const struct {
   double deep;        /* so near to the path of a corridor is near enough, as it may run along a limit of the box [radii] */
   double hasty;       /* time for which a joint may exceed its speed limit: light ones do as they break away [s] */
   double stopping;    /* time constant with which a reference comes to rest that does not go on [s] */
+  double trend;       /* rate of the filter of speeds that shows accelerations [1/s] */
   int forever;        /* ticks; a counter stops there, before it overflows */
   int bisections;     /* of the way of a stream to the boundary: 1e-3 of it */
   int sweeps;         /* of rotations for an eigenvalue; they converge quadratically */
@@ -47,7 +48,7 @@ static const struct {
 #ifndef ORTHOCAS_CHART_ONLY
   .turn = 6.283185307179586, .longest = 1e6, .implausible = 30.0, .jitter = 0.01, .alike = 0.2, .stirring = 1e-3,
   .standing = 0.1, .room = 0.05, .nearly = 0.2, .slow = 1.0 / 3.0, .settling = 0.5, .giving = 0.02, .learning = 2.0,
-  .lifted = 0.5, .far_off = 0.1, .deep = 0.5, .hasty = 5e-3, .stopping = 0.1, .forever = 1000000, .bisections = 10, .sweeps = 6,
+  .lifted = 0.5, .far_off = 0.1, .deep = 0.5, .hasty = 5e-3, .trend = 200.0, .stopping = 0.1, .forever = 1000000, .bisections = 10, .sweeps = 6,
 #endif
 };
 
@@ -811,29 +812,25 @@ static void move_anchor(const orthocas_arm *arm, orthocas_state *state, double p
 
 static int works(int law) { return law == ORTHOCAS_OK || law == ORTHOCAS_SATURATED; }
 
-/* Whether joints are faster than their limits, or are on the way there: before the torque that drives them can be taken back,
- * by command_rate, it brings a momentum of half its square over that rate. Friction may take its share. */
-static int hurries(const orthocas_arm *arm, const orthocas_state *state, const double *dq, double *work) {
-  const int n = arm->n;
-  double *M = take(&work, n * n), *speed = take(&work, n);
-  int i;
-  if (faster_than(arm, dq, state->safety->speed_limit, 1.0)) return 1;
-  if (!arm->torque || state->mode != ORTHOCAS_LAW) return 0;
-  for (i = 0; i < n; ++i) {
-    const double felt = state->drive[i] - state->load[i], drive = felt - clipped(felt, state->safety->friction[i]);
-    speed[i] = 0.5 * drive * fabs(drive) / fmax(state->safety->command_rate[i], arm->numbers.smallest);
+/* Whether joints are faster than their limits, or are on the way there: they go on to accelerate, half as much on average, until
+ * the torque that drives them is taken back, which takes time by command_rate. */
+static int hurries(const orthocas_arm *arm, orthocas_state *state, const double *dq, double period) {
+  const orthocas_safety *safety = state->safety;
+  int i, hurry = faster_than(arm, dq, safety->speed_limit, 1.0);
+  for (i = 0; i < arm->n && arm->torque; ++i) {
+    const double gained = dq[i] - state->trend[i], torque = fabs(state->drive[i] - state->load[i]);
+    const double soon = 0.5 * rules.trend * gained * torque / fmax(safety->command_rate[i], arm->numbers.smallest);
+    hurry = hurry || (state->mode == ORTHOCAS_LAW && fabs(dq[i] + soon) > safety->speed_limit[i]);
+    state->trend[i] += fmin(1.0, rules.trend * period) * gained;
   }
-  copy(M, state->inertia, n * n);
-  if (!solve(arm, M, speed, n, 1)) return 0;
-  for (i = 0; i < n; ++i) speed[i] += dq[i];
-  return faster_than(arm, speed, state->safety->speed_limit, 1.0);
+  return hurry;
 }
 
 /* R12: who commands, by the table of modes. law: its status. Joints may be fast for 5 ms, which they get back in 10 ms. */
 static void choose_mode(const orthocas_arm *arm, orthocas_state *state, int law, const double *q, const double *dq,
                         double clear, double room, const double *error, double period, int late, double *work) {
   const orthocas_safety *safety = state->safety;
-  const int hurry = hurries(arm, state, dq, work), fast = hurry && state->hasty >= rules.hasty;
+  const int hurry = hurries(arm, state, dq, period), fast = hurry && state->hasty >= rules.hasty;
   const int ready = works(law) && room >= safety->return_margin;
   double *speed = take(&work, arm->n);
   int i;
