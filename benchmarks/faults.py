@@ -255,7 +255,9 @@ def stands_still(arm: Arm, case: str) -> tuple[float, float]:
     q, domain = arm.posture(), arm.chart.problem.domain
     if case == "way back":
         # Outside a tight domain, but within the joint's stops.
-        q[1] = min(domain.centre[1] + 1.25 * min(domain.half_width[1], 2.0), arm.safety.upper[1] - arm.safety.stop_zone[1])
+        q[1] = min(
+            domain.centre[1] + 1.25 * min(domain.half_width[1], 2.0), arm.safety.upper[1] - arm.safety.stop_zone[1]
+        )
     supervisor, plant = arm.started(
         q,
         arm.robot.with_scaled_masses(1.2) if wrong else None,

@@ -252,7 +252,7 @@ static const orthocas_arm *arm;
 static orthocas_state state;
 static orthocas_safety safety;
 static orthocas_reference reference, given;
-static double numbers[40 * N + 2 * N * N], settings[20][N], values[6][K], work[WORK];
+static double numbers[48 * N + 2 * N * N], settings[20][N], values[6][K], work[WORK];
 static double q[N], dq[N], command[N], limit[N], used[2 * N];
 static const double anything[N] = {INFINITY, INFINITY, INFINITY};
 
@@ -292,8 +292,9 @@ static void open_all(const orthocas_arm *which) {
   double *next = numbers, **places[] = {&state.q, &state.dq, &state.seen_q, &state.seen_dq, &state.command, &state.led,
                                         &state.impulse, &state.impulse_from, &state.law, &state.anchor, &state.safe,
                                         &state.limit, &state.offset, &state.integral, &state.load, &state.drive,
-                                        &state.speed, &state.expected, &state.unexplained, &state.reference.value,
-                                        &state.reference.velocity, &state.reference.acceleration};
+                                        &state.speed, &state.expected, &state.unexplained, &state.momentum, &state.trend,
+                                        &state.reference.value, &state.reference.velocity,
+                                        &state.reference.acceleration};
   size_t i;
   memset(&state, 0, sizeof state);
   memset(numbers, 0, sizeof numbers);

@@ -816,11 +816,13 @@ static int works(int law) { return law == ORTHOCAS_OK || law == ORTHOCAS_SATURAT
  * the torque that drives them is taken back, which takes time by command_rate. */
 static int hurries(const orthocas_arm *arm, orthocas_state *state, const double *dq, double period) {
   const orthocas_safety *safety = state->safety;
+  double until = 0.0;
   int i, hurry = faster_than(arm, dq, safety->speed_limit, 1.0);
+  for (i = 0; i < arm->n && arm->torque; ++i)
+    until = fmax(until, fabs(state->drive[i] - state->load[i]) / fmax(safety->command_rate[i], arm->numbers.smallest));
   for (i = 0; i < arm->n && arm->torque; ++i) {
-    const double gained = dq[i] - state->trend[i], torque = fabs(state->drive[i] - state->load[i]);
-    const double soon = 0.5 * rules.trend * gained * torque / fmax(safety->command_rate[i], arm->numbers.smallest);
-    hurry = hurry || (state->mode == ORTHOCAS_LAW && fabs(dq[i] + soon) > safety->speed_limit[i]);
+    const double gained = dq[i] - state->trend[i], soon = 0.5 * rules.trend * gained * until; /* as they gain */
+    hurry = hurry || (state->mode == ORTHOCAS_LAW && gained * dq[i] > 0.0 && fabs(dq[i] + soon) > safety->speed_limit[i]);
     state->trend[i] += fmin(1.0, rules.trend * period) * gained;
   }
   return hurry;
@@ -1398,10 +1400,11 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   fallback_at(arm, here, gains->used, fallback);
   /* Who commands, and the command. */
   choose_mode(arm, state, status, here, speed, clear, room, error, since, late, work);
-  for (i = 0; i < n; ++i) { /* a law that gives way gets no more than it had */
+  for (i = 0; i < n; ++i) { /* a law that made joints fast gets no more than it had */
     const double had = state->command[i] - fallback[i];
     if (works(status)) state->law[i] = law[i] - fallback[i];
-    if (state->mode != ORTHOCAS_LAW) state->law[i] = fmin(fmax(state->law[i], fmin(had, 0.0)), fmax(had, 0.0));
+    if (state->mode == ORTHOCAS_CATCHER && state->cause == ORTHOCAS_TOO_FAST)
+      state->law[i] = fmin(fmax(state->law[i], fmin(had, 0.0)), fmax(had, 0.0));
   }
   if (works(status) && state->mode == ORTHOCAS_LAW && room >= safety->return_margin + rules.room)
     copy(state->safe, here, n); /* the law works here */
