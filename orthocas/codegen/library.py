@@ -59,10 +59,10 @@ def compile_shared(
         CompileError: if compilation fails; the message starts with the compiler's first lines.
     """
     library = folder / f"lib{generated.name}.so"
-    source = generated.folder / f"{generated.name}.c"
+    sources = [generated.folder / f"{generated.name}{end}.c" for end in ("", "_distance")]
     compiler = find_compilers()[0] if compiler is None else compiler
     warnings = (*STRICT, *(NO_DOUBLE if generated.single_precision else ()))
-    command = [compiler, *warnings, *flags, "-fPIC", "-shared", "-o", str(library), str(source), "-lm"]
+    command = [compiler, *warnings, *flags, "-fPIC", "-shared", "-o", str(library), *(str(path) for path in sources if path.exists()), "-lm"]
     run_program(command)
     return library
 

@@ -39,6 +39,7 @@ static const struct {
   double hasty;       /* time for which a joint may exceed its speed limit: light ones do as they break away [s] */
   double stopping;    /* time constant with which a reference comes to rest that does not go on [s] */
   double trend;       /* rate of the filter of speeds that shows accelerations [1/s] */
+  double contact;     /* distance of links that counts as 1 [m]: catch_margin to return_margin are 2 to 20 mm */
   int forever;        /* ticks; a counter stops there, before it overflows */
   int bisections;     /* of the way of a stream to the boundary: 1e-3 of it */
   int sweeps;         /* of rotations for an eigenvalue; they converge quadratically */
@@ -48,7 +49,7 @@ static const struct {
 #ifndef ORTHOCAS_CHART_ONLY
   .turn = 6.283185307179586, .longest = 1e6, .implausible = 30.0, .jitter = 0.01, .alike = 0.2, .stirring = 1e-3,
   .standing = 0.1, .room = 0.05, .nearly = 0.2, .slow = 1.0 / 3.0, .settling = 0.5, .giving = 0.02, .learning = 2.0,
-  .lifted = 0.5, .far_off = 0.1, .deep = 0.5, .hasty = 5e-3, .trend = 200.0, .stopping = 0.1, .forever = 1000000, .bisections = 10, .sweeps = 6,
+  .lifted = 0.5, .far_off = 0.1, .deep = 0.5, .hasty = 5e-3, .contact = 0.2, .trend = 200.0, .stopping = 0.1, .forever = 1000000, .bisections = 10, .sweeps = 6,
 #endif
 };
 
@@ -633,15 +634,24 @@ static double smallest_eigenvalue(double *A, int m) {
   return least;
 }
 
+/* How far the links are from each other beyond contact_margin; 1 where nothing checks that. */
+static double contact_room(const orthocas_arm *arm, const double *q, double *work) {
+  double *gradient = take(&work, arm->n), points[6], gap;
+  int pair;
+  if (arm->kernels.gap_of_links == 0) return 1.0;
+  return arm->kernels.gap_of_links(q, &gap, gradient, points, &pair) == 0 ? (gap - arm->contact_margin) / rules.contact : -1.0;
+}
+
 /* How far q is inside the condition of the domain beside its box, 0 at its boundary; 1 without one. In a corridor: 1 on the
- * path. Of a singular value: 1 as at the centre; or the room to a fold, if that is less. */
+ * path. Of a singular value: 1 as at the centre; or the room to a fold, or to a contact, if that is less. */
 static double clearance(const orthocas_arm *arm, const double *q, double *work) {
   const orthocas_boundary *boundary = &arm->boundary;
-  double *way = take(&work, boundary->lines > 0 ? boundary->counted : arm->m * arm->m), room;
-  if (boundary->lines > 0) return 1.0 - way_from_path(boundary, q, way, work);
-  if (arm->kernels.gram == 0) return 1.0;
+  double *way = take(&work, boundary->lines > 0 ? boundary->counted : arm->m * arm->m);
+  double room = contact_room(arm, q, work);
+  if (boundary->lines > 0) return fmin(room, 1.0 - way_from_path(boundary, q, way, work));
+  if (arm->kernels.gram == 0) return room;
   arm->kernels.gram(q, way);
-  room = (sqrt(fmax(smallest_eigenvalue(way, arm->m), 0.0)) - boundary->bound) / boundary->span;
+  room = fmin(room, (sqrt(fmax(smallest_eigenvalue(way, arm->m), 0.0)) - boundary->bound) / boundary->span);
   return arm->kernels.room_to_fold != 0 ? fmin(arm->kernels.room_to_fold(q), room) : room;
 }
 
@@ -828,6 +838,20 @@ static int hurries(const orthocas_arm *arm, orthocas_state *state, const double 
   return hurry;
 }
 
+/* R32: whether an arm that the catcher stops from now on stays clear of contacts: speeds towards one are bounded by its
+ * distance over the time that the law takes to give way and the catcher to stop. */
+static int stops_clear(const orthocas_arm *arm, const orthocas_safety *safety, const double *q, const double *dq,
+                       double *work) {
+  const double time = safety->fade_out + 1.0 / safety->damping;
+  double *ahead = take(&work, arm->n), nearest = contact_room(arm, q, work);
+  int i, k;
+  for (k = 1; k <= 2; ++k) {
+    for (i = 0; i < arm->n; ++i) ahead[i] = q[i] + 0.5 * k * time * dq[i];
+    nearest = fmin(nearest, contact_room(arm, ahead, work));
+  }
+  return nearest > 0.0;
+}
+
 /* R12: who commands, by the table of modes. law: its status. Joints may be fast for 5 ms, which they get back in 10 ms. */
 static void choose_mode(const orthocas_arm *arm, orthocas_state *state, int law, const double *q, const double *dq,
                         double clear, double room, const double *error, double period, int late, double *work) {
@@ -841,6 +865,8 @@ static void choose_mode(const orthocas_arm *arm, orthocas_state *state, int law,
   if (state->mode == ORTHOCAS_LAW) {
     if (!works(law)) catch_arm(arm, state, law, q);
     else if (distance(arm, q, speed, safety->fade_out, clear, work) < safety->catch_margin)
+      catch_arm(arm, state, ORTHOCAS_OUTSIDE_DOMAIN, q);
+    else if (arm->kernels.gap_of_links != 0 && !stops_clear(arm, safety, q, dq, work))
       catch_arm(arm, state, ORTHOCAS_OUTSIDE_DOMAIN, q);
     else if (fast) catch_arm(arm, state, ORTHOCAS_TOO_FAST, q);
     else if (late) catch_arm(arm, state, ORTHOCAS_LATE, q);

@@ -74,6 +74,8 @@ typedef struct {
   /* J J^T (m, m) of the task, scaled, and the volume of the coordinates, in shares of the median. */
   void (*gram)(const double *q, double *gram);
   double (*room_to_fold)(const double *q);
+  /* NAME_distance: how far links are apart. */
+  int (*gap_of_links)(const double *q, double *gap, double *gradient, double *points, int *pair);
 } orthocas_kernels;
 
 /* A part of the boundary beside the box, for supervision. None: lines and span are 0. */
@@ -128,6 +130,7 @@ typedef struct {
   int shared, memory;                    /* numbers of `shared`, and of NAME_memory */
   int memory_torque;                     /* where NAME_memory has a torque (n,) that the first command shows; or -1 */
   int turned_first, turned_end;          /* components of x that are an orientation; equal: none */
+  double contact_margin;                 /* what links keep of each other [m] */
   const int *bounded, *turning;          /* joints with boundaries of the domain; joints that turn without end (n,) */
   const double *unit;                    /* of distances to the boundaries (n,) */
   const double *turns;                   /* periods of joints in NAME_control (n,), 0: none; null: no joint turns */
