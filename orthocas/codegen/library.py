@@ -62,7 +62,17 @@ def compile_shared(
     sources = [generated.folder / f"{generated.name}{end}.c" for end in ("", "_distance")]
     compiler = find_compilers()[0] if compiler is None else compiler
     warnings = (*STRICT, *(NO_DOUBLE if generated.single_precision else ()))
-    command = [compiler, *warnings, *flags, "-fPIC", "-shared", "-o", str(library), *(str(path) for path in sources if path.exists()), "-lm"]
+    command = [
+        compiler,
+        *warnings,
+        *flags,
+        "-fPIC",
+        "-shared",
+        "-o",
+        str(library),
+        *(str(path) for path in sources if path.exists()),
+        "-lm",
+    ]
     run_program(command)
     return library
 

@@ -88,7 +88,9 @@ class Safety:
     offset_rate: Annotated[Array, "speed at which the reference goes from the arm to what is asked (k,) [1/s]"]
     integral_rate: Annotated[Array, "integral action: growth of the reference's shift per error (k,) [1/s]; 0: none"]
     integral_limit: Annotated[Array, "largest shift (k,)"]
-    hold_ticks: Annotated[int, "ticks without a good measurement for which the last command is held"]
+    hold_ticks: Annotated[
+        int, "ticks without a good measurement for which the last command is held; beyond 1 ms each: milliseconds"
+    ]
     stale_ticks: Annotated[
         int, "ticks for which a moving arm may measure the same, bit by bit; more are a bad measurement"
     ]

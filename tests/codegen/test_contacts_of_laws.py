@@ -27,10 +27,13 @@ def test_the_supervised_law_keeps_links_apart(planar_arm: oc.Chart, tmp_path: Pa
 
     law = PDPlus.on_chart(planar_arm)
     generated = oc.generate_c(planar_arm, tmp_path, law, "arm", capsules=oc.fit_capsules(around))
-    supervisor = Supervisor(CompiledLibrary(compile_shared(generated, tmp_path), "arm", 3), law, Safety.of(law, offset_rate=2.0))
+    supervisor = Supervisor(
+        CompiledLibrary(compile_shared(generated, tmp_path), "arm", 3), law, Safety.of(law, offset_rate=2.0)
+    )
     arm = Arm(robot, start)
     supervisor.start(start)
     reference, target, path, statuses = at_rest(planar_arm, start), planar_arm.phi(goal), [], []
+    arm_speed = arm.dq
     for k in range(9000):
         # Asked for the law again at rest before the ball, with a target that is free.
         if k == 5000:
@@ -40,16 +43,17 @@ def test_the_supervised_law_keeps_links_apart(planar_arm: oc.Chart, tmp_path: Pa
         if k < 3000 or k >= 5000:
             supervisor.stream(reference, target, 6.0, TICK)
         else:
-            reference[:3] = target
+            reference[:3], reference[3:] = target, 0.0
         command, status = supervisor.step(arm.q, arm.dq, reference, TICK)
         arm.move(command)
+        arm_speed = arm.dq if k < 5000 else arm_speed
         path.append(arm.q)
         statuses.append(status)
     gaps = around.distance(np.array(path)).distance
-    assert statuses[2999] in (ControlStatus.OK, ControlStatus.NEAR_BOUNDARY)
-    assert statuses[4999] is ControlStatus.CAUGHT
-    assert supervisor.cause == ControlStatus.OUTSIDE_DOMAIN
-    assert gaps[4999] < 0.15
+    # It waits near the margin, under the law or its fallback.
+    assert statuses[4999] in (ControlStatus.OK, ControlStatus.NEAR_BOUNDARY, ControlStatus.CAUGHT)
+    assert gaps[4999] < 0.06
+    assert np.abs(arm_speed).max() < 0.01
     assert gaps.min() > MARGIN - 1e-3
     assert statuses[-1] is ControlStatus.OK
     assert np.abs(path[-1] - start).max() < 0.02
