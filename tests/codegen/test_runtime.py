@@ -49,6 +49,7 @@ def test_it_is_short_and_has_no_state() -> None:
     assert not re.findall(r"\b(?:malloc|calloc|realloc|free|printf|goto|setjmp)\b", text)
 
 
+@pytest.mark.slow
 def test_it_compiles_alone_without_a_warning(tmp_path: Path) -> None:
     warnings = (*STRICT, "-Wcast-qual", "-Wstrict-prototypes", "-Wmissing-prototypes", "-Wvla")
     output_of(find_compilers()[0], *warnings, "-O2", "-c", SOURCE, "-o", tmp_path / "runtime.o")
