@@ -42,10 +42,20 @@ def compile_shared(
         CompileError: if compilation fails; the message starts with the compiler's first lines.
     """
     library = folder / f"lib{generated.name}.so"
-    source = generated.folder / f"{generated.name}.c"
+    sources = [generated.folder / f"{generated.name}{end}.c" for end in ("", "_distance")]
     compiler = find_compilers()[0] if compiler is None else compiler
     warnings = (*STRICT, *(NO_DOUBLE if generated.single_precision else ()))
-    command = [compiler, *warnings, *flags, "-fPIC", "-shared", "-o", str(library), str(source), "-lm"]
+    command = [
+        compiler,
+        *warnings,
+        *flags,
+        "-fPIC",
+        "-shared",
+        "-o",
+        str(library),
+        *(str(path) for path in sources if path.exists()),
+        "-lm",
+    ]
     run_program(command)
     return library
 
@@ -337,7 +347,7 @@ def _build_state(
     layout |= dict.fromkeys(names, joints) | dict.fromkeys(("offset", "integral"), quantities)
     if has_spring:
         layout |= dict.fromkeys(("load", "drive", "speed"), joints) | {"inertia": number * n**2}
-        layout |= dict.fromkeys(("expected", "unexplained"), joints)
+        layout |= dict.fromkeys(("expected", "unexplained", "momentum", "trend"), joints)
     # Laws that remember have their fields before the last reference.
     if memory._fields_:
         layout["memory"] = memory

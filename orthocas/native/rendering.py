@@ -28,7 +28,7 @@ def get_source(name: str, package: str = __package__) -> str:
 
 @cache
 def _environment(package: str) -> Environment:
-    """Blocks vanish with their lines; `x | numbers` are literals of C, and `x | array` an initialiser."""
+    """Blocks vanish with their lines; `x | numbers` are literals of C, `x | array` and `x | strings` initialisers."""
     from jinja2 import Environment, PackageLoader, StrictUndefined, pass_context  # charts load without it
 
     # Missing names are errors, and generated text is not HTML.
@@ -41,8 +41,14 @@ def _environment(package: str) -> Environment:
         autoescape=False,
     )
     environment.filters |= {"numbers": write_numbers, "array": lambda values: f"{{{write_numbers(values)}}}"}
+    environment.filters["strings"] = lambda words: f"{{{', '.join(map(_quote, words))}}}"
     environment.filters["code"] = pass_context(_translate)
     return environment
+
+
+def _quote(word: str) -> str:
+    """A string of C; a quote in it would end it."""
+    return '"' + word.replace('"', "'") + '"'
 
 
 def _translate(context: Context, text: str) -> str:

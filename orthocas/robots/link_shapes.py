@@ -49,7 +49,7 @@ def place_links(
     Raises:
         RobotError: if the file cannot be read, or its joints are not those of the robot.
     """
-    whole, mimics = (read_mjcf(path), {}) if path.suffix.lower() == MJCF else read_urdf(path)
+    whole, mimics = read_mjcf(path, locked) if path.suffix.lower() == MJCF else read_urdf(path)
     model = lock_joints(whole, locked or {}, mimics)
     if lost := [name for name in tree.body_joints if name not in (*model.names, *BASE_JOINTS)]:
         raise RobotError(f"{path} has the joints {listed(list(model.names)[1:])}, expected {listed(lost)} among them")
@@ -89,6 +89,7 @@ def read_mesh(file: Path, scale: Array) -> tuple[Array, Indices]:
         mesh: Any = coal.MeshLoader().load(str(file), scale)
     except RuntimeError as error:
         raise ValueError(str(error)) from None
+    # coal's arrays belong to the mesh, and end with it.
     vertices = np.array(mesh.vertices(), dtype=float).reshape(-1, 3)
     faces = np.array([[t[0], t[1], t[2]] for t in map(mesh.tri_indices, range(mesh.num_tris))], dtype=np.intp)
     if not (len(faces) and np.isfinite(vertices).all()):

@@ -39,6 +39,28 @@ class Mimic(NamedTuple):
 Mimics = Mapping[str, Mimic]  #: by the name of the joint that follows
 
 
+def resolve_mimics(direct: Mimics) -> dict[str, Mimic]:
+    """Each joint that follows, with its independent leader: leaders in `direct` may follow others.
+
+    Raises:
+        RobotError: if joints follow each other in a loop.
+    """
+    resolved = {}
+    for name in direct:
+        leader, factor, offset, passed = name, 1.0, 0.0, set[str]()
+        # Factors multiply, offsets add up.
+        while leader in direct:
+            if leader in passed:
+                raise RobotError(f"joint '{name}' mimics itself")
+            passed.add(leader)
+            step = direct[leader]
+            offset += factor * step.offset
+            factor *= step.factor
+            leader = step.leader
+        resolved[name] = Mimic(leader, factor, offset)
+    return resolved
+
+
 def build_tree(model: pin.Model, *tips: str, base: str | None = None, mimics: Mimics | None = None) -> KinematicTree:
     """Read joints, bodies, limits, tips and links from a Pinocchio model, whose base may move; see `place_on_base`.
 
@@ -165,6 +187,7 @@ def _find_limits(
     joint gets a turn from -pi to pi, where its next turns would bring a mimic joint elsewhere.
     """
     n = len(bodies) - len(follow)
+    # Own limits of all joints first, then the leaders are narrowed to what their mimics can follow.
     ends: tuple[list[float], list[float]] = ([], [])
     for i in bodies:
         joint = model.joints[i]
@@ -248,6 +271,7 @@ def lock_off_chain(model: pin.Model, *tips: str, mimics: Mimics | None = None) -
     follow = {name: mimic for name, mimic in (mimics or {}).items() if model.existJointName(name)}
     chains = [model.supports[model.frames[find_frame(model, tip)].parentJoint] for tip in tips]
     moving = {model.names[i] for supports in chains for i in supports if i > 0}
+    # A mimic joint on the way needs its leader, wherever that is, and the leader moves its other mimics too.
     for name in sorted(moving & follow.keys()):
         if not model.existJointName(leader := follow[name].leader):
             raise RobotError(f"joint '{name}' mimics joint '{leader}', which the file does not have")
